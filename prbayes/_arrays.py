@@ -1,0 +1,138 @@
+"""Coercion and checks of samples, weights and shapes; every message says got, expected, what to do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+
+def real_array(values: ArrayLike, name: str) -> Floats:
+    """Return ``values`` as a float array, or raise a `TypeError` that says what was got.
+
+    Parameters
+    ----------
+    values : array_like of real numbers
+    name : str
+        How the message calls the argument.
+    """
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise TypeError(f"{name}: got a ragged sequence, expected a regular array of numbers") from error
+    if array.dtype.kind == "c":
+        raise TypeError(f"{name}: got complex numbers, expected real ones; pass the real part or the modulus")
+    if array.dtype.kind not in "fiub":
+        try:
+            if array.dtype.kind != "O":
+                raise TypeError
+            array = array.astype(np.float64)
+        except (TypeError, ValueError):
+            raise TypeError(f"{name}: got {_describe(values, array)}, expected real numbers") from None
+    return np.asarray(array, dtype=np.float64)
+
+
+def _describe(values: object, array: NDArray[Any]) -> str:
+    if array.ndim == 0:
+        return f"{type(values).__name__} {values!r:.60}"
+    return f"an array of dtype {array.dtype}"
+
+
+def observed_sample(values: ArrayLike, name: str = "observed", *, minimum: int = 1) -> Floats:
+    """Check measured responses: one-dimensional, finite, at least ``minimum`` of them.
+
+    Parameters
+    ----------
+    values : array_like, shape (N,)
+    name : str
+    minimum : int
+
+    Returns
+    -------
+    ndarray, shape (N,)
+
+    Raises
+    ------
+    TypeError
+        If the values are not real numbers.
+    ValueError
+        If they are not one-dimensional, too few, or not finite.
+    """
+    array = real_array(values, name)
+    if array.ndim != 1:
+        raise ValueError(
+            f"{name}: got an array of shape {array.shape}, expected one dimension, (N,); "
+            "several responses of a specimen go to one Simulator each"
+        )
+    if array.size < minimum:
+        few = "no values" if array.size == 0 else f"{array.size} value"
+        raise ValueError(f"{name}: got {few}, expected at least {minimum} measured responses")
+    bad = int((~np.isfinite(array)).sum())
+    if bad:
+        raise ValueError(
+            f"{name}: got {bad} NaN or infinite among {array.size} values, expected finite ones; "
+            "leave missing specimens out"
+        )
+    return array
+
+
+def simulated_sample(values: ArrayLike, name: str = "simulated") -> Floats:
+    """Check simulated responses, shape (..., n); NaN and -inf are refused, +inf (a failed specimen) is not."""
+    array = real_array(values, name)
+    if array.ndim == 0 or array.shape[-1] == 0:
+        raise ValueError(f"{name}: got shape {array.shape}, expected (..., n) with n >= 1")
+    if np.isnan(array).any() or np.isneginf(array).any():
+        raise ValueError(
+            f"{name}: got NaN or -inf, expected numbers; a specimen that failed is +inf, "
+            "other points are to be left out with weight"
+        )
+    return array
+
+
+def sample_weights(weights: ArrayLike | None, n: int, name: str = "weights") -> Floats:
+    """Return weights of the last axis that sum to one; ``None`` means equal weights.
+
+    Parameters
+    ----------
+    weights : array_like, shape (..., n), or None
+        Non-negative, finite, with a positive sum along the last axis.
+    n : int
+        Expected length of the last axis.
+    name : str
+
+    Returns
+    -------
+    ndarray, shape (..., n)
+    """
+    if weights is None:
+        return np.full(n, 1.0 / n)
+    array = real_array(weights, name)
+    if array.ndim == 0 or array.shape[-1] != n:
+        raise ValueError(f"{name}: got shape {array.shape}, expected (..., {n}), one weight per value")
+    if not np.isfinite(array).all() or (array < 0).any():
+        raise ValueError(f"{name}: got negative or non-finite weights, expected weights >= 0")
+    total = array.sum(axis=-1, keepdims=True)
+    if (total <= 0).any():
+        raise ValueError(f"{name}: got weights that sum to zero, expected a positive sum")
+    return np.asarray(array / total)
+
+
+def positive_number(value: object, name: str) -> float:
+    """Return ``value`` as a float, or raise if it is not a positive finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise TypeError(f"{name}: got {type(value).__name__} {value!r:.60}, expected a positive number")
+    if not np.isfinite(value) or value <= 0:
+        raise ValueError(f"{name}: got {value!r}, expected a positive finite number")
+    return float(value)
+
+
+def positive_integer(value: object, name: str, *, minimum: int = 1) -> int:
+    """Return ``value`` as an int, or raise if it is not an integer of at least ``minimum``."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"{name}: got {type(value).__name__} {value!r:.60}, expected an integer >= {minimum}")
+    if value < minimum:
+        raise ValueError(f"{name}: got {value}, expected an integer >= {minimum}")
+    return int(value)

@@ -1,0 +1,184 @@
+"""The design of `Reweighted`: stored responses, the mixture density they were drawn from, refinement."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pytensor
+import pytensor.tensor as pt
+from pytensor.tensor.variable import TensorVariable
+from scipy.special import logsumexp
+
+from prbayes._arrays import Floats
+from prbayes.inputs import PopulationSampler, compile_batched, log_density, prior_draws, quantiles
+from prbayes.metrics import Discrepancy
+from prbayes.propagation import Bound, Reweighted, base_points, refuse_all_nan
+from prbayes.responses import Responses
+
+_MAX_THETAS = 512  # components of a batch's mixture density
+_DRAFT = 16  # draft points, whose response is not computed, for each point of a one-dimensional design
+
+
+class Design(Bound):
+    """Design points with their responses, and weights p(x given theta) / g(x) for every theta.
+
+    The points of a batch are stratified over a finite list of roots' values; the list is kept, and g is
+    exactly the mixture, over all batches, of the densities at the listed values (balance heuristic).
+    """
+
+    def __init__(
+        self, name: str, inputs: Any, target: Discrepancy, responses: Responses, config: Reweighted
+    ) -> None:
+        super().__init__(name, inputs, target, responses)
+        self.config = config
+        self.batches = 0
+        self._thetas: list[Floats] = []
+        self._counts = np.empty(0)
+        self._points: list[Floats] = []
+        self.values = np.empty(0)
+        self._shared: list[Any] = []
+        thetas = prior_draws(inputs.roots, min(config.n, _MAX_THETAS), config.seed)
+        self.prior_size = self.add(thetas)
+        refuse_all_nan(name, self.values)
+
+    @property
+    def n_points(self) -> int:
+        """Number of stored responses."""
+        return self.values.size
+
+    def add(self, thetas: Sequence[Floats]) -> float:
+        """Compute n more responses, at points drawn from the populations of ``thetas``, shapes (k, *shape).
+
+        Returns
+        -------
+        float
+            The median weight effective sample size over these populations.
+        """
+        n, seed = self.config.n, self.config.seed + 7919 * self.batches
+        if self._is_line:
+            points, counts = self._equal_mass(thetas, n, seed)
+        else:
+            points, counts = self._place(thetas, n, seed)
+        values = self.responses(points, [])
+        if self.batches:
+            points = [np.concatenate(pair) for pair in zip(self._points, points, strict=True)]
+            values = np.concatenate([self.values, values])
+            thetas = [np.concatenate(pair) for pair in zip(self._thetas, thetas, strict=True)]
+        k = len(counts)
+        self._points, self.values, self._thetas = points, values, list(thetas)
+        self._counts = np.concatenate([self._counts, counts])
+        self.batches += 1
+        logs = self._log_density(*self._thetas, *points)[0]
+        used = self._counts > 0
+        log_g = logsumexp(logs[used], axis=0, b=self._counts[used, None] / values.size)
+        self._store([*points, log_g, *self.target.basis(values)])
+        weights = logs[-k:] - log_g
+        return float(np.median(np.exp(2 * logsumexp(weights, axis=1) - logsumexp(2 * weights, axis=1))))
+
+    def _store(self, arrays: Sequence[Any]) -> None:
+        if not self._shared:
+            self._shared = [pytensor.shared(a, shape=(None,) * a.ndim) for a in arrays]
+        for shared, array in zip(self._shared, arrays, strict=True):
+            shared.set_value(array)
+
+    @cached_property
+    def _log_density(self) -> Any:
+        symbols = self.inputs.placeholders()
+        points = [pt.tensor(dtype=x.dtype, shape=(None,) * (x.type.ndim + 1)) for x in self.inputs.aleatory]
+        graph = log_density(self.inputs, self.inputs.rebuilt(symbols)[0], points)
+        return compile_batched(symbols, [graph], points)
+
+    @cached_property
+    def _quantiles(self) -> Any:
+        symbols = self.inputs.placeholders()
+        uniforms = [pt.tensor(dtype="float64", shape=x.type.shape) for x in self.inputs.aleatory]
+        dists = self.inputs.rebuilt(symbols)[0]
+        placed = [quantiles(self.name, d, u[None])[0] for d, u in zip(dists, uniforms, strict=True)]
+        return compile_batched([*symbols, *uniforms], placed)
+
+    @property
+    def _is_line(self) -> bool:
+        """Whether there is one continuous aleatory input of one dimension."""
+        x = self.inputs.aleatory[0]
+        return len(self.inputs.aleatory) == 1 and x.type.ndim == 0 and x.dtype.startswith("float")
+
+    def _place(self, thetas: Sequence[Floats], n: int, seed: int) -> tuple[list[Floats], Floats]:
+        """Return n points, one from each population of a stratified list, and how often each theta was used.
+
+        Scrambled Sobol points go through the inverse distribution functions where they exist.
+        """
+        k = len(thetas[0])
+        spare, uniforms = base_points(self.inputs, n, seed)
+        which = np.minimum((spare * k).astype(int), k - 1)
+        at = [t[which] for t in thetas]
+        try:
+            points = list(self._quantiles(*at, *uniforms))
+        except TypeError:  # a distribution without inverse distribution function
+            draws, _ = PopulationSampler(self.inputs)(at, 1, np.random.default_rng(seed))
+            points = [x[:, 0] for x in draws]
+        return points, np.bincount(which, minlength=k).astype(float)
+
+    def _equal_mass(self, thetas: Sequence[Floats], n: int, seed: int) -> tuple[list[Floats], Floats]:
+        """Return n points of one input that cut the mixture over all thetas into parts of equal mass."""
+        (draft,), counts = self._place(thetas, _DRAFT * n, seed)
+        grid = np.unique(draft[np.isfinite(draft)])
+        logs = self._log_density(*thetas, grid)[0]
+        used = counts > 0
+        density = np.exp(logsumexp(logs[used], axis=0, b=counts[used, None] / counts.sum()))
+        mass = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(grid))])
+        levels = (np.arange(n) + np.random.default_rng(seed).uniform()) / n
+        return [np.interp(levels * mass[-1], mass, grid)], counts * (n / counts.sum())
+
+    def log_weights(self, params: Sequence[Any]) -> TensorVariable:
+        """Return log p(x given theta) - log g(x) at the design points, shape (n,)."""
+        k = len(self.inputs.aleatory)
+        logp = log_density(self.inputs, self.inputs.rebuilt(params)[0], self._shared[:k])
+        return logp - self._shared[k]
+
+    def discrepancy(self, params: Sequence[Any]) -> TensorVariable:
+        """Return the discrepancy of the reweighted responses, +inf where no point has weight."""
+        logs = self.log_weights(params)
+        supported = pt.max(logs) > -np.inf
+        weights = pt.special.softmax(pt.switch(supported, logs, 0.0))
+        basis = tuple(self._shared[len(self.inputs.aleatory) + 1 :])
+        d = self.target.outer(*self.target.from_basis(weights, basis, pt), xp=pt)
+        return pt.switch(supported, d, np.inf)
+
+    @cached_property
+    def _log_weights(self) -> Any:
+        symbols = self.inputs.placeholders()
+        return compile_batched(symbols, [self.log_weights(symbols)])
+
+    def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
+        """Return the stored responses and their weights at given roots."""
+        (logs,) = self._log_weights(*params)
+        top = logs.max(axis=-1, keepdims=True)
+        weights = np.exp(logs - np.where(np.isfinite(top), top, 0.0))
+        total = weights.sum(axis=-1, keepdims=True)
+        with np.errstate(invalid="ignore"):
+            weights = weights / total
+        return np.broadcast_to(self.values, weights.shape), weights
+
+    def support(self, params: Sequence[Any]) -> dict[str, Floats]:
+        """Say how well the design supports the populations at given roots, shapes (k,).
+
+        Returns
+        -------
+        dict
+            ``weight_ess``, the effective sample size of the weights; ``mean_weight``, the mean raw weight
+            (1 in expectation; less when part of the population is out of the design's reach);
+            ``lost_mass``, the share of weight on points whose response is NaN.
+        """
+        (logs,) = self._log_weights(*params)
+        total = logsumexp(logs, axis=-1)
+        with np.errstate(invalid="ignore"):
+            ess = np.exp(2 * total - logsumexp(2 * logs, axis=-1))
+            lost = np.exp(logsumexp(logs[..., np.isnan(self.values)], axis=-1) - total)
+        return {
+            "weight_ess": np.nan_to_num(ess),
+            "mean_weight": np.exp(total - np.log(self.values.size)),
+            "lost_mass": np.nan_to_num(lost, nan=1.0),
+        }

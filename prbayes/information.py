@@ -1,0 +1,232 @@
+"""What N observations tell about the hyperparameters: Hessians, sampling covariances, bootstrap.
+
+Everything is computed at one theta from the model's own population there, so that under `Reweighted` no
+response is computed. Derivatives are central differences of stored weights, exact to rounding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from prbayes._arrays import Floats
+from prbayes.metrics import FunctionMetric
+from prbayes.population import Evaluator
+
+_STEP = 1e-3  # of the prior's standard deviation; densities are twice differentiable
+_WIDE_STEP = 0.05  # where a distribution function of simulated values, a step function, is differenced
+_IRLS = 30
+_POINTS = 1000  # single observations over which the covariance of an additive gradient is taken
+
+
+def prior_scale(evaluator: Evaluator, *, size: int = 256, seed: int = 0) -> Floats:
+    """Return the prior's standard deviation of each element of theta, robust, shape (d,)."""
+    thetas = evaluator.prior_thetas(size, seed)
+    spread = np.subtract(*np.quantile(thetas, [0.84, 0.16], axis=0)) / 2
+    return np.where((spread > 0) & np.isfinite(spread), spread, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """Local information about theta in the data of one simulator, were they drawn from the model at ``theta``.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    k : int
+        Which simulator.
+    theta : ndarray, shape (d,)
+    scale : ndarray, shape (d,)
+        The prior's standard deviations; sets the step of the differences.
+    n_sets : int
+        Number of simulated data sets, each of the observed size.
+    seed : int
+    """
+
+    evaluator: Evaluator
+    k: int
+    theta: Floats
+    scale: Floats
+    n_sets: int = 200
+    seed: int = 0
+
+    @cached_property
+    def _step(self) -> Floats:
+        node = self.evaluator.nodes[self.k]
+        rough = not node.metric.smooth and node.bound.n_per_theta > 0
+        return (_WIDE_STEP if rough else _STEP) * self.scale
+
+    @cached_property
+    def _stencil(self) -> Floats:
+        """Displacements: none, +- each, and the four corners of each pair."""
+        d = self.theta.size
+        unit = np.diag(self._step)
+        rows = [np.zeros(d), *(s * u for u in unit for s in (1, -1))]
+        for i in range(d):
+            rows += [a * unit[i] + b * unit[j] for j in range(i) for a in (1, -1) for b in (1, -1)]
+        return np.array(rows)
+
+    @cached_property
+    def _populations(self) -> tuple[Floats, Floats]:
+        return self.evaluator.populations(self.theta + self._stencil, self.k)
+
+    @cached_property
+    def _center(self) -> tuple[Floats, Floats]:
+        """The population at theta that could be observed: finite responses, weights that sum to one."""
+        values, weights = self._populations
+        finite = np.isfinite(values[0])
+        w = weights[0][finite]
+        return values[0][finite], w / w.sum()
+
+    @cached_property
+    def data_sets(self) -> Floats:
+        """Data sets of the observed size from the population at theta, shape (n_sets, N)."""
+        values, weights = self._center
+        rng = np.random.default_rng([self.seed, self.k])
+        n = self.evaluator.nodes[self.k].target.observed.size
+        return rng.choice(values, size=(self.n_sets, n), p=weights)
+
+    @cached_property
+    def _features(self) -> Any:
+        """Features at the stencil where they do not depend on the observed side."""
+        target = self.evaluator.nodes[self.k].target
+        return target.features(*self._populations, np) if hasattr(target, "cells") else None
+
+    def _along_stencil(self, observed: Floats, weights: Floats | None = None) -> Floats:
+        node = self.evaluator.nodes[self.k]
+        target = node.target.with_observed(observed, weights)
+        features = self._features if self._features is not None else target.features(*self._populations, np)
+        return np.asarray(target.outer(*features, xp=np))
+
+    @cached_property
+    def noise_floor(self) -> float:
+        """The mean discrepancy between the population at theta and data sets drawn from it."""
+        target = self.evaluator.nodes[self.k].target
+        values, weights = (a[:1] for a in self._populations)
+        return float(
+            np.mean([target.with_observed(z).of(values, weights) for z in self.data_sets])
+        )
+
+    def _gradients(self, data_sets: Floats) -> Floats:
+        """Gradients of the discrepancy at theta for each data set, shape (n_sets, d)."""
+        d = self.theta.size
+        values = np.array([self._along_stencil(z)[1 : 1 + 2 * d] for z in data_sets])
+        return np.asarray((values[:, 0::2] - values[:, 1::2]) / (2 * self._step))
+
+    @cached_property
+    def gradients(self) -> Floats:
+        """Gradients of the discrepancy at theta for each data set, shape (n_sets, d)."""
+        return self._gradients(self.data_sets)
+
+    @cached_property
+    def sampling_covariance(self) -> Floats:
+        """J: the covariance of the gradient over data sets of the observed size, shape (d, d)."""
+        target = self.evaluator.nodes[self.k].target
+        if not target.metric.additive:
+            return np.atleast_2d(np.cov(self.gradients, rowvar=False))
+        values, weights = self._center
+        order = np.argsort(values)
+        levels = (np.arange(_POINTS) + 0.5) / _POINTS
+        points = values[order][np.minimum(np.searchsorted(np.cumsum(weights[order]), levels), values.size - 1)]
+        return np.atleast_2d(np.cov(self._gradients(points[:, None]), rowvar=False)) / target.n_effective
+
+    @cached_property
+    def hessian(self) -> Floats:
+        """H: the Hessian of the discrepancy at theta against the population at theta, shape (d, d)."""
+        f = self._along_stencil(*self._center)
+        d, h = self.theta.size, self._step
+        out = np.diag((f[1 : 1 + 2 * d : 2] - 2 * f[0] + f[2 : 2 + 2 * d : 2]) / h**2)
+        row = 1 + 2 * d
+        for i in range(d):
+            for j in range(i):
+                pp, pm, mp, mm = f[row : row + 4]
+                out[i, j] = out[j, i] = (pp - pm - mp + mm) / (4 * h[i] * h[j])
+                row += 4
+        return np.asarray(out)
+
+    @cached_property
+    def area(self) -> tuple[Floats, Floats, Floats]:
+        """Linear model of the area metric: gaps (n_sets, m), their slopes (d, m), lengths (m,)."""
+        values, weights = self._populations
+        order = np.argsort(values[0])
+        order = order[np.isfinite(values[0][order])]
+        knots = values[0][order]
+        if np.ndim(values) == 2 and not np.array_equal(values[0], values[-1], equal_nan=True):
+            cdf = np.array([_cdf(v, w, knots) for v, w in zip(values, weights, strict=True)])
+        else:
+            cdf = np.cumsum(weights[:, order], axis=-1)
+        d = self.theta.size
+        slopes = (cdf[1 : 1 + 2 * d : 2] - cdf[2 : 2 + 2 * d : 2]) / (2 * self._step[:, None])
+        steps = np.array([np.searchsorted(np.sort(z), knots, side="right") / z.size for z in self.data_sets])
+        return (cdf[0] - steps)[:, :-1], slopes[:, :-1], np.diff(knots)
+
+
+def _cdf(values: Floats, weights: Floats, at: Floats) -> Floats:
+    order = np.argsort(values)
+    total = np.concatenate([[0.0], np.cumsum(weights[order])])
+    return np.asarray(total[np.searchsorted(values[order], at, side="right")])
+
+
+def symmetric_inverse(matrix: Floats) -> Floats:
+    """Return the inverse of a symmetric positive semi-definite matrix, infinite along directions it is blind to."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    inverse = np.where(values > 1e-9 * max(values.max(), 1e-300), 1 / np.where(values > 0, values, 1.0), np.inf)
+    with np.errstate(invalid="ignore"):
+        return np.nan_to_num((vectors[:, None] * inverse * vectors).sum(axis=-1), nan=np.inf, posinf=np.inf)
+
+
+def bootstrap_shifts(parts: list[Information], scales: Floats) -> Floats:
+    """Return shifts of the minimiser over simulated data sets, to first order, shape (n_sets, d).
+
+    The features are taken as linear in theta. Smooth discrepancies then contribute their gradient and
+    Hessian; areas, integrals of an absolute value, are minimised by iterated reweighting.
+    """
+    n_sets, d = parts[0].n_sets, parts[0].theta.size
+    unit = parts[0].scale
+    rhs, curvature = np.zeros((n_sets, d)), np.zeros((d, d))
+    areas = []
+    for part, s in zip(parts, scales, strict=True):
+        if part.evaluator.nodes[part.k].metric.smooth:
+            rhs -= part.gradients / s
+            curvature += part.hessian / s
+        else:
+            gap, slopes, lengths = part.area
+            areas.append((gap, slopes * unit[:, None], lengths / s))
+    rhs, curvature = rhs * unit, curvature * np.outer(unit, unit)
+    shifts = np.zeros((n_sets, d))
+    ridge = 1e-10 * np.eye(d)
+    for _ in range(_IRLS if areas else 1):
+        left, right = np.broadcast_to(curvature, (n_sets, d, d)).copy(), rhs.copy()
+        for gap, slopes, lengths in areas:
+            residual = gap + shifts @ slopes
+            weight = lengths / np.sqrt(residual**2 + 1e-8)
+            left += np.einsum("bm,im,jm->bij", weight, slopes, slopes, optimize=True)
+            right -= np.einsum("bm,im->bi", weight * gap, slopes, optimize=True)
+        size = np.trace(left, axis1=1, axis2=2)[:, None, None]
+        shifts = np.linalg.solve(left + ridge * size, right[..., None])[..., 0]
+    return shifts * unit
+
+
+def sampling_covariance(parts: list[Information], scales: Floats) -> Floats:
+    """Return the sampling covariance of the minimiser of sum of d_k / scale_k in theta, shape (d, d).
+
+    Raises
+    ------
+    TypeError
+        If one of the metrics is a user's function, of which nothing is known.
+    """
+    metrics = [p.evaluator.nodes[p.k].metric for p in parts]
+    if any(isinstance(m, FunctionMetric) for m in metrics):
+        raise TypeError("standard errors: got a FunctionMetric, expected a metric of this package")
+    if all(m.smooth for m in metrics):
+        hessian = sum(p.hessian / s for p, s in zip(parts, scales, strict=True))
+        noise = sum(p.sampling_covariance / s**2 for p, s in zip(parts, scales, strict=True))
+        unit = np.outer(parts[0].scale, parts[0].scale)
+        inverse = symmetric_inverse(hessian * unit)
+        if not np.isfinite(inverse).all():
+            return inverse
+        return np.asarray(inverse @ (noise * unit) @ inverse * unit)
+    return np.atleast_2d(np.cov(bootstrap_shifts(parts, scales), rowvar=False))

@@ -1,0 +1,369 @@
+"""The deterministic route: `minimize` moves the hyperparameters until the discrepancy is smallest."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+from scipy import optimize
+
+from prbayes._arrays import Floats
+from prbayes.information import Information, prior_scale, sampling_covariance
+from prbayes.metrics import FunctionMetric
+from prbayes.population import Evaluator
+from prbayes.propagation import FreshBound
+from prbayes.refinement import _MAX_ROUNDS, refine_at, refuse, shortcomings, spread_around
+from prbayes.simulator import model_on_context
+
+_log = logging.getLogger("prbayes")
+
+_GRADIENT_FREE = {"nelder-mead", "powell", "cobyla", "cobyqa"}
+_SCREENED = 256  # prior draws tried as starts where a theta costs no response
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """The result of `minimize`; numerical failure is a value in it, not an exception.
+
+    Attributes
+    ----------
+    point : dict
+        Hyperparameters and deterministics by name, in the user's own units.
+    discrepancy : float
+        The minimised sum of d_k / s_k; with one simulator, its discrepancy.
+    discrepancies : dict
+        Discrepancy by simulator.
+    scales : dict
+        The s_k by simulator.
+    n_evaluations : int
+        Calls of the objective by the optimiser.
+    n_screened : int
+        Prior draws that were tried as starting points, in one batch.
+    n_responses : int
+        Scalar responses computed for this optimum, the design's included.
+    converged : bool
+    message : str
+        What the optimiser said.
+    stderr : dict
+        Standard errors by name, in the user's own units: the estimator's sampling standard deviation;
+        infinite along directions that the data do not identify.
+    covariance : ndarray, shape (d, d)
+        Sampling covariance in unconstrained space.
+    theta : ndarray, shape (d,)
+        The optimum in unconstrained space.
+    names : list of str
+        Names of the elements of theta.
+    trace : dict
+        ``theta`` (n, d) and ``discrepancy`` (n,) of each evaluation.
+    seconds : float
+    """
+
+    point: dict[str, Any]
+    discrepancy: float
+    discrepancies: dict[str, float]
+    scales: dict[str, float]
+    n_evaluations: int
+    n_screened: int
+    n_responses: int
+    converged: bool
+    message: str
+    stderr: dict[str, Any]
+    covariance: Floats
+    theta: Floats
+    names: list[str]
+    model: pm.Model = field(repr=False)
+    trace: dict[str, Floats] = field(repr=False, default_factory=dict)
+    seconds: float = 0.0
+
+    def to_datatree(self) -> xr.DataTree:
+        """Return the optimum as a DataTree with groups ``optimum``, ``stderr``, ``trace`` and ``calibration``."""
+        from prbayes.results import optimum_tree
+
+        return optimum_tree(self)
+
+
+class _Counted:
+    """The objective on standardised parameters; records every evaluation."""
+
+    def __init__(self, function: Any, center: Floats, scale: Floats, *, gradient: bool) -> None:
+        self.function, self.center, self.scale, self.gradient = function, center, scale, gradient
+        self.thetas: list[Floats] = []
+        self.values: list[float] = []
+        self.gradients: list[Floats] = []
+
+    def __call__(self, t: Floats) -> Any:
+        theta = self.center + t * self.scale
+        value, *gradient = self.function(theta)
+        value = float(value)
+        self.thetas.append(theta)
+        self.values.append(value)
+        if not self.gradient:
+            return value if np.isfinite(value) else 1e300
+        g = np.asarray(gradient[0]) * self.scale
+        self.gradients.append(g)
+        if not np.isfinite(value) or not np.isfinite(g).all():
+            return 1e10 + float(t @ t), 2 * t  # back towards the start, without breaking a line search
+        return value, g
+
+
+def minimize(
+    model: pm.Model | None = None,
+    *,
+    start: dict[str, Any] | None = None,
+    method: str | None = None,
+    prior: bool = False,
+    tolerance: float = 1e-8,
+    max_evaluations: int = 2000,
+    refine: bool = True,
+    random_seed: int = 0,
+) -> Optimum:
+    """Find the hyperparameters with the smallest discrepancy, inside the support of their priors.
+
+    The parameters are unconstrained through PyMC's transforms and standardised by the prior's spread.
+    With several simulators the sum of d_k / s_k is minimised: s_k is epsilon where it was given, and else
+    the sampling noise of d_k, the mean discrepancy of data sets drawn from the model, at a pilot optimum.
+
+    Parameters
+    ----------
+    model : pymc.Model, optional
+        The one on the context by default.
+    start : dict, optional
+        A value for each free variable, in the user's own units. By default the best of 256 prior draws where
+        they cost no response (`Reweighted`), and else the model's initial point.
+    method : str, optional
+        Any of `scipy.optimize.minimize`. BFGS by default, with exact gradients where there are any and
+        finite differences on common random numbers elsewhere.
+    prior : bool
+        Add minus the log prior (then discrepancies should be divided by calibrated epsilons).
+    tolerance : float
+        Relative tolerance of the standardised problem.
+    max_evaluations : int
+    refine : bool
+        Whether designs of `Reweighted` that do not support the optimum get more points.
+    random_seed : int
+        Seed of the starting draws.
+
+    Returns
+    -------
+    Optimum
+
+    Raises
+    ------
+    TypeError
+        If there is no model, or a gradient method is used on `Fresh`.
+    KeyError, ValueError
+        If ``start`` does not fit the model.
+    DesignError
+        If a design does not support the optimum after refinement.
+
+    References
+    ----------
+    .. [1] Oh et al. (2019), doi:10.1007/s00158-019-02288-6.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    >>> optimum = prb.minimize(model)
+    >>> bool(abs(optimum.point["mu"] - 1) < 0.1)
+    True
+    """
+    clock = time.perf_counter()
+    model = model_on_context(model, "prb.minimize")
+    evaluator = Evaluator(model)
+    method = method or "BFGS"
+    gradient = method.lower() not in _GRADIENT_FREE
+    fresh = [n.name for n in evaluator.nodes if isinstance(n.bound, FreshBound)]
+    if gradient and fresh:
+        raise TypeError(
+            f"{fresh[0]}: prb.Fresh draws new responses at every evaluation, so the method {method} has no gradient to "
+            "follow; use prb.minimize(method='Nelder-Mead'), or propagation=prb.Reweighted() or prb.Resimulated()"
+        )
+    scale = prior_scale(evaluator, seed=random_seed)
+    already = evaluator.n_responses
+    stored = sum(d.n_points for d in evaluator.designs.values())
+    natural = np.array([
+        n.target.scale if len(evaluator.nodes) > 1 and np.isnan(e) else e if len(evaluator.nodes) > 1 or prior else 1.0
+        for n, e in zip(evaluator.nodes, evaluator.epsilon, strict=True)
+    ])
+    if np.isnan(natural).any():
+        natural = np.where(np.isnan(natural), [n.target.scale for n in evaluator.nodes], natural)
+    search = _Search(evaluator, scale, method, gradient, prior, tolerance, max_evaluations)
+    theta, screened = search.start(start, natural, random_seed)
+    scales = natural
+    for round_ in range(_MAX_ROUNDS + 1):
+        result = search(theta, scales)
+        theta = search.best
+        if len(evaluator.nodes) > 1 and np.isnan(evaluator.epsilon).any():
+            noise = [Information(evaluator, k, theta, scale).noise_floor for k in range(len(evaluator.nodes))]
+            scales = np.where(np.isnan(evaluator.epsilon), noise, evaluator.epsilon)
+            result = search(theta, scales)
+            theta = search.best
+        covariance = _covariance(evaluator, theta, scale, scales)
+        if not (refine and evaluator.designs):
+            break
+        around = spread_around(theta, covariance, scale, seed=random_seed)
+        around = around[evaluator.in_support(around)]
+        if round_ == _MAX_ROUNDS:
+            refuse(shortcomings(evaluator, around), evaluator)
+        elif not refine_at(evaluator, around):
+            break
+    return _optimum(
+        evaluator, theta, scales, covariance, search, result, screened, evaluator.n_responses - already + stored, clock
+    )
+
+
+class _Search:
+    """Runs scipy on the objective, as often as scales or designs change."""
+
+    def __init__(
+        self, evaluator: Evaluator, scale: Floats, method: str, gradient: bool, prior: bool, tolerance: float, most: int
+    ) -> None:
+        self.evaluator, self.scale, self.method = evaluator, scale, method
+        self.gradient, self.prior, self.tolerance, self.most = gradient, prior, tolerance, most
+        self.thetas: list[Floats] = []
+        self.values: list[float] = []
+        self.best = np.empty(0)
+
+    def start(self, start: dict[str, Any] | None, scales: Floats, seed: int) -> tuple[Floats, int]:
+        """Return where to begin and how many draws were screened for it."""
+        if start is not None:
+            return self.evaluator.unconstrained(start), 0
+        if self.evaluator.responses_per_theta:
+            return self.evaluator.initial, 0
+        draws = np.concatenate([self.evaluator.initial[None], self.evaluator.prior_thetas(_SCREENED, seed)])
+        found = self.evaluator(draws)
+        value = (found.discrepancies / scales).sum(axis=-1) - found.log_other
+        return draws[np.argmin(np.where(np.isfinite(value), value, np.inf))], len(draws)
+
+    def __call__(self, theta: Floats, scales: Floats) -> Any:
+        """Minimise from theta; sets ``best``."""
+        exact = self.gradient
+        try:
+            function = self.evaluator.objective(scales, prior=self.prior, gradient=exact)
+        except NotImplementedError as error:
+            _log.info("no exact gradient (%s): finite differences on common random numbers", error)
+            exact = False
+            function = self.evaluator.objective(scales, prior=self.prior, gradient=False)
+        counted = _Counted(function, theta, self.scale, gradient=exact)
+        zero = np.zeros_like(theta)
+        first = counted(zero)
+        size = max(abs(first[0] if exact else first), 1e-12)
+        options: dict[str, Any] = {}
+        name = self.method.lower()
+        if name in {"bfgs", "cg"}:
+            options = {"gtol": self.tolerance * size, "maxiter": self.most}
+            if not exact:
+                options["finite_diff_rel_step"] = None
+                options["eps"] = 1e-5
+        elif name == "l-bfgs-b":
+            options = {"gtol": self.tolerance * size, "ftol": self.tolerance**2, "maxfun": self.most}
+        elif name == "nelder-mead":
+            options = {"xatol": 1e-6, "fatol": self.tolerance * size, "maxfev": self.most}
+            options["initial_simplex"] = np.vstack([zero, 0.2 * np.eye(zero.size)])
+        result = optimize.minimize(
+            counted, zero, jac=exact if self.gradient else None, method=self.method, options=options
+        )
+        self._record(counted)
+        if self.gradient and not result.success:
+            result = self._settle(counted, result, size, exact)
+        return result
+
+    def _record(self, counted: _Counted) -> None:
+        self.thetas += counted.thetas
+        self.values += counted.values
+        values = np.array(counted.values)
+        self.best = counted.thetas[int(np.argmin(np.where(np.isfinite(values), values, np.inf)))]
+        self.scale_of_objective = abs(float(np.nanmin(values)))
+
+    def _settle(self, counted: _Counted, result: Any, size: float, exact: bool) -> Any:
+        """Decide on a line search that gave up: at a kink or at rounding that is the minimum, if a simplex agrees."""
+        start = (self.best - counted.center) / self.scale
+        before = min(v for v in counted.values if np.isfinite(v))
+        again = _Counted(
+            counted.function if not exact else (lambda theta: counted.function(theta)[:1]),
+            counted.center,
+            self.scale,
+            gradient=False,
+        )
+        simplex = np.vstack([start, start + 0.01 * np.eye(start.size)])
+        polished = optimize.minimize(
+            again,
+            start,
+            method="Nelder-Mead",
+            options={"initial_simplex": simplex, "xatol": 1e-5, "fatol": 1e-9 * size, "maxfev": 100 * start.size},
+        )
+        self._record_more(again)
+        gain = (before - polished.fun) / max(abs(before), 1e-300)
+        polished.message = f"{result.message} A simplex from there gained {max(gain, 0):.1e}: {polished.message}"
+        return polished
+
+    def _record_more(self, counted: _Counted) -> None:
+        best = min((v for v in self.values if np.isfinite(v)), default=np.inf)
+        self.thetas += counted.thetas
+        self.values += counted.values
+        values = np.array(counted.values)
+        if np.nanmin(values) <= best:
+            self.best = counted.thetas[int(np.nanargmin(values))]
+
+
+def _covariance(evaluator: Evaluator, theta: Floats, scale: Floats, scales: Floats) -> Floats:
+    unknown = any(isinstance(n.metric, FunctionMetric) or isinstance(n.bound, FreshBound) for n in evaluator.nodes)
+    if unknown:
+        return np.full((theta.size, theta.size), np.nan)
+    parts = [Information(evaluator, k, theta, scale) for k in range(len(evaluator.nodes))]
+    return sampling_covariance(parts, scales)
+
+
+def _optimum(
+    evaluator: Evaluator,
+    theta: Floats,
+    scales: Floats,
+    covariance: Floats,
+    search: _Search,
+    result: Any,
+    screened: int,
+    n_responses: int,
+    clock: float,
+) -> Optimum:
+    step = 1e-4 * search.scale
+    rows = np.vstack([theta, *(theta + s * e for e in np.diag(step) for s in (1, -1))])
+    values = evaluator.constrained(rows)
+    stderr = {}
+    for name, v in values.items():
+        slopes = np.moveaxis((v[1::2] - v[2::2]), 0, -1) / (2 * step)
+        with np.errstate(invalid="ignore"):
+            variance = np.einsum("...i,ij,...j->...", slopes, covariance, slopes)
+        touched = np.einsum("...i,ij,...j->...", np.abs(slopes), np.isinf(covariance).astype(float), np.abs(slopes))
+        stderr[name] = _plain(np.sqrt(np.where(touched > 0, np.inf, np.maximum(variance, 0))))
+    found = evaluator(theta[None])
+    discrepancies = dict(zip([n.name for n in evaluator.nodes], map(float, found.discrepancies[0]), strict=True))
+    return Optimum(
+        point={name: _plain(v[0]) for name, v in values.items()},
+        discrepancy=float((found.discrepancies[0] / scales).sum()),
+        discrepancies=discrepancies,
+        scales=dict(zip(discrepancies, map(float, scales), strict=True)),
+        n_evaluations=len(search.values),
+        n_screened=screened,
+        n_responses=n_responses,
+        converged=bool(result.success),
+        message=str(result.message),
+        stderr=stderr,
+        covariance=covariance,
+        theta=theta,
+        names=evaluator.names,
+        model=evaluator.model,
+        trace={"theta": np.array(search.thetas), "discrepancy": np.array(search.values)},
+        seconds=time.perf_counter() - clock,
+    )
+
+
+def _plain(value: Any) -> Any:
+    return float(value) if np.ndim(value) == 0 else np.asarray(value)

@@ -1,0 +1,367 @@
+"""How a population of inputs becomes responses: `Reweighted`, `Resimulated`, `Fresh`.
+
+A propagation is configuration. ``bind`` makes the moving part for one simulator, a `Bound`, which gives
+the discrepancy as a graph of the hyperparameters and knows how many responses were computed.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pytensor.tensor as pt
+from pytensor.compile import function
+from pytensor.graph.basic import Apply
+from pytensor.graph.op import Op
+from pytensor.graph.replace import _vectorize_node
+from pytensor.tensor.variable import TensorVariable
+from scipy.stats import qmc
+
+from prbayes._arrays import Floats, positive_integer, positive_number
+from prbayes.inputs import (
+    PLAIN, Inputs, PopulationSampler, compile_batched, event_shape, prior_draws, quantiles, valid,
+)
+from prbayes.metrics import Discrepancy
+from prbayes.responses import ResponseError, ResponseOp, Responses, symbolic_discrepancy
+
+
+class Bound(ABC):
+    """A propagation at work for one simulator.
+
+    Attributes
+    ----------
+    name : str
+    inputs : Inputs
+    target : Discrepancy
+    responses : Responses
+    n_per_theta : int
+        Number of responses that one evaluation of the discrepancy computes.
+    symbolic : bool
+        Whether the responses are part of the graph, so that `responses` does not count them.
+    """
+
+    n_per_theta: int = 0
+    symbolic: bool = False
+
+    def __init__(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> None:
+        self.name = name
+        self.inputs = inputs
+        self.target = target
+        self.responses = responses
+
+    @property
+    def n_points(self) -> int:
+        """Number of points that carry weight in one evaluation of the discrepancy."""
+        return self.n_per_theta
+
+    @abstractmethod
+    def discrepancy(self, params: Sequence[Any]) -> TensorVariable:
+        """Return the discrepancy as a scalar graph of the roots' values."""
+
+    @abstractmethod
+    def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
+        """Return responses and weights of the populations at given roots, each of shape (k, n)."""
+
+    def draw(self, rng: np.random.Generator, size: int, params: Sequence[Any]) -> Floats:
+        """Draw responses of ``size`` different specimens from the population at one value of the roots."""
+        values, weights = self.populations([np.asarray(p)[None] for p in params])
+        good = ~np.isnan(values[0])
+        w = np.where(good, weights[0], 0.0)
+        if not w.sum() > 0:
+            return np.full(size, np.nan)
+        return rng.choice(values[0], size=size, p=w / w.sum())
+
+
+class Propagation(ABC):
+    """How a population of inputs becomes responses."""
+
+    @abstractmethod
+    def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
+        """Return the moving part for one simulator; raises what this propagation cannot do."""
+
+
+@dataclass(frozen=True)
+class Reweighted(Propagation):
+    """Simulate once: stored responses at design points get weights p(x given theta) / g(x) for each theta.
+
+    Parameters
+    ----------
+    n : int
+        Number of design points, drawn from the inputs' prior predictive distribution; the response is
+        computed n times, once. `refine` adds batches of the same size where they are needed.
+    seed : int
+        Seed of the design.
+    max_lost : float
+        Largest share of a population's weight that may fall on points whose response is NaN.
+
+    References
+    ----------
+    .. [1] A. B. Owen, Monte Carlo theory, methods and examples, chapter 9 (mixture importance sampling).
+
+    Examples
+    --------
+    >>> Reweighted(256)
+    Reweighted(n=256, seed=0, max_lost=0.05)
+    """
+
+    n: int = 1024
+    seed: int = 0
+    max_lost: float = 0.05
+
+    def __post_init__(self) -> None:
+        positive_integer(self.n, "Reweighted: n", minimum=16)
+        positive_integer(self.seed, "Reweighted: seed", minimum=0)
+        if not 0 <= positive_number(self.max_lost, "Reweighted: max_lost") < 1:
+            raise ValueError(f"Reweighted: max_lost: got {self.max_lost}, expected a share below 1")
+
+    def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
+        """Compute the responses at the first design points."""
+        from prbayes.design import Design
+
+        if inputs.epistemic:
+            raise TypeError(
+                f"{name}: {', '.join(str(e.name or e) for e in inputs.epistemic)} goes into the response as a model "
+                "variable (epistemic), so stored responses cannot be reweighted; use propagation=prb.Resimulated()"
+            )
+        refuse_nested(name, inputs)
+        if getattr(target.metric, "weighted", True) is False:
+            raise TypeError(
+                f"{name}: a FunctionMetric without weights cannot be used with prb.Reweighted; write "
+                "function(simulated, observed, weights) with weighted=True, or use propagation=prb.Resimulated()"
+            )
+        return Design(name, inputs, target, responses, self)
+
+
+@dataclass(frozen=True)
+class Resimulated(Propagation):
+    """Fixed scrambled Sobol points through the inputs' inverse distribution functions, for each theta anew.
+
+    Parameters
+    ----------
+    n : int
+        Number of points, best a power of two; n responses are computed for each theta.
+    seed : int
+        Seed of the scrambling.
+
+    Examples
+    --------
+    >>> Resimulated(512)
+    Resimulated(n=512, seed=0)
+    """
+
+    n: int = 1024
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        positive_integer(self.n, "Resimulated: n", minimum=2)
+        positive_integer(self.seed, "Resimulated: seed", minimum=0)
+
+    def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
+        """Lay out the base points and find out whether the response accepts PyTensor variables."""
+        refuse_nested(name, inputs)
+        return ResimulatedBound(name, inputs, target, responses, self)
+
+
+@dataclass(frozen=True)
+class Fresh(Propagation):
+    """New random draws at every evaluation, as in classic ABC; the discrepancy is noisy and has no gradient.
+
+    Parameters
+    ----------
+    n : int
+        Number of draws for each theta.
+    seed : int
+        Seed of the generator that belongs to the simulator.
+
+    Examples
+    --------
+    >>> Fresh(50)
+    Fresh(n=50, seed=0)
+    """
+
+    n: int = 1024
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        positive_integer(self.n, "Fresh: n", minimum=1)
+        positive_integer(self.seed, "Fresh: seed", minimum=0)
+
+    def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
+        """Prepare the generator of draws."""
+        return FreshBound(name, inputs, target, responses, self)
+
+
+def refuse_nested(name: str, inputs: Inputs) -> None:
+    """Refuse a `.dist()` that depends on another one."""
+    if inputs.nested:
+        raise TypeError(
+            f"{name}: an input is a `.dist()` that depends on another `.dist()`; its density is not that of "
+            "independent inputs; use one multivariate distribution, or propagation=prb.Fresh()"
+        )
+
+
+def sobol(n: int, dimensions: int, seed: int) -> Floats:
+    """Return n scrambled Sobol points in the open unit cube, shape (n, dimensions)."""
+    engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
+    points = engine.random_base2(int(np.ceil(np.log2(n))))[:n] if n > 1 else engine.random(1)
+    return np.clip(points, 1e-12, 1 - 1e-12)
+
+
+def base_points(inputs: Inputs, n: int, seed: int) -> tuple[Floats, list[Floats]]:
+    """Return one spare Sobol coordinate, shape (n,), and one array of points, (n, *event), per aleatory input."""
+    shapes = [event_shape(x) for x in inputs.aleatory]
+    sizes = [int(np.prod(s, dtype=int)) for s in shapes]
+    u = sobol(n, 1 + sum(sizes), seed)
+    edges = np.cumsum([1, *sizes])
+    parts = [
+        u[:, a:b].reshape(n, *s) for a, b, s in zip(edges[:-1], edges[1:], shapes, strict=True)
+    ]
+    return u[:, 0], parts
+
+
+def probe(inputs: Inputs, responses: Responses, sampler: PopulationSampler, seed: int) -> tuple[Any, ...]:
+    """Call the response at a few points of the prior, shape (2, 8), so that mistakes show at once.
+
+    Raises
+    ------
+    ResponseError
+        If the response raises, has the wrong shape, or is NaN everywhere.
+    """
+    thetas = prior_draws(inputs.roots, 2, seed)
+    aleatory, epistemic = sampler(thetas, 8, np.random.default_rng(seed))
+    values = responses(aleatory, epistemic)
+    refuse_all_nan(responses.name, values)
+    return values, aleatory, epistemic
+
+
+def refuse_all_nan(name: str, values: Floats) -> None:
+    """Raise if no response is a number."""
+    if np.isnan(values).all():
+        raise ResponseError(
+            f"{name}: the response is NaN at all {values.size} points drawn from the prior, expected numbers; look at "
+            "the priors and at the response's domain; a specimen that fails is +inf"
+        )
+
+
+class ResimulatedBound(Bound):
+    """Common random numbers: the same base points for every theta."""
+
+    def __init__(
+        self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses, config: Resimulated
+    ) -> None:
+        super().__init__(name, inputs, target, responses)
+        self.n_per_theta = config.n
+        _, self._points = base_points(inputs, config.n, config.seed)
+        for dist, u in zip(inputs.aleatory, self._points, strict=True):
+            quantiles(name, dist, u)  # refuses what has no inverse distribution function
+        self.symbolic = self._accepts_tensors(*probe(inputs, responses, PopulationSampler(inputs), config.seed))
+
+    def _accepts_tensors(self, expected: Floats, aleatory: list[Floats], epistemic: list[Floats]) -> bool:
+        """Try the response on PyTensor variables, and believe it only if the numbers agree."""
+        symbols = [pt.tensor(dtype="float64", shape=(None,) * v.ndim) for v in (*aleatory, *epistemic)]
+        try:
+            graph = self.responses.function(*self.inputs.fill(symbols[: len(aleatory)], symbols[len(aleatory) :]))
+            if not isinstance(graph, TensorVariable):
+                return False
+            values = function(symbols, graph, mode=PLAIN, on_unused_input="ignore")(*aleatory, *epistemic)
+        except Exception:  # whatever it is: the response is then called with arrays
+            return False
+        return values.shape == expected.shape and np.allclose(values, expected, rtol=1e-9, equal_nan=True)
+
+    def _response(self, params: Sequence[Any]) -> tuple[TensorVariable, TensorVariable]:
+        dists, epistemic = self.inputs.rebuilt(params)
+        aleatory = [quantiles(self.name, d, u) for d, u in zip(dists, self._points, strict=True)]
+        common = [e[None] for e in epistemic]
+        if self.symbolic:
+            values = self.responses.function(*self.inputs.fill(aleatory, common))
+        else:
+            values = ResponseOp(self.responses)(*aleatory, *common)
+        return values, valid(self.inputs, dists)
+
+    def discrepancy(self, params: Sequence[Any]) -> TensorVariable:
+        """Return the discrepancy of the responses at the base points, +inf where parameters are invalid."""
+        values, ok = self._response(params)
+        weights = np.full(self.n_per_theta, 1 / self.n_per_theta)
+        return pt.switch(ok, symbolic_discrepancy(self.target, values, weights), np.inf)
+
+    @cached_property
+    def _values(self) -> Any:
+        symbols = self.inputs.placeholders()
+        return compile_batched(symbols, [self._response(symbols)[0]])
+
+    def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
+        """Return the responses at the base points, with equal weights."""
+        (values,) = self._values(*params)
+        if self.symbolic:
+            self.responses.count += values.size
+        return values, np.broadcast_to(1 / self.n_per_theta, values.shape)
+
+
+class FreshBound(Bound):
+    """New random draws at every evaluation."""
+
+    def __init__(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses, config: Fresh) -> None:
+        super().__init__(name, inputs, target, responses)
+        self.n_per_theta = config.n
+        self.rng = np.random.default_rng(config.seed)
+        self._sampler = PopulationSampler(inputs)
+        symbols = inputs.placeholders()
+        self._valid = compile_batched(symbols, [valid(inputs, inputs.rebuilt(symbols)[0])])
+        probe(inputs, responses, self._sampler, config.seed)
+
+    def discrepancy(self, params: Sequence[Any]) -> TensorVariable:
+        """Return an operation that draws and evaluates."""
+        return FreshOp(self)(*params)
+
+    def valid(self, params: Sequence[Any]) -> Any:
+        """Return which of a batch of roots give valid distributions, shape (k,)."""
+        return np.broadcast_to(self._valid(*params)[0], np.shape(params[0])[:1])
+
+    def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
+        """Return fresh responses with equal weights."""
+        values = self.responses(*self._sampler(params, self.n_per_theta, self.rng))
+        return values, np.broadcast_to(1 / self.n_per_theta, values.shape)
+
+
+class FreshOp(Op):
+    """Draws a population and returns its discrepancy, () ... -> ()."""
+
+    def __init__(self, bound: FreshBound) -> None:
+        self.bound = bound
+
+    def make_node(self, *params: Any) -> Apply[Any, Any]:
+        """Apply to the roots' values."""
+        tensors = [pt.as_tensor(p) for p in params]
+        ndims = [r.type.ndim for r in self.bound.inputs.roots]
+        batch = max(t.type.ndim - d for t, d in zip(tensors, ndims, strict=True))
+        return Apply(self, tensors, [pt.tensor(dtype="float64", shape=(None,) * batch)])
+
+    def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
+        """Draw, call the response, compare."""
+        ndims = [r.type.ndim for r in self.bound.inputs.roots]
+        batch = np.broadcast_shapes(*(p.shape[: p.ndim - d] for p, d in zip(inputs, ndims, strict=True)))
+        params = [
+            np.broadcast_to(p, batch + p.shape[p.ndim - d :]).reshape(-1, *p.shape[p.ndim - d :])
+            for p, d in zip(inputs, ndims, strict=True)
+        ]
+        result = np.full(len(params[0]), np.inf)
+        ok = self.bound.valid(params)
+        if ok.any():
+            values, weights = self.bound.populations([p[ok] for p in params])
+            result[ok] = self.bound.target.of(values, weights)
+        outputs[0][0] = result.reshape(batch)
+
+    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
+        """Refuse by name; not as NotImplementedError, which PyMC takes as leave to use a slice sampler."""
+        raise TypeError(
+            f"{self.bound.name}: prb.Fresh draws new responses at every evaluation, so its log-density is random and "
+            "has no gradient: pm.sample, pm.find_MAP and gradient methods of prb.minimize would be wrong; use "
+            "propagation=prb.Reweighted() or prb.Resimulated(), or prb.sample_smc"
+        )
+
+
+_vectorize_node.register(FreshOp, lambda op, node, *batched: op.make_node(*batched))

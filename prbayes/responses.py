@@ -1,0 +1,219 @@
+"""Calling the user's response: shapes, checks, counting; and the PyTensor operations made from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytensor.tensor as pt
+from pytensor.graph.basic import Apply, Variable
+from pytensor.graph.op import Op
+from pytensor.graph.replace import _vectorize_node
+
+from prbayes._arrays import Floats
+from prbayes.density import Cells
+from prbayes.inputs import Inputs
+from prbayes.metrics import Discrepancy
+
+
+class ResponseError(RuntimeError):
+    """The user's response raised, or returned something that is no response."""
+
+
+class Responses:
+    """The user's response function, called on whole batches; counts the scalar responses it computed.
+
+    Parameters
+    ----------
+    name : str
+        Name of the simulator, for messages.
+    function : callable
+        ``function(*inputs)``, one array per input, any leading batch shape.
+    inputs : Inputs
+    """
+
+    def __init__(self, name: str, function: Callable[..., Any], inputs: Inputs) -> None:
+        if not callable(function):
+            raise TypeError(
+                f"{name}: response: got {type(function).__name__}, expected a function of the inputs, such as "
+                "lambda x: x**2; the order is Simulator(name, response, *inputs, metric=..., observed=...)"
+            )
+        self.name = name
+        self.function = function
+        self.inputs = inputs
+        self.count = 0
+
+    def __call__(self, aleatory: Sequence[Floats], epistemic: Sequence[Floats]) -> Floats:
+        """Return responses, shape (...), for aleatory values (..., *event) and epistemic ones (..., *event).
+
+        Raises
+        ------
+        ResponseError
+            If the response raises, or if its result is not real numbers in the batch shape.
+        """
+        ndims = [*self.inputs.event_ndims, *(e.type.ndim for e in self.inputs.epistemic)]
+        values = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
+        leading = [v.shape[: v.ndim - e] for v, e in zip(values, ndims, strict=True)]
+        batch = np.broadcast_shapes(*leading)
+        full = [
+            np.broadcast_to(v, batch + v.shape[v.ndim - e :]) for v, e in zip(values, ndims, strict=True)
+        ]
+        arguments = self.inputs.fill(full[: len(aleatory)], full[len(aleatory) :])
+        shapes = ", ".join(str(np.shape(a)) for a in arguments)
+        try:
+            with np.errstate(all="ignore"):
+                result = self.function(*arguments)
+        except Exception as error:
+            raise ResponseError(
+                f"{self.name}: the response raised {type(error).__name__}: {error}; it was called with inputs of "
+                f"shapes {shapes} and is expected to take arrays of any leading shape"
+            ) from error
+        self.count += int(np.prod(batch, dtype=int))
+        array = np.asarray(result)
+        if array.dtype.kind not in "fiub":
+            got = "complex numbers" if array.dtype.kind == "c" else f"{type(result).__name__} of dtype {array.dtype}"
+            raise ResponseError(f"{self.name}: the response returned {got}, expected an array of real numbers")
+        if array.shape != batch:
+            raise ResponseError(
+                f"{self.name}: the response returned shape {array.shape} for inputs of shapes {shapes}, expected "
+                f"{batch}: one response per specimen; reduce over the event axis only (the last one)"
+            )
+        return array.astype(np.float64)
+
+
+class ResponseOp(Op):
+    """The response as an operation; it has no gradient and is computed in one call for a whole batch."""
+
+    __props__ = ()
+
+    def __init__(self, responses: Responses) -> None:
+        self.responses = responses
+        inputs = responses.inputs
+        self.event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ResponseOp) and self.responses is other.responses
+
+    def __hash__(self) -> int:
+        return hash((type(self), id(self.responses)))
+
+    def make_node(self, *inputs: Any) -> Apply[Any, Any]:
+        """Apply to values of shape (..., *event); the result has the leading axes."""
+        tensors = [pt.as_tensor(x) for x in inputs]
+        ndim = max(t.type.ndim - e for t, e in zip(tensors, self.event_ndims, strict=True))
+        return Apply(self, tensors, [pt.tensor(dtype="float64", shape=(None,) * ndim)])
+
+    def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
+        """Call the response."""
+        k = len(self.responses.inputs.aleatory)
+        outputs[0][0] = self.responses(inputs[:k], inputs[k:])
+
+    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
+        """Refuse: the response is a black box."""
+        raise NotImplementedError(
+            f"{self.responses.name}: the response does not accept PyTensor variables, so it has no gradient under "
+            "prb.Resimulated; use propagation=prb.Reweighted(), or prb.sample_smc, which needs none"
+        )
+
+
+class DensityOp(Op):
+    """The density of a weighted sample on cells, (..., n), (..., n) -> (..., m)."""
+
+    def __init__(self, cells: Cells) -> None:
+        self.cells = cells
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, DensityOp) and self.cells is other.cells
+
+    def __hash__(self) -> int:
+        return hash((type(self), id(self.cells)))
+
+    def make_node(self, sample: Any, weights: Any) -> Apply[Any, Any]:
+        """Apply to a sample and its weights."""
+        sample, weights = pt.as_tensor(sample), pt.as_tensor(weights)
+        ndim = max(sample.type.ndim, weights.type.ndim)
+        shape = (None,) * (ndim - 1) + (self.cells.widths.size,)
+        return Apply(self, [sample, weights], [pt.tensor(dtype="float64", shape=shape)])
+
+    def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
+        """Bin and smooth."""
+        sample, weights = np.broadcast_arrays(*inputs)
+        outputs[0][0] = self.cells.density(sample, weights)
+
+    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
+        """Return the derivatives by another operation."""
+        if not self.cells.smooth:
+            raise NotImplementedError(
+                "a Histogram has no gradient under prb.Resimulated: use GaussianKDE, or prb.Reweighted"
+            )
+        return DensityPullbackOp(self.cells)(*inputs, *cotangents)
+
+
+class DensityPullbackOp(DensityOp):
+    """Derivatives of a density on cells: (n), (n), (m) -> (n), (n)."""
+
+    def make_node(self, sample: Any, weights: Any, cotangent: Any = None) -> Apply[Any, Any]:
+        """Apply to a sample, its weights and the cotangent of the density."""
+        tensors = [pt.as_tensor(x) for x in (sample, weights, cotangent)]
+        ndim = max(t.type.ndim for t in tensors)
+        return Apply(self, tensors, [pt.tensor(dtype="float64", shape=(None,) * ndim) for _ in range(2)])
+
+    def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
+        """Gather."""
+        outputs[0][0], outputs[1][0] = (np.array(g) for g in self.cells.pullback(*inputs))
+
+    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
+        """Refuse second derivatives."""
+        raise NotImplementedError("second derivatives of a density of simulated values are not implemented as a graph")
+
+
+class OpaqueOp(Op):
+    """A user's metric on weighted responses, (..., n), (..., n) -> (...); it has no gradient."""
+
+    __props__ = ()
+
+    def __init__(self, target: Discrepancy) -> None:
+        self.target = target
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, OpaqueOp) and self.target is other.target
+
+    def __hash__(self) -> int:
+        return hash((type(self), id(self.target)))
+
+    def make_node(self, sample: Any, weights: Any) -> Apply[Any, Any]:
+        """Apply to a sample and its weights."""
+        sample, weights = pt.as_tensor(sample), pt.as_tensor(weights)
+        ndim = max(sample.type.ndim, weights.type.ndim)
+        return Apply(self, [sample, weights], [pt.tensor(dtype="float64", shape=(None,) * (ndim - 1))])
+
+    def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
+        """Call the user's function."""
+        sample, weights = np.broadcast_arrays(*inputs)
+        outputs[0][0] = np.asarray(self.target.of(sample, weights))
+
+    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
+        """Refuse: nothing is known about the function."""
+        raise NotImplementedError(
+            "a FunctionMetric has no gradient; use prb.sample_smc, prb.minimize(method='Nelder-Mead') or pm.Slice"
+        )
+
+
+def _on_batches(op: Any, node: Apply[Any, Any], *batched: Variable) -> Any:
+    """Operations that take leading axes themselves: a batch is one call."""
+    return op.make_node(*batched)
+
+
+for _op in (ResponseOp, DensityOp, OpaqueOp):
+    _vectorize_node.register(_op, _on_batches)
+
+
+def symbolic_discrepancy(target: Discrepancy, sample: Any, weights: Any) -> Any:
+    """Return the graph of a discrepancy for a sample that depends on theta, shapes (n,), (n,) -> ()."""
+    cells = getattr(target, "cells", None)
+    if cells is not None:
+        return target.outer(DensityOp(cells)(sample, weights), xp=pt)
+    if getattr(target.metric, "function", None) is not None:
+        return OpaqueOp(target)(sample, weights)
+    return target.outer(*target.features(sample, weights, pt), xp=pt)

@@ -1,0 +1,158 @@
+"""The schema of results: groups, dimensions, attributes, in one place."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from prbayes._arrays import Floats
+from prbayes.population import Evaluator
+
+if TYPE_CHECKING:
+    from prbayes.optimize import Optimum
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a result depends on."""
+    return {f"{name}_version": importlib.metadata.version(name) for name in ("prbayes", "pymc", "numpy")}
+
+
+def _dataset(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, int]) -> xr.Dataset:
+    """Label values, shapes (*leading, *shape), with the model's own dimensions and coordinates."""
+    dims = evaluator.model.named_vars_to_dims
+    coords: dict[str, Any] = {name: np.arange(size) for name, size in leading.items()}
+    variables = {}
+    for name, value in values.items():
+        rest = np.ndim(value) - len(leading)
+        own = [d or f"{name}_dim_{i}" for i, d in enumerate(dims.get(name) or [None] * rest)]
+        for d in own:
+            if evaluator.model.coords.get(d) is not None:
+                coords[d] = np.asarray(evaluator.model.coords[d])
+        variables[name] = ([*leading, *own], np.asarray(value))
+    return xr.Dataset(variables, coords=coords)
+
+
+def posterior_tree(
+    evaluator: Evaluator,
+    thetas: Floats,
+    stats: list[dict[str, list[float]]],
+    *,
+    seed: int | None,
+    n_responses: int,
+    seconds: float,
+) -> xr.DataTree:
+    """Return the DataTree of a sampler's draws.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    thetas : ndarray, shape (chains, draws, d)
+    stats : list of dict
+        By chain: statistics by name, one value per stage.
+    seed : int or None
+    n_responses : int
+        Scalar responses computed, the designs' included.
+    seconds : float
+    """
+    chains, draws, d = thetas.shape
+    leading = {"chain": chains, "draw": draws}
+    flat = thetas.reshape(-1, d)
+    values = {n: v.reshape(chains, draws, *v.shape[1:]) for n, v in evaluator.constrained(flat).items()}
+    posterior = _dataset(evaluator, values, leading)
+    n_stages = max(len(s["beta"]) for s in stats)
+    sample_stats = xr.Dataset(
+        {
+            name: (
+                ["chain", "stage"],
+                np.array([list(map(float, s[name])) + [np.nan] * (n_stages - len(s[name])) for s in stats]),
+            )
+            for name in stats[0]
+        },
+        coords={"chain": np.arange(chains), "stage": np.arange(n_stages)},
+    )
+    attrs = {
+        "sampler": "SMC-ABC",
+        "n_responses": n_responses,
+        "seconds": seconds,
+        "random_seed": "None" if seed is None else str(seed),
+        **versions(),
+    }
+    posterior.attrs.update({"inference_library": "prbayes", **attrs})
+    names = [n.name for n in evaluator.nodes]
+    where = ["chain", "draw", "simulator"]
+    shape = (chains, draws, len(names))
+    support = evaluator.support(flat)
+    nothing = {"weight_ess": np.nan, "mean_weight": np.nan, "lost_mass": np.nan}
+    calibration = xr.Dataset(
+        {
+            "discrepancy": (where, evaluator(flat).discrepancies.reshape(shape)),
+            **{
+                key: (where, np.stack([np.broadcast_to(support.get(n, nothing)[key], len(flat)) for n in names], -1)
+                      .reshape(shape))
+                for key in nothing
+            },
+            "theta": (["chain", "draw", "element"], thetas),
+            "epsilon": ("simulator", evaluator.epsilon),
+            "metric": ("simulator", [repr(n.metric) for n in evaluator.nodes]),
+            "propagation": ("simulator", [repr(n.propagation) for n in evaluator.nodes]),
+            "n_points": ("simulator", [n.bound.n_points for n in evaluator.nodes]),
+        },
+        coords={"simulator": names, "element": evaluator.names, **{k: np.arange(v) for k, v in leading.items()}},
+        attrs=attrs,
+    )
+    return xr.DataTree.from_dict(
+        {
+            "posterior": posterior,
+            "sample_stats": sample_stats,
+            "calibration": calibration,
+            "observed_data": _observed(evaluator),
+        }
+    )
+
+
+def _observed(evaluator: Evaluator) -> xr.Dataset:
+    return _dataset(evaluator, {n.name: n.target.observed for n in evaluator.nodes}, {})
+
+
+def optimum_tree(optimum: Optimum) -> xr.DataTree:
+    """Return the DataTree of an optimum."""
+    evaluator = Evaluator(optimum.model)
+    names = list(optimum.discrepancies)
+    attrs = {
+        "discrepancy": optimum.discrepancy,
+        "converged": int(optimum.converged),
+        "message": optimum.message,
+        "n_evaluations": optimum.n_evaluations,
+        "n_screened": optimum.n_screened,
+        "n_responses": optimum.n_responses,
+        "seconds": optimum.seconds,
+        **versions(),
+    }
+    elements = {"element": optimum.names, "other_element": optimum.names}
+    return xr.DataTree.from_dict(
+        {
+            "optimum": _dataset(evaluator, optimum.point, {}).assign_attrs(attrs),
+            "stderr": _dataset(evaluator, optimum.stderr, {}),
+            "trace": xr.Dataset(
+                {
+                    "theta": (["evaluation", "element"], optimum.trace["theta"]),
+                    "discrepancy": ("evaluation", optimum.trace["discrepancy"]),
+                },
+                coords={"element": optimum.names},
+            ),
+            "calibration": xr.Dataset(
+                {
+                    "discrepancy": ("simulator", list(optimum.discrepancies.values())),
+                    "scale": ("simulator", list(optimum.scales.values())),
+                    "theta": ("element", optimum.theta),
+                    "covariance": (["element", "other_element"], optimum.covariance),
+                    "metric": ("simulator", [repr(n.metric) for n in evaluator.nodes]),
+                },
+                coords={"simulator": names, **elements},
+            ),
+            "observed_data": _observed(evaluator),
+        }
+    )

@@ -1,0 +1,72 @@
+import csv
+import doctest
+from importlib.resources import files
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from prbayes import datasets
+
+
+@pytest.fixture
+def crack() -> xr.Dataset:
+    return datasets.crack_growth()
+
+
+@pytest.fixture
+def rows() -> list[dict[str, str]]:
+    with files("prbayes.datasets").joinpath("crack_growth.csv").open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_shape_dims_and_coordinates(crack):
+    lengths = crack.crack_length_inch
+    assert lengths.dims == ("specimen", "million_cycles")
+    assert lengths.shape == (21, 13)
+    np.testing.assert_array_equal(crack.specimen, np.arange(1, 22))
+    np.testing.assert_allclose(crack.million_cycles, np.linspace(0, 0.12, 13), atol=1e-15)
+
+
+def test_every_csv_row_stands_at_its_specimen_and_cycle(crack, rows):
+    assert int(crack.crack_length_inch.notnull().sum()) == len(rows)
+    for row in rows:
+        cell = crack.crack_length_inch.sel(
+            specimen=int(row["specimen"]), million_cycles=float(row["million_cycles"])
+        )
+        assert float(cell) == float(row["crack_length_inch"])
+
+
+def test_every_specimen_starts_at_the_notch(crack):
+    assert crack.attrs["notch_inch"] == 0.90
+    assert (crack.crack_length_inch.sel(million_cycles=0) == 0.90).all()
+
+
+def test_nan_only_after_the_reading_at_which_the_specimen_failed(crack):
+    for lengths in crack.crack_length_inch.to_numpy():
+        measured = lengths[np.isfinite(lengths)]
+        assert np.isnan(lengths[measured.size :]).all()
+        assert (np.diff(measured) > 0).all()
+        assert (measured[:-1] < 1.60).all()
+        assert measured.size == lengths.size or measured[-1] >= 1.60
+
+
+def test_units_and_source_are_stated(crack):
+    assert crack.crack_length_inch.attrs["units"] == "inch"
+    assert "Lu and W. Q. Meeker (1993)" in crack.attrs["source"]
+    assert "Bogdanoff and F. Kozin (1985)" in crack.attrs["source"]
+    assert "21 specimens" in crack.attrs["description"]
+
+
+def test_two_calls_give_independent_objects(crack):
+    crack.crack_length_inch[:] = 0.0
+    crack.attrs["notch_inch"] = 0.0
+    again = datasets.crack_growth()
+    assert float(again.crack_length_inch.max()) == 1.77
+    assert again.attrs["notch_inch"] == 0.90
+
+
+def test_the_docstring_example_runs():
+    result = doctest.testmod(datasets)
+    assert result.attempted > 0
+    assert result.failed == 0
