@@ -1,6 +1,12 @@
 """Statistical model calibration in PyMC: optimiser and ABC on one model, with one metric."""
 
+from importlib.metadata import version
+
+from prbayes import datasets
+from prbayes.compare import compare
 from prbayes.density import GaussianKDE, Histogram
+from prbayes.diagnose import Diagnosis, diagnose
+from prbayes.epsilon import calibrate_epsilon
 from prbayes.metrics import (
     AreaMetric,
     FunctionMetric,
@@ -9,10 +15,40 @@ from prbayes.metrics import (
     Metric,
     ProbabilityResidual,
 )
+from prbayes.optimize import Optimum, minimize
 from prbayes.propagation import Fresh, Resimulated, Reweighted
+from prbayes.refinement import DesignError, refine
 from prbayes.responses import ResponseError
 from prbayes.simulator import Simulator, abc_distance, set_epsilon
-from prbayes.optimize import minimize
-from prbayes.smc import sample_smc
-from prbayes.epsilon import calibrate_epsilon
-from prbayes.refinement import refine
+from prbayes.smc import BatchedKernel, sample_smc
+
+__version__ = version("prbayes")
+
+__all__ = [
+    "AreaMetric",
+    "BatchedKernel",
+    "DesignError",
+    "Diagnosis",
+    "Fresh",
+    "FunctionMetric",
+    "GaussianKDE",
+    "Histogram",
+    "KullbackLeibler",
+    "LogLikelihood",
+    "Metric",
+    "Optimum",
+    "ProbabilityResidual",
+    "Resimulated",
+    "ResponseError",
+    "Reweighted",
+    "Simulator",
+    "abc_distance",
+    "calibrate_epsilon",
+    "compare",
+    "datasets",
+    "diagnose",
+    "minimize",
+    "refine",
+    "sample_smc",
+    "set_epsilon",
+]

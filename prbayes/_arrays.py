@@ -61,6 +61,8 @@ def observed_sample(values: ArrayLike, name: str = "observed", *, minimum: int =
     ValueError
         If they are not one-dimensional, too few, or not finite.
     """
+    if np.ma.is_masked(values):
+        raise ValueError(f"{name}: got masked values, expected none; leave missing specimens out")
     array = real_array(values, name)
     if array.ndim != 1:
         raise ValueError(

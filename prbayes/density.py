@@ -41,7 +41,7 @@ def spread(sample: Floats, weights: Floats) -> float:
     mean = weights @ sample
     sd = float(np.sqrt(weights @ (sample - mean) ** 2))
     iqr = weighted_quantile(sample, weights, 0.75) - weighted_quantile(sample, weights, 0.25)
-    return min(sd, iqr / 1.34) if iqr > 0 else sd
+    return float(min(sd, iqr / 1.34)) if iqr > 0 else sd
 
 
 def silverman(sample: Floats, weights: Floats) -> float:
@@ -62,7 +62,7 @@ def silverman(sample: Floats, weights: Floats) -> float:
     >>> round(silverman(np.arange(32.0), np.full(32, 1 / 32)), 3)
     4.155
     """
-    return 0.9 * spread(sample, weights) * float((weights**2).sum()) ** 0.2
+    return float(0.9 * spread(sample, weights) * (weights**2).sum() ** 0.2)
 
 
 def twice_silverman(sample: Floats, weights: Floats) -> float:
@@ -76,7 +76,7 @@ def likelihood_bandwidth(sample: Floats, weights: Floats) -> float:
     Only the simulated side is smoothed there, which makes the fitted population too narrow by about
     h^2 / (2 sd^2); with this rule that is at most a tenth of the sampling error sd / sqrt(2 n) for every n.
     """
-    return 0.35 * spread(sample, weights) * float((weights**2).sum()) ** 0.25
+    return float(0.35 * spread(sample, weights) * (weights**2).sum() ** 0.25)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +128,8 @@ class GaussianKDE(DensityEstimator):
 
     The sample is binned on a regular grid of four nodes per bandwidth, with cubic B-spline weights, and
     smoothed there; the kernel is narrowed by the spline's variance, so that the density's variance is
-    exact, its error is of fourth order in the spacing, and it is twice differentiable in the sample.
+    exact, its error is of fourth order in the spacing, and it is twice differentiable in the sample inside the
+    grid.
 
     Parameters
     ----------
@@ -179,17 +180,17 @@ class GaussianKDE(DensityEstimator):
         if n_cells > _MAX_CELLS:
             raise ValueError(
                 f"bandwidth: got {h:g} for observed values that span {np.ptp(observed):g}, expected a span "
-                f"below {_MAX_CELLS / _PER_BANDWIDTH:g} bandwidths; look for outliers, pass a larger "
+                f"below {_MAX_CELLS / _PER_BANDWIDTH / 2:g} bandwidths; look for outliers, pass a larger "
                 "GaussianKDE(bandwidth=...), or use AreaMetric"
             )
-        length = n_cells * step
+        tight = 2 * np.sqrt(np.pi) * h  # the integral of a kernel's square is 1 / tight
         s = np.sqrt(h**2 - step**2 / 3)
         reach = int(np.ceil(7 * s / step))
         offsets = step * np.arange(-reach, reach + 1)
         kernel = np.exp(-0.5 * (offsets / s) ** 2) / (s * np.sqrt(2 * np.pi))
         return KernelCells(
-            widths=np.r_[np.full(n_cells, step), length, length],
-            centers=low + step * np.arange(n_cells),
+            widths=np.r_[np.full(n_cells, step), tight, tight],
+            centers=low + step * np.arange(n_cells, dtype=np.float64),
             smooth=True,
             bandwidth=h,
             step=step,
@@ -199,7 +200,7 @@ class GaussianKDE(DensityEstimator):
 
 @dataclass(frozen=True, eq=False)
 class KernelCells(Cells):
-    """Nodes of a regular grid; mass outside is taken as spread evenly over one more grid length."""
+    """Nodes of a regular grid; mass outside counts as one tight cluster on either side, at its most conspicuous."""
 
     bandwidth: float
     step: float
@@ -215,7 +216,7 @@ class KernelCells(Cells):
         return node, u - node, inside, below, above
 
     def density(self, sample: Floats, weights: Floats) -> Floats:
-        """Return densities at the nodes, then mass below and above divided by the grid's length."""
+        """Return densities at the nodes, then mass below and above divided by the width of a cluster."""
         batch, n, g = sample.shape[:-1], sample.shape[-1], self.centers.size
         rows = int(np.prod(batch, dtype=int))
         flat = sample.reshape(rows, n)
@@ -281,8 +282,8 @@ class Histogram(DensityEstimator):
     Parameters
     ----------
     bins : int, optional
-        Number of bins over the observed range; by default ceil(range / (2 IQR N^(-1/3))), the
-        Freedman-Diaconis rule, at least five.
+        Number of bins over the observed range; by default ceil(range / (2 s N^(-1/3))), the
+        Freedman-Diaconis rule with s = min(1.34 sd, IQR), at least five.
 
     References
     ----------
@@ -312,12 +313,13 @@ class Histogram(DensityEstimator):
             )
         bins = self.bins
         if bins is None:
-            iqr = 1.34 * spread(observed, weights)
-            bins = max(5, int(np.ceil((high - low) / (2 * iqr * float((weights**2).sum()) ** (1 / 3)))))
-            bins = min(bins, _MAX_CELLS)
+            wide = 2 * 1.34 * spread(observed, weights) * float((weights**2).sum()) ** (1 / 3)
+            bins = int(np.clip(np.ceil((high - low) / wide), 5, _MAX_CELLS)) if wide > 0 else _MAX_CELLS
         width = (high - low) / bins
         return BinCells(
-            widths=np.full(bins + 2, width), centers=low + width * (np.arange(bins) + 0.5), smooth=False
+            widths=np.full(bins + 2, width),
+            centers=low + width * (np.arange(bins, dtype=np.float64) + 0.5),
+            smooth=False,
         )
 
 

@@ -14,9 +14,9 @@ from scipy.special import logsumexp
 
 from prbayes._arrays import Floats
 from prbayes.inputs import PopulationSampler, compile_batched, log_density, prior_draws, quantiles
-from prbayes.metrics import Discrepancy
+from prbayes.metrics import Discrepancy, FunctionMetric
 from prbayes.propagation import Bound, Reweighted, base_points, refuse_all_nan
-from prbayes.responses import Responses
+from prbayes.responses import OpaqueOp, Responses
 
 _MAX_THETAS = 512  # components of a batch's mixture density
 _DRAFT = 16  # draft points, whose response is not computed, for each point of a one-dimensional design
@@ -29,9 +29,7 @@ class Design(Bound):
     exactly the mixture, over all batches, of the densities at the listed values (balance heuristic).
     """
 
-    def __init__(
-        self, name: str, inputs: Any, target: Discrepancy, responses: Responses, config: Reweighted
-    ) -> None:
+    def __init__(self, name: str, inputs: Any, target: Discrepancy, responses: Responses, config: Reweighted) -> None:
         super().__init__(name, inputs, target, responses)
         self.config = config
         self.batches = 0
@@ -58,6 +56,7 @@ class Design(Bound):
             The median weight effective sample size over these populations.
         """
         n, seed = self.config.n, self.config.seed + 7919 * self.batches
+        thetas = self.valid_only(thetas)
         if self._is_line:
             points, counts = self._equal_mass(thetas, n, seed)
         else:
@@ -138,13 +137,16 @@ class Design(Bound):
         logp = log_density(self.inputs, self.inputs.rebuilt(params)[0], self._shared[:k])
         return logp - self._shared[k]
 
-    def discrepancy(self, params: Sequence[Any]) -> TensorVariable:
+    def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy of the reweighted responses, +inf where no point has weight."""
         logs = self.log_weights(params)
         supported = pt.max(logs) > -np.inf
         weights = pt.special.softmax(pt.switch(supported, logs, 0.0))
         basis = tuple(self._shared[len(self.inputs.aleatory) + 1 :])
-        d = self.target.outer(*self.target.from_basis(weights, basis, pt), xp=pt)
+        if isinstance(self.target.metric, FunctionMetric):
+            d = OpaqueOp(self.target)(*basis, weights)
+        else:
+            d = self.target.outer(*self.target.from_basis(weights, basis, pt), xp=pt)
         return pt.switch(supported, d, np.inf)
 
     @cached_property

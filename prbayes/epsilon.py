@@ -58,6 +58,11 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
     >>> prb.calibrate_epsilon(prb.minimize(model))
     {'y': 0.3333333333333333}
     """
+    if not isinstance(optimum, Optimum):
+        raise TypeError(
+            f"calibrate_epsilon: got {type(optimum).__name__}, expected an Optimum; call "
+            "prb.calibrate_epsilon(prb.minimize(model))"
+        )
     evaluator = Evaluator(optimum.model)
     scale = prior_scale(evaluator)
     return {
@@ -114,4 +119,3 @@ def _by_coverage(information: Information) -> float:
         middle = float(np.sqrt(low * high))
         low, high = (middle, high) if coverage(middle) < _LEVEL else (low, middle)
     return float(np.sqrt(low * high))
-

@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from prbayes._arrays import Floats
 from prbayes.metrics import FunctionMetric
@@ -56,7 +57,9 @@ class Information:
     @cached_property
     def _step(self) -> Floats:
         node = self.evaluator.nodes[self.k]
-        rough = not node.metric.smooth and node.bound.n_per_theta > 0
+        cells = getattr(node.target, "cells", None)
+        smooth = node.metric.smooth and (cells is None or cells.smooth)
+        rough = not smooth and node.bound.n_per_theta > 0
         return (_WIDE_STEP if rough else _STEP) * self.scale
 
     @cached_property
@@ -106,9 +109,7 @@ class Information:
         """The mean discrepancy between the population at theta and data sets drawn from it."""
         target = self.evaluator.nodes[self.k].target
         values, weights = (a[:1] for a in self._populations)
-        return float(
-            np.mean([target.with_observed(z).of(values, weights) for z in self.data_sets])
-        )
+        return float(np.mean([target.with_observed(z).of(values, weights) for z in self.data_sets]))
 
     def _gradients(self, data_sets: Floats) -> Floats:
         """Gradients of the discrepancy at theta for each data set, shape (n_sets, d)."""
@@ -147,6 +148,14 @@ class Information:
                 row += 4
         return np.asarray(out)
 
+    @property
+    def curvature(self) -> Floats:
+        """A matrix, shape (d, d), that is blind to the directions that the data do not identify."""
+        if self.evaluator.nodes[self.k].metric.smooth:
+            return self.hessian
+        _, slopes, lengths = self.area
+        return np.asarray((slopes * lengths) @ slopes.T)
+
     @cached_property
     def area(self) -> tuple[Floats, Floats, Floats]:
         """Linear model of the area metric: gaps (n_sets, m), their slopes (d, m), lengths (m,)."""
@@ -170,12 +179,20 @@ def _cdf(values: Floats, weights: Floats, at: Floats) -> Floats:
     return np.asarray(total[np.searchsorted(values[order], at, side="right")])
 
 
-def symmetric_inverse(matrix: Floats) -> Floats:
-    """Return the inverse of a symmetric positive semi-definite matrix, infinite along directions it is blind to."""
+def identified(matrix: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Split a symmetric positive semi-definite matrix, of order one, into what it sees and what it is blind to.
+
+    Returns
+    -------
+    ndarray, shape (d, d)
+        The inverse on the directions that it sees.
+    ndarray of bool, shape (d, d)
+        The pairs of elements that have a part in a direction that it is blind to.
+    """
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    inverse = np.where(values > 1e-9 * max(values.max(), 1e-300), 1 / np.where(values > 0, values, 1.0), np.inf)
-    with np.errstate(invalid="ignore"):
-        return np.nan_to_num((vectors[:, None] * inverse * vectors).sum(axis=-1), nan=np.inf, posinf=np.inf)
+    seen = values > 1e-9 * max(values.max(), 1e-300)
+    parts = np.abs(vectors[:, ~seen]) > 1e-6
+    return (vectors[:, seen] / values[seen]) @ vectors[:, seen].T, (parts[:, None] & parts).any(axis=-1)
 
 
 def bootstrap_shifts(parts: list[Information], scales: Floats) -> Floats:
@@ -205,13 +222,15 @@ def bootstrap_shifts(parts: list[Information], scales: Floats) -> Floats:
             weight = lengths / np.sqrt(residual**2 + 1e-8)
             left += np.einsum("bm,im,jm->bij", weight, slopes, slopes, optimize=True)
             right -= np.einsum("bm,im->bi", weight * gap, slopes, optimize=True)
-        size = np.trace(left, axis1=1, axis2=2)[:, None, None]
+        size = np.maximum(np.trace(left, axis1=1, axis2=2), 1e-200)[:, None, None]
         shifts = np.linalg.solve(left + ridge * size, right[..., None])[..., 0]
     return shifts * unit
 
 
 def sampling_covariance(parts: list[Information], scales: Floats) -> Floats:
     """Return the sampling covariance of the minimiser of sum of d_k / scale_k in theta, shape (d, d).
+
+    It is infinite for pairs of elements that have a part in a direction that the data do not identify.
 
     Raises
     ------
@@ -221,12 +240,11 @@ def sampling_covariance(parts: list[Information], scales: Floats) -> Floats:
     metrics = [p.evaluator.nodes[p.k].metric for p in parts]
     if any(isinstance(m, FunctionMetric) for m in metrics):
         raise TypeError("standard errors: got a FunctionMetric, expected a metric of this package")
+    unit = np.outer(parts[0].scale, parts[0].scale)
+    inverse, blind = identified(sum(p.curvature / s for p, s in zip(parts, scales, strict=True)) * unit)
     if all(m.smooth for m in metrics):
-        hessian = sum(p.hessian / s for p, s in zip(parts, scales, strict=True))
         noise = sum(p.sampling_covariance / s**2 for p, s in zip(parts, scales, strict=True))
-        unit = np.outer(parts[0].scale, parts[0].scale)
-        inverse = symmetric_inverse(hessian * unit)
-        if not np.isfinite(inverse).all():
-            return inverse
-        return np.asarray(inverse @ (noise * unit) @ inverse * unit)
-    return np.atleast_2d(np.cov(bootstrap_shifts(parts, scales), rowvar=False))
+        covariance = inverse @ (noise * unit) @ inverse * unit
+    else:
+        covariance = np.atleast_2d(np.cov(bootstrap_shifts(parts, scales), rowvar=False))
+    return np.where(blind, np.inf, covariance)

@@ -71,8 +71,7 @@ class Inputs:
         """Return the response's arguments from values for the aleatory and the epistemic inputs."""
         rest = iter(epistemic)
         return [
-            next(rest) if isinstance(a, Variable) else aleatory[a] if isinstance(a, int) else a
-            for a in self.arguments
+            next(rest) if isinstance(a, Variable) else aleatory[a] if isinstance(a, int) else a for a in self.arguments
         ]
 
     @property
@@ -110,7 +109,9 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
         above = list(walk([x], lambda v: None if v in known or v.owner is None else v.owner.inputs))
         roots.update((v, None) for v in above if v in known)
         latent = [v for v in above if v not in known and _is_random(v)]
-        strays = [v for v in above if v.owner is None and not _is_bound(v)]
+        # PyMC gives a `str_repr` to the variables of a model, and none to a `.dist()`.
+        foreign = [v for v in latent if hasattr(v, "str_repr")]
+        strays = [v for v in above if v.owner is None and not _is_bound(v)] + foreign
         if strays:
             raise TypeError(
                 f"{label}: got {x} which depends on {strays[0]}, expected a `.dist()`, a variable of this model "
@@ -184,9 +185,24 @@ def log_density(inputs: Inputs, aleatory: Sequence[TensorVariable], values: Sequ
     """Return log p(x), shape (n,), of values x, shapes (n, *event), summed over the aleatory inputs."""
     total: Any = 0.0
     for dist, x in zip(aleatory, values, strict=True):
-        logp = pm.logp(dist, x, warn_rvs=False)
+        logp = _mvnormal_logp(dist, x) if _is_mvnormal(dist) else pm.logp(dist, x, warn_rvs=False)
         total = total + (logp.sum(axis=tuple(range(1, logp.type.ndim))) if logp.type.ndim > 1 else logp)
     return total
+
+
+def _is_mvnormal(dist: TensorVariable) -> bool:
+    return isinstance(dist.owner.op, type(MvNormal.rv_op))
+
+
+def _mvnormal_logp(dist: TensorVariable, x: Any) -> TensorVariable:
+    """Return log p(x) by forward substitution, elementwise; PyMC's own solves once per theta and point in a batch."""
+    mean, covariance = dist.owner.op.dist_params(dist.owner)
+    root = pt.linalg.cholesky(covariance, on_error="nan")
+    z: list[Any] = []
+    for i in range(event_shape(dist)[0]):
+        z.append((x[..., i] - mean[i] - sum(root[i, j] * z[j] for j in range(i))) / root[i, i])
+    logp = sum(-0.5 * z_i**2 - pt.log(root[i, i]) - 0.5 * np.log(2 * np.pi) for i, z_i in enumerate(z))
+    return pt.switch(pt.isnan(logp), -np.inf, logp)
 
 
 def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
@@ -202,7 +218,7 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
     op = dist.owner.op
     if dist.dtype.startswith(("int", "uint", "bool")):
         raise TypeError(f"{name}: {op} is discrete; use propagation=prb.Reweighted() or prb.Fresh()")
-    if isinstance(op, type(MvNormal.rv_op)):
+    if _is_mvnormal(dist):
         mean, covariance = op.dist_params(dist.owner)
         z = pm.icdf(pm.Normal.dist(0.0, 1.0), u)
         return mean + z @ pt.linalg.cholesky(covariance).T
@@ -269,22 +285,34 @@ class PopulationSampler:
         for v in ancestors(dists):
             if _is_random(v) and not any(a in symbols or (a is not v and _is_random(a)) for a in ancestors([v])):
                 per_specimen[v] = change_dist_size(v, size, expand=True)
-        outputs = vectorize_graph(dists, per_specimen)
-        common = vectorize_graph(epistemic, dict(zip(symbols, batched, strict=True))) if epistemic else []
+        self._batched = True
+        try:
+            outputs = vectorize_graph(dists, per_specimen)
+            common = vectorize_graph(epistemic, dict(zip(symbols, batched, strict=True))) if epistemic else []
+        except (NotImplementedError, ValueError):  # what PyTensor does not vectorize: one population at a time
+            self._batched, batched = False, symbols
+            # Resized before the roots are replaced, since PyMC resizes a CustomDist with its first parameters.
+            resized = [change_dist_size(d, (n,), expand=True) for d in inputs.aleatory]
+            outputs = graph_replace(resized, dict(zip(inputs.roots, symbols, strict=True)), strict=False)
+            common = epistemic
         self._n_aleatory = len(dists)
+        self._epistemic_ndims = [e.type.ndim for e in epistemic]
         self._function = pm.compile(
             [n, *batched], [*outputs, *common], mode=PLAIN, on_unused_input="ignore", allow_input_downcast=True
         )
         self._generators = [v for v in self._function.get_shared() if isinstance(v.type, RandomGeneratorType)]
 
-    def __call__(
-        self, params: Sequence[Any], n: int, rng: np.random.Generator
-    ) -> tuple[list[Floats], list[Floats]]:
-        """Return aleatory draws, shapes (k, n, *event), and epistemic values, shapes (k, 1, *event)."""
+    def __call__(self, params: Sequence[Any], n: int, rng: np.random.Generator) -> tuple[list[Floats], list[Floats]]:
+        """Return aleatory draws, shapes (k, n, *event), and epistemic values, shapes (k, 1, *event) or (*event)."""
         for shared, child in zip(self._generators, rng.spawn(len(self._generators)), strict=True):
             shared.set_value(child, borrow=True)
-        values = self._function(n, *params)
-        return values[: self._n_aleatory], [v[:, None] for v in values[self._n_aleatory :]]
+        if self._batched:
+            values = self._function(n, *params)
+        else:
+            rows = [self._function(n, *row) for row in zip(*params, strict=True)]
+            values = [np.stack(column) for column in zip(*rows, strict=True)]
+        common = zip(values[self._n_aleatory :], self._epistemic_ndims, strict=True)
+        return values[: self._n_aleatory], [v[:, None] if v.ndim > d else v for v, d in common]
 
 
 def compile_batched(

@@ -195,6 +195,12 @@ class DensityDiscrepancy(Discrepancy):
         return (1 - _FLOOR) * density + _FLOOR / self.cells.widths.sum()
 
 
+def _density_estimator(density: object) -> None:
+    if not isinstance(density, DensityEstimator):
+        got = f"the class {density.__name__}" if isinstance(density, type) else f"{type(density).__name__} {density!r}"
+        raise TypeError(f"density: got {got}, expected prb.GaussianKDE() or prb.Histogram(), perhaps with arguments")
+
+
 @dataclass(frozen=True)
 class ProbabilityResidual(Metric):
     r"""Probability residual: the scaled squared difference of two densities.
@@ -234,21 +240,30 @@ class ProbabilityResidual(Metric):
     scale_base: float = 100.0
 
     def __post_init__(self) -> None:
+        _density_estimator(self.density)
         positive_number(self.scale_base, "scale_base")
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         return ResidualDiscrepancy(self, observed, weights, self.density.cells(observed, weights))
 
 
+@dataclass(frozen=True, eq=False)
 class ResidualDiscrepancy(DensityDiscrepancy):
-    """The probability residual against fixed observed values."""
+    """The probability residual against fixed observed values; ``scale_factor`` is S of eq. 10."""
 
     metric: ProbabilityResidual
+    scale_factor: float = field(init=False)
 
-    @property
-    def scale_factor(self) -> float:
-        """S of eq. 10."""
-        return float(self.metric.scale_base ** -np.floor(np.log10(self.density.max())))
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        power = np.floor(np.log10(self.density.max()))
+        object.__setattr__(self, "scale_factor", float(self.metric.scale_base**-power))
+
+    def with_observed(self, observed: Floats, weights: Floats | None = None) -> Discrepancy:
+        """Return the same metric, with the same scale factor, on the same cells, against other values."""
+        other = super().with_observed(observed, weights)
+        object.__setattr__(other, "scale_factor", self.scale_factor)
+        return other
 
     @property
     def _measure(self) -> Any:
@@ -300,6 +315,9 @@ class KullbackLeibler(Metric):
     reverse: bool = False
     likelihood: ClassVar[bool] = True
 
+    def __post_init__(self) -> None:
+        _density_estimator(self.density)
+
     @property
     def additive(self) -> bool:
         """Whether the gradient in the hyperparameters is a mean over observations."""
@@ -347,6 +365,9 @@ class LogLikelihood(Metric):
 
     density: DensityEstimator = field(default_factory=lambda: GaussianKDE(likelihood_bandwidth))
     likelihood: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        _density_estimator(self.density)
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         return LikelihoodDiscrepancy(self, observed, weights, self.density.cells(observed, weights))

@@ -17,7 +17,7 @@ from prbayes.information import Information, prior_scale, sampling_covariance
 from prbayes.metrics import FunctionMetric
 from prbayes.population import Evaluator
 from prbayes.propagation import FreshBound
-from prbayes.refinement import _MAX_ROUNDS, refine_at, refuse, shortcomings, spread_around
+from prbayes.refinement import _MAX_ROUNDS, pilot, refine_at, refuse, shortcomings, spread_around
 from prbayes.simulator import model_on_context
 
 _log = logging.getLogger("prbayes")
@@ -51,7 +51,8 @@ class Optimum:
         What the optimiser said.
     stderr : dict
         Standard errors by name, in the user's own units: the estimator's sampling standard deviation;
-        infinite along directions that the data do not identify.
+        infinite along directions that the data do not identify; NaN where nothing is known, as at the edge
+        of a support.
     covariance : ndarray, shape (d, d)
         Sampling covariance in unconstrained space.
     theta : ndarray, shape (d,)
@@ -87,16 +88,23 @@ class Optimum:
         return optimum_tree(self)
 
 
-class _Counted:
-    """The objective on standardised parameters; records every evaluation."""
+class _SpentError(Exception):
+    """The budget of evaluations is spent."""
 
-    def __init__(self, function: Any, center: Floats, scale: Floats, *, gradient: bool) -> None:
+
+class _Counted:
+    """The objective on standardised parameters; records every evaluation, at most ``most`` of them."""
+
+    def __init__(self, function: Any, center: Floats, scale: Floats, *, gradient: bool, most: int) -> None:
         self.function, self.center, self.scale, self.gradient = function, center, scale, gradient
+        self.most = most
         self.thetas: list[Floats] = []
         self.values: list[float] = []
         self.gradients: list[Floats] = []
 
     def __call__(self, t: Floats) -> Any:
+        if len(self.values) >= self.most:
+            raise _SpentError
         theta = self.center + t * self.scale
         value, *gradient = self.function(theta)
         value = float(value)
@@ -143,6 +151,7 @@ def minimize(
     tolerance : float
         Relative tolerance of the standardised problem.
     max_evaluations : int
+        Largest number of evaluations of the objective by the optimiser, on one design with one set of scales.
     refine : bool
         Whether designs of `Reweighted` that do not support the optimum get more points.
     random_seed : int
@@ -189,19 +198,17 @@ def minimize(
     scale = prior_scale(evaluator, seed=random_seed)
     already = evaluator.n_responses
     stored = sum(d.n_points for d in evaluator.designs.values())
-    natural = np.array([
-        n.target.scale if len(evaluator.nodes) > 1 and np.isnan(e) else e if len(evaluator.nodes) > 1 or prior else 1.0
-        for n, e in zip(evaluator.nodes, evaluator.epsilon, strict=True)
-    ])
-    if np.isnan(natural).any():
-        natural = np.where(np.isnan(natural), [n.target.scale for n in evaluator.nodes], natural)
+    several = len(evaluator.nodes) > 1
+    natural = np.array([n.target.scale for n in evaluator.nodes]) if several or prior else np.ones(1)
+    natural = np.where(np.isnan(evaluator.epsilon) | (not (several or prior)), natural, evaluator.epsilon)
     search = _Search(evaluator, scale, method, gradient, prior, tolerance, max_evaluations)
     theta, screened = search.start(start, natural, random_seed)
     scales = natural
+    cloud: Floats | None = None
     for round_ in range(_MAX_ROUNDS + 1):
         result = search(theta, scales)
         theta = search.best
-        if len(evaluator.nodes) > 1 and np.isnan(evaluator.epsilon).any():
+        if several and np.isnan(evaluator.epsilon).any():
             noise = [Information(evaluator, k, theta, scale).noise_floor for k in range(len(evaluator.nodes))]
             scales = np.where(np.isnan(evaluator.epsilon), noise, evaluator.epsilon)
             result = search(theta, scales)
@@ -209,15 +216,20 @@ def minimize(
         covariance = _covariance(evaluator, theta, scale, scales)
         if not (refine and evaluator.designs):
             break
-        around = spread_around(theta, covariance, scale, seed=random_seed)
-        around = around[evaluator.in_support(around)]
-        if round_ == _MAX_ROUNDS:
-            refuse(shortcomings(evaluator, around), evaluator)
-        elif not refine_at(evaluator, around):
+        near = spread_around(theta, covariance, scale, seed=random_seed) if cloud is None else cloud
+        near = near[evaluator.in_support(near)]
+        short = shortcomings(evaluator, near)
+        if not short:
             break
-    return _optimum(
-        evaluator, theta, scales, covariance, search, result, screened, evaluator.n_responses - already + stored, clock
-    )
+        if round_ == _MAX_ROUNDS:
+            refuse(short, evaluator)
+        elif cloud is None:
+            cloud = pilot(evaluator, scales, scale, seed=random_seed)
+        else:
+            refine_at(evaluator, near)
+    result = search.settle(result)
+    theta = search.best
+    return _optimum(evaluator, theta, scales, covariance, search, result, screened, already - stored, clock)
 
 
 class _Search:
@@ -247,12 +259,12 @@ class _Search:
         """Minimise from theta; sets ``best``."""
         exact = self.gradient
         try:
-            function = self.evaluator.objective(scales, prior=self.prior, gradient=exact)
+            compiled = self.evaluator.objective(prior=self.prior, gradient=exact)
         except NotImplementedError as error:
             _log.info("no exact gradient (%s): finite differences on common random numbers", error)
             exact = False
-            function = self.evaluator.objective(scales, prior=self.prior, gradient=False)
-        counted = _Counted(function, theta, self.scale, gradient=exact)
+            compiled = self.evaluator.objective(prior=self.prior, gradient=False)
+        counted = _Counted(lambda theta: compiled(theta, scales), theta, self.scale, gradient=exact, most=self.most)
         zero = np.zeros_like(theta)
         first = counted(zero)
         size = max(abs(first[0] if exact else first), 1e-12)
@@ -268,23 +280,29 @@ class _Search:
         elif name == "nelder-mead":
             options = {"xatol": 1e-6, "fatol": self.tolerance * size, "maxfev": self.most}
             options["initial_simplex"] = np.vstack([zero, 0.2 * np.eye(zero.size)])
-        result = optimize.minimize(
-            counted, zero, jac=exact if self.gradient else None, method=self.method, options=options
-        )
+        result = self._run(counted, zero, jac=exact if self.gradient else None, method=self.method, options=options)
         self._record(counted)
-        if self.gradient and not result.success:
-            result = self._settle(counted, result, size, exact)
+        self._last = counted, size, exact
         return result
+
+    def _run(self, counted: _Counted, start: Floats, **settings: Any) -> Any:
+        try:
+            return optimize.minimize(counted, start, **settings)
+        except _SpentError:
+            message = f"max_evaluations = {self.most} was reached before convergence."
+            return optimize.OptimizeResult(success=False, message=message, fun=np.nanmin(counted.values))
 
     def _record(self, counted: _Counted) -> None:
         self.thetas += counted.thetas
         self.values += counted.values
         values = np.array(counted.values)
         self.best = counted.thetas[int(np.argmin(np.where(np.isfinite(values), values, np.inf)))]
-        self.scale_of_objective = abs(float(np.nanmin(values)))
 
-    def _settle(self, counted: _Counted, result: Any, size: float, exact: bool) -> Any:
+    def settle(self, result: Any) -> Any:
         """Decide on a line search that gave up: at a kink or at rounding that is the minimum, if a simplex agrees."""
+        counted, size, exact = self._last
+        if result.success or not self.gradient or len(counted.values) >= self.most:
+            return result
         start = (self.best - counted.center) / self.scale
         before = min(v for v in counted.values if np.isfinite(v))
         again = _Counted(
@@ -292,26 +310,22 @@ class _Search:
             counted.center,
             self.scale,
             gradient=False,
+            most=self.most - len(counted.values),
         )
         simplex = np.vstack([start, start + 0.01 * np.eye(start.size)])
-        polished = optimize.minimize(
+        polished = self._run(
             again,
             start,
             method="Nelder-Mead",
-            options={"initial_simplex": simplex, "xatol": 1e-5, "fatol": 1e-9 * size, "maxfev": 100 * start.size},
+            options={"initial_simplex": simplex, "xatol": 1e-5, "fatol": 1e-9 * size, "maxfev": 60 * start.size},
         )
-        self._record_more(again)
+        self.thetas += again.thetas
+        self.values += again.values
+        if polished.fun <= before:
+            self.best = again.thetas[int(np.nanargmin(again.values))]
         gain = (before - polished.fun) / max(abs(before), 1e-300)
         polished.message = f"{result.message} A simplex from there gained {max(gain, 0):.1e}: {polished.message}"
         return polished
-
-    def _record_more(self, counted: _Counted) -> None:
-        best = min((v for v in self.values if np.isfinite(v)), default=np.inf)
-        self.thetas += counted.thetas
-        self.values += counted.values
-        values = np.array(counted.values)
-        if np.nanmin(values) <= best:
-            self.best = counted.thetas[int(np.nanargmin(values))]
 
 
 def _covariance(evaluator: Evaluator, theta: Floats, scale: Floats, scales: Floats) -> Floats:
@@ -330,7 +344,7 @@ def _optimum(
     search: _Search,
     result: Any,
     screened: int,
-    n_responses: int,
+    computed: int,
     clock: float,
 ) -> Optimum:
     step = 1e-4 * search.scale
@@ -339,10 +353,14 @@ def _optimum(
     stderr = {}
     for name, v in values.items():
         slopes = np.moveaxis((v[1::2] - v[2::2]), 0, -1) / (2 * step)
-        with np.errstate(invalid="ignore"):
-            variance = np.einsum("...i,ij,...j->...", slopes, covariance, slopes)
-        touched = np.einsum("...i,ij,...j->...", np.abs(slopes), np.isinf(covariance).astype(float), np.abs(slopes))
-        stderr[name] = _plain(np.sqrt(np.where(touched > 0, np.inf, np.maximum(variance, 0))))
+        blind = np.isinf(covariance)
+        variance = np.einsum("...i,ij,...j->...", slopes, np.where(blind, 0.0, covariance), slopes)
+        touched = np.einsum("...i,ij,...j->...", np.abs(slopes), blind.astype(float), np.abs(slopes))
+        at_edge = blind.any() & (slopes == 0).all(axis=-1)
+        variance = np.where(at_edge, np.nan, np.where(touched > 0, np.inf, np.maximum(variance, 0)))
+        stderr[name] = _plain(np.sqrt(variance))
+    flat = bool(np.isinf(np.diag(covariance)).all()) and _flat(evaluator, theta, search.scale)
+    lost = " No hyperparameter changes the discrepancy here, far from the data: try another start." if flat else ""
     found = evaluator(theta[None])
     discrepancies = dict(zip([n.name for n in evaluator.nodes], map(float, found.discrepancies[0]), strict=True))
     return Optimum(
@@ -352,9 +370,9 @@ def _optimum(
         scales=dict(zip(discrepancies, map(float, scales), strict=True)),
         n_evaluations=len(search.values),
         n_screened=screened,
-        n_responses=n_responses,
-        converged=bool(result.success),
-        message=str(result.message),
+        n_responses=evaluator.n_responses - computed,
+        converged=bool(result.success) and not flat,
+        message=f"{result.message}{lost}",
         stderr=stderr,
         covariance=covariance,
         theta=theta,
@@ -363,6 +381,13 @@ def _optimum(
         trace={"theta": np.array(search.thetas), "discrepancy": np.array(search.values)},
         seconds=time.perf_counter() - clock,
     )
+
+
+def _flat(evaluator: Evaluator, theta: Floats, scale: Floats) -> bool:
+    """Whether no discrepancy changes around theta, as where populations and observed values do not overlap."""
+    around = np.vstack([theta, *(theta + s * e for e in np.diag(0.01 * scale) for s in (1, -1))])
+    found = evaluator(around).discrepancies
+    return bool((np.ptp(found, axis=0) <= 1e-12 * np.abs(found[0])).all())
 
 
 def _plain(value: Any) -> Any:

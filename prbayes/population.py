@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,8 @@ import pytensor
 import pytensor.tensor as pt
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.replace import graph_replace, vectorize_graph
-from scipy.special import logsumexp
 
-from prbayes._arrays import Floats
+from prbayes._arrays import Floats, real_array
 from prbayes.design import Design
 from prbayes.inputs import PLAIN, ninf_for_invalid, prior_draws
 from prbayes.simulator import Node, log_kernel, required_nodes
@@ -46,7 +45,7 @@ class Evaluation:
 
     def log_likelihood(self, epsilon: Floats) -> Floats:
         """Return the pseudo log-likelihood, shape (P,), for epsilons of shape (k,)."""
-        return self.log_other + np.asarray(log_kernel(self.discrepancies, epsilon)).sum(axis=-1)
+        return np.asarray(self.log_other + np.asarray(log_kernel(self.discrepancies, epsilon)).sum(axis=-1))
 
 
 class Evaluator:
@@ -146,29 +145,43 @@ class Evaluator:
             prior, other, *ds = self._evaluate(block)
             log_prior[i : i + step], log_other[i : i + step] = prior, other
             discrepancies[i : i + step] = np.stack([np.broadcast_to(d, len(block)) for d in ds], axis=-1)
-            for node in self.nodes:
-                if node.bound.symbolic:
-                    node.bound.responses.count += node.bound.n_per_theta * len(block)
+            self._count(len(block))
         return Evaluation(
             np.nan_to_num(log_prior, nan=-np.inf, posinf=np.inf, neginf=-np.inf),
             np.nan_to_num(log_other, nan=-np.inf, posinf=np.inf, neginf=-np.inf),
             np.nan_to_num(discrepancies, nan=np.inf, posinf=np.inf, neginf=-np.inf),
         )
 
-    def objective(self, scales: Floats, *, prior: bool, gradient: bool) -> Any:
-        """Compile theta (d,) -> sum of d_k / scale_k [- log prior] - log of ordinary terms [, its gradient].
+    def _count(self, thetas: int) -> None:
+        """Count the responses that are part of a graph, evaluated at so many thetas."""
+        for node in self.nodes:
+            if node.bound.symbolic:
+                node.bound.responses.count += node.bound.n_per_theta * thetas
+
+    @cache  # noqa: B019 (lives as long as the evaluator)
+    def objective(self, *, prior: bool, gradient: bool) -> Any:
+        """Compile (theta, scales) -> sum of d_k / scale_k [- log prior] - log of ordinary terms [, its gradient].
+
+        The prior's density is that of the user's own units, as in `pymc.find_MAP`: without Jacobian.
 
         Raises
         ------
         NotImplementedError, TypeError
             If a gradient is asked for and there is none.
         """
-        total = sum(g / s for g, s in zip(self._graphs(), scales, strict=True)) - self._log_other()
-        log_prior = self.model.varlogp
+        scales = pt.dvector("scales")
+        total = sum(g / scales[k] for k, g in enumerate(self._graphs())) - self._log_other()
+        log_prior = self.model.logp(vars=self.model.free_RVs, jacobian=False)
         total = pt.switch(log_prior > -np.inf, total - log_prior if prior else total, np.inf)
         outputs, theta = join_nonshared_inputs(self._point, [total], self.model.value_vars)
         graphs = [outputs[0], *([pt.grad(outputs[0], theta)] if gradient else [])]
-        return pytensor.function([theta], ninf_for_invalid(graphs), mode=PLAIN, on_unused_input="ignore")
+        compiled = pytensor.function([theta, scales], ninf_for_invalid(graphs), mode=PLAIN, on_unused_input="ignore")
+
+        def counted(theta: Floats, scales: Floats) -> Any:
+            self._count(1)
+            return compiled(theta, scales)
+
+        return counted
 
     def in_support(self, thetas: Floats) -> Any:
         """Return which thetas have a finite log prior, shape (P,)."""
@@ -193,14 +206,19 @@ class Evaluator:
 
         Raises
         ------
-        KeyError, ValueError
+        KeyError, TypeError, ValueError
             If the names are not the model's free variables, or a value is outside its support.
         """
         free = {rv.name: rv for rv in self.model.free_RVs}
         if set(point) != set(free):
             raise KeyError(f"start: got {sorted(point)}, expected a value for each of {sorted(free)}")
-        draws = [np.broadcast_to(np.asarray(point[n], float), tuple(rv.shape.eval()))[None] for n, rv in free.items()]
-        theta = self._transform(*draws)[0]
+        draws = []
+        for name, rv in free.items():
+            value, shape = real_array(point[name], f"start: {name}"), tuple(map(int, rv.shape.eval()))
+            if value.shape not in ((), shape):
+                raise ValueError(f"start: {name}: got shape {value.shape}, expected {shape}")
+            draws.append(np.broadcast_to(value, shape)[None])
+        theta: Floats = self.thetas_of(draws)[0]
         if not np.isfinite(theta).all() or not self.in_support(theta[None])[0]:
             raise ValueError(f"start: got {point}, expected values inside the support of the priors")
         return theta
@@ -231,9 +249,13 @@ class Evaluator:
             if isinstance(node.bound, Design)
         }
 
+    def thetas_of(self, draws: Sequence[Floats]) -> Floats:
+        """Return thetas, shape (P, d), of values of the free variables, shapes (P, *shape), in the model's order."""
+        return np.asarray(self._transform(*draws))
+
     def prior_thetas(self, size: int, seed: int) -> Floats:
         """Draw thetas from the prior, shape (size, d)."""
-        return np.asarray(self._transform(*prior_draws(self.model.free_RVs, size, seed)))
+        return self.thetas_of(prior_draws(self.model.free_RVs, size, seed))
 
     @cached_property
     def _transform(self) -> Any:
@@ -255,8 +277,3 @@ class Evaluator:
             on_unused_input="ignore",
             allow_input_downcast=True,
         )
-
-
-def effective_sample_size(log_weights: Floats) -> float:
-    """Return the effective sample size of log weights."""
-    return float(np.exp(2 * logsumexp(log_weights) - logsumexp(2 * log_weights)))

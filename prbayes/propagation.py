@@ -17,13 +17,21 @@ import pytensor.tensor as pt
 from pytensor.compile import function
 from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
-from pytensor.graph.replace import _vectorize_node
+from pytensor.graph.replace import _vectorize_node, graph_replace
 from pytensor.tensor.variable import TensorVariable
 from scipy.stats import qmc
 
 from prbayes._arrays import Floats, positive_integer, positive_number
 from prbayes.inputs import (
-    PLAIN, Inputs, PopulationSampler, compile_batched, event_shape, prior_draws, quantiles, valid,
+    PLAIN,
+    Inputs,
+    PopulationSampler,
+    compile_batched,
+    event_shape,
+    ninf_for_invalid,
+    prior_draws,
+    quantiles,
+    valid,
 )
 from prbayes.metrics import Discrepancy
 from prbayes.responses import ResponseError, ResponseOp, Responses, symbolic_discrepancy
@@ -58,17 +66,47 @@ class Bound(ABC):
         """Number of points that carry weight in one evaluation of the discrepancy."""
         return self.n_per_theta
 
-    @abstractmethod
     def discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy as a scalar graph of the roots' values."""
+        # Built on plain symbols: PyMC may clone parameters that are random, and a copy would be drawn, not given.
+        symbols = self.inputs.placeholders()
+        swap = {s: pt.as_tensor(p) for s, p in zip(symbols, params, strict=True)}
+        return graph_replace([self._discrepancy(symbols)], swap, strict=False)[0]
+
+    @abstractmethod
+    def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
+        """Return the discrepancy as a scalar graph of symbols for the roots' values."""
 
     @abstractmethod
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
         """Return responses and weights of the populations at given roots, each of shape (k, n)."""
 
+    @cached_property
+    def _valid(self) -> Any:
+        symbols = self.inputs.placeholders()
+        return compile_batched(symbols, [valid(self.inputs, self.inputs.rebuilt(symbols)[0])])
+
+    def valid(self, params: Sequence[Any]) -> Any:
+        """Return which of a batch of roots give valid distributions (sigma > 0 and such), shape (k,)."""
+        return np.broadcast_to(self._valid(*params)[0], np.shape(params[0])[:1]).astype(bool)
+
+    def valid_only(self, params: Sequence[Floats]) -> list[Floats]:
+        """Leave out the roots that give no valid distributions, or raise if none does."""
+        ok = self.valid(params)
+        if not ok.any():
+            names = ", ".join(str(r.name) for r in self.inputs.roots)
+            raise ValueError(
+                f"{self.name}: priors: got invalid parameters of the inputs at all {len(ok)} draws of {names}, "
+                "expected valid ones; give scales a prior on positive numbers, such as pm.HalfNormal"
+            )
+        return [p[ok] for p in params]
+
     def draw(self, rng: np.random.Generator, size: int, params: Sequence[Any]) -> Floats:
         """Draw responses of ``size`` different specimens from the population at one value of the roots."""
-        values, weights = self.populations([np.asarray(p)[None] for p in params])
+        at = [np.asarray(p)[None] for p in params]
+        if not self.valid(at).all():
+            return np.full(size, np.nan)
+        values, weights = self.populations(at)
         good = ~np.isnan(values[0])
         w = np.where(good, weights[0], 0.0)
         if not w.sum() > 0:
@@ -208,7 +246,7 @@ def sobol(n: int, dimensions: int, seed: int) -> Floats:
     """Return n scrambled Sobol points in the open unit cube, shape (n, dimensions)."""
     engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
     points = engine.random_base2(int(np.ceil(np.log2(n))))[:n] if n > 1 else engine.random(1)
-    return np.clip(points, 1e-12, 1 - 1e-12)
+    return np.asarray(np.clip(points, 1e-12, 1 - 1e-12))
 
 
 def base_points(inputs: Inputs, n: int, seed: int) -> tuple[Floats, list[Floats]]:
@@ -217,13 +255,11 @@ def base_points(inputs: Inputs, n: int, seed: int) -> tuple[Floats, list[Floats]
     sizes = [int(np.prod(s, dtype=int)) for s in shapes]
     u = sobol(n, 1 + sum(sizes), seed)
     edges = np.cumsum([1, *sizes])
-    parts = [
-        u[:, a:b].reshape(n, *s) for a, b, s in zip(edges[:-1], edges[1:], shapes, strict=True)
-    ]
+    parts = [u[:, a:b].reshape(n, *s) for a, b, s in zip(edges[:-1], edges[1:], shapes, strict=True)]
     return u[:, 0], parts
 
 
-def probe(inputs: Inputs, responses: Responses, sampler: PopulationSampler, seed: int) -> tuple[Any, ...]:
+def probe(bound: Bound, sampler: PopulationSampler, seed: int) -> tuple[Any, ...]:
     """Call the response at a few points of the prior, shape (2, 8), so that mistakes show at once.
 
     Raises
@@ -231,10 +267,10 @@ def probe(inputs: Inputs, responses: Responses, sampler: PopulationSampler, seed
     ResponseError
         If the response raises, has the wrong shape, or is NaN everywhere.
     """
-    thetas = prior_draws(inputs.roots, 2, seed)
+    thetas = [t[:2] for t in bound.valid_only(prior_draws(bound.inputs.roots, 64, seed))]
     aleatory, epistemic = sampler(thetas, 8, np.random.default_rng(seed))
-    values = responses(aleatory, epistemic)
-    refuse_all_nan(responses.name, values)
+    values = bound.responses(aleatory, epistemic)
+    refuse_all_nan(bound.name, values)
     return values, aleatory, epistemic
 
 
@@ -258,7 +294,7 @@ class ResimulatedBound(Bound):
         _, self._points = base_points(inputs, config.n, config.seed)
         for dist, u in zip(inputs.aleatory, self._points, strict=True):
             quantiles(name, dist, u)  # refuses what has no inverse distribution function
-        self.symbolic = self._accepts_tensors(*probe(inputs, responses, PopulationSampler(inputs), config.seed))
+        self.symbolic = self._accepts_tensors(*probe(self, PopulationSampler(inputs), config.seed))
 
     def _accepts_tensors(self, expected: Floats, aleatory: list[Floats], epistemic: list[Floats]) -> bool:
         """Try the response on PyTensor variables, and believe it only if the numbers agree."""
@@ -274,7 +310,7 @@ class ResimulatedBound(Bound):
 
     def _response(self, params: Sequence[Any]) -> tuple[TensorVariable, TensorVariable]:
         dists, epistemic = self.inputs.rebuilt(params)
-        aleatory = [quantiles(self.name, d, u) for d, u in zip(dists, self._points, strict=True)]
+        aleatory = ninf_for_invalid([quantiles(self.name, d, u) for d, u in zip(dists, self._points, strict=True)])
         common = [e[None] for e in epistemic]
         if self.symbolic:
             values = self.responses.function(*self.inputs.fill(aleatory, common))
@@ -282,7 +318,7 @@ class ResimulatedBound(Bound):
             values = ResponseOp(self.responses)(*aleatory, *common)
         return values, valid(self.inputs, dists)
 
-    def discrepancy(self, params: Sequence[Any]) -> TensorVariable:
+    def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy of the responses at the base points, +inf where parameters are invalid."""
         values, ok = self._response(params)
         weights = np.full(self.n_per_theta, 1 / self.n_per_theta)
@@ -309,17 +345,11 @@ class FreshBound(Bound):
         self.n_per_theta = config.n
         self.rng = np.random.default_rng(config.seed)
         self._sampler = PopulationSampler(inputs)
-        symbols = inputs.placeholders()
-        self._valid = compile_batched(symbols, [valid(inputs, inputs.rebuilt(symbols)[0])])
-        probe(inputs, responses, self._sampler, config.seed)
+        probe(self, self._sampler, config.seed)
 
-    def discrepancy(self, params: Sequence[Any]) -> TensorVariable:
+    def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return an operation that draws and evaluates."""
         return FreshOp(self)(*params)
-
-    def valid(self, params: Sequence[Any]) -> Any:
-        """Return which of a batch of roots give valid distributions, shape (k,)."""
-        return np.broadcast_to(self._valid(*params)[0], np.shape(params[0])[:1])
 
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
         """Return fresh responses with equal weights."""

@@ -9,8 +9,10 @@ import pymc as pm
 
 from prbayes._arrays import Floats
 from prbayes.design import Design
+from prbayes.information import Information
 from prbayes.inputs import event_shape
 from prbayes.population import Evaluator
+from prbayes.simulator import model_on_context
 
 _log = logging.getLogger("prbayes")
 
@@ -39,7 +41,7 @@ def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, str]:
     for name, support in evaluator.support(thetas).items():
         ess, mass, lost = (support[key] for key in ("weight_ess", "mean_weight", "lost_mass"))
         design = evaluator.designs[name]
-        low, need = float(np.quantile(ess, 0.05)), required_ess(design)
+        (low, middle), need = np.quantile(ess, [0.05, 0.5]), required_ess(design)
         mass_low, mass_high = np.quantile(mass, [0.05, 0.95])
         most_lost = float(np.quantile(lost, 0.95))
         if most_lost > design.config.max_lost:
@@ -47,8 +49,11 @@ def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, str]:
                 f"lost mass: {most_lost:.1%} of a population's weight is on points whose response is NaN, expected at "
                 f"most max_lost = {design.config.max_lost:.1%}"
             )
-        elif low < need:
-            found[name] = f"weight effective sample size {low:.0f} of {design.n_points} points, expected {need:.0f}"
+        elif middle < need or low < need / 10:
+            found[name] = (
+                f"weight effective sample size {low:.0f} (5% quantile) and {middle:.0f} (median) of {design.n_points} "
+                f"points, expected {need / 10:.0f} and {need:.0f}"
+            )
         elif mass_low < 0.8 or mass_high > 1.25:
             found[name] = f"mean raw weight from {mass_low:.2f} to {mass_high:.2f}, expected within 0.8 to 1.25"
     return found
@@ -69,6 +74,46 @@ def refine_at(evaluator: Evaluator, thetas: Floats) -> dict[str, str]:
     return short
 
 
+def pilot(evaluator: Evaluator, scales: Floats, scale: Floats, *, seed: int = 0) -> Floats:
+    """Lead a design that is far too thin from the prior to where the discrepancy is small, in short steps.
+
+    Each step keeps the best quarter of the thetas and, where the design is thin there, adds points from
+    their populations before it looks closer: the kept thetas are never far from the design's reach.
+
+    Returns
+    -------
+    ndarray, shape (256, d)
+        Thetas whose discrepancies differ by no more than sampling noise.
+    """
+    rng = np.random.default_rng(seed)
+    thetas = evaluator.prior_thetas(4 * _THETAS, seed)
+    for _ in range(2 * _MAX_ROUNDS):
+        found = evaluator(thetas)
+        value = (found.discrepancies / scales).sum(axis=-1) - found.log_other
+        value = np.where(np.isfinite(found.log_prior), value, np.inf)
+        order = np.argsort(value)[:_THETAS]
+        best = thetas[order]
+        thin = [
+            name
+            for name, support in evaluator.support(best).items()
+            if np.median(support["weight_ess"]) < required_ess(evaluator.designs[name])
+        ]
+        for k, node in enumerate(evaluator.nodes):
+            if node.name in thin and isinstance(node.bound, Design) and node.bound.batches <= _MAX_ROUNDS:
+                node.bound.add(evaluator.roots(best, k))
+                _log.info("%s: pilot design of %d responses", node.name, node.bound.n_points)
+        noise = sum(
+            Information(evaluator, k, best[0], scale, n_sets=50).noise_floor / s for k, s in enumerate(scales)
+        )
+        if not thin and value[order[-1]] - value[order[0]] < noise:
+            break
+        covariance = np.atleast_2d(np.cov(best, rowvar=False))
+        root = np.linalg.cholesky(covariance + 1e-12 * np.diag(np.diag(covariance)))
+        parents = best[rng.integers(len(best), size=4 * _THETAS)]
+        thetas = parents + 0.4 * rng.standard_normal(parents.shape) @ root.T
+    return best
+
+
 def refuse(short: dict[str, str], evaluator: Evaluator) -> None:
     """Raise for designs that still fall short."""
     if short:
@@ -81,16 +126,17 @@ def refuse(short: dict[str, str], evaluator: Evaluator) -> None:
         )
 
 
-def spread_around(center: Floats, covariance: Floats, scale: Floats, *, size: int = _THETAS, seed: int = 0) -> Floats:
-    """Return thetas around an optimum, from a normal with four times the covariance, at most the prior's scale."""
-    values, vectors = np.linalg.eigh(np.nan_to_num(covariance, posinf=0.0) / np.outer(scale, scale))
-    blind = ~np.isfinite(covariance).all()
-    sd = np.ones_like(values) if blind else 2 * np.sqrt(np.clip(values, 0, 1))
-    z = np.random.default_rng(seed).standard_normal((size, center.size))
+def spread_around(center: Floats, covariance: Floats, scale: Floats, *, seed: int = 0) -> Floats:
+    """Return thetas around an optimum, from a normal with its covariance, at most the prior's scale."""
+    known = np.where(np.isfinite(covariance), covariance / np.outer(scale, scale), 0.0)
+    known[np.diag_indices_from(known)] = np.where(np.isfinite(np.diag(covariance)), np.diag(known), 1.0)
+    values, vectors = np.linalg.eigh(known)
+    sd = np.sqrt(np.clip(values, 0, 1))
+    z = np.random.default_rng(seed).standard_normal((_THETAS, center.size))
     return np.asarray(center + (z * sd) @ vectors.T * scale)
 
 
-def refine(model: pm.Model, thetas: Floats | None = None) -> dict[str, int]:
+def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[str, int]:
     """Add design points where the posterior's populations live, until the designs support them.
 
     `minimize` and `sample_smc` call it; call it yourself before `pymc.sample` on models with several
@@ -98,7 +144,8 @@ def refine(model: pm.Model, thetas: Floats | None = None) -> dict[str, int]:
 
     Parameters
     ----------
-    model : pymc.Model
+    model : pymc.Model, optional
+        The one on the context by default.
     thetas : ndarray, shape (P, d), optional
         Unconstrained hyperparameters whose populations matter; by default those around the optimum.
 
@@ -127,6 +174,7 @@ def refine(model: pm.Model, thetas: Floats | None = None) -> dict[str, int]:
     """
     from prbayes.optimize import minimize
 
+    model = model_on_context(model, "prb.refine")
     evaluator = Evaluator(model)
     if thetas is None:
         minimize(model)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,9 +17,23 @@ from prbayes.density import Cells
 from prbayes.inputs import Inputs
 from prbayes.metrics import Discrepancy
 
+# Calls of the user's functions have no compiled form; nothing is gained by saying so at every compilation.
+warnings.filterwarnings(
+    "ignore", message="Numba will use object mode to run (prbayes_Simulator|FreshOp|ResponseOp|Density|OpaqueOp|abc_d)"
+)
+
 
 class ResponseError(RuntimeError):
     """The user's response raised, or returned something that is no response."""
+
+
+def refuse_uncallable(name: str, function: object) -> None:
+    """Raise if a response is no function: often the inputs were given first."""
+    if not callable(function):
+        raise TypeError(
+            f"{name}: response: got {type(function).__name__}, expected a function of the inputs, such as "
+            "lambda x: x**2; the order is Simulator(name, response, *inputs, metric=..., observed=...)"
+        )
 
 
 class Responses:
@@ -34,11 +49,7 @@ class Responses:
     """
 
     def __init__(self, name: str, function: Callable[..., Any], inputs: Inputs) -> None:
-        if not callable(function):
-            raise TypeError(
-                f"{name}: response: got {type(function).__name__}, expected a function of the inputs, such as "
-                "lambda x: x**2; the order is Simulator(name, response, *inputs, metric=..., observed=...)"
-            )
+        refuse_uncallable(name, function)
         self.name = name
         self.function = function
         self.inputs = inputs
@@ -56,9 +67,7 @@ class Responses:
         values = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
         leading = [v.shape[: v.ndim - e] for v, e in zip(values, ndims, strict=True)]
         batch = np.broadcast_shapes(*leading)
-        full = [
-            np.broadcast_to(v, batch + v.shape[v.ndim - e :]) for v, e in zip(values, ndims, strict=True)
-        ]
+        full = [np.broadcast_to(v, batch + v.shape[v.ndim - e :]) for v, e in zip(values, ndims, strict=True)]
         arguments = self.inputs.fill(full[: len(aleatory)], full[len(aleatory) :])
         shapes = ", ".join(str(np.shape(a)) for a in arguments)
         try:
@@ -105,9 +114,20 @@ class ResponseOp(Op):
         return Apply(self, tensors, [pt.tensor(dtype="float64", shape=(None,) * ndim)])
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
-        """Call the response."""
+        """Call the response, but not for populations that are invalid: their quantiles are not finite."""
         k = len(self.responses.inputs.aleatory)
-        outputs[0][0] = self.responses(inputs[:k], inputs[k:])
+        ndims = list(zip(inputs, self.event_ndims, strict=True))
+        batch = np.broadcast_shapes(*(x.shape[: x.ndim - e] for x, e in ndims))
+        full = [np.broadcast_to(x, batch + x.shape[x.ndim - e :]) for x, e in ndims]
+        finite = [np.isfinite(x).all(axis=tuple(range(len(batch), x.ndim))) for x in full[:k]]
+        valid = np.all([f.any(axis=-1) for f in finite], axis=0)
+        if valid.all():
+            outputs[0][0] = self.responses(inputs[:k], inputs[k:])
+            return
+        values = np.full(batch, np.nan)
+        if valid.any():
+            values[valid] = self.responses([x[valid] for x in full[:k]], [x[valid] for x in full[k:]])
+        outputs[0][0] = values
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
         """Refuse: the response is a black box."""

@@ -90,8 +90,12 @@ def posterior_tree(
         {
             "discrepancy": (where, evaluator(flat).discrepancies.reshape(shape)),
             **{
-                key: (where, np.stack([np.broadcast_to(support.get(n, nothing)[key], len(flat)) for n in names], -1)
-                      .reshape(shape))
+                key: (
+                    where,
+                    np.stack([np.broadcast_to(support.get(n, nothing)[key], len(flat)) for n in names], -1).reshape(
+                        shape
+                    ),
+                )
                 for key in nothing
             },
             "theta": (["chain", "draw", "element"], thetas),

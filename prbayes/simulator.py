@@ -20,7 +20,7 @@ from prbayes._arrays import Floats, observed_sample, positive_number
 from prbayes.inputs import read_inputs
 from prbayes.metrics import Discrepancy, Metric
 from prbayes.propagation import Bound, Propagation, Reweighted
-from prbayes.responses import Responses
+from prbayes.responses import Responses, refuse_uncallable
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +178,7 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     labels = None if specimens is None else _labels(name, specimens, values.size)
     if epsilon is not None:
         positive_number(epsilon, f"{name}: epsilon")
+    refuse_uncallable(name, response)
     sorted_inputs = read_inputs(name, inputs, model)
     responses = Responses(name, response, sorted_inputs)
     bound = propagation.bind(name, sorted_inputs, target, responses)

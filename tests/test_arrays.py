@@ -74,6 +74,8 @@ def test_missing_values_in_a_list_are_not_taken_for_numbers() -> None:
         observed_sample([1.0, None, 2.0])
     with pytest.raises(ValueError, match="simulated: got NaN or -inf"):
         simulated_sample([1.0, None])
+    with pytest.raises(ValueError, match="observed: got masked values, expected none"):
+        observed_sample(np.ma.masked_equal([1.0, -999.0, 2.0], -999.0))
 
 
 @pytest.mark.parametrize(

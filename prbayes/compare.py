@@ -1,0 +1,99 @@
+"""Optimum and posterior side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+
+from prbayes.optimize import Optimum
+
+_INTERVAL = 0.89
+
+
+def compare(results: Mapping[str, Optimum | xr.DataTree], *, model: pm.Model | None = None) -> xr.Dataset:
+    """Set optima and posteriors side by side, one row per result and hyperparameter.
+
+    Parameters
+    ----------
+    results : mapping
+        `Optimum` objects and DataTrees with a ``posterior`` group, by the label they get.
+    model : pymc.Model, optional
+        Restricts the table to the model's free variables; by default all that the results share.
+
+    Returns
+    -------
+    xarray.Dataset
+        With dimensions ``result`` and ``hyperparameter``: ``estimate`` (the optimum, or the posterior mean),
+        ``sd`` (the standard error, or the posterior standard deviation), ``lower`` and ``upper`` (an 89%
+        interval: normal, or equal-tailed), ``shift`` (of the estimate from the first result, in its sd);
+        and by result: ``n_responses`` and ``seconds``, NaN where a result does not tell.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If there is no result, one is of another type, or they share no hyperparameter.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    >>> table = prb.compare({"optimum": prb.minimize(model)}, model=model)
+    >>> table.hyperparameter.values.tolist()
+    ['mu']
+    """
+    if not results:
+        raise ValueError("compare: got no results, expected a dict such as {'optimum': optimum, 'ABC': idata}")
+    columns = {label: _column(label, result) for label, result in results.items()}
+    names = [n for n in next(iter(columns.values()))[0] if all(n in c[0] for c in columns.values())]
+    if model is not None:
+        free = [rv.name for rv in model.free_RVs]
+        names = [n for n in names if n.split("[")[0] in free]
+    if not names:
+        raise ValueError(f"compare: got results {list(results)} that share no hyperparameter, expected the same model")
+    table = np.array([[columns[label][0][n] for n in names] for label in columns])
+    first = table[0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shift = (table[..., 0] - first[:, 0]) / first[:, 1]
+    keys = ("estimate", "sd", "lower", "upper")
+    where = ["result", "hyperparameter"]
+    data: dict[str, Any] = {key: (where, table[..., i]) for i, key in enumerate(keys)}
+    data["shift"] = (where, shift)
+    data["n_responses"] = ("result", [c[1] for c in columns.values()])
+    data["seconds"] = ("result", [c[2] for c in columns.values()])
+    return xr.Dataset(data, coords={"result": list(columns), "hyperparameter": names}, attrs={"interval": _INTERVAL})
+
+
+def _column(label: str, result: Any) -> tuple[dict[str, tuple[float, ...]], float, float]:
+    """Return (estimate, sd, lower, upper) by element, responses, seconds."""
+    rows: dict[str, tuple[float, ...]] = {}
+    if isinstance(result, Optimum):
+        z = 1.5982  # the normal's quantile at (1 + 0.89) / 2
+        for name, value in result.point.items():
+            for i in np.ndindex(np.shape(value)):
+                estimate, sd = float(np.asarray(value)[i]), float(np.asarray(result.stderr[name])[i])
+                rows[_element(name, i)] = (estimate, sd, estimate - z * sd, estimate + z * sd)
+        return rows, float(result.n_responses), result.seconds
+    if not isinstance(result, xr.DataTree) or "posterior" not in result:
+        raise TypeError(
+            f"{label}: got {type(result).__name__}, expected an Optimum or a DataTree with a posterior group"
+        )
+    posterior = result["posterior"]
+    for key, variable in posterior.data_vars.items():
+        name = str(key)
+        draws = variable.stack(sample=("chain", "draw")).transpose("sample", ...).values
+        for i in np.ndindex(draws.shape[1:]):
+            x = draws[(slice(None), *i)]
+            lower, upper = np.quantile(x, [(1 - _INTERVAL) / 2, (1 + _INTERVAL) / 2])
+            rows[_element(name, i)] = (float(x.mean()), float(x.std(ddof=1)), float(lower), float(upper))
+    attrs = posterior.attrs
+    return rows, float(attrs.get("n_responses", np.nan)), float(attrs.get("seconds", np.nan))
+
+
+def _element(name: str, index: tuple[int, ...]) -> str:
+    return f"{name}[{','.join(map(str, index))}]" if index else name

@@ -1,0 +1,626 @@
+"""Propagations times samplers: every way of drawing or optimising gives the same answer from the same node."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+from pymc.model.fgraph import clone_model
+from pymc.model.transform.optimization import freeze_dims_and_data
+from scipy import stats
+
+import prbayes as prb
+from prbayes._arrays import Floats
+from prbayes.inputs import PLAIN
+from prbayes.metrics import Metric
+from prbayes.population import Evaluator
+from prbayes.propagation import Propagation
+from prbayes.simulator import Node, nodes
+
+N, MU, SIGMA, EPSILON, POINTS = 30, 2.0, 0.8, 0.02, 128
+OBSERVED = np.random.default_rng(3).permutation(0.75 * stats.norm(MU, SIGMA).ppf((np.arange(N) + 0.5) / N))
+QUIET = {"progressbar": False}
+
+
+def line(x: Any) -> Any:
+    return 0.75 * x
+
+
+@dataclass
+class BlackBox:
+    """A response that PyTensor cannot look into; counts its scalar responses by itself."""
+
+    count: int = 0
+
+    def __call__(self, x: Any) -> Any:
+        values = np.asarray(x, dtype=np.float64)
+        self.count += values.size
+        return 0.75 * values
+
+
+def build(
+    propagation: Propagation, response: Any = line, *, metric: Metric | None = None, **changes: Any
+) -> tuple[pm.Model, Node]:
+    keywords = {"metric": metric or prb.AreaMetric(), "observed": OBSERVED, "epsilon": EPSILON} | changes
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1)
+        prb.Simulator("y", response, pm.Normal.dist(mu, sigma), propagation=propagation, **keywords)
+    return model, next(iter(nodes(model).values()))
+
+
+RESPONSES = {"Reweighted": BlackBox(), "Resimulated": line, "black box": BlackBox(), "Fresh": BlackBox()}
+PROPAGATIONS: dict[str, Propagation] = {
+    "Reweighted": prb.Reweighted(POINTS),
+    "Resimulated": prb.Resimulated(POINTS),
+    "black box": prb.Resimulated(POINTS),
+    "Fresh": prb.Fresh(POINTS),
+}
+every_model = pytest.mark.parametrize("name", PROPAGATIONS)
+
+
+@cache
+def model_of(name: str) -> tuple[pm.Model, Node]:
+    return build(PROPAGATIONS[name], RESPONSES[name])
+
+
+@cache
+def reference(name: str) -> dict[str, tuple[float, float]]:
+    """Posterior mean and sd on a grid, for the same node; Fresh has that of Resimulated, blurred by its noise."""
+    evaluator = Evaluator(model_of("Resimulated" if name == "Fresh" else name)[0])
+    grid = np.stack(np.meshgrid(np.linspace(1.5, 2.5, 41), np.linspace(-1, 0.4, 41)), -1).reshape(-1, 2)
+    found = evaluator(grid)
+    logs = found.log_prior + found.log_likelihood(evaluator.epsilon)
+    w = np.exp(logs - logs.max())
+    w /= w.sum()
+    out = {}
+    for key, values in {"mu": grid[:, 0], "sigma": np.exp(grid[:, 1])}.items():
+        mean = float(w @ values)
+        out[key] = (mean, float(np.sqrt(w @ (values - mean) ** 2)))
+    return out
+
+
+def nuts(model: pm.Model) -> Any:
+    return pm.sample(
+        200, tune=200, chains=2, cores=1, model=model, random_seed=1, compute_convergence_checks=False, **QUIET
+    )
+
+
+def find_map(model: pm.Model) -> Any:
+    return pm.find_MAP(model=model, return_inferencedata=True, jitter=False, **QUIET)
+
+
+def stock_smc(model: pm.Model, kernel: Any = pm.smc.IMH, cores: int = 1) -> Any:
+    return pm.sample_smc(
+        300,
+        kernel=kernel,
+        chains=2,
+        cores=cores,
+        model=model,
+        random_seed=2,
+        compute_convergence_checks=False,
+        **QUIET,
+    )
+
+
+def own_smc(model: pm.Model) -> Any:
+    return prb.sample_smc(300, chains=2, model=model, random_seed=3, **QUIET)
+
+
+SAMPLERS: dict[str, Callable[[pm.Model], Any]] = {
+    "NUTS": nuts,
+    "stock SMC": stock_smc,
+    "stock SMC, two cores": lambda model: stock_smc(model, cores=2),
+    "batched kernel": lambda model: stock_smc(model, prb.BatchedKernel),
+    "batched kernel, two cores": lambda model: stock_smc(model, prb.BatchedKernel, cores=2),
+    "prbayes SMC": own_smc,
+}
+
+
+@cache
+def draws_of(name: str, sampler: str) -> Any:
+    return SAMPLERS[sampler](model_of(name)[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "sampler"),
+    [
+        ("Reweighted", "NUTS"),
+        ("Reweighted", "stock SMC, two cores"),
+        ("Reweighted", "batched kernel, two cores"),
+        ("Reweighted", "prbayes SMC"),
+        ("Resimulated", "NUTS"),
+        ("Resimulated", "stock SMC"),
+        ("Resimulated", "batched kernel"),
+        ("Resimulated", "prbayes SMC"),
+        ("black box", "stock SMC"),
+        ("black box", "batched kernel"),
+        ("black box", "prbayes SMC"),
+        ("Fresh", "stock SMC"),
+        ("Fresh", "batched kernel"),
+        ("Fresh", "prbayes SMC"),
+    ],
+)
+def test_samplers_find_the_posterior(name: str, sampler: str) -> None:
+    idata = draws_of(name, sampler)
+    assert ("diverging" in idata.sample_stats) == (sampler == "NUTS")
+    if sampler == "NUTS":
+        assert int(idata.sample_stats["diverging"].sum()) <= 2
+    for key, (mean, sd) in reference(name).items():
+        draws = idata.posterior[key].values
+        assert draws.shape[0] == 2
+        blur = 1.8 if name == "Fresh" else 1.0
+        assert abs(draws.mean() - mean) < 0.4 * sd, key
+        assert 0.7 < draws.std() / sd < 1.35 * blur, key
+
+
+@pytest.mark.parametrize("name", ["Reweighted", "Resimulated", "black box"])
+def test_find_map_agrees_with_minimize(name: str) -> None:
+    model = model_of(name)[0]
+    optimum = prb.minimize(model, prior=True).point
+    warns = pytest.warns(UserWarning, match="Gradient not available") if name == "black box" else nullcontext()
+    with warns:
+        found = find_map(model).posterior
+    for key, (_, sd) in reference(name).items():
+        np.testing.assert_allclose(found[key].item(), optimum[key], atol=0.1 * sd)
+
+
+@pytest.mark.parametrize("sampler", [nuts, find_map, prb.minimize])
+def test_fresh_is_refused_where_gradients_are_needed(sampler: Callable[[pm.Model], Any]) -> None:
+    with pytest.raises(TypeError, match=r"y: prb.Fresh draws new .*use .*prb.Re"):
+        sampler(model_of("Fresh")[0])
+
+
+def test_fresh_with_an_epsilon_for_the_run() -> None:
+    model, node = build(prb.Fresh(POINTS), epsilon=None)
+    idata = prb.sample_smc(100, chains=1, model=model, epsilon=EPSILON, random_seed=1, **QUIET)
+    assert abs(float(idata.posterior["mu"].mean()) - MU) < 0.1
+    assert float(idata.calibration["epsilon"][0]) == EPSILON
+    assert np.isnan(node.epsilon_value)
+    with pytest.raises(TypeError, match=r"y: prb.Fresh .*Nelder-Mead"):
+        prb.sample_smc(100, model=model, **QUIET)
+
+
+# Predictive sampling.
+
+
+@cache
+def predictive(name: str, kind: str, seed: int = 1) -> Floats:
+    """Data sets, shape (draws, N)."""
+    model = model_of(name)[0]
+    if kind == "prior":
+        group = pm.sample_prior_predictive(40, model=model, random_seed=seed).prior_predictive
+    else:
+        few = draws_of(name, "prbayes SMC").isel(draw=slice(0, 40))
+        group = pm.sample_posterior_predictive(few, model=model, random_seed=seed, **QUIET).posterior_predictive
+    assert group["y"].dims[:2] == ("chain", "draw")
+    return np.asarray(group["y"].values.reshape(-1, N))
+
+
+@pytest.mark.parametrize("kind", ["prior", "posterior"])
+@pytest.mark.parametrize("name", ["Reweighted", "Resimulated", "Fresh"])
+def test_predictive_draws_are_different_specimens(name: str, kind: str) -> None:
+    before = RESPONSES["Reweighted"].count
+    sets = predictive(name, kind)
+    assert sets.shape == ((40, N) if kind == "prior" else (80, N))
+    within, between = sets.std(axis=1, ddof=1), sets.mean(axis=1).std()
+    assert (within > 0).all()
+    if kind == "prior":
+        np.testing.assert_allclose(within.mean(), 0.75 * np.sqrt(2 / np.pi), rtol=0.2)
+        np.testing.assert_allclose(between, 0.75, rtol=0.25)
+    else:
+        np.testing.assert_allclose(within.mean(), 0.75 * SIGMA, rtol=0.08)
+        np.testing.assert_allclose(sets.mean(), 0.75 * MU, atol=0.06)
+        assert 0.75 * SIGMA / np.sqrt(N) * 0.7 < between < 0.75 * SIGMA / np.sqrt(N) * 2
+    # Neither a repeated data set, nor an order: specimen i is no better than specimen j.
+    assert len(np.unique(sets[:, 0])) > 1
+    assert len(np.unique(sets.mean(axis=1))) == len(sets)
+    inside = sets - sets.mean(axis=1, keepdims=True)
+    assert abs(stats.spearmanr(np.tile(np.arange(N), len(sets)), inside.ravel()).statistic) < 0.1
+    if name == "Reweighted":
+        assert RESPONSES["Reweighted"].count == before
+        assert np.isin(sets, model_of(name)[1].bound.values).all()
+
+
+@pytest.mark.parametrize("name", ["Reweighted", "Resimulated"])
+def test_the_same_seed_gives_the_same_prediction(name: str) -> None:
+    first = predictive(name, "prior")
+    predictive.cache_clear()
+    np.testing.assert_array_equal(predictive(name, "prior"), first)
+    assert not np.array_equal(predictive(name, "prior", seed=2), first)
+
+
+def test_reweighted_calls_the_response_n_times_in_all() -> None:
+    for sampler in ("NUTS", "stock SMC, two cores", "batched kernel, two cores", "prbayes SMC"):
+        draws_of("Reweighted", sampler)
+    model, node = model_of("Reweighted")
+    optimum = prb.minimize(model)
+    assert RESPONSES["Reweighted"].count == node.bound.responses.count == node.bound.n_points == POINTS
+    assert optimum.n_responses == draws_of("Reweighted", "prbayes SMC").posterior.attrs["n_responses"] == POINTS
+
+
+@pytest.mark.parametrize("response", [line, BlackBox()])
+def test_resimulated_counts_its_responses(response: Any) -> None:
+    model, node = build(prb.Resimulated(64), response)
+    assert node.bound.symbolic == (response is line)
+    evaluator, before = Evaluator(model), node.bound.responses.count
+    evaluator(np.zeros((5, 2)))
+    evaluator.populations(np.zeros((2, 2)), 0)
+    assert node.bound.responses.count - before == 7 * 64
+    if response is not line:
+        assert node.bound.responses.count == response.count
+
+
+# Inputs.
+
+
+@dataclass(frozen=True)
+class Case:
+    """Hyperparameters near ``at``, the input made of them, and the distribution of its response by scipy."""
+
+    at: dict[str, float]
+    dist: Callable[..., Any]
+    expected: Any
+    response: Callable[..., Any] = line
+    positive: tuple[str, ...] = ()
+
+
+def total(x: Any) -> Any:
+    return x[..., 0] + x[..., 1]
+
+
+def correlated(rho: Any = 0.5, sd: Any = 1.0) -> Any:
+    covariance = pt.stacklists([[sd**2, 0.6 * rho * sd], [0.6 * rho * sd, 0.36]])
+    return pm.MvNormal.dist(np.array([1.0, 2.0]), covariance)
+
+
+def exponential_of_normal(mu: Any, sigma: Any) -> Any:
+    return pm.CustomDist.dist(mu, sigma, dist=lambda m, s, size: pt.exp(pm.Normal.dist(m, s, size=size)))
+
+
+CASES = {
+    "Normal": Case({"mu": 2, "sigma": 0.8}, pm.Normal.dist, stats.norm(1.5, 0.6)),
+    "LogNormal": Case({"mu": 0.4, "sigma": 0.5}, pm.LogNormal.dist, stats.lognorm(0.5, scale=0.75 * np.exp(0.4))),
+    "Weibull": Case({"alpha": 2, "beta": 1.5}, pm.Weibull.dist, stats.weibull_min(2, scale=0.75 * 1.5)),
+    "Gamma": Case({"alpha": 3, "beta": 2}, pm.Gamma.dist, stats.gamma(3, scale=0.75 / 2)),
+    "Beta": Case({"alpha": 2, "beta": 3}, pm.Beta.dist, stats.beta(2, 3, scale=0.75)),
+    "Uniform": Case({"lower": 1, "upper": 3}, pm.Uniform.dist, stats.uniform(0.75, 1.5)),
+    "TruncatedNormal": Case(
+        {"mu": 1, "sigma": 0.8},
+        lambda mu, sigma: pm.TruncatedNormal.dist(mu, sigma, lower=0.5, upper=2.5),
+        stats.truncnorm(-0.625, 1.875, 0.75, 0.6),
+    ),
+    "Gumbel": Case({"mu": 2, "beta": 0.5}, pm.Gumbel.dist, stats.gumbel_r(1.5, 0.375)),
+    "CustomDist": Case({"mu": 0.4, "sigma": 0.5}, exponential_of_normal, stats.lognorm(0.5, scale=0.75 * np.exp(0.4))),
+    "MvNormal, correlation": Case({"rho": 0.5}, correlated, stats.norm(3, np.sqrt(1.96)), total),
+    "MvNormal, sd": Case({"sd": 1.2}, lambda sd: correlated(sd=sd), stats.norm(3, np.sqrt(1.8 + 0.72)), total),
+    "iid vector": Case(
+        {"mu": 1, "sigma": 0.8},
+        lambda mu, sigma: pm.Normal.dist(mu, sigma, shape=2),
+        stats.norm(2, 0.8 * np.sqrt(2)),
+        total,
+    ),
+}
+# Distributions that only draws or densities are known of.
+ROUGH = {
+    "Poisson": Case({"mu": 4}, pm.Poisson.dist, stats.poisson(4), lambda x: 1.0 * x),
+    "VonMises": Case({"mu": 0.3, "kappa": 3}, pm.VonMises.dist, stats.vonmises(3, 0.3), lambda x: 1.0 * x),
+    "MvStudentT": Case(
+        {"mu": 1},
+        lambda mu: pm.MvStudentT.dist(9, mu=pt.stack([mu, 2.0]), scale=np.eye(2)),
+        stats.t(9, 1),
+        lambda x: x[..., 0],
+    ),
+}
+
+
+def with_input(case: Case, propagation: Propagation) -> tuple[Evaluator, Floats]:
+    with pm.Model() as model:
+        parameters = {
+            k: pm.Uniform(k, -1.2, 1.2) if k == "rho" else pm.TruncatedNormal(k, v, 0.4, lower=v / 4)
+            for k, v in case.at.items()
+        }
+        prb.Simulator(
+            "y",
+            case.response,
+            case.dist(**parameters),
+            metric=prb.AreaMetric(),
+            observed=OBSERVED,
+            propagation=propagation,
+        )
+    evaluator = Evaluator(model)
+    return evaluator, evaluator.unconstrained(case.at)[None]
+
+
+def check_population(values: Floats, weights: Floats, expected: Any, tolerance: float) -> None:
+    mean = weights @ values
+    np.testing.assert_allclose(mean, expected.mean(), atol=tolerance * expected.std())
+    np.testing.assert_allclose(np.sqrt(weights @ (values - mean) ** 2), expected.std(), rtol=tolerance)
+    for z in expected.ppf([0.25, 0.5, 0.75]):
+        np.testing.assert_allclose(weights @ (values <= z), expected.cdf(z), atol=tolerance)
+
+
+@pytest.mark.parametrize("propagation", [prb.Reweighted(512), prb.Resimulated(2048)], ids=lambda p: type(p).__name__)
+@pytest.mark.parametrize("name", CASES)
+def test_populations_of_inputs(name: str, propagation: Propagation) -> None:
+    evaluator, theta = with_input(CASES[name], propagation)
+    (values,), (weights,) = evaluator.populations(theta, 0)
+    several = CASES[name].response is total
+    tolerance = (0.1 if several else 0.03) if isinstance(propagation, prb.Reweighted) else 0.02
+    check_population(values, weights, CASES[name].expected, tolerance)
+    node = evaluator.nodes[0]
+    np.testing.assert_allclose(evaluator(theta).discrepancies[0, 0], node.target(values, weights), rtol=1e-9)
+
+
+@pytest.mark.parametrize("propagation", [prb.Reweighted(1024), prb.Fresh(20_000)], ids=lambda p: type(p).__name__)
+@pytest.mark.parametrize("name", ROUGH)
+def test_populations_of_inputs_without_quantiles(name: str, propagation: Propagation) -> None:
+    evaluator, theta = with_input(ROUGH[name], propagation)
+    (values,), (weights,) = evaluator.populations(theta, 0)
+    check_population(values, weights, ROUGH[name].expected, 0.06 if isinstance(propagation, prb.Reweighted) else 0.03)
+
+
+@pytest.mark.parametrize("propagation", [prb.Resimulated(2048), prb.Fresh(20_000)], ids=lambda p: type(p).__name__)
+@pytest.mark.parametrize("black", [False, True])
+def test_epistemic_variables_data_and_constants(propagation: Propagation, black: bool) -> None:
+    def response(x: Any, slope: Any, c: Any, level: Any, power: Any) -> Any:
+        if black:
+            x, slope, level = (np.asarray(v, dtype=np.float64) for v in (x, slope, level))
+            assert x.shape == slope.shape == level.shape
+        return slope * x + c[1] + level * power
+
+    with pm.Model() as model:
+        mu, sigma, slope = pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1), pm.Normal("slope", 1, 1)
+        prb.Simulator(
+            "y",
+            response,
+            pm.Normal.dist(mu, sigma),
+            2 * slope,
+            np.array([5.0, 7.0]),
+            pm.Data("level", 3.0),
+            2,
+            metric=prb.AreaMetric(),
+            observed=OBSERVED,
+            propagation=propagation,
+        )
+    evaluator = Evaluator(model)
+    thetas = np.array([evaluator.unconstrained({"mu": 2.0, "sigma": 0.5, "slope": s}) for s in (1.0, -0.5)])
+    for level in (3.0, 4.0):
+        model.set_data("level", level)
+        values, weights = evaluator.populations(thetas, 0)
+        found = evaluator(thetas).discrepancies[:, 0]
+        for v, w, s, d in zip(values, weights, (1.0, -0.5), found, strict=True):
+            expected = stats.norm(2 * s * 2.0 + 7 + 2 * level, abs(2 * s) * 0.5)
+            check_population(v, w, expected, 0.01 if isinstance(propagation, prb.Resimulated) else 0.03)
+            np.testing.assert_allclose(d, expected.mean() - OBSERVED.mean(), rtol=0.01)
+
+
+def test_inputs_that_depend_on_each_other_are_drawn_fresh() -> None:
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 2, 1)
+        batch = pm.Normal.dist(mu, 0.6)
+        prb.Simulator(
+            "y",
+            lambda x, b: x - 0.5 * b,
+            pm.Normal.dist(batch, 0.8),
+            batch,
+            metric=prb.AreaMetric(),
+            observed=OBSERVED,
+            propagation=prb.Fresh(20_000),
+        )
+    evaluator = Evaluator(model)
+    values, weights = evaluator.populations(np.array([[1.0], [3.0]]), 0)
+    for v, w, m in zip(values, weights, (1.0, 3.0), strict=True):
+        check_population(v, w, stats.norm(0.5 * m, np.hypot(0.3, 0.8)), 0.03)
+    found = evaluator(np.array([[-8.0], [0.0], [8.0]])).discrepancies[:, 0]
+    np.testing.assert_allclose(found, np.abs(np.array([-4, 0, 4]) - OBSERVED.mean()), rtol=0.05)
+
+
+# One implementation.
+
+METRICS: dict[str, Metric] = {
+    "PR": prb.ProbabilityResidual(),
+    "PR, bins": prb.ProbabilityResidual(prb.Histogram(6)),
+    "KLD": prb.KullbackLeibler(),
+    "KLD, reverse": prb.KullbackLeibler(reverse=True),
+    "KLD, bins": prb.KullbackLeibler(prb.Histogram(6)),
+    "LL": prb.LogLikelihood(),
+    "LL, bins": prb.LogLikelihood(prb.Histogram(6)),
+    "area": prb.AreaMetric(),
+    "own": prb.FunctionMetric(
+        lambda simulated, observed, w: ((simulated * w).sum(-1) - observed.mean()) ** 2, weighted=True
+    ),
+}
+THETAS = np.array([[2.0, np.log(0.8)], [1.6, np.log(0.7)], [2.3, np.log(1.1)]])
+both = pytest.mark.parametrize(
+    "propagation", [prb.Reweighted(POINTS), prb.Resimulated(POINTS)], ids=lambda p: type(p).__name__
+)
+
+
+@both
+@pytest.mark.parametrize("metric", METRICS)
+def test_one_implementation(metric: str, propagation: Propagation) -> None:
+    weights = None if metric == "own" else np.random.default_rng(5).dirichlet(np.full(N, 9.0))
+    model, _ = build(propagation, metric=METRICS[metric], weights=weights, epsilon=0.37)
+    evaluator = Evaluator(model)
+    values, w = evaluator.populations(THETAS, 0)
+    direct = METRICS[metric](values, OBSERVED, weights=w, observed_weights=weights)
+    assert direct.shape == (3,)
+    np.testing.assert_allclose(evaluator(THETAS).discrepancies[:, 0], direct, rtol=1e-9)
+    node = model.compile_logp(vars=model.observed_RVs, mode=PLAIN)
+    whole = model.compile_logp(mode=PLAIN)
+    for theta, d in zip(THETAS, direct, strict=True):
+        point = dict(zip(evaluator.names, theta, strict=True))
+        np.testing.assert_allclose(-0.37 * node(point), d, rtol=1e-9)
+        prior = stats.norm(2, 1).logpdf(theta[0]) + stats.halfnorm.logpdf(np.exp(theta[1])) + theta[1]
+        np.testing.assert_allclose(whole(point), prior - d / 0.37, rtol=1e-9)
+
+
+@both
+@pytest.mark.parametrize("metric", METRICS)
+def test_gradients(metric: str, propagation: Propagation) -> None:
+    model, _ = build(propagation, metric=METRICS[metric], epsilon=0.37)
+    names = [v.name for v in model.value_vars]
+    if metric == "own" or (metric.endswith("bins") and isinstance(propagation, prb.Resimulated)):
+        with pytest.raises(NotImplementedError, match=r"no gradient.*use .*(prb.sample_smc|prb.Reweighted)"):
+            model.compile_dlogp(mode=PLAIN)
+        return
+    logp, gradient = model.compile_logp(mode=PLAIN), model.compile_dlogp(mode=PLAIN)
+    h = 1e-6
+    for theta in THETAS:
+        ends = [[float(logp(dict(zip(names, theta + s * e, strict=True)))) for s in (h, -h)] for e in np.eye(2)]
+        expected = [(a - b) / (2 * h) for a, b in ends]
+        found = gradient(dict(zip(names, theta, strict=True)))
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+
+
+# Invalid particles.
+
+
+@pytest.mark.parametrize("black", [False, True])
+@pytest.mark.parametrize("name", ["Reweighted", "Resimulated", "Fresh"])
+def test_an_invalid_particle_leaves_the_others_alone(name: str, black: bool) -> None:
+    def response(x: Any, z: Any) -> Any:
+        if black:
+            x = np.asarray(x, dtype=np.float64)
+            assert np.isfinite(x).all()
+        return 0.75 * x + z
+
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 2, 1), pm.Normal("sigma", 0.8, 0.8)  # a sixth of the prior is invalid
+        prb.Simulator(
+            "y",
+            response,
+            pm.Normal.dist(mu, sigma),
+            pm.Normal.dist(0, sigma),
+            metric=prb.AreaMetric(),
+            observed=OBSERVED,
+            epsilon=EPSILON,
+            propagation=PROPAGATIONS[name],
+        )
+    evaluator = Evaluator(model)
+    thetas = np.column_stack([np.linspace(1, 3, 7), np.full(7, 0.6)])
+    thetas[2, 1], thetas[4, 1] = -0.6, np.nan
+    batch = evaluator(thetas)
+    expected = np.isin(np.arange(7), [2, 4])
+    np.testing.assert_array_equal(np.isinf(batch.discrepancies[:, 0]), expected)
+    singles = np.array([evaluator(t[None]).discrepancies[0, 0] for t in thetas])
+    if name == "Fresh":
+        np.testing.assert_allclose(batch.discrepancies[~expected, 0], singles[~expected], atol=0.3)
+    else:
+        np.testing.assert_allclose(batch.discrepancies[:, 0], singles, rtol=1e-12)
+        valid = evaluator(thetas[~expected])
+        np.testing.assert_allclose(batch.discrepancies[~expected], valid.discrepancies, rtol=1e-12)
+    logp = model.compile_logp(mode=PLAIN)
+    assert float(logp({"mu": 2.0, "sigma": -0.6})) == -np.inf
+    assert np.isfinite(logp({"mu": 2.0, "sigma": 0.6}))
+    sets = model["y"].owner.op
+    assert sets.prbayes_node.bound.draw(np.random.default_rng(1), N, [2.0, -0.6]).shape == (N,)
+
+
+def test_an_invalid_correlation_leaves_the_others_alone() -> None:
+    for propagation in (prb.Reweighted(256), prb.Resimulated(256), prb.Fresh(256)):
+        with pm.Model() as model:
+            rho = pm.Normal("rho", 0, 0.8)
+            prb.Simulator(
+                "y", total, correlated(rho), metric=prb.AreaMetric(), observed=OBSERVED, propagation=propagation
+            )
+        found = Evaluator(model)(np.array([[0.0], [1.3], [-0.9], [0.9]])).discrepancies[:, 0]
+        np.testing.assert_array_equal(np.isinf(found), [False, True, False, False])
+        # The mean is 1.5 too large whatever the correlation.
+        assert (found[[0, 2, 3]] > 1.2).all()
+
+
+# Clones of a model.
+
+
+@pytest.mark.parametrize("name", ["Reweighted", "Resimulated", "Fresh"])
+def test_clones_keep_the_node(name: str) -> None:
+    model, node = model_of(name)
+    theta = THETAS[1]
+    point = {"mu": theta[0], "sigma_log__": theta[1]}
+    clones = {
+        "clone": (clone_model(model), point),
+        "freeze": (freeze_dims_and_data(model), point),
+        "do": (pm.do(model, {"mu": theta[0]}), {"sigma_log__": theta[1]}),
+        "observe": (pm.observe(model, {"sigma": np.exp(theta[1])}), {"mu": theta[0]}),
+    }
+    expected = Evaluator(model)(theta[None]).discrepancies[0, 0]
+    tolerance = {"rtol": 0.3} if name == "Fresh" else {"rtol": 1e-9}
+    for clone, at in clones.values():
+        assert next(iter(nodes(clone).values())) is node
+        evaluator = Evaluator(clone)
+        assert sorted(evaluator.names) == sorted(at)
+        found = evaluator(np.array([[at[n] for n in evaluator.names]])).discrepancies[0, 0]
+        np.testing.assert_allclose(found, expected, **tolerance)
+        logp = clone.compile_logp(vars=[clone["y"]], mode=PLAIN)
+        np.testing.assert_allclose(logp(at), -expected / EPSILON, **tolerance)
+
+
+@both
+def test_data_above_the_inputs_is_followed(propagation: Propagation) -> None:
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", pm.Data("centre", 2.0), 1), pm.HalfNormal("sigma", 1)
+        x = pm.Normal.dist(mu + pm.Data("shift", 0.0), sigma)
+        prb.Simulator("y", line, x, metric=prb.AreaMetric(), observed=OBSERVED, epsilon=1.0, propagation=propagation)
+    evaluator, logp, point = Evaluator(model), model.compile_logp(mode=PLAIN), {"mu": 2.0, "sigma_log__": 0.0}
+    theta = np.array([[2.0, 0.0], [2.3, 0.0]])
+    first, before = evaluator(theta), logp(point)
+    model.set_data("centre", 3.0)
+    np.testing.assert_allclose(evaluator(theta).discrepancies, first.discrepancies, rtol=1e-12)
+    np.testing.assert_allclose(evaluator(theta).log_prior - first.log_prior, [-0.5, -0.2], rtol=1e-9)
+    np.testing.assert_allclose(logp(point) - before, -0.5, rtol=1e-9)
+    model.set_data("centre", 2.0)
+    model.set_data("shift", 0.3)
+    np.testing.assert_allclose(evaluator(theta).discrepancies[0], first.discrepancies[1], rtol=1e-9)
+    np.testing.assert_allclose(logp(point) - before, first.discrepancies[0] - first.discrepancies[1], rtol=1e-9)
+
+
+# Stock PyMC with our metrics.
+
+
+def simulate(rng: np.random.Generator, mu: Any, sigma: Any, size: Any = None) -> Any:
+    return 0.75 * rng.normal(mu, sigma, size=200)
+
+
+STOCK = {
+    "PR": (prb.ProbabilityResidual(), 0.01),
+    "KLD": (prb.KullbackLeibler(), 1 / N),
+    "LL": (prb.LogLikelihood(), 1 / N),
+    "area": (prb.AreaMetric(), 0.02),
+}
+
+
+@pytest.mark.parametrize("name", STOCK)
+def test_stock_simulator_with_our_metrics(name: str) -> None:
+    metric, epsilon = STOCK[name]
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1)
+        distance = prb.abc_distance(metric)
+        pm.Simulator("y", simulate, mu, sigma, distance=distance, epsilon=epsilon, observed=OBSERVED)
+    cores = 2 if name == "area" else 1
+    idata = pm.sample_smc(
+        200, chains=cores, cores=cores, model=model, random_seed=4, compute_convergence_checks=False, **QUIET
+    )
+    np.testing.assert_allclose(idata.posterior["mu"].mean(), MU, atol=0.1)
+    np.testing.assert_allclose(idata.posterior["sigma"].mean(), SIGMA, atol=0.15)
+
+
+@pytest.mark.parametrize("bad", [np.nan, -np.inf])
+def test_stock_distance_of_invalid_samples(bad: float) -> None:
+    observed, simulated = pt.dvector(), pt.dvector()
+    epsilon = pt.dscalar()
+    logp = prb.abc_distance(prb.AreaMetric())(epsilon, observed, simulated)
+    sample = np.linspace(0, 3, 50)
+    given = {epsilon: 0.1, observed: OBSERVED}
+    expected = -prb.AreaMetric()(sample, OBSERVED) / 0.1
+    np.testing.assert_allclose(logp.eval(given | {simulated: sample}, mode=PLAIN), expected, rtol=1e-12)
+    assert logp.eval(given | {simulated: np.r_[sample, bad]}, mode=PLAIN) == -np.inf
+    failed = logp.eval(given | {simulated: np.r_[sample, np.inf]}, mode=PLAIN)
+    np.testing.assert_allclose(failed, -prb.AreaMetric()(np.r_[sample, np.inf], OBSERVED) / 0.1, rtol=1e-12)
