@@ -92,7 +92,9 @@ def picture(observed, log_c, results, path):
         axis.axvline(least_squares_value, color="k", ls=":", lw=1.2)
         axis.set(yticks=range(len(results)), yticklabels=list(results), ylim=(len(results) - 0.5, -0.5))
     top.set(xlabel="mu: mean of log C")
-    top.set_title("optimum (dot); posterior mean and 89% interval (bar);\nleast squares per specimen (dotted)", fontsize=9)
+    top.set_title(
+        "optimum (dot); posterior mean and 89% interval (bar);\nleast squares per specimen (dotted)", fontsize=9
+    )
     bottom.set(xlabel="sigma: standard deviation of log C")
     figure.savefig(path, dpi=150)
 
@@ -113,10 +115,14 @@ def main():
         model, optimum, posterior = calibrate(metric, observed)
         results[label] = optimum, posterior
         table = prb.compare({"optimum": optimum, "ABC": posterior}, model=model)
-        print(f"{label}: {optimum.n_responses} responses computed, epsilon {float(posterior.calibration.epsilon[0]):.3g}")
+        print(
+            f"{label}: {optimum.n_responses} responses computed, epsilon {float(posterior.calibration.epsilon[0]):.3g}"
+        )
         print(table[["estimate", "sd", "lower", "upper", "shift"]].to_dataframe().round(3).to_string())
         ess = posterior.calibration.weight_ess.quantile([0.05, 0.5]).values
-        print(f"weight effective sample size {ess[0]:.0f} (5%), {ess[1]:.0f} (median); {prb.diagnose(posterior, model=model)}\n")
+        print(
+            f"weight effective sample size {ess[0]:.0f} (5%), {ess[1]:.0f} (median); {prb.diagnose(posterior, model=model)}\n"
+        )
     out.mkdir(parents=True, exist_ok=True)
     picture(observed, log_c, results, out / "crack_growth.png")
     print(f"figure: {out / 'crack_growth.png'}; {time.perf_counter() - clock:.0f} s")

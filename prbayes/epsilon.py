@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from prbayes.information import Information, bootstrap_shifts, prior_scale
+from prbayes.information import Information, bootstrap_shifts, prior_scale, seen_by_area, seen_by_curvature
 from prbayes.metrics import FunctionMetric
 from prbayes.optimize import Optimum
 from prbayes.population import Evaluator
@@ -23,7 +23,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
       Hessian of the discrepancy at the optimum and J the sampling covariance of its gradient: then the
       posterior's covariance epsilon H^-1 matches the estimator's H^-1 J H^-1 on average.
     - Area metric: the epsilon with which 89% intervals of the posteriors of data sets simulated at the
-      optimum contain the optimum in 89% of cases, on average over the hyperparameters.
+      optimum contain the optimum in 89% of cases, on average over the two directions that the data see best.
 
     No response is computed under `Reweighted`.
 
@@ -87,22 +87,32 @@ def _epsilon(information: Information) -> float:
 def _sandwich(information: Information) -> float:
     unit = np.outer(information.scale, information.scale)
     hessian, noise = information.hessian * unit, information.sampling_covariance * unit
-    values, vectors = np.linalg.eigh(hessian)
-    seen = values > 1e-6 * values.max()
-    along = np.einsum("ik,ij,jk->k", vectors[:, seen], noise, vectors[:, seen])
-    return float(np.mean(along / values[seen]))
+    values, vectors, seen = seen_by_curvature(hessian, noise)
+    _refuse_blind(information, bool(seen.any()))
+    along = np.einsum("ik,ij,jk->k", vectors, noise, vectors)
+    return float(np.mean(along[seen] / values[seen]))
+
+
+def _refuse_blind(information: Information, anything: bool) -> None:
+    if not anything:
+        raise ValueError(
+            f"{information.evaluator.nodes[information.k].name}: the data tell less than the prior about every "
+            "hyperparameter, so epsilon cannot be calibrated; look at the optimum, widen the priors, or pass epsilon="
+        )
 
 
 def _by_coverage(information: Information) -> float:
     """Solve for the epsilon whose posteriors cover, the features taken as linear in theta."""
     gap, slopes, lengths = information.area
-    shifts = bootstrap_shifts([information], np.ones(1))
-    covariance = np.atleast_2d(np.cov(shifts, rowvar=False))
-    values, vectors = np.linalg.eigh(covariance / np.outer(information.scale, information.scale))
-    seen = values > 1e-6 * values.max()
-    # The cloud spans the identified directions, three times as wide as the estimator's sampling distribution.
-    z = np.random.default_rng(information.seed).standard_normal((_CLOUD, int(seen.sum())))
-    directions = vectors[:, seen] * np.sqrt(values[seen]) * information.scale[:, None]
+    # Strongest last. What a sample of one response tells beyond two directions, close to its location and its
+    # spread, is of the order of the error of derivatives of stored weights.
+    basis = seen_by_area(information)[:, -2:]
+    _refuse_blind(information, basis.shape[1] > 0)
+    shifts = bootstrap_shifts([information], np.ones(1), basis)
+    # The cloud spans the directions seen, three times as wide as the estimator's sampling distribution.
+    values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(shifts, rowvar=False)))
+    directions = (basis @ (vectors * np.sqrt(np.maximum(values, 0)))) * information.scale[:, None]
+    z = np.random.default_rng(information.seed).standard_normal((_CLOUD, basis.shape[1]))
     moved = 3 * (z @ directions.T) @ slopes
     log_proposal = -0.5 * (z**2).sum(axis=-1)
     distances = np.array([(np.abs(g + moved) * lengths).sum(axis=-1) for g in gap])

@@ -20,6 +20,7 @@ from prbayes.population import Evaluator
 _STEP = 1e-3  # of the prior's standard deviation; densities are twice differentiable
 _WIDE_STEP = 0.05  # where a distribution function of simulated values, a step function, is differenced
 _IRLS = 30
+_LOADING = 0.02  # share of a hyperparameter in unseen directions above which it is not identified
 _POINTS = 1000  # single observations over which the covariance of an additive gradient is taken
 
 
@@ -148,14 +149,6 @@ class Information:
                 row += 4
         return np.asarray(out)
 
-    @property
-    def curvature(self) -> Floats:
-        """A matrix, shape (d, d), that is blind to the directions that the data do not identify."""
-        if self.evaluator.nodes[self.k].metric.smooth:
-            return self.hessian
-        _, slopes, lengths = self.area
-        return np.asarray((slopes * lengths) @ slopes.T)
-
     @cached_property
     def area(self) -> tuple[Floats, Floats, Floats]:
         """Linear model of the area metric: gaps (n_sets, m), their slopes (d, m), lengths (m,)."""
@@ -179,58 +172,63 @@ def _cdf(values: Floats, weights: Floats, at: Floats) -> Floats:
     return np.asarray(total[np.searchsorted(values[order], at, side="right")])
 
 
-def identified(matrix: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Split a symmetric positive semi-definite matrix, of order one, into what it sees and what it is blind to.
+def seen_by_area(part: Information) -> Floats:
+    """Return the directions that an area metric sees, orthonormal in units of the prior's spread, shape (d, r).
 
-    Returns
-    -------
-    ndarray, shape (d, d)
-        The inverse on the directions that it sees.
-    ndarray of bool, shape (d, d)
-        The pairs of elements that have a part in a direction that it is blind to.
+    A direction is not seen if one prior standard deviation along it changes the area by less than half the
+    noise floor: then derivatives along it are mostly the design's own error.
     """
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    seen = values > 1e-9 * max(values.max(), 1e-300)
-    parts = np.abs(vectors[:, ~seen]) > 1e-6
-    return (vectors[:, seen] / values[seen]) @ vectors[:, seen].T, (parts[:, None] & parts).any(axis=-1)
+    _, slopes, lengths = part.area
+    slopes = slopes * part.scale[:, None]
+    _, vectors = np.linalg.eigh((slopes * lengths) @ slopes.T)
+    change = (np.abs(vectors.T @ slopes) * lengths).sum(axis=-1)
+    return np.asarray(vectors[:, change > 0.5 * part.noise_floor])
 
 
-def bootstrap_shifts(parts: list[Information], scales: Floats) -> Floats:
-    """Return shifts of the minimiser over simulated data sets, to first order, shape (n_sets, d).
+def bootstrap_shifts(parts: list[Information], scales: Floats, basis: Floats) -> Floats:
+    """Return shifts of the minimiser over simulated data sets, to first order, along a basis.
 
     The features are taken as linear in theta. Smooth discrepancies then contribute their gradient and
     Hessian; areas, integrals of an absolute value, are minimised by iterated reweighting.
+
+    Parameters
+    ----------
+    parts : list of Information
+    scales : ndarray, shape (k,)
+    basis : ndarray, shape (d, r)
+        Directions in units of the prior's spread.
+
+    Returns
+    -------
+    ndarray, shape (n_sets, r)
     """
-    n_sets, d = parts[0].n_sets, parts[0].theta.size
-    unit = parts[0].scale
-    rhs, curvature = np.zeros((n_sets, d)), np.zeros((d, d))
+    n_sets, r = parts[0].n_sets, basis.shape[1]
+    directions = basis * parts[0].scale[:, None]
+    rhs, curvature = np.zeros((n_sets, r)), np.zeros((r, r))
     areas = []
     for part, s in zip(parts, scales, strict=True):
         if part.evaluator.nodes[part.k].metric.smooth:
-            rhs -= part.gradients / s
-            curvature += part.hessian / s
+            rhs -= part.gradients @ directions / s
+            curvature += directions.T @ part.hessian @ directions / s
         else:
             gap, slopes, lengths = part.area
-            areas.append((gap, slopes * unit[:, None], lengths / s))
-    rhs, curvature = rhs * unit, curvature * np.outer(unit, unit)
-    shifts = np.zeros((n_sets, d))
-    ridge = 1e-10 * np.eye(d)
+            areas.append((gap, directions.T @ slopes, lengths / s))
+    shifts = np.zeros((n_sets, r))
     for _ in range(_IRLS if areas else 1):
-        left, right = np.broadcast_to(curvature, (n_sets, d, d)).copy(), rhs.copy()
+        left, right = np.broadcast_to(curvature, (n_sets, r, r)).copy(), rhs.copy()
         for gap, slopes, lengths in areas:
-            residual = gap + shifts @ slopes
-            weight = lengths / np.sqrt(residual**2 + 1e-8)
+            weight = lengths / np.sqrt((gap + shifts @ slopes) ** 2 + 1e-8)
             left += np.einsum("bm,im,jm->bij", weight, slopes, slopes, optimize=True)
             right -= np.einsum("bm,im->bi", weight * gap, slopes, optimize=True)
-        size = np.maximum(np.trace(left, axis1=1, axis2=2), 1e-200)[:, None, None]
-        shifts = np.linalg.solve(left + ridge * size, right[..., None])[..., 0]
-    return shifts * unit
+        size = np.trace(left, axis1=1, axis2=2)[:, None, None]
+        shifts = np.linalg.solve(left + 1e-10 * size * np.eye(r), right[..., None])[..., 0]
+    return shifts
 
 
 def sampling_covariance(parts: list[Information], scales: Floats) -> Floats:
     """Return the sampling covariance of the minimiser of sum of d_k / scale_k in theta, shape (d, d).
 
-    It is infinite for pairs of elements that have a part in a direction that the data do not identify.
+    It is infinite for elements with a share in directions about which the data tell less than the prior.
 
     Raises
     ------
@@ -241,10 +239,37 @@ def sampling_covariance(parts: list[Information], scales: Floats) -> Floats:
     if any(isinstance(m, FunctionMetric) for m in metrics):
         raise TypeError("standard errors: got a FunctionMetric, expected a metric of this package")
     unit = np.outer(parts[0].scale, parts[0].scale)
-    inverse, blind = identified(sum(p.curvature / s for p, s in zip(parts, scales, strict=True)) * unit)
     if all(m.smooth for m in metrics):
-        noise = sum(p.sampling_covariance / s**2 for p, s in zip(parts, scales, strict=True))
-        covariance = inverse @ (noise * unit) @ inverse * unit
+        hessian = unit * sum(p.hessian / s for p, s in zip(parts, scales, strict=True))
+        noise = unit * sum(p.sampling_covariance / s**2 for p, s in zip(parts, scales, strict=True))
+        values, vectors, seen = seen_by_curvature(hessian, noise)
+        inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
+        covariance, blind = inverse @ noise @ inverse, vectors[:, ~seen]
     else:
-        covariance = np.atleast_2d(np.cov(bootstrap_shifts(parts, scales), rowvar=False))
-    return np.where(blind, np.inf, covariance)
+        seen_by = [
+            np.linalg.eigh(p.hessian * unit)[1][:, seen_by_curvature(p.hessian * unit, p.sampling_covariance * unit)[2]]
+            if m.smooth
+            else seen_by_area(p)
+            for p, m in zip(parts, metrics, strict=True)
+        ]
+        left, strength, _ = np.linalg.svd(np.concatenate([np.zeros((len(unit), 1)), *seen_by], axis=1))
+        rank = int((strength > 0.1).sum())
+        basis, blind = left[:, :rank], left[:, rank:]
+        covariance = np.zeros_like(unit)
+        if rank:
+            shifts = bootstrap_shifts(parts, scales, basis)
+            covariance = basis @ np.atleast_2d(np.cov(shifts, rowvar=False)) @ basis.T
+    covariance = covariance * unit
+    hidden = (blind**2).sum(axis=1) > _LOADING
+    covariance[hidden] = covariance[:, hidden] = np.inf
+    return np.asarray(covariance)
+
+
+def seen_by_curvature(hessian: Floats, noise: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Return eigenvalues and eigenvectors of the Hessian, and along which the data tell more than the prior.
+
+    Both matrices are in units of the prior's spread: there the estimator's variance has to be below one.
+    """
+    values, vectors = np.linalg.eigh((hessian + hessian.T) / 2)
+    along = np.einsum("ik,ij,jk->k", vectors, noise, vectors)
+    return values, vectors, (values > 0) & (along < values**2)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import xarray as xr
-from scipy import optimize
 
 from prbayes._arrays import Floats
 from prbayes.information import Information, prior_scale, sampling_covariance
@@ -23,6 +22,7 @@ from prbayes.simulator import model_on_context
 _log = logging.getLogger("prbayes")
 
 _GRADIENT_FREE = {"nelder-mead", "powell", "cobyla", "cobyqa"}
+_SETTLED = 1e-4  # relative gain of a simplex below which a stalled line search counts as converged
 _SCREENED = 256  # prior draws tried as starts where a theta costs no response
 
 
@@ -286,6 +286,8 @@ class _Search:
         return result
 
     def _run(self, counted: _Counted, start: Floats, **settings: Any) -> Any:
+        from scipy import optimize  # takes longer to import than the whole package
+
         try:
             return optimize.minimize(counted, start, **settings)
         except _SpentError:
@@ -324,6 +326,7 @@ class _Search:
         if polished.fun <= before:
             self.best = again.thetas[int(np.nanargmin(again.values))]
         gain = (before - polished.fun) / max(abs(before), 1e-300)
+        polished.success = bool(polished.success or gain < _SETTLED)
         polished.message = f"{result.message} A simplex from there gained {max(gain, 0):.1e}: {polished.message}"
         return polished
 
@@ -387,7 +390,8 @@ def _flat(evaluator: Evaluator, theta: Floats, scale: Floats) -> bool:
     """Whether no discrepancy changes around theta, as where populations and observed values do not overlap."""
     around = np.vstack([theta, *(theta + s * e for e in np.diag(0.01 * scale) for s in (1, -1))])
     found = evaluator(around).discrepancies
-    return bool((np.ptp(found, axis=0) <= 1e-12 * np.abs(found[0])).all())
+    with np.errstate(invalid="ignore"):
+        return bool(((found == found[0]) | (np.abs(found - found[0]) <= 1e-12 * np.abs(found[0]))).all())
 
 
 def _plain(value: Any) -> Any:

@@ -19,7 +19,6 @@ from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 from pytensor.graph.replace import _vectorize_node, graph_replace
 from pytensor.tensor.variable import TensorVariable
-from scipy.stats import qmc
 
 from prbayes._arrays import Floats, positive_integer, positive_number
 from prbayes.inputs import (
@@ -244,6 +243,8 @@ def refuse_nested(name: str, inputs: Inputs) -> None:
 
 def sobol(n: int, dimensions: int, seed: int) -> Floats:
     """Return n scrambled Sobol points in the open unit cube, shape (n, dimensions)."""
+    from scipy.stats import qmc  # takes longer to import than the whole package
+
     engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
     points = engine.random_base2(int(np.ceil(np.log2(n))))[:n] if n > 1 else engine.random(1)
     return np.asarray(np.clip(points, 1e-12, 1 - 1e-12))

@@ -102,9 +102,7 @@ def pilot(evaluator: Evaluator, scales: Floats, scale: Floats, *, seed: int = 0)
             if node.name in thin and isinstance(node.bound, Design) and node.bound.batches <= _MAX_ROUNDS:
                 node.bound.add(evaluator.roots(best, k))
                 _log.info("%s: pilot design of %d responses", node.name, node.bound.n_points)
-        noise = sum(
-            Information(evaluator, k, best[0], scale, n_sets=50).noise_floor / s for k, s in enumerate(scales)
-        )
+        noise = sum(Information(evaluator, k, best[0], scale, n_sets=50).noise_floor / s for k, s in enumerate(scales))
         if not thin and value[order[-1]] - value[order[0]] < noise:
             break
         covariance = np.atleast_2d(np.cov(best, rowvar=False))

@@ -1,0 +1,496 @@
+"""`minimize` against closed forms, brute force, and its own promises."""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+from scipy import optimize
+from scipy.stats import norm
+
+import prbayes as prb
+from prbayes._arrays import Floats
+from prbayes.density import GaussianKDE
+from prbayes.population import Evaluator
+from prbayes.simulator import nodes
+
+OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
+N, MEAN, SD = OBSERVED.size, float(OBSERVED.mean()), float(OBSERVED.std())
+METRICS: dict[str, prb.Metric] = {
+    "kl": prb.KullbackLeibler(),
+    "ll": prb.LogLikelihood(),
+    "pr": prb.ProbabilityResidual(),
+    "area": prb.AreaMetric(),
+}
+# Largest error of 256 reweighted responses, in standard errors of the data: kinks cost the area metric some.
+DESIGN_ERROR = {"kl": 0.02, "ll": 0.02, "pr": 0.02, "area": 0.08}
+METHODS = ("BFGS", "L-BFGS-B", "Nelder-Mead", "Powell", "CG")
+NORMAL = ("mu", "sigma")
+R256 = prb.Reweighted(256)
+
+
+def same(x: Any) -> Any:
+    return x
+
+
+class Counting:
+    """A response that PyTensor variables cannot enter, with the number of its scalar responses."""
+
+    def __init__(self) -> None:
+        self.calls = self.count = 0
+
+    def __call__(self, x: Any) -> Floats:
+        x = np.asarray(x, dtype=float)
+        self.calls, self.count = self.calls + 1, self.count + x.size
+        return np.asarray(x)
+
+
+def normal_model(
+    metric: prb.Metric,
+    propagation: Any = R256,
+    response: Callable[..., Any] = same,
+    observed: Floats = OBSERVED,
+    **keywords: Any,
+) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", response, x, metric=metric, observed=observed, propagation=propagation, **keywords)
+    return model
+
+
+def mean_model(metric: prb.Metric, **keywords: Any) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
+        prb.Simulator("y", same, x, metric=metric, observed=OBSERVED, propagation=R256, **keywords)
+    return model
+
+
+def node(model: pm.Model) -> Any:
+    return next(iter(nodes(model).values()))
+
+
+@cache
+def fitted(name: str) -> prb.Optimum:
+    # A simplex where BFGS would walk along the kinks of the area metric: a third of the time.
+    return prb.minimize(normal_model(METRICS[name]), method="Nelder-Mead" if name == "area" else None)
+
+
+def pair(optimum: prb.Optimum) -> Floats:
+    return np.array([optimum.point[n] for n in NORMAL])
+
+
+def errors(optimum: prb.Optimum) -> Floats:
+    return np.array([optimum.stderr[n] for n in NORMAL])
+
+
+def simplex(f: Callable[..., float], start: Floats, size: float, tolerance: float = 1e-7) -> Floats:
+    vertices = np.vstack([start, start + size * np.eye(len(start))])
+    options = {"initial_simplex": vertices, "xatol": tolerance, "fatol": 1e-14, "maxiter": 500}
+    return np.asarray(optimize.minimize(f, start, method="Nelder-Mead", options=options).x)
+
+
+# -- where the optimum is --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "tolerance"), [("kl", 0.02), ("ll", 0.1)])
+def test_a_normal_population_gets_mean_and_sd_of_the_data(name: str, tolerance: float) -> None:
+    # Kullback-Leibler with one bandwidth for both sides matches moments; the likelihood is smoothed at one side
+    # only, with a bandwidth that costs at most a tenth of a standard error.
+    optimum = fitted(name)
+    assert optimum.converged
+    assert (np.abs(pair(optimum) - [MEAN, SD]) < tolerance * np.array([SD / N**0.5, SD / (2 * N) ** 0.5])).all()
+
+
+def residual(mu: Any, sigma: Any) -> Any:
+    """The probability residual of a normal population, in closed form, without grid or design."""
+    h = node(fitted("pr").model).target.cells.bandwidth
+    scale = 100.0 ** -np.floor(np.log10(_kde(h).max()))
+    cross = norm.pdf(OBSERVED - mu[..., None], scale=np.sqrt(sigma**2 + 2 * h**2)[..., None]).mean(axis=-1)
+    data = norm.pdf(OBSERVED - OBSERVED[:, None], scale=np.sqrt(2) * h).mean()
+    return scale * (1 / np.sqrt(4 * np.pi * (sigma**2 + h**2)) - 2 * cross + data)
+
+
+def _kde(h: float) -> Any:
+    z = np.linspace(-2, 4, 4001)
+    return norm.pdf(z[:, None] - OBSERVED, scale=h).mean(axis=1)
+
+
+def area(mu: Any, sigma: Any, observed: Floats = OBSERVED, points: int = 4000) -> Any:
+    """The area metric of a normal population from its inverse distribution function."""
+    u = (np.arange(points) + 0.5) / points
+    data = np.sort(observed)[(u * observed.size).astype(int)]
+    return np.abs(mu[..., None] + sigma[..., None] * norm.ppf(u) - data).mean(axis=-1)
+
+
+@pytest.mark.parametrize(("name", "brute"), [("pr", residual), ("area", area)])
+def test_the_optimum_is_that_of_a_brute_force_grid(name: str, brute: Callable[..., Any]) -> None:
+    optimum = fitted(name)
+    mu, sigma = np.meshgrid(np.linspace(0.5, 1.5, 41), np.linspace(0.2, 0.8, 41), indexing="ij")
+    best = int(np.argmin(brute(mu.ravel(), sigma.ravel())))
+    start = np.array([mu.ravel()[best], sigma.ravel()[best]])  # refined from the best node: one basin
+    expected = simplex(lambda p: float(brute(np.array(p[0]), np.array(p[1]))), start, 0.02)
+    assert (np.abs(pair(optimum) - start) < 0.025).all()
+    assert (np.abs(pair(optimum) - expected) < DESIGN_ERROR[name] * errors(optimum)).all()
+    at = brute(*(np.array(p) for p in pair(optimum)))
+    np.testing.assert_allclose(optimum.discrepancy, at, rtol=0.03 if name == "area" else 5e-3)
+
+
+@pytest.mark.parametrize("name", METRICS)
+def test_reweighting_256_responses_agrees_with_resimulating_thousands(name: str) -> None:
+    # 4096 points do for the area metric, whose standard errors would take a minute with more.
+    method, n = ("Nelder-Mead", 4096) if name == "area" else (None, 16384)
+    model = normal_model(METRICS[name], prb.Resimulated(n))
+    other = prb.minimize(model, method=method, start=fitted(name).point, tolerance=1e-4)
+    assert (np.abs(pair(other) - pair(fitted(name))) < DESIGN_ERROR[name] * errors(fitted(name))).all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_methods_agree(method: str) -> None:
+    best = fitted("pr")
+    other = prb.minimize(best.model, method=method, start={"mu": 0.3, "sigma": 1.0})
+    assert other.converged
+    assert (np.abs(pair(other) - pair(best)) < 1e-3 * errors(best)).all()
+    np.testing.assert_allclose(other.discrepancy, best.discrepancy, rtol=1e-6)
+
+
+def test_a_quadratic_case_with_everything_mixed_in() -> None:
+    # With a known sd and one bandwidth for both sides the divergence is (mu - mean)^2 / (2 (sd^2 + h^2)) plus a
+    # constant; the ordinary likelihood and the potential are quadratic as well.
+    extra = np.random.default_rng(2).normal(1.2, 0.5, 30)
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, 2)
+        x = pm.Normal.dist(mu, 0.5)
+        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
+        pm.Normal("z", mu, 0.5, observed=extra)
+        pm.Potential("pull", -5.0 * (mu - 3.0) ** 2)
+    precision = np.array([1 / (0.25 + node(model).target.cells.bandwidth ** 2), 30 / 0.25, 10.0, 1 / 4])
+    centers = np.array([MEAN, extra.mean(), 3.0, 0.0])
+    plain = prb.minimize(model)
+    np.testing.assert_allclose(plain.point["mu"], precision[:3] @ centers[:3] / precision[:3].sum(), atol=1e-4)
+    assert plain.scales == {"y": 1.0}
+    with_prior = prb.minimize(model, prior=True)  # in units of log-densities: discrepancy / epsilon, epsilon = 1/N
+    np.testing.assert_allclose(with_prior.scales["y"], 1 / N)
+    precision[0] *= N
+    np.testing.assert_allclose(with_prior.point["mu"], precision @ centers / precision.sum(), atol=1e-4)
+
+
+def test_prior_true_is_find_map() -> None:
+    model = fitted("kl").model
+    mode = pm.find_MAP(model=model, progressbar=False, return_inferencedata=True, jitter=False).posterior
+    optimum = prb.minimize(model, prior=True)
+    for name in NORMAL:
+        np.testing.assert_allclose(optimum.point[name], float(mode[name].squeeze()), rtol=1e-4)
+    assert abs(optimum.point["sigma"] - SD) > 1e-3  # the prior has an influence
+
+
+# -- several simulators ----------------------------------------------------------------------------------
+
+
+def test_two_simulators_are_scaled_by_their_noise() -> None:
+    # The same specimens measured in metres and in millimetres: each counts the same, and the optimum is that of one.
+    with pm.Model() as model:
+        x = pm.Normal.dist(1.0, pm.HalfNormal("sigma", 2))
+        for name, unit in (("m", 1.0), ("mm", 1000.0)):
+            prb.Simulator(
+                name, lambda x, unit=unit: unit * x, x, metric=METRICS["area"], observed=unit * OBSERVED,
+                propagation=R256,
+            )  # fmt: skip
+    optimum = prb.minimize(model)
+    # Noise floors are means over 200 simulated data sets whose discrepancies vary by 40%: standard error 3%.
+    np.testing.assert_allclose(optimum.scales["mm"] / optimum.scales["m"], 1000, rtol=5 * 0.03 * 2**0.5)
+    np.testing.assert_allclose(optimum.discrepancies["mm"] / optimum.discrepancies["m"], 1000, rtol=1e-6)
+    expected = sum(optimum.discrepancies[n] / optimum.scales[n] for n in ("m", "mm"))
+    np.testing.assert_allclose(optimum.discrepancy, expected, rtol=1e-12)
+    alone = simplex(lambda p: float(area(np.array(1.0), np.array(p[0]))), np.array([0.4]), 0.05)
+    assert abs(optimum.point["sigma"] - alone[0]) < DESIGN_ERROR["area"] * optimum.stderr["sigma"]
+
+
+def test_given_epsilons_weigh_the_simulators() -> None:
+    other = np.random.default_rng(3).normal(2.0, 0.5, 20)
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, 2)
+        for name, data, epsilon in (("a", OBSERVED, 0.02), ("b", other, None)):
+            x = pm.Normal.dist(mu, 0.5)
+            prb.Simulator(name, same, x, metric=METRICS["kl"], observed=data, epsilon=epsilon, propagation=R256)
+    h = [n.target.cells.bandwidth for n in nodes(model).values()]
+    precision = np.array([1 / 0.02, 20.0]) / (0.25 + np.square(h))  # unset: 1/N
+    optimum = prb.minimize(model)
+    np.testing.assert_allclose([optimum.scales["a"], optimum.scales["b"]], [0.02, 0.05])
+    np.testing.assert_allclose(optimum.point["mu"], precision @ [MEAN, other.mean()] / precision.sum(), atol=3e-4)
+    # Each gradient is linear in the mean of its data: the sandwich in closed form.
+    noise = (precision**2 * np.array([0.25 / N, 0.25 / 20])).sum()
+    np.testing.assert_allclose(optimum.stderr["mu"], noise**0.5 / precision.sum(), rtol=0.02)
+
+
+def test_vector_hyperparameters_of_a_multivariate_input() -> None:
+    covariance = np.array([[1.0, 0.5], [0.5, 1.0]])
+    data = np.random.default_rng(4).multivariate_normal([1.0, 2.0], covariance, 30)
+    with pm.Model(coords={"axis": ["a", "b"]}) as model:
+        mean = pm.MvNormal("mean", [0.0, 0.0], 4 * np.eye(2), dims="axis")
+        x = pm.MvNormal.dist(mean, covariance)
+        for i, name in enumerate(("first", "second")):
+            prb.Simulator(
+                name, lambda x, i=i: x[..., i], x, metric=METRICS["kl"], observed=data[:, i],
+                propagation=prb.Reweighted(1024),
+            )  # fmt: skip
+        pm.Deterministic("gap", mean[1] - mean[0])
+    optimum = prb.minimize(model)
+    assert optimum.names == ["mean[0]", "mean[1]"]
+    assert optimum.point["mean"].shape == optimum.stderr["mean"].shape == (2,)
+    expected = data.mean(axis=0)  # a quadratic in each mean; correlation does not matter to marginal conditions
+    assert (np.abs(optimum.point["mean"] - expected) < 0.25 * optimum.stderr["mean"]).all()
+    np.testing.assert_allclose(optimum.stderr["mean"], 1 / 30**0.5, rtol=0.1)
+    np.testing.assert_allclose(optimum.point["gap"], np.diff(optimum.point["mean"])[0], rtol=1e-12)
+    tree = optimum.to_datatree()
+    assert tree["optimum"]["mean"].dims == ("axis",)
+    assert list(tree["optimum"]["axis"].values) == ["a", "b"]
+
+
+# -- supports and starts ---------------------------------------------------------------------------------
+
+
+def priors(kind: str) -> tuple[Any, Any]:
+    if kind == "uniform":
+        return pm.Uniform("mu", 0, 5), pm.Uniform("sigma", 0.1, 2)
+    if kind == "beta":
+        return pm.Deterministic("mu", 3 * pm.Beta("share", 2, 2)), pm.Gamma("sigma", 2, 2)
+    return pm.Uniform("mu", 0, 5, default_transform=None), pm.HalfNormal("sigma", 1, default_transform=None)
+
+
+@pytest.mark.parametrize("kind", ["uniform", "beta", "untransformed"])
+def test_the_optimum_does_not_depend_on_how_hyperparameters_are_constrained(kind: str) -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(*priors(kind))
+        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
+    optimum = prb.minimize(model)
+    assert (np.abs(pair(optimum) - [MEAN, SD]) < 0.02 * errors(fitted("kl"))).all()
+    np.testing.assert_allclose(errors(optimum), errors(fitted("kl")), rtol=0.02)
+
+
+@pytest.mark.parametrize("transform", ["default", None])
+def test_an_optimum_at_the_edge_of_a_support_stays_inside(transform: str | None) -> None:
+    keywords: dict[str, Any] = {} if transform else {"default_transform": None}
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Uniform("mu", 0, 0.9, **keywords), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
+    optimum = prb.minimize(model, method="Nelder-Mead")
+    assert 0.9 - 1e-3 < optimum.point["mu"] <= 0.9
+    # Moment matching around 0.9 instead of the mean.
+    np.testing.assert_allclose(optimum.point["sigma"], np.hypot(SD, MEAN - 0.9), atol=2e-3)
+    np.testing.assert_allclose(optimum.stderr["sigma"], errors(fitted("kl"))[1], rtol=0.1)
+
+
+def test_the_start_is_honoured() -> None:
+    model = fitted("pr").model
+    optimum = prb.minimize(model, start={"mu": 0.5, "sigma": 0.9})
+    np.testing.assert_allclose(optimum.trace["theta"][0], [0.5, np.log(0.9)], rtol=1e-12)
+    assert optimum.n_screened == 0
+    assert fitted("pr").n_screened == 257
+    first = Evaluator(model)(optimum.trace["theta"][:1]).discrepancies[0, 0]
+    np.testing.assert_allclose(optimum.trace["discrepancy"][0], first, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("start", "error", "words"),
+    [
+        ({"mu": 1.0}, KeyError, "expected a value for each of \\['mu', 'sigma'\\]"),
+        ({"mu": 1.0, "sigma": 1.0, "tau": 1.0}, KeyError, "tau"),
+        ({"mu": 1.0, "sigma": -1.0}, ValueError, "inside the support"),
+        ({"mu": np.nan, "sigma": 1.0}, ValueError, "inside the support"),
+        ({"mu": [1.0, 2.0], "sigma": 1.0}, ValueError, "mu"),
+    ],
+)
+def test_a_start_that_does_not_fit_is_refused(start: dict[str, Any], error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        prb.minimize(fitted("pr").model, start=start)
+
+
+def test_a_start_out_of_an_untransformed_support_is_refused() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Uniform("mu", 0, 5, default_transform=None), 0.5)
+        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=prb.Reweighted(64))
+    with pytest.raises(ValueError, match="inside the support"):
+        prb.minimize(model, start={"mu": 6.0})
+
+
+@pytest.mark.parametrize("name", ["pr", "area"])
+def test_a_start_where_nothing_changes_is_no_convergence(name: str) -> None:
+    # The gradient vanishes where supports do not overlap; under Reweighted also that of the area metric, because all
+    # weight is on the outermost design point.
+    optimum = prb.minimize(normal_model(METRICS[name]), start={"mu": 30.0, "sigma": 0.1}, refine=False)
+    assert not optimum.converged
+    assert "try another start" in optimum.message
+    assert np.isinf(errors(optimum)).all()
+
+
+# -- standard errors -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["kl", "ll"])
+def test_standard_errors_of_likelihoods_are_the_textbook_ones(name: str) -> None:
+    expected = SD / np.sqrt([N, 2 * N])
+    np.testing.assert_allclose(errors(fitted(name)), expected, rtol=0.05)
+
+
+def test_standard_errors_of_the_area_metric_against_refitting_1000_data_sets() -> None:
+    start, rng = pair(fitted("area")), np.random.default_rng(5)
+    u = (np.arange(500) + 0.5) / 500
+    z, step = norm.ppf(u), (u * N).astype(int)
+    fits = []
+    for _ in range(1000):
+        data = np.sort(rng.normal(*start, N))[step]
+        fits.append(simplex(lambda p, data=data: float(np.abs(p[0] + p[1] * z - data).mean()), start, 0.04, 1e-4))
+    # The sd of 1000 fits has a relative standard error of 2.2%, that of 200 linearised fits one of 5%: 5.5% together.
+    np.testing.assert_allclose(errors(fitted("area")), np.std(fits, axis=0, ddof=1), rtol=4 * 0.055)
+
+
+@pytest.mark.slow
+def test_standard_errors_against_refitting_200_data_sets_with_minimize() -> None:
+    # Also the linearisation of the optimiser's own path: data sets from the population at the optimum.
+    for name in ("pr", "area"):
+        optimum = fitted(name)
+        mu, sigma = pair(optimum)
+        rng = np.random.default_rng(6)
+        fits = []
+        for _ in range(200):
+            model = normal_model(METRICS[name], observed=rng.normal(mu, sigma, N))
+            fits.append(pair(prb.minimize(model, method="Nelder-Mead", start=optimum.point, refine=False)))
+        # Both sides have a relative standard error of 5% for the area metric, one side has it for the residual.
+        np.testing.assert_allclose(errors(optimum), np.std(fits, axis=0, ddof=1), rtol=4 * 0.07)
+
+
+def test_standard_errors_of_what_the_data_do_not_identify_are_infinite() -> None:
+    for metric in (METRICS["kl"], METRICS["area"]):
+        with pm.Model() as model:
+            mu, sigma = pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1)
+            pm.Normal("idle", 0, 1)
+            x = pm.Normal.dist(mu, sigma)
+            prb.Simulator("y", same, x, metric=metric, observed=OBSERVED, propagation=R256)
+        optimum = prb.minimize(model)
+        expected = errors(fitted("kl" if metric is METRICS["kl"] else "area"))
+        np.testing.assert_allclose(errors(optimum), expected, rtol=0.05 if metric is METRICS["kl"] else 0.25)
+        assert np.isinf(optimum.stderr["idle"])
+        assert optimum.n_responses <= 512  # an idle hyperparameter asks for no responses
+
+
+def test_standard_errors_are_carried_to_deterministics() -> None:
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1)
+        pm.Deterministic("both", pm.math.stack([2 * mu, sigma**2]))
+        x = pm.Normal.dist(mu, sigma)
+        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
+    optimum = prb.minimize(model)
+    np.testing.assert_allclose(optimum.point["both"], [2 * optimum.point["mu"], optimum.point["sigma"] ** 2])
+    slopes = [2.0, 2 * optimum.point["sigma"]]
+    np.testing.assert_allclose(optimum.stderr["both"], slopes * errors(optimum), rtol=1e-3)
+
+
+# -- what it costs, and failure as a value ---------------------------------------------------------------
+
+
+def test_responses_under_reweighted_are_those_of_the_design() -> None:
+    response = Counting()
+    model = normal_model(METRICS["kl"], response=response)
+    assert response.count == 256
+    optimum = prb.minimize(model)
+    assert optimum.n_responses == response.count == node(model).bound.n_points
+    again = prb.minimize(model)  # the design is there already, and is part of this optimum as well
+    assert again.n_responses == response.count == optimum.n_responses
+    assert optimum.n_evaluations == len(optimum.trace["discrepancy"]) == len(optimum.trace["theta"]) > 3
+
+
+def test_a_black_box_response_under_resimulated() -> None:
+    response = Counting()
+    model = normal_model(METRICS["pr"], prb.Resimulated(1024), response)
+    probe = response.count  # a few responses at the model's construction, to check its shape
+    assert probe <= 16
+    optimum = prb.minimize(model)  # BFGS on finite differences
+    assert optimum.converged
+    assert optimum.n_responses == response.count - probe
+    assert optimum.n_evaluations * 1024 < optimum.n_responses < (optimum.n_evaluations + 20) * 1024
+    assert (np.abs(pair(optimum) - pair(fitted("pr"))) < 0.02 * errors(fitted("pr"))).all()
+    symbolic = prb.minimize(normal_model(METRICS["pr"], prb.Resimulated(1024)))
+    np.testing.assert_allclose(pair(optimum), pair(symbolic), atol=1e-5)
+    # Responses inside a graph are counted all the same, and a gradient costs no more than a value.
+    assert symbolic.n_evaluations < optimum.n_evaluations / 2
+    extra = optimum.n_responses - 1024 * optimum.n_evaluations
+    assert symbolic.n_responses == 1024 * symbolic.n_evaluations + extra
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_running_out_of_evaluations_is_a_value(method: str) -> None:
+    optimum = prb.minimize(fitted("pr").model, method=method, max_evaluations=2)
+    assert not optimum.converged
+    assert "max_evaluations = 2" in optimum.message
+    assert optimum.n_evaluations == len(optimum.trace["discrepancy"]) == 2
+    np.testing.assert_allclose(optimum.discrepancy, optimum.trace["discrepancy"].min(), rtol=1e-9)
+    assert optimum.to_datatree()["optimum"].attrs["converged"] == 0
+
+
+def test_fresh_draws_have_no_gradient_and_no_standard_errors() -> None:
+    model = normal_model(METRICS["area"], prb.Fresh(200))
+    with pytest.raises(TypeError, match=r"y: prb.Fresh .*Nelder-Mead"):
+        prb.minimize(model)
+    optimum = prb.minimize(model, method="Nelder-Mead", start={"mu": 1.0, "sigma": 0.5}, max_evaluations=60)
+    assert np.isnan(errors(optimum)).all()
+    assert abs(optimum.point["mu"] - MEAN) < 5 * 0.5 / 50**0.5  # the noise of 200 draws is half that of the data
+
+
+def test_a_users_own_metric_is_minimised_without_standard_errors() -> None:
+    metric = prb.FunctionMetric(
+        lambda z, observed, w: (
+            ((z * w).sum(axis=-1) - observed.mean()) ** 2 + ((z**2 * w).sum(axis=-1) - (observed**2).mean()) ** 2
+        ),
+        weighted=True,
+    )
+    optimum = prb.minimize(normal_model(metric), method="Nelder-Mead")
+    np.testing.assert_allclose(pair(optimum), [MEAN, SD], atol=1e-3)
+    assert np.isnan(errors(optimum)).all()
+
+
+def test_no_simulator_and_no_model() -> None:
+    with pm.Model() as model:
+        pm.Normal("mu")
+    with pytest.raises(ValueError, match=r"expected at least one; add prb\.Simulator"):
+        prb.minimize(model)
+    with pytest.raises(TypeError, match="no model on the context"):
+        prb.minimize()
+    with fitted("pr").model:
+        assert pair(prb.minimize(max_evaluations=1)).shape == (2,)
+
+
+# -- determinism and storage -----------------------------------------------------------------------------
+
+
+def test_bit_identical_twice() -> None:
+    first, second = (prb.minimize(normal_model(METRICS["pr"])) for _ in range(2))
+    assert first.point == second.point
+    assert first.stderr == second.stderr
+    for key in ("theta", "discrepancy"):
+        np.testing.assert_array_equal(first.trace[key], second.trace[key])
+
+
+def test_an_optimum_survives_storage(tmp_path: Path) -> None:
+    optimum = fitted("area")
+    tree = optimum.to_datatree()
+    tree.to_netcdf(tmp_path / "optimum.nc")
+    with xr.open_datatree(tmp_path / "optimum.nc") as loaded:
+        for group in ("optimum", "stderr", "trace", "calibration", "observed_data"):
+            xr.testing.assert_equal(loaded[group].to_dataset().load(), tree[group].to_dataset())
+        attrs = loaded["optimum"].attrs
+        assert attrs["message"] == optimum.message
+        assert attrs["n_responses"] == optimum.n_responses
+        assert float(loaded["optimum"]["mu"]) == optimum.point["mu"]
+        assert list(loaded["calibration"]["element"].values) == ["mu", "sigma_log__"]
+
+
+def test_the_scale_base_changes_the_residual_and_not_its_minimiser() -> None:
+    other = prb.minimize(normal_model(prb.ProbabilityResidual(GaussianKDE(), scale_base=10.0)))
+    np.testing.assert_allclose(pair(other), pair(fitted("pr")), atol=1e-5)
+    ratio = node(fitted("pr").model).target.scale_factor / node(other.model).target.scale_factor
+    assert ratio == 1.0 or abs(np.log10(ratio)) >= 1.0
+    np.testing.assert_allclose(fitted("pr").discrepancy, ratio * other.discrepancy, rtol=1e-6)
