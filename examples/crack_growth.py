@@ -120,9 +120,8 @@ def main():
         )
         print(table[["estimate", "sd", "lower", "upper", "shift"]].to_dataframe().round(3).to_string())
         ess = posterior.calibration.weight_ess.quantile([0.05, 0.5]).values
-        print(
-            f"weight effective sample size {ess[0]:.0f} (5%), {ess[1]:.0f} (median); {prb.diagnose(posterior, model=model)}\n"
-        )
+        print(f"weight effective sample size {ess[0]:.0f} (5%), {ess[1]:.0f} (median)")
+        print(f"{prb.diagnose(posterior, model=model)}\n")
     out.mkdir(parents=True, exist_ok=True)
     picture(observed, log_c, results, out / "crack_growth.png")
     print(f"figure: {out / 'crack_growth.png'}; {time.perf_counter() - clock:.0f} s")

@@ -38,6 +38,7 @@ def _dataset(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, in
 def posterior_tree(
     evaluator: Evaluator,
     thetas: Floats,
+    discrepancies: Floats,
     stats: list[dict[str, list[float]]],
     *,
     seed: int | None,
@@ -50,6 +51,7 @@ def posterior_tree(
     ----------
     evaluator : Evaluator
     thetas : ndarray, shape (chains, draws, d)
+    discrepancies : ndarray, shape (chains, draws, k)
     stats : list of dict
         By chain: statistics by name, one value per stage.
     seed : int or None
@@ -88,7 +90,7 @@ def posterior_tree(
     nothing = {"weight_ess": np.nan, "mean_weight": np.nan, "lost_mass": np.nan}
     calibration = xr.Dataset(
         {
-            "discrepancy": (where, evaluator(flat).discrepancies.reshape(shape)),
+            "discrepancy": (where, discrepancies),
             **{
                 key: (
                     where,

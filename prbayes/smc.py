@@ -89,13 +89,13 @@ class BatchedKernel(SMC_KERNEL):
         """Take over a chain's generator."""
         self.rng = rng
 
-    def _evaluate(self, thetas: Floats) -> tuple[Floats, Floats]:
+    def _evaluate(self, thetas: Floats) -> tuple[Floats, Floats, Floats]:
         found: Evaluation = self.evaluator(thetas)
-        return found.log_prior, found.log_likelihood(self.evaluator.epsilon)
+        return found.log_prior, found.log_likelihood(self.evaluator.epsilon), found.discrepancies
 
     def _initialize_kernel(self) -> None:
         self.tempered_posterior = self.evaluator.prior_thetas(self.draws, int(self.rng.integers(2**31)))
-        self.prior_logp, self.likelihood_logp = self._evaluate(self.tempered_posterior)
+        self.prior_logp, self.likelihood_logp, self.discrepancies = self._evaluate(self.tempered_posterior)
         if not np.isfinite(self.likelihood_logp).any():
             raise ValueError(
                 f"model: got no finite discrepancy among {self.draws} draws from the prior, expected some; the "
@@ -108,6 +108,7 @@ class BatchedKernel(SMC_KERNEL):
         self.resampling_indexes = index
         self.tempered_posterior = self.tempered_posterior[index]
         self.prior_logp, self.likelihood_logp = self.prior_logp[index], self.likelihood_logp[index]
+        self.discrepancies = self.discrepancies[index]
 
     def mutate(self) -> None:
         """Move all particles by Metropolis-Hastings steps that leave the tempered posterior as it is."""
@@ -135,12 +136,13 @@ class BatchedKernel(SMC_KERNEL):
         self.accept_rate, self.n_steps = float(np.mean(accepted)), step
 
     def _accept(self, moved: Floats, log_ratio: Floats) -> float:
-        prior, likelihood = self._evaluate(moved)
+        prior, likelihood, discrepancies = self._evaluate(moved)
         with np.errstate(invalid="ignore"):
             gain = prior - self.prior_logp + self.beta * (likelihood - self.likelihood_logp) + log_ratio
         ok = np.log(self.rng.random(len(moved))) < np.nan_to_num(gain, nan=-np.inf)
         self.tempered_posterior[ok] = moved[ok]
         self.prior_logp[ok], self.likelihood_logp[ok] = prior[ok], likelihood[ok]
+        self.discrepancies[ok] = discrepancies[ok]
         return float(ok.mean())
 
     def sample_stats(self) -> dict[str, Any]:
@@ -243,7 +245,7 @@ def sample_smc(
                 node.epsilon.set_value(np.asarray(calibrated[node.name]))
         seeds = np.random.SeedSequence(random_seed)
         for round_ in range(_MAX_ROUNDS + 1):
-            thetas, stats = _run(evaluator, draws, chains, threshold, seeds, progressbar)
+            thetas, discrepancies, stats = _run(evaluator, draws, chains, threshold, seeds, progressbar)
             if not (refine and evaluator.designs):
                 break
             some = np.random.default_rng(seeds).permutation(thetas.reshape(-1, evaluator.size))[:256]
@@ -255,6 +257,7 @@ def sample_smc(
         return posterior_tree(
             evaluator,
             thetas,
+            discrepancies,
             stats,
             seed=random_seed,
             n_responses=evaluator.n_responses - computed,
@@ -284,8 +287,8 @@ def _set_for_run(evaluator: Evaluator, epsilon: float | dict[str, float] | None)
 
 def _run(
     evaluator: Evaluator, draws: int, chains: int, threshold: float, seeds: np.random.SeedSequence, progressbar: bool
-) -> tuple[Floats, list[dict[str, list[float]]]]:
-    """Run all chains; return thetas, shape (chains, draws, d), and the statistics of each chain's stages."""
+) -> tuple[Floats, Floats, list[dict[str, list[float]]]]:
+    """Run all chains; return thetas, (chains, draws, d), discrepancies, (chains, draws, k), and statistics by stage."""
     columns = (
         TextColumn("SMC chain {task.fields[chain]}"),
         BarColumn(),
@@ -293,7 +296,7 @@ def _run(
         TextColumn("acceptance {task.fields[rate]:.2f}"),
         TimeElapsedColumn(),
     )
-    thetas, stats = [], []
+    thetas, discrepancies, stats = [], [], []
     with Progress(*columns, disable=not progressbar) as progress:
         for chain, seed in enumerate(seeds.spawn(chains)):
             task = progress.add_task("", total=1.0, chain=chain, rate=0.0)
@@ -306,5 +309,6 @@ def _run(
                     stages[name].append(value)
                 progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
             thetas.append(kernel.tempered_posterior)
+            discrepancies.append(kernel.discrepancies)
             stats.append(stages)
-    return np.array(thetas), stats
+    return np.array(thetas), np.array(discrepancies), stats

@@ -139,6 +139,12 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
             ("NaN", lambda x: x * np.nan, prb.ResponseError, r"NaN at all .*expected numbers; look at the priors"),
             ("complex", lambda x: x + 1j, prb.ResponseError, r"returned complex numbers, expected an array of real"),
             ("None", lambda x: None, prb.ResponseError, r"returned NoneType .*expected an array of real numbers"),
+            (
+                "PyTensor",
+                lambda x: x * STRANGER,
+                prb.ResponseError,
+                r"returned TensorVariable .*expected an array of re",
+            ),
             ("raises", raises, prb.ResponseError, r"raised KeyError: 'no such key'; .* arrays of any leading shape"),
             ("scalars only", lambda x: x if x > 0 else -x, prb.ResponseError, r"raised ValueError: The truth value .*"),
             ("too few arguments", lambda: 0.0, prb.ResponseError, r"raised TypeError: .* inputs of shapes"),
@@ -215,6 +221,11 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     # Priors.
     "flat prior": (lambda: build(never, prior=pm.Flat), TypeError, r"got mu.*replace pm.Flat .*wide pm.Normal"),
     "half-flat prior": (lambda: build(never, prior=pm.HalfFlat), TypeError, r"got mu.*pm.HalfFlat by a wide"),
+    "prior of invalid parameters": (
+        simulator(inputs=lambda m, s: [pm.Normal.dist(m, -s)], propagation=SMALL[2]),
+        ValueError,
+        r"y: priors: got invalid parameters .*mu, sigma, expected valid .*pm.HalfNormal",
+    ),
     "discrete prior, minimize": (lambda: prb.minimize(discrete()), TypeError, r"got discrete .*\['mu'\].*pm.sample"),
     "discrete prior, SMC": (lambda: prb.sample_smc(model=discrete()), TypeError, r"\['mu'\], expected continuous"),
     # Other arguments of a simulator.

@@ -421,9 +421,10 @@ def test_a_black_box_response_under_resimulated() -> None:
     assert symbolic.n_responses == 1024 * symbolic.n_evaluations + extra
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["BFGS", "Nelder-Mead", "Powell"])
 def test_running_out_of_evaluations_is_a_value(method: str) -> None:
-    optimum = prb.minimize(fitted("pr").model, method=method, max_evaluations=2)
+    with fitted("pr").model:
+        optimum = prb.minimize(method=method, max_evaluations=2)
     assert not optimum.converged
     assert "max_evaluations = 2" in optimum.message
     assert optimum.n_evaluations == len(optimum.trace["discrepancy"]) == 2
@@ -459,15 +460,13 @@ def test_no_simulator_and_no_model() -> None:
         prb.minimize(model)
     with pytest.raises(TypeError, match="no model on the context"):
         prb.minimize()
-    with fitted("pr").model:
-        assert pair(prb.minimize(max_evaluations=1)).shape == (2,)
 
 
 # -- determinism and storage -----------------------------------------------------------------------------
 
 
 def test_bit_identical_twice() -> None:
-    first, second = (prb.minimize(normal_model(METRICS["pr"])) for _ in range(2))
+    first, second = fitted("pr"), prb.minimize(normal_model(METRICS["pr"]))
     assert first.point == second.point
     assert first.stderr == second.stderr
     for key in ("theta", "discrepancy"):

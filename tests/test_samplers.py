@@ -516,8 +516,11 @@ def test_an_invalid_particle_leaves_the_others_alone(name: str, black: bool) -> 
     logp = model.compile_logp(mode=PLAIN)
     assert float(logp({"mu": 2.0, "sigma": -0.6})) == -np.inf
     assert np.isfinite(logp({"mu": 2.0, "sigma": 0.6}))
-    sets = model["y"].owner.op
-    assert sets.prbayes_node.bound.draw(np.random.default_rng(1), N, [2.0, -0.6]).shape == (N,)
+    bound = evaluator.nodes[0].bound
+    for sigma, fine in ((0.6, True), (-0.6, False)):
+        data = bound.draw(np.random.default_rng(1), N, [np.array(2.0), np.array(sigma)])
+        assert data.shape == (N,)
+        assert np.isfinite(data).all() if fine else np.isnan(data).all()
 
 
 def test_an_invalid_correlation_leaves_the_others_alone() -> None:
