@@ -6,13 +6,13 @@ from prbayes import datasets
 from prbayes.compare import compare
 from prbayes.density import GaussianKDE, Histogram
 from prbayes.diagnose import Diagnosis, diagnose
+from prbayes.discrepancy import Metric
 from prbayes.epsilon import calibrate_epsilon
 from prbayes.metrics import (
     AreaMetric,
     FunctionMetric,
     KullbackLeibler,
     LogLikelihood,
-    Metric,
     ProbabilityResidual,
 )
 from prbayes.optimize import Optimum, minimize

@@ -13,8 +13,9 @@ from pytensor.tensor.variable import TensorVariable
 from scipy.special import logsumexp
 
 from prbayes._arrays import Floats
+from prbayes.discrepancy import Discrepancy
 from prbayes.inputs import PopulationSampler, compile_batched, log_density, prior_draws, quantiles
-from prbayes.metrics import Discrepancy, FunctionMetric
+from prbayes.metrics import FunctionMetric
 from prbayes.propagation import Bound, Reweighted, base_points, refuse_all_nan
 from prbayes.responses import OpaqueOp, Responses
 

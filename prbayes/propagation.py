@@ -21,6 +21,7 @@ from pytensor.graph.replace import _vectorize_node, graph_replace
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._arrays import Floats, positive_integer, positive_number
+from prbayes.discrepancy import Discrepancy
 from prbayes.inputs import (
     PLAIN,
     Inputs,
@@ -32,7 +33,6 @@ from prbayes.inputs import (
     quantiles,
     valid,
 )
-from prbayes.metrics import Discrepancy
 from prbayes.responses import ResponseError, ResponseOp, Responses, symbolic_discrepancy
 
 

@@ -14,8 +14,8 @@ from pytensor.graph.replace import _vectorize_node
 
 from prbayes._arrays import Floats
 from prbayes.density import Cells
+from prbayes.discrepancy import Discrepancy
 from prbayes.inputs import Inputs
-from prbayes.metrics import Discrepancy
 
 # Calls of the user's functions have no compiled form; nothing is gained by saying so at every compilation.
 warnings.filterwarnings(

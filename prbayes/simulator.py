@@ -17,8 +17,8 @@ from pytensor.graph.op import Op
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._arrays import Floats, observed_sample, positive_number
+from prbayes.discrepancy import Discrepancy, Metric
 from prbayes.inputs import read_inputs
-from prbayes.metrics import Discrepancy, Metric
 from prbayes.propagation import Bound, Propagation, Reweighted
 from prbayes.responses import Responses, refuse_uncallable
 

@@ -18,8 +18,8 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes._arrays import Floats
+from prbayes.discrepancy import Metric
 from prbayes.inputs import PLAIN
-from prbayes.metrics import Metric
 from prbayes.population import Evaluator
 from prbayes.propagation import Propagation
 from prbayes.simulator import Node, nodes
