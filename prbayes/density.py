@@ -14,7 +14,6 @@ from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve1d
 
 from prbayes._arrays import Floats, positive_integer, positive_number
 
@@ -228,8 +227,13 @@ class KernelCells(Cells):
             for i in range(0, n, _CHUNK):
                 block = np.s_[r : r + rows_at_once, i : i + _CHUNK]
                 self._count(flat[block], w[block], counts[r : r + rows_at_once], outside[r : r + rows_at_once])
-        grid = convolve1d(counts, self.kernel, axis=-1, mode="constant")
+        grid = self._smooth(counts)
         return np.concatenate([grid, outside / self.widths[-1]], axis=-1).reshape(*batch, g + 2)
+
+    def _smooth(self, counts: Floats) -> Floats:
+        from scipy.ndimage import convolve1d  # takes longer to import than the whole package
+
+        return np.asarray(convolve1d(counts, self.kernel, axis=-1, mode="constant"))
 
     def _count(self, sample: Floats, weights: Floats, counts: Floats, outside: Floats) -> None:
         rows, g = counts.shape
@@ -253,7 +257,7 @@ class KernelCells(Cells):
     def pullback(self, sample: Floats, weights: Floats, cotangent: Floats) -> tuple[Floats, Floats]:
         """Return the derivatives for sample and weights; the smoothing kernel is its own transpose."""
         node, t, inside, below, above = self._locate(sample)
-        c = convolve1d(cotangent[..., :-2], self.kernel, axis=-1, mode="constant")
+        c = self._smooth(cotangent[..., :-2])
         gathered = [np.take_along_axis(c, node + (k - 1), axis=-1) for k in range(4)]
         slope = sum(b * ck for b, ck in zip(_spline_slope(t), gathered, strict=True))
         value = sum(b * ck for b, ck in zip(_spline(t), gathered, strict=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
@@ -10,14 +11,15 @@ import numpy as np
 import pytensor
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
-from scipy.special import logsumexp
 
 from prbayes._arrays import Floats
 from prbayes.discrepancy import Discrepancy
-from prbayes.inputs import PopulationSampler, compile_batched, log_density, prior_draws, quantiles
+from prbayes.inputs import PopulationSampler, compile_batched, event_shape, log_density, prior_draws, quantiles
 from prbayes.metrics import FunctionMetric
 from prbayes.propagation import Bound, Reweighted, base_points, refuse_all_nan
 from prbayes.responses import OpaqueOp, Responses
+
+_log = logging.getLogger("prbayes")
 
 _MAX_THETAS = 512  # components of a batch's mixture density
 _DRAFT = 16  # draft points, whose response is not computed, for each point of a one-dimensional design
@@ -40,8 +42,29 @@ class Design(Bound):
         self.values = np.empty(0)
         self._shared: list[Any] = []
         thetas = prior_draws(inputs.roots, min(config.n, _MAX_THETAS), config.seed)
-        self.prior_size = self.add(thetas)
+        size = self.add(thetas)
         refuse_all_nan(name, self.values)
+        if size < self.required_ess:
+            _log.warning(
+                "%s: the design of %d responses supports a typical population of the prior with a weight effective "
+                "sample size of %.0f, expected %.0f; prb.minimize and prb.sample_smc refine it themselves, before "
+                "pm.sample call prb.refine(model)",
+                name,
+                config.n,
+                size,
+                self.required_ess,
+            )
+
+    @property
+    def required_ess(self) -> float:
+        """The weight effective sample size that keeps design error well below sampling error.
+
+        Stratified points of one input integrate with an error that falls like 1/n, of several like n^(-3/4);
+        the size follows from asking that error to be a fraction of 1/sqrt(N).
+        """
+        inputs = sum(int(np.prod(event_shape(x), dtype=int)) for x in self.inputs.aleatory)
+        root = np.sqrt(self.target.n_effective)
+        return float(max(50.0, 6 * root) if inputs == 1 else max(100.0, (15 * root) ** (4 / 3)))
 
     @property
     def n_points(self) -> int:
@@ -73,10 +96,11 @@ class Design(Bound):
         self.batches += 1
         logs = self._log_density(*self._thetas, *points)[0]
         used = self._counts > 0
-        log_g = logsumexp(logs[used], axis=0, b=self._counts[used, None] / values.size)
+        log_g = np.logaddexp.reduce(logs[used] + np.log(self._counts[used, None] / values.size), axis=0)
         self._store([*points, log_g, *self.target.basis(values)])
         weights = logs[-k:] - log_g
-        return float(np.median(np.exp(2 * logsumexp(weights, axis=1) - logsumexp(2 * weights, axis=1))))
+        total = np.logaddexp.reduce(weights, axis=1)
+        return float(np.median(np.exp(2 * total - np.logaddexp.reduce(2 * weights, axis=1))))
 
     def _store(self, arrays: Sequence[Any]) -> None:
         if not self._shared:
@@ -127,7 +151,7 @@ class Design(Bound):
         grid = np.unique(draft[np.isfinite(draft)])
         logs = self._log_density(*thetas, grid)[0]
         used = counts > 0
-        density = np.exp(logsumexp(logs[used], axis=0, b=counts[used, None] / counts.sum()))
+        density = np.exp(np.logaddexp.reduce(logs[used] + np.log(counts[used, None] / counts.sum()), axis=0))
         mass = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(grid))])
         levels = (np.arange(n) + np.random.default_rng(seed).uniform()) / n
         return [np.interp(levels * mass[-1], mass, grid)], counts * (n / counts.sum())
@@ -176,10 +200,10 @@ class Design(Bound):
             ``lost_mass``, the share of weight on points whose response is NaN.
         """
         (logs,) = self._log_weights(*params)
-        total = logsumexp(logs, axis=-1)
+        total = np.logaddexp.reduce(logs, axis=-1)
         with np.errstate(invalid="ignore"):
-            ess = np.exp(2 * total - logsumexp(2 * logs, axis=-1))
-            lost = np.exp(logsumexp(logs[..., np.isnan(self.values)], axis=-1) - total)
+            ess = np.exp(2 * total - np.logaddexp.reduce(2 * logs, axis=-1))
+            lost = np.exp(np.logaddexp.reduce(logs[..., np.isnan(self.values)], axis=-1) - total)
         return {
             "weight_ess": np.nan_to_num(ess),
             "mean_weight": np.exp(total - np.log(self.values.size)),

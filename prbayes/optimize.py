@@ -218,15 +218,17 @@ def minimize(
             break
         near = spread_around(theta, covariance, scale, seed=random_seed) if cloud is None else cloud
         near = near[evaluator.in_support(near)]
-        short = shortcomings(evaluator, near)
+        short = shortcomings(evaluator, near) or shortcomings(evaluator, theta[None])
         if not short:
             break
         if round_ == _MAX_ROUNDS:
             refuse(short, evaluator)
         elif cloud is None:
-            cloud = pilot(evaluator, scales, scale, seed=random_seed)
-        else:
-            refine_at(evaluator, near)
+            cloud = near = pilot(evaluator, scales, scale, seed=random_seed)
+        elif not refine_at(evaluator, near):
+            refine_at(evaluator, theta[None])
+        # What looked best on a thin design may be an artefact of it.
+        theta = search.best_of(np.vstack([theta, near]), scales)
     result = search.settle(result)
     theta = search.best
     return _optimum(evaluator, theta, scales, covariance, search, result, screened, already - stored, clock)
@@ -251,9 +253,13 @@ class _Search:
         if self.evaluator.responses_per_theta:
             return self.evaluator.initial, 0
         draws = np.concatenate([self.evaluator.initial[None], self.evaluator.prior_thetas(_SCREENED, seed)])
-        found = self.evaluator(draws)
+        return self.best_of(draws, scales), len(draws)
+
+    def best_of(self, thetas: Floats, scales: Floats) -> Floats:
+        """Return the theta with the smallest objective, evaluated in one batch."""
+        found = self.evaluator(thetas)
         value = (found.discrepancies / scales).sum(axis=-1) - found.log_other
-        return draws[np.argmin(np.where(np.isfinite(value), value, np.inf))], len(draws)
+        return np.asarray(thetas[np.argmin(np.where(np.isfinite(value), value, np.inf))])
 
     def __call__(self, theta: Floats, scales: Floats) -> Any:
         """Minimise from theta; sets ``best``."""
@@ -362,7 +368,8 @@ def _optimum(
         at_edge = blind.any() & (slopes == 0).all(axis=-1)
         variance = np.where(at_edge, np.nan, np.where(touched > 0, np.inf, np.maximum(variance, 0)))
         stderr[name] = _plain(np.sqrt(variance))
-    flat = bool(np.isinf(np.diag(covariance)).all()) and _flat(evaluator, theta, search.scale)
+    variance = np.diag(covariance) / search.scale**2  # where nothing changes, that of rounding errors
+    flat = bool((np.isinf(variance) | (variance < 1e-16)).all()) and _flat(evaluator, theta, search.scale)
     lost = " No hyperparameter changes the discrepancy here, far from the data: try another start." if flat else ""
     found = evaluator(theta[None])
     discrepancies = dict(zip([n.name for n in evaluator.nodes], map(float, found.discrepancies[0]), strict=True))

@@ -10,7 +10,6 @@ import pymc as pm
 from prbayes._arrays import Floats
 from prbayes.design import Design
 from prbayes.information import Information
-from prbayes.inputs import event_shape
 from prbayes.population import Evaluator
 from prbayes.simulator import model_on_context
 
@@ -24,24 +23,13 @@ class DesignError(RuntimeError):
     """A design that cannot support the answer, even after refinement."""
 
 
-def required_ess(design: Design) -> float:
-    """Return the weight effective sample size that keeps design error well below sampling error.
-
-    Stratified points of one input integrate with an error that falls like 1/n, of several like n^(-3/4);
-    the size follows from asking that error to be a fraction of 1/sqrt(N).
-    """
-    inputs = sum(int(np.prod(event_shape(x), dtype=int)) for x in design.inputs.aleatory)
-    root = np.sqrt(design.target.n_effective)
-    return float(max(50.0, 6 * root) if inputs == 1 else max(100.0, (15 * root) ** (4 / 3)))
-
-
 def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, str]:
     """Say, by simulator, in what its design does not support the populations at thetas, shape (P, d)."""
     found = {}
     for name, support in evaluator.support(thetas).items():
         ess, mass, lost = (support[key] for key in ("weight_ess", "mean_weight", "lost_mass"))
         design = evaluator.designs[name]
-        (low, middle), need = np.quantile(ess, [0.05, 0.5]), required_ess(design)
+        (low, middle), need = np.quantile(ess, [0.05, 0.5]), design.required_ess
         mass_low, mass_high = np.quantile(mass, [0.05, 0.95])
         most_lost = float(np.quantile(lost, 0.95))
         if most_lost > design.config.max_lost:
@@ -96,7 +84,7 @@ def pilot(evaluator: Evaluator, scales: Floats, scale: Floats, *, seed: int = 0)
         thin = [
             name
             for name, support in evaluator.support(best).items()
-            if np.median(support["weight_ess"]) < required_ess(evaluator.designs[name])
+            if np.median(support["weight_ess"]) < evaluator.designs[name].required_ess
         ]
         for k, node in enumerate(evaluator.nodes):
             if node.name in thin and isinstance(node.bound, Design) and node.bound.batches <= _MAX_ROUNDS:
