@@ -14,7 +14,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._arrays import Floats
 from prbayes.discrepancy import Discrepancy
-from prbayes.inputs import PopulationSampler, compile_batched, event_shape, log_density, prior_draws, quantiles
+from prbayes.inputs import PopulationSampler, compile_batched, log_density, prior_draws, quantiles
 from prbayes.metrics import FunctionMetric
 from prbayes.propagation import Bound, Reweighted, base_points, refuse_all_nan
 from prbayes.responses import OpaqueOp, Responses
@@ -62,7 +62,7 @@ class Design(Bound):
         Stratified points of one input integrate with an error that falls like 1/n, of several like n^(-3/4);
         the size follows from asking that error to be a fraction of 1/sqrt(N).
         """
-        inputs = sum(int(np.prod(event_shape(x), dtype=int)) for x in self.inputs.aleatory)
+        inputs = sum(int(np.prod(shape, dtype=int)) for shape in self.inputs.event_shapes)
         root = np.sqrt(self.target.n_effective)
         return float(max(50.0, 6 * root) if inputs == 1 else max(100.0, (15 * root) ** (4 / 3)))
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,11 @@ class Inputs:
         return [
             next(rest) if isinstance(a, Variable) else aleatory[a] if isinstance(a, int) else a for a in self.arguments
         ]
+
+    @cached_property
+    def event_shapes(self) -> tuple[tuple[int, ...], ...]:
+        """Event shape of each aleatory input, evaluated where it is not static."""
+        return tuple(_event_shape(x) for x in self.aleatory)
 
     @property
     def event_ndims(self) -> tuple[int, ...]:
@@ -184,8 +190,8 @@ def ninf_for_invalid(graphs: Sequence[TensorVariable]) -> list[TensorVariable]:
 def log_density(inputs: Inputs, aleatory: Sequence[TensorVariable], values: Sequence[Any]) -> TensorVariable:
     """Return log p(x), shape (n,), of values x, shapes (n, *event), summed over the aleatory inputs."""
     total: Any = 0.0
-    for dist, x in zip(aleatory, values, strict=True):
-        logp = _mvnormal_logp(dist, x) if _is_mvnormal(dist) else pm.logp(dist, x, warn_rvs=False)
+    for dist, x, shape in zip(aleatory, values, inputs.event_shapes, strict=True):
+        logp = _mvnormal_logp(dist, x, shape[0]) if _is_mvnormal(dist) else pm.logp(dist, x, warn_rvs=False)
         total = total + (logp.sum(axis=tuple(range(1, logp.type.ndim))) if logp.type.ndim > 1 else logp)
     return total
 
@@ -194,12 +200,12 @@ def _is_mvnormal(dist: TensorVariable) -> bool:
     return isinstance(dist.owner.op, type(MvNormal.rv_op))
 
 
-def _mvnormal_logp(dist: TensorVariable, x: Any) -> TensorVariable:
+def _mvnormal_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
     """Return log p(x) by forward substitution, elementwise; PyMC's own solves once per theta and point in a batch."""
     mean, covariance = dist.owner.op.dist_params(dist.owner)
     root = pt.linalg.cholesky(covariance, on_error="nan")
     z: list[Any] = []
-    for i in range(event_shape(dist)[0]):
+    for i in range(size):
         z.append((x[..., i] - mean[i] - sum(root[i, j] * z[j] for j in range(i))) / root[i, i])
     logp = sum(-0.5 * z_i**2 - pt.log(root[i, i]) - 0.5 * np.log(2 * np.pi) for i, z_i in enumerate(z))
     return pt.switch(pt.isnan(logp), -np.inf, logp)
@@ -231,7 +237,7 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
         ) from None
 
 
-def event_shape(dist: TensorVariable) -> tuple[int, ...]:
+def _event_shape(dist: TensorVariable) -> tuple[int, ...]:
     """Return the event shape of an aleatory input, evaluated."""
     if dist.type.ndim == 0:
         return ()

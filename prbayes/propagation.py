@@ -27,7 +27,6 @@ from prbayes.inputs import (
     Inputs,
     PopulationSampler,
     compile_batched,
-    event_shape,
     ninf_for_invalid,
     prior_draws,
     quantiles,
@@ -252,7 +251,7 @@ def sobol(n: int, dimensions: int, seed: int) -> Floats:
 
 def base_points(inputs: Inputs, n: int, seed: int) -> tuple[Floats, list[Floats]]:
     """Return one spare Sobol coordinate, shape (n,), and one array of points, (n, *event), per aleatory input."""
-    shapes = [event_shape(x) for x in inputs.aleatory]
+    shapes = inputs.event_shapes
     sizes = [int(np.prod(s, dtype=int)) for s in shapes]
     u = sobol(n, 1 + sum(sizes), seed)
     edges = np.cumsum([1, *sizes])

@@ -169,7 +169,7 @@ def test_samplers_find_the_posterior(name: str, sampler: str) -> None:
         draws = idata.posterior[key].values
         assert draws.shape[0] == 2
         blur = 1.8 if name == "Fresh" else 1.0
-        assert abs(draws.mean() - mean) < 0.4 * sd, key
+        assert abs(draws.mean() - mean) < 0.4 * sd * blur, key
         assert 0.7 < draws.std() / sd < 1.35 * blur, key
 
 
@@ -564,7 +564,7 @@ def test_an_invalid_correlation_leaves_the_others_alone() -> None:
 
 @pytest.mark.parametrize("name", ["Reweighted", "Resimulated", "Fresh"])
 def test_clones_keep_the_node(name: str) -> None:
-    model, node = model_of(name)
+    model, node = build(prb.Fresh(20_000)) if name == "Fresh" else model_of(name)
     theta = THETAS[1]
     point = {"mu": theta[0], "sigma_log__": theta[1]}
     clones = {
@@ -574,7 +574,7 @@ def test_clones_keep_the_node(name: str) -> None:
         "observe": (pm.observe(model, {"sigma": np.exp(theta[1])}), {"mu": theta[0]}),
     }
     expected = Evaluator(model)(theta[None]).discrepancies[0, 0]
-    tolerance = {"rtol": 0.3} if name == "Fresh" else {"rtol": 1e-9}
+    tolerance = {"rtol": 0.1} if name == "Fresh" else {"rtol": 1e-9}
     for clone, at in clones.values():
         assert next(iter(nodes(clone).values())) is node
         evaluator = Evaluator(clone)
