@@ -151,7 +151,7 @@ class Reweighted(Propagation):
     def __post_init__(self) -> None:
         positive_integer(self.n, "Reweighted: n", minimum=16)
         positive_integer(self.seed, "Reweighted: seed", minimum=0)
-        if not 0 <= positive_number(self.max_lost, "Reweighted: max_lost") < 1:
+        if self.max_lost != 0 and positive_number(self.max_lost, "Reweighted: max_lost") >= 1:
             raise ValueError(f"Reweighted: max_lost: got {self.max_lost}, expected a share below 1")
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:

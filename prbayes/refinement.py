@@ -37,13 +37,17 @@ def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, str]:
                 f"lost mass: {most_lost:.1%} of a population's weight is on points whose response is NaN, expected at "
                 f"most max_lost = {design.config.max_lost:.1%}"
             )
-        elif middle < need or low < need / 10:
-            found[name] = (
+            continue
+        complaints = []
+        if middle < need or low < need / 10:
+            complaints.append(
                 f"weight effective sample size {low:.0f} (5% quantile) and {middle:.0f} (median) of {design.n_points} "
                 f"points, expected {need / 10:.0f} and {need:.0f}"
             )
-        elif mass_low < 0.8 or mass_high > 1.25:
-            found[name] = f"mean raw weight from {mass_low:.2f} to {mass_high:.2f}, expected within 0.8 to 1.25"
+        if mass_low < 0.8 or mass_high > 1.25:
+            complaints.append(f"mean raw weight from {mass_low:.2f} to {mass_high:.2f}, expected within 0.8 to 1.25")
+        if complaints:
+            found[name] = ", and ".join(complaints)
     return found
 
 
