@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,11 @@ if TYPE_CHECKING:
 def versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
     return {f"{name}_version": importlib.metadata.version(name) for name in ("prbayes", "pymc", "numpy")}
+
+
+def _described(configuration: object) -> str:
+    """Return the representation of a metric or propagation, the same in every session."""
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(configuration))
 
 
 def _dataset(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, int]) -> xr.Dataset:
@@ -102,8 +108,8 @@ def posterior_tree(
             },
             "theta": (["chain", "draw", "element"], thetas),
             "epsilon": ("simulator", evaluator.epsilon),
-            "metric": ("simulator", [repr(n.metric) for n in evaluator.nodes]),
-            "propagation": ("simulator", [repr(n.propagation) for n in evaluator.nodes]),
+            "metric": ("simulator", [_described(n.metric) for n in evaluator.nodes]),
+            "propagation": ("simulator", [_described(n.propagation) for n in evaluator.nodes]),
             "n_points": ("simulator", [n.bound.n_points for n in evaluator.nodes]),
         },
         coords={"simulator": names, "element": evaluator.names, **{k: np.arange(v) for k, v in leading.items()}},
@@ -155,7 +161,7 @@ def optimum_tree(optimum: Optimum) -> xr.DataTree:
                     "scale": ("simulator", list(optimum.scales.values())),
                     "theta": ("element", optimum.theta),
                     "covariance": (["element", "other_element"], optimum.covariance),
-                    "metric": ("simulator", [repr(n.metric) for n in evaluator.nodes]),
+                    "metric": ("simulator", [_described(n.metric) for n in evaluator.nodes]),
                 },
                 coords={"simulator": names, **elements},
             ),

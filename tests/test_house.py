@@ -26,6 +26,9 @@ UPWARDS = {
     ("results", "optimize"),  # annotation of optimum_tree
 }
 
+# Results, errors and base classes, which nobody makes; and a kernel that is passed to PyMC.
+WITHOUT_EXAMPLE = {"BatchedKernel", "DesignError", "Diagnosis", "Metric", "Optimum", "ResponseError"}
+
 INNER = ("pymc.logprob", "pymc.smc", "pymc.pytensorf", "pymc.distributions", "pymc.model.core", "pymc.backends")
 MAY_TOUCH_PYMC = {"inputs", "simulator", "population", "smc"}
 
@@ -69,6 +72,49 @@ def test_files_are_short_and_print_nothing(path: Path) -> None:
     assert len(text.splitlines()) <= 400
     calls = [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]
     assert not {"print", "eval", "exec", "breakpoint"} & {c.func.id for c in calls if isinstance(c.func, ast.Name)}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
+def test_nothing_reaches_for_private_attributes_of_pymc(path: Path) -> None:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    private = [
+        alias.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("pymc")
+        for alias in node.names
+        if alias.name.startswith("_")
+    ]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and node.attr.startswith("_") and not node.attr.endswith("__"):
+            source = ast.unparse(node)
+            private += [source] if source.startswith(("pm.", "pymc.")) else []
+    assert not private
+
+
+def test_imports_form_no_cycle() -> None:
+    """Module-level imports only, whatever ORDER says: each file can be imported first."""
+    graph: dict[str, set[str]] = {}
+    for path in FILES:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        top = [n for n in tree.body if isinstance(n, ast.ImportFrom) and (n.module or "").startswith("prbayes.")]
+        graph[path.stem] = {(n.module or "").split(".")[1] for n in top} & {p.stem for p in FILES}
+    done: set[str] = set()
+    while ready := {name for name in graph if name not in done and graph[name] <= done}:
+        done |= ready
+    assert done == set(graph), f"a cycle among {sorted(set(graph) - done)}"
+
+
+def test_a_new_room_gets_a_place() -> None:
+    assert sorted(ORDER) == sorted(p.stem for p in FILES if p.stem != "__init__")
+
+
+@pytest.mark.parametrize("name", sorted(set(prbayes.__all__) - {"datasets"}))
+def test_public_functions_and_configurations_have_an_example(name: str) -> None:
+    if name in WITHOUT_EXAMPLE:
+        return
+    text = getattr(prbayes, name).__doc__
+    assert "Examples\n" in text
+    assert ">>> " in text
 
 
 @pytest.mark.parametrize("name", sorted(set(prbayes.__all__) - {"datasets"}))

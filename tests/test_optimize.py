@@ -336,16 +336,16 @@ def test_standard_errors_of_likelihoods_are_the_textbook_ones(name: str) -> None
     np.testing.assert_allclose(errors(fitted(name)), expected, rtol=0.05)
 
 
-def test_standard_errors_of_the_area_metric_against_refitting_1000_data_sets() -> None:
+def test_standard_errors_of_the_area_metric_against_refitting_500_data_sets() -> None:
     start, rng = pair(fitted("area")), np.random.default_rng(5)
     u = (np.arange(500) + 0.5) / 500
     z, step = norm.ppf(u), (u * N).astype(int)
     fits = []
-    for _ in range(1000):
+    for _ in range(500):
         data = np.sort(rng.normal(*start, N))[step]
         fits.append(simplex(lambda p, data=data: float(np.abs(p[0] + p[1] * z - data).mean()), start, 0.04, 1e-4))
-    # The sd of 1000 fits has a relative standard error of 2.2%, that of 200 linearised fits one of 5%: 5.5% together.
-    np.testing.assert_allclose(errors(fitted("area")), np.std(fits, axis=0, ddof=1), rtol=4 * 0.055)
+    # The sd of 500 fits has a relative standard error of 3.2%, that of 200 linearised fits one of 5%: 6% together.
+    np.testing.assert_allclose(errors(fitted("area")), np.std(fits, axis=0, ddof=1), rtol=4 * 0.06)
 
 
 @pytest.mark.slow

@@ -1,0 +1,226 @@
+"""What results look like: the trees of `sample_smc` and `minimize`, and `compare`."""
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import arviz as az
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+from scipy.stats import norm
+
+import prbayes as prb
+from prbayes._arrays import Floats
+from prbayes.population import Evaluator
+from prbayes.results import posterior_tree, versions
+
+DATA = np.random.default_rng(1).normal([1.0, 3.0], 0.5, (40, 2))
+
+
+def same(x: Any) -> Any:
+    return x
+
+
+@cache
+def model() -> pm.Model:
+    """Two simulators, a vector hyperparameter with named elements, a scalar one, a deterministic, named specimens."""
+    with pm.Model(coords={"lab": ["north", "south"], "specimen": [f"s{i}" for i in range(40)]}) as m:
+        mean = pm.Normal("mean", 0, [3.0, 3.0], dims="lab")
+        sigma = pm.HalfNormal("sigma", 1)
+        pm.Deterministic("variance", sigma**2)
+        for i, name in enumerate(("first", "second")):
+            x = pm.Normal.dist(mean[i], sigma)
+            prb.Simulator(
+                name, same, x, metric=prb.KullbackLeibler() if i else prb.AreaMetric(), observed=DATA[:, i],
+                epsilon=None if i else 0.02, dims=None if i else "specimen", propagation=prb.Reweighted(256),
+            )  # fmt: skip
+    return m
+
+
+@cache
+def optimum() -> prb.Optimum:
+    return prb.minimize(model(), method="Nelder-Mead")
+
+
+@cache
+def idata() -> xr.DataTree:
+    return prb.sample_smc(200, chains=4, model=model(), random_seed=3, progressbar=False)
+
+
+# -- trees -----------------------------------------------------------------------------------------------
+
+
+def test_the_tree_of_an_optimum() -> None:
+    tree = optimum().to_datatree()
+    assert set(tree.children) == {"optimum", "stderr", "trace", "calibration", "observed_data"}
+    assert set(tree["optimum"].data_vars) == set(tree["stderr"].data_vars) == {"mean", "sigma", "variance"}
+    assert tree["optimum"]["mean"].dims == ("lab",)
+    assert float(tree["optimum"]["mean"].sel(lab="south")) == optimum().point["mean"][1]
+    assert float(tree["stderr"]["sigma"]) == optimum().stderr["sigma"]
+    calibration = tree["calibration"]
+    assert calibration["covariance"].dims == ("element", "other_element")
+    assert calibration["covariance"].sel(element="mean[1]", other_element="sigma_log__") == optimum().covariance[1, 2]
+    assert float(calibration["discrepancy"].sel(simulator="second")) == optimum().discrepancies["second"]
+    assert float(calibration["scale"].sel(simulator="first")) == 0.02
+    assert tree["trace"].sizes["evaluation"] == optimum().n_evaluations
+    assert {"discrepancy", "converged", "message", "n_evaluations", "n_responses", "n_screened", "seconds"} <= set(
+        tree["optimum"].attrs
+    )
+    assert versions().items() <= tree["optimum"].attrs.items()
+
+
+def test_observed_data_keep_their_labels() -> None:
+    for tree in (optimum().to_datatree(), idata()):
+        observed = tree["observed_data"]
+        np.testing.assert_array_equal(observed["first"], DATA[:, 0])
+        np.testing.assert_array_equal(observed["second"], DATA[:, 1])
+        assert observed["first"].dims == ("specimen",)
+        assert str(observed["specimen"].values[3]) == "s3"
+        assert observed["second"].dims == ("second_dim_0",)
+
+
+def test_the_tree_of_a_sampler() -> None:
+    tree = idata()
+    assert tree["posterior"]["mean"].dims == ("chain", "draw", "lab")
+    np.testing.assert_allclose(tree["posterior"]["variance"], tree["posterior"]["sigma"] ** 2)
+    calibration = tree["calibration"]
+    assert calibration["discrepancy"].dims == ("chain", "draw", "simulator")
+    thetas = calibration["theta"].values.reshape(-1, 3)
+    found = Evaluator(model())(thetas)
+    np.testing.assert_allclose(calibration["discrepancy"].values.reshape(-1, 2), found.discrepancies, rtol=1e-9)
+    support = Evaluator(model()).support(thetas)
+    for name in ("first", "second"):
+        one = calibration.to_dataset().sel(simulator=name)
+        assert int(one["n_points"]) % 256 == 0
+        np.testing.assert_allclose(one["weight_ess"].values.ravel(), support[name]["weight_ess"], rtol=1e-9)
+        np.testing.assert_allclose(one["mean_weight"].values.ravel(), support[name]["mean_weight"], rtol=1e-9)
+    np.testing.assert_allclose(calibration["epsilon"], [0.02, 1 / 40])
+    assert tree["posterior"].attrs["inference_library"] == "prbayes"
+    assert versions().items() <= tree["posterior"].attrs.items()
+
+
+def test_metrics_are_described_the_same_in_every_session() -> None:
+    expected = [
+        "AreaMetric()",
+        "KullbackLeibler(density=GaussianKDE(bandwidth=<function twice_silverman>), reverse=False)",
+    ]
+    for tree in (optimum().to_datatree(), idata()):
+        assert list(tree["calibration"]["metric"].values) == expected
+    assert list(idata()["calibration"]["propagation"].values) == ["Reweighted(n=256, seed=0, max_lost=0.05)"] * 2
+
+
+def test_chains_with_different_numbers_of_stages() -> None:
+    evaluator = Evaluator(model())
+    thetas = np.zeros((2, 3, 3))
+    stats: list[dict[str, list[float]]] = [{"beta": [0.2, 1.0], "n_steps": [2, 4]}, {"beta": [1.0], "n_steps": [6]}]
+    tree = posterior_tree(evaluator, thetas, np.ones((2, 3, 2)), stats, seed=None, n_responses=7, seconds=1.5)
+    np.testing.assert_array_equal(tree["sample_stats"]["beta"], [[0.2, 1.0], [1.0, np.nan]])
+    np.testing.assert_array_equal(tree["sample_stats"]["n_steps"], [[2, 4], [6, np.nan]])
+    assert tree["posterior"].attrs["random_seed"] == "None"
+    assert tree["posterior"].attrs["n_responses"] == 7
+    np.testing.assert_array_equal(tree["posterior"]["sigma"], 1.0)
+
+
+@pytest.mark.parametrize("make", [idata, lambda: optimum().to_datatree()])
+def test_trees_survive_storage(make: Any, tmp_path: Path) -> None:
+    tree = make()
+    tree.to_netcdf(tmp_path / "tree.nc")
+    loaded = az.from_netcdf(tmp_path / "tree.nc")
+    try:
+        assert set(loaded.children) == set(tree.children)
+        for group in tree.children:
+            xr.testing.assert_equal(loaded[group].to_dataset().load(), tree[group].to_dataset())
+            assert {k: loaded[group].attrs[k] for k in tree[group].attrs} == dict(tree[group].attrs)
+            assert all(v.dtype != object for v in tree[group].data_vars.values())
+    finally:
+        loaded.close()
+
+
+def test_propagations_without_a_design_have_no_support_to_report() -> None:
+    with pm.Model() as m:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
+        prb.Simulator("y", same, x, metric=prb.KullbackLeibler(), observed=DATA[:, 0], propagation=prb.Resimulated(64))
+    tree = prb.sample_smc(50, chains=1, model=m, random_seed=1, progressbar=False)
+    for key in ("weight_ess", "mean_weight", "lost_mass"):
+        assert np.isnan(tree["calibration"][key]).all()
+    assert int(tree["calibration"]["n_points"][0]) == 64
+    assert prb.diagnose(tree, model=m).ok
+    assert prb.diagnose(tree, model=m).support.sizes["simulator"] == 0
+
+
+# -- compare ---------------------------------------------------------------------------------------------
+
+
+def test_compare_sets_optimum_and_posterior_side_by_side() -> None:
+    table = prb.compare({"optimum": optimum(), "ABC": idata()}, model=model())
+    assert list(table["result"].values) == ["optimum", "ABC"]
+    assert list(table["hyperparameter"].values) == ["mean[0]", "mean[1]", "sigma"]
+    z = norm.ppf(0.945)
+    best = table.sel(result="optimum")
+    estimates = [*optimum().point["mean"], optimum().point["sigma"]]
+    errors = [*optimum().stderr["mean"], optimum().stderr["sigma"]]
+    np.testing.assert_allclose(best["estimate"], estimates)
+    np.testing.assert_allclose(best["sd"], errors)
+    np.testing.assert_allclose(best["lower"], np.subtract(estimates, np.multiply(z, errors)), rtol=1e-4)
+    np.testing.assert_allclose(best["upper"], np.add(estimates, np.multiply(z, errors)), rtol=1e-4)
+    np.testing.assert_array_equal(best["shift"], 0.0)
+    abc = table.sel(result="ABC")
+    posterior = idata()["posterior"]
+    draws = np.stack([*np.moveaxis(posterior["mean"].values, -1, 0), posterior["sigma"].values]).reshape(3, -1)
+    np.testing.assert_allclose(abc["estimate"], draws.mean(axis=1))
+    np.testing.assert_allclose(abc["sd"], draws.std(axis=1, ddof=1))
+    np.testing.assert_allclose([abc["lower"], abc["upper"]], np.quantile(draws, [0.055, 0.945], axis=1))
+    np.testing.assert_allclose(abc["shift"], (draws.mean(axis=1) - estimates) / errors)
+    assert (np.abs(abc["shift"]) < 1).all()  # one model, one metric
+    assert list(table["n_responses"].values) == [optimum().n_responses, posterior.attrs["n_responses"]]
+    assert (table["seconds"] > 0).all()
+    frame = table.to_dataframe()
+    assert {"estimate", "sd", "lower", "upper", "shift"} <= set(frame.columns)
+    assert table.attrs["interval"] == 0.89
+
+
+def test_compare_without_a_model_shows_all_that_is_shared() -> None:
+    table = prb.compare({"a": optimum(), "b": idata()})
+    assert list(table["hyperparameter"].values) == ["mean[0]", "mean[1]", "sigma", "variance"]
+
+
+def tree_of(**values: Floats) -> xr.DataTree:
+    return xr.DataTree.from_dict({"posterior": xr.Dataset({k: (["chain", "draw"], v) for k, v in values.items()})})
+
+
+def test_compare_takes_the_posterior_of_any_sampler() -> None:
+    rng = np.random.default_rng(2)
+    table = prb.compare({"NUTS": tree_of(sigma=rng.normal(size=(2, 50))), "optimum": optimum()})
+    assert list(table["hyperparameter"].values) == ["sigma"]
+    assert np.isnan(table["n_responses"].sel(result="NUTS"))
+    assert np.isnan(table["seconds"].sel(result="NUTS"))
+    shift = (table["estimate"][1] - table["estimate"][0]) / table["sd"][0]
+    np.testing.assert_allclose(table["shift"].sel(result="optimum"), shift)
+
+
+def test_compare_with_a_first_result_without_spread() -> None:
+    table = prb.compare({"a": tree_of(sigma=np.ones((1, 5))), "b": tree_of(sigma=np.full((1, 5), 2.0))})
+    assert np.isinf(table["shift"].sel(result="b")).all()
+
+
+@pytest.mark.parametrize(
+    ("results", "error", "words"),
+    [
+        ({}, ValueError, "got no results"),
+        ({"a": {"mu": 1.0}}, TypeError, "a: got dict, expected an Optimum or a DataTree"),
+        ({"a": xr.DataTree()}, TypeError, "a: got DataTree, expected"),
+        ({"a": tree_of(x=np.ones((1, 5))), "b": tree_of(y=np.ones((1, 5)))}, ValueError, "share no hyperparameter"),
+    ],
+)
+def test_compare_refuses_what_cannot_be_compared(results: Any, error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        prb.compare(results)
+
+
+def test_compare_of_a_model_that_is_another() -> None:
+    with pm.Model() as other:
+        pm.Normal("tau")
+    with pytest.raises(ValueError, match="share no hyperparameter"):
+        prb.compare({"a": optimum()}, model=other)
