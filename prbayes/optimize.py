@@ -58,6 +58,8 @@ class Optimum:
         The optimum in unconstrained space.
     names : list of str
         Names of the elements of theta.
+    support : dict
+        By simulator with `Reweighted`: ``weight_ess``, ``mean_weight`` and ``lost_mass`` at the optimum.
     trace : dict
         ``theta`` (n, d) and ``discrepancy`` (n,) of each evaluation.
     seconds : float
@@ -77,6 +79,7 @@ class Optimum:
     theta: Floats
     names: list[str]
     model: pm.Model = field(repr=False)
+    support: dict[str, dict[str, float]] = field(default_factory=dict)
     trace: dict[str, Floats] = field(repr=False, default_factory=dict)
     seconds: float = 0.0
 
@@ -253,6 +256,10 @@ def _optimum(
         theta=theta,
         names=evaluator.names,
         model=evaluator.model,
+        support={
+            name: {key: float(value[0]) for key, value in support.items()}
+            for name, support in evaluator.support(theta[None]).items()
+        },
         trace={"theta": np.array(search.thetas), "discrepancy": np.array(search.values)},
         seconds=time.perf_counter() - clock,
     )

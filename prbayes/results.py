@@ -159,6 +159,10 @@ def optimum_tree(optimum: Optimum) -> xr.DataTree:
                 {
                     "discrepancy": ("simulator", list(optimum.discrepancies.values())),
                     "scale": ("simulator", list(optimum.scales.values())),
+                    **{
+                        key: ("simulator", [optimum.support.get(n, {}).get(key, np.nan) for n in names])
+                        for key in ("weight_ess", "mean_weight", "lost_mass")
+                    },
                     "theta": ("element", optimum.theta),
                     "covariance": (["element", "other_element"], optimum.covariance),
                     "metric": ("simulator", [_described(n.metric) for n in evaluator.nodes]),

@@ -224,3 +224,14 @@ def test_compare_of_a_model_that_is_another() -> None:
         pm.Normal("tau")
     with pytest.raises(ValueError, match="share no hyperparameter"):
         prb.compare({"a": optimum()}, model=other)
+
+
+def test_the_support_of_an_optimum_is_part_of_it() -> None:
+    assert optimum().support
+    tree = optimum().to_datatree()["calibration"]
+    for name, support in optimum().support.items():
+        for key, value in support.items():
+            assert float(tree[key].sel(simulator=name)) == value
+        assert support["weight_ess"] > 30
+        assert 0.8 < support["mean_weight"] < 1.25
+        assert support["lost_mass"] == 0
