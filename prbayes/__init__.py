@@ -3,6 +3,8 @@
 from importlib.metadata import version
 
 from prbayes import datasets
+from prbayes.adjust import Affine
+from prbayes.bootstrap import bootstrap
 from prbayes.compare import compare
 from prbayes.density import GaussianKDE, Histogram
 from prbayes.diagnose import Diagnosis, diagnose
@@ -19,12 +21,14 @@ from prbayes.optimize import Optimum, minimize
 from prbayes.propagation import Fresh, Resimulated, Reweighted
 from prbayes.refinement import DesignError, refine
 from prbayes.responses import ResponseError
+from prbayes.sbc import simulation_based_calibration
 from prbayes.simulator import Simulator, abc_distance, set_epsilon
 from prbayes.smc import BatchedKernel, sample_smc
 
 __version__ = version("prbayes")
 
 __all__ = [
+    "Affine",
     "AreaMetric",
     "BatchedKernel",
     "DesignError",
@@ -43,6 +47,7 @@ __all__ = [
     "Reweighted",
     "Simulator",
     "abc_distance",
+    "bootstrap",
     "calibrate_epsilon",
     "compare",
     "datasets",
@@ -51,4 +56,5 @@ __all__ = [
     "refine",
     "sample_smc",
     "set_epsilon",
+    "simulation_based_calibration",
 ]

@@ -106,7 +106,10 @@ class Cells(ABC):
 
     @abstractmethod
     def reading(self, points: Floats, weights: Floats) -> Floats:
-        """Return r, shape (m,), such that ``r @ g`` is the weighted mean of g (given on the cells) at the points."""
+        """Return r, shape (..., m), such that ``r @ g`` is the weighted mean of g (given on the cells) at the points.
+
+        The points have shape (n,), their weights (..., n).
+        """
 
     @abstractmethod
     def pullback(self, sample: Floats, weights: Floats, cotangent: Floats) -> tuple[Floats, Floats]:
@@ -250,9 +253,10 @@ class KernelCells(Cells):
         node, t, inside, _, _ = self._locate(points)
         s = 1 - t
         keys = (-t * s**2 / 2, 1 - 2.5 * t**2 + 1.5 * t**3, 1 - 2.5 * s**2 + 1.5 * s**3, -s * t**2 / 2)
-        w = np.where(inside, weights, 0.0)
-        size = self.widths.size
-        return np.sum([np.bincount(node - 1 + k, w * b, size) for k, b in enumerate(keys)], axis=0)
+        each = np.zeros((points.size, self.widths.size))
+        for k, b in enumerate(keys):
+            each[np.arange(points.size), node - 1 + k] += np.where(inside, b, 0.0)
+        return np.asarray(weights @ each)
 
     def pullback(self, sample: Floats, weights: Floats, cotangent: Floats) -> tuple[Floats, Floats]:
         """Return the derivatives for sample and weights; the smoothing kernel is its own transpose."""
@@ -343,7 +347,7 @@ class BinCells(Cells):
 
     def reading(self, points: Floats, weights: Floats) -> Floats:
         """Return the weight of the points in each bin."""
-        return self.density(points, weights) * self.widths
+        return np.asarray(weights @ self.basis(points) * self.widths)
 
     def _cell(self, sample: Floats) -> NDArrayInt:
         """Return cell numbers: bins, then below, above, and NaN."""

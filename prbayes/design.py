@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
@@ -41,6 +42,7 @@ class Design(Bound):
         self._points: list[Floats] = []
         self.values = np.empty(0)
         self._shared: list[Any] = []
+        self._basis: tuple[Any, int, Any] = (None, 0, None)
         thetas = prior_draws(inputs.roots, min(config.n, _MAX_THETAS), config.seed)
         size = self.add(thetas)
         refuse_all_nan(name, self.values)
@@ -70,6 +72,12 @@ class Design(Bound):
     def n_points(self) -> int:
         """Number of stored responses."""
         return self.values.size
+
+    def same_points(self, other: Bound) -> bool:
+        """Return whether another design has the same points, so that their responses belong together."""
+        return isinstance(other, Design) and all(
+            np.array_equal(a, b) for a, b in zip(self._points, other._points, strict=True)
+        )
 
     def add(self, thetas: Sequence[Floats]) -> float:
         """Compute n more responses, at points drawn from the populations of ``thetas``, shapes (k, *shape).
@@ -101,6 +109,17 @@ class Design(Bound):
         weights = logs[-k:] - log_g
         total = np.logaddexp.reduce(weights, axis=1)
         return float(np.median(np.exp(2 * total - np.logaddexp.reduce(2 * weights, axis=1))))
+
+    @contextmanager
+    def undone(self) -> Iterator[None]:
+        """Forget, afterwards, the batches that are added inside."""
+        kept = (self._points, self.values, self._thetas, self._counts, self.batches)
+        shared = [s.get_value() for s in self._shared]
+        try:
+            yield
+        finally:
+            self._points, self.values, self._thetas, self._counts, self.batches = kept
+            self._store(shared)
 
     def _store(self, arrays: Sequence[Any]) -> None:
         if not self._shared:
@@ -188,6 +207,15 @@ class Design(Bound):
         with np.errstate(invalid="ignore"):
             weights = weights / total
         return np.broadcast_to(self.values, weights.shape), weights
+
+    def discrepancies(self, params: Sequence[Any], target: Discrepancy) -> Floats:
+        """Return the discrepancies of the populations at given roots, shape (k,); +inf where none has support."""
+        if self._basis[:2] != (target, self.n_points):
+            self._basis = (target, self.n_points, target.basis(self.values))
+        _, weights = self.populations(params)
+        supported = np.isfinite(weights).all(axis=-1)
+        weights = np.where(supported[:, None], weights, 1 / self.n_points)
+        return np.where(supported, target.outer(*target.from_basis(weights, self._basis[2], np), xp=np), np.inf)
 
     def support(self, params: Sequence[Any]) -> dict[str, Floats]:
         """Say how well the design supports the populations at given roots, shapes (k,).

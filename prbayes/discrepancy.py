@@ -8,6 +8,7 @@ run through the same lines.
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
@@ -36,10 +37,21 @@ class Discrepancy(ABC):
     metric: Metric
     observed: Floats
     weights: Floats
+    _by_data_set: ClassVar[tuple[str, ...]] = ("weights",)
 
     def with_observed(self, observed: Floats, weights: Floats | None = None) -> Discrepancy:
-        """Return the same metric, on the same cells, against other values; for resampling."""
+        """Return the same metric, on the same cells, against other values; for resampling.
+
+        Weights of shape (..., N) stand for as many data sets; then `outer` broadcasts against features.
+        """
         return replace(self, observed=observed, weights=sample_weights(weights, observed.size))
+
+    def rows(self, index: Any) -> Discrepancy:
+        """Return some of the data sets of which there are several."""
+        chosen = copy.copy(self)
+        for name in self._by_data_set:
+            object.__setattr__(chosen, name, getattr(self, name)[index])
+        return chosen
 
     @property
     def n_effective(self) -> float:
@@ -160,9 +172,16 @@ class DensityDiscrepancy(Discrepancy):
 
     cells: Cells
     density: Floats = field(init=False)
+    _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "density")
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "density", self.cells.density(self.observed, self.weights))
+        several = self.weights.ndim > 1
+        density = (
+            self.weights @ self.cells.basis(self.observed)
+            if several
+            else self.cells.density(self.observed, self.weights)
+        )
+        object.__setattr__(self, "density", density)
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
         """Return the density on the cells."""

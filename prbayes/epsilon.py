@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from prbayes.information import Information, bootstrap_shifts, prior_scale, seen_by_area, seen_by_curvature
+from prbayes.information import Information, first_order_shifts, prior_scale, seen_by_area, seen_by_curvature
 from prbayes.metrics import FunctionMetric
 from prbayes.optimize import Optimum
-from prbayes.population import Evaluator
 from prbayes.propagation import FreshBound
 
-_CLOUD = 1000  # thetas that carry each simulated data set's posterior
+_CLOUD = 500  # thetas that carry each simulated data set's posterior
 _SETS = 200
 _LEVEL = 0.89
 
@@ -63,7 +62,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
             f"calibrate_epsilon: got {type(optimum).__name__}, expected an Optimum; call "
             "prb.calibrate_epsilon(prb.minimize(model))"
         )
-    evaluator = Evaluator(optimum.model)
+    evaluator = optimum.evaluator
     scale = prior_scale(evaluator)
     return {
         node.name: _epsilon(Information(evaluator, k, optimum.theta, scale, n_sets=_SETS))
@@ -103,12 +102,12 @@ def _refuse_blind(information: Information, anything: bool) -> None:
 
 def _by_coverage(information: Information) -> float:
     """Solve for the epsilon whose posteriors cover, the features taken as linear in theta."""
-    gap, slopes, lengths = information.area
+    gap, slopes, lengths = information.area(*information.data_set)
     # Strongest last. What a sample of one response tells beyond two directions, close to its location and its
     # spread, is of the order of the error of derivatives of stored weights.
     basis = seen_by_area(information)[:, -2:]
     _refuse_blind(information, basis.shape[1] > 0)
-    shifts = bootstrap_shifts([information], np.ones(1), basis)
+    shifts = first_order_shifts([information], np.ones(1), basis, information.data_sets)
     # The cloud spans the directions seen, three times as wide as the estimator's sampling distribution.
     values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(shifts, rowvar=False)))
     directions = (basis @ (vectors * np.sqrt(np.maximum(values, 0)))) * information.scale[:, None]

@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 from prbayes._arrays import Floats
 from prbayes.metrics import FunctionMetric
 from prbayes.population import Evaluator
+from prbayes.resampling import DataSets, dependent, simulated_sets
 
 _STEP = 1e-3  # of the prior's standard deviation; densities are twice differentiable
 _WIDE_STEP = 0.05  # where a distribution function of simulated values, a step function, is differenced
+_KNOTS = 400  # on which distribution functions are linearised
 _IRLS = 30
 _LOADING = 0.02  # share of a hyperparameter in unseen directions above which it is not identified
 _POINTS = 1000  # single observations over which the covariance of an additive gradient is taken
@@ -86,54 +88,49 @@ class Information:
         return values[0][finite], w / w.sum()
 
     @cached_property
-    def data_sets(self) -> Floats:
-        """Data sets of the observed size from the population at theta, shape (n_sets, N)."""
-        values, weights = self._center
-        rng = np.random.default_rng([self.seed, self.k])
-        n = self.evaluator.nodes[self.k].target.observed.size
-        return rng.choice(values, size=(self.n_sets, n), p=weights)
+    def data_sets(self) -> DataSets:
+        """Data sets drawn from the model at theta, for all simulators; the same for all parts of one seed."""
+        return simulated_sets(self.evaluator, self.theta, self.n_sets, self.seed)
+
+    @property
+    def data_set(self) -> tuple[Floats, Floats]:
+        """The values and weights of this simulator's data sets, shapes (n,), (n_sets, n)."""
+        return self.data_sets.values[self.k], self.data_sets.weights[self.k]
 
     @cached_property
     def _features(self) -> Any:
-        """Features at the stencil where they do not depend on the observed side."""
-        target = self.evaluator.nodes[self.k].target
-        return target.features(*self._populations, np) if hasattr(target, "cells") else None
+        """Features at the stencil, of a metric whose features do not depend on the observed side."""
+        return self.evaluator.nodes[self.k].target.features(*self._populations, np)
 
-    def _along_stencil(self, observed: Floats, weights: Floats | None = None) -> Floats:
-        node = self.evaluator.nodes[self.k]
-        target = node.target.with_observed(observed, weights)
-        features = self._features if self._features is not None else target.features(*self._populations, np)
-        return np.asarray(target.outer(*features, xp=np))
+    def _along_stencil(self, observed: Floats, weights: Floats) -> Floats:
+        target = self.evaluator.nodes[self.k].target.with_observed(observed, weights)
+        return np.asarray(target.outer(*self._features, xp=np))
 
     @cached_property
     def noise_floor(self) -> float:
         """The mean discrepancy between the population at theta and data sets drawn from it."""
         target = self.evaluator.nodes[self.k].target
         values, weights = (a[:1] for a in self._populations)
-        return float(np.mean([target.with_observed(z).of(values, weights) for z in self.data_sets]))
+        observed, u = self.data_set
+        return float(np.mean([target.with_observed(observed[v > 0], v[v > 0]).of(values, weights) for v in u]))
 
-    def _gradients(self, data_sets: Floats) -> Floats:
-        """Gradients of the discrepancy at theta for each data set, shape (n_sets, d)."""
-        d = self.theta.size
-        values = np.array([self._along_stencil(z)[1 : 1 + 2 * d] for z in data_sets])
+    def gradients(self, observed: Floats, weights: Floats) -> Floats:
+        """Return the gradients of the discrepancy at theta for data sets (n,), (n_sets, n), shape (n_sets, d)."""
+        values = self._along_stencil(observed, weights[:, None])[:, 1 : 1 + 2 * self.theta.size]
         return np.asarray((values[:, 0::2] - values[:, 1::2]) / (2 * self._step))
-
-    @cached_property
-    def gradients(self) -> Floats:
-        """Gradients of the discrepancy at theta for each data set, shape (n_sets, d)."""
-        return self._gradients(self.data_sets)
 
     @cached_property
     def sampling_covariance(self) -> Floats:
         """J: the covariance of the gradient over data sets of the observed size, shape (d, d)."""
         target = self.evaluator.nodes[self.k].target
-        if not target.metric.additive:
-            return np.atleast_2d(np.cov(self.gradients, rowvar=False))
+        if not target.metric.additive or dependent([self.evaluator.nodes[self.k]]):
+            return np.atleast_2d(np.cov(self.gradients(*self.data_set), rowvar=False))
         values, weights = self._center
         order = np.argsort(values)
         levels = (np.arange(_POINTS) + 0.5) / _POINTS
         points = values[order][np.minimum(np.searchsorted(np.cumsum(weights[order]), levels), values.size - 1)]
-        return np.atleast_2d(np.cov(self._gradients(points[:, None]), rowvar=False)) / target.n_effective
+        slopes = self.gradients(points, np.eye(_POINTS))
+        return np.atleast_2d(np.cov(slopes, rowvar=False)) / target.n_effective
 
     @cached_property
     def hessian(self) -> Floats:
@@ -149,27 +146,32 @@ class Information:
                 row += 4
         return np.asarray(out)
 
-    @cached_property
-    def area(self) -> tuple[Floats, Floats, Floats]:
-        """Linear model of the area metric: gaps (n_sets, m), their slopes (d, m), lengths (m,)."""
-        values, weights = self._populations
-        order = np.argsort(values[0])
-        order = order[np.isfinite(values[0][order])]
-        knots = values[0][order]
-        if np.ndim(values) == 2 and not np.array_equal(values[0], values[-1], equal_nan=True):
-            cdf = np.array([_cdf(v, w, knots) for v, w in zip(values, weights, strict=True)])
+    def area(self, observed: Floats, weights: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return a linear model of the area metric for data sets (n,), (n_sets, n).
+
+        Returns
+        -------
+        tuple of ndarray
+            Gaps between distribution functions (n_sets, m), their slopes (d, m), lengths (m,).
+        """
+        values, w = self._populations
+        knots = np.unique(np.concatenate([values[0][np.isfinite(values[0])], observed]))
+        knots = knots[np.unique(np.linspace(0, knots.size - 1, _KNOTS).astype(int))]
+        if np.array_equal(values[0], values[-1], equal_nan=True):
+            cdf = _cdf(values[0], w, knots)
         else:
-            cdf = np.cumsum(weights[:, order], axis=-1)
+            cdf = np.array([_cdf(v, u, knots) for v, u in zip(values, w, strict=True)])
         d = self.theta.size
         slopes = (cdf[1 : 1 + 2 * d : 2] - cdf[2 : 2 + 2 * d : 2]) / (2 * self._step[:, None])
-        steps = np.array([np.searchsorted(np.sort(z), knots, side="right") / z.size for z in self.data_sets])
-        return (cdf[0] - steps)[:, :-1], slopes[:, :-1], np.diff(knots)
+        return (cdf[0] - _cdf(observed, weights, knots))[:, :-1], slopes[:, :-1], np.diff(knots)
 
 
 def _cdf(values: Floats, weights: Floats, at: Floats) -> Floats:
+    """Return distribution functions of values (n,) with weights (..., n), shape (..., m)."""
     order = np.argsort(values)
-    total = np.concatenate([[0.0], np.cumsum(weights[order])])
-    return np.asarray(total[np.searchsorted(values[order], at, side="right")])
+    total = np.cumsum(weights[..., order], axis=-1)
+    total = np.concatenate([np.zeros_like(total[..., :1]), total], axis=-1)
+    return np.asarray(total[..., np.searchsorted(values[order], at, side="right")])
 
 
 def seen_by_area(part: Information) -> Floats:
@@ -178,15 +180,15 @@ def seen_by_area(part: Information) -> Floats:
     A direction is not seen if one prior standard deviation along it changes the area by less than half the
     noise floor: then derivatives along it are mostly the design's own error.
     """
-    _, slopes, lengths = part.area
+    _, slopes, lengths = part.area(*part.data_set)
     slopes = slopes * part.scale[:, None]
     _, vectors = np.linalg.eigh((slopes * lengths) @ slopes.T)
     change = (np.abs(vectors.T @ slopes) * lengths).sum(axis=-1)
     return np.asarray(vectors[:, change > 0.5 * part.noise_floor])
 
 
-def bootstrap_shifts(parts: list[Information], scales: Floats, basis: Floats) -> Floats:
-    """Return shifts of the minimiser over simulated data sets, to first order, along a basis.
+def first_order_shifts(parts: list[Information], scales: Floats, basis: Floats, sets: DataSets) -> Floats:
+    """Return shifts of the minimiser over data sets, to first order, along a basis.
 
     The features are taken as linear in theta. Smooth discrepancies then contribute their gradient and
     Hessian; areas, integrals of an absolute value, are minimised by iterated reweighting.
@@ -197,21 +199,23 @@ def bootstrap_shifts(parts: list[Information], scales: Floats, basis: Floats) ->
     scales : ndarray, shape (k,)
     basis : ndarray, shape (d, r)
         Directions in units of the prior's spread.
+    sets : DataSets
 
     Returns
     -------
     ndarray, shape (n_sets, r)
     """
-    n_sets, r = parts[0].n_sets, basis.shape[1]
+    n_sets, r = len(sets.weights[0]), basis.shape[1]
     directions = basis * parts[0].scale[:, None]
     rhs, curvature = np.zeros((n_sets, r)), np.zeros((r, r))
     areas = []
     for part, s in zip(parts, scales, strict=True):
+        data = sets.values[part.k], sets.weights[part.k]
         if part.evaluator.nodes[part.k].metric.smooth:
-            rhs -= part.gradients @ directions / s
+            rhs -= part.gradients(*data) @ directions / s
             curvature += directions.T @ part.hessian @ directions / s
         else:
-            gap, slopes, lengths = part.area
+            gap, slopes, lengths = part.area(*data)
             areas.append((gap, directions.T @ slopes, lengths / s))
     shifts = np.zeros((n_sets, r))
     for _ in range(_IRLS if areas else 1):
@@ -225,10 +229,38 @@ def bootstrap_shifts(parts: list[Information], scales: Floats, basis: Floats) ->
     return shifts
 
 
-def sampling_covariance(parts: list[Information], scales: Floats) -> Floats:
-    """Return the sampling covariance of the minimiser of sum of d_k / scale_k in theta, shape (d, d).
+@dataclass(frozen=True, eq=False)
+class Local:
+    """First-order sampling distribution of the minimiser, in units of the prior's spread.
 
-    It is infinite for elements with a share in directions about which the data tell less than the prior.
+    Attributes
+    ----------
+    scale : ndarray, shape (d,)
+        The prior's spread.
+    directions : ndarray, shape (d, r)
+        Orthonormal directions about which the data tell more than the prior.
+    blind : ndarray, shape (d, d - r)
+        The other directions.
+    covariance : ndarray, shape (r, r)
+        Of the minimiser, along the directions.
+    """
+
+    scale: Floats
+    directions: Floats
+    blind: Floats
+    covariance: Floats
+
+    @property
+    def in_theta(self) -> Floats:
+        """The covariance in theta, shape (d, d), infinite for elements with a share in blind directions."""
+        covariance = self.directions @ self.covariance @ self.directions.T * np.outer(self.scale, self.scale)
+        hidden = (self.blind**2).sum(axis=1) > _LOADING
+        covariance[hidden] = covariance[:, hidden] = np.inf
+        return np.asarray(covariance)
+
+
+def local_sampling(parts: list[Information], scales: Floats) -> Local:
+    """Return the sampling distribution of the minimiser of sum of d_k / scale_k.
 
     Raises
     ------
@@ -238,31 +270,32 @@ def sampling_covariance(parts: list[Information], scales: Floats) -> Floats:
     metrics = [p.evaluator.nodes[p.k].metric for p in parts]
     if any(isinstance(m, FunctionMetric) for m in metrics):
         raise TypeError("standard errors: got a FunctionMetric, expected a metric of this package")
-    unit = np.outer(parts[0].scale, parts[0].scale)
+    scale = parts[0].scale
+    unit = np.outer(scale, scale)
     if all(m.smooth for m in metrics):
         hessian = unit * sum(p.hessian / s for p, s in zip(parts, scales, strict=True))
-        noise = unit * sum(p.sampling_covariance / s**2 for p, s in zip(parts, scales, strict=True))
+        if dependent(parts[0].evaluator.nodes):
+            together = sum(p.gradients(*p.data_set) / s for p, s in zip(parts, scales, strict=True))
+            noise = unit * np.atleast_2d(np.cov(together, rowvar=False))
+        else:
+            noise = unit * sum(p.sampling_covariance / s**2 for p, s in zip(parts, scales, strict=True))
         values, vectors, seen = seen_by_curvature(hessian, noise)
-        inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
-        covariance, blind = inverse @ noise @ inverse, vectors[:, ~seen]
-    else:
-        seen_by = [
-            np.linalg.eigh(p.hessian * unit)[1][:, seen_by_curvature(p.hessian * unit, p.sampling_covariance * unit)[2]]
-            if m.smooth
-            else seen_by_area(p)
-            for p, m in zip(parts, metrics, strict=True)
-        ]
-        left, strength, _ = np.linalg.svd(np.concatenate([np.zeros((len(unit), 1)), *seen_by], axis=1))
-        rank = int((strength > 0.1).sum())
-        basis, blind = left[:, :rank], left[:, rank:]
-        covariance = np.zeros_like(unit)
-        if rank:
-            shifts = bootstrap_shifts(parts, scales, basis)
-            covariance = basis @ np.atleast_2d(np.cov(shifts, rowvar=False)) @ basis.T
-    covariance = covariance * unit
-    hidden = (blind**2).sum(axis=1) > _LOADING
-    covariance[hidden] = covariance[:, hidden] = np.inf
-    return np.asarray(covariance)
+        inverse = vectors[:, seen] / values[seen]
+        return Local(scale, vectors[:, seen], vectors[:, ~seen], inverse.T @ noise @ inverse)
+    seen_by = [
+        np.linalg.eigh(p.hessian * unit)[1][:, seen_by_curvature(p.hessian * unit, p.sampling_covariance * unit)[2]]
+        if m.smooth
+        else seen_by_area(p)
+        for p, m in zip(parts, metrics, strict=True)
+    ]
+    left, strength, _ = np.linalg.svd(np.concatenate([np.zeros((len(unit), 1)), *seen_by], axis=1))
+    rank = int((strength > 0.1).sum())
+    basis, blind = left[:, :rank], left[:, rank:]
+    covariance = np.zeros((rank, rank))
+    if rank:
+        shifts = first_order_shifts(parts, scales, basis, parts[0].data_sets)
+        covariance = np.cov(shifts, rowvar=False).reshape(rank, rank)
+    return Local(scale, basis, blind, covariance)
 
 
 def seen_by_curvature(hessian: Floats, noise: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:

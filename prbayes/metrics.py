@@ -205,6 +205,7 @@ class LikelihoodDiscrepancy(DensityDiscrepancy):
     """The mean log-likelihood of fixed observed values."""
 
     reading: Floats = field(init=False)
+    _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "density", "reading")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -263,19 +264,25 @@ class AreaDiscrepancy(Discrepancy):
         return xp.cumsum(xp.take_along_axis(signed, order, axis=-1), axis=-1)[..., :-1], lengths
 
     def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
-        """Return the order of the pooled values and the lengths of the intervals between them."""
-        pooled = np.r_[simulated, self.observed]
-        order = np.argsort(pooled)
-        return order, _lengths(pooled[order], np)
+        """Return, for the simulated and for the observed values, their order and how many are below each knot.
+
+        Last come the lengths of the intervals between the knots, which are all finite values.
+        """
+        knots = np.unique(np.concatenate([simulated[np.isfinite(simulated)], self.observed]))
+        order, own = np.argsort(simulated), np.argsort(self.observed)
+        below = np.searchsorted(simulated[order], knots, side="right")
+        own_below = np.searchsorted(self.observed[own], knots, side="right")
+        return order, below[:-1], own, own_below[:-1], np.diff(knots)
 
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
-        """Return F - S_N on each interval of the pooled values, and the interval's length."""
-        order, lengths = basis
-        u = self.weights
-        if xp is np:
-            u = np.broadcast_to(u, (*weights.shape[:-1], u.size))
-        signed = xp.concatenate([weights, -u], axis=-1)
-        return xp.cumsum(signed[..., order], axis=-1)[..., :-1], lengths
+        """Return F - S_N on each interval between knots, and the interval's length."""
+        order, below, own, own_below, lengths = basis
+
+        def cdf(w: Any, order: Any, below: Any) -> Any:
+            total = xp.cumsum(xp.take(w, order, axis=-1), axis=-1)
+            return xp.take(xp.concatenate([xp.zeros_like(total[..., :1]), total], axis=-1), below, axis=-1)
+
+        return cdf(weights, order, below) - cdf(self.weights, own, own_below), lengths
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the sum of |F - S_N| times length: eq. 5."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,9 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._arrays import Floats
-from prbayes.information import Information, prior_scale, sampling_covariance
+from prbayes.information import Information, Local, local_sampling, prior_scale
 from prbayes.metrics import FunctionMetric
+from prbayes.modes import Rival, blind_directions, rivals
 from prbayes.population import Evaluator
 from prbayes.propagation import FreshBound
 from prbayes.refinement import _MAX_ROUNDS, pilot, refine_at, refuse, shortcomings, spread_around
@@ -22,6 +23,8 @@ from prbayes.simulator import model_on_context
 
 _log = logging.getLogger("prbayes")
 
+_STARTS = 32  # prior draws from which other optima are searched for where a theta costs no response
+_FLOOR = 0.3  # of the noise floor: about the difference of the discrepancy between the data's fit and the truth's
 _GRADIENT_FREE = {"nelder-mead", "powell", "cobyla", "cobyqa"}
 
 
@@ -63,6 +66,11 @@ class Optimum:
     trace : dict
         ``theta`` (n, d) and ``discrepancy`` (n,) of each evaluation.
     seconds : float
+    rivals : tuple of dict
+        Other optima, such as mirror solutions: ``point``, ``discrepancy`` (the sum of d_k / s_k), ``theta``, and
+        ``comparable``, whether the data could as well come from there.
+    warnings : tuple of str
+        What is not identified, in sentences; also logged.
     """
 
     point: dict[str, Any]
@@ -78,10 +86,17 @@ class Optimum:
     covariance: Floats
     theta: Floats
     names: list[str]
-    model: pm.Model = field(repr=False)
+    evaluator: Evaluator = field(repr=False)
     support: dict[str, dict[str, float]] = field(default_factory=dict)
     trace: dict[str, Floats] = field(repr=False, default_factory=dict)
     seconds: float = 0.0
+    rivals: tuple[dict[str, Any], ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def model(self) -> pm.Model:
+        """The model."""
+        return self.evaluator.model
 
     def to_datatree(self) -> xr.DataTree:
         """Return the optimum as a DataTree with groups ``optimum``, ``stderr``, ``trace`` and ``calibration``."""
@@ -99,6 +114,7 @@ def minimize(
     tolerance: float = 1e-8,
     max_evaluations: int = 2000,
     refine: bool = True,
+    starts: int | None = None,
     random_seed: int = 0,
 ) -> Optimum:
     """Find the hyperparameters with the smallest discrepancy, inside the support of their priors.
@@ -125,6 +141,9 @@ def minimize(
         Largest number of evaluations of the objective by the optimiser, on one design with one set of scales.
     refine : bool
         Whether designs of `Reweighted` that do not support the optimum get more points.
+    starts : int, optional
+        Number of prior draws from which other optima, such as mirror solutions, are searched for, all at once; 0
+        for none. By default 32 where a theta costs no response (`Reweighted`), and else none.
     random_seed : int
         Seed of the starting draws.
 
@@ -155,9 +174,34 @@ def minimize(
     >>> bool(abs(optimum.point["mu"] - 1) < 0.1)
     True
     """
+    evaluator = Evaluator(model_on_context(model, "prb.minimize"))
+    return find_optimum(
+        evaluator,
+        start=start,
+        method=method,
+        prior=prior,
+        tolerance=tolerance,
+        max_evaluations=max_evaluations,
+        refine=refine,
+        starts=starts,
+        random_seed=random_seed,
+    )
+
+
+def find_optimum(
+    evaluator: Evaluator,
+    *,
+    start: dict[str, Any] | None = None,
+    method: str | None = None,
+    prior: bool = False,
+    tolerance: float = 1e-8,
+    max_evaluations: int = 2000,
+    refine: bool = True,
+    starts: int | None = None,
+    random_seed: int = 0,
+) -> Optimum:
+    """Do what `minimize` does, for an evaluator."""
     clock = time.perf_counter()
-    model = model_on_context(model, "prb.minimize")
-    evaluator = Evaluator(model)
     method = method or "BFGS"
     gradient = method.lower() not in _GRADIENT_FREE
     fresh = [n.name for n in evaluator.nodes if isinstance(n.bound, FreshBound)]
@@ -184,7 +228,8 @@ def minimize(
             scales = np.where(np.isnan(evaluator.epsilon), noise, evaluator.epsilon)
             result = search(theta, scales)
             theta = search.best
-        covariance = _covariance(evaluator, theta, scale, scales)
+        local = _local(evaluator, theta, scale, scales)
+        covariance = np.full((theta.size, theta.size), np.nan) if local is None else local.in_theta
         if not (refine and evaluator.designs):
             break
         near = spread_around(theta, covariance, scale, seed=random_seed) if cloud is None else cloud
@@ -200,30 +245,79 @@ def minimize(
             refine_at(evaluator, theta[None])
         # What looked best on a thin design may be an artefact of it.
         theta = search.best_of(np.vstack([theta, near]), scales)
+    starts = (0 if evaluator.responses_per_theta else _STARTS) if starts is None else starts
+    others: list[Rival] = []
+    if starts and local is not None:
+        others = _rivals(evaluator, theta, scales, local, starts, random_seed)
+        if others and others[0].better:
+            result = search(others[0].theta, scales)
+            theta = search.best
+            local = _local(evaluator, theta, scale, scales)
+            others = _rivals(evaluator, theta, scales, local, starts, random_seed) if local is not None else []
     result = search.settle(result)
     theta = search.best
-    return _optimum(evaluator, theta, scales, covariance, search, result, screened, already - stored, clock)
+    warnings = _warnings(evaluator, local, others)
+    for line in warnings:
+        _log.warning("%s", line)
+    found = _optimum(evaluator, theta, scales, local, search, result, screened, already - stored, clock)
+    return replace(found, rivals=tuple(_described(evaluator, o) for o in others), warnings=warnings)
 
 
-def _covariance(evaluator: Evaluator, theta: Floats, scale: Floats, scales: Floats) -> Floats:
-    unknown = any(isinstance(n.metric, FunctionMetric) or isinstance(n.bound, FreshBound) for n in evaluator.nodes)
-    if unknown:
-        return np.full((theta.size, theta.size), np.nan)
+def _local(evaluator: Evaluator, theta: Floats, scale: Floats, scales: Floats) -> Local | None:
+    """Return the sampling distribution of the minimiser, or None where nothing is known of it."""
+    if any(isinstance(n.metric, FunctionMetric) or isinstance(n.bound, FreshBound) for n in evaluator.nodes):
+        return None
     parts = [Information(evaluator, k, theta, scale) for k in range(len(evaluator.nodes))]
-    return sampling_covariance(parts, scales)
+    return local_sampling(parts, scales)
+
+
+def _rivals(evaluator: Evaluator, theta: Floats, scales: Floats, local: Local, starts: int, seed: int) -> list[Rival]:
+    """Look for other optima that the designs support."""
+    floors = [Information(evaluator, k, theta, local.scale, n_sets=50).noise_floor for k in range(len(evaluator.nodes))]
+    noise = _FLOOR * float((np.array(floors) / scales).sum())
+    found = rivals(evaluator, theta, scales, local, noise, starts=starts, seed=seed)
+    return [r for r in found if not shortcomings(evaluator, r.theta[None])]
+
+
+def _described(evaluator: Evaluator, rival: Rival) -> dict[str, Any]:
+    point = {name: _plain(v[0]) for name, v in evaluator.constrained(rival.theta[None]).items()}
+    return {"point": point, "discrepancy": rival.value, "theta": rival.theta, "comparable": rival.comparable}
+
+
+def _warnings(evaluator: Evaluator, local: Local | None, others: list[Rival]) -> tuple[str, ...]:
+    """Say what is not identified."""
+    lines = []
+    for rival in others:
+        if rival.comparable:
+            point = evaluator.constrained(rival.theta[None])
+            at = ", ".join(
+                f"{rv.name} = {np.array2string(point[rv.name][0], precision=4)}" for rv in evaluator.model.free_RVs
+            )
+            lines.append(
+                f"the data could as well come from {at}: another optimum, or mirror solution, whose discrepancy "
+                "differs by no more than sampling noise; state a prior that excludes one, or report both"
+            )
+    if local is not None:
+        lines += [
+            f"the data tell less than the prior about {direction} (in units of the priors' standard deviations): it is "
+            "not identified, and its posterior is its prior"
+            for direction in blind_directions(local, evaluator.names)
+        ]
+    return tuple(lines)
 
 
 def _optimum(
     evaluator: Evaluator,
     theta: Floats,
     scales: Floats,
-    covariance: Floats,
+    local: Local | None,
     search: Search,
     result: Any,
     screened: int,
     computed: int,
     clock: float,
 ) -> Optimum:
+    covariance = np.full((theta.size, theta.size), np.nan) if local is None else local.in_theta
     step = 1e-4 * search.scale
     rows = np.vstack([theta, *(theta + s * e for e in np.diag(step) for s in (1, -1))])
     values = evaluator.constrained(rows)
@@ -255,7 +349,7 @@ def _optimum(
         covariance=covariance,
         theta=theta,
         names=evaluator.names,
-        model=evaluator.model,
+        evaluator=evaluator,
         support={
             name: {key: float(value[0]) for key, value in support.items()}
             for name, support in evaluator.support(theta[None]).items()

@@ -5,8 +5,9 @@ Theta is the vector of the model's value variables, unconstrained through PyMC's
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -72,6 +73,7 @@ class Evaluator:
         self.initial = np.concatenate([np.ravel(point[v.name]) for v in model.value_vars])
         self.size = self.initial.size
         self._point = point
+        self._drawn: dict[tuple[int, int], Floats] = {}
 
     @property
     def names(self) -> list[str]:
@@ -127,7 +129,7 @@ class Evaluator:
 
     @cached_property
     def _evaluate(self) -> Any:
-        return self._compile([self.model.varlogp, self._log_other(), *self._graphs()])
+        return self._compile([self.model.varlogp, self._log_other()])
 
     @cached_property
     def _prior(self) -> Any:
@@ -142,10 +144,9 @@ class Evaluator:
         discrepancies = np.empty((size, len(self.nodes)))
         for i in range(0, size, step):
             block = np.ascontiguousarray(thetas[i : i + step])
-            prior, other, *ds = self._evaluate(block)
-            log_prior[i : i + step], log_other[i : i + step] = prior, other
-            discrepancies[i : i + step] = np.stack([np.broadcast_to(d, len(block)) for d in ds], axis=-1)
-            self._count(len(block))
+            log_prior[i : i + step], log_other[i : i + step] = self._evaluate(block)
+            for k, node in enumerate(self.nodes):
+                discrepancies[i : i + step, k] = node.bound.discrepancies(self.roots(block, k), node.target)
         return Evaluation(
             np.nan_to_num(log_prior, nan=-np.inf, posinf=np.inf, neginf=-np.inf),
             np.nan_to_num(log_other, nan=-np.inf, posinf=np.inf, neginf=-np.inf),
@@ -182,6 +183,43 @@ class Evaluator:
             return compiled(theta, scales)
 
         return counted
+
+    def observing(self, data: dict[str, Floats]) -> Evaluator:
+        """Return an evaluator of the same model with other observed responses, by the names of simulators.
+
+        Metrics choose bandwidths and cells anew; designs and epsilons are the same objects.
+        """
+        _ = self._evaluate, self._prior, self._constrain, self._roots, self._transform  # compiled once, for all copies
+        other = copy.copy(self)
+        other.nodes = [
+            replace(
+                n,
+                target=n.metric.against(
+                    data[n.name], n.target.weights if n.target.observed.size == np.size(data[n.name]) else None
+                ),
+            )
+            for n in self.nodes
+        ]
+        other.__dict__["objective"] = other._differenced
+        return other
+
+    def _differenced(self, *, prior: bool, gradient: bool) -> Any:
+        """Return the objective without compiling it; gradients are differences of one batch."""
+        if prior:
+            raise NotImplementedError("the prior's density is not part of an objective on other data")
+        spread = np.subtract(*np.quantile(self.prior_thetas(256, 0), [0.84, 0.16], axis=0)) / 2
+        step = 1e-4 * np.where(spread > 0, spread, 1.0)
+        stencil = np.concatenate([np.zeros((1, self.size)), np.diag(step), -np.diag(step)])
+
+        def objective(theta: Floats, scales: Floats) -> Any:
+            found = self(theta + stencil if gradient else theta[None])
+            with np.errstate(invalid="ignore"):
+                total = (found.discrepancies / scales).sum(axis=-1) - found.log_other
+                slopes = (total[1 : 1 + self.size] - total[1 + self.size :]) / (2 * step)
+            value = np.where(np.isfinite(found.log_prior[0]), total[0], np.inf)
+            return (value, slopes) if gradient else (value,)
+
+        return objective
 
     def in_support(self, thetas: Floats) -> Any:
         """Return which thetas have a finite log prior, shape (P,)."""
@@ -255,7 +293,9 @@ class Evaluator:
 
     def prior_thetas(self, size: int, seed: int) -> Floats:
         """Draw thetas from the prior, shape (size, d)."""
-        return self.thetas_of(prior_draws(self.model.free_RVs, size, seed))
+        if (size, seed) not in self._drawn:
+            self._drawn[size, seed] = self.thetas_of(prior_draws(self.model.free_RVs, size, seed))
+        return self._drawn[size, seed].copy()
 
     @cached_property
     def _transform(self) -> Any:

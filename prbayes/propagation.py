@@ -79,6 +79,15 @@ class Bound(ABC):
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
         """Return responses and weights of the populations at given roots, each of shape (k, n)."""
 
+    def discrepancies(self, params: Sequence[Any], target: Discrepancy) -> Floats:
+        """Return the discrepancies of the populations at given roots, shape (k,); +inf where they are invalid."""
+        result = np.full(len(params[0]) if params else 1, np.inf)
+        ok = self.valid(params)
+        if ok.any():
+            values, weights = self.populations([p[ok] for p in params])
+            result[ok] = target.of(values, weights)
+        return result
+
     @cached_property
     def _valid(self) -> Any:
         symbols = self.inputs.placeholders()
@@ -320,9 +329,8 @@ class ResimulatedBound(Bound):
 
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy of the responses at the base points, +inf where parameters are invalid."""
-        values, ok = self._response(params)
-        weights = np.full(self.n_per_theta, 1 / self.n_per_theta)
-        return pt.switch(ok, symbolic_discrepancy(self.target, values, weights), np.inf)
+        (values, ok), n = self._response(params), self.n_per_theta
+        return pt.switch(ok, symbolic_discrepancy(self.target, values, np.full(n, 1 / n)), np.inf)
 
     @cached_property
     def _values(self) -> Any:
@@ -378,12 +386,7 @@ class FreshOp(Op):
             np.broadcast_to(p, batch + p.shape[p.ndim - d :]).reshape(-1, *p.shape[p.ndim - d :])
             for p, d in zip(inputs, ndims, strict=True)
         ]
-        result = np.full(len(params[0]), np.inf)
-        ok = self.bound.valid(params)
-        if ok.any():
-            values, weights = self.bound.populations([p[ok] for p in params])
-            result[ok] = self.bound.target.of(values, weights)
-        outputs[0][0] = result.reshape(batch)
+        outputs[0][0] = self.bound.discrepancies(params, self.bound.target).reshape(batch)
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
         """Refuse by name; not as NotImplementedError, which PyMC takes as leave to use a slice sampler."""

@@ -11,6 +11,7 @@ from prbayes._arrays import Floats
 from prbayes.design import Design
 from prbayes.information import Information
 from prbayes.population import Evaluator
+from prbayes.resampling import siblings
 from prbayes.simulator import model_on_context
 
 _log = logging.getLogger("prbayes")
@@ -54,16 +55,23 @@ def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, str]:
 def refine_at(evaluator: Evaluator, thetas: Floats) -> dict[str, str]:
     """Add one batch to each design that falls short at thetas, shape (P, d); return what was short."""
     short = shortcomings(evaluator, thetas)
-    for k, node in enumerate(evaluator.nodes):
-        if node.name in short and isinstance(node.bound, Design):
-            if short[node.name].startswith("lost mass"):
-                raise DesignError(
-                    f"{node.name}: {short[node.name]}; repair the response there, return +inf for specimens that "
-                    "fail, narrow the priors, or raise max_lost"
-                )
-            node.bound.add(evaluator.roots(thetas, k))
-            _log.info("%s: %s; refined to %d responses", node.name, short[node.name], node.bound.n_points)
+    for name, what in short.items():
+        if what.startswith("lost mass"):
+            raise DesignError(
+                f"{name}: {what}; repair the response there, return +inf for specimens that fail, narrow the priors, "
+                "or raise max_lost"
+            )
+    _add(evaluator, thetas, set(short))
     return short
+
+
+def _add(evaluator: Evaluator, thetas: Floats, names: set[str]) -> None:
+    """Add one batch to the designs named, and to those of simulators that share their specimens."""
+    names = siblings(evaluator.nodes, names)
+    for k, node in enumerate(evaluator.nodes):
+        if node.name in names and isinstance(node.bound, Design):
+            node.bound.add(evaluator.roots(thetas, k))
+            _log.info("%s: refined to %d responses", node.name, node.bound.n_points)
 
 
 def pilot(evaluator: Evaluator, scales: Floats, scale: Floats, *, seed: int = 0) -> Floats:
@@ -85,15 +93,12 @@ def pilot(evaluator: Evaluator, scales: Floats, scale: Floats, *, seed: int = 0)
         value = np.where(np.isfinite(found.log_prior), value, np.inf)
         order = np.argsort(value)[:_THETAS]
         best = thetas[order]
-        thin = [
+        thin = {
             name
             for name, support in evaluator.support(best).items()
             if np.median(support["weight_ess"]) < evaluator.designs[name].required_ess
-        ]
-        for k, node in enumerate(evaluator.nodes):
-            if node.name in thin and isinstance(node.bound, Design) and node.bound.batches <= _MAX_ROUNDS:
-                node.bound.add(evaluator.roots(best, k))
-                _log.info("%s: pilot design of %d responses", node.name, node.bound.n_points)
+        }
+        _add(evaluator, best, {name for name in thin if evaluator.designs[name].batches <= _MAX_ROUNDS})
         noise = sum(Information(evaluator, k, best[0], scale, n_sets=50).noise_floor / s for k, s in enumerate(scales))
         if not thin and value[order[-1]] - value[order[0]] < noise:
             break

@@ -47,6 +47,8 @@ def posterior_tree(
     discrepancies: Floats,
     stats: list[dict[str, list[float]]],
     *,
+    unadjusted: Floats | None = None,
+    adjustment: str = "none",
     seed: int | None,
     n_responses: int,
     seconds: float,
@@ -58,8 +60,12 @@ def posterior_tree(
     evaluator : Evaluator
     thetas : ndarray, shape (chains, draws, d)
     discrepancies : ndarray, shape (chains, draws, k)
+        Before an adjustment; afterwards they are computed anew where that costs no response, and else NaN.
     stats : list of dict
         By chain: statistics by name, one value per stage.
+    unadjusted : ndarray, shape (chains, draws, d), or None
+    adjustment : str
+        What was done to the draws.
     seed : int or None
     n_responses : int
         Scalar responses computed, the designs' included.
@@ -68,8 +74,10 @@ def posterior_tree(
     chains, draws, d = thetas.shape
     leading = {"chain": chains, "draw": draws}
     flat = thetas.reshape(-1, d)
-    values = {n: v.reshape(chains, draws, *v.shape[1:]) for n, v in evaluator.constrained(flat).items()}
-    posterior = _dataset(evaluator, values, leading)
+    posterior = _draws(evaluator, thetas)
+    if unadjusted is not None:
+        free = not evaluator.responses_per_theta
+        discrepancies = evaluator(flat).discrepancies.reshape(discrepancies.shape) if free else discrepancies * np.nan
     n_stages = max(len(s["beta"]) for s in stats)
     sample_stats = xr.Dataset(
         {
@@ -86,6 +94,7 @@ def posterior_tree(
         "n_responses": n_responses,
         "seconds": seconds,
         "random_seed": "None" if seed is None else str(seed),
+        "adjustment": adjustment,
         **versions(),
     }
     posterior.attrs.update({"inference_library": "prbayes", **attrs})
@@ -115,13 +124,67 @@ def posterior_tree(
         coords={"simulator": names, "element": evaluator.names, **{k: np.arange(v) for k, v in leading.items()}},
         attrs=attrs,
     )
-    return xr.DataTree.from_dict(
+    groups = {
+        "posterior": posterior,
+        "sample_stats": sample_stats,
+        "calibration": calibration,
+        "observed_data": _observed(evaluator),
+    }
+    if unadjusted is not None:
+        groups["unadjusted"] = _draws(evaluator, unadjusted)
+    return xr.DataTree.from_dict(groups)
+
+
+def bootstrap_tree(
+    evaluator: Evaluator,
+    thetas: Floats,
+    *,
+    sampler: str,
+    converged: float,
+    seed: int,
+    n_responses: int,
+    seconds: float,
+) -> xr.DataTree:
+    """Return the DataTree of minimisers, shape (1, draws, d)."""
+    posterior = _draws(evaluator, thetas)
+    posterior.attrs.update(
         {
-            "posterior": posterior,
-            "sample_stats": sample_stats,
-            "calibration": calibration,
-            "observed_data": _observed(evaluator),
+            "inference_library": "prbayes",
+            "sampler": sampler,
+            "converged": converged,
+            "n_responses": n_responses,
+            "seconds": seconds,
+            "random_seed": str(seed),
+            **versions(),
         }
+    )
+    return xr.DataTree.from_dict({"posterior": posterior, "observed_data": _observed(evaluator)})
+
+
+def calibration_tree(
+    evaluator: Evaluator, rows: list[dict[str, Floats]], *, failed: int, draws: int, adjust: object, seed: int
+) -> xr.DataTree:
+    """Return the DataTree of a simulation-based calibration, from rank, truth and sd by variable and data set."""
+    stacked = {name: np.stack([row[name] for row in rows])[None] for name in rows[0]}
+    leading = {"chain": 1, "draw": len(rows)}
+    groups = {
+        group: _dataset(evaluator, {name: v[:, :, i] for name, v in stacked.items()}, leading)
+        for i, group in enumerate(("prior_sbc", "truth", "posterior_sd"))
+    }
+    groups["prior_sbc"].attrs.update(
+        {"failed": failed, "draws": draws, "adjustment": repr(adjust), "random_seed": str(seed), **versions()}
+    )
+    return xr.DataTree.from_dict(groups)
+
+
+def _draws(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
+    """Return draws, shape (chains, draws, d), as labelled variables."""
+    chains, draws, d = thetas.shape
+    values = evaluator.constrained(thetas.reshape(-1, d)).items()
+    return _dataset(
+        evaluator,
+        {n: v.reshape(chains, draws, *v.shape[1:]) for n, v in values},
+        {"chain": chains, "draw": draws},
     )
 
 
@@ -131,7 +194,7 @@ def _observed(evaluator: Evaluator) -> xr.Dataset:
 
 def optimum_tree(optimum: Optimum) -> xr.DataTree:
     """Return the DataTree of an optimum."""
-    evaluator = Evaluator(optimum.model)
+    evaluator = optimum.evaluator
     names = list(optimum.discrepancies)
     attrs = {
         "discrepancy": optimum.discrepancy,

@@ -11,6 +11,7 @@ import pymc as pm
 import pytensor
 import pytensor.tensor as pt
 from numpy.typing import ArrayLike, NDArray
+from pymc.logprob.abstract import _logprob
 from pymc.logprob.utils import CheckParameterValue
 from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
@@ -56,6 +57,11 @@ class Node:
     def epsilon_value(self) -> float:
         """The value of epsilon, NaN while it is not set."""
         return float(self.epsilon.get_value())
+
+    @property
+    def epsilon_is_default(self) -> bool:
+        """Whether epsilon is the 1/N of a metric on the scale of a likelihood, which nobody gave."""
+        return self.metric.likelihood and self.epsilon_value == 1 / self.target.n_effective
 
 
 def log_kernel(discrepancy: Any, epsilon: Any) -> Any:
@@ -209,7 +215,20 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         class_name="prbayes_Simulator",
     )
     type(rv.owner.op).prbayes_node = node
+    type(rv.owner.op).prbayes_logp = staticmethod(logp)
     return rv
+
+
+def revive(model: pm.Model) -> pm.Model:
+    """Tell PyMC of the log-densities of simulators in a model that was sent from another process."""
+
+    def logp(op: Any, values: Any, rng: Any, size: Any, *params: Any, **kwargs: Any) -> Any:
+        return op.prbayes_logp(values[0], *params)
+
+    for rv in nodes(model):
+        if _logprob.dispatch(type(rv.owner.op)) is _logprob.dispatch(object):
+            _logprob.register(type(rv.owner.op), logp)
+    return model
 
 
 def _signature(ndims: Sequence[int]) -> str:

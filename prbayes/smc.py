@@ -13,14 +13,16 @@ from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from prbayes._arrays import Floats, positive_integer, positive_number
+from prbayes.adjust import Affine, inapplicable
 from prbayes.epsilon import calibrate_epsilon
-from prbayes.optimize import Optimum, minimize
+from prbayes.optimize import Optimum, find_optimum
 from prbayes.population import Evaluation, Evaluator
 from prbayes.refinement import _MAX_ROUNDS, refine_at, refuse, shortcomings
 from prbayes.results import posterior_tree
 from prbayes.simulator import model_on_context
 
 _log = logging.getLogger("prbayes")
+
 
 _MAX_STEPS = 25
 _UNCORRELATED = 0.05  # with the particles before the last stage; on the way, six times as much will do
@@ -173,6 +175,7 @@ def sample_smc(
     model: pm.Model | None = None,
     epsilon: float | dict[str, float] | None = None,
     optimum: Optimum | None = None,
+    adjust: Affine | bool = True,
     threshold: float = 0.5,
     refine: bool = True,
     random_seed: int | None = None,
@@ -191,7 +194,10 @@ def sample_smc(
     epsilon : float or dict, optional
         For this run. By default the simulators' own, calibrated where unset (`calibrate_epsilon`).
     optimum : Optimum, optional
-        Where to calibrate epsilon; `minimize` finds it if needed.
+        Where to calibrate epsilon, and the centre of the adjustment; `minimize` finds it if needed.
+    adjust : Affine or bool
+        Whether, and how, the draws are brought to the width that the data warrant. By default by `Affine()`,
+        unless an epsilon was given, which is then taken at its word; an `Affine` adjusts in any case.
     threshold : float
         Share of the effective sample size that a stage keeps; higher means more stages.
     refine : bool
@@ -202,7 +208,8 @@ def sample_smc(
     Returns
     -------
     xarray.DataTree
-        Groups ``posterior`` (chain, draw), ``sample_stats`` (chain, stage; NaN after the last stage),
+        Groups ``posterior`` (chain, draw), ``unadjusted`` (the draws before the adjustment, if there was one),
+        ``sample_stats`` (chain, stage; NaN after the last stage),
         ``calibration`` (discrepancy, epsilon, weight effective sample size, mean raw weight, lost mass; by
         simulator) and ``observed_data``; ArviZ takes it, ``to_netcdf`` saves it.
 
@@ -228,37 +235,82 @@ def sample_smc(
     >>> idata.posterior["mu"].shape
     (2, 100)
     """
-    clock = time.perf_counter()
     positive_integer(draws, "draws", minimum=10)
     positive_integer(chains, "chains")
     model = model_on_context(model, "prb.sample_smc")
-    evaluator = Evaluator(model)
+    if not isinstance(adjust, Affine | bool):
+        raise TypeError(f"adjust: got {type(adjust).__name__} {adjust!r:.60}, expected prb.Affine(), True or False")
+    if optimum is not None and not isinstance(optimum, Optimum):
+        raise TypeError(f"optimum: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first")
+    return sample(
+        Evaluator(model) if optimum is None else optimum.evaluator,
+        draws=draws,
+        chains=chains,
+        epsilon=epsilon,
+        optimum=optimum,
+        adjust=adjust,
+        threshold=threshold,
+        refine=refine,
+        random_seed=random_seed,
+        progressbar=progressbar,
+    )
+
+
+def sample(
+    evaluator: Evaluator,
+    *,
+    draws: int,
+    chains: int,
+    epsilon: float | dict[str, float] | None,
+    optimum: Optimum | None,
+    adjust: Affine | bool,
+    threshold: float,
+    refine: bool,
+    random_seed: int | None,
+    progressbar: bool,
+) -> xr.DataTree:
+    """Do what `sample_smc` does, for an evaluator."""
+    clock = time.perf_counter()
     computed = evaluator.n_responses - sum(d.n_points for d in evaluator.designs.values())
     before = evaluator.epsilon
     try:
         _set_for_run(evaluator, epsilon)
         unset = [n for n in evaluator.nodes if np.isnan(n.epsilon_value)]
-        if unset:
-            optimum = optimum or minimize(model, refine=refine)
+        if adjust is True and all(n in unset or n.epsilon_is_default for n in evaluator.nodes):
+            adjust = Affine()
+        if optimum is None and (unset or (isinstance(adjust, Affine) and not inapplicable(evaluator))):
+            optimum = find_optimum(evaluator, refine=refine)
+        if unset and optimum is not None:
             calibrated = calibrate_epsilon(optimum)
             for node in unset:
                 node.epsilon.set_value(np.asarray(calibrated[node.name]))
         seeds = np.random.SeedSequence(random_seed)
         for round_ in range(_MAX_ROUNDS + 1):
-            thetas, discrepancies, stats = _run(evaluator, draws, chains, threshold, seeds, progressbar)
+            plain, discrepancies, stats = _run(evaluator, draws, chains, threshold, seeds, progressbar)
+            thetas, note = plain, "none"
+            if isinstance(adjust, Affine):
+                optima = (
+                    [] if optimum is None else [optimum.theta, *(r["theta"] for r in optimum.rivals if r["comparable"])]
+                )
+                thetas, note = adjust(evaluator, plain, optima)
             if not (refine and evaluator.designs):
                 break
-            some = np.random.default_rng(seeds).permutation(thetas.reshape(-1, evaluator.size))[:256]
+            both = np.concatenate([plain, thetas]).reshape(-1, evaluator.size)
+            some = np.random.default_rng(seeds).permutation(both)[:256]
             if round_ == _MAX_ROUNDS:
                 refuse(shortcomings(evaluator, some), evaluator)
             elif not refine_at(evaluator, some):
                 break
             _log.info("sampling again on the refined design")
+        if note.startswith("none: "):
+            _log.warning("the draws are not adjusted: %s; their width is epsilon's", note.removeprefix("none: "))
         return posterior_tree(
             evaluator,
             thetas,
             discrepancies,
             stats,
+            unadjusted=None if thetas is plain else plain,
+            adjustment=note,
             seed=random_seed,
             n_responses=evaluator.n_responses - computed,
             seconds=time.perf_counter() - clock,

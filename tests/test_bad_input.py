@@ -289,7 +289,8 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "SMC epsilon name": (sample_smc(epsilon={"z": 1.0}), KeyError, r"epsilon: got \['z'\], expected names .*\['y'\]"),
     "SMC epsilon 0": (sample_smc(epsilon=0), ValueError, r"y: epsilon: got 0, expected a positive finite number"),
     "SMC epsilon string": (sample_smc(epsilon={"y": "a"}), TypeError, r"y: epsilon: got str 'a', expected a pos"),
-    "SMC optimum": (sample_smc(optimum=3), TypeError, r"calibrate_epsilon: got int, expected an Optimum"),
+    "SMC optimum": (sample_smc(optimum=3), TypeError, r"optimum: got int, expected an Optimum"),
+    "SMC adjust": (sample_smc(adjust="affine"), TypeError, r"adjust: got str 'affine', expected prb.Affine\(\), True"),
     "calibrate a model": (lambda: prb.calibrate_epsilon(good()), TypeError, r"got Model, expected an Optimum; call"),
     # Epsilon that nobody set.
     "unset, logp": (

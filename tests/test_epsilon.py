@@ -127,8 +127,8 @@ def test_sandwich_of_a_normal_mean(n: int | None) -> None:
     np.testing.assert_allclose(prb.calibrate_epsilon(optimum)["y"], noise / hessian, rtol=5e-3)
     np.testing.assert_allclose(optimum.stderr["mu"], noise**0.5 / hessian, rtol=5e-3)
     # Simulated data sets say the same: 200 of them give a variance with a relative standard error of 10%.
-    np.testing.assert_allclose(np.var(information.gradients, ddof=1), noise, rtol=0.5)
-    assert abs(information.gradients.mean()) < 4 * (noise / 200) ** 0.5
+    np.testing.assert_allclose(np.var(information.gradients(*information.data_set), ddof=1), noise, rtol=0.5)
+    assert abs(information.gradients(*information.data_set).mean()) < 4 * (noise / 200) ** 0.5
 
 
 def test_the_posterior_width_that_it_gives() -> None:

@@ -1,0 +1,139 @@
+"""Adjustment of a pseudo-posterior's draws, so that their width is that of the metric's own estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from prbayes._arrays import Floats, positive_integer
+from prbayes.information import prior_scale
+from prbayes.metrics import FunctionMetric
+from prbayes.population import Evaluator
+from prbayes.propagation import FreshBound
+from prbayes.refit import Neighbourhood
+from prbayes.resampling import observed_set, simulated_sets
+
+_FEWEST = 50  # draws of a mode below which it is left as it is
+_APART = 1.5  # ratio of distances to two modes below which a draw is between them
+_BETWEEN = 0.05  # share of such draws above which modes are not separate
+
+
+@dataclass(frozen=True)
+class Affine:
+    r"""An affine map of the draws, in unconstrained space, to the covariance and centre that the data warrant.
+
+    Data sets are drawn from the model at the optimum, and each is fitted anew. The covariance of the
+    minimisers is the inverse of A, the (Godambe) information in the data, and their mean shift is the bias
+    b of the minimiser. With prior mean :math:`\theta_0` and precision P the draws get covariance
+    :math:`(A + P)^{-1}` and mean :math:`(A + P)^{-1} (A (\hat\theta - b) + P \theta_0)`, in the directions
+    about which the data tell more than the prior; along the others they keep their distribution given those.
+
+    Parameters
+    ----------
+    n_sets : int
+        Number of data sets drawn and fitted.
+    seed : int
+
+    References
+    ----------
+    .. [1] B. A. Shaby (2014), The open-faced sandwich adjustment for MCMC using estimating functions,
+       J. Comput. Graph. Stat. 23, 853-876, doi:10.1080/10618600.2013.842174.
+
+    Examples
+    --------
+    >>> Affine()
+    Affine(n_sets=200, seed=0)
+    """
+
+    n_sets: int = 200
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        positive_integer(self.n_sets, "Affine: n_sets", minimum=20)
+        positive_integer(self.seed, "Affine: seed", minimum=0)
+
+    def target(self, hood: Neighbourhood) -> tuple[Floats, Floats]:
+        """Return the mean (r,) and covariance (r, r) that draws should have, in the coordinates of ``hood``."""
+        evaluator, r = hood.evaluator, hood.sd.size
+        (center,), _ = hood.refit(observed_set(evaluator))
+        x, ok = hood.refit(simulated_sets(evaluator, hood.thetas(center), self.n_sets, self.seed))
+        information = np.linalg.inv(np.cov(x[ok], rowvar=False).reshape(r, r))
+        bias = x[ok].mean(axis=0) - center
+        prior, _ = hood.coordinates(evaluator.prior_thetas(1024, self.seed))
+        precision = np.linalg.inv(np.cov(prior, rowvar=False).reshape(r, r))
+        covariance = np.linalg.inv(information + precision)
+        return covariance @ (information @ (center - bias) + precision @ prior.mean(axis=0)), covariance
+
+    def __call__(self, evaluator: Evaluator, thetas: Floats, optima: Sequence[Floats]) -> tuple[Floats, str]:
+        """Map draws of the pseudo-posterior, each mode by itself.
+
+        Parameters
+        ----------
+        evaluator : Evaluator
+            With the epsilons of the draws.
+        thetas : ndarray, shape (..., d)
+        optima : sequence of ndarray, shapes (d,)
+            The best one first; draws belong to the nearest, in its own standard errors.
+
+        Returns
+        -------
+        thetas : ndarray, shape (..., d)
+        note : str
+            What was done, or why nothing.
+        """
+        reason = inapplicable(evaluator)
+        if reason:
+            return thetas, f"none: {reason}"
+        flat, scale = thetas.reshape(-1, thetas.shape[-1]), prior_scale(evaluator)
+        hoods = [Neighbourhood.of(evaluator, theta, evaluator.epsilon, scale) for theta in optima]
+        hoods = [h for h in hoods if h.sd.size]
+        if not hoods:
+            return thetas, "none: the data tell less than the prior about every hyperparameter"
+        distances = np.array([np.linalg.norm(h.coordinates(flat)[0], axis=-1) / np.sqrt(h.sd.size) for h in hoods])
+        nearest = distances.argmin(axis=0)
+        if len(hoods) > 1:
+            first, second = np.sort(distances, axis=0)[:2]
+            if np.mean(second < _APART * first) > _BETWEEN:
+                return thetas, "none: the posterior has modes that run into each other"
+        out = flat.copy()
+        count = 0
+        for m, hood in enumerate(hoods):
+            mine = nearest == m
+            if mine.sum() >= _FEWEST:
+                x, rest = hood.coordinates(flat[mine])
+                out[mine] = moved(hood, x, rest, *self.target(hood))
+                count += 1
+        modes = "" if len(hoods) == 1 else f", {count} modes each by itself"
+        return out.reshape(thetas.shape), f"{self!r}{modes}"
+
+
+def inapplicable(evaluator: Evaluator) -> str:
+    """Say why draws of a model cannot be adjusted; empty if they can."""
+    for node in evaluator.nodes:
+        if isinstance(node.metric, FunctionMetric):
+            return f"{node.name} has a FunctionMetric, of which nothing is known"
+        if isinstance(node.bound, FreshBound):
+            return f"{node.name} has prb.Fresh, whose discrepancy is random"
+    if evaluator.model.potentials or len(evaluator.model.observed_RVs) > len(evaluator.nodes):
+        return "the model has likelihood terms or potentials besides its simulators"
+    return ""
+
+
+def moved(hood: Neighbourhood, x: Floats, rest: Floats, mean: Floats, covariance: Floats) -> Floats:
+    """Move draws to a mean and covariance along the frame; what is left follows as its regression on them says."""
+    r = hood.sd.size
+    now = np.cov(x, rowvar=False).reshape(r, r)
+    center = x.mean(axis=0)
+    root = _root(now)
+    inverse = np.linalg.inv(root)
+    to = mean + (x - center) @ (inverse @ _root(root @ covariance @ root) @ inverse).T
+    slopes = np.linalg.solve(now, (x - center).T @ (rest - rest.mean(axis=0)) / (len(x) - 1))
+    return hood.thetas(to, rest + (to - x) @ slopes)
+
+
+def _root(matrix: Floats) -> Floats:
+    """Return the symmetric square root."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T)

@@ -1,0 +1,96 @@
+"""Bootstrap distributions of the minimiser: no epsilon and no prior."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import xarray as xr
+
+from prbayes._arrays import positive_integer
+from prbayes.adjust import inapplicable
+from prbayes.information import prior_scale
+from prbayes.modes import blind_directions
+from prbayes.optimize import Optimum
+from prbayes.refit import Neighbourhood
+from prbayes.resampling import reweighted_sets, simulated_sets
+from prbayes.results import bootstrap_tree
+
+
+def bootstrap(optimum: Optimum, draws: int = 1000, *, parametric: bool = False, random_seed: int = 0) -> xr.DataTree:
+    """Minimise the discrepancy once for each of many data sets that resemble the observed one.
+
+    By default the observed specimens get Dirichlet weights: the loss-likelihood bootstrap, whose minimisers
+    are draws from a posterior without prior and without epsilon. The parametric bootstrap draws data sets
+    from the model at the optimum; its minimisers are the sampling distribution of the optimum. Observations
+    that share a specimen label are weighted, or drawn, together.
+
+    With `Reweighted` each minimisation is exact and computes no response; with `Resimulated` it is of first
+    order.
+
+    Parameters
+    ----------
+    optimum : Optimum
+        From `minimize`, without the prior.
+    draws : int
+    parametric : bool
+    random_seed : int
+
+    Returns
+    -------
+    xarray.DataTree
+        Group ``posterior`` with dimensions (chain, draw), chain of length one, for ArviZ and `compare`; and
+        ``observed_data``. The attribute ``converged`` is the share of minimisations that did.
+
+    Raises
+    ------
+    TypeError
+        If ``optimum`` is no Optimum.
+    ValueError
+        If the data tell less than the prior about a direction, along which the minimiser is anywhere; or if
+        nothing is known of a metric or propagation (`FunctionMetric`, `Fresh`).
+
+    References
+    ----------
+    .. [1] S. P. Lyddon, C. C. Holmes and S. G. Walker (2019), General Bayesian updating and the
+       loss-likelihood bootstrap, Biometrika 106, 465-478, doi:10.1093/biomet/asz006.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    >>> prb.bootstrap(prb.minimize(model), draws=50).posterior["mu"].shape
+    (1, 50)
+    """
+    clock = time.perf_counter()
+    if not isinstance(optimum, Optimum):
+        raise TypeError(f"bootstrap: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first")
+    positive_integer(draws, "draws", minimum=2)
+    evaluator = optimum.evaluator
+    reason = inapplicable(evaluator)
+    if reason:
+        raise ValueError(f"bootstrap: {reason}; use prb.sample_smc")
+    scales = np.array(list(optimum.scales.values()))
+    hood = Neighbourhood.of(evaluator, optimum.theta, scales, prior_scale(evaluator))
+    blind = blind_directions(hood.local, evaluator.names)
+    if blind:
+        raise ValueError(
+            f"bootstrap: the data tell less than the prior about {', '.join(blind)}, along which the minimiser is "
+            "anywhere; use prb.sample_smc, whose posterior falls back on the prior there, or fix a hyperparameter"
+        )
+    if parametric:
+        data = simulated_sets(evaluator, optimum.theta, draws, random_seed)
+    else:
+        data = reweighted_sets(evaluator, draws, random_seed)
+    x, converged = hood.refit(data)
+    return bootstrap_tree(
+        evaluator,
+        hood.thetas(x)[None],
+        sampler="parametric bootstrap" if parametric else "loss-likelihood bootstrap",
+        converged=float(converged.mean()),
+        seed=random_seed,
+        n_responses=optimum.n_responses,
+        seconds=time.perf_counter() - clock,
+    )

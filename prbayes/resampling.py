@@ -1,0 +1,179 @@
+"""Data sets that might have been observed: drawn from the model, or by resampling specimens.
+
+Observations that carry the same specimen label, within a simulator or between simulators, belong together:
+they are drawn, or get their weight, together.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prbayes._arrays import Floats
+from prbayes.design import Design
+from prbayes.inputs import PopulationSampler
+from prbayes.population import Evaluator
+from prbayes.simulator import Node
+
+_SPARE = 4  # draws for each specimen that is needed, in case responses are not finite
+
+
+@dataclass(frozen=True, eq=False)
+class DataSets:
+    """Data sets for all simulators of a model, as weights on fixed values.
+
+    Attributes
+    ----------
+    values : list of ndarray, shapes (n_k,)
+        By simulator: all values that occur.
+    weights : list of ndarray, shapes (n_sets, n_k)
+        By simulator: the weight of each value in each data set; they sum to one.
+    """
+
+    values: list[Floats]
+    weights: list[Floats]
+
+
+def specimens(nodes: list[Node]) -> tuple[list[NDArray[np.intp]], int]:
+    """Return the number of the specimen of each observation, by simulator, and how many specimens there are.
+
+    Observations without labels are specimens of their own.
+    """
+    numbers: dict[object, int] = {}
+    out = []
+    for k, node in enumerate(nodes):
+        size = node.target.observed.size
+        labels = [(k, i) for i in range(size)] if node.specimens is None else node.specimens.tolist()
+        out.append(np.array([numbers.setdefault(label, len(numbers)) for label in labels], dtype=np.intp))
+    return out, len(numbers)
+
+
+def dependent(nodes: list[Node]) -> bool:
+    """Return whether a specimen has several observations."""
+    numbers, total = specimens(nodes)
+    return total < sum(n.size for n in numbers)
+
+
+def siblings(nodes: list[Node], names: set[str]) -> set[str]:
+    """Return names with those of simulators that share specimens with them, whose designs have to stay the same."""
+    numbers, _ = specimens(nodes)
+    chosen = [set(numbers[k].tolist()) for k, n in enumerate(nodes) if n.name in names]
+    return names | {n.name for k, n in enumerate(nodes) if any(c & set(numbers[k].tolist()) for c in chosen)}
+
+
+def aligned(nodes: list[Node]) -> bool:
+    """Return whether the i-th points of all simulators' populations are the same specimen."""
+    first = nodes[0].bound
+    return all(
+        list(map(id, n.bound.inputs.aleatory)) == list(map(id, first.inputs.aleatory))
+        and type(n.bound) is type(first)
+        and n.propagation == nodes[0].propagation
+        and (not isinstance(n.bound, Design) or n.bound.same_points(first))
+        for n in nodes
+    )
+
+
+def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int = 0) -> DataSets:
+    """Draw data sets of the observed sizes from the populations at theta (parametric bootstrap).
+
+    Only responses that are finite can be observed. Repeated observations of one specimen within a simulator
+    are equal, as the model has them.
+
+    Raises
+    ------
+    ValueError
+        If specimens are shared by simulators whose inputs are not the same ``.dist()`` objects, or whose
+        designs differ, so that the model does not say how their responses depend on each other.
+    """
+    nodes = evaluator.nodes
+    rng = np.random.default_rng([seed, 1])
+    populations = [evaluator.populations(theta[None], k) for k in range(len(nodes))]
+    numbers, total = specimens(nodes)
+    shared = sum(np.unique(n).size for n in numbers) > total
+    if shared:
+        _refuse_unlike(nodes)
+        finite = np.all([np.isfinite(v[0]) for v, _ in populations], axis=0)
+        draws = _draw(populations[0][1][0], finite, (n_sets, total), rng)
+    values, weights = [], []
+    for k, node in enumerate(nodes):
+        responses, w = populations[k][0][0], populations[k][1][0]
+        finite = np.isfinite(responses)
+        if not shared:
+            draws = _draw(w, finite, (n_sets, total), rng)
+        where = np.cumsum(finite) - 1
+        size = int(finite.sum())
+        cells = where[draws[:, numbers[k]]] + size * np.arange(n_sets)[:, None]
+        count = np.bincount(cells.ravel(), np.tile(node.target.weights, n_sets), n_sets * size)
+        values.append(responses[finite])
+        weights.append(count.reshape(n_sets, size))
+    return DataSets(values, weights)
+
+
+def _refuse_unlike(nodes: list[Node]) -> None:
+    if not aligned(nodes):
+        raise ValueError(
+            "specimens: got the same labels in simulators with different inputs or designs, expected the same "
+            ".dist() objects, n and seed in all; then the model says how responses of one specimen depend on each other"
+        )
+
+
+def _draw(
+    weights: Floats, finite: NDArray[np.bool_], size: tuple[int, int], rng: np.random.Generator
+) -> NDArray[np.intp]:
+    p = np.where(finite, weights, 0.0)
+    return rng.choice(p.size, size=size, p=p / p.sum())
+
+
+def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) -> dict[str, Floats]:
+    """Draw one data set from the populations at theta by calling the response, not from design points.
+
+    Specimens whose response is not finite cannot be observed; others take their place.
+
+    Raises
+    ------
+    ValueError
+        If hardly any response is finite.
+    """
+    nodes = evaluator.nodes
+    numbers, total = specimens(nodes)
+    shared = sum(np.unique(n).size for n in numbers) > total
+    if shared:
+        _refuse_unlike(nodes)
+    data = {}
+    seeds = rng.spawn(1) * len(nodes) if shared else rng.spawn(len(nodes))
+    columns = []
+    for k, (node, seed) in enumerate(zip(nodes, seeds, strict=True)):
+        sampler = PopulationSampler(node.bound.inputs)
+        # The same generator for all that share specimens: the same inputs, one row per specimen.
+        generator = copy.deepcopy(seed)
+        aleatory, epistemic = sampler(evaluator.roots(theta[None], k), _SPARE * total, generator)
+        columns.append(node.bound.responses(aleatory, epistemic)[0])
+    finite = [np.isfinite(c) for c in columns]
+    if shared:
+        finite = [np.all(finite, axis=0)] * len(nodes)
+    for node, number, column, ok in zip(nodes, numbers, columns, finite, strict=True):
+        if ok.sum() < total:
+            raise ValueError(f"{node.name}: got {ok.sum()} finite responses of {ok.size}, expected at least {total}")
+        data[node.name] = column[ok][number]
+    return data
+
+
+def observed_set(evaluator: Evaluator) -> DataSets:
+    """Return the observed responses as the only data set."""
+    targets = [n.target for n in evaluator.nodes]
+    return DataSets([t.observed for t in targets], [t.weights[None] for t in targets])
+
+
+def reweighted_sets(evaluator: Evaluator, n_sets: int, seed: int = 0) -> DataSets:
+    """Give the observed specimens Dirichlet weights (Bayesian bootstrap), on top of the observations' own."""
+    rng = np.random.default_rng([seed, 2])
+    numbers, total = specimens(evaluator.nodes)
+    gains = rng.standard_exponential((n_sets, total))
+    weights = [gains[:, i] * n.target.weights for i, n in zip(numbers, evaluator.nodes, strict=True)]
+    return DataSets(
+        [n.target.observed for n in evaluator.nodes],
+        [w / w.sum(axis=-1, keepdims=True) for w in weights],
+    )
