@@ -5,11 +5,13 @@ from importlib.metadata import version
 from prbayes import datasets
 from prbayes.adjust import Affine
 from prbayes.bootstrap import bootstrap
+from prbayes.calling import ResponseError, scalar
 from prbayes.compare import compare
 from prbayes.density import GaussianKDE, Histogram
 from prbayes.diagnose import Diagnosis, diagnose
 from prbayes.discrepancy import Metric
 from prbayes.epsilon import calibrate_epsilon
+from prbayes.failures import Abort, Replace, Retry
 from prbayes.metrics import (
     AreaMetric,
     FunctionMetric,
@@ -20,14 +22,15 @@ from prbayes.metrics import (
 from prbayes.optimize import Optimum, minimize
 from prbayes.propagation import Fresh, Resimulated, Reweighted
 from prbayes.refinement import DesignError, refine
-from prbayes.responses import ResponseError
 from prbayes.sbc import simulation_based_calibration
 from prbayes.simulator import Simulator, abc_distance, set_epsilon
 from prbayes.smc import BatchedKernel, sample_smc
+from prbayes.store import StoreError
 
 __version__ = version("prbayes")
 
 __all__ = [
+    "Abort",
     "Affine",
     "AreaMetric",
     "BatchedKernel",
@@ -42,10 +45,13 @@ __all__ = [
     "Metric",
     "Optimum",
     "ProbabilityResidual",
+    "Replace",
     "Resimulated",
     "ResponseError",
+    "Retry",
     "Reweighted",
     "Simulator",
+    "StoreError",
     "abc_distance",
     "bootstrap",
     "calibrate_epsilon",
@@ -55,6 +61,7 @@ __all__ = [
     "minimize",
     "refine",
     "sample_smc",
+    "scalar",
     "set_epsilon",
     "simulation_based_calibration",
 ]

@@ -119,6 +119,7 @@ class Design(Bound):
             yield
         finally:
             self._points, self.values, self._thetas, self._counts, self.batches = kept
+            self._basis = (None, 0, None)
             self._store(shared)
 
     def _store(self, arrays: Sequence[Any]) -> None:

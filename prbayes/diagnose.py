@@ -40,7 +40,7 @@ class Diagnosis:
 
 
 def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) -> Diagnosis:
-    """Say whether the stored responses supported an answer, whichever sampler gave it.
+    """Say what is not identified, and whether the stored responses supported an answer, whichever sampler gave it.
 
     Parameters
     ----------
@@ -73,10 +73,13 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     messages: list[str] = []
     if isinstance(result, Optimum):
         thetas = result.theta[None]
+        messages += [f"{line[0].upper()}{line[1:]}." for line in result.warnings]
         if not result.converged:
             messages.append(f"The optimiser did not converge ({result.message}); try another start or method.")
     else:
         thetas = evaluator.thetas_of(_free_values(result, model))
+        said = str(result["posterior"].attrs.get("warnings", ""))
+        messages += [f"{line[0].upper()}{line[1:]}." for line in said.splitlines()]
     for name, what in shortcomings(evaluator, thetas).items():
         messages.append(
             f"{name}: the design does not support the answer: {what}. Call prb.refine(model) and sample again, or use "

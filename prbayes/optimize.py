@@ -16,8 +16,8 @@ from prbayes.information import Information, Local, local_sampling, prior_scale
 from prbayes.metrics import FunctionMetric
 from prbayes.modes import Rival, blind_directions, rivals
 from prbayes.population import Evaluator
-from prbayes.propagation import FreshBound
 from prbayes.refinement import _MAX_ROUNDS, pilot, refine_at, refuse, shortcomings, spread_around
+from prbayes.resimulation import FreshBound
 from prbayes.search import Search
 from prbayes.simulator import model_on_context
 

@@ -8,31 +8,29 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
 from functools import cached_property
+from os import PathLike
 from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
-from pytensor.compile import function
-from pytensor.graph.basic import Apply
-from pytensor.graph.op import Op
-from pytensor.graph.replace import _vectorize_node, graph_replace
+from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._arrays import Floats, positive_integer, positive_number
+from prbayes.calling import ResponseError
 from prbayes.discrepancy import Discrepancy
+from prbayes.failures import Abort, OnFailure
 from prbayes.inputs import (
-    PLAIN,
     Inputs,
     PopulationSampler,
     compile_batched,
-    ninf_for_invalid,
     prior_draws,
-    quantiles,
     valid,
 )
-from prbayes.responses import ResponseError, ResponseOp, Responses, symbolic_discrepancy
+from prbayes.responses import Responses
 
 
 class Bound(ABC):
@@ -121,8 +119,36 @@ class Bound(ABC):
         return rng.choice(values[0], size=size, p=w / w.sum())
 
 
+@dataclass(frozen=True, kw_only=True)
 class Propagation(ABC):
-    """How a population of inputs becomes responses."""
+    """How a population of inputs becomes responses, and all that concerns calling the response.
+
+    Parameters
+    ----------
+    executor : concurrent.futures.Executor, optional
+        Where the response is computed: threads, processes, loky, ``dask.distributed.Client().get_executor()``,
+        ``mpi4py.futures.MPIPoolExecutor()``. In this process by default.
+    store : path-like, optional
+        A folder that keeps every computed response, by simulator: none is computed again, also in another run.
+    on_failure : OnFailure
+        What to do with a response that raises or is NaN: `Abort` (default), `Replace` or `Retry`.
+    """
+
+    executor: Executor | None = field(default=None, repr=False)
+    store: str | PathLike[str] | None = field(default=None, repr=False)
+    on_failure: OnFailure = field(default_factory=Abort, repr=False)
+
+    def check(self) -> None:
+        """Refuse what is no executor, folder or policy."""
+        if self.executor is not None and not (hasattr(self.executor, "submit") and hasattr(self.executor, "map")):
+            raise TypeError(f"executor: got {type(self.executor).__name__}, expected a concurrent.futures.Executor")
+        if self.store is not None and not isinstance(self.store, str | PathLike):
+            raise TypeError(f"store: got {type(self.store).__name__}, expected the path of a folder")
+        if not isinstance(self.on_failure, OnFailure):
+            raise TypeError(
+                f"on_failure: got {type(self.on_failure).__name__} {self.on_failure!r:.60}, expected prb.Abort(), "
+                "prb.Replace() or prb.Retry()"
+            )
 
     @abstractmethod
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
@@ -158,6 +184,7 @@ class Reweighted(Propagation):
     max_lost: float = 0.05
 
     def __post_init__(self) -> None:
+        self.check()
         positive_integer(self.n, "Reweighted: n", minimum=16)
         positive_integer(self.seed, "Reweighted: seed", minimum=0)
         if self.max_lost != 0 and positive_number(self.max_lost, "Reweighted: max_lost") >= 1:
@@ -202,11 +229,14 @@ class Resimulated(Propagation):
     seed: int = 0
 
     def __post_init__(self) -> None:
+        self.check()
         positive_integer(self.n, "Resimulated: n", minimum=2)
         positive_integer(self.seed, "Resimulated: seed", minimum=0)
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Lay out the base points and find out whether the response accepts PyTensor variables."""
+        from prbayes.resimulation import ResimulatedBound
+
         refuse_nested(name, inputs)
         return ResimulatedBound(name, inputs, target, responses, self)
 
@@ -232,11 +262,14 @@ class Fresh(Propagation):
     seed: int = 0
 
     def __post_init__(self) -> None:
+        self.check()
         positive_integer(self.n, "Fresh: n", minimum=1)
         positive_integer(self.seed, "Fresh: seed", minimum=0)
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Prepare the generator of draws."""
+        from prbayes.resimulation import FreshBound
+
         return FreshBound(name, inputs, target, responses, self)
 
 
@@ -290,111 +323,3 @@ def refuse_all_nan(name: str, values: Floats) -> None:
             f"{name}: the response is NaN at all {values.size} points drawn from the prior, expected numbers; look at "
             "the priors and at the response's domain; a specimen that fails is +inf"
         )
-
-
-class ResimulatedBound(Bound):
-    """Common random numbers: the same base points for every theta."""
-
-    def __init__(
-        self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses, config: Resimulated
-    ) -> None:
-        super().__init__(name, inputs, target, responses)
-        self.n_per_theta = config.n
-        _, self._points = base_points(inputs, config.n, config.seed)
-        for dist, u in zip(inputs.aleatory, self._points, strict=True):
-            quantiles(name, dist, u)  # refuses what has no inverse distribution function
-        self.symbolic = self._accepts_tensors(*probe(self, PopulationSampler(inputs), config.seed))
-
-    def _accepts_tensors(self, expected: Floats, aleatory: list[Floats], epistemic: list[Floats]) -> bool:
-        """Try the response on PyTensor variables, and believe it only if the numbers agree."""
-        symbols = [pt.tensor(dtype="float64", shape=(None,) * v.ndim) for v in (*aleatory, *epistemic)]
-        try:
-            graph = self.responses.function(*self.inputs.fill(symbols[: len(aleatory)], symbols[len(aleatory) :]))
-            if not isinstance(graph, TensorVariable):
-                return False
-            values = function(symbols, graph, mode=PLAIN, on_unused_input="ignore")(*aleatory, *epistemic)
-        except Exception:  # whatever it is: the response is then called with arrays
-            return False
-        return values.shape == expected.shape and np.allclose(values, expected, rtol=1e-9, equal_nan=True)
-
-    def _response(self, params: Sequence[Any]) -> tuple[TensorVariable, TensorVariable]:
-        dists, epistemic = self.inputs.rebuilt(params)
-        aleatory = ninf_for_invalid([quantiles(self.name, d, u) for d, u in zip(dists, self._points, strict=True)])
-        common = [e[None] for e in epistemic]
-        if self.symbolic:
-            values = self.responses.function(*self.inputs.fill(aleatory, common))
-        else:
-            values = ResponseOp(self.responses)(*aleatory, *common)
-        return values, valid(self.inputs, dists)
-
-    def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
-        """Return the discrepancy of the responses at the base points, +inf where parameters are invalid."""
-        (values, ok), n = self._response(params), self.n_per_theta
-        return pt.switch(ok, symbolic_discrepancy(self.target, values, np.full(n, 1 / n)), np.inf)
-
-    @cached_property
-    def _values(self) -> Any:
-        symbols = self.inputs.placeholders()
-        return compile_batched(symbols, [self._response(symbols)[0]])
-
-    def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
-        """Return the responses at the base points, with equal weights."""
-        (values,) = self._values(*params)
-        if self.symbolic:
-            self.responses.count += values.size
-        return values, np.broadcast_to(1 / self.n_per_theta, values.shape)
-
-
-class FreshBound(Bound):
-    """New random draws at every evaluation."""
-
-    def __init__(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses, config: Fresh) -> None:
-        super().__init__(name, inputs, target, responses)
-        self.n_per_theta = config.n
-        self.rng = np.random.default_rng(config.seed)
-        self._sampler = PopulationSampler(inputs)
-        probe(self, self._sampler, config.seed)
-
-    def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
-        """Return an operation that draws and evaluates."""
-        return FreshOp(self)(*params)
-
-    def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
-        """Return fresh responses with equal weights."""
-        values = self.responses(*self._sampler(params, self.n_per_theta, self.rng))
-        return values, np.broadcast_to(1 / self.n_per_theta, values.shape)
-
-
-class FreshOp(Op):
-    """Draws a population and returns its discrepancy, () ... -> ()."""
-
-    def __init__(self, bound: FreshBound) -> None:
-        self.bound = bound
-
-    def make_node(self, *params: Any) -> Apply[Any, Any]:
-        """Apply to the roots' values."""
-        tensors = [pt.as_tensor(p) for p in params]
-        ndims = [r.type.ndim for r in self.bound.inputs.roots]
-        batch = max(t.type.ndim - d for t, d in zip(tensors, ndims, strict=True))
-        return Apply(self, tensors, [pt.tensor(dtype="float64", shape=(None,) * batch)])
-
-    def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
-        """Draw, call the response, compare."""
-        ndims = [r.type.ndim for r in self.bound.inputs.roots]
-        batch = np.broadcast_shapes(*(p.shape[: p.ndim - d] for p, d in zip(inputs, ndims, strict=True)))
-        params = [
-            np.broadcast_to(p, batch + p.shape[p.ndim - d :]).reshape(-1, *p.shape[p.ndim - d :])
-            for p, d in zip(inputs, ndims, strict=True)
-        ]
-        outputs[0][0] = self.bound.discrepancies(params, self.bound.target).reshape(batch)
-
-    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
-        """Refuse by name; not as NotImplementedError, which PyMC takes as leave to use a slice sampler."""
-        raise TypeError(
-            f"{self.bound.name}: prb.Fresh draws new responses at every evaluation, so its log-density is random and "
-            "has no gradient: pm.sample, pm.find_MAP and gradient methods of prb.minimize would be wrong; use "
-            "propagation=prb.Reweighted() or prb.Resimulated(), or prb.sample_smc"
-        )
-
-
-_vectorize_node.register(FreshOp, lambda op, node, *batched: op.make_node(*batched))

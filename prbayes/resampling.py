@@ -57,11 +57,21 @@ def dependent(nodes: list[Node]) -> bool:
     return total < sum(n.size for n in numbers)
 
 
+def groups(nodes: list[Node]) -> list[list[int]]:
+    """Return the simulators by their position, those together that share specimens, be it through others."""
+    numbers, _ = specimens(nodes)
+    found: list[tuple[list[int], set[int]]] = []
+    for k, own in enumerate(set(n.tolist()) for n in numbers):
+        joined = [g for g in found if g[1] & own]
+        found = [g for g in found if not g[1] & own]
+        found.append((sorted([k, *(i for g in joined for i in g[0])]), own.union(*(g[1] for g in joined))))
+    return sorted(g[0] for g in found)
+
+
 def siblings(nodes: list[Node], names: set[str]) -> set[str]:
     """Return names with those of simulators that share specimens with them, whose designs have to stay the same."""
-    numbers, _ = specimens(nodes)
-    chosen = [set(numbers[k].tolist()) for k, n in enumerate(nodes) if n.name in names]
-    return names | {n.name for k, n in enumerate(nodes) if any(c & set(numbers[k].tolist()) for c in chosen)}
+    together = [{nodes[k].name for k in group} for group in groups(nodes)]
+    return names.union(*(g for g in together if g & names))
 
 
 def aligned(nodes: list[Node]) -> bool:
@@ -92,20 +102,19 @@ def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int =
     rng = np.random.default_rng([seed, 1])
     populations = [evaluator.populations(theta[None], k) for k in range(len(nodes))]
     numbers, total = specimens(nodes)
-    shared = sum(np.unique(n).size for n in numbers) > total
-    if shared:
-        _refuse_unlike(nodes)
-        finite = np.all([np.isfinite(v[0]) for v, _ in populations], axis=0)
-        draws = _draw(populations[0][1][0], finite, (n_sets, total), rng)
+    draws: dict[int, NDArray[np.intp]] = {}
+    for group in groups(nodes):
+        _refuse_unlike([nodes[k] for k in group])
+        ok = np.all([np.isfinite(populations[k][0][0]) for k in group], axis=0)
+        drawn = _draw(populations[group[0]][1][0], ok, (n_sets, total), rng)
+        draws |= dict.fromkeys(group, drawn)
     values, weights = [], []
     for k, node in enumerate(nodes):
-        responses, w = populations[k][0][0], populations[k][1][0]
+        responses = populations[k][0][0]
         finite = np.isfinite(responses)
-        if not shared:
-            draws = _draw(w, finite, (n_sets, total), rng)
         where = np.cumsum(finite) - 1
         size = int(finite.sum())
-        cells = where[draws[:, numbers[k]]] + size * np.arange(n_sets)[:, None]
+        cells = where[draws[k][:, numbers[k]]] + size * np.arange(n_sets)[:, None]
         count = np.bincount(cells.ravel(), np.tile(node.target.weights, n_sets), n_sets * size)
         values.append(responses[finite])
         weights.append(count.reshape(n_sets, size))
@@ -115,8 +124,9 @@ def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int =
 def _refuse_unlike(nodes: list[Node]) -> None:
     if not aligned(nodes):
         raise ValueError(
-            "specimens: got the same labels in simulators with different inputs or designs, expected the same "
-            ".dist() objects, n and seed in all; then the model says how responses of one specimen depend on each other"
+            f"specimens: got the same labels in {', '.join(n.name for n in nodes)} with different inputs or designs, "
+            "expected the same .dist() objects, n and seed in all; then the model says how responses of one specimen "
+            "depend on each other"
         )
 
 
@@ -139,21 +149,19 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
     """
     nodes = evaluator.nodes
     numbers, total = specimens(nodes)
-    shared = sum(np.unique(n).size for n in numbers) > total
-    if shared:
-        _refuse_unlike(nodes)
     data = {}
-    seeds = rng.spawn(1) * len(nodes) if shared else rng.spawn(len(nodes))
-    columns = []
-    for k, (node, seed) in enumerate(zip(nodes, seeds, strict=True)):
-        sampler = PopulationSampler(node.bound.inputs)
-        # The same generator for all that share specimens: the same inputs, one row per specimen.
-        generator = copy.deepcopy(seed)
-        aleatory, epistemic = sampler(evaluator.roots(theta[None], k), _SPARE * total, generator)
-        columns.append(node.bound.responses(aleatory, epistemic)[0])
-    finite = [np.isfinite(c) for c in columns]
-    if shared:
-        finite = [np.all(finite, axis=0)] * len(nodes)
+    together = groups(nodes)
+    columns, finite = [np.empty(0)] * len(nodes), [np.empty(0, dtype=bool)] * len(nodes)
+    for group, seed in zip(together, rng.spawn(len(together)), strict=True):
+        _refuse_unlike([nodes[k] for k in group])
+        for k in group:
+            sampler = PopulationSampler(nodes[k].bound.inputs)
+            # The same generator for all that share specimens: the same inputs, one row per specimen.
+            aleatory, epistemic = sampler(evaluator.roots(theta[None], k), _SPARE * total, copy.deepcopy(seed))
+            columns[k] = nodes[k].bound.responses(aleatory, epistemic)[0]
+        ok = np.all([np.isfinite(columns[k]) for k in group], axis=0)
+        for k in group:
+            finite[k] = ok
     for node, number, column, ok in zip(nodes, numbers, columns, finite, strict=True):
         if ok.sum() < total:
             raise ValueError(f"{node.name}: got {ok.sum()} finite responses of {ok.size}, expected at least {total}")

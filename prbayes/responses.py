@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from typing import Any
 
 import numpy as np
@@ -13,18 +14,17 @@ from pytensor.graph.op import Op
 from pytensor.graph.replace import _vectorize_node
 
 from prbayes._arrays import Floats
+from prbayes.calling import Caller, ResponseError, checked, scalar
 from prbayes.density import Cells
 from prbayes.discrepancy import Discrepancy
+from prbayes.failures import Abort, OnFailure
 from prbayes.inputs import Inputs
+from prbayes.store import Store
 
 # Calls of the user's functions have no compiled form; nothing is gained by saying so at every compilation.
 warnings.filterwarnings(
     "ignore", message="Numba will use object mode to run (prbayes_Simulator|FreshOp|ResponseOp|Density|OpaqueOp|abc_d)"
 )
-
-
-class ResponseError(RuntimeError):
-    """The user's response raised, or returned something that is no response."""
 
 
 def refuse_uncallable(name: str, function: object) -> None:
@@ -37,23 +37,63 @@ def refuse_uncallable(name: str, function: object) -> None:
 
 
 class Responses:
-    """The user's response function, called on whole batches; counts the scalar responses it computed.
+    """The user's response function; counts the scalar responses it computed.
 
     Parameters
     ----------
     name : str
         Name of the simulator, for messages.
-    function : callable
+    function : callable or scalar
         ``function(*inputs)``, one array per input, any leading batch shape.
     inputs : Inputs
+    executor : concurrent.futures.Executor, optional
+    store : path-like, optional
+        A folder.
+    on_failure : OnFailure, optional
     """
 
-    def __init__(self, name: str, function: Callable[..., Any], inputs: Inputs) -> None:
+    def __init__(
+        self,
+        name: str,
+        function: Callable[..., Any],
+        inputs: Inputs,
+        *,
+        executor: Executor | None = None,
+        store: Any = None,
+        on_failure: OnFailure | None = None,
+    ) -> None:
         refuse_uncallable(name, function)
         self.name = name
         self.function = function
         self.inputs = inputs
-        self.count = 0
+        # A function that takes whole batches, and nothing else asked for, is called once for each.
+        self.plain = executor is store is None and not isinstance(function, scalar) and on_failure in (None, Abort())
+        self._event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
+        self._caller: Caller | None = None
+        if not self.plain:
+            kept = None if store is None else Store(store, name, self._columns())
+            self._caller = Caller(name, function, executor, on_failure or Abort(), kept)
+        self._count = 0
+
+    def _columns(self) -> int:
+        """Return of how many numbers the inputs of one point are made."""
+        sizes = [int(np.prod(s, dtype=int)) for s in self.inputs.event_shapes]
+        sizes += [int(np.prod(e.shape.eval() if e.type.ndim else (), dtype=int)) for e in self.inputs.epistemic]
+        return sum(sizes) + sum(np.size(a) for a in self.inputs.arguments if not isinstance(a, int | Variable))
+
+    @property
+    def count(self) -> int:
+        """Scalar responses computed so far."""
+        return self._count + (self._caller.count if self._caller is not None else 0)
+
+    @count.setter
+    def count(self, value: int) -> None:
+        self._count = value - (self._caller.count if self._caller is not None else 0)
+
+    @property
+    def failures(self) -> int:
+        """Points whose response failed and was replaced."""
+        return 0 if self._caller is None else self._caller.failures
 
     def __call__(self, aleatory: Sequence[Floats], epistemic: Sequence[Floats]) -> Floats:
         """Return responses, shape (...), for aleatory values (..., *event) and epistemic ones (..., *event).
@@ -63,32 +103,43 @@ class Responses:
         ResponseError
             If the response raises, or if its result is not real numbers in the batch shape.
         """
-        ndims = [*self.inputs.event_ndims, *(e.type.ndim for e in self.inputs.epistemic)]
         values = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
-        leading = [v.shape[: v.ndim - e] for v, e in zip(values, ndims, strict=True)]
+        leading = [v.shape[: v.ndim - e] for v, e in zip(values, self._event_ndims, strict=True)]
         batch = np.broadcast_shapes(*leading)
-        full = [np.broadcast_to(v, batch + v.shape[v.ndim - e :]) for v, e in zip(values, ndims, strict=True)]
-        arguments = self.inputs.fill(full[: len(aleatory)], full[len(aleatory) :])
-        shapes = ", ".join(str(np.shape(a)) for a in arguments)
+        full = [
+            np.broadcast_to(v, batch + v.shape[v.ndim - e :]) for v, e in zip(values, self._event_ndims, strict=True)
+        ]
+        k = len(aleatory)
+        if self._caller is not None:
+            return self._call_each(full, k, batch)
+        arguments = self.inputs.fill(full[:k], full[k:])
         try:
             with np.errstate(all="ignore"):
                 result = self.function(*arguments)
         except Exception as error:
+            shapes = ", ".join(str(np.shape(a)) for a in arguments)
             raise ResponseError(
                 f"{self.name}: the response raised {type(error).__name__}: {error}; it was called with inputs of "
-                f"shapes {shapes} and is expected to take arrays of any leading shape"
+                f"shapes {shapes} and is expected to take arrays of any leading shape, or to be wrapped in prb.scalar"
             ) from error
-        self.count += int(np.prod(batch, dtype=int))
-        array = np.asarray(result)
-        if array.dtype.kind not in "fiub":
-            got = "complex numbers" if array.dtype.kind == "c" else f"{type(result).__name__} of dtype {array.dtype}"
-            raise ResponseError(f"{self.name}: the response returned {got}, expected an array of real numbers")
-        if array.shape != batch:
-            raise ResponseError(
-                f"{self.name}: the response returned shape {array.shape} for inputs of shapes {shapes}, expected "
-                f"{batch}: one response per specimen; reduce over the event axis only (the last one)"
-            )
-        return array.astype(np.float64)
+        self._count += int(np.prod(batch, dtype=int))
+        try:
+            return checked(result, batch, arguments)
+        except ResponseError as error:
+            raise ResponseError(f"{self.name}: {error}") from None
+
+    def _call_each(self, full: Sequence[Floats], k: int, batch: tuple[int, ...]) -> Floats:
+        """Call through the executor, the store and the failure policy, with one leading axis."""
+        n = int(np.prod(batch, dtype=int))
+        flat = [v.reshape(n, *v.shape[len(batch) :]) for v in full]
+        arguments = self.inputs.fill(flat[:k], flat[k:])
+        varying = [isinstance(a, int | Variable) for a in self.inputs.arguments]
+        keys = [
+            (a if v else np.broadcast_to(a, (n, *np.shape(a)))).reshape(n, -1)
+            for a, v in zip(arguments, varying, strict=True)
+        ]
+        assert self._caller is not None
+        return self._caller(arguments, varying, np.concatenate(keys, axis=1).astype(np.float64)).reshape(batch)
 
 
 class ResponseOp(Op):

@@ -49,6 +49,7 @@ def posterior_tree(
     *,
     unadjusted: Floats | None = None,
     adjustment: str = "none",
+    warnings: tuple[str, ...] = (),
     seed: int | None,
     n_responses: int,
     seconds: float,
@@ -66,6 +67,8 @@ def posterior_tree(
     unadjusted : ndarray, shape (chains, draws, d), or None
     adjustment : str
         What was done to the draws.
+    warnings : tuple of str
+        What is not identified.
     seed : int or None
     n_responses : int
         Scalar responses computed, the designs' included.
@@ -95,6 +98,7 @@ def posterior_tree(
         "seconds": seconds,
         "random_seed": "None" if seed is None else str(seed),
         "adjustment": adjustment,
+        "warnings": "\n".join(warnings),
         **versions(),
     }
     posterior.attrs.update({"inference_library": "prbayes", **attrs})
@@ -204,6 +208,7 @@ def optimum_tree(optimum: Optimum) -> xr.DataTree:
         "n_screened": optimum.n_screened,
         "n_responses": optimum.n_responses,
         "seconds": optimum.seconds,
+        "warnings": "\n".join(optimum.warnings),
         **versions(),
     }
     elements = {"element": optimum.names, "other_element": optimum.names}

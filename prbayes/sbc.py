@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, as_completed
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,13 @@ from prbayes.adjust import Affine
 from prbayes.population import Evaluator
 from prbayes.resampling import fresh_data
 from prbayes.results import calibration_tree
-from prbayes.simulator import model_on_context, revive
+from prbayes.simulator import model_on_context, nodes, revive
 from prbayes.smc import sample
 
 _log = logging.getLogger("prbayes")
 
 _CHUNK = 10  # data sets that a worker analyses before it reports
+_ARRIVING = Lock()  # threads share the classes that hold the nodes, of which the last model to arrive has its own
 
 
 def simulation_based_calibration(
@@ -109,10 +111,11 @@ def simulation_based_calibration(
             import cloudpickle
 
             sent = cloudpickle.dumps(model)
-            futures: list[Future[Any]] = [executor.submit(_remote, sent, *job) for job in jobs]
-            for done in as_completed(futures):
-                progress.advance(task, len(done.result()))
-            rows = [row for future in futures for row in future.result()]
+            with _classes_kept(model):
+                futures: list[Future[Any]] = [executor.submit(_remote, sent, *job) for job in jobs]
+                for done in as_completed(futures):
+                    progress.advance(task, len(done.result()))
+                rows = [row for future in futures for row in future.result()]
     failed = [row for row in rows if isinstance(row, str)]
     good = [row for row in rows if not isinstance(row, str)]
     if failed:
@@ -122,10 +125,25 @@ def simulation_based_calibration(
     return calibration_tree(evaluator, good, failed=len(failed), draws=draws, adjust=adjust, seed=random_seed)
 
 
+@contextmanager
+def _classes_kept(model: pm.Model) -> Iterator[None]:
+    """Undo what a model that arrives in a thread does to the classes of this one's simulators."""
+    kept = [(type(rv.owner.op), dict(vars(type(rv.owner.op)))) for rv in nodes(model)]
+    try:
+        yield
+    finally:
+        for class_, attributes in kept:
+            for name, value in attributes.items():
+                if vars(class_)[name] is not value:
+                    setattr(class_, name, value)
+
+
 def _remote(sent: bytes, *job: Any) -> list[Any]:
     import cloudpickle
 
-    return _analyse(Evaluator(revive(cloudpickle.loads(sent))), *job)
+    with _ARRIVING:
+        evaluator = Evaluator(revive(cloudpickle.loads(sent)))
+    return _analyse(evaluator, *job)
 
 
 def _analyse(

@@ -186,7 +186,14 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         positive_number(epsilon, f"{name}: epsilon")
     refuse_uncallable(name, response)
     sorted_inputs = read_inputs(name, inputs, model)
-    responses = Responses(name, response, sorted_inputs)
+    responses = Responses(
+        name,
+        response,
+        sorted_inputs,
+        executor=propagation.executor,
+        store=propagation.store,
+        on_failure=propagation.on_failure,
+    )
     bound = propagation.bind(name, sorted_inputs, target, responses)
     if epsilon is None:
         epsilon = 1 / target.n_effective if metric.likelihood else np.nan

@@ -311,6 +311,7 @@ def sample(
             stats,
             unadjusted=None if thetas is plain else plain,
             adjustment=note,
+            warnings=() if optimum is None else optimum.warnings,
             seed=random_seed,
             n_responses=evaluator.n_responses - computed,
             seconds=time.perf_counter() - clock,

@@ -14,21 +14,23 @@ FILES = sorted(PACKAGE.glob("*.py"))
 
 # A file may import those before it.
 ORDER = [
-    "_arrays", "density", "discrepancy", "metrics", "inputs", "responses", "propagation", "design", "simulator",
-    "population", "resampling", "information", "descent", "refit", "modes", "refinement", "search", "optimize",
-    "epsilon", "adjust", "results", "bootstrap", "smc", "sbc", "diagnose", "compare",
+    "_arrays", "density", "discrepancy", "metrics", "failures", "store", "calling", "inputs", "responses",
+    "propagation", "resimulation", "design", "simulator", "population", "resampling", "information", "descent",
+    "refit", "modes", "refinement", "search", "optimize", "epsilon", "adjust", "results", "bootstrap", "smc", "sbc",
+    "diagnose", "compare",
 ]  # fmt: skip
 
 # Upwards, inside a function or for types only, with the reason.
 UPWARDS = {
-    ("propagation", "design"),  # Reweighted.bind makes its own moving part
+    ("propagation", "design"),  # a propagation's bind makes its own moving part
+    ("propagation", "resimulation"),
     ("refinement", "optimize"),  # the public refine() looks around the optimum
     ("optimize", "results"),  # Optimum.to_datatree
     ("results", "optimize"),  # annotation of optimum_tree
 }
 
 # Results, errors and base classes, which nobody makes; and a kernel that is passed to PyMC.
-WITHOUT_EXAMPLE = {"BatchedKernel", "DesignError", "Diagnosis", "Metric", "Optimum", "ResponseError"}
+WITHOUT_EXAMPLE = {"BatchedKernel", "DesignError", "Diagnosis", "Metric", "Optimum", "ResponseError", "StoreError"}
 
 INNER = ("pymc.logprob", "pymc.smc", "pymc.pytensorf", "pymc.distributions", "pymc.model.core", "pymc.backends")
 MAY_TOUCH_PYMC = {"inputs", "simulator", "population", "smc"}
