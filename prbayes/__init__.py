@@ -12,6 +12,7 @@ from prbayes.diagnose import Diagnosis, diagnose
 from prbayes.discrepancy import Metric
 from prbayes.epsilon import calibrate_epsilon
 from prbayes.failures import Abort, Replace, Retry
+from prbayes.kernel import BatchedKernel
 from prbayes.metrics import (
     AreaMetric,
     FunctionMetric,
@@ -24,7 +25,7 @@ from prbayes.propagation import Fresh, Resimulated, Reweighted
 from prbayes.refinement import DesignError, refine
 from prbayes.sbc import simulation_based_calibration
 from prbayes.simulator import Simulator, abc_distance, set_epsilon
-from prbayes.smc import BatchedKernel, sample_smc
+from prbayes.smc import sample_smc
 from prbayes.store import StoreError
 
 __version__ = version("prbayes")

@@ -215,9 +215,10 @@ class Evaluator:
             found = self(theta + stencil if gradient else theta[None])
             with np.errstate(invalid="ignore"):
                 total = (found.discrepancies / scales).sum(axis=-1) - found.log_other
-                slopes = (total[1 : 1 + self.size] - total[1 + self.size :]) / (2 * step)
-            value = np.where(np.isfinite(found.log_prior[0]), total[0], np.inf)
-            return (value, slopes) if gradient else (value,)
+                value = np.where(np.isfinite(found.log_prior[0]), total[0], np.inf)
+                if not gradient:
+                    return (value,)
+                return value, (total[1 : 1 + self.size] - total[1 + self.size :]) / (2 * step)
 
         return objective
 

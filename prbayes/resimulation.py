@@ -77,12 +77,19 @@ class ResimulatedBound(Bound):
 
 
 class FreshBound(Bound):
-    """New random draws at every evaluation."""
+    """New random draws at every evaluation.
+
+    Attributes
+    ----------
+    used : int
+        Number of evaluations so far; with the seed it determines the next draws.
+    """
 
     def __init__(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses, config: Fresh) -> None:
         super().__init__(name, inputs, target, responses)
         self.n_per_theta = config.n
-        self.rng = np.random.default_rng(config.seed)
+        self._seed = config.seed
+        self.used = 0
         self._sampler = PopulationSampler(inputs)
         probe(self, self._sampler, config.seed)
 
@@ -92,7 +99,9 @@ class FreshBound(Bound):
 
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
         """Return fresh responses with equal weights."""
-        values = self.responses(*self._sampler(params, self.n_per_theta, self.rng))
+        self.used += 1
+        rng = np.random.default_rng([self._seed, self.used])
+        values = self.responses(*self._sampler(params, self.n_per_theta, rng))
         return values, np.broadcast_to(1 / self.n_per_theta, values.shape)
 
 

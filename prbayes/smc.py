@@ -1,171 +1,32 @@
-"""ABC by sequential Monte Carlo: a kernel that evaluates a whole population in one call, and `sample_smc`."""
+"""ABC by sequential Monte Carlo: `sample_smc`."""
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import time
-from typing import Any, ClassVar
+from os import PathLike
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
-from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from prbayes._arrays import Floats, positive_integer, positive_number
 from prbayes.adjust import Affine, inapplicable
+from prbayes.checkpoint import Checkpoint, stored_identity
 from prbayes.epsilon import calibrate_epsilon
+from prbayes.kernel import BatchedKernel
 from prbayes.optimize import Optimum, find_optimum
-from prbayes.population import Evaluation, Evaluator
+from prbayes.population import Evaluator
 from prbayes.refinement import _MAX_ROUNDS, refine_at, refuse, shortcomings
+from prbayes.resimulation import FreshBound
 from prbayes.results import posterior_tree
 from prbayes.simulator import model_on_context
 
 _log = logging.getLogger("prbayes")
-
-
-_MAX_STEPS = 25
-_UNCORRELATED = 0.05  # with the particles before the last stage; on the way, six times as much will do
-
-
-class BatchedKernel(SMC_KERNEL):
-    """SMC kernel that computes priors, responses and discrepancies of all particles in one call.
-
-    It mutates by independent proposals from a normal fitted to the particles, which forget the past at
-    once, in turn with random-walk proposals, which also move inside separate modes; until the particles
-    are uncorrelated with those before, or stop becoming less so. Also usable as
-    ``pymc.sample_smc(kernel=prbayes.BatchedKernel)``.
-
-    Parameters
-    ----------
-    draws : int
-        Number of particles.
-    start : None
-        Particles start from the prior.
-    model : pymc.Model, optional
-        The one on the context by default.
-    random_seed : int, optional
-    threshold : float
-        Share of the effective sample size that a stage keeps.
-    compile_kwargs : dict, optional
-        Accepted for PyMC's sake; the populations are evaluated in NumPy.
-    """
-
-    stats_dtypes_shapes: ClassVar[dict[str, tuple[type, list[Any]]]] = {
-        "log_marginal_likelihood": (float, []),
-        "beta": (float, []),
-        "accept_rate": (float, []),
-        "n_steps": (int, []),
-    }
-
-    def __init__(
-        self,
-        draws: int = 2000,
-        start: Any = None,
-        model: pm.Model | None = None,
-        random_seed: int | None = None,
-        threshold: float = 0.5,
-        compile_kwargs: dict[str, Any] | None = None,
-        evaluator: Evaluator | None = None,
-    ) -> None:
-        # PyMC's constructor compiles functions of single particles, which this kernel never calls.
-        if not 0 < threshold < 1:
-            raise ValueError(f"threshold: got {threshold}, expected a number between 0 and 1")
-        self.draws = draws
-        self.start = start
-        self.threshold = threshold
-        model = model_on_context(model, "BatchedKernel")
-        self.evaluator = evaluator or Evaluator(model)
-        unset = [n.name for n, e in zip(self.evaluator.nodes, self.evaluator.epsilon, strict=True) if np.isnan(e)]
-        if unset:
-            raise ValueError(
-                f"{unset[0]}: epsilon is not set; call prb.set_epsilon(model, "
-                "prb.calibrate_epsilon(prb.minimize(model))) or use prb.sample_smc, which calibrates it"
-            )
-        self.variables = model.value_vars
-        self.var_info = {n: (s, int(np.prod(s, dtype=int))) for n, s in self.evaluator.shapes.items()}
-        self.rng = np.random.default_rng(random_seed)
-        self._reset_state()
-
-    def set_rng(self, rng: np.random.Generator) -> None:
-        """Take over a chain's generator."""
-        self.rng = rng
-
-    def _evaluate(self, thetas: Floats) -> tuple[Floats, Floats, Floats]:
-        found: Evaluation = self.evaluator(thetas)
-        return found.log_prior, found.log_likelihood(self.evaluator.epsilon), found.discrepancies
-
-    def _initialize_kernel(self) -> None:
-        self.tempered_posterior = self.evaluator.prior_thetas(self.draws, int(self.rng.integers(2**31)))
-        self.prior_logp, self.likelihood_logp, self.discrepancies = self._evaluate(self.tempered_posterior)
-        if not np.isfinite(self.likelihood_logp).any():
-            raise ValueError(
-                f"model: got no finite discrepancy among {self.draws} draws from the prior, expected some; the "
-                "populations of the prior are invalid or far from the design: look at the priors"
-            )
-
-    def resample(self) -> None:
-        """Resample the particles in proportion to their weights."""
-        index = systematic_resampling(self.weights, self.rng)
-        self.resampling_indexes = index
-        self.tempered_posterior = self.tempered_posterior[index]
-        self.prior_logp, self.likelihood_logp = self.prior_logp[index], self.likelihood_logp[index]
-        self.discrepancies = self.discrepancies[index]
-
-    def mutate(self) -> None:
-        """Move all particles by Metropolis-Hastings steps that leave the tempered posterior as it is."""
-        before = self.tempered_posterior.copy()
-        mean, d = before.mean(axis=0), before.shape[1]
-        covariance = np.atleast_2d(np.cov(before, rowvar=False))
-        root = np.linalg.cholesky(covariance + 1e-12 * np.diag(np.diag(covariance) + 1e-300))
-        scale, accepted, correlation = 2.38 / np.sqrt(d), [], 1.0
-        enough = _UNCORRELATED * (1 if self.beta == 1 else 6)
-        for step in range(1, _MAX_STEPS + 1):
-            noise = self.rng.standard_normal(before.shape)
-            if step % 2:
-                moved = mean + noise @ root.T
-                now = np.linalg.solve(root, (self.tempered_posterior - mean).T)
-                log_ratio = 0.5 * ((noise**2).sum(axis=1) - (now**2).sum(axis=0))
-            else:
-                moved, log_ratio = self.tempered_posterior + scale * noise @ root.T, np.zeros(len(before))
-            rate = self._accept(moved, log_ratio)
-            accepted.append(rate)
-            if not step % 2:
-                scale *= np.exp(rate - 0.3)
-                last, correlation = correlation, _correlation(before, self.tempered_posterior)
-                if correlation < enough or correlation > last - 0.01:
-                    break
-        self.accept_rate, self.n_steps = float(np.mean(accepted)), step
-
-    def _accept(self, moved: Floats, log_ratio: Floats) -> float:
-        prior, likelihood, discrepancies = self._evaluate(moved)
-        with np.errstate(invalid="ignore"):
-            gain = prior - self.prior_logp + self.beta * (likelihood - self.likelihood_logp) + log_ratio
-        ok = np.log(self.rng.random(len(moved))) < np.nan_to_num(gain, nan=-np.inf)
-        self.tempered_posterior[ok] = moved[ok]
-        self.prior_logp[ok], self.likelihood_logp[ok] = prior[ok], likelihood[ok]
-        self.discrepancies[ok] = discrepancies[ok]
-        return float(ok.mean())
-
-    def sample_stats(self) -> dict[str, Any]:
-        """Return the statistics of a stage."""
-        return {
-            "log_marginal_likelihood": self.log_marginal_likelihood if self.beta == 1 else np.nan,
-            "beta": self.beta,
-            "accept_rate": self.accept_rate,
-            "n_steps": self.n_steps,
-        }
-
-    def sample_settings(self) -> dict[str, Any]:
-        """Return the settings of the run."""
-        return {"_n_draws": self.draws, "threshold": self.threshold, "_n_tune": self.n_steps}
-
-
-def _correlation(before: Floats, after: Floats) -> float:
-    """Return the mean absolute correlation of the particles' coordinates with those before."""
-    a, b = before - before.mean(axis=0), after - after.mean(axis=0)
-    size = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
-    return float(np.mean(np.abs((a * b).sum(axis=0)) / np.where(size > 0, size, 1.0)))
 
 
 def sample_smc(
@@ -179,6 +40,7 @@ def sample_smc(
     threshold: float = 0.5,
     refine: bool = True,
     random_seed: int | None = None,
+    checkpoint: str | PathLike[str] | None = None,
     progressbar: bool = True,
 ) -> xr.DataTree:
     """Draw from the pseudo-posterior prior x exp(-sum of d_k / epsilon_k) by sequential Monte Carlo.
@@ -203,6 +65,10 @@ def sample_smc(
     refine : bool
         Whether designs of `Reweighted` that do not support the posterior get more points.
     random_seed : int, optional
+    checkpoint : path-like, optional
+        A file that keeps the state after every stage: a run that was killed goes on from there when it is
+        called again, and gives the same draws. Give the propagations a ``store`` as well, so that the search
+        for the optimum computes nothing again.
     progressbar : bool
 
     Returns
@@ -219,6 +85,8 @@ def sample_smc(
         If an argument is not as described, or no prior draw has a finite discrepancy.
     DesignError
         If a design does not support the posterior after refinement.
+    StoreError
+        If the checkpoint is damaged, or belongs to another run.
 
     References
     ----------
@@ -252,6 +120,7 @@ def sample_smc(
         threshold=threshold,
         refine=refine,
         random_seed=random_seed,
+        checkpoint=checkpoint,
         progressbar=progressbar,
     )
 
@@ -268,6 +137,7 @@ def sample(
     refine: bool,
     random_seed: int | None,
     progressbar: bool,
+    checkpoint: str | PathLike[str] | None = None,
 ) -> xr.DataTree:
     """Do what `sample_smc` does, for an evaluator."""
     clock = time.perf_counter()
@@ -284,9 +154,16 @@ def sample(
             calibrated = calibrate_epsilon(optimum)
             for node in unset:
                 node.epsilon.set_value(np.asarray(calibrated[node.name]))
-        seeds = np.random.SeedSequence(random_seed)
+        saved = _checkpoint(checkpoint, evaluator, draws, chains, threshold, random_seed)
+        seeds = np.random.SeedSequence(random_seed if saved is None else int(saved.identity["entropy"]))
+        run = _Run(evaluator, draws, threshold, saved)
         for round_ in range(_MAX_ROUNDS + 1):
-            plain, discrepancies, stats = _run(evaluator, draws, chains, threshold, seeds, progressbar)
+            children = seeds.spawn(chains)
+            if saved is not None and round_ < saved.note.get("round", 0):
+                run.refined.append(saved.arrays[f"refined{round_}_thetas"])
+                refine_at(evaluator, run.refined[-1])
+                continue
+            plain, discrepancies, stats = run(children, progressbar)
             thetas, note = plain, "none"
             if isinstance(adjust, Affine):
                 optima = (
@@ -301,6 +178,7 @@ def sample(
                 refuse(shortcomings(evaluator, some), evaluator)
             elif not refine_at(evaluator, some):
                 break
+            run.refined.append(some)
             _log.info("sampling again on the refined design")
         if note.startswith("none: "):
             _log.warning("the draws are not adjusted: %s; their width is epsilon's", note.removeprefix("none: "))
@@ -321,6 +199,35 @@ def sample(
             node.epsilon.set_value(np.asarray(value))
 
 
+def _checkpoint(
+    path: str | PathLike[str] | None,
+    evaluator: Evaluator,
+    draws: int,
+    chains: int,
+    threshold: float,
+    seed: int | None,
+) -> Checkpoint | None:
+    """Open the checkpoint; a run without a seed takes that of the run it goes on with."""
+    if path is None:
+        return None
+    entropy = np.random.SeedSequence(seed).entropy
+    if seed is None and Path(path).exists():
+        entropy = stored_identity(path).get("entropy", entropy)
+    observed = b"".join(n.target.observed.tobytes() + n.target.weights.tobytes() for n in evaluator.nodes)
+    identity = {
+        "draws": draws,
+        "chains": chains,
+        "threshold": threshold,
+        "entropy": str(entropy),
+        "hyperparameters": evaluator.names,
+        "epsilon": [float(e) for e in evaluator.epsilon],
+        "metrics and propagations": [f"{n.metric!r} {n.propagation!r}".split(" at 0x")[0] for n in evaluator.nodes],
+        "observed": hashlib.sha256(observed).hexdigest(),
+        "responses before": [n.bound.n_points for n in evaluator.nodes],
+    }
+    return Checkpoint(path, identity)
+
+
 def _set_for_run(evaluator: Evaluator, epsilon: float | dict[str, float] | None) -> None:
     names = [n.name for n in evaluator.nodes]
     if epsilon is None:
@@ -338,30 +245,81 @@ def _set_for_run(evaluator: Evaluator, epsilon: float | dict[str, float] | None)
             node.epsilon.set_value(np.asarray(values[node.name]))
 
 
-def _run(
-    evaluator: Evaluator, draws: int, chains: int, threshold: float, seeds: np.random.SeedSequence, progressbar: bool
-) -> tuple[Floats, Floats, list[dict[str, list[float]]]]:
-    """Run all chains; return thetas, (chains, draws, d), discrepancies, (chains, draws, k), and statistics by stage."""
-    columns = (
-        TextColumn("SMC chain {task.fields[chain]}"),
-        BarColumn(),
-        TextColumn("beta {task.completed:.4f}"),
-        TextColumn("acceptance {task.fields[rate]:.2f}"),
-        TimeElapsedColumn(),
-    )
-    thetas, discrepancies, stats = [], [], []
-    with Progress(*columns, disable=not progressbar) as progress:
-        for chain, seed in enumerate(seeds.spawn(chains)):
-            task = progress.add_task("", total=1.0, chain=chain, rate=0.0)
-            kernel = BatchedKernel(draws, model=evaluator.model, threshold=threshold, evaluator=evaluator)
-            kernel.initialize(None, np.random.default_rng(seed))
-            stages: dict[str, list[float]] = {name: [] for name in kernel.stats_dtypes_shapes}
-            while kernel.beta < 1:
-                kernel.update_beta_and_weights()
-                for name, value in kernel.step().items():
-                    stages[name].append(value)
-                progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
-            thetas.append(kernel.tempered_posterior)
-            discrepancies.append(kernel.discrepancies)
-            stats.append(stages)
-    return np.array(thetas), np.array(discrepancies), stats
+class _Run:
+    """All chains of one round on one design; saves its state after every stage, and takes over one that was saved."""
+
+    def __init__(self, evaluator: Evaluator, draws: int, threshold: float, checkpoint: Checkpoint | None) -> None:
+        self.evaluator, self.draws, self.threshold, self.checkpoint = evaluator, draws, threshold, checkpoint
+        self.refined: list[Floats] = []  # thetas at which designs were refined in earlier rounds
+
+    def __call__(
+        self, seeds: list[np.random.SeedSequence], progressbar: bool
+    ) -> tuple[Floats, Floats, list[dict[str, list[float]]]]:
+        """Return thetas, (chains, draws, d), discrepancies, (chains, draws, k), and statistics by stage."""
+        columns = (
+            TextColumn("SMC chain {task.fields[chain]}"),
+            BarColumn(),
+            TextColumn("beta {task.completed:.4f}"),
+            TextColumn("acceptance {task.fields[rate]:.2f}"),
+            TimeElapsedColumn(),
+        )
+        done: list[tuple[Floats, Floats]] = []
+        stats: list[dict[str, list[float]]] = []
+        saved = self._saved()
+        with Progress(*columns, disable=not progressbar) as progress:
+            for chain, seed in enumerate(seeds):
+                task = progress.add_task("", total=1.0, chain=chain, rate=0.0)
+                kernel = BatchedKernel(
+                    self.draws, model=self.evaluator.model, threshold=self.threshold, evaluator=self.evaluator
+                )
+                if chain < saved.get("chain", 0):
+                    arrays = self._arrays(f"chain{chain}_")
+                    done.append((arrays["thetas"], arrays["discrepancies"]))
+                    stats.append(saved["stats"][chain])
+                    continue
+                stages: dict[str, list[float]] = {name: [] for name in kernel.stats_dtypes_shapes}
+                if chain == saved.get("chain"):
+                    kernel.restore(self._arrays("now_"), saved["state"])
+                    stages = saved["stats"][chain]
+                    self._restore_generators(saved["generators"])
+                else:
+                    kernel.initialize(None, np.random.default_rng(seed))
+                while kernel.beta < 1:
+                    kernel.update_beta_and_weights()
+                    for name, value in kernel.step().items():
+                        stages[name].append(value)
+                    self._save(done, [*stats, stages], kernel)
+                    progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
+                done.append((kernel.tempered_posterior, kernel.discrepancies))
+                stats.append(stages)
+        return np.array([d[0] for d in done]), np.array([d[1] for d in done]), stats
+
+    def _saved(self) -> dict[str, Any]:
+        note = self.checkpoint.note if self.checkpoint is not None else {}
+        return note if note.get("round") == len(self.refined) else {}
+
+    def _arrays(self, prefix: str) -> dict[str, Floats]:
+        assert self.checkpoint is not None
+        return {k.removeprefix(prefix): v for k, v in self.checkpoint.arrays.items() if k.startswith(prefix)}
+
+    def _save(
+        self, done: list[tuple[Floats, Floats]], stats: list[dict[str, list[float]]], kernel: BatchedKernel
+    ) -> None:
+        if self.checkpoint is None:
+            return
+        arrays, state = kernel.state()
+        everything = {f"now_{k}": v for k, v in arrays.items()}
+        for i, (thetas, discrepancies) in enumerate(done):
+            everything |= {f"chain{i}_thetas": thetas, f"chain{i}_discrepancies": discrepancies}
+        everything |= {f"refined{i}_thetas": thetas for i, thetas in enumerate(self.refined)}
+        note = {"round": len(self.refined), "chain": len(done), "stats": stats, "state": state}
+        self.checkpoint.save(everything, note | {"generators": self._generators()})
+
+    def _generators(self) -> dict[str, Any]:
+        """Return how often the generators of simulators with `Fresh` have been used."""
+        return {n.name: n.bound.used for n in self.evaluator.nodes if isinstance(n.bound, FreshBound)}
+
+    def _restore_generators(self, states: dict[str, Any]) -> None:
+        for node in self.evaluator.nodes:
+            if isinstance(node.bound, FreshBound):
+                node.bound.used = states[node.name]

@@ -16,8 +16,8 @@ FILES = sorted(PACKAGE.glob("*.py"))
 ORDER = [
     "_arrays", "density", "discrepancy", "metrics", "failures", "store", "calling", "inputs", "responses",
     "propagation", "resimulation", "design", "simulator", "population", "resampling", "information", "descent",
-    "refit", "modes", "refinement", "search", "optimize", "epsilon", "adjust", "results", "bootstrap", "smc", "sbc",
-    "diagnose", "compare",
+    "refit", "modes", "refinement", "search", "optimize", "epsilon", "adjust", "results", "bootstrap", "checkpoint",
+    "kernel", "smc", "sbc", "diagnose", "compare",
 ]  # fmt: skip
 
 # Upwards, inside a function or for types only, with the reason.
@@ -33,7 +33,7 @@ UPWARDS = {
 WITHOUT_EXAMPLE = {"BatchedKernel", "DesignError", "Diagnosis", "Metric", "Optimum", "ResponseError", "StoreError"}
 
 INNER = ("pymc.logprob", "pymc.smc", "pymc.pytensorf", "pymc.distributions", "pymc.model.core", "pymc.backends")
-MAY_TOUCH_PYMC = {"inputs", "simulator", "population", "smc"}
+MAY_TOUCH_PYMC = {"inputs", "simulator", "population", "kernel"}
 
 
 # PyMC's private names that are touched, each with a test of what it is used for.

@@ -355,7 +355,8 @@ def test_first_order_without_a_design(name: str) -> None:
     b = first.thetas(first.refit(sets)[0]) - first.theta
     for i in range(2):
         assert np.corrcoef(a[:, i], b[:, i])[0, 1] > 0.9
-        np.testing.assert_allclose(b[:, i].std(), a[:, i].std(), rtol=0.25)
+        # A linear model of distribution functions knows the spread of other data to 30%, one of densities to 10%.
+        np.testing.assert_allclose(b[:, i].std(), a[:, i].std(), rtol=0.35 if name == "area" else 0.15)
 
 
 def test_blocks_of_data_sets_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,414 @@
+"""The adjustment of draws: what it maps exactly, what it leaves alone, and whether the widths are right."""
+
+import logging
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+from scipy.special import digamma
+from scipy.stats import gamma, norm
+
+import prbayes as prb
+from prbayes._arrays import Floats
+from prbayes.adjust import inapplicable, moved
+from prbayes.information import prior_scale
+from prbayes.population import Evaluator
+from prbayes.refit import Neighbourhood
+
+OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
+N = OBSERVED.size
+METRICS = {
+    "ll": prb.LogLikelihood(),
+    "kl": prb.KullbackLeibler(),
+    "pr": prb.ProbabilityResidual(),
+    "area": prb.AreaMetric(),
+}
+R256 = prb.Reweighted(256)
+
+
+def same(x: Any) -> Any:
+    return x
+
+
+def build(metric: prb.Metric, observed: Floats = OBSERVED, sd: float | None = None, **keywords: Any) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1) if sd is None else sd)
+        prb.Simulator("y", same, x, metric=metric, observed=observed, **({"propagation": R256} | keywords))
+    return model
+
+
+def sample(model: pm.Model, draws: int = 300, **keywords: Any) -> xr.DataTree:
+    keywords = {"chains": 2, "random_seed": 1, "progressbar": False} | keywords
+    return prb.sample_smc(draws, model=model, **keywords)
+
+
+@cache
+def fit(name: str, n: int = N) -> prb.Optimum:
+    return prb.minimize(build(METRICS[name], OBSERVED[:n]), method="Nelder-Mead")
+
+
+@cache
+def adjusted(name: str, n: int = N) -> xr.DataTree:
+    return sample(fit(name, n).model, optimum=fit(name, n), adjust=prb.Affine(n_sets=1000))
+
+
+def thetas(idata: xr.DataTree) -> Floats:
+    return np.asarray(idata.calibration["theta"]).reshape(-1, idata.calibration.sizes["element"])
+
+
+# -- the map ---------------------------------------------------------------------------------------------
+
+
+@cache
+def blind_hood() -> Neighbourhood:
+    """Two hyperparameters that the data see and one that they do not, with unlike units."""
+    with pm.Model() as model:
+        pm.Normal("idle", 5, 30)
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
+    evaluator = Evaluator(model)
+    theta = evaluator.unconstrained({"mu": 1.0, "sigma": 0.5, "idle": 5.0})
+    return Neighbourhood.of(evaluator, theta, evaluator.epsilon, prior_scale(evaluator))
+
+
+def test_mean_and_covariance_are_hit_exactly() -> None:
+    hood = blind_hood()
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(3, 3))
+    draws = hood.theta + rng.standard_normal((500, 3)) @ root.T * np.array([30.0, 0.1, 0.2])
+    x, rest = hood.coordinates(draws)
+    assert x.shape == (500, 2)
+    mean, covariance = np.array([0.3, -0.7]), np.array([[2.0, 0.9], [0.9, 0.7]])
+    out = moved(hood, x, rest, mean, covariance)
+    new_x, new_rest = hood.coordinates(out)
+    np.testing.assert_allclose(new_x.mean(axis=0), mean, atol=1e-10)
+    np.testing.assert_allclose(np.cov(new_x, rowvar=False), covariance, rtol=1e-9)
+
+    # What the data do not see has the same distribution given the rest: slopes and residuals of the regression.
+    def regression(x: Floats, rest: Floats) -> tuple[Floats, Floats]:
+        design = np.column_stack([np.ones(len(x)), x])
+        slopes = np.linalg.lstsq(design, rest, rcond=None)[0]
+        return slopes, rest - design @ slopes
+
+    before, after = regression(x, rest), regression(new_x, new_rest)
+    assert np.abs(before[0][1:]).max() > 1  # there is something to follow
+    for b, a in zip(before, after, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-8)
+
+
+def test_the_least_motion_among_all_maps() -> None:
+    # The map between normals is symmetric in these coordinates: draws that are there already stay.
+    hood = blind_hood()
+    draws = hood.thetas(np.random.default_rng(3).standard_normal((200, 2)) @ np.array([[1.0, 0.4], [0.0, 0.8]]))
+    x, rest = hood.coordinates(draws)
+    np.testing.assert_allclose(moved(hood, x, rest, x.mean(axis=0), np.cov(x, rowvar=False)), draws, atol=1e-9)
+    # And uncorrelated ones only stretch: no rotation, no reflection.
+    x -= x.mean(axis=0)
+    x = np.linalg.solve(np.linalg.cholesky(np.cov(x, rowvar=False)), x.T).T
+    new, _ = hood.coordinates(moved(hood, x, rest, np.zeros(2), np.diag([4.0, 0.25])))
+    np.testing.assert_allclose(new, x * [2.0, 0.5], atol=1e-9)
+
+
+def test_draws_get_the_moments_that_the_target_says() -> None:
+    optimum, idata = fit("kl"), adjusted("kl")
+    evaluator = optimum.evaluator
+    epsilon = idata.calibration["epsilon"].values
+    hood = Neighbourhood.of(evaluator, optimum.theta, epsilon, prior_scale(evaluator))
+    prb.set_epsilon(optimum.model, {"y": epsilon[0]})
+    mean, covariance = prb.Affine(n_sets=1000).target(hood)
+    x, _ = hood.coordinates(thetas(idata))
+    np.testing.assert_allclose(x.mean(axis=0), mean, atol=1e-6)
+    np.testing.assert_allclose(np.cov(x, rowvar=False), covariance, atol=1e-6)
+
+
+def test_the_target_combines_data_and_prior() -> None:
+    # Two observations and a narrow prior, both known: a normal mean, whose estimator is about the sample's.
+    data, prior_sd = np.array([2.5, 3.5]), 0.4
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 2.0, prior_sd), 0.5)
+        prb.Simulator("y", same, x, metric=METRICS["ll"], observed=data, propagation=R256)
+    idata = sample(model, adjust=prb.Affine(n_sets=1000))
+    information, precision = 2 / 0.25, 1 / prior_sd**2
+    # Variances of 1000 data sets and of 1024 prior draws have relative standard errors of 4.5%.
+    np.testing.assert_allclose(idata.posterior["mu"].std(), (information + precision) ** -0.5, rtol=0.1)
+    expected = (information * 3.0 + precision * 2.0) / (information + precision)
+    assert abs(float(idata.posterior["mu"].mean()) - expected) < 0.05
+
+
+# -- widths and centres ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", list(METRICS))
+def test_widths_are_those_of_the_bootstrap_with_the_prior(name: str) -> None:
+    idata = adjusted(name)
+    # Another seed: two sets of 1000 data sets, each with a standard error of 2.2%, and 600 draws matched exactly.
+    sampling = prb.bootstrap(fit(name), 1000, parametric=True, random_seed=7).posterior
+    for variable, log, prior in (("mu", False, 2.0), ("sigma", True, 1.11)):  # sd of the log of a half-normal
+        minimisers, draws = (np.log(d[variable]) if log else d[variable] for d in (sampling, idata.posterior))
+        expected = (1 / float(minimisers.var()) + 1 / prior**2) ** -0.5
+        np.testing.assert_allclose(float(draws.std()), expected, rtol=4 * 0.032)
+        # The pseudo-posterior was not there before, or else this says nothing; the log-likelihood's is close.
+        before = idata.unadjusted[variable]
+        if name != "ll":
+            assert abs(float((np.log(before) if log else before).std()) / expected - 1) > 0.1
+
+
+@pytest.mark.parametrize("name", ["ll", "kl"])
+def test_efficient_estimators_give_the_posterior_of_normal_data(name: str) -> None:
+    idata = sample(build(METRICS[name], sd=0.5), adjust=prb.Affine(n_sets=1000))
+    precision = 1 / 4 + N / 0.25
+    np.testing.assert_allclose(idata.posterior["mu"].std(), precision**-0.5, rtol=4 * 0.022 + 0.03)
+    assert abs(float(idata.posterior["mu"].mean()) - N * OBSERVED.mean() / 0.25 / precision) < 0.3 * precision**-0.5
+
+
+@pytest.mark.parametrize("name", list(METRICS))
+def test_the_bias_is_taken_away(name: str) -> None:
+    # Twenty observations spread less around their own centre than around the truth: log sigma is underestimated by
+    # about (psi(19/2) - log 10) / 2 = -0.05 by all of these metrics, and the posterior has to lie above the optimum.
+    optimum, idata = fit(name, 20), adjusted(name, 20)
+    sampling = np.log(prb.bootstrap(optimum, 1000, parametric=True, random_seed=7).posterior["sigma"])
+    at = float(np.log(optimum.point["sigma"]))
+    bias, error = float(sampling.mean()) - at, float(sampling.std()) / 1000**0.5
+    assert -0.12 < bias < -0.02
+    if name in ("ll", "kl"):
+        assert abs(bias - (digamma(9.5) - np.log(10)) / 2) < 0.05
+    found = float(np.log(idata.posterior["sigma"]).mean())
+    # The prior of log sigma, mean -0.64 and sd 1.11, pulls by a fiftieth of the way.
+    share = float(sampling.var()) / (float(sampling.var()) + 1.11**2)
+    expected = (1 - share) * (at - bias) + share * -0.64
+    assert abs(found - expected) < 4 * 2**0.5 * error
+    assert found > at + 0.02
+
+
+# -- what the response does not depend on ----------------------------------------------------------------
+
+LEVELS = [0.05, 0.25, 0.5, 0.75, 0.95]
+
+
+def assert_quantiles(draws: Any, distribution: Any, size: int) -> None:
+    # Standard errors of quantile levels sqrt(p q / n), n about half of the draws for the kernel's correlation.
+    levels = distribution.cdf(np.quantile(draws, LEVELS))
+    error = np.sqrt(np.array(LEVELS) * (1 - np.array(LEVELS)) / (size / 2))
+    assert (np.abs(levels - LEVELS) < 4 * error).all()
+
+
+@pytest.mark.parametrize("name", ["kl", "area"])
+def test_hyperparameters_absent_from_the_response_keep_their_prior(name: str) -> None:
+    with pm.Model() as model:
+        pm.Normal("idle", 3, 20)
+        pm.Gamma("rate", 2, 1)
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", same, x, metric=METRICS[name], observed=OBSERVED, propagation=R256)
+    idata = sample(model, 500)
+    assert idata.posterior.attrs["adjustment"].startswith("Affine")
+    assert_quantiles(idata.posterior["idle"], norm(3, 20), 1000)
+    assert_quantiles(idata.posterior["rate"], gamma(2), 1000)
+    # While the others were adjusted.
+    assert not np.allclose(idata.posterior["mu"], idata.unadjusted["mu"])
+
+
+def test_hyperparameters_that_follow_others_in_the_prior_still_do() -> None:
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, 2)
+        pm.Normal("follower", 3 * mu, 0.5)
+        prb.Simulator("y", same, pm.Normal.dist(mu, 0.5), metric=METRICS["area"], observed=OBSERVED, propagation=R256)
+    idata = sample(model, 500)
+    posterior = idata.posterior
+    residual = (posterior["follower"] - 3 * posterior["mu"]).values.ravel()
+    assert_quantiles(residual, norm(0, 0.5), 1000)
+    assert abs(np.corrcoef(residual, posterior["mu"].values.ravel())[0, 1]) < 4 / 500**0.5
+    assert not np.allclose(posterior["mu"], idata.unadjusted["mu"])
+    # Its own regression: had the draws moved alone, residuals would be off by three times the motion of mu.
+    motion = 3 * (posterior["mu"] - idata.unadjusted["mu"]).values.ravel()
+    assert motion.std() > 0.01
+
+
+# -- when there is an adjustment -------------------------------------------------------------------------
+
+
+def adjustment(idata: xr.DataTree) -> str:
+    assert ("unadjusted" in idata.children) == idata.posterior.attrs["adjustment"].startswith("Affine")
+    return str(idata.posterior.attrs["adjustment"])
+
+
+def test_a_given_epsilon_is_taken_at_its_word() -> None:
+    optimum = prb.minimize(build(METRICS["kl"], sd=0.5))
+    short = {"draws": 60, "optimum": optimum}
+    assert adjustment(sample(optimum.model, **short)) == "Affine(n_sets=200, seed=0)"  # 1/N, which nobody gave
+    assert adjustment(sample(optimum.model, epsilon=0.01, **short)) == "none"
+    assert adjustment(sample(optimum.model, epsilon=0.01, adjust=prb.Affine(50, 3), **short)) == "Affine(n_sets=50, seed=3)"
+    assert adjustment(sample(optimum.model, adjust=False, **short)) == "none"
+    prb.set_epsilon(optimum.model, {"y": 0.05})
+    assert adjustment(sample(optimum.model, **short)) == "none"
+    assert adjustment(sample(build(METRICS["kl"], sd=0.5, epsilon=0.05), 60)) == "none"
+
+
+def test_an_explicit_adjustment_forgets_the_epsilon() -> None:
+    # From draws far too wide and far too narrow: the same width.
+    optimum = prb.minimize(build(METRICS["kl"], sd=0.5))
+    runs = [sample(optimum.model, optimum=optimum, epsilon=e, adjust=prb.Affine()) for e in (0.2 / N, 5 / N)]
+    widths = [float(r.posterior["mu"].std()) for r in runs]
+    np.testing.assert_allclose(widths[0], widths[1], rtol=0.01)
+    before = [float(r.unadjusted["mu"].std()) for r in runs]
+    assert before[1] > 3 * before[0]
+    assert before[0] < 0.7 * widths[0] < widths[0] < before[1]
+    means = [float(r.posterior["mu"].mean()) for r in runs]
+    assert abs(means[0] - means[1]) < 0.02 * widths[0]
+
+
+def test_one_given_epsilon_of_two_is_a_given_epsilon() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
+        for name, epsilon in (("a", None), ("b", 0.05)):
+            prb.Simulator(name, same, x, metric=METRICS["kl"], observed=OBSERVED, epsilon=epsilon, propagation=R256)
+    assert adjustment(sample(model, 60)) == "none"
+
+
+def test_the_unadjusted_draws_are_those_of_no_adjustment() -> None:
+    idata = adjusted("pr")
+    plain = sample(fit("pr").model, optimum=fit("pr"), adjust=False)
+    assert adjustment(plain) == "none"
+    xr.testing.assert_equal(idata.unadjusted.to_dataset(), plain.posterior.to_dataset())
+    assert set(idata.unadjusted.data_vars) == set(idata.posterior.data_vars)
+    # Discrepancies are those of the draws that are reported.
+    evaluator = Evaluator(fit("pr").model)
+    np.testing.assert_allclose(
+        idata.calibration["discrepancy"].values.ravel(), evaluator(thetas(idata)).discrepancies[:, 0]
+    )
+    assert (idata.calibration["discrepancy"].values != plain.calibration["discrepancy"].values).all()
+    # Deterministic for a seed.
+    again = sample(fit("pr").model, optimum=fit("pr"), adjust=prb.Affine(n_sets=1000))
+    xr.testing.assert_equal(again.posterior.to_dataset(), idata.posterior.to_dataset())
+
+
+def test_discrepancies_that_would_cost_responses_are_left_out() -> None:
+    model = build(METRICS["kl"], sd=0.5, propagation=prb.Resimulated(64))
+    idata = sample(model, 60)
+    assert adjustment(idata).startswith("Affine")
+    assert np.isnan(idata.calibration["discrepancy"]).all()
+    assert np.isfinite(sample(model, 60, adjust=False).calibration["discrepancy"]).all()
+
+
+def with_another_term(kind: str) -> pm.Model:
+    model = build(METRICS["kl"], sd=0.5)
+    with model:
+        if kind == "likelihood":
+            pm.Normal("z", model["mu"], 0.5, observed=OBSERVED)
+        else:
+            pm.Potential("z", -(model["mu"] ** 2))
+    return model
+
+
+OWN = prb.FunctionMetric(lambda z, y, w: np.abs((z * w).sum(axis=-1) - y.mean()), weighted=True)
+NONE = {
+    "likelihood": (lambda: with_another_term("likelihood"), "likelihood terms or potentials besides"),
+    "potential": (lambda: with_another_term("potential"), "likelihood terms or potentials besides"),
+    "function": (lambda: build(OWN, sd=0.5, epsilon=0.1), "y has a FunctionMetric"),
+    "fresh": (lambda: build(METRICS["kl"], sd=0.5, propagation=prb.Fresh(64)), "y has prb.Fresh"),
+}
+
+
+@pytest.mark.parametrize("case", list(NONE))
+def test_what_cannot_be_adjusted_says_so(case: str, caplog: pytest.LogCaptureFixture) -> None:
+    make, words = NONE[case]
+    model = make()
+    assert words in inapplicable(Evaluator(model))
+    # A FunctionMetric's epsilon has to be given: only an explicit Affine would adjust it.
+    with caplog.at_level(logging.WARNING, logger="prbayes"):
+        idata = sample(model, 60, chains=1, adjust=prb.Affine() if case == "function" else True)
+    note = adjustment(idata)
+    assert note.startswith("none: ")
+    assert words in note
+    assert f"the draws are not adjusted: {note.removeprefix('none: ')}; their width is epsilon's" in caplog.text
+    if case == "function":
+        return
+    caplog.clear()
+    sample(model, 60, chains=1, adjust=False)
+    assert "not adjusted" not in caplog.text  # nobody asked
+
+
+def test_too_few_draws_are_left_alone_and_it_is_said(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING, logger="prbayes"):
+        idata = sample(build(METRICS["kl"], sd=0.5), 20)
+    assert adjustment(idata).startswith("none: ")
+    assert "not adjusted" in caplog.text
+
+
+def test_data_that_tell_nothing_leave_the_prior() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1.0, 0.01), 0.5)
+        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED[:5], propagation=R256)
+    idata = sample(model, 100)
+    assert adjustment(idata) == "none: the data tell less than the prior about every hyperparameter"
+    np.testing.assert_allclose(idata.posterior["mu"].std(), 0.01, rtol=4 / (2 * 200) ** 0.5)
+
+
+# -- specimens -------------------------------------------------------------------------------------------
+
+
+def two_responses(metric: prb.Metric, *, labels: bool, same_input: bool = True) -> pm.Model:
+    """Lengths and lengths to the power of three of the same specimens: what one tells, the other does, too."""
+    data = np.random.default_rng(6).normal(2.0, 0.25, 40)
+    keywords: dict[str, Any] = {"specimens": [f"s{i}" for i in range(40)]} if labels else {}
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 2, 1)
+        x, z = pm.Normal.dist(mu, 0.25), pm.Normal.dist(mu, 0.25)
+        keywords |= {"metric": metric, "propagation": R256}
+        prb.Simulator("length", same, x, observed=data, **keywords)
+        prb.Simulator("volume", lambda x: 2 * x, x if same_input else z, observed=2 * data, **keywords)
+    return model
+
+
+@pytest.mark.parametrize("name", list(METRICS))
+def test_shared_specimens_do_not_count_twice(name: str) -> None:
+    stderr, widths, bootstrapped = [], [], []
+    for labels in (True, False):
+        optimum = prb.minimize(two_responses(METRICS[name], labels=labels), method="Nelder-Mead")
+        stderr.append(optimum.stderr["mu"])
+        idata = sample(optimum.model, optimum=optimum)
+        assert adjustment(idata).startswith("Affine")
+        widths.append(float(idata.posterior["mu"].std()))
+        bootstrapped.append(float(prb.bootstrap(optimum, 400).posterior["mu"].std()))
+    # Standard deviations of 200 data sets, twice: 5% each, 7% the ratio; of 400: 5%.
+    np.testing.assert_allclose(stderr[0] / stderr[1], 2**0.5, rtol=3 * 0.07)
+    np.testing.assert_allclose(widths[0] / widths[1], 2**0.5, rtol=3 * 0.07)
+    np.testing.assert_allclose(bootstrapped[0] / bootstrapped[1], 2**0.5, rtol=3 * 0.05)
+    # Labelled, both responses tell as much as one: the sd of a mean of 40.
+    if name in ("ll", "kl"):
+        np.testing.assert_allclose(widths[0], 0.25 / 40**0.5, rtol=3 * 0.05)
+
+
+def test_labels_of_different_inputs_are_refused_by_name() -> None:
+    model = two_responses(METRICS["kl"], labels=True, same_input=False)
+    words = r"same labels in length, volume with different inputs.*the same \.dist\(\) objects"
+    for call in (
+        lambda: prb.minimize(model),
+        lambda: sample(model, 60),
+        lambda: prb.simulation_based_calibration(2, model=model, progressbar=False),
+    ):
+        with pytest.raises((ValueError, RuntimeError), match=words):
+            call()
+    assert prb.minimize(two_responses(METRICS["kl"], labels=False, same_input=False)).converged
+
+
+# -- saving ----------------------------------------------------------------------------------------------
+
+
+def test_results_can_be_saved(tmp_path: Path) -> None:
+    results = {
+        "smc": adjusted("kl"),
+        "bootstrap": prb.bootstrap(fit("kl"), 10),
+        "optimum": fit("kl").to_datatree(),
+    }
+    for name, tree in results.items():
+        tree.to_netcdf(tmp_path / f"{name}.nc", engine="h5netcdf")
+        with xr.open_datatree(tmp_path / f"{name}.nc", engine="h5netcdf") as again:
+            assert set(again.children) == set(tree.children)
+            for group in tree.children:
+                xr.testing.assert_equal(again[group].to_dataset(), tree[group].to_dataset())
+                assert again[group].attrs.keys() == tree[group].attrs.keys()
+    assert "unadjusted" in results["smc"].children

@@ -1,0 +1,264 @@
+"""Mirror solutions, blind directions, and what is said about them."""
+
+import logging
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+
+import prbayes as prb
+from prbayes.information import Local
+from prbayes.modes import blind_directions, rivals
+from prbayes.population import Evaluator
+
+DATA = (np.random.default_rng(3).normal(2.0, 0.5, 40) - 1) ** 2
+OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
+METRICS = {
+    "ll": prb.LogLikelihood(),
+    "kl": prb.KullbackLeibler(),
+    "pr": prb.ProbabilityResidual(),
+    "area": prb.AreaMetric(),
+}
+R256 = prb.Reweighted(256)
+
+
+def parabola(x: Any) -> Any:
+    return x**2 - 2 * x + 1
+
+
+def same(x: Any) -> Any:
+    return x
+
+
+def mirrored(metric: prb.Metric, **keywords: Any) -> pm.Model:
+    """Symmetric about mu = 1, the prior too: the data cannot tell one side from the other."""
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1.5), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", parabola, x, metric=metric, observed=DATA, **({"propagation": R256} | keywords))
+    return model
+
+
+@cache
+def fit(name: str) -> prb.Optimum:
+    return prb.minimize(mirrored(METRICS[name]))
+
+
+@cache
+def posterior(name: str) -> xr.DataTree:
+    return prb.sample_smc(500, chains=2, optimum=fit(name), model=fit(name).model, random_seed=1, progressbar=False)
+
+
+# -- mirror solutions ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["ll", "pr", "area"])
+def test_both_optima_are_found(name: str) -> None:
+    optimum = fit(name)
+    comparable = [r for r in optimum.rivals if r["comparable"]]
+    assert len(comparable) == 1
+    (rival,) = comparable
+    # The design is not quite symmetric: a tenth of a standard error.
+    assert abs(optimum.point["mu"] + rival["point"]["mu"] - 2) < optimum.stderr["mu"]
+    assert abs(abs(optimum.point["mu"] - 1) - 1) < 4 * optimum.stderr["mu"]
+    assert abs(np.log(optimum.point["sigma"] / rival["point"]["sigma"])) < 0.1
+    np.testing.assert_allclose(rival["discrepancy"], optimum.discrepancy, rtol=0.05)
+    evaluator = Evaluator(optimum.model)
+    assert evaluator(rival["theta"][None]).discrepancies[0, 0] == pytest.approx(rival["discrepancy"])
+    (line,) = optimum.warnings
+    assert "the data could as well come from mu = " in line
+    assert f"{rival['point']['mu']:.3f}"[:4] in line
+
+
+def test_rivals_are_minima() -> None:
+    optimum = fit("pr")
+    evaluator = Evaluator(optimum.model)
+    for theta in (optimum.theta, *(r["theta"] for r in optimum.rivals)):
+        around = theta + 0.05 * np.vstack([np.eye(2), -np.eye(2)])
+        assert (evaluator(around).discrepancies > evaluator(theta[None]).discrepancies).all()
+    values = [r["discrepancy"] for r in optimum.rivals]
+    assert values == sorted(values)
+
+
+def test_warnings_are_logged(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING, logger="prbayes"):
+        optimum = prb.minimize(mirrored(METRICS["pr"]))
+    assert [r.message for r in caplog.records] == list(optimum.warnings)
+    assert len(optimum.warnings) == 1
+
+
+def test_starts() -> None:
+    none = prb.minimize(mirrored(METRICS["pr"]), starts=0)
+    assert none.rivals == none.warnings == ()
+    np.testing.assert_allclose(none.theta, fit("pr").theta)
+    # Each theta costs responses: looked for only if asked.
+    propagation = prb.Resimulated(128)
+    assert prb.minimize(mirrored(METRICS["pr"], propagation=propagation)).rivals == ()
+    asked = prb.minimize(mirrored(METRICS["pr"], propagation=propagation), starts=8)
+    assert any(r["comparable"] for r in asked.rivals)
+    assert asked.n_responses > 8 * 128
+
+
+def test_a_prior_that_excludes_one_leaves_one() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.LogNormal("excess", 0, 0.5) + 1, pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", parabola, x, metric=METRICS["pr"], observed=DATA, propagation=R256)
+    optimum = prb.minimize(model)
+    assert not [r for r in optimum.rivals if r["comparable"]]
+    assert optimum.warnings == ()
+    assert abs(optimum.point["excess"] - 1) < 4 * optimum.stderr["excess"]
+
+
+def test_a_worse_optimum_is_left_for_the_better_one() -> None:
+    # Responses 1 apart from the data on one side and right on the other.
+    def lopsided(x: Any) -> Any:
+        return np.where(x > 0, x, -x + 2.0 * np.tanh(-x))
+
+    def model() -> pm.Model:
+        with pm.Model() as made:
+            x = pm.Normal.dist(pm.Normal("mu", 0, 3), 0.3)
+            data = np.random.default_rng(5).normal(4.0, 0.3, 60)
+            prb.Simulator("y", lopsided, x, metric=METRICS["ll"], observed=data, propagation=prb.Reweighted(512))
+        return made
+
+    with pm.Model() as rough:  # a wider population on the wrong side
+        z = pm.Normal.dist(pm.Normal("mu", 0, 3), 0.3)
+        data = np.random.default_rng(5).normal(4.0, 0.3, 60)
+        wrong = lambda x: np.where(x > 0, x, 4.0 + 3 * (-x - 2))  # noqa: E731 (three times too wide where x < 0)
+        prb.Simulator("y", wrong, z, metric=METRICS["ll"], observed=data, propagation=prb.Reweighted(512))
+    stuck = prb.minimize(rough, start={"mu": -2.0}, starts=0)
+    assert abs(stuck.point["mu"] + 2) < 0.2
+    found = prb.minimize(rough, start={"mu": -2.0})
+    assert abs(found.point["mu"] - 4) < 0.2
+    assert found.discrepancy < stuck.discrepancy - 0.1
+    # What was the first one is now among the others, and said to be worse.
+    (other,) = found.rivals
+    assert abs(other["point"]["mu"] + 2) < 0.2
+    assert not other["comparable"]
+    assert found.warnings == ()
+    assert all(not r["comparable"] or r["point"]["mu"] < 0 for r in prb.minimize(model()).rivals)
+
+
+@pytest.mark.parametrize("name", list(METRICS))
+def test_a_linear_problem_has_no_rivals(name: str) -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", lambda x: 3 * x + 1, x, metric=METRICS[name], observed=3 * OBSERVED + 1, propagation=R256)
+    optimum = prb.minimize(model)
+    assert optimum.rivals == ()
+    assert optimum.warnings == ()
+
+
+def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
+    optimum = fit("pr")
+    evaluator = Evaluator(optimum.model)
+    local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), np.eye(2))
+    arguments = (evaluator, optimum.theta, np.ones(1), local)
+    assert rivals(*arguments, 1e-3, starts=16, seed=0)
+    assert rivals(*arguments, 1e3, starts=16, seed=0) == []
+
+
+# -- the posterior of two modes --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["ll", "pr", "area"])
+def test_each_mode_is_adjusted_by_itself(name: str) -> None:
+    optimum, idata = fit(name), posterior(name)
+    assert idata.posterior.attrs["adjustment"] == "Affine(n_sets=200, seed=0), 2 modes each by itself"
+    mu, before = idata.posterior["mu"].values.ravel(), idata.unadjusted["mu"].values.ravel()
+    # No draw changes sides; 1000 of them keep the shares to 1.6%, and resampling adds drift.
+    np.testing.assert_array_equal(mu > 1, before > 1)
+    assert 0.3 < (mu > 1).mean() < 0.7
+    for side in (mu > 1, mu < 1):
+        # The sd of each mode is that of the estimator, not of the distance between modes; linear theory is 15% off.
+        np.testing.assert_allclose(mu[side].std(), optimum.stderr["mu"], rtol=0.25)
+        assert abs(abs(mu[side].mean() - 1) - 1) < 4 * optimum.stderr["mu"]
+
+
+def test_modes_that_run_into_each_other_are_left_alone(caplog: pytest.LogCaptureFixture) -> None:
+    # An epsilon so large that the ridge between the modes is full of draws.
+    with caplog.at_level(logging.WARNING, logger="prbayes"):
+        idata = prb.sample_smc(
+            200, chains=1, model=fit("pr").model, optimum=fit("pr"), epsilon=1.0, adjust=prb.Affine(), random_seed=1,
+            progressbar=False,
+        )  # fmt: skip
+    assert idata.posterior.attrs["adjustment"] == "none: the posterior has modes that run into each other"
+    assert "unadjusted" not in idata.children
+    assert "modes that run into each other; their width is epsilon's" in caplog.text
+
+
+# -- blind directions ------------------------------------------------------------------------------------
+
+
+def local(blind: Any) -> Local:
+    basis = np.linalg.qr(np.array(blind, dtype=float).T)[0]
+    d, k = basis.shape
+    return Local(np.ones(d), np.zeros((d, d - k)), basis, np.eye(d - k))
+
+
+@pytest.mark.parametrize(
+    ("blind", "lines"),
+    [
+        ([[0, 1, 0]], ["b"]),
+        ([[1, -1, 0]], ["a - b"]),
+        ([[1, 1, 0]], ["a + b"]),
+        ([[1, -0.5, 0.05]], ["a - 0.5 b"]),  # the smallest is not mentioned
+        ([[0.2, 0, -1]], ["c - 0.2 a"]),  # the largest comes first, with a plus
+        ([[1, 1, 1], [1, 1, -1]], ["c", "a + b"]),  # rotated so that c stands alone
+        ([[1, 0, 0], [0, 1, 0], [0, 0, 1]], ["a", "b", "c"]),
+    ],
+)
+def test_directions_have_names(blind: Any, lines: list[str]) -> None:
+    assert [sorted_signs(d) for d in blind_directions(local(blind), ["a", "b", "c"])] == lines
+
+
+def sorted_signs(line: str) -> str:
+    # Where two are equally large, rounding decides which comes first.
+    return {"b - a": "a - b", "b + a": "a + b"}.get(line, line)
+
+
+def test_nothing_is_blind() -> None:
+    assert blind_directions(Local(np.ones(2), np.eye(2), np.zeros((2, 0)), np.eye(2)), ["a", "b"]) == []
+
+
+@pytest.mark.parametrize("name", ["ll", "pr", "area"])
+def test_a_sum_hides_a_difference(name: str) -> None:
+    # Both priors have the same spread, hence coefficients of one in its units; the response weighs b twice.
+    with pm.Model() as model:
+        a, b = pm.Normal("a", 0, 1), pm.Normal("b", 0, 1, shape=1)
+        x, z = pm.Normal.dist(a, 0.5), pm.Normal.dist(b[0], 0.5)
+        prb.Simulator(
+            "y", lambda x, z: x + 2 * z, x, z, metric=METRICS[name], observed=3 * OBSERVED,
+            propagation=prb.Resimulated(256),
+        )  # fmt: skip
+    optimum = prb.minimize(model, method="Nelder-Mead" if name == "area" else None)
+    (line,) = optimum.warnings
+    assert line.startswith("the data tell less than the prior about a - 0.5 b[0] (in units of the priors'")
+    assert np.isinf(optimum.stderr["a"])
+    assert np.isinf(optimum.stderr["b"]).all()
+
+
+def test_a_hyperparameter_without_effect_is_named_and_makes_no_rivals() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
+        pm.Normal("idle", 3, 2)
+        prb.Simulator("y", same, x, metric=METRICS["pr"], observed=OBSERVED, propagation=R256)
+    optimum = prb.minimize(model)
+    assert optimum.rivals == ()
+    (line,) = optimum.warnings
+    assert "about idle (" in line
+    assert line.endswith("it is not identified, and its posterior is its prior")
+
+
+def test_rivals_stand_where_the_optimum_does_along_blind_directions() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1.5), 0.5)
+        pm.Normal("idle", 3, 2)
+        prb.Simulator("y", parabola, x, metric=METRICS["pr"], observed=DATA, propagation=R256)
+    optimum = prb.minimize(model)
+    comparable = [r for r in optimum.rivals if r["comparable"]]
+    assert len(comparable) == 1
+    assert comparable[0]["point"]["idle"] == pytest.approx(optimum.point["idle"], abs=1e-6)
+    assert len(optimum.warnings) == 2
