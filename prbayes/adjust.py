@@ -105,6 +105,8 @@ class Affine:
                 x, rest = hood.coordinates(flat[mine])
                 out[mine] = moved(hood, x, rest, *self.target(hood))
                 count += 1
+        if not count:
+            return thetas, f"none: there are fewer than {_FEWEST} draws of a mode"
         modes = "" if len(hoods) == 1 else f", {count} modes each by itself"
         return out.reshape(thetas.shape), f"{self!r}{modes}"
 

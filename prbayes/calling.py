@@ -6,12 +6,13 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 from rich.errors import LiveError
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -175,7 +176,8 @@ class Caller:
         self, arguments: Sequence[Any], varying: Sequence[bool], missing: Any, tolerant: bool
     ) -> Iterator[tuple[Any, Floats, dict[int, str]]]:
         """Yield rows, their responses (NaN if they raised) and messages by position, as they are computed."""
-        payload = b"" if self.executor is None else _packed(self.function)
+        here = self.executor is None or isinstance(self.executor, ThreadPoolExecutor)
+        work = partial(_compute, self.function) if here else partial(_remote, _packed(self.function))
         begun: dict[Future[Any], Any] = {}
         at = 0
         with _progress(self.name, missing.size) as report:
@@ -187,7 +189,7 @@ class Caller:
                     if self.executor is None:
                         yield self._take(rows, self._here(part, varying, tolerant), report)
                     else:
-                        begun[self.executor.submit(_remote, payload, part, list(varying), tolerant)] = rows
+                        begun[self.executor.submit(work, part, list(varying), tolerant)] = rows
                 for future in wait(begun, return_when=FIRST_COMPLETED).done if begun else ():
                     rows = begun.pop(future)
                     try:
@@ -314,7 +316,7 @@ def _progress(name: str, total: int) -> Iterator[Callable[[int, float], None]]:
         TextColumn("{task.fields[rate]}"),
         TimeRemainingColumn(),
     )
-    bar = Progress(*columns)
+    bar = Progress(*columns, console=Console(stderr=True))
     task = bar.add_task("", total=total, rate="")
     started = False
 

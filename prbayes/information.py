@@ -23,6 +23,7 @@ _WIDE_STEP = 0.05  # where a distribution function of simulated values, a step f
 _KNOTS = 400  # on which distribution functions are linearised
 _IRLS = 30
 _LOADING = 0.02  # share of a hyperparameter in unseen directions above which it is not identified
+_ROUNDING = 0.01  # curvature, in units of the gradient's variance over the curvature, that is a rounding error
 _POINTS = 1000  # single observations over which the covariance of an additive gradient is taken
 
 
@@ -305,4 +306,6 @@ def seen_by_curvature(hessian: Floats, noise: Floats) -> tuple[Floats, Floats, N
     """
     values, vectors = np.linalg.eigh((hessian + hessian.T) / 2)
     along = np.einsum("ik,ij,jk->k", vectors, noise, vectors)
-    return values, vectors, (values > 0) & (along < values**2)
+    # Where the data see nothing both are rounding errors, and small against their ratio elsewhere.
+    floor = max(0.0, _ROUNDING * float(np.trace(noise) / np.trace(hessian)))
+    return values, vectors, (values > floor) & (along < values**2)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import xarray as xr
+from rich.console import Console
 from rich.progress import Progress
 
 from prbayes._arrays import Floats, positive_integer
@@ -103,7 +104,7 @@ def simulation_based_calibration(
             "whose data cannot be drawn; expected prb.Simulator nodes only"
         )
     jobs = [(range(i, min(i + _CHUNK, n)), draws, adjust, random_seed) for i in range(0, n, _CHUNK)]
-    with Progress(disable=not progressbar) as progress:
+    with Progress(console=Console(stderr=True), disable=not progressbar) as progress:
         task = progress.add_task("data sets", total=n)
         if executor is None:
             rows = [row for job in jobs for row in _analyse(evaluator, *job, lambda: progress.advance(task))]

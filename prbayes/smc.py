@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import xarray as xr
+from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from prbayes._arrays import Floats, positive_integer, positive_number
@@ -266,7 +267,7 @@ class _Run:
         done: list[tuple[Floats, Floats]] = []
         stats: list[dict[str, list[float]]] = []
         saved = self._saved()
-        with Progress(*columns, disable=not progressbar) as progress:
+        with Progress(*columns, console=Console(stderr=True), disable=not progressbar) as progress:
             for chain, seed in enumerate(seeds):
                 task = progress.add_task("", total=1.0, chain=chain, rate=0.0)
                 kernel = BatchedKernel(

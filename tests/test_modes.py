@@ -14,7 +14,7 @@ from prbayes.information import Local
 from prbayes.modes import blind_directions, rivals
 from prbayes.population import Evaluator
 
-DATA = (np.random.default_rng(3).normal(2.0, 0.5, 40) - 1) ** 2
+DATA = (np.random.default_rng(3).normal(2.0, 0.3, 40) - 1) ** 2
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 METRICS = {
     "ll": prb.LogLikelihood(),
@@ -75,7 +75,7 @@ def test_both_optima_are_found(name: str) -> None:
 def test_rivals_are_minima() -> None:
     optimum = fit("pr")
     evaluator = Evaluator(optimum.model)
-    for theta in (optimum.theta, *(r["theta"] for r in optimum.rivals)):
+    for theta in (optimum.theta, *(r["theta"] for r in optimum.rivals if r["comparable"])):
         around = theta + 0.05 * np.vstack([np.eye(2), -np.eye(2)])
         assert (evaluator(around).discrepancies > evaluator(theta[None]).discrepancies).all()
     values = [r["discrepancy"] for r in optimum.rivals]
@@ -112,22 +112,12 @@ def test_a_prior_that_excludes_one_leaves_one() -> None:
 
 
 def test_a_worse_optimum_is_left_for_the_better_one() -> None:
-    # Responses 1 apart from the data on one side and right on the other.
-    def lopsided(x: Any) -> Any:
-        return np.where(x > 0, x, -x + 2.0 * np.tanh(-x))
-
-    def model() -> pm.Model:
-        with pm.Model() as made:
-            x = pm.Normal.dist(pm.Normal("mu", 0, 3), 0.3)
-            data = np.random.default_rng(5).normal(4.0, 0.3, 60)
-            prb.Simulator("y", lopsided, x, metric=METRICS["ll"], observed=data, propagation=prb.Reweighted(512))
-        return made
-
-    with pm.Model() as rough:  # a wider population on the wrong side
+    # Right where x > 0, and three times too wide a population where x < 0.
+    wrong = lambda x: np.where(x > 0, x, 4 - 3 * (x + 2))  # noqa: E731
+    with pm.Model() as rough:
         z = pm.Normal.dist(pm.Normal("mu", 0, 3), 0.3)
         data = np.random.default_rng(5).normal(4.0, 0.3, 60)
-        wrong = lambda x: np.where(x > 0, x, 4.0 + 3 * (-x - 2))  # noqa: E731 (three times too wide where x < 0)
-        prb.Simulator("y", wrong, z, metric=METRICS["ll"], observed=data, propagation=prb.Reweighted(512))
+        prb.Simulator("y", wrong, z, metric=METRICS["ll"], observed=data, propagation=prb.Reweighted(2048))
     stuck = prb.minimize(rough, start={"mu": -2.0}, starts=0)
     assert abs(stuck.point["mu"] + 2) < 0.2
     found = prb.minimize(rough, start={"mu": -2.0})
@@ -138,7 +128,6 @@ def test_a_worse_optimum_is_left_for_the_better_one() -> None:
     assert abs(other["point"]["mu"] + 2) < 0.2
     assert not other["comparable"]
     assert found.warnings == ()
-    assert all(not r["comparable"] or r["point"]["mu"] < 0 for r in prb.minimize(model()).rivals)
 
 
 @pytest.mark.parametrize("name", list(METRICS))
@@ -181,7 +170,7 @@ def test_modes_that_run_into_each_other_are_left_alone(caplog: pytest.LogCapture
     # An epsilon so large that the ridge between the modes is full of draws.
     with caplog.at_level(logging.WARNING, logger="prbayes"):
         idata = prb.sample_smc(
-            200, chains=1, model=fit("pr").model, optimum=fit("pr"), epsilon=1.0, adjust=prb.Affine(), random_seed=1,
+            200, chains=1, model=fit("pr").model, optimum=fit("pr"), epsilon=5.0, adjust=prb.Affine(), random_seed=1,
             progressbar=False,
         )  # fmt: skip
     assert idata.posterior.attrs["adjustment"] == "none: the posterior has modes that run into each other"
@@ -223,7 +212,7 @@ def test_nothing_is_blind() -> None:
     assert blind_directions(Local(np.ones(2), np.eye(2), np.zeros((2, 0)), np.eye(2)), ["a", "b"]) == []
 
 
-@pytest.mark.parametrize("name", ["ll", "pr", "area"])
+@pytest.mark.parametrize("name", ["ll", "kl", "pr"])
 def test_a_sum_hides_a_difference(name: str) -> None:
     # Both priors have the same spread, hence coefficients of one in its units; the response weighs b twice.
     with pm.Model() as model:
@@ -233,7 +222,7 @@ def test_a_sum_hides_a_difference(name: str) -> None:
             "y", lambda x, z: x + 2 * z, x, z, metric=METRICS[name], observed=3 * OBSERVED,
             propagation=prb.Resimulated(256),
         )  # fmt: skip
-    optimum = prb.minimize(model, method="Nelder-Mead" if name == "area" else None)
+    optimum = prb.minimize(model)
     (line,) = optimum.warnings
     assert line.startswith("the data tell less than the prior about a - 0.5 b[0] (in units of the priors'")
     assert np.isinf(optimum.stderr["a"])

@@ -1,0 +1,321 @@
+"""`bootstrap` against theory, and `simulation_based_calibration` against what it promises, wherever it runs."""
+
+import logging
+import multiprocessing
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+
+import prbayes as prb
+from prbayes import sbc
+from prbayes._arrays import Floats
+from prbayes.population import Evaluator
+from prbayes.simulator import nodes
+
+OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
+N, SD = OBSERVED.size, float(OBSERVED.std())
+METRICS = {
+    "ll": prb.LogLikelihood(),
+    "kl": prb.KullbackLeibler(),
+    "pr": prb.ProbabilityResidual(),
+    "area": prb.AreaMetric(),
+}
+R256 = prb.Reweighted(256)
+
+
+def bent(x: Any) -> Any:
+    return x + 0.1 * x**2
+
+
+def same(x: Any) -> Any:
+    return x
+
+
+def build(
+    metric: prb.Metric = METRICS["kl"], response: Callable[..., Any] = same, n: int = N, **keywords: Any
+) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
+        prb.Simulator("y", response, x, metric=metric, observed=OBSERVED[:n], **({"propagation": R256} | keywords))
+    return model
+
+
+# -- bootstrap -------------------------------------------------------------------------------------------
+
+
+@cache
+def fit(name: str, propagation: Any = R256) -> prb.Optimum:
+    return prb.minimize(build(METRICS[name], propagation=propagation), method="Nelder-Mead", starts=0)
+
+
+@pytest.mark.parametrize("name", ["ll", "kl"])
+@pytest.mark.parametrize("parametric", [False, True])
+def test_standard_deviations_of_a_normal_mean(name: str, parametric: bool) -> None:
+    result = prb.bootstrap(fit(name), 1000, parametric=parametric)
+    draws = result.posterior["mu"]
+    assert draws.shape == (1, 1000)
+    # The minimiser is about the mean: its Dirichlet weighted variance is s^2 / (N + 1), its sampling variance 0.5^2 / N
+    # with the model's sd. 1000 draws: 2.2%; the mean is not quite the minimiser, nor these data normal: 6%.
+    expected = 0.5 / N**0.5 if parametric else SD / (N + 1) ** 0.5
+    np.testing.assert_allclose(float(draws.std()), expected, rtol=4 * 0.022 + 0.06)
+    assert abs(0.5 / SD - 1) > 0.1  # the two are told apart
+    assert abs(float(draws.mean()) - fit(name).point["mu"]) < 4 * expected / 1000**0.5 + 0.05 * expected
+    assert result.posterior.attrs["converged"] == 1.0
+    assert result.posterior.attrs["sampler"].startswith("parametric" if parametric else "loss-likelihood")
+    np.testing.assert_array_equal(result.observed_data["y"], OBSERVED)
+
+
+@pytest.mark.parametrize("name", ["pr", "area"])
+def test_the_parametric_bootstrap_agrees_with_the_standard_error(name: str) -> None:
+    # One by refitting, one to first order: 2.2% and 5% of sampling error, and curvature.
+    draws = prb.bootstrap(fit(name), 1000, parametric=True, random_seed=3).posterior["mu"]
+    np.testing.assert_allclose(float(draws.std()), fit(name).stderr["mu"], rtol=0.2)
+
+
+def test_no_response_is_computed_and_nothing_is_random() -> None:
+    optimum = fit("kl")
+    before = optimum.evaluator.n_responses
+    one, two, other = (prb.bootstrap(optimum, 20, random_seed=seed).posterior for seed in (1, 1, 2))
+    assert optimum.evaluator.n_responses == before
+    xr.testing.assert_equal(one.to_dataset(), two.to_dataset())
+    assert (one["mu"].values != other["mu"].values).any()
+
+
+def test_bootstrap_without_a_design_is_of_first_order() -> None:
+    draws = prb.bootstrap(fit("kl", prb.Resimulated(256)), 500).posterior["mu"]
+    np.testing.assert_allclose(float(draws.std()), SD / (N + 1) ** 0.5, rtol=4 * 0.032 + 0.06)
+
+
+def test_what_cannot_be_bootstrapped_is_refused() -> None:
+    with pytest.raises(TypeError, match="bootstrap: got dict, expected an Optimum"):
+        prb.bootstrap({"mu": 1.0})  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="draws"):
+        prb.bootstrap(fit("kl"), 1)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
+        pm.Normal("idle", 3, 2)
+        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
+    for parametric in (False, True):
+        with pytest.raises(ValueError, match="bootstrap: the data tell less than the prior about idle, along which"):
+            prb.bootstrap(prb.minimize(model, starts=0), 10, parametric=parametric)
+    model = build(propagation=prb.Fresh(64))
+    with pytest.raises(ValueError, match=r"bootstrap: y has prb\.Fresh"):
+        prb.bootstrap(prb.minimize(model, method="Nelder-Mead", max_evaluations=5), 10)
+
+
+# -- simulation-based calibration: where it runs ---------------------------------------------------------
+
+RUN = {"n": 12, "draws": 50, "progressbar": False}  # two jobs; fifty draws, or there is no adjustment
+
+
+
+@cache
+def serial() -> tuple[pm.Model, xr.DataTree]:
+    model = build(response=bent, n=30, propagation=prb.Reweighted(64))
+    return model, prb.simulation_based_calibration(model=model, **RUN)
+
+
+@pytest.fixture(scope="module")
+def executors() -> Iterator[dict[str, Executor]]:
+    with (
+        ThreadPoolExecutor(2) as threads,
+        ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as processes,
+    ):
+        yield {"threads": threads, "processes": processes}
+
+
+@pytest.mark.parametrize("response", [bent, lambda x: x + 0.1 * x**2], ids=["module", "lambda"])
+@pytest.mark.parametrize("kind", ["threads", "processes"])
+def test_ranks_do_not_depend_on_where_they_are_found(
+    kind: str, response: Callable[..., Any], executors: dict[str, Executor]
+) -> None:
+    model = build(response=response, n=30, propagation=prb.Reweighted(64))
+    ((rv, node),) = nodes(model).items()
+    before = dict(vars(type(rv.owner.op)))
+    result = prb.simulation_based_calibration(model=model, executor=executors[kind], **RUN)
+    for group in ("prior_sbc", "truth", "posterior_sd"):
+        xr.testing.assert_equal(result[group].to_dataset(), serial()[1][group].to_dataset())
+    # The model is the one that was sent, not the one that arrived in a thread.
+    assert nodes(model)[rv] is node
+    assert all(vars(type(rv.owner.op))[name] is value for name, value in before.items())
+    prb.set_epsilon(model, {"y": 1.0})
+    assert model.compile_logp()({"mu": 0.0}) == pytest.approx(
+        -Evaluator(model)(np.zeros((1, 1))).discrepancies[0, 0] - 0.5 * np.log(2 * np.pi)
+    )
+
+
+def test_the_result_is_complete_and_the_model_as_before() -> None:
+    model, result = serial()
+    assert set(result.children) == {"prior_sbc", "truth", "posterior_sd"}
+    for group in result.children:
+        assert result[group].sizes == {"chain": 1, "draw": 12}
+        assert set(result[group].data_vars) == {"mu"}
+    ranks = result.prior_sbc["mu"].values
+    assert ((ranks > 0) & (ranks < 1)).all()
+    assert np.unique(ranks).size == 12
+    truth = result.truth["mu"].values
+    assert abs(truth.mean()) < 4 / 12**0.5
+    assert 0.3 < truth.std() < 2
+    np.testing.assert_allclose(result.posterior_sd["mu"], 0.5 / 30**0.5, rtol=0.5)
+    attrs = result.prior_sbc.attrs
+    assert (attrs["failed"], attrs["draws"], attrs["random_seed"]) == (0, 50, "0")
+    # Designs were refined for some data sets, and are as they were.
+    (node,) = nodes(model).values()
+    assert node.bound.n_points == 64
+    assert node.bound.responses.count > 64
+    assert node.epsilon_value == 1 / 30
+    np.testing.assert_array_equal(node.target.observed, OBSERVED[:30])
+
+
+def test_data_sets_do_not_depend_on_their_number() -> None:
+    model, result = serial()
+    few = prb.simulation_based_calibration(model=model, **(RUN | {"n": 3}))
+    np.testing.assert_array_equal(few.prior_sbc["mu"].values[0], result.prior_sbc["mu"].values[0, :3])
+    other = prb.simulation_based_calibration(model=model, random_seed=1, **(RUN | {"n": 2}))
+    assert not np.isin(other.truth["mu"].values, result.truth["mu"].values).any()
+
+
+def test_ranks_count_the_draws_below_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A posterior that is always the same: 0, 1, ..., 9.
+    def fixed(evaluator: Evaluator, **keywords: Any) -> xr.DataTree:
+        draws = xr.Dataset({"mu": (["chain", "draw"], np.arange(10.0)[None] / 5 - 1)})
+        return xr.DataTree.from_dict({"posterior": draws})
+
+    monkeypatch.setattr(sbc, "sample", fixed)
+    result = prb.simulation_based_calibration(20, model=build(), draws=10, progressbar=False)
+    truth, ranks = result.truth["mu"].values, result.prior_sbc["mu"].values
+    below = np.clip(np.ceil((truth + 1) * 5), 0, 10)
+    np.testing.assert_array_equal(np.floor(ranks * 11), below)
+    np.testing.assert_allclose(result.posterior_sd["mu"], np.std(np.arange(10) / 5))
+
+
+def test_it_can_be_drawn_and_saved(tmp_path: Path) -> None:
+    mpl.use("Agg")
+    import arviz as az
+    from matplotlib import pyplot as plt
+
+    result = serial()[1]
+    collection = az.plot_ecdf_pit(result)
+    line = collection.viz["ecdf_lines"]["mu"].item()
+    assert np.isfinite(line.get_ydata()).all()
+    assert len(line.get_ydata()) > 1
+    plt.close("all")
+    result.to_netcdf(tmp_path / "sbc.nc", engine="h5netcdf")
+    with xr.open_datatree(tmp_path / "sbc.nc", engine="h5netcdf") as again:
+        for group in result.children:
+            xr.testing.assert_identical(again[group].to_dataset(), result[group].to_dataset())
+
+
+# -- failures --------------------------------------------------------------------------------------------
+
+
+def breaking(x: Any) -> Any:
+    return np.where(x < -1, np.inf, x)  # hardly any specimen of a population around -2 can be observed
+
+
+def test_failures_are_counted_and_not_lost(caplog: pytest.LogCaptureFixture) -> None:
+    model = build(METRICS["area"], breaking, n=20, epsilon=0.1)
+    with caplog.at_level(logging.WARNING, logger="prbayes"):
+        result = prb.simulation_based_calibration(12, model=model, draws=20, adjust=False, progressbar=False)
+    failed = result.prior_sbc.attrs["failed"]
+    # Specimens around mu < -1.3 fail in three cases of four: 10% of the prior.
+    assert 1 <= failed <= 6
+    assert result.prior_sbc.sizes["draw"] == 12 - failed
+    assert f"{failed} of 12 data sets could not be analysed; the first: ValueError: y: got" in caplog.text
+    assert (result.truth["mu"] > -1.5).all()
+
+
+@pytest.mark.parametrize("error", [ValueError, RuntimeError, np.linalg.LinAlgError])
+def test_single_failures_leave_the_others_as_they_are(
+    error: type[Exception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original, calls = sbc._one, []
+
+    def sometimes(*arguments: Any) -> Any:
+        calls.append(1)
+        row = original(*arguments)
+        if len(calls) in (1, 4):
+            raise error("by chance")
+        return row
+
+    keywords = {"model": build(epsilon=0.02), "draws": 10, "adjust": False, "progressbar": False}
+    whole = prb.simulation_based_calibration(6, **keywords)
+    monkeypatch.setattr(sbc, "_one", sometimes)
+    result = prb.simulation_based_calibration(6, **keywords)
+    assert result.prior_sbc.attrs["failed"] == 2
+    np.testing.assert_array_equal(result.prior_sbc["mu"].values, whole.prior_sbc["mu"].values[:, [1, 2, 4, 5]])
+
+
+def test_mostly_failures_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(*_: Any) -> None:
+        raise ValueError("no luck")
+
+    model = build()
+    monkeypatch.setattr(sbc, "_one", never)
+    with pytest.raises(RuntimeError, match="4 of 4 data sets failed; first: ValueError: no luck"):
+        prb.simulation_based_calibration(4, model=model, progressbar=False)
+
+
+def test_mistakes_are_not_failures(monkeypatch: pytest.MonkeyPatch) -> None:
+    def wrong(*_: Any) -> None:
+        raise KeyError("a bug")
+
+    model = build()
+    monkeypatch.setattr(sbc, "_one", wrong)
+    with pytest.raises(KeyError, match="a bug"):
+        prb.simulation_based_calibration(4, model=model, progressbar=False)
+
+
+def test_what_cannot_be_simulated_is_refused() -> None:
+    with build() as model:
+        pm.Normal("z", model["mu"], 1.0, observed=OBSERVED)
+    with pytest.raises(ValueError, match="likelihood terms or potentials besides its simulators, whose data cannot"):
+        prb.simulation_based_calibration(2, model=model, progressbar=False)
+    with build() as model:
+        pm.Potential("z", -(model["mu"] ** 2))
+    with pytest.raises(ValueError, match="likelihood terms or potentials"):
+        prb.simulation_based_calibration(2, model=model, progressbar=False)
+    with pytest.raises(TypeError, match=r"prb\.simulation_based_calibration: got no model on the context"):
+        prb.simulation_based_calibration(2, progressbar=False)
+    for keywords, words in (({"n": 1}, "n: "), ({"draws": 5}, "draws: ")):
+        with pytest.raises(ValueError, match=words):
+            prb.simulation_based_calibration(**({"n": 2, "model": build(), "progressbar": False} | keywords))
+
+
+# -- what it is for --------------------------------------------------------------------------------------
+
+
+def spread(result: xr.DataTree) -> Floats:
+    """Mean squared distance of the ranks from a half, in standard errors from that of uniform ones, 1/12."""
+    ranks = result.prior_sbc["mu"].values.ravel()
+    return np.asarray((((ranks - 0.5) ** 2).mean() - 1 / 12) / (180 * ranks.size) ** -0.5)
+
+
+def test_overconfidence_shows() -> None:
+    # Ten times too small an epsilon: posteriors are too narrow by sqrt(10), and ranks Phi(sqrt(10) z) have a mean square
+    # of asin(10/11) / (2 pi) = 0.18, eight standard errors of 40 uniform ones above 1/12.
+    narrow = prb.simulation_based_calibration(
+        40, model=build(epsilon=0.1 / N), draws=50, adjust=False, progressbar=False
+    )
+    assert spread(narrow) > 4
+    # And ten times too large a one, ranks Phi(z / sqrt(10)): asin(1/11) / (2 pi) = 0.014.
+    wide = prb.simulation_based_calibration(40, model=build(epsilon=10 / N), draws=50, adjust=False, progressbar=False)
+    assert spread(wide) < -4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(METRICS))
+def test_adjusted_posteriors_are_calibrated(name: str) -> None:
+    result = prb.simulation_based_calibration(100, model=build(METRICS[name]), draws=100, progressbar=False)
+    assert result.prior_sbc.attrs["failed"] == 0
+    assert abs(spread(result)) < 4
+    ranks = result.prior_sbc["mu"].values
+    assert abs(ranks.mean() - 0.5) < 4 / (12 * ranks.size) ** 0.5
