@@ -37,7 +37,7 @@ def refuse_uncallable(name: str, function: object) -> None:
 
 
 class Responses:
-    """The user's response function; counts the scalar responses it computed.
+    """The user's response function.
 
     Parameters
     ----------
@@ -50,6 +50,11 @@ class Responses:
     store : path-like, optional
         A folder.
     on_failure : OnFailure, optional
+
+    Attributes
+    ----------
+    count : int
+        Scalar responses that were needed so far, whether computed here or found in the store.
     """
 
     def __init__(
@@ -73,7 +78,7 @@ class Responses:
         if not self.plain:
             kept = None if store is None else Store(store, name, self._columns())
             self._caller = Caller(name, function, executor, on_failure or Abort(), kept)
-        self._count = 0
+        self.count = 0
 
     def _columns(self) -> int:
         """Return of how many numbers the inputs of one point are made."""
@@ -82,13 +87,9 @@ class Responses:
         return sum(sizes) + sum(np.size(a) for a in self.inputs.arguments if not isinstance(a, int | Variable))
 
     @property
-    def count(self) -> int:
-        """Scalar responses computed so far."""
-        return self._count + (self._caller.count if self._caller is not None else 0)
-
-    @count.setter
-    def count(self, value: int) -> None:
-        self._count = value - (self._caller.count if self._caller is not None else 0)
+    def computed(self) -> int:
+        """Scalar responses computed here: without those found in a store, with those computed again."""
+        return self.count if self._caller is None else self._caller.count
 
     @property
     def failures(self) -> int:
@@ -122,7 +123,7 @@ class Responses:
                 f"{self.name}: the response raised {type(error).__name__}: {error}; it was called with inputs of "
                 f"shapes {shapes} and is expected to take arrays of any leading shape, or to be wrapped in prb.scalar"
             ) from error
-        self._count += int(np.prod(batch, dtype=int))
+        self.count += int(np.prod(batch, dtype=int))
         try:
             return checked(result, batch, arguments)
         except ResponseError as error:
@@ -139,6 +140,7 @@ class Responses:
             for a, v in zip(arguments, varying, strict=True)
         ]
         assert self._caller is not None
+        self.count += n
         return self._caller(arguments, varying, np.concatenate(keys, axis=1).astype(np.float64)).reshape(batch)
 
 

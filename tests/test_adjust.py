@@ -30,6 +30,10 @@ METRICS = {
 R256 = prb.Reweighted(256)
 
 
+def slow(name: str) -> Any:
+    return pytest.param(name, marks=pytest.mark.slow)
+
+
 def same(x: Any) -> Any:
     return x
 
@@ -157,7 +161,7 @@ def test_widths_are_those_of_the_bootstrap_with_the_prior(name: str) -> None:
             assert abs(float((np.log(before) if log else before).std()) / expected - 1) > 0.1
 
 
-@pytest.mark.parametrize("name", ["ll", "kl"])
+@pytest.mark.parametrize("name", [slow("ll"), "kl"])
 def test_efficient_estimators_give_the_posterior_of_normal_data(name: str) -> None:
     idata = sample(build(METRICS[name], sd=0.5), adjust=prb.Affine(n_sets=1000))
     precision = 1 / 4 + N / 0.25
@@ -165,7 +169,7 @@ def test_efficient_estimators_give_the_posterior_of_normal_data(name: str) -> No
     assert abs(float(idata.posterior["mu"].mean()) - N * OBSERVED.mean() / 0.25 / precision) < 0.3 * precision**-0.5
 
 
-@pytest.mark.parametrize("name", list(METRICS))
+@pytest.mark.parametrize("name", ["ll", "kl", slow("pr"), "area"])
 def test_the_bias_is_taken_away(name: str) -> None:
     # Twenty observations spread less around their own centre than around the truth: log sigma is underestimated by
     # about (psi(19/2) - log 10) / 2 = -0.05 by all of these metrics, and the posterior has to lie above the optimum.
@@ -196,7 +200,7 @@ def assert_quantiles(draws: Any, distribution: Any, size: int) -> None:
     assert (np.abs(levels - LEVELS) < 4 * error).all()
 
 
-@pytest.mark.parametrize("name", ["kl", "area"])
+@pytest.mark.parametrize("name", [slow("kl"), "area"])
 def test_hyperparameters_absent_from_the_response_keep_their_prior(name: str) -> None:
     with pm.Model() as model:
         pm.Normal("idle", 3, 20)
@@ -240,7 +244,10 @@ def test_a_given_epsilon_is_taken_at_its_word() -> None:
     short = {"draws": 60, "optimum": optimum}
     assert adjustment(sample(optimum.model, **short)) == "Affine(n_sets=200, seed=0)"  # 1/N, which nobody gave
     assert adjustment(sample(optimum.model, epsilon=0.01, **short)) == "none"
-    assert adjustment(sample(optimum.model, epsilon=0.01, adjust=prb.Affine(50, 3), **short)) == "Affine(n_sets=50, seed=3)"
+    assert (
+        adjustment(sample(optimum.model, epsilon=0.01, adjust=prb.Affine(50, 3), **short))
+        == "Affine(n_sets=50, seed=3)"
+    )
     assert adjustment(sample(optimum.model, adjust=False, **short)) == "none"
     prb.set_epsilon(optimum.model, {"y": 0.05})
     assert adjustment(sample(optimum.model, **short)) == "none"
@@ -363,7 +370,7 @@ def two_responses(metric: prb.Metric, *, labels: bool, same_input: bool = True) 
     return model
 
 
-@pytest.mark.parametrize("name", list(METRICS))
+@pytest.mark.parametrize("name", ["ll", slow("kl"), slow("pr"), "area"])
 def test_shared_specimens_do_not_count_twice(name: str) -> None:
     stderr, widths, bootstrapped = [], [], []
     for labels in (True, False):

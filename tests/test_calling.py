@@ -85,7 +85,7 @@ def test_executors_give_the_same_responses(response: Any, processes: Executor) -
         for executor in (threads, processes):
             found = model(response, executor=executor)
             np.testing.assert_array_equal(stored(found), EXPECTED)
-            assert responses(found).count == N
+            assert responses(found).computed == N
 
 
 def test_resimulated_and_fresh_use_the_executor_too() -> None:
@@ -199,13 +199,13 @@ def test_retried_once_and_then_it_works() -> None:
     np.testing.assert_array_equal(stored(found), EXPECTED)
     # The simulator tries 16 points of the prior only where it has to; here every design point, the steep ones twice.
     assert sorted(set(calls.values())) == [1, 2]
-    assert responses(found).count == N + STEEP.sum()
+    assert responses(found).computed == N + STEEP.sum()
 
 
 def test_retried_in_vain() -> None:
     found = failing("scalar", fails_above_two, prb.Retry(2, then=prb.Replace(-1.0)))
     np.testing.assert_array_equal(stored(found), np.where(STEEP, -1.0, EXPECTED))
-    assert responses(found).count == N + 2 * STEEP.sum()
+    assert responses(found).computed == N + 2 * STEEP.sum()
     with pytest.raises(prb.ResponseError, match="too steep"):
         failing("scalar", fails_above_two, prb.Retry(2, then=prb.Abort()))
 
@@ -247,9 +247,9 @@ def test_nothing_is_computed_twice(tmp_path: Path) -> None:
     first = model(prb.scalar(times), store=tmp_path)
     second = model(prb.scalar(times), store=tmp_path)
     np.testing.assert_array_equal(stored(second), EXPECTED)
-    assert (responses(first).count, responses(second).count) == (N, 0)
+    assert (responses(first).computed, responses(second).computed) == (N, 0)
     more = model(prb.scalar(times), propagation=prb.Reweighted(N, seed=1, store=tmp_path))
-    assert responses(more).count == N  # other points
+    assert responses(more).computed == N  # other points
     assert {p.suffix for p in tmp_path.iterdir()} == {".nc"}
     with xr.open_dataset(tmp_path / "y.nc") as data:
         assert data["response"].size == 2 * N
@@ -271,7 +271,7 @@ def test_another_constant_is_another_input(tmp_path: Path) -> None:
             propagation=prb.Reweighted(N, store=tmp_path),
         )
     np.testing.assert_array_equal(stored(other), 1.5 * EXPECTED)
-    assert responses(other).count == N
+    assert responses(other).computed == N
 
 
 def test_what_was_computed_before_a_failure_is_kept(tmp_path: Path) -> None:
@@ -280,7 +280,7 @@ def test_what_was_computed_before_a_failure_is_kept(tmp_path: Path) -> None:
     kept = len(Store(tmp_path, "y", 2))
     found = model(prb.scalar(times), store=tmp_path)
     np.testing.assert_array_equal(stored(found), EXPECTED)
-    assert responses(found).count == N - kept
+    assert responses(found).computed == N - kept
     assert kept == int(np.argmax(STEEP))  # all that came before the first steep point
 
 
@@ -288,7 +288,7 @@ def test_stored_failures_are_replaced_as_the_policy_of_the_day_says(tmp_path: Pa
     model(prb.scalar(fails_above_two), store=tmp_path, on_failure=prb.Replace(np.inf))
     found = model(prb.scalar(fails_above_two), store=tmp_path, on_failure=prb.Replace(-1.0))
     np.testing.assert_array_equal(stored(found), np.where(STEEP, -1.0, EXPECTED))
-    assert responses(found).count == 0
+    assert responses(found).computed == 0
 
 
 def filled(folder: Path) -> Store:

@@ -25,6 +25,10 @@ METRICS = {
 R256 = prb.Reweighted(256)
 
 
+def slow(name: str) -> Any:
+    return pytest.param(name, marks=pytest.mark.slow)
+
+
 def parabola(x: Any) -> Any:
     return x**2 - 2 * x + 1
 
@@ -54,7 +58,7 @@ def posterior(name: str) -> xr.DataTree:
 # -- mirror solutions ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["ll", "pr", "area"])
+@pytest.mark.parametrize("name", [slow("ll"), "pr", "area"])
 def test_both_optima_are_found(name: str) -> None:
     optimum = fit(name)
     comparable = [r for r in optimum.rivals if r["comparable"]]
@@ -130,7 +134,7 @@ def test_a_worse_optimum_is_left_for_the_better_one() -> None:
     assert found.warnings == ()
 
 
-@pytest.mark.parametrize("name", list(METRICS))
+@pytest.mark.parametrize("name", [slow("ll"), "kl", slow("pr"), "area"])
 def test_a_linear_problem_has_no_rivals(name: str) -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
@@ -152,7 +156,7 @@ def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
 # -- the posterior of two modes --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["ll", "pr", "area"])
+@pytest.mark.parametrize("name", [slow("ll"), "pr", "area"])
 def test_each_mode_is_adjusted_by_itself(name: str) -> None:
     optimum, idata = fit(name), posterior(name)
     assert idata.posterior.attrs["adjustment"] == "Affine(n_sets=200, seed=0), 2 modes each by itself"
@@ -212,7 +216,7 @@ def test_nothing_is_blind() -> None:
     assert blind_directions(Local(np.ones(2), np.eye(2), np.zeros((2, 0)), np.eye(2)), ["a", "b"]) == []
 
 
-@pytest.mark.parametrize("name", ["ll", "kl", "pr"])
+@pytest.mark.parametrize("name", [slow("ll"), slow("kl"), "pr"])
 def test_a_sum_hides_a_difference(name: str) -> None:
     # Both priors have the same spread, hence coefficients of one in its units; the response weighs b twice.
     with pm.Model() as model:

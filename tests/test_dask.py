@@ -1,0 +1,59 @@
+"""A real Dask cluster on the loopback interface, one worker of which is killed while it computes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import prbayes as prb
+from prbayes.simulator import nodes
+
+distributed = pytest.importorskip("distributed")
+
+N = 96
+
+
+def slow(x: float) -> float:
+    time.sleep(0.03)
+    return 2 * x
+
+
+def build(**keywords: object) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
+        prb.Simulator(
+            "y",
+            prb.scalar(slow),
+            x,
+            metric=prb.AreaMetric(),
+            observed=[1, 2.0],
+            propagation=prb.Reweighted(N, **keywords),
+        )
+    return model
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
+def test_a_worker_is_killed_and_nothing_is_lost(tmp_path: Path) -> None:
+    cluster = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
+    )
+    with cluster, distributed.Client(cluster) as client:
+        pids = list(client.run(os.getpid).values())
+        killer = threading.Timer(0.6, os.kill, (pids[0], signal.SIGKILL))
+        killer.start()
+        begun = time.perf_counter()
+        model = build(executor=client.get_executor(pure=False), store=tmp_path)
+        assert time.perf_counter() - begun > 0.6, "the worker was to be killed while it computes"
+        killer.join()
+        assert pids[0] not in client.run(os.getpid).values()
+    responses = next(iter(nodes(model).values())).bound
+    np.testing.assert_array_equal(responses.values, next(iter(nodes(build()).values())).bound.values)
+    again = next(iter(nodes(build(store=tmp_path)).values())).bound.responses
+    assert again.computed == 0
