@@ -199,8 +199,8 @@ def analyse(
     epsilon = np.array([calibrate_epsilon(optimum)["y"]])
     hood = Neighbourhood.of(ev, optimum.theta, epsilon, prior_scale(ev))
     r = hood.sd.size
-    cov = (hood.frame * hood.sd**2) @ hood.frame.T * np.outer(hood.local.scale, hood.local.scale)
-    thetas, log_q = proposal(optimum.theta, 2.0 * cov + 1e-10 * np.diag(np.diag(cov)))
+    spread = 2.0 * (hood.frame * hood.sd**2) @ hood.frame.T + hood.local.blind @ hood.local.blind.T
+    thetas, log_q = proposal(optimum.theta, spread * np.outer(hood.local.scale, hood.local.scale))
     found = ev(thetas)
     draws, ess = weighted(found.log_prior + found.log_likelihood(epsilon) - log_q, thetas)
     exact, ess_exact = weighted(found.log_prior + log_likelihood(thetas) - log_q, thetas)

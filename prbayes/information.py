@@ -307,5 +307,6 @@ def seen_by_curvature(hessian: Floats, noise: Floats) -> tuple[Floats, Floats, N
     values, vectors = np.linalg.eigh((hessian + hessian.T) / 2)
     along = np.einsum("ik,ij,jk->k", vectors, noise, vectors)
     # Where the data see nothing both are rounding errors, and small against their ratio elsewhere.
-    floor = max(0.0, _ROUNDING * float(np.trace(noise) / np.trace(hessian)))
+    total = float(np.trace(hessian))
+    floor = _ROUNDING * float(np.trace(noise)) / total if total > 0 else 0.0
     return values, vectors, (values > floor) & (along < values**2)

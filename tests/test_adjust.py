@@ -146,7 +146,7 @@ def test_the_target_combines_data_and_prior() -> None:
 # -- widths and centres ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", list(METRICS))
+@pytest.mark.parametrize("name", [slow("ll"), "kl", slow("pr"), "area"])
 def test_widths_are_those_of_the_bootstrap_with_the_prior(name: str) -> None:
     idata = adjusted(name)
     # Another seed: two sets of 1000 data sets, each with a standard error of 2.2%, and 600 draws matched exactly.
@@ -169,7 +169,7 @@ def test_efficient_estimators_give_the_posterior_of_normal_data(name: str) -> No
     assert abs(float(idata.posterior["mu"].mean()) - N * OBSERVED.mean() / 0.25 / precision) < 0.3 * precision**-0.5
 
 
-@pytest.mark.parametrize("name", ["ll", "kl", slow("pr"), "area"])
+@pytest.mark.parametrize("name", [slow("ll"), "kl", slow("pr"), "area"])
 def test_the_bias_is_taken_away(name: str) -> None:
     # Twenty observations spread less around their own centre than around the truth: log sigma is underestimated by
     # about (psi(19/2) - log 10) / 2 = -0.05 by all of these metrics, and the posterior has to lie above the optimum.
@@ -370,7 +370,7 @@ def two_responses(metric: prb.Metric, *, labels: bool, same_input: bool = True) 
     return model
 
 
-@pytest.mark.parametrize("name", ["ll", slow("kl"), slow("pr"), "area"])
+@pytest.mark.parametrize("name", [slow("ll"), "kl", slow("pr"), slow("area")])
 def test_shared_specimens_do_not_count_twice(name: str) -> None:
     stderr, widths, bootstrapped = [], [], []
     for labels in (True, False):
@@ -399,7 +399,6 @@ def test_labels_of_different_inputs_are_refused_by_name() -> None:
     ):
         with pytest.raises((ValueError, RuntimeError), match=words):
             call()
-    assert prb.minimize(two_responses(METRICS["kl"], labels=False, same_input=False)).converged
 
 
 # -- saving ----------------------------------------------------------------------------------------------

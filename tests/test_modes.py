@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.information import Local
+from prbayes.information import Local, seen_by_curvature
 from prbayes.modes import blind_directions, rivals
 from prbayes.population import Evaluator
 
@@ -231,6 +231,16 @@ def test_a_sum_hides_a_difference(name: str) -> None:
     assert line.startswith("the data tell less than the prior about a - 0.5 b[0] (in units of the priors'")
     assert np.isinf(optimum.stderr["a"])
     assert np.isinf(optimum.stderr["b"]).all()
+
+
+def test_rounding_errors_are_not_information() -> None:
+    noise = np.diag([0.5, 1e-13])
+    # Curvature and noise of the second direction are rounding errors; their ratio looks like a standard error of 0.1.
+    assert list(seen_by_curvature(np.diag([5.0, 3e-6]), noise)[2]) == [False, True]  # sorted by curvature
+    # A direction that says a little more than the prior is seen beside one that says much more.
+    assert seen_by_curvature(np.diag([500.0, 0.15]), np.diag([50.0, 0.015]))[2].all()
+    # Where nothing changes, nothing is seen.
+    assert not seen_by_curvature(np.zeros((2, 2)), np.zeros((2, 2)))[2].any()
 
 
 def test_a_hyperparameter_without_effect_is_named_and_makes_no_rivals() -> None:

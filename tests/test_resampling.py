@@ -444,19 +444,19 @@ def test_batches_added_inside_are_undone() -> None:
     thetas = evaluator.prior_thetas(30, 1)
     before, support = evaluator(thetas).discrepancies, evaluator.support(thetas)["y"]
     inside = []
-    for at in (thetas[:3], thetas[3:6]):
+    for at in (thetas[:3], thetas[3:6]):  # one after the other, without a look at the first design between them
         with design.undone():
             design.add(evaluator.roots(at, 0))
             assert design.n_points == 512
             assert design.batches == 2
             inside.append(evaluator(thetas).discrepancies)
         assert (design.n_points, design.batches) == (256, 1)
-        np.testing.assert_array_equal(evaluator(thetas).discrepancies, before)
-        for key, value in evaluator.support(thetas)["y"].items():
-            np.testing.assert_array_equal(value, support[key])
-        # What PyMC's samplers evaluate is back too.
-        graph = evaluator.objective(prior=False, gradient=False)(thetas[0], np.ones(1))[0]
-        np.testing.assert_allclose(graph, before[0, 0], rtol=1e-10)
+    np.testing.assert_array_equal(evaluator(thetas).discrepancies, before)
+    for key, value in evaluator.support(thetas)["y"].items():
+        np.testing.assert_array_equal(value, support[key])
+    # What PyMC's samplers evaluate is back too.
+    graph = evaluator.objective(prior=False, gradient=False)(thetas[0], np.ones(1))[0]
+    np.testing.assert_allclose(graph, before[0, 0], rtol=1e-10)
     # Two designs of equal size are two designs: nothing of the first is remembered in the second.
     fresh = Evaluator(build(KL, sd=None))
     fresh.nodes[0].bound.add(fresh.roots(thetas[3:6], 0))

@@ -56,7 +56,7 @@ def fit(name: str, propagation: Any = R256) -> prb.Optimum:
     return prb.minimize(build(METRICS[name], propagation=propagation), method="Nelder-Mead", starts=0)
 
 
-@pytest.mark.parametrize("name", ["ll", "kl"])
+@pytest.mark.parametrize("name", [pytest.param("ll", marks=pytest.mark.slow), "kl"])
 @pytest.mark.parametrize("parametric", [False, True])
 def test_standard_deviations_of_a_normal_mean(name: str, parametric: bool) -> None:
     result = prb.bootstrap(fit(name), 1000, parametric=parametric)
@@ -103,9 +103,10 @@ def test_what_cannot_be_bootstrapped_is_refused() -> None:
         x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
         pm.Normal("idle", 3, 2)
         prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
+    optimum = prb.minimize(model, starts=0)
     for parametric in (False, True):
         with pytest.raises(ValueError, match="bootstrap: the data tell less than the prior about idle, along which"):
-            prb.bootstrap(prb.minimize(model, starts=0), 10, parametric=parametric)
+            prb.bootstrap(optimum, 10, parametric=parametric)
     model = build(propagation=prb.Fresh(64))
     with pytest.raises(ValueError, match=r"bootstrap: y has prb\.Fresh"):
         prb.bootstrap(prb.minimize(model, method="Nelder-Mead", max_evaluations=5), 10)
@@ -315,7 +316,11 @@ def test_overconfidence_shows() -> None:
         25, model=build(epsilon=0.1 / N), draws=50, adjust=False, progressbar=False
     )
     assert spread(narrow) > 4
-    # And ten times too large a one, ranks Phi(z / sqrt(10)): asin(1/11) / (2 pi) = 0.014.
+
+
+@pytest.mark.slow
+def test_underconfidence_shows() -> None:
+    # Ten times too large an epsilon, ranks Phi(z / sqrt(10)): asin(1/11) / (2 pi) = 0.014.
     wide = prb.simulation_based_calibration(25, model=build(epsilon=10 / N), draws=50, adjust=False, progressbar=False)
     assert spread(wide) < -3
 

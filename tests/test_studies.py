@@ -1,0 +1,76 @@
+"""Short versions of the statistical studies in benchmarks/, to see that they run and that their figures hold."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks import contamination, coverage
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("size", [20, 50])
+@pytest.mark.parametrize("problem", ["linear", "quadratic", "correlated"])
+def test_coverage(problem: str, size: int) -> None:
+    rows = coverage.block(problem, size, 0, 60, coverage.METRICS)
+    for metric in coverage.METRICS:
+        found = coverage.summarise(rows, metric, "affine")
+        assert found["failed"] == 0
+        # 60 data sets, two hyperparameters that are nearly independent: standard error .03.
+        assert abs(np.mean(found["coverage_89%"]) - 0.89) < 0.10
+        assert np.min(found["sd_over_own_sampling_sd"]) > 0.7
+        assert np.max(found["sd_over_own_sampling_sd"]) < 1.5
+
+
+def test_a_study_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    called = []
+
+    def block(problem: str, size: int, first: int, count: int, metrics: tuple[str, ...]) -> list[dict[str, object]]:
+        called.append((problem, size, first))
+        return coverage_block(problem, size, first, 2, metrics)
+
+    coverage_block = coverage.block
+    monkeypatch.setattr(coverage, "block", block)
+    monkeypatch.setattr(coverage, "ProcessPoolExecutor", _Here)
+    arguments = ["coverage", "--problems", "linear", "--sizes", "20", "--store", str(tmp_path)]
+    for replicates in ("20", "40", "40"):
+        monkeypatch.setattr(sys, "argv", [*arguments, "--replicates", replicates])
+        coverage.main()
+    assert called == [("linear", 20, 0), ("linear", 20, 20)]
+
+
+class _Here:
+    def __init__(self, workers: int, mp_context: object) -> None:
+        pass
+
+    def __enter__(self) -> _Here:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def submit(self, function: object, *arguments: object) -> object:
+        from concurrent.futures import Future
+
+        future: Future[object] = Future()
+        future.set_result(function(*arguments))  # type: ignore[operator]
+        return future
+
+
+def test_contamination_of_the_probability_residual() -> None:
+    evaluator = contamination.evaluator_of("ProbabilityResidual")
+    shifts = []
+    for i in range(6):
+        data = np.random.default_rng([5, i]).normal(10, 1, contamination.SIZE)
+        dirty = np.r_[data[:-3], np.full(3, 10 + contamination.DISTANCE)]
+        clean, after = (contamination.posterior(evaluator, d, True) for d in (data, dirty))
+        shifts.append((after[:, 0] - clean[:, 0]) / clean[:, 1])
+    mu, sigma = np.mean(shifts, axis=0)
+    assert abs(mu) < 0.3
+    assert abs(sigma) < 1.3
