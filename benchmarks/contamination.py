@@ -1,8 +1,9 @@
 """What gross outliers do to each metric: shift of the posterior, in standard deviations of the clean posterior.
 
 Data are normal, N(10, 1), with N = 50; then 5% of them, 2 or 3 values at random, are replaced by gross
-outliers 8 standard deviations above the mean. The same data sets, clean and contaminated, are calibrated with each metric, and
-the shift of the posterior mean and the ratio of the posterior's sd to the clean one are averaged.
+outliers 8 standard deviations above the mean. The same data sets, clean and contaminated, are calibrated with
+each metric, and the shift of the posterior mean and the ratio of the posterior's sd to the clean one are
+averaged.
 
     uv run python -m benchmarks.contamination [--replicates 40] [--out contamination.json]
 """

@@ -23,6 +23,7 @@ from prbayes.simulator import model_on_context
 
 _log = logging.getLogger("prbayes")
 
+_LOOKS = 3  # at other optima, with a design that is refined in between
 _STARTS = 32  # prior draws from which other optima are searched for where a theta costs no response
 _FLOOR = 0.3  # of the noise floor: about the difference of the discrepancy between the data's fit and the truth's
 _GRADIENT_FREE = {"nelder-mead", "powell", "cobyla", "cobyqa"}
@@ -248,12 +249,16 @@ def find_optimum(
     starts = (0 if evaluator.responses_per_theta else _STARTS) if starts is None else starts
     others: list[Rival] = []
     if starts and local is not None:
-        others = _rivals(evaluator, theta, scales, local, starts, random_seed)
+        others = _rivals(evaluator, theta, scales, local, starts, random_seed, refine=refine)
         if others and others[0].better:
             result = search(others[0].theta, scales)
             theta = search.best
             local = _local(evaluator, theta, scale, scales)
-            others = _rivals(evaluator, theta, scales, local, starts, random_seed) if local is not None else []
+            others = (
+                _rivals(evaluator, theta, scales, local, starts, random_seed, refine=refine)
+                if local is not None
+                else []
+            )
     result = search.settle(result)
     theta = search.best
     warnings = _warnings(evaluator, local, others)
@@ -271,11 +276,18 @@ def _local(evaluator: Evaluator, theta: Floats, scale: Floats, scales: Floats) -
     return local_sampling(parts, scales)
 
 
-def _rivals(evaluator: Evaluator, theta: Floats, scales: Floats, local: Local, starts: int, seed: int) -> list[Rival]:
-    """Look for other optima that the designs support."""
+def _rivals(
+    evaluator: Evaluator, theta: Floats, scales: Floats, local: Local, starts: int, seed: int, *, refine: bool
+) -> list[Rival]:
+    """Look for other optima; where a design is too thin for one that matters, refine it there and look again."""
     floors = [Information(evaluator, k, theta, local.scale, n_sets=50).noise_floor for k in range(len(evaluator.nodes))]
     noise = _FLOOR * float((np.array(floors) / scales).sum())
-    found = rivals(evaluator, theta, scales, local, noise, starts=starts, seed=seed)
+    for _ in range(_LOOKS):
+        found = rivals(evaluator, theta, scales, local, noise, starts=starts, seed=seed)
+        thin = [r for r in found if (r.better or r.comparable) and shortcomings(evaluator, r.theta[None])]
+        if not thin or not refine:
+            break
+        refine_at(evaluator, thin[0].theta[None])
     return [r for r in found if not shortcomings(evaluator, r.theta[None])]
 
 
