@@ -12,6 +12,8 @@ import xarray as xr
 from prbayes._arrays import Floats
 from prbayes.population import Evaluator
 
+_ENVELOPE = 0.95  # probability that the ECDF of uniform ranks stays inside
+
 if TYPE_CHECKING:
     from prbayes.optimize import Optimum
 
@@ -175,10 +177,45 @@ def calibration_tree(
         group: _dataset(evaluator, {name: v[:, :, i] for name, v in stacked.items()}, leading)
         for i, group in enumerate(("prior_sbc", "truth", "posterior_sd"))
     }
+    groups["envelope"], outside = _envelopes(groups["prior_sbc"])
     groups["prior_sbc"].attrs.update(
-        {"failed": failed, "draws": draws, "adjustment": repr(adjust), "random_seed": str(seed), **versions()}
+        {
+            "outside": ", ".join(outside),
+            "failed": failed,
+            "draws": draws,
+            "adjustment": repr(adjust),
+            "random_seed": str(seed),
+            **versions(),
+        }
     )
     return xr.DataTree.from_dict(groups)
+
+
+def _envelopes(ranks: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
+    """Return ECDFs of ranks with ArviZ's envelope for uniform ones, and the names of those that leave it."""
+    from arviz_stats.ecdf_utils import ecdf_pit
+
+    rows, names = {}, []
+    for key, variable in ranks.data_vars.items():
+        values = variable.values[0]
+        for i in np.ndindex(values.shape[1:]):
+            name = f"{key}[{','.join(map(str, i))}]" if i else str(key)
+            x, ecdf, lower, upper = ecdf_pit(  # type: ignore[no-untyped-call]
+                values[(slice(None), *i)], _ENVELOPE, n_simulations=1000, rng=np.random.default_rng(0)
+            )
+            rows[name] = ecdf
+            if ((ecdf < lower) | (ecdf > upper)).any():
+                names.append(name)
+    found = xr.Dataset(
+        {
+            "ecdf": (["variable", "x"], np.array(list(rows.values()))),
+            "lower": ("x", lower),
+            "upper": ("x", upper),
+        },
+        coords={"variable": list(rows), "x": x},
+        attrs={"probability": _ENVELOPE},
+    )
+    return found, names
 
 
 def _draws(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
