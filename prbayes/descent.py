@@ -81,7 +81,7 @@ def descend(
         active, move, promise, length = active[~done], move[~done], promise[~done], length[~done]
         if not active.size:
             break
-        move *= np.minimum(1, _LONGEST / length)[:, None]
+        move *= (_LONGEST / np.maximum(length, _LONGEST))[:, None]
         moved, new_f, new_g = x[active].copy(), f[active].copy(), g[active].copy()
         waiting, share = np.arange(active.size), 1.0
         for _ in range(_HALVINGS):

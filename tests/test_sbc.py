@@ -166,8 +166,11 @@ def test_ranks_do_not_depend_on_where_they_are_found(
 
 def test_the_result_is_complete_and_the_model_as_before() -> None:
     model, result = serial()
-    assert set(result.children) == {"prior_sbc", "truth", "posterior_sd"}
-    for group in result.children:
+    assert set(result.children) == {"prior_sbc", "truth", "posterior_sd", "envelope"}
+    envelope = result.envelope
+    assert (envelope["lower"] <= envelope["upper"]).all()
+    assert envelope["ecdf"].sel(variable="mu").values[-1] == 1.0
+    for group in ("prior_sbc", "truth", "posterior_sd"):
         assert result[group].sizes == {"chain": 1, "draw": 6}
         assert set(result[group].data_vars) == {"mu"}
     ranks = result.prior_sbc["mu"].values
