@@ -25,7 +25,8 @@ def test_coverage(problem: str, size: int) -> None:
         # 60 data sets, two hyperparameters that are nearly independent: standard error .03.
         assert abs(np.mean(found["coverage_89%"]) - 0.89) < 0.10
         assert np.min(found["sd_over_own_sampling_sd"]) > 0.7
-        assert np.max(found["sd_over_own_sampling_sd"]) < 1.5
+        # At N = 20 the full study has up to 1.42; the spread of 60 estimates has a standard error of 9%.
+        assert np.max(found["sd_over_own_sampling_sd"]) < (2.0 if size == 20 else 1.5)
 
 
 def test_a_study_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
