@@ -123,20 +123,20 @@ class Caller:
         if self.store is not None:
             values, known = self.store.find(keys)
             missing = np.flatnonzero(~known)
-        messages: dict[int, str] = {}
         times = 1 + (self.on_failure.times if isinstance(self.on_failure, Retry) else 0)
         for attempt in range(times):
             last = attempt == times - 1
             policy = self._policy(last=last)
             tolerant = not isinstance(policy, Abort)
+            messages: dict[int, str] = {}
             for rows, found, said in self._computed(arguments, varying, missing, tolerant):
                 values[rows] = found
                 messages.update({int(rows[i]): text for i, text in said.items()})
                 settled = rows if last and (tolerant or not said) else rows[~np.isnan(found)]
                 if self.store is not None and settled.size:
                     self.store.add(keys[settled], values[settled])
-                if said and not tolerant:
-                    self._raise(messages)
+            if messages and not tolerant:
+                self._raise(messages)
             missing = missing[np.isnan(values[missing])]
             if not missing.size:
                 break
@@ -175,39 +175,39 @@ class Caller:
     def _computed(
         self, arguments: Sequence[Any], varying: Sequence[bool], missing: Any, tolerant: bool
     ) -> Iterator[tuple[Any, Floats, dict[int, str]]]:
-        """Yield rows, their responses (NaN if they raised) and messages by position, as they are computed."""
+        """Yield rows, their responses (NaN if they raised) and messages by position, as they are computed.
+
+        After a failure that is not tolerated nothing more is begun, and what was begun is waited for and kept.
+        """
         here = self.executor is None or isinstance(self.executor, ThreadPoolExecutor)
         work = partial(_compute, self.function) if here else partial(_remote, _packed(self.function))
         begun: dict[Future[Any], Any] = {}
         at = 0
+        error: BaseException | None = None
         with _progress(self.name, missing.size) as report:
             while at < missing.size or begun:
                 while at < missing.size and len(begun) < self._window:
                     rows = missing[at : at + self._chunk(missing.size - at)]
                     at += rows.size
                     part = [a[rows] if v else a for a, v in zip(arguments, varying, strict=True)]
-                    if self.executor is None:
-                        yield self._take(rows, self._here(part, varying, tolerant), report)
-                    else:
-                        begun[self.executor.submit(work, part, list(varying), tolerant)] = rows
-                for future in wait(begun, return_when=FIRST_COMPLETED).done if begun else ():
+                    future = _submitted(self.executor, work, part, list(varying), tolerant)
+                    begun[future] = rows
+                for future in wait(begun, return_when=FIRST_COMPLETED).done:
                     rows = begun.pop(future)
-                    try:
-                        result = future.result()
-                    except ResponseError as error:
-                        raise ResponseError(f"{self.name}: {error}") from None
-                    except Exception as error:
-                        raise ResponseError(
-                            f"{self.name}: a worker was lost ({type(error).__name__}: {error}); run again: with store= "
-                            "nothing that was computed is computed again"
-                        ) from error
-                    yield self._take(rows, result, report)
-
-    def _here(self, part: Sequence[Any], varying: Sequence[bool], tolerant: bool) -> Any:
-        try:
-            return _compute(self.function, part, varying, tolerant)
-        except ResponseError as error:
+                    if future.exception() is not None:
+                        error = error or future.exception()
+                        at = missing.size
+                        continue
+                    if future.result()[1] and not tolerant:
+                        at = missing.size
+                    yield self._take(rows, future.result(), report)
+        if isinstance(error, ResponseError):
             raise ResponseError(f"{self.name}: {error}") from None
+        if error is not None:
+            raise ResponseError(
+                f"{self.name}: a worker was lost ({type(error).__name__}: {error}); run again: with store= "
+                "nothing that was computed is computed again"
+            ) from error
 
     def _take(self, rows: Any, result: tuple[Floats, dict[int, str], float], report: Any) -> tuple[Any, Floats, Any]:
         values, messages, seconds = result
@@ -233,6 +233,18 @@ class Caller:
             return 1
         share = max(1, left // (2 * self._workers)) if self.executor is not None else left
         return int(max(1, min(share, _CHUNK_SECONDS / self._cost)))
+
+
+def _submitted(executor: Executor | None, work: Callable[..., Any], *job: Any) -> Future[Any]:
+    """Return the work as a future: done already if there is no executor, failed if the executor is broken."""
+    future: Future[Any] = Future()
+    try:
+        if executor is not None:
+            return executor.submit(work, *job)
+        future.set_result(work(*job))
+    except Exception as error:
+        future.set_exception(error)
+    return future
 
 
 def _compute(

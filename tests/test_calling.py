@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -282,6 +282,33 @@ def test_what_was_computed_before_a_failure_is_kept(tmp_path: Path) -> None:
     np.testing.assert_array_equal(stored(found), EXPECTED)
     assert responses(found).computed == N - kept
     assert kept == int(np.argmax(STEEP))  # all that came before the first steep point
+
+
+@pytest.mark.parametrize("error", [ArithmeticError, BrokenExecutor])
+def test_what_is_being_computed_when_one_fails_is_kept(error: type[Exception], tmp_path: Path) -> None:
+    """The first of four tasks that are begun fails at once; the others are waited for, and nothing more is begun."""
+
+    def function(x: float) -> float:
+        if x == 0:
+            raise error("too steep")
+        time.sleep(0.3)
+        return 2 * x
+
+    class Pool(ThreadPoolExecutor):
+        """Loses a worker, rather than an answer, at a `BrokenExecutor`."""
+
+        def submit(self, work: Any, /, *job: Any, **keywords: Any) -> Any:
+            if error is BrokenExecutor and job[0][0][0] == 0:
+                raise error("too steep")
+            return super().submit(work, *job, **keywords)
+
+    keys = np.arange(12.0)[:, None]
+    store = Store(tmp_path, "y", 1)
+    with Pool(2) as pool, pytest.raises(prb.ResponseError, match="too steep"):
+        Caller("y", prb.scalar(function), pool, Abort(), store)([keys[:, 0]], [True], keys)
+    values, known = store.find(keys)
+    np.testing.assert_array_equal(np.flatnonzero(known), [1, 2, 3])
+    np.testing.assert_array_equal(values[known], [2.0, 4.0, 6.0])
 
 
 def test_stored_failures_are_replaced_as_the_policy_of_the_day_says(tmp_path: Path) -> None:
