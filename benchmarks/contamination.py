@@ -45,18 +45,7 @@ def evaluator_of(metric: str) -> Evaluator:
 
 def posterior(evaluator: Evaluator, data: Any, adjust: bool) -> Any:
     """Return means and standard deviations of mu and sigma."""
-    tree = sample(
-        evaluator.observing({"y": data}),
-        draws=1000,
-        chains=1,
-        epsilon=None,
-        optimum=None,
-        adjust=adjust,
-        threshold=0.5,
-        refine=True,
-        random_seed=1,
-        progressbar=False,
-    )
+    tree = sample(evaluator.observing({"y": data}), adjust=adjust, random_seed=1)
     draws = tree["posterior"].dataset
     return np.array([[float(draws[n].mean()), float(draws[n].std())] for n in ("mu", "sigma")])
 

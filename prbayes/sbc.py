@@ -177,14 +177,8 @@ def _one(evaluator: Evaluator, draws: int, adjust: Affine | bool, rng: np.random
     tree = sample(
         evaluator.observing(fresh_data(evaluator, theta, rng)),
         draws=draws,
-        chains=1,
-        epsilon=None,
-        optimum=None,
         adjust=adjust,
-        threshold=0.5,
-        refine=True,
         random_seed=int(rng.integers(2**31)),
-        progressbar=False,
     )
     out = {}
     for name, value in evaluator.constrained(theta[None]).items():
