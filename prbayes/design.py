@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytensor
 import pytensor.tensor as pt
+from numpy.typing import NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._arrays import Floats
@@ -23,7 +24,12 @@ from prbayes.responses import OpaqueOp, Responses
 _log = logging.getLogger("prbayes")
 
 _MAX_THETAS = 512  # components of a batch's mixture density
+N_BLOCKS = 8  # parts of a batch whose differences tell its error
 _DRAFT = 16  # draft points, whose response is not computed, for each point of a one-dimensional design
+
+_MANY = 4  # inputs beyond which reweighting is seldom worth its while
+_REFINED = "prb.minimize and prb.sample_smc refine it themselves, before pm.sample call prb.refine(model)"
+_TOO_MANY = "{} inputs are many for stored responses: rather use propagation=prb.Resimulated(n), which has no design"
 
 
 class Design(Bound):
@@ -36,7 +42,7 @@ class Design(Bound):
     def __init__(self, name: str, inputs: Any, target: Discrepancy, responses: Responses, config: Reweighted) -> None:
         super().__init__(name, inputs, target, responses)
         self.config = config
-        self.batches = 0
+        self._sizes: list[int] = []
         self._thetas: list[Floats] = []
         self._counts = np.empty(0)
         self._points: list[Floats] = []
@@ -49,13 +55,18 @@ class Design(Bound):
         if size < self.required_ess:
             _log.warning(
                 "%s: the design of %d responses supports a typical population of the prior with a weight effective "
-                "sample size of %.0f, expected %.0f; prb.minimize and prb.sample_smc refine it themselves, before "
-                "pm.sample call prb.refine(model)",
+                "sample size of %.0f, expected %.0f; %s",
                 name,
                 config.n,
                 size,
                 self.required_ess,
+                _REFINED if self._dimensions <= _MANY else _TOO_MANY.format(self._dimensions),
             )
+
+    @property
+    def _dimensions(self) -> int:
+        """Number of aleatory numbers that make one specimen."""
+        return sum(int(np.prod(shape, dtype=int)) for shape in self.inputs.event_shapes)
 
     @property
     def required_ess(self) -> float:
@@ -64,14 +75,33 @@ class Design(Bound):
         Stratified points of one input integrate with an error that falls like 1/n, of several like n^(-3/4);
         the size follows from asking that error to be a fraction of 1/sqrt(N).
         """
-        inputs = sum(int(np.prod(shape, dtype=int)) for shape in self.inputs.event_shapes)
         root = np.sqrt(self.target.n_effective)
-        return float(max(50.0, 6 * root) if inputs == 1 else max(100.0, (15 * root) ** (4 / 3)))
+        return float(max(50.0, 6 * root) if self._dimensions == 1 else max(100.0, (15 * root) ** (4 / 3)))
+
+    @property
+    def batches(self) -> int:
+        """How often points were added."""
+        return len(self._sizes)
+
+    @property
+    def max_points(self) -> int:
+        """The largest number of points that refinement may reach."""
+        return self.config.max_points or 32 * self.config.n
 
     @property
     def n_points(self) -> int:
         """Number of stored responses."""
         return self.values.size
+
+    @property
+    def blocks(self) -> NDArray[np.intp]:
+        """Which of eight coarser designs each point belongs to, shape (n,); 0 for all on a line.
+
+        Consecutive points of a Sobol sequence, of which each stretch is a net of its own.
+        """
+        if self._is_line:
+            return np.zeros(self.n_points, dtype=int)
+        return np.concatenate([np.arange(n) * N_BLOCKS // n for n in self._sizes])
 
     def same_points(self, other: Bound) -> bool:
         """Return whether another design has the same points, so that their responses belong together."""
@@ -79,15 +109,21 @@ class Design(Bound):
             np.array_equal(a, b) for a, b in zip(self._points, other._points, strict=True)
         )
 
-    def add(self, thetas: Sequence[Floats]) -> float:
-        """Compute n more responses, at points drawn from the populations of ``thetas``, shapes (k, *shape).
+    def add(self, thetas: Sequence[Floats], n: int | None = None) -> float:
+        """Compute more responses, at points drawn from the populations of ``thetas``, shapes (k, *shape).
+
+        Parameters
+        ----------
+        thetas : sequence of ndarray
+        n : int, optional
+            How many; ``config.n`` by default.
 
         Returns
         -------
         float
             The median weight effective sample size over these populations.
         """
-        n, seed = self.config.n, self.config.seed + 7919 * self.batches
+        n, seed = n or self.config.n, self.config.seed + 7919 * self.batches
         thetas = self.valid_only(thetas)
         if self._is_line:
             points, counts = self._equal_mass(thetas, n, seed)
@@ -101,7 +137,7 @@ class Design(Bound):
         k = len(counts)
         self._points, self.values, self._thetas = points, values, list(thetas)
         self._counts = np.concatenate([self._counts, counts])
-        self.batches += 1
+        self._sizes.append(n)
         logs = self._log_density(*self._thetas, *points)[0]
         used = self._counts > 0
         log_g = np.logaddexp.reduce(logs[used] + np.log(self._counts[used, None] / values.size), axis=0)
@@ -113,12 +149,12 @@ class Design(Bound):
     @contextmanager
     def undone(self) -> Iterator[None]:
         """Forget, afterwards, the batches that are added inside."""
-        kept = (self._points, self.values, self._thetas, self._counts, self.batches)
+        kept = (self._points, self.values, self._thetas, self._counts, list(self._sizes))
         shared = [s.get_value() for s in self._shared]
         try:
             yield
         finally:
-            self._points, self.values, self._thetas, self._counts, self.batches = kept
+            self._points, self.values, self._thetas, self._counts, self._sizes = kept
             self._basis = (None, 0, None)
             self._store(shared)
 

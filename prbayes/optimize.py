@@ -12,11 +12,12 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._arrays import Floats
-from prbayes.information import Information, Local, local_sampling, prior_scale
+from prbayes.information import Information, Local, prior_scale
 from prbayes.metrics import FunctionMetric
 from prbayes.modes import Rival, blind_directions, rivals
 from prbayes.population import Evaluator
-from prbayes.refinement import _MAX_ROUNDS, pilot, refine_at, refuse, shortcomings, spread_around
+from prbayes.refinement import _MAX_ROUNDS, AGREE, grow, pilot, refine_at, refuse, shortcomings, spread_around
+from prbayes.refit import Neighbourhood
 from prbayes.resimulation import FreshBound
 from prbayes.search import Search
 from prbayes.simulator import model_on_context
@@ -25,6 +26,7 @@ _log = logging.getLogger("prbayes")
 
 _LOOKS = 3  # at other optima, with a design that is refined in between
 _STARTS = 32  # prior draws from which other optima are searched for where a theta costs no response
+_TOLERATED = 1.5 * AGREE  # an estimate from eight blocks is itself uncertain
 _FLOOR = 0.3  # of the noise floor: about the difference of the discrepancy between the data's fit and the truth's
 _GRADIENT_FREE = {"nelder-mead", "powell", "cobyla", "cobyqa"}
 
@@ -67,6 +69,9 @@ class Optimum:
     trace : dict
         ``theta`` (n, d) and ``discrepancy`` (n,) of each evaluation.
     seconds : float
+    design_error : float
+        How far the optimum of an independent design of the same size would be, in standard errors, along the worst
+        direction; NaN where it is not known (`Resimulated`) or is negligible (one input).
     rivals : tuple of dict
         Other optima, such as mirror solutions: ``point``, ``discrepancy`` (the sum of d_k / s_k), ``theta``, and
         ``comparable``, whether the data could as well come from there.
@@ -91,6 +96,7 @@ class Optimum:
     support: dict[str, dict[str, float]] = field(default_factory=dict)
     trace: dict[str, Floats] = field(repr=False, default_factory=dict)
     seconds: float = 0.0
+    design_error: float = np.nan
     rivals: tuple[dict[str, Any], ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -221,7 +227,8 @@ def find_optimum(
     theta, screened = search.start(start, natural, random_seed)
     scales = natural
     cloud: Floats | None = None
-    for round_ in range(_MAX_ROUNDS + 1):
+    error, rounds = np.nan, 0
+    while True:
         result = search(theta, scales)
         theta = search.best
         if several and np.isnan(evaluator.epsilon).any():
@@ -229,7 +236,8 @@ def find_optimum(
             scales = np.where(np.isnan(evaluator.epsilon), noise, evaluator.epsilon)
             result = search(theta, scales)
             theta = search.best
-        local = _local(evaluator, theta, scale, scales)
+        hood = _hood(evaluator, theta, scale, scales)
+        local = None if hood is None else hood.local
         covariance = np.full((theta.size, theta.size), np.nan) if local is None else local.in_theta
         if not (refine and evaluator.designs):
             break
@@ -237,13 +245,16 @@ def find_optimum(
         near = near[evaluator.in_support(near)]
         short = shortcomings(evaluator, near) or shortcomings(evaluator, theta[None])
         if not short:
-            break
-        if round_ == _MAX_ROUNDS:
+            error = np.nan if hood is None else hood.design_error()
+            if not error > AGREE or not grow(evaluator, near, error):
+                break
+        elif rounds == _MAX_ROUNDS:
             refuse(short, evaluator)
         elif cloud is None:
             cloud = near = pilot(evaluator, scales, scale, seed=random_seed)
         elif not refine_at(evaluator, near):
             refine_at(evaluator, theta[None])
+        rounds += 1
         # What looked best on a thin design may be an artefact of it.
         theta = search.best_of(np.vstack([theta, near]), scales)
     starts = (0 if evaluator.responses_per_theta else _STARTS) if starts is None else starts
@@ -253,7 +264,8 @@ def find_optimum(
         if others and others[0].better:
             result = search(others[0].theta, scales)
             theta = search.best
-            local = _local(evaluator, theta, scale, scales)
+            hood = _hood(evaluator, theta, scale, scales)
+            local = None if hood is None else hood.local
             others = (
                 _rivals(evaluator, theta, scales, local, starts, random_seed, refine=refine)
                 if local is not None
@@ -261,19 +273,20 @@ def find_optimum(
             )
     result = search.settle(result)
     theta = search.best
-    warnings = _warnings(evaluator, local, others)
+    if hood is not None and (np.isnan(error) or not np.array_equal(theta, hood.theta)):
+        error = hood.design_error()
+    warnings = _warnings(evaluator, local, others, error)
     for line in warnings:
         _log.warning("%s", line)
     found = _optimum(evaluator, theta, scales, local, search, result, screened, already - stored, clock)
-    return replace(found, rivals=tuple(_described(evaluator, o) for o in others), warnings=warnings)
+    return replace(found, design_error=error, rivals=tuple(_described(evaluator, o) for o in others), warnings=warnings)
 
 
-def _local(evaluator: Evaluator, theta: Floats, scale: Floats, scales: Floats) -> Local | None:
-    """Return the sampling distribution of the minimiser, or None where nothing is known of it."""
+def _hood(evaluator: Evaluator, theta: Floats, scale: Floats, scales: Floats) -> Neighbourhood | None:
+    """Return the sampling distribution of the minimiser around theta, or None where nothing is known of it."""
     if any(isinstance(n.metric, FunctionMetric) or isinstance(n.bound, FreshBound) for n in evaluator.nodes):
         return None
-    parts = [Information(evaluator, k, theta, scale) for k in range(len(evaluator.nodes))]
-    return local_sampling(parts, scales)
+    return Neighbourhood.of(evaluator, theta, scales, scale)
 
 
 def _rivals(
@@ -296,9 +309,15 @@ def _described(evaluator: Evaluator, rival: Rival) -> dict[str, Any]:
     return {"point": point, "discrepancy": rival.value, "theta": rival.theta, "comparable": rival.comparable}
 
 
-def _warnings(evaluator: Evaluator, local: Local | None, others: list[Rival]) -> tuple[str, ...]:
-    """Say what is not identified."""
+def _warnings(evaluator: Evaluator, local: Local | None, others: list[Rival], error: float) -> tuple[str, ...]:
+    """Say what is not identified, and whether the design is too small."""
     lines = []
+    if error > _TOLERATED:
+        points = max(d.n_points for d in evaluator.designs.values())
+        lines.append(
+            f"the optimum of another design would differ by about {error:.2f} standard errors, expected at most "
+            f"{AGREE}; pass a larger n or max_points to prb.Reweighted (now {points} points)"
+        )
     for rival in others:
         if rival.comparable:
             point = evaluator.constrained(rival.theta[None])

@@ -163,11 +163,13 @@ class Reweighted(Propagation):
     ----------
     n : int
         Number of design points, drawn from the inputs' prior predictive distribution; the response is
-        computed n times, once. `refine` adds batches of the same size where they are needed.
+        computed n times, once. `refine` adds batches where they are needed.
     seed : int
         Seed of the design.
     max_lost : float
         Largest share of a population's weight that may fall on points whose response is NaN.
+    max_points : int, optional
+        Largest number of design points, refinement included; 32 n by default.
 
     References
     ----------
@@ -176,12 +178,13 @@ class Reweighted(Propagation):
     Examples
     --------
     >>> Reweighted(256)
-    Reweighted(n=256, seed=0, max_lost=0.05)
+    Reweighted(n=256, seed=0, max_lost=0.05, max_points=None)
     """
 
     n: int = 1024
     seed: int = 0
     max_lost: float = 0.05
+    max_points: int | None = None
 
     def __post_init__(self) -> None:
         self.check()
@@ -189,6 +192,8 @@ class Reweighted(Propagation):
         positive_integer(self.seed, "Reweighted: seed", minimum=0)
         if self.max_lost != 0 and positive_number(self.max_lost, "Reweighted: max_lost") >= 1:
             raise ValueError(f"Reweighted: max_lost: got {self.max_lost}, expected a share below 1")
+        if self.max_points is not None and positive_integer(self.max_points, "Reweighted: max_points") < self.n:
+            raise ValueError(f"Reweighted: max_points: got {self.max_points}, expected n = {self.n} or more")
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Compute the responses at the first design points."""

@@ -18,6 +18,8 @@ _log = logging.getLogger("prbayes")
 
 _MAX_ROUNDS = 8
 _THETAS = 256
+AGREE = 0.1  # standard errors within which the optima of two independent designs are to be
+_RATE = 0.65  # the power of its size with which the error of a design of several inputs falls, about
 
 
 class DesignError(RuntimeError):
@@ -65,13 +67,40 @@ def refine_at(evaluator: Evaluator, thetas: Floats) -> dict[str, str]:
     return short
 
 
-def _add(evaluator: Evaluator, thetas: Floats, names: set[str]) -> None:
-    """Add one batch to the designs named, and to those of simulators that share their specimens."""
+def grow(evaluator: Evaluator, thetas: Floats, error: float) -> bool:
+    """Add points to all designs until their error is expected to be small enough; return whether any were added.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    thetas : ndarray, shape (P, d)
+        Where the populations live that matter.
+    error : float
+        Difference between the optima of independent designs, in standard errors.
+    """
+    factor = min(2.0, (error / AGREE) ** (1 / _RATE))
+    _log.info("independent designs would differ by %.2f standard errors, expected at most %.2f", error, AGREE)
+    return _add(evaluator, thetas, set(evaluator.designs), factor)
+
+
+def _add(evaluator: Evaluator, thetas: Floats, names: set[str], factor: float = 1.0) -> bool:
+    """Add one batch to the designs named, and to those of simulators that share their specimens.
+
+    The batch has the design's first size, or brings the whole to ``factor`` times what it was. Returns whether
+    ``max_points`` left room for any.
+    """
     names = siblings(evaluator.nodes, names)
+    added = False
     for k, node in enumerate(evaluator.nodes):
         if node.name in names and isinstance(node.bound, Design):
-            node.bound.add(evaluator.roots(thetas, k))
-            _log.info("%s: refined to %d responses", node.name, node.bound.n_points)
+            first, now = node.bound.config.n, node.bound.n_points
+            batches = max(1, round((factor - 1) * now / first))
+            size = min(batches * first, node.bound.max_points - now)
+            if size > 0:
+                node.bound.add(evaluator.roots(thetas, k), size)
+                added = True
+                _log.info("%s: refined to %d responses", node.name, node.bound.n_points)
+    return added
 
 
 def pilot(evaluator: Evaluator, scales: Floats, scale: Floats, *, seed: int = 0) -> Floats:
@@ -116,7 +145,8 @@ def refuse(short: dict[str, str], evaluator: Evaluator) -> None:
         points = evaluator.designs[first].n_points
         raise DesignError(
             "; ".join(f"{name}: the design does not support the answer: {what}" for name, what in short.items())
-            + f"; narrow the priors, pass a larger prb.Reweighted(n) (now {points} points in all), or use "
+            + f"; narrow the priors, pass a larger prb.Reweighted(n) (now {points} points in all, of at "
+            f"most {evaluator.designs[first].max_points}), or use "
             "prb.Resimulated(n), which has no design"
         )
 
@@ -152,7 +182,7 @@ def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[
     Raises
     ------
     DesignError
-        If a design does not support them after eight more batches.
+        If a design does not support them after eight more batches, or at ``max_points``.
 
     References
     ----------

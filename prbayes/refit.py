@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from prbayes._arrays import Floats
 from prbayes.descent import descend
-from prbayes.design import Design
+from prbayes.design import N_BLOCKS, Design
 from prbayes.information import Information, Local, first_order_shifts, local_sampling
 from prbayes.population import Evaluator
-from prbayes.resampling import DataSets
+from prbayes.resampling import DataSets, observed_set
 
 _STEP = 0.02  # of differences, in standard errors
 _TOLERANCE = 1e-4  # gain, in units of the curvature along a standard error, that is left on the table
@@ -82,13 +82,35 @@ class Neighbourhood:
         found = [self._refit(sets, np.arange(i, min(i + block, size))) for i in range(0, size, block)]
         return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
 
-    def _refit(self, sets: DataSets, which: NDArray[np.intp]) -> tuple[Floats, NDArray[np.bool_]]:
+    def design_error(self) -> float:
+        """Return how far the optimum of an independent design would be, in standard errors; NaN if not known.
+
+        The design is taken apart into blocks, each a coarser design of the same kind, and the minimum of each
+        is found: their spread, as if they were independent, bounds the error of the whole. The largest over the
+        frame is returned. Points on a line, which cut it into parts of equal mass, are far better together than
+        their parts tell: they count as exact.
+        """
+        bounds = [n.bound for n in self.evaluator.nodes]
+        blocks = [b.blocks for b in bounds if isinstance(b, Design)]
+        if len(blocks) < len(bounds) or all((b == 0).all() for b in blocks):
+            return np.nan
+        x, converged = self._refit(observed_set(self.evaluator), np.zeros(N_BLOCKS, dtype=int), blocks)
+        if converged.sum() < N_BLOCKS / 2:
+            return np.inf
+        spread = x[converged].std(axis=0, ddof=1) / np.sqrt(N_BLOCKS)
+        return float(np.sqrt(2) * spread.max(initial=0.0))
+
+    def _refit(
+        self, sets: DataSets, which: NDArray[np.intp], blocks: Sequence[NDArray[np.intp]] = ()
+    ) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return minimisers for some of the data sets; with blocks, each on one block of the designs."""
         nodes = self.evaluator.nodes
         designs = list(self.evaluator.designs.values())
         targets = [
             n.target.with_observed(v, w[which, None]) for n, v, w in zip(nodes, sets.values, sets.weights, strict=True)
         ]
         bases = [t.basis(d.values) for t, d in zip(targets, designs, strict=True)]
+        every = np.arange(which.size)
 
         def value(x: Floats, rows: Any) -> Floats:
             thetas = self.thetas(x)
@@ -96,6 +118,10 @@ class Neighbourhood:
             for k, (target, basis) in enumerate(zip(targets, bases, strict=True)):
                 _, weights = self.evaluator.populations(thetas.reshape(-1, thetas.shape[-1]), k)
                 weights = weights.reshape(*thetas.shape[:-1], -1)
+                if blocks and blocks[k].any():
+                    weights = weights * (blocks[k] == every[rows, None, None])
+                    with np.errstate(invalid="ignore"):
+                        weights = weights / weights.sum(axis=-1, keepdims=True)
                 total = (
                     total
                     + target.rows(rows).outer(*target.rows(rows).from_basis(weights, basis, np), xp=np) / self.scales[k]
