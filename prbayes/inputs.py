@@ -21,6 +21,7 @@ from pytensor.compile.mode import Mode
 from pytensor.graph.basic import Variable
 from pytensor.graph.replace import graph_replace, vectorize_graph
 from pytensor.graph.traversal import ancestors, walk
+from pytensor.graph.utils import MissingInputError
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.variable import TensorVariable
@@ -247,17 +248,43 @@ def _event_shape(dist: TensorVariable) -> tuple[int, ...]:
     return tuple(int(s) for s in pm.draw(dist, random_seed=0, mode=PLAIN).shape)
 
 
+class PriorSampler:
+    """Draws of variables from the prior, all in one call of a function that is compiled once."""
+
+    def __init__(self, roots: Sequence[TensorVariable]) -> None:
+        self._names = ", ".join(str(r.name) for r in roots)
+        n = pt.iscalar("n")
+        first = [r for r in roots if not any(a in roots for a in ancestors([r]) if a is not r)]
+        self._batched = True
+        try:
+            outputs = vectorize_graph(list(roots), {v: change_dist_size(v, (n,), expand=True) for v in first})
+            self._function = pm.compile([n], outputs, mode=PLAIN)
+        except (NotImplementedError, ValueError, MissingInputError):  # not vectorized, or not resized: one at a time
+            self._batched = False
+            self._function = pm.compile([n], list(roots), mode=PLAIN, on_unused_input="ignore")
+        self._generators = [v for v in self._function.get_shared() if isinstance(v.type, RandomGeneratorType)]
+
+    def __call__(self, k: int, seed: int) -> list[Floats]:
+        """Return k draws of each variable, shapes (k, *shape)."""
+        for shared, child in zip(
+            self._generators, np.random.default_rng(seed).spawn(len(self._generators)), strict=True
+        ):
+            shared.set_value(child, borrow=True)
+        try:
+            if self._batched:
+                return [np.asarray(v) for v in self._function(k)]
+            values = [self._function(k) for _ in range(k)]
+        except NotImplementedError as error:
+            raise TypeError(
+                f"priors: got {self._names}, of which one cannot be drawn ({error}), expected proper priors; "
+                "replace pm.Flat and pm.HalfFlat by a wide pm.Normal or pm.HalfNormal"
+            ) from None
+        return [np.array(column) for column in zip(*values, strict=True)]
+
+
 def prior_draws(roots: Sequence[TensorVariable], k: int, seed: int) -> list[Floats]:
     """Draw the roots k times from the prior; arrays of shape (k, *shape)."""
-    try:
-        values = pm.draw(list(roots), draws=k, random_seed=seed, mode=PLAIN)
-    except NotImplementedError as error:
-        names = ", ".join(str(r.name) for r in roots)
-        raise TypeError(
-            f"priors: got {names}, of which one cannot be drawn ({error}), expected proper priors; "
-            "replace pm.Flat and pm.HalfFlat by a wide pm.Normal or pm.HalfNormal"
-        ) from None
-    return [np.asarray(v).reshape(k, *np.shape(v)[1:]) if k > 1 else np.asarray(v)[None] for v in values]
+    return PriorSampler(roots)(k, seed)
 
 
 def valid(inputs: Inputs, aleatory: Sequence[TensorVariable]) -> TensorVariable:

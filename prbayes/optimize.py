@@ -267,9 +267,7 @@ def find_optimum(
             hood = _hood(evaluator, theta, scale, scales)
             local = None if hood is None else hood.local
             others = (
-                _rivals(evaluator, theta, scales, local, starts, random_seed, refine=refine)
-                if local is not None
-                else []
+                [] if local is None else _rivals(evaluator, theta, scales, local, starts, random_seed, refine=refine)
             )
     result = search.settle(result)
     theta = search.best

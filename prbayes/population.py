@@ -20,7 +20,7 @@ from pytensor.graph.replace import graph_replace, vectorize_graph
 
 from prbayes._arrays import Floats, real_array
 from prbayes.design import Design
-from prbayes.inputs import PLAIN, ninf_for_invalid, prior_draws
+from prbayes.inputs import PLAIN, PriorSampler, ninf_for_invalid
 from prbayes.simulator import Node, log_kernel, required_nodes
 
 _CHUNK = 1 << 22  # design points times particles evaluated at a time: bounds memory
@@ -292,10 +292,14 @@ class Evaluator:
         """Return thetas, shape (P, d), of values of the free variables, shapes (P, *shape), in the model's order."""
         return np.asarray(self._transform(*draws))
 
+    @cached_property
+    def _sampler(self) -> PriorSampler:
+        return PriorSampler(self.model.free_RVs)
+
     def prior_thetas(self, size: int, seed: int) -> Floats:
         """Draw thetas from the prior, shape (size, d)."""
         if (size, seed) not in self._drawn:
-            self._drawn[size, seed] = self.thetas_of(prior_draws(self.model.free_RVs, size, seed))
+            self._drawn[size, seed] = self.thetas_of(self._sampler(size, seed))
         return self._drawn[size, seed].copy()
 
     @cached_property

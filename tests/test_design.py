@@ -100,7 +100,7 @@ def test_the_weights_integrate(model: Any) -> None:
     # moments are those of the population; with stratified points much better than by sampling.
     mu, sigma = (a.ravel() for a in np.meshgrid(np.linspace(-3, 3, 13), [0.3, 0.6, 1.2]))
     d = design(model())
-    np.testing.assert_allclose(d.support([mu, sigma])["mean_weight"], 1.0, atol=0.01)
+    np.testing.assert_allclose(d.support([mu, sigma])["mean_weight"], 1.0, atol=0.02)
     x, w = d.populations([mu, sigma])
     mean = (x * w).sum(axis=-1)
     assert (np.abs(mean - mu) < 0.02 * sigma).all()

@@ -27,7 +27,7 @@ METRICS: dict[str, prb.Metric] = {
     "area": prb.AreaMetric(),
 }
 # Largest error of 256 reweighted responses, in standard errors of the data: kinks cost the area metric some.
-DESIGN_ERROR = {"kl": 0.02, "ll": 0.02, "pr": 0.02, "area": 0.08}
+DESIGN_ERROR = {"kl": 0.03, "ll": 0.03, "pr": 0.03, "area": 0.08}
 METHODS = ("BFGS", "L-BFGS-B", "Nelder-Mead", "Powell", "CG")
 NORMAL = ("mu", "sigma")
 R256 = prb.Reweighted(256)
@@ -96,7 +96,7 @@ def simplex(f: Callable[..., float], start: Floats, size: float, tolerance: floa
 # -- where the optimum is --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "tolerance"), [("kl", 0.02), ("ll", 0.1)])
+@pytest.mark.parametrize(("name", "tolerance"), [("kl", 0.03), ("ll", 0.1)])
 def test_a_normal_population_gets_mean_and_sd_of_the_data(name: str, tolerance: float) -> None:
     # Kullback-Leibler with one bandwidth for both sides matches moments; the likelihood is smoothed at one side
     # only, with a bandwidth that costs at most a tenth of a standard error.
@@ -136,7 +136,7 @@ def test_the_optimum_is_that_of_a_brute_force_grid(name: str, brute: Callable[..
     assert (np.abs(pair(optimum) - start) < 0.025).all()
     assert (np.abs(pair(optimum) - expected) < DESIGN_ERROR[name] * errors(optimum)).all()
     at = brute(*(np.array(p) for p in pair(optimum)))
-    np.testing.assert_allclose(optimum.discrepancy, at, rtol=0.03 if name == "area" else 5e-3)
+    np.testing.assert_allclose(optimum.discrepancy, at, rtol=0.03 if name == "area" else 1e-2)
 
 
 @pytest.mark.parametrize("name", METRICS)
@@ -267,7 +267,7 @@ def test_the_optimum_does_not_depend_on_how_hyperparameters_are_constrained(kind
         x = pm.Normal.dist(*priors(kind))
         prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
     optimum = prb.minimize(model)
-    assert (np.abs(pair(optimum) - [MEAN, SD]) < 0.02 * errors(fitted("kl"))).all()
+    assert (np.abs(pair(optimum) - [MEAN, SD]) < 0.03 * errors(fitted("kl"))).all()
     np.testing.assert_allclose(errors(optimum), errors(fitted("kl")), rtol=0.02)
 
 
@@ -413,7 +413,7 @@ def test_a_black_box_response_under_resimulated() -> None:
     assert optimum.converged
     assert optimum.n_responses == response.count - probe
     assert optimum.n_evaluations * 1024 < optimum.n_responses < (optimum.n_evaluations + 20) * 1024
-    assert (np.abs(pair(optimum) - pair(fitted("pr"))) < 0.02 * errors(fitted("pr"))).all()
+    assert (np.abs(pair(optimum) - pair(fitted("pr"))) < 0.03 * errors(fitted("pr"))).all()
     symbolic = prb.minimize(normal_model(METRICS["pr"], prb.Resimulated(1024)))
     np.testing.assert_allclose(pair(optimum), pair(symbolic), atol=1e-5)
     # Responses inside a graph are counted all the same, and a gradient costs no more than a value.
