@@ -18,6 +18,8 @@ from prbayes.resimulation import FreshBound
 _FEWEST = 50  # draws of a mode below which it is left as it is
 _APART = 1.5  # ratio of distances to two modes below which a draw is between them
 _BETWEEN = 0.05  # share of such draws above which modes are not separate
+_FAR = 6.0  # standard deviations to which draws farther out are drawn in
+_WIDTH = 3.2  # of the middle 89% of a normal distribution, in standard deviations
 
 
 @dataclass(frozen=True)
@@ -98,17 +100,19 @@ class Affine:
             if np.mean(second < _APART * first) > _BETWEEN:
                 return thetas, "none: the posterior has modes that run into each other"
         out = flat.copy()
-        count = 0
+        count, far = 0, 0
         for m, hood in enumerate(hoods):
             mine = nearest == m
             if mine.sum() >= _FEWEST:
                 x, rest = hood.coordinates(flat[mine])
                 out[mine] = moved(hood, x, rest, *self.target(hood))
+                far += int((_drawn_in(x) != x).any(axis=1).sum())
                 count += 1
         if not count:
             return thetas, f"none: there are fewer than {_FEWEST} draws of a mode"
         modes = "" if len(hoods) == 1 else f", {count} modes each by itself"
-        return out.reshape(thetas.shape), f"{self!r}{modes}"
+        drawn_in = f", {far / len(flat):.1%} of the draws drawn in to {_FAR:.0f} standard deviations" if far else ""
+        return out.reshape(thetas.shape), f"{self!r}{modes}{drawn_in}"
 
 
 def inapplicable(evaluator: Evaluator) -> str:
@@ -126,6 +130,7 @@ def inapplicable(evaluator: Evaluator) -> str:
 def moved(hood: Neighbourhood, x: Floats, rest: Floats, mean: Floats, covariance: Floats) -> Floats:
     """Move draws to a mean and covariance along the frame; what is left follows as its regression on them says."""
     r = hood.sd.size
+    x = _drawn_in(x)
     now = np.cov(x, rowvar=False).reshape(r, r)
     center = x.mean(axis=0)
     root = _root(now)
@@ -133,6 +138,17 @@ def moved(hood: Neighbourhood, x: Floats, rest: Floats, mean: Floats, covariance
     to = mean + (x - center) @ (inverse @ _root(root @ covariance @ root) @ inverse).T
     slopes = np.linalg.solve(now, (x - center).T @ (rest - rest.mean(axis=0)) / (len(x) - 1))
     return hood.thetas(to, rest + (to - x) @ slopes)
+
+
+def _drawn_in(x: Floats) -> Floats:
+    """Return draws, (n, r), at most six standard deviations from the median, as the middle 89% tells them.
+
+    A few in a thousand far out, as where a bounded parameter comes near its bound, would otherwise decide how
+    all others are moved.
+    """
+    low, middle, high = np.quantile(x, [0.055, 0.5, 0.945], axis=0)
+    far = _FAR * (high - low) / _WIDTH
+    return np.clip(x, middle - far, middle + far)
 
 
 def _root(matrix: Floats) -> Floats:

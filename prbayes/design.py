@@ -12,6 +12,7 @@ import numpy as np
 import pytensor
 import pytensor.tensor as pt
 from numpy.typing import NDArray
+from pytensor.gradient import disconnected_grad
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._arrays import Floats
@@ -26,7 +27,9 @@ _log = logging.getLogger("prbayes")
 _MAX_THETAS = 512  # components of a batch's mixture density
 N_BLOCKS = 8  # parts of a batch whose differences tell its error
 _DRAFT = 16  # draft points, whose response is not computed, for each point of a one-dimensional design
+_MOST_DRAFT = 1 << 18  # from which on they are a fine grid
 
+_CHUNK = 1 << 22  # thetas times points at a time: bounds memory
 _MANY = 4  # inputs beyond which reweighting is seldom worth its while
 _REFINED = "prb.minimize and prb.sample_smc refine it themselves, before pm.sample call prb.refine(model)"
 _TOO_MANY = "{} inputs are many for stored responses: rather use propagation=prb.Resimulated(n), which has no design"
@@ -138,13 +141,27 @@ class Design(Bound):
         self._points, self.values, self._thetas = points, values, list(thetas)
         self._counts = np.concatenate([self._counts, counts])
         self._sizes.append(n)
-        logs = self._log_density(*self._thetas, *points)[0]
-        used = self._counts > 0
-        log_g = np.logaddexp.reduce(logs[used] + np.log(self._counts[used, None] / values.size), axis=0)
+        log_g, sums = self._log_mixture(self._thetas, self._counts, points)
         self._store([*points, log_g, *self.target.basis(values)])
-        weights = logs[-k:] - log_g
-        total = np.logaddexp.reduce(weights, axis=1)
-        return float(np.median(np.exp(2 * total - np.logaddexp.reduce(2 * weights, axis=1))))
+        return float(np.median(np.exp(2 * sums[0] - sums[1])[-k:]))
+
+    def _log_mixture(self, thetas: Sequence[Floats], counts: Floats, points: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """Return the log density of a mixture at points, (n,), and log sums of its components' weights, (2, k).
+
+        The sums over the points are of the weights, component over mixture, and of their squares.
+        """
+        used = counts > 0
+        share = np.log(counts[used, None] / counts.sum())
+        log_g = np.empty(len(points[0]))
+        sums = np.full((2, counts.size), -np.inf)
+        step = max(1, _CHUNK // counts.size)
+        for i in range(0, log_g.size, step):
+            (logs,) = self._log_density(*thetas, *(p[i : i + step] for p in points))
+            log_g[i : i + step] = np.logaddexp.reduce(logs[used] + share, axis=0)
+            weights = logs - log_g[i : i + step]
+            each = [np.logaddexp.reduce(power * weights, axis=1) for power in (1, 2)]
+            sums = np.logaddexp(sums, each)
+        return log_g, sums
 
     @contextmanager
     def undone(self) -> Iterator[None]:
@@ -203,11 +220,9 @@ class Design(Bound):
 
     def _equal_mass(self, thetas: Sequence[Floats], n: int, seed: int) -> tuple[list[Floats], Floats]:
         """Return n points of one input that cut the mixture over all thetas into parts of equal mass."""
-        (draft,), counts = self._place(thetas, _DRAFT * n, seed)
+        (draft,), counts = self._place(thetas, min(_DRAFT * n, _MOST_DRAFT), seed)
         grid = np.unique(draft[np.isfinite(draft)])
-        logs = self._log_density(*thetas, grid)[0]
-        used = counts > 0
-        density = np.exp(np.logaddexp.reduce(logs[used] + np.log(counts[used, None] / counts.sum()), axis=0))
+        density = np.exp(self._log_mixture(thetas, counts, [grid])[0])
         mass = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(grid))])
         levels = (np.arange(n) + np.random.default_rng(seed).uniform()) / n
         return [np.interp(levels * mass[-1], mass, grid)], counts * (n / counts.sum())
@@ -221,8 +236,11 @@ class Design(Bound):
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy of the reweighted responses, +inf where no point has weight."""
         logs = self.log_weights(params)
-        supported = pt.max(logs) > -np.inf
-        weights = pt.special.softmax(pt.switch(supported, logs, 0.0))
+        top = pt.max(logs)
+        supported = top > -np.inf
+        # PyTensor's softmax is compiled with a backend of its own; the largest only guards against overflow.
+        raw = pt.exp(pt.switch(supported, logs - disconnected_grad(top), 0.0))
+        weights = raw / raw.sum()
         basis = tuple(self._shared[len(self.inputs.aleatory) + 1 :])
         if isinstance(self.target.metric, FunctionMetric):
             d = OpaqueOp(self.target)(*basis, weights)

@@ -30,7 +30,9 @@ from prbayes._arrays import Floats, real_array
 
 # Batched NumPy calls: nothing here runs often enough to repay a heavy compilation. Without fusion every
 # elementwise operation is one NumPy ufunc; with it, the Python linker would loop over scalars.
-PLAIN = Mode(linker="py", optimizer="fast_run").excluding("fusion", "inplace", "BlasOpt", "c_blas")
+PLAIN = Mode(linker="py", optimizer="fast_run").excluding(
+    "fusion", "inplace", "BlasOpt", "c_blas", "symbolic_op_recognition"
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -258,10 +258,11 @@ class AreaDiscrepancy(Discrepancy):
             observed = np.broadcast_to(observed, (*batch, observed.size))
             u, weights = np.broadcast_to(u, observed.shape), np.broadcast_to(weights, simulated.shape)
         pooled = xp.concatenate([simulated, observed], axis=-1)
-        signed = xp.concatenate([weights, -u], axis=-1)
         order = xp.argsort(pooled, axis=-1)
-        lengths = _lengths(xp.take_along_axis(pooled, order, axis=-1), xp)
-        return xp.cumsum(xp.take_along_axis(signed, order, axis=-1), axis=-1)[..., :-1], lengths
+        pooled = xp.take_along_axis(pooled, order, axis=-1)
+        signed = xp.take_along_axis(xp.concatenate([weights, -u], axis=-1), order, axis=-1)
+        del order  # a population of ten million is to fit into little memory
+        return xp.cumsum(signed, axis=-1)[..., :-1], _lengths(pooled, xp)
 
     def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
         """Return, for the simulated and for the observed values, their order and how many are below each knot.

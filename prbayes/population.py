@@ -131,10 +131,6 @@ class Evaluator:
     def _evaluate(self) -> Any:
         return self._compile([self.model.varlogp, self._log_other()])
 
-    @cached_property
-    def _prior(self) -> Any:
-        return self._compile([self.model.varlogp])
-
     def __call__(self, thetas: Floats) -> Evaluation:
         """Evaluate a batch, shape (P, d); invalid thetas leave the others alone."""
         size = len(thetas)
@@ -189,7 +185,7 @@ class Evaluator:
 
         Metrics choose bandwidths and cells anew; designs and epsilons are the same objects.
         """
-        _ = self._evaluate, self._prior, self._constrain, self._roots, self._transform  # compiled once, for all copies
+        _ = self._evaluate, self._constrain, self._roots, self._transform  # compiled once, for all copies
         other = copy.copy(self)
         other.nodes = [
             replace(
@@ -224,7 +220,7 @@ class Evaluator:
 
     def in_support(self, thetas: Floats) -> Any:
         """Return which thetas have a finite log prior, shape (P,)."""
-        return np.isfinite(np.broadcast_to(self._prior(np.ascontiguousarray(thetas))[0], len(thetas)))
+        return np.isfinite(np.broadcast_to(self._evaluate(np.ascontiguousarray(thetas))[0], len(thetas)))
 
     @cached_property
     def _constrain(self) -> tuple[list[str], Any]:

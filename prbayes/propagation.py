@@ -293,7 +293,7 @@ def sobol(n: int, dimensions: int, seed: int) -> Floats:
 
     engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
     points = engine.random_base2(int(np.ceil(np.log2(n))))[:n] if n > 1 else engine.random(1)
-    return np.asarray(np.clip(points, 1e-12, 1 - 1e-12))
+    return np.asarray(np.clip(points, 1e-12, 1 - 1e-12, out=points))
 
 
 def base_points(inputs: Inputs, n: int, seed: int) -> tuple[Floats, list[Floats]]:
@@ -302,8 +302,8 @@ def base_points(inputs: Inputs, n: int, seed: int) -> tuple[Floats, list[Floats]
     sizes = [int(np.prod(s, dtype=int)) for s in shapes]
     u = sobol(n, 1 + sum(sizes), seed)
     edges = np.cumsum([1, *sizes])
-    parts = [u[:, a:b].reshape(n, *s) for a, b, s in zip(edges[:-1], edges[1:], shapes, strict=True)]
-    return u[:, 0], parts
+    parts = [u[:, a:b].reshape(n, *s).copy() for a, b, s in zip(edges[:-1], edges[1:], shapes, strict=True)]
+    return u[:, 0].copy(), parts
 
 
 def probe(bound: Bound, sampler: PopulationSampler, seed: int) -> tuple[Any, ...]:

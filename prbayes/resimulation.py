@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
+from pytensor import shared
 from pytensor.compile import function
 from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
@@ -20,6 +21,8 @@ from prbayes.inputs import PLAIN, Inputs, PopulationSampler, compile_batched, ni
 from prbayes.propagation import Bound, Fresh, Resimulated, base_points, probe
 from prbayes.responses import ResponseOp, Responses, symbolic_discrepancy
 
+_KEPT = 1 << 21  # base points whose transforms may stay in memory
+
 
 class ResimulatedBound(Bound):
     """Common random numbers: the same base points for every theta."""
@@ -29,7 +32,9 @@ class ResimulatedBound(Bound):
     ) -> None:
         super().__init__(name, inputs, target, responses)
         self.n_per_theta = config.n
-        _, self._points = base_points(inputs, config.n, config.seed)
+        _, points = base_points(inputs, config.n, config.seed)
+        # What depends on constants alone, PyTensor computes once and keeps: fast, unless it is too large to keep.
+        self._points: list[Any] = points if config.n <= _KEPT else [shared(u) for u in points]
         for dist, u in zip(inputs.aleatory, self._points, strict=True):
             quantiles(name, dist, u)  # refuses what has no inverse distribution function
         self.symbolic = self._accepts_tensors(*probe(self, PopulationSampler(inputs), config.seed))

@@ -104,6 +104,16 @@ def test_mean_and_covariance_are_hit_exactly() -> None:
         np.testing.assert_allclose(a, b, atol=1e-8)
 
 
+def test_a_few_draws_far_out_do_not_decide_how_the_others_are_moved() -> None:
+    hood = blind_hood()
+    x = np.random.default_rng(4).standard_normal((2000, 2))
+    x[:10, 0] -= 60
+    new, _ = hood.coordinates(moved(hood, x, np.zeros((2000, 3)), np.array([1.0, 2.0]), np.diag([4.0, 0.25])))
+    np.testing.assert_allclose(new[10:].std(axis=0), [2.0, 0.5], rtol=0.12)
+    np.testing.assert_allclose(new[10:].mean(axis=0), [1.0, 2.0], atol=0.1)
+    assert new[:10, 0].max() < new[10:, 0].min()
+
+
 def test_the_least_motion_among_all_maps() -> None:
     # The map between normals is symmetric in these coordinates: draws that are there already stay.
     hood = blind_hood()

@@ -16,17 +16,19 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("size", [20, 50])
-@pytest.mark.parametrize("problem", ["linear", "quadratic", "correlated"])
-def test_coverage(problem: str, size: int) -> None:
-    rows = coverage.block(problem, size, 0, 60, coverage.METRICS)
+@pytest.mark.parametrize(("problem", "count"), [("linear", 60), ("quadratic", 60), ("correlated", 15)])
+def test_coverage(problem: str, count: int, size: int) -> None:
+    # Two hyperparameters that are nearly independent: at 60 data sets the standard error of the mean coverage is
+    # .03, and that of a standard deviation 9%.
+    rows = coverage.block(problem, size, 0, count, coverage.METRICS)
+    error = (60 / count) ** 0.5
     for metric in coverage.METRICS:
         found = coverage.summarise(rows, metric, "affine")
         assert found["failed"] == 0
-        # 60 data sets, two hyperparameters that are nearly independent: standard error .03.
-        assert abs(np.mean(found["coverage_89%"]) - 0.89) < 0.10
-        assert np.min(found["sd_over_own_sampling_sd"]) > 0.7
-        # At N = 20 the full study has up to 1.42; the spread of 60 estimates has a standard error of 9%.
-        assert np.max(found["sd_over_own_sampling_sd"]) < (2.0 if size == 20 else 1.5)
+        assert abs(np.mean(found["coverage_89%"]) - 0.89) < 0.10 * error
+        assert np.min(found["sd_over_own_sampling_sd"]) > 1 - 0.3 * error
+        # At N = 20 the full study has up to 1.42.
+        assert np.max(found["sd_over_own_sampling_sd"]) < (1.7 if size == 20 else 1.2) + 0.3 * error
 
 
 def test_a_study_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
