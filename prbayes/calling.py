@@ -24,6 +24,7 @@ _log = logging.getLogger("prbayes")
 
 _CHUNK_SECONDS = 0.2  # that a task should take: long against sending it, short against losing it
 _ALONE_SECONDS = 0.01  # from which a response of one specimen at a time is a task of its own
+_MANY = 1024  # tasks sent out to an executor that does not tell how many workers it has
 _SHOWN_FROM = 2.0  # expected seconds from which there is a progress bar
 
 
@@ -106,6 +107,7 @@ class Caller:
         self.count = 0
         self.failures = 0
         self._cost = 0.0  # seconds for one response, measured
+        self._workers, self._window = 1, 1  # tasks at work, and those sent out, at any time
 
     def __call__(self, arguments: Sequence[Any], varying: Sequence[bool], keys: Floats) -> Floats:
         """Return responses, shape (n,).
@@ -181,6 +183,7 @@ class Caller:
         """
         here = self.executor is None or isinstance(self.executor, ThreadPoolExecutor)
         work = partial(_compute, self.function) if here else partial(_remote, _packed(self.function))
+        self._workers, self._window = _capacity(self.executor)
         begun: dict[Future[Any], Any] = {}
         at = 0
         error: BaseException | None = None
@@ -217,14 +220,6 @@ class Caller:
         report(rows.size, self._cost / self._workers)
         return rows, values, messages
 
-    @property
-    def _workers(self) -> int:
-        return 1 if self.executor is None else int(getattr(self.executor, "_max_workers", 0) or os.cpu_count() or 1)
-
-    @property
-    def _window(self) -> int:
-        return 1 if self.executor is None else 2 * self._workers
-
     def _chunk(self, left: int) -> int:
         """Return how many points the next task gets."""
         if self._cost == 0:
@@ -233,6 +228,20 @@ class Caller:
             return 1
         share = max(1, left // (2 * self._workers)) if self.executor is not None else left
         return int(max(1, min(share, _CHUNK_SECONDS / self._cost)))
+
+
+def _capacity(executor: Executor | None) -> tuple[int, int]:
+    """Return how many workers an executor has, and how many tasks to send out at a time.
+
+    The interface does not tell: processes, threads and loky keep ``_max_workers``, MPI ``num_workers``, and Dask's
+    client knows. Of others many tasks are sent out, lest workers wait.
+    """
+    if executor is None:
+        return 1, 1
+    nthreads = getattr(getattr(executor, "_client", None), "nthreads", None)
+    known = getattr(executor, "_max_workers", 0) or getattr(executor, "num_workers", 0)
+    workers = int(known or (sum(nthreads().values()) if callable(nthreads) else 0))
+    return (workers, 2 * workers) if workers else (os.cpu_count() or 1, _MANY)
 
 
 def _submitted(executor: Executor | None, work: Callable[..., Any], *job: Any) -> Future[Any]:

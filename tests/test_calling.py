@@ -284,6 +284,38 @@ def test_what_was_computed_before_a_failure_is_kept(tmp_path: Path) -> None:
     assert kept == int(np.argmax(STEEP))  # all that came before the first steep point
 
 
+def test_an_executor_that_does_not_tell_its_size_gets_work_for_many() -> None:
+    class Cluster:
+        """Begins once all has come, or a second later."""
+
+        most = 0
+
+        def __init__(self, pool: ThreadPoolExecutor) -> None:
+            self.pool, self.under_way, self.lock, self.full = pool, 0, threading.Lock(), threading.Event()
+
+        def submit(self, function: Any, *arguments: Any) -> Any:
+            with self.lock:
+                self.under_way += 1
+                self.most = max(self.most, self.under_way)
+                if self.under_way == N:
+                    self.full.set()
+            return self.pool.submit(self.work, function, *arguments)
+
+        def work(self, function: Any, *arguments: Any) -> Any:
+            self.full.wait(1.0)
+            with self.lock:
+                self.under_way -= 1
+            return function(*arguments)
+
+        map = None
+
+    with ThreadPoolExecutor(N) as pool:
+        cluster = Cluster(pool)
+        caller = Caller("y", prb.scalar(lambda x: 2 * x), cluster, Abort(), None)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(caller([POINTS], [True], POINTS[:, None]), 2 * POINTS)
+    assert cluster.most == N
+
+
 @pytest.mark.parametrize("error", [ArithmeticError, BrokenExecutor])
 def test_what_is_being_computed_when_one_fails_is_kept(error: type[Exception], tmp_path: Path) -> None:
     """The first of four tasks that are begun fails at once; the others are waited for, and nothing more is begun."""
