@@ -128,6 +128,7 @@ def statistics(u: Any) -> dict[str, Any]:
     i = np.arange(1, n + 1)
     return {
         "area": area(u),
+        "area of |2u - 1|": area(np.abs(2 * u - 1)),
         "Kolmogorov-Smirnov": np.array([kstest(row, "uniform").statistic for row in u]),
         "Cramer-von Mises": np.array([cramervonmises(row, "uniform").statistic for row in u]),
         "Anderson-Darling": -n - ((2 * i - 1) / n * (np.log(u) + np.log1p(-u[:, ::-1]))).sum(axis=1),

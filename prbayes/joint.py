@@ -13,7 +13,7 @@ from prbayes._arrays import Floats, positive_integer
 from prbayes.adjust import inapplicable
 from prbayes.information import prior_scale
 from prbayes.inputs import read_inputs
-from prbayes.nulls import Case, Condition, Predictive, SimulatedNull, area
+from prbayes.nulls import Case, Condition, Predictive, SimulatedNull
 from prbayes.optimize import Optimum
 from prbayes.predict import at_design_points, data_digest, serving, specimen_names
 from prbayes.refit import Neighbourhood
@@ -107,7 +107,7 @@ class JointNull(SimulatedNull):
             own = refitted if values is None else np.broadcast_to(values, weights.shape)
             rows = zip(own, weights, measured, strict=True)
             u.append(np.array([Predictive(v, w).transform(y, ties) for v, w, y in rows]))
-        statistics = area(np.concatenate(u, axis=1))
+        statistics = case.statistic(np.concatenate(u, axis=1))
         return np.asarray(statistics[~np.isnan(statistics)])
 
     def _served(self, case: Case, condition: Condition) -> tuple[int, Floats | None]:

@@ -106,12 +106,15 @@ class Case:
         Whether a specimen occurs in several conditions.
     seed : int or None
         With a seed u-values are randomised within ties.
+    folded : bool
+        Whether the statistic is the area of abs(2u - 1).
     """
 
     conditions: tuple[Condition, ...]
     n_specimens: int
     shared: bool
     seed: int | None
+    folded: bool = False
 
     @property
     def size(self) -> int:
@@ -131,6 +134,10 @@ class Case:
     def rng(self, stream: int) -> np.random.Generator | None:
         """Return a generator for the choice within ties, or None for the mid-transform."""
         return None if self.seed is None else np.random.default_rng([self.seed, stream])
+
+    def statistic(self, u: Floats) -> Floats:
+        """Return the areas of u-values, shape (..., n)."""
+        return area(np.abs(2 * u - 1) if self.folded else u)
 
     def u_values(self) -> list[Floats]:
         """Return the u-values of each condition."""
@@ -289,7 +296,7 @@ class PosteriorNull(SimulatedNull):
                 # The same place in every condition: the same sample, hence the same specimen.
                 which = at[d, (place[:, c.numbers] * count[d]).astype(int)]
                 u.append(between(left[d, which], right[d, which], ties))
-            found[i : i + step] = area(np.concatenate(u, axis=1))
+            found[i : i + step] = case.statistic(np.concatenate(u, axis=1))
         return found
 
     def describe(self, case: Case) -> str:

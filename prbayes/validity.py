@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._arrays import Floats, positive_integer, real_array
-from prbayes.nulls import Case, Condition, ExactModel, Null, PosteriorNull, area
+from prbayes.nulls import Case, Condition, ExactModel, Null, PosteriorNull
 from prbayes.predict import data_digest, specimen_names
 from prbayes.results import versions
 
@@ -32,6 +32,8 @@ class ValidityTest:
     level : float
     null : str
         What was held to be true.
+    folded : bool
+        Whether the area is that of ``|2u - 1|``.
     u_values : ndarray, shape (n,)
         Of all conditions, one after the other.
     conditions, specimens : ndarray of str, shape (n,)
@@ -43,6 +45,7 @@ class ValidityTest:
     p_value: float
     level: float
     null: str
+    folded: bool
     u_values: Floats
     conditions: NDArray[np.str_]
     specimens: NDArray[np.str_]
@@ -56,7 +59,7 @@ class ValidityTest:
         n, of = self.u_values.size, np.unique(self.specimens).size
         return (
             f"ValidityTest: {'rejected' if self.rejected else 'not rejected'} at level {self.level:g}\n"
-            f"  area {self.statistic:.4f}, critical value {self.critical_value:.4f}, p-value {self.p_value:.3g}\n"
+            f"  area {'of |2u - 1| ' if self.folded else ''}{self.statistic:.4f}, critical value {self.critical_value:.4f}, p-value {self.p_value:.3g}\n"
             f"  {n} values of {of} specimens, {np.unique(self.conditions).size} condition(s)\n"
             f"  null: {self.null}"
         )
@@ -71,6 +74,7 @@ class ValidityTest:
                 "p_value": self.p_value,
                 "rejected": self.rejected,
                 "level": self.level,
+                "folded": self.folded,
             },
             coords={"condition": ("observation", self.conditions), "specimen": ("observation", self.specimens)},
             attrs={"null": self.null, **versions()},
@@ -135,6 +139,7 @@ def area_test(
     level: float = 0.05,
     null: Null | None = None,
     specimens: ArrayLike | Mapping[str, ArrayLike | None] | Sequence[ArrayLike | None] | None = None,
+    folded: bool = False,
     random_seed: int | None = None,
 ) -> ValidityTest:
     r"""Test whether measured responses may come from the calibrated population.
@@ -142,6 +147,8 @@ def area_test(
     The statistic is the area between the ECDF of the u-values, of all conditions together, and the identity:
 
     .. math:: A = \int_0^1 |F_n(v) - v| \, dv
+
+    It sees a wrong mean well and a wrong spread hardly; the area of ``|2u - 1|`` sees a wrong spread.
 
     Parameters
     ----------
@@ -159,6 +166,9 @@ def area_test(
         Labels. Values with the same label, also of several conditions, are of one specimen, and replicates of the
         null then are as dependent as they: sample i of a draw must be the same specimen in all conditions, as
         `predict` has it with the same seed. Without labels all values are of different specimens.
+    folded : bool
+        Whether to test ``|2u - 1|``, which a right model makes uniform as well: responses too far out, or too
+        close to the middle. Two tests at ``level`` / 2 look at both mean and spread.
     random_seed : int, optional
         As in `u_values`.
 
@@ -194,7 +204,7 @@ def area_test(
         )
     if isinstance(level, bool) or not isinstance(level, int | float | np.floating) or not 0 < level < 1:
         raise ValueError(f"level: got {level!r:.60}, expected a probability between 0 and 1, such as 0.05")
-    case, attributes = _case(observed, predicted, specimens, random_seed)
+    case, attributes = _case(observed, predicted, specimens, random_seed, folded)
     if case.draws > 1 or case.dependent:
         null = PosteriorNull() if null is None else null
     null = ExactModel() if null is None else null
@@ -204,7 +214,7 @@ def area_test(
     if case.shared:
         _refuse_unlike(case, attributes)
     u = np.concatenate(case.u_values())
-    statistic = float(area(u))
+    statistic = float(case.statistic(u))
     p_value, critical = null.judge(case, statistic, float(level))
     labels = [c.labels or tuple(f"{c.name}, {i}" for i in range(c.observed.size)) for c in case.conditions]
     return ValidityTest(
@@ -214,12 +224,15 @@ def area_test(
         level=float(level),
         null=null.describe(case),
         u_values=u,
+        folded=folded,
         conditions=np.array([c.name for c in case.conditions for _ in c.observed]),
         specimens=np.array([label for part in labels for label in part]),
     )
 
 
-def _case(observed: Any, predicted: Any, specimens: Any, seed: int | None) -> tuple[Case, list[dict[Any, Any]]]:
+def _case(
+    observed: Any, predicted: Any, specimens: Any, seed: int | None, folded: bool = False
+) -> tuple[Case, list[dict[Any, Any]]]:
     """Return the conditions, checked, and the attributes of their predictions."""
     if seed is not None:
         positive_integer(seed, "random_seed", minimum=0)
@@ -246,7 +259,7 @@ def _case(observed: Any, predicted: Any, specimens: Any, seed: int | None) -> tu
             "all; pass the same result and draws= to prb.predict"
         )
     distinct = sum(np.unique(c.numbers).size for c in conditions)
-    return Case(tuple(conditions), len(numbers), distinct > len(numbers), seed), attributes
+    return Case(tuple(conditions), len(numbers), distinct > len(numbers), seed, folded), attributes
 
 
 def _by_condition(observed: Any, predicted: Any, specimens: Any) -> tuple[list[str], list[tuple[Any, Any, Any]]]:
