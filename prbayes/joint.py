@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from prbayes._arrays import Floats, positive_integer
 from prbayes.adjust import inapplicable
+from prbayes.design import Design
 from prbayes.information import prior_scale
 from prbayes.inputs import read_inputs
 from prbayes.nulls import Case, Condition, Predictive, SimulatedNull
 from prbayes.optimize import Optimum
-from prbayes.predict import at_design_points, data_digest, serving, specimen_names
+from prbayes.predict import data_digest, serving, specimen_names
 from prbayes.refit import Neighbourhood
 from prbayes.resampling import groups, sets_at, simulated_points, specimens
 from prbayes.responses import Responses, refuse_uncallable
@@ -137,14 +138,15 @@ class JointNull(SimulatedNull):
         labels = set(condition.labels or ())
         # First the simulators that measured these specimens.
         among = sorted(nodes, key=lambda n: n.specimens is None or not labels & set(specimen_names(n.specimens)))
-        node = serving(among, response, sorted_inputs)
+        called = Responses(condition.name, response, sorted_inputs)
+        node = serving(among, called)
         if node is None:
             raise ValueError(
                 f"{condition.name}: responses: got inputs that no simulator with prb.Reweighted has, expected its "
                 ".dist() objects; only then is it known which responses belong to the specimens of the calibration"
             )
-        called = Responses(condition.name, response, sorted_inputs)
-        return nodes.index(node), at_design_points(node, response, sorted_inputs, called)[0]
+        assert isinstance(node.bound, Design)
+        return nodes.index(node), node.bound.values_of(called)
 
     def _numbers(self, case: Case, served: list[int]) -> tuple[list[NDArray[np.intp]], int]:
         """Return the specimens of each condition, those of the calibration by their numbers, and how many are new."""

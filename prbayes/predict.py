@@ -28,10 +28,6 @@ from prbayes.simulator import Node, model_on_context, nodes
 
 _log = logging.getLogger("prbayes")
 
-STORED = "stored responses of {}"
-AT_POINTS = "the design points of {}"
-NEW = "new specimens"
-
 
 def predict(
     result: Optimum | xr.DataTree,
@@ -51,7 +47,7 @@ def predict(
     Each draw of the posterior is a population of its own, of which ``n_samples`` specimens are drawn; an
     optimum is one population. Where the model has a simulator with `Reweighted` and the same ``.dist()``
     objects, the specimens are its design points, resampled by their weights: its own response then costs
-    nothing, and any other one is computed once per design point, not once per draw and specimen. Elsewhere
+    nothing, and any other one is computed once per design point, not once per draw, specimen or call. Elsewhere
     specimens are new: Sobol points through the inverse distribution functions, with another shift for each
     draw, or random draws where there is no inverse.
 
@@ -127,15 +123,18 @@ def predict(
     sorted_inputs = read_inputs(label, inputs, model)
     responses = Responses(label, response, sorted_inputs, executor=executor, store=store)
     rng = np.random.default_rng(random_seed)
-    node = serving(list(nodes(model).values()), response, sorted_inputs) if stored else None
+    node = serving(list(nodes(model).values()), responses) if stored else None
     if node is not None:
-        at, which, source = at_design_points(node, response, sorted_inputs, responses)
-        chosen = _resampled(node, [points[str(r.name)] for r in node.bound.inputs.roots], n_samples, rng)
-        values, specimens, by = at[chosen], [x[chosen] for x in which], node.name
+        design = node.bound
+        assert isinstance(design, Design)
+        chosen = _resampled(node, [points[str(r.name)] for r in design.inputs.roots], n_samples, rng)
+        values = design.values_of(responses)[chosen]
+        specimens = [x[chosen] for x in design.points_of(sorted_inputs)]
+        source = f"{'design points' if responses.count else 'stored responses'} of {node.name}"
     else:
         roots = [points[str(r.name)] for r in sorted_inputs.roots]
         specimens, epistemic = _new_specimens(label, sorted_inputs, roots, n_samples, rng)
-        values, source, by = responses(specimens, epistemic), NEW, ""
+        values, source = responses(specimens, epistemic), "new specimens"
     bad = int(np.isnan(values).sum())
     if bad == values.size:
         raise ResponseError(f"{label}: got NaN at all {bad} specimens, expected numbers; +inf is a specimen that fails")
@@ -147,7 +146,7 @@ def predict(
         coords={**coords, "sample": np.arange(n_samples)},
         name=label,
         attrs={
-            "source": source.format(by),
+            "source": source,
             "responses": responses.count,
             "nan": bad,
             "specimens_id": _digest(*specimens),
@@ -184,42 +183,17 @@ def _populations(result: Any, model: pm.Model, draws: int) -> tuple[dict[str, Fl
     return {n: a.reshape(-1, *a.shape[2:]) for n, a in arrays.items()}, coords
 
 
-def serving(among: Sequence[Node], response: object, inputs: Inputs) -> Node | None:
+def serving(among: Sequence[Node], responses: Responses) -> Node | None:
     """Return the simulator whose design points are specimens of these inputs: best the one with this response."""
+    wanted = responses.inputs
     able = [
         n
         for n in among
         if isinstance(n.bound, Design)
-        and not inputs.epistemic
-        and all(any(x is y for y in n.bound.inputs.aleatory) for x in inputs.aleatory)
+        and not wanted.epistemic
+        and all(any(x is y for y in n.bound.inputs.aleatory) for x in wanted.aleatory)
     ]
-    return next((n for n in able if _computes(n, response, inputs)), able[0] if able else None)
-
-
-def _computes(node: Node, response: object, inputs: Inputs) -> bool:
-    """Whether a simulator has this response, with the same inputs and constants."""
-    own = node.bound.inputs
-    if node.bound.responses.function is not response or len(own.arguments) != len(inputs.arguments):
-        return False
-    for a, b in zip(own.arguments, inputs.arguments, strict=True):
-        if isinstance(a, int) is not isinstance(b, int):
-            return False
-        if not (own.aleatory[a] is inputs.aleatory[b] if isinstance(a, int) else np.array_equal(a, b)):
-            return False
-    return True
-
-
-def at_design_points(
-    node: Node, response: object, inputs: Inputs, responses: Responses
-) -> tuple[Floats, list[Floats], str]:
-    """Return responses at a simulator's design points, the points of each aleatory input, and how they were got."""
-    design = node.bound
-    assert isinstance(design, Design)
-    points = dict(zip(map(id, design.inputs.aleatory), design._points, strict=True))
-    own = [points[id(x)] for x in inputs.aleatory]
-    if _computes(node, response, inputs):
-        return design.values, own, STORED
-    return responses(own, []), own, AT_POINTS
+    return next((n for n in able if responses.same_as(n.bound.responses)), able[0] if able else None)
 
 
 def _resampled(node: Node, roots: list[Floats], n: int, rng: np.random.Generator) -> NDArray[np.intp]:

@@ -57,9 +57,10 @@ class ValidityTest:
 
     def __repr__(self) -> str:
         n, of = self.u_values.size, np.unique(self.specimens).size
+        what = "area of |2u - 1|" if self.folded else "area"
         return (
             f"ValidityTest: {'rejected' if self.rejected else 'not rejected'} at level {self.level:g}\n"
-            f"  area {'of |2u - 1| ' if self.folded else ''}{self.statistic:.4f}, critical value {self.critical_value:.4f}, p-value {self.p_value:.3g}\n"
+            f"  {what} {self.statistic:.4f}, critical value {self.critical_value:.4f}, p-value {self.p_value:.3g}\n"
             f"  {n} values of {of} specimens, {np.unique(self.conditions).size} condition(s)\n"
             f"  null: {self.null}"
         )

@@ -140,8 +140,23 @@ def test_another_response_is_computed_once_for_each_design_point() -> None:
     response = Counted()
     found = prb.predict(POSTERIOR, response, x, model=model, n_samples=2000, random_seed=1)
     assert response.count == found.attrs["responses"] == 512
-    assert found.attrs["source"] == "the design points of y"
+    assert found.attrs["source"] == "design points of y"
     np.testing.assert_allclose(np.median(np.log(found), axis=-1), MEANS, atol=0.01)
+
+
+def test_what_was_computed_for_one_prediction_serves_the_next() -> None:
+    model, x = build()
+    response = Counted()
+    one = prb.predict(POSTERIOR, response, x, model=model, random_seed=1)
+    two = prb.predict(prb.minimize(model, refine=False), response, x, n_samples=100, random_seed=2)
+    assert response.count == 512
+    assert (one.attrs["responses"], two.attrs["responses"]) == (512, 0)
+    assert two.attrs["source"] == "stored responses of y"
+    bound = prb.simulator.nodes(model)[model["y"]].bound
+    bound.add([np.array([0.9, 1.1]), np.array([0.5, 0.5])], 100)
+    after = prb.predict(POSTERIOR, response, x, model=model, random_seed=1)
+    assert response.count == 612
+    np.testing.assert_allclose(np.median(np.log(after), axis=-1), MEANS, atol=0.01)
 
 
 def test_another_constant_is_another_response() -> None:
@@ -166,9 +181,9 @@ def test_without_stored_points_every_specimen_is_computed() -> None:
 
 
 def test_a_store_keeps_the_responses(tmp_path: Path) -> None:
-    model, x = plain()
     response = Counted()
     for _ in range(2):
+        model, x = build()
         prb.predict(POSTERIOR, response, x, model=model, store=tmp_path, name="later", random_seed=1)
     assert response.count == 512
     with pytest.raises(ValueError, match="a function called <lambda>, expected a name"):

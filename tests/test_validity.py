@@ -222,7 +222,7 @@ def test_p_values_of_replicates_count_the_observed_data_in() -> None:
     assert Fixed().judge(case, 19.5, 0.05) == (1 / 20, 19.0)
     assert Fixed().judge(case, 19.0, 0.05)[0] == 2 / 20
     assert Fixed().judge(case, 0.0, 0.10) == (1.0, 18.0)
-    with pytest.raises(ValueError, match="level: got 0.01 with 19 replicates"):
+    with pytest.raises(ValueError, match=r"level: got 0\.01 with 19 replicates"):
         Fixed().judge(case, 19.5, 0.01)
 
 
@@ -252,6 +252,30 @@ def test_ties_in_populations_are_randomised_alike() -> None:
     """Discrete responses: with a seed the size stays nominal, as if they were continuous."""
     test = prb.area_test(np.zeros(5), np.round(GRID), null=prb.PosteriorNull(9999), random_seed=1)
     assert test.critical_value == pytest.approx(EXACT.critical_value(5), abs=0.01)
+
+
+# -- folded u-values -------------------------------------------------------------------------------------
+
+
+def test_folded_u_values_see_the_spread_and_not_the_mean() -> None:
+    z = GRID[10::20]  # 50 values, as regular as can be
+    cases = ((z, False, False), (0.65 * z, False, True), (1.5 * z, False, True), (z + 0.6, True, False))
+    for y, plain, folded in cases:
+        for population in (GRID, posterior(200)):
+            tests = [prb.area_test(y, population, folded=f, null=QUICK) for f in (False, True)]
+            assert [t.rejected for t in tests] == [plain, folded]
+    assert tests[1].statistic == area(np.abs(2 * tests[1].u_values - 1))
+    assert "area of |2u - 1|" in repr(tests[1])
+    assert bool(tests[1].to_dataset().folded)
+
+
+def test_folded_u_values_have_the_same_exact_null_and_their_own_for_a_posterior() -> None:
+    y = GRID[::50]
+    exact = [prb.area_test(y, GRID, folded=f, null=prb.PosteriorNull(19_999)).critical_value for f in (False, True)]
+    np.testing.assert_allclose(exact, EXACT.critical_value(20), atol=0.004)
+    plain, folded = (prb.area_test(y, posterior(), folded=f).critical_value for f in (False, True))
+    # Doubt about the mean hardly moves the folded values.
+    assert EXACT.critical_value(20) < folded < 0.95 * plain
 
 
 # -- specimens and conditions ----------------------------------------------------------------------------
