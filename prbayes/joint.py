@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -83,7 +83,7 @@ class JointNull(SimulatedNull):
         positive_integer(self.replicates, "JointNull: replicates", minimum=19)
         positive_integer(self.seed, "JointNull: seed", minimum=0)
 
-    def statistics(self, case: Case) -> Floats:
+    def replicates_of(self, case: Case) -> Iterator[Floats]:
         """Draw, calibrate, test."""
         evaluator, theta, ties = self.optimum.evaluator, self.optimum.theta, case.rng(1)
         found = [self._served(case, c) for c in case.conditions]
@@ -108,8 +108,8 @@ class JointNull(SimulatedNull):
             own = refitted if values is None else np.broadcast_to(values, weights.shape)
             rows = zip(own, weights, measured, strict=True)
             u.append(np.array([Predictive(v, w).transform(y, ties) for v, w, y in rows]))
-        statistics = case.statistic(np.concatenate(u, axis=1))
-        return np.asarray(statistics[~np.isnan(statistics)])
+        together = np.concatenate(u, axis=1)
+        yield together[~np.isnan(together).any(axis=1)]
 
     def _served(self, case: Case, condition: Condition) -> tuple[int, Floats | None]:
         """Return the simulator whose points are the specimens, and responses at them unless they are its own."""

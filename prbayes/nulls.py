@@ -8,6 +8,7 @@ themselves (`JointNull`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from prbayes._arrays import Floats, positive_integer
 
 _BLOCK = 1 << 22  # u-values held at a time
+_ENVELOPED = 999  # replicates from which an envelope is made
 
 
 def area(u: Floats) -> Floats:
@@ -135,14 +137,31 @@ class Case:
         """Return a generator for the choice within ties, or None for the mid-transform."""
         return None if self.seed is None else np.random.default_rng([self.seed, stream])
 
-    def statistic(self, u: Floats) -> Floats:
-        """Return the areas of u-values, shape (..., n)."""
-        return area(np.abs(2 * u - 1) if self.folded else u)
+    def tested(self, u: Floats) -> Floats:
+        """Return the values that are tested for uniformity."""
+        return np.abs(2 * u - 1) if self.folded else u
 
     def u_values(self) -> list[Floats]:
         """Return the u-values of each condition."""
         rng = self.rng(0)
         return [Predictive(c.predicted).transform(c.observed, rng) for c in self.conditions]
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """What a null says of a case.
+
+    Attributes
+    ----------
+    p_value, critical_value : float
+    lower, upper : ndarray, shape (n,)
+        The envelope: bounds of the sorted values that are tested.
+    """
+
+    p_value: float
+    critical_value: float
+    lower: Floats
+    upper: Floats
 
 
 class Null(ABC):
@@ -151,8 +170,8 @@ class Null(ABC):
     own_specimens: ClassVar[bool] = False  # whether the calibration's own specimens may be tested
 
     @abstractmethod
-    def judge(self, case: Case, statistic: float, level: float) -> tuple[float, float]:
-        """Return p-value and critical value."""
+    def judge(self, case: Case, statistic: float, level: float) -> Judgement:
+        """Return p-value, critical value and envelope."""
 
     @abstractmethod
     def describe(self, case: Case) -> str:
@@ -163,12 +182,19 @@ class SimulatedNull(Null):
     """A null distribution of which replicates are drawn."""
 
     @abstractmethod
-    def statistics(self, case: Case) -> Floats:
-        """Return the statistics of replicates."""
+    def replicates_of(self, case: Case) -> Iterator[Floats]:
+        """Yield u-values of replicates, shapes (r, n)."""
 
-    def judge(self, case: Case, statistic: float, level: float) -> tuple[float, float]:
+    def judge(self, case: Case, statistic: float, level: float) -> Judgement:
         """Count the observed data among the replicates: p = (1 + number as large) / (1 + number)."""
-        found = np.sort(self.statistics(case))
+        some: Floats | None = None
+        parts = []
+        for u in self.replicates_of(case):
+            tested = case.tested(u)
+            some = tested[:_ENVELOPED] if some is None else some
+            parts.append(area(tested))
+        assert some is not None
+        found = np.sort(np.concatenate(parts))
         allowed = int(np.floor(level * (found.size + 1) + 1e-9)) - 1
         if allowed < 0:
             raise ValueError(
@@ -176,7 +202,23 @@ class SimulatedNull(Null):
                 "pass a null with more replicates"
             )
         p_value = (1 + np.sum(found >= statistic * (1 - 1e-12))) / (found.size + 1)
-        return float(p_value), float(found[found.size - allowed - 1])
+        return Judgement(float(p_value), float(found[found.size - allowed - 1]), *envelope(some, level))
+
+
+def envelope(replicates: Floats, level: float) -> tuple[Floats, Floats]:
+    """Return bounds, shapes (n,), of sorted values within which a share 1 - level of replicates, (r, n), lies entirely.
+
+    The bounds of all n leave out the same number of replicates on either side, the largest that will do.
+    """
+    rows = np.sort(replicates, axis=1)
+    columns, size = np.sort(rows, axis=0), len(rows)
+    depth = np.full(size, size)
+    for column, values in zip(columns.T, rows.T, strict=True):
+        as_low, lower = (np.searchsorted(column, values, side=side) for side in ("right", "left"))
+        depth = np.minimum(depth, np.minimum(as_low, size - lower))
+    depth.sort()
+    k = max(1, int(depth[int(level * size)]))
+    return columns[k - 1], columns[size - k]
 
 
 @cache
@@ -227,8 +269,8 @@ class ExactModel(Null):
         low = min(int(place), sizes.size - 2)
         return np.asarray(rows[low] + (place - low) * (rows[low + 1] - rows[low]))
 
-    def judge(self, case: Case, statistic: float, level: float) -> tuple[float, float]:
-        """Look up p-value and critical value."""
+    def judge(self, case: Case, statistic: float, level: float) -> Judgement:
+        """Look up p-value and critical value; simulate the envelope."""
         if case.dependent:
             raise ValueError(
                 f"null: got ExactModel() for {case.size} values of {case.n_specimens} specimens, expected one value "
@@ -240,7 +282,8 @@ class ExactModel(Null):
                     f"{c.name}: predicted: got {c.predicted.size} values for {c.observed.size} observed ones, expected "
                     "at least 10 times as many, so that the population is known exactly; pass a larger n_samples"
                 )
-        return self.p_value(statistic, case.size), self.critical_value(case.size, level)
+        bounds = envelope(np.random.default_rng(0).random((_ENVELOPED, case.size)), level)
+        return Judgement(self.p_value(statistic, case.size), self.critical_value(case.size, level), *bounds)
 
     def describe(self, case: Case) -> str:
         """Return what is held to be true."""
@@ -273,7 +316,7 @@ class PosteriorNull(SimulatedNull):
         positive_integer(self.replicates, "PosteriorNull: replicates", minimum=19)
         positive_integer(self.seed, "PosteriorNull: seed", minimum=0)
 
-    def statistics(self, case: Case) -> Floats:
+    def replicates_of(self, case: Case) -> Iterator[Floats]:
         """Draw replicates."""
         rng, ties = np.random.default_rng(self.seed), case.rng(1)
         usable = [~np.isnan(c.predicted) for c in case.conditions]
@@ -286,7 +329,6 @@ class PosteriorNull(SimulatedNull):
         if not draws.size:
             raise ValueError("predicted: got NaN in every draw, expected specimens whose responses are numbers")
         each = rng.permutation(draws[np.arange(self.replicates) % draws.size])
-        found = np.empty(self.replicates)
         step = max(1, _BLOCK // case.size)
         for i in range(0, self.replicates, step):
             d = each[i : i + step, None]
@@ -296,8 +338,7 @@ class PosteriorNull(SimulatedNull):
                 # The same place in every condition: the same sample, hence the same specimen.
                 which = at[d, (place[:, c.numbers] * count[d]).astype(int)]
                 u.append(between(left[d, which], right[d, which], ties))
-            found[i : i + step] = case.statistic(np.concatenate(u, axis=1))
-        return found
+            yield np.concatenate(u, axis=1)
 
     def describe(self, case: Case) -> str:
         """Return what is held to be true."""

@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._arrays import Floats, positive_integer, real_array
-from prbayes.nulls import Case, Condition, ExactModel, Null, PosteriorNull
+from prbayes.nulls import Case, Condition, ExactModel, Null, PosteriorNull, area
 from prbayes.predict import data_digest, specimen_names
 from prbayes.results import versions
 
@@ -36,6 +36,9 @@ class ValidityTest:
         Whether the area is that of ``|2u - 1|``.
     u_values : ndarray, shape (n,)
         Of all conditions, one after the other.
+    envelope : ndarray, shape (2, n)
+        Bounds of the sorted values that are tested; under the null they hold all of them with probability
+        1 - ``level``.
     conditions, specimens : ndarray of str, shape (n,)
         Where each u-value comes from.
     """
@@ -47,6 +50,7 @@ class ValidityTest:
     null: str
     folded: bool
     u_values: Floats
+    envelope: Floats
     conditions: NDArray[np.str_]
     specimens: NDArray[np.str_]
 
@@ -66,10 +70,12 @@ class ValidityTest:
         )
 
     def to_dataset(self) -> xr.Dataset:
-        """Return the result as a Dataset with dimension ``observation``, which ``to_netcdf`` saves."""
+        """Return the result as a Dataset, which ``to_netcdf`` saves; ``rank`` is the dimension of the envelope."""
         return xr.Dataset(
             {
                 "u": ("observation", self.u_values),
+                "lower": ("rank", self.envelope[0]),
+                "upper": ("rank", self.envelope[1]),
                 "statistic": self.statistic,
                 "critical_value": self.critical_value,
                 "p_value": self.p_value,
@@ -215,17 +221,18 @@ def area_test(
     if case.shared:
         _refuse_unlike(case, attributes)
     u = np.concatenate(case.u_values())
-    statistic = float(case.statistic(u))
-    p_value, critical = null.judge(case, statistic, float(level))
+    statistic = float(area(case.tested(u)))
+    judged = null.judge(case, statistic, float(level))
     labels = [c.labels or tuple(f"{c.name}, {i}" for i in range(c.observed.size)) for c in case.conditions]
     return ValidityTest(
         statistic=statistic,
-        critical_value=critical,
-        p_value=p_value,
+        critical_value=judged.critical_value,
+        p_value=judged.p_value,
         level=float(level),
         null=null.describe(case),
         u_values=u,
         folded=folded,
+        envelope=np.array([judged.lower, judged.upper]),
         conditions=np.array([c.name for c in case.conditions for _ in c.observed]),
         specimens=np.array([label for part in labels for label in part]),
     )

@@ -1,7 +1,7 @@
 """u-values, the area test and its null distributions."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from scipy.special import ndtr, ndtri
 
 import prbayes as prb
 from prbayes._arrays import Floats
-from prbayes.nulls import Case, Condition, Predictive, SimulatedNull, _table, area
+from prbayes.nulls import Case, Condition, Predictive, SimulatedNull, _table, area, envelope
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -211,19 +211,27 @@ def test_a_statistic_beyond_the_critical_value_is_one_with_a_small_p_value(shift
 
 
 def test_p_values_of_replicates_count_the_observed_data_in() -> None:
+    AREAS = np.linspace(0.01, 0.49, 19)
+
     class Fixed(SimulatedNull):
-        def statistics(self, case: Case) -> Floats:
-            return np.arange(1.0, 20.0)
+        def replicates_of(self, case: Case) -> Iterator[Floats]:
+            yield AREAS[:, None]
 
         def describe(self, case: Case) -> str:
             return ""
 
     case = Case((Condition("a", np.zeros(1), np.zeros((1, 1)), None, np.zeros(1, dtype=int)),), 1, False, None)
-    assert Fixed().judge(case, 19.5, 0.05) == (1 / 20, 19.0)
-    assert Fixed().judge(case, 19.0, 0.05)[0] == 2 / 20
-    assert Fixed().judge(case, 0.0, 0.10) == (1.0, 18.0)
+
+    def judged(statistic: float, level: float) -> tuple[float, float]:
+        found = Fixed().judge(case, statistic, level)
+        return found.p_value, found.critical_value
+
+    areas = area(AREAS[:, None])  # falling
+    assert judged(0.5, 0.05) == (1 / 20, areas[0])
+    assert judged(areas[0], 0.05)[0] == 2 / 20
+    assert judged(0.0, 0.10) == (1.0, areas[1])
     with pytest.raises(ValueError, match=r"level: got 0\.01 with 19 replicates"):
-        Fixed().judge(case, 19.5, 0.01)
+        Fixed().judge(case, 0.5, 0.01)
 
 
 def test_the_test_does_not_care_for_order_or_increasing_transformations() -> None:
@@ -252,6 +260,25 @@ def test_ties_in_populations_are_randomised_alike() -> None:
     """Discrete responses: with a seed the size stays nominal, as if they were continuous."""
     test = prb.area_test(np.zeros(5), np.round(GRID), null=prb.PosteriorNull(9999), random_seed=1)
     assert test.critical_value == pytest.approx(EXACT.critical_value(5), abs=0.01)
+
+
+def test_the_envelope_holds_right_models_and_no_wrong_ones() -> None:
+    rng = np.random.default_rng(14)
+    lower, upper = envelope(rng.random((999, 20)), 0.1)
+    u = np.sort(rng.random((4000, 20)), axis=1)
+    inside = ((u >= lower) & (u <= upper)).all(axis=1).mean()
+    # Standard errors: .009 of the envelope, .005 of the share.
+    assert abs(inside - 0.9) < 0.045
+    np.testing.assert_allclose(lower + upper[::-1], 1, atol=0.04)
+    y = rng.normal(size=20)
+    for population in (GRID, posterior(200)):
+        for shift, expected in ((0.0, True), (1.5, False)):
+            test = prb.area_test(y + shift, population, null=QUICK)
+            low, high = test.envelope
+            ranked = np.sort(test.u_values)
+            assert ((ranked >= low) & (ranked <= high)).all() == expected
+    wider, narrow = (np.ptp(prb.area_test(y, p, null=QUICK).envelope, axis=0).mean() for p in (posterior(15), GRID))
+    assert wider > 1.2 * narrow
 
 
 # -- folded u-values -------------------------------------------------------------------------------------
