@@ -19,13 +19,12 @@ from prbayes._arrays import Floats
 from prbayes.discrepancy import Discrepancy
 from prbayes.inputs import Inputs, PopulationSampler, compile_batched, log_density, prior_draws, quantiles
 from prbayes.metrics import FunctionMetric
-from prbayes.propagation import Bound, Reweighted, base_points, refuse_all_nan
+from prbayes.propagation import N_BLOCKS, Bound, Reweighted, base_points, refuse_all_nan
 from prbayes.responses import OpaqueOp, Responses
 
 _log = logging.getLogger("prbayes")
 
 _MAX_THETAS = 512  # components of a batch's mixture density
-N_BLOCKS = 8  # parts of a batch whose differences tell its error
 _DRAFT = 16  # draft points, whose response is not computed, for each point of a one-dimensional design
 
 _OTHERS = 32  # responses under other conditions that are kept
@@ -98,12 +97,12 @@ class Design(Bound):
 
     @property
     def blocks(self) -> NDArray[np.intp]:
-        """Which of eight coarser designs each point belongs to, shape (n,); 0 for all on a line.
+        """Which of eight coarser designs each point belongs to, shape (n,).
 
-        Consecutive points of a Sobol sequence, of which each stretch is a net of its own.
+        Consecutive points of a Sobol sequence, of which each stretch is a net of its own; on a line every eighth.
         """
-        if self._is_line:
-            return np.zeros(self.n_points, dtype=int)
+        if self.is_line:
+            return np.arange(self.n_points) % N_BLOCKS
         return np.concatenate([np.arange(n) * N_BLOCKS // n for n in self._sizes])
 
     def points_of(self, inputs: Inputs) -> list[Floats]:
@@ -143,7 +142,7 @@ class Design(Bound):
         """
         n, seed = n or self.config.n, self.config.seed + 7919 * self.batches
         thetas = self.valid_only(thetas)
-        if self._is_line:
+        if self.is_line:
             points, counts = self._equal_mass(thetas, n, seed)
         else:
             points, counts = self._place(thetas, n, seed)
@@ -198,7 +197,7 @@ class Design(Bound):
         return compile_batched([*symbols, *uniforms], placed)
 
     @property
-    def _is_line(self) -> bool:
+    def is_line(self) -> bool:
         """Whether there is one continuous aleatory input of one dimension."""
         x = self.inputs.aleatory[0]
         return len(self.inputs.aleatory) == 1 and x.type.ndim == 0 and x.dtype.startswith("float")
