@@ -12,6 +12,7 @@ from prbayes.diagnose import Diagnosis, diagnose
 from prbayes.discrepancy import Metric
 from prbayes.epsilon import calibrate_epsilon
 from prbayes.failures import Abort, Replace, Retry
+from prbayes.heldout import held_out
 from prbayes.joint import JointNull
 from prbayes.kernel import BatchedKernel
 from prbayes.metrics import (
@@ -23,6 +24,7 @@ from prbayes.metrics import (
 )
 from prbayes.nulls import ExactModel, PosteriorNull
 from prbayes.optimize import Optimum, minimize
+from prbayes.plots import plot_validity
 from prbayes.predict import predict
 from prbayes.propagation import Fresh, Resimulated, Reweighted
 from prbayes.refinement import DesignError, refine
@@ -68,7 +70,9 @@ __all__ = [
     "compare",
     "datasets",
     "diagnose",
+    "held_out",
     "minimize",
+    "plot_validity",
     "predict",
     "refine",
     "sample_smc",

@@ -123,16 +123,18 @@ def _convergence(posterior: xr.Dataset) -> list[str]:
     messages = []
     if draws < 4:
         return []
+    with np.errstate(all="ignore"):  # a variable that never moves
+        rhats, sizes = _elements(stats.rhat(posterior)), _elements(stats.ess(posterior))
     if chains > 1:
         limit = max(_RHAT, 1 + _NOISE / (chains * draws))
-        high = {name: r for name, r in _elements(stats.rhat(posterior)).items() if r > limit}
+        high = {name: r for name, r in rhats.items() if r > limit}
         if high:
             messages.append(
                 f"R-hat is {_listed(high, '.2f')}, expected at most {limit:.2f}: the chains disagree, look at "
                 "az.plot_rank(idata). Pass more draws, or with prb.sample_smc a threshold of 0.8; if the chains sit in "
                 "separate modes, state a prior that excludes one."
             )
-    low = {name: e for name, e in _elements(stats.ess(posterior)).items() if e < min(_ESS, chains * draws / 4)}
+    low = {name: e for name, e in sizes.items() if e < min(_ESS, chains * draws / 4)}
     if low:
         messages.append(
             f"The effective sample size is {_listed(low, '.0f')} of {chains * draws} draws: too few for means and "

@@ -18,7 +18,7 @@ ORDER = [
     "propagation", "resimulation", "design", "simulator", "population", "resampling", "information", "descent",
     "refit", "modes", "refinement", "search", "optimize", "epsilon", "adjust", "results", "bootstrap", "checkpoint",
     "kernel", "smc", "sbc", "diagnose", "compare",
-    "predict", "nulls", "joint", "validity",
+    "heldout", "predict", "nulls", "joint", "validity", "plots",
 ]  # fmt: skip
 
 # Upwards, inside a function or for types only, with the reason.
