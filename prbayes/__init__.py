@@ -12,6 +12,8 @@ from prbayes.diagnose import Diagnosis, diagnose
 from prbayes.discrepancy import Metric
 from prbayes.epsilon import calibrate_epsilon
 from prbayes.failures import Abort, Replace, Retry
+from prbayes.heldout import held_out
+from prbayes.joint import JointNull
 from prbayes.kernel import BatchedKernel
 from prbayes.metrics import (
     AreaMetric,
@@ -20,13 +22,17 @@ from prbayes.metrics import (
     LogLikelihood,
     ProbabilityResidual,
 )
+from prbayes.nulls import ExactModel, PosteriorNull
 from prbayes.optimize import Optimum, minimize
+from prbayes.plots import plot_validity
+from prbayes.predict import predict
 from prbayes.propagation import Fresh, Resimulated, Reweighted
 from prbayes.refinement import DesignError, refine
 from prbayes.sbc import simulation_based_calibration
 from prbayes.simulator import Simulator, abc_distance, set_epsilon
 from prbayes.smc import sample_smc
 from prbayes.store import StoreError
+from prbayes.validity import ValidityTest, area_test, u_values
 
 __version__ = version("prbayes")
 
@@ -37,14 +43,17 @@ __all__ = [
     "BatchedKernel",
     "DesignError",
     "Diagnosis",
+    "ExactModel",
     "Fresh",
     "FunctionMetric",
     "GaussianKDE",
     "Histogram",
+    "JointNull",
     "KullbackLeibler",
     "LogLikelihood",
     "Metric",
     "Optimum",
+    "PosteriorNull",
     "ProbabilityResidual",
     "Replace",
     "Resimulated",
@@ -53,16 +62,22 @@ __all__ = [
     "Reweighted",
     "Simulator",
     "StoreError",
+    "ValidityTest",
     "abc_distance",
+    "area_test",
     "bootstrap",
     "calibrate_epsilon",
     "compare",
     "datasets",
     "diagnose",
+    "held_out",
     "minimize",
+    "plot_validity",
+    "predict",
     "refine",
     "sample_smc",
     "scalar",
     "set_epsilon",
     "simulation_based_calibration",
+    "u_values",
 ]

@@ -18,6 +18,7 @@ ORDER = [
     "propagation", "resimulation", "design", "simulator", "population", "resampling", "information", "descent",
     "refit", "modes", "refinement", "search", "optimize", "epsilon", "adjust", "results", "bootstrap", "checkpoint",
     "kernel", "smc", "sbc", "diagnose", "compare",
+    "heldout", "predict", "nulls", "joint", "validity", "plots",
 ]  # fmt: skip
 
 # Upwards, inside a function or for types only, with the reason.
@@ -30,7 +31,8 @@ UPWARDS = {
 }
 
 # Results, errors and base classes, which nobody makes; and a kernel that is passed to PyMC.
-WITHOUT_EXAMPLE = {"BatchedKernel", "DesignError", "Diagnosis", "Metric", "Optimum", "ResponseError", "StoreError"}
+WITHOUT_EXAMPLE = {"BatchedKernel", "DesignError", "Diagnosis", "Metric", "Optimum", "ResponseError", "StoreError",
+                   "ValidityTest"}  # fmt: skip
 
 INNER = ("pymc.logprob", "pymc.smc", "pymc.pytensorf", "pymc.distributions", "pymc.model.core", "pymc.backends")
 MAY_TOUCH_PYMC = {"inputs", "simulator", "population", "kernel"}
