@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
 
+from prbayes._arrays import Floats
+from prbayes.discrepancy import Metric
+from prbayes.metrics import AreaMetric, KullbackLeibler, LogLikelihood, ProbabilityResidual
 from prbayes.optimize import Optimum
+from prbayes.population import Evaluator
+from prbayes.refinement import shortcomings
+from prbayes.simulator import nodes
 
 _INTERVAL = 0.89
+_METRICS = (ProbabilityResidual(), KullbackLeibler(), AreaMetric(), LogLikelihood())
 
 
-def compare(results: Mapping[str, Optimum | xr.DataTree], *, model: pm.Model | None = None) -> xr.Dataset:
+def compare(
+    results: Mapping[str, Optimum | xr.DataTree],
+    *,
+    model: pm.Model | None = None,
+    metrics: Sequence[Metric] | None = None,
+) -> xr.Dataset:
     """Set optima and posteriors side by side, one row per result and hyperparameter.
 
     Parameters
@@ -22,15 +34,21 @@ def compare(results: Mapping[str, Optimum | xr.DataTree], *, model: pm.Model | N
     results : mapping
         `Optimum` objects and DataTrees with a ``posterior`` group, by the label they get.
     model : pymc.Model, optional
-        Restricts the table to the model's free variables; by default all that the results share.
+        Restricts the table to the model's free variables; by default all that the results share. Its data, and
+        its populations, score the results.
+    metrics : sequence of Metric, optional
+        Under which each estimate is scored, whatever it was made with. By default all four where that costs no
+        response (`Reweighted`); under the other propagations each result costs n responses per simulator.
 
     Returns
     -------
     xarray.Dataset
         With dimensions ``result`` and ``hyperparameter``: ``estimate`` (the optimum, or the posterior mean),
         ``sd`` (the standard error, or the posterior standard deviation), ``lower`` and ``upper`` (an 89%
-        interval: normal, or equal-tailed), ``shift`` (of the estimate from the first result, in its sd);
-        and by result: ``n_responses`` and ``seconds``, NaN where a result does not tell.
+        interval: normal, or equal-tailed), ``shift`` (of the estimate from that of the first result, in this
+        result's sd); and by result: ``n_responses`` and ``seconds``, NaN where a result does not tell, and the
+        discrepancy of the estimate's population under each metric, by the metric's class, with the simulator's name
+        before it if there are several; NaN where stored responses do not support it.
 
     Raises
     ------
@@ -59,14 +77,44 @@ def compare(results: Mapping[str, Optimum | xr.DataTree], *, model: pm.Model | N
     table = np.array([[columns[label][0][n] for n in names] for label in columns])
     first = table[0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        shift = (table[..., 0] - first[:, 0]) / first[:, 1]
+        shift = (table[..., 0] - first[:, 0]) / table[..., 1]
+    shift[0] = 0.0
     keys = ("estimate", "sd", "lower", "upper")
     where = ["result", "hyperparameter"]
     data: dict[str, Any] = {key: (where, table[..., i]) for i, key in enumerate(keys)}
     data["shift"] = (where, shift)
     data["n_responses"] = ("result", [c[1] for c in columns.values()])
     data["seconds"] = ("result", [c[2] for c in columns.values()])
+    if model is not None and nodes(model):
+        data |= {key: ("result", found) for key, found in _scores(model, names, table[..., 0], metrics).items()}
     return xr.Dataset(data, coords={"result": list(columns), "hyperparameter": names}, attrs={"interval": _INTERVAL})
+
+
+def _scores(
+    model: pm.Model, names: list[str], estimates: Floats, metrics: Sequence[Metric] | None
+) -> dict[str, Floats]:
+    """Return the discrepancies of estimates, (results, elements), by simulator and metric."""
+    evaluator = Evaluator(model)
+    if metrics is None and evaluator.responses_per_theta:
+        return {}
+    place = {name: i for i, name in enumerate(names)}
+    shapes = {str(rv.name): tuple(map(int, rv.shape.eval())) for rv in model.free_RVs}
+    elements = {rv: [_element(rv, i) for i in np.ndindex(shape)] for rv, shape in shapes.items()}
+    if not all(e in place for row in elements.values() for e in row):
+        return {}
+    found = {}
+    thetas = evaluator.thetas_of(
+        [estimates[:, [place[e] for e in elements[rv]]].reshape(-1, *shape) for rv, shape in shapes.items()]
+    )
+    thin = {i: shortcomings(evaluator, theta[None]) for i, theta in enumerate(thetas)}
+    for k, node in enumerate(evaluator.nodes):
+        known = np.array([node.name not in thin[i] for i in range(len(thetas))])
+        for metric in _METRICS if metrics is None else metrics:
+            target = metric.against(node.target.observed, node.target.weights)
+            scores = node.bound.discrepancies(evaluator.roots(thetas, k), target)
+            name = type(metric).__name__
+            found[name if len(evaluator.nodes) == 1 else f"{node.name} {name}"] = np.where(known, scores, np.nan)
+    return found
 
 
 def _column(label: str, result: Any) -> tuple[dict[str, tuple[float, ...]], float, float]:

@@ -172,13 +172,36 @@ def test_compare_sets_optimum_and_posterior_side_by_side() -> None:
     np.testing.assert_allclose(abc["estimate"], draws.mean(axis=1))
     np.testing.assert_allclose(abc["sd"], draws.std(axis=1, ddof=1))
     np.testing.assert_allclose([abc["lower"], abc["upper"]], np.quantile(draws, [0.055, 0.945], axis=1))
-    np.testing.assert_allclose(abc["shift"], (draws.mean(axis=1) - estimates) / errors)
+    np.testing.assert_allclose(abc["shift"], (draws.mean(axis=1) - estimates) / draws.std(axis=1, ddof=1))
     assert (np.abs(abc["shift"]) < 1).all()  # one model, one metric
     assert list(table["n_responses"].values) == [optimum().n_responses, posterior.attrs["n_responses"]]
     assert (table["seconds"] > 0).all()
     frame = table.to_dataframe()
     assert {"estimate", "sd", "lower", "upper", "shift"} <= set(frame.columns)
     assert table.attrs["interval"] == 0.89
+
+
+def test_compare_scores_each_result_under_every_metric() -> None:
+    results = {"optimum": optimum(), "ABC": idata()}
+    before = optimum().evaluator.n_responses
+    table = prb.compare(results, model=model())
+    assert optimum().evaluator.n_responses == before
+    for name, metric in (("first AreaMetric", "first"), ("second KullbackLeibler", "second")):
+        np.testing.assert_allclose(table[name].sel(result="optimum"), optimum().discrepancies[metric], rtol=1e-9)
+    total = table["first AreaMetric"] / optimum().scales["first"]
+    total = total + table["second KullbackLeibler"] / optimum().scales["second"]
+    assert total.sel(result="ABC") > total.sel(result="optimum")
+    # A metric that the model does not have, by the direct call on the population at the posterior mean.
+    mean = {k: np.asarray(idata()["posterior"][k].mean(("chain", "draw"))) for k in ("mean", "sigma")}
+    values, weights = optimum().evaluator.populations(optimum().evaluator.unconstrained(mean)[None], 0)
+    direct = prb.ProbabilityResidual().against(DATA[:, 0])(values, weights)
+    np.testing.assert_allclose(table["first ProbabilityResidual"].sel(result="ABC"), direct)
+    few = prb.compare(results, model=model(), metrics=[prb.ProbabilityResidual(scale_base=1)])
+    assert "first AreaMetric" not in few
+    assert few["first ProbabilityResidual"].sel(result="ABC") != table["first ProbabilityResidual"].sel(result="ABC")
+    far = tree_of(sigma=np.full((1, 5), 1e-3), **{"mean": np.zeros((1, 5))})
+    far["posterior"] = far["posterior"].to_dataset().assign(mean=(["chain", "draw", "lab"], np.full((1, 5, 2), 90.0)))
+    assert np.isnan(prb.compare({"far": far}, model=model())["first AreaMetric"]).all()
 
 
 def test_compare_without_a_model_shows_all_that_is_shared() -> None:
@@ -196,7 +219,7 @@ def test_compare_takes_the_posterior_of_any_sampler() -> None:
     assert list(table["hyperparameter"].values) == ["sigma"]
     assert np.isnan(table["n_responses"].sel(result="NUTS"))
     assert np.isnan(table["seconds"].sel(result="NUTS"))
-    shift = (table["estimate"][1] - table["estimate"][0]) / table["sd"][0]
+    shift = (table["estimate"][1] - table["estimate"][0]) / table["sd"][1]
     np.testing.assert_allclose(table["shift"].sel(result="optimum"), shift)
 
 
