@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._arrays import Floats, observed_sample, sample_weights, simulated_sample
-from prbayes.density import Cells
+from prbayes.cells import Cells
 
 _FLOOR = 1e-9
 

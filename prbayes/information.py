@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from prbayes._arrays import Floats
 from prbayes.metrics import FunctionMetric
 from prbayes.population import Evaluator
-from prbayes.resampling import DataSets, dependent, simulated_sets
+from prbayes.resampling import DataSets, dependent, simulated_sets, thinned
 
 _STEP = 1e-3  # of the prior's standard deviation; densities are twice differentiable
 _WIDE_STEP = 0.05  # where a distribution function of simulated values, a step function, is differenced
@@ -111,7 +111,7 @@ class Information:
     def noise_floor(self) -> float:
         """The mean discrepancy between the population at theta and data sets drawn from it."""
         target = self.evaluator.nodes[self.k].target
-        values, weights = (a[:1] for a in self._populations)
+        values, weights = thinned(self._populations[0][:1], self._populations[1][:1], self.evaluator.nodes[self.k])
         observed, u = self.data_set
         return float(np.mean([target.with_observed(observed[v > 0], v[v > 0]).of(values, weights) for v in u]))
 

@@ -14,7 +14,7 @@ FILES = sorted(PACKAGE.glob("*.py"))
 
 # A file may import those before it.
 ORDER = [
-    "_arrays", "density", "discrepancy", "metrics", "failures", "store", "calling", "inputs", "responses",
+    "_arrays", "cells", "density", "discrepancy", "metrics", "failures", "store", "calling", "inputs", "responses",
     "propagation", "resimulation", "design", "simulator", "population", "resampling", "information", "descent",
     "refit", "modes", "refinement", "search", "optimize", "epsilon", "adjust", "results", "bootstrap", "checkpoint",
     "kernel", "smc", "sbc", "diagnose", "compare",
