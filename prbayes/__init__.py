@@ -20,10 +20,12 @@ from prbayes.metrics import (
     LogLikelihood,
     ProbabilityResidual,
 )
-from prbayes.optimize import Optimum, minimize
-from prbayes.propagation import Fresh, Resimulated, Reweighted
+from prbayes.optimize import minimize
+from prbayes.optimum import Optimum
+from prbayes.propagation import Fresh, Resimulated, Reweighted, monte_carlo, sobol
 from prbayes.refinement import DesignError, refine
 from prbayes.sbc import simulation_based_calibration
+from prbayes.search import Scipy
 from prbayes.simulator import Simulator, abc_distance, set_epsilon
 from prbayes.smc import sample_smc
 from prbayes.store import StoreError
@@ -51,6 +53,7 @@ __all__ = [
     "ResponseError",
     "Retry",
     "Reweighted",
+    "Scipy",
     "Simulator",
     "StoreError",
     "abc_distance",
@@ -60,9 +63,11 @@ __all__ = [
     "datasets",
     "diagnose",
     "minimize",
+    "monte_carlo",
     "refine",
     "sample_smc",
     "scalar",
     "set_epsilon",
     "simulation_based_calibration",
+    "sobol",
 ]

@@ -163,7 +163,8 @@ class KernelCells(Cells):
         each = np.zeros((points.size, self.widths.size))
         for k, b in enumerate(keys):
             each[np.arange(points.size), node - 1 + k] += np.where(inside, b, 0.0)
-        return np.asarray(weights @ each)
+        flat = weights.reshape(-1, points.size) @ each
+        return flat.reshape(*weights.shape[:-1], each.shape[1])
 
     def value(self, sample: Floats, cotangent: Floats) -> Floats:
         """Return the smoothed cotangent at the sample; the smoothing kernel is its own transpose."""

@@ -9,7 +9,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes.optimize import Optimum
+from prbayes.optimum import Optimum
 
 _INTERVAL = 0.89
 

@@ -24,6 +24,7 @@ _KNOTS = 400  # on which distribution functions are linearised
 _IRLS = 30
 _LOADING = 0.02  # share of a hyperparameter in unseen directions above which it is not identified
 _ROUNDING = 0.01  # curvature, in units of the gradient's variance over the curvature, that is a rounding error
+_BLOCK = 1 << 20  # numbers held at a time where data sets meet the features of a stencil
 _POINTS = 1000  # single observations over which the covariance of an additive gradient is taken
 
 
@@ -104,8 +105,12 @@ class Information:
         return self.evaluator.nodes[self.k].target.features(*self._populations, np)
 
     def _along_stencil(self, observed: Floats, weights: Floats) -> Floats:
-        target = self.evaluator.nodes[self.k].target.with_observed(observed, weights)
-        return np.asarray(target.outer(*self._features, xp=np))
+        target = self.evaluator.nodes[self.k].target
+        at_once = max(1, _BLOCK // sum(f.size for f in self._features)) if weights.ndim > 1 else len(weights)
+        blocks = [weights[i : i + at_once] for i in range(0, len(weights), at_once)]
+        return np.concatenate(
+            [np.atleast_1d(target.with_observed(observed, w).outer(*self._features, xp=np)) for w in blocks]
+        )
 
     @cached_property
     def noise_floor(self) -> float:

@@ -29,7 +29,7 @@ class ResimulatedBound(Bound):
     ) -> None:
         super().__init__(name, inputs, target, responses)
         self.n_per_theta = config.n
-        _, self._points = base_points(inputs, config.n, config.seed)
+        _, self._points = base_points(inputs, config.n, config.seed, config.points)
         for dist, u in zip(inputs.aleatory, self._points, strict=True):
             quantiles(name, dist, u)  # refuses what has no inverse distribution function
         self.symbolic = self._accepts_tensors(*probe(self, PopulationSampler(inputs), config.seed))

@@ -16,8 +16,8 @@ FILES = sorted(PACKAGE.glob("*.py"))
 ORDER = [
     "_arrays", "cells", "density", "discrepancy", "metrics", "failures", "store", "calling", "inputs", "responses",
     "propagation", "resimulation", "design", "simulator", "population", "resampling", "information", "descent",
-    "refit", "modes", "refinement", "search", "optimize", "epsilon", "adjust", "results", "bootstrap", "checkpoint",
-    "kernel", "smc", "sbc", "diagnose", "compare",
+    "refit", "modes", "refinement", "search", "optimum", "optimize", "epsilon", "adjust", "results", "bootstrap",
+    "checkpoint", "kernel", "smc", "sbc", "diagnose", "compare",
 ]  # fmt: skip
 
 # Upwards, inside a function or for types only, with the reason.
@@ -25,8 +25,8 @@ UPWARDS = {
     ("propagation", "design"),  # a propagation's bind makes its own moving part
     ("propagation", "resimulation"),
     ("refinement", "optimize"),  # the public refine() looks around the optimum
-    ("optimize", "results"),  # Optimum.to_datatree
-    ("results", "optimize"),  # annotation of optimum_tree
+    ("optimum", "results"),  # Optimum.to_datatree
+    ("results", "optimum"),  # annotation of optimum_tree
 }
 
 # Results, errors and base classes, which nobody makes; and a kernel that is passed to PyMC.
