@@ -20,6 +20,7 @@ from pytensor.graph.replace import graph_replace, vectorize_graph
 
 from prbayes._arrays import Floats, real_array
 from prbayes.design import Design
+from prbayes.discrepancy import Metric
 from prbayes.inputs import PLAIN, PriorPoints, PriorSampler, ninf_for_invalid
 from prbayes.propagation import sobol
 from prbayes.simulator import Node, log_kernel, required_nodes
@@ -185,17 +186,18 @@ class Evaluator:
 
         return counted
 
-    def observing(self, data: dict[str, Floats]) -> Evaluator:
+    def observing(self, data: dict[str, Floats], metric: Metric | None = None) -> Evaluator:
         """Return an evaluator of the same model with other observed responses, by the names of simulators.
 
-        Metrics choose bandwidths and cells anew; designs and epsilons are the same objects.
+        Metrics choose bandwidths and cells anew; designs and epsilons are the same objects. With ``metric`` all
+        simulators have that one.
         """
         _ = self._evaluate, self._prior, self._constrain, self._roots, self._transform  # compiled once, for all copies
         other = copy.copy(self)
         other.nodes = [
             replace(
                 n,
-                target=n.metric.against(
+                target=(metric or n.metric).against(
                     data[n.name], n.target.weights if n.target.observed.size == np.size(data[n.name]) else None
                 ),
             )

@@ -328,7 +328,7 @@ def test_data_that_no_population_reaches_are_no_convergence(name: str) -> None:
 
 @pytest.mark.parametrize("propagation", [R256, prb.Resimulated(1024)], ids=["reweighted", "resimulated"])
 @pytest.mark.parametrize("name", ["pr", "kl"])
-@pytest.mark.parametrize("start", [(5.0, 0.1), (-3.0, 0.5), (30.0, 0.1)])  # 8 sd of the data away, and 60
+@pytest.mark.parametrize("start", [(-3.0, 0.5), (30.0, 0.1)])  # 8 sd of the data away, and 58
 def test_far_starts_converge(name: str, propagation: Any, start: tuple[float, float]) -> None:
     model = far_model(name, propagation)
     optimum = prb.minimize(model, start=dict(zip(NORMAL, start, strict=True)), refine=False, starts=0)
@@ -338,7 +338,8 @@ def test_far_starts_converge(name: str, propagation: Any, start: tuple[float, fl
     assert "the area metric" not in best.message
     np.testing.assert_allclose(optimum.theta, best.theta, atol=1e-4)
     assert optimum.n_evaluations == optimum.trace["evaluations"][-1] > len(optimum.trace["theta"])
-    assert optimum.trace["discrepancy"][0] > 0.9 * optimum.trace["discrepancy"].max()
+    if propagation is not R256:  # the first point is the start itself, and not a draw of the prior that costs nothing
+        np.testing.assert_allclose(optimum.trace["theta"][0], [start[0], np.log(start[1])], rtol=1e-12)
     np.testing.assert_allclose(optimum.trace["discrepancy"].min(), optimum.discrepancy, rtol=1e-9)
 
 
