@@ -23,12 +23,14 @@ from prbayes.metrics import (
     ProbabilityResidual,
 )
 from prbayes.nulls import ExactModel, PosteriorNull
-from prbayes.optimize import Optimum, minimize
+from prbayes.optimize import minimize
+from prbayes.optimum import Optimum
 from prbayes.plots import plot_validity
 from prbayes.predict import predict
-from prbayes.propagation import Fresh, Resimulated, Reweighted
+from prbayes.propagation import Fresh, Resimulated, Reweighted, monte_carlo, sobol
 from prbayes.refinement import DesignError, refine
 from prbayes.sbc import simulation_based_calibration
+from prbayes.search import Scipy
 from prbayes.simulator import Simulator, abc_distance, set_epsilon
 from prbayes.smc import sample_smc
 from prbayes.store import StoreError
@@ -60,6 +62,7 @@ __all__ = [
     "ResponseError",
     "Retry",
     "Reweighted",
+    "Scipy",
     "Simulator",
     "StoreError",
     "ValidityTest",
@@ -72,6 +75,7 @@ __all__ = [
     "diagnose",
     "held_out",
     "minimize",
+    "monte_carlo",
     "plot_validity",
     "predict",
     "refine",
@@ -79,5 +83,6 @@ __all__ = [
     "scalar",
     "set_epsilon",
     "simulation_based_calibration",
+    "sobol",
     "u_values",
 ]

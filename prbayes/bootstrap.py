@@ -11,7 +11,7 @@ from prbayes._arrays import positive_integer
 from prbayes.adjust import inapplicable
 from prbayes.information import prior_scale
 from prbayes.modes import blind_directions
-from prbayes.optimize import Optimum
+from prbayes.optimum import Optimum
 from prbayes.refit import Neighbourhood
 from prbayes.resampling import reweighted_sets, simulated_sets
 from prbayes.results import bootstrap_tree

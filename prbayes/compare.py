@@ -12,7 +12,7 @@ import xarray as xr
 from prbayes._arrays import Floats
 from prbayes.discrepancy import Metric
 from prbayes.metrics import AreaMetric, KullbackLeibler, LogLikelihood, ProbabilityResidual
-from prbayes.optimize import Optimum
+from prbayes.optimum import Optimum
 from prbayes.population import Evaluator
 from prbayes.refinement import shortcomings
 from prbayes.simulator import nodes

@@ -11,7 +11,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._arrays import Floats
-from prbayes.optimize import Optimum
+from prbayes.optimum import Optimum
 from prbayes.population import Evaluator
 from prbayes.refinement import shortcoming
 from prbayes.simulator import model_on_context

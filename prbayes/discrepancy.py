@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._arrays import Floats, observed_sample, sample_weights, simulated_sample
-from prbayes.density import Cells
+from prbayes.cells import Cells
 
 _FLOOR = 1e-9
 
@@ -103,6 +103,12 @@ class Discrepancy(ABC):
         return float(result) if np.ndim(result) == 0 else result
 
 
+def product(weights: Floats, matrix: Floats) -> Floats:
+    """Return weights @ matrix, shapes (..., n), (n, m), as one product of matrices."""
+    flat = weights.reshape(-1, weights.shape[-1]) @ matrix
+    return flat.reshape(*weights.shape[:-1], matrix.shape[-1])
+
+
 class Metric(ABC):
     """A calibration metric; `against` prepares the observed side once.
 
@@ -177,7 +183,7 @@ class DensityDiscrepancy(Discrepancy):
     def __post_init__(self) -> None:
         several = self.weights.ndim > 1
         density = (
-            self.weights @ self.cells.basis(self.observed)
+            product(self.weights, self.cells.basis(self.observed))
             if several
             else self.cells.density(self.observed, self.weights)
         )
@@ -199,6 +205,12 @@ class DensityDiscrepancy(Discrepancy):
     def scale(self) -> float:
         """One: divergences and log densities have no units."""
         return 1.0
+
+    def overlap(self, simulated: Floats, weights: Floats) -> Floats:
+        """Return the cosine of simulated and observed density, shape (...): one if they are equal, zero if disjoint."""
+        p, q, dz = self.cells.density(simulated, weights)[..., :-2], self.density[..., :-2], self.cells.widths[:-2]
+        size = np.sqrt(((p**2) * dz).sum(axis=-1) * ((q**2) * dz).sum(axis=-1))
+        return np.asarray(np.nan_to_num((p * q * dz).sum(axis=-1) / np.where(size > 0, size, 1.0)))
 
     def floored(self, density: Any) -> Any:
         """Mix a density with 1e-9 of the uniform density over all cells: the only floor in this package.

@@ -6,7 +6,7 @@ import numpy as np
 
 from prbayes.information import Information, first_order_shifts, prior_scale, seen_by_area, seen_by_curvature
 from prbayes.metrics import FunctionMetric
-from prbayes.optimize import Optimum
+from prbayes.optimum import Optimum
 from prbayes.resimulation import FreshBound
 
 _CLOUD = 500  # thetas that carry each simulated data set's posterior

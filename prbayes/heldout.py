@@ -8,7 +8,7 @@ import xarray as xr
 from prbayes._arrays import positive_integer
 from prbayes.adjust import inapplicable
 from prbayes.information import prior_scale
-from prbayes.optimize import Optimum
+from prbayes.optimum import Optimum
 from prbayes.refit import Neighbourhood
 from prbayes.resampling import DataSets, specimens
 from prbayes.results import versions

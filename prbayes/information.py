@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from prbayes._arrays import Floats
 from prbayes.metrics import FunctionMetric
 from prbayes.population import Evaluator
-from prbayes.resampling import DataSets, dependent, simulated_sets
+from prbayes.resampling import DataSets, dependent, simulated_sets, thinned
 
 _STEP = 1e-3  # of the prior's standard deviation; densities are twice differentiable
 _WIDE_STEP = 0.05  # where a distribution function of simulated values, a step function, is differenced
@@ -24,6 +24,7 @@ _KNOTS = 400  # on which distribution functions are linearised
 _IRLS = 30
 _LOADING = 0.02  # share of a hyperparameter in unseen directions above which it is not identified
 _ROUNDING = 0.01  # curvature, in units of the gradient's variance over the curvature, that is a rounding error
+_BLOCK = 1 << 20  # numbers held at a time where data sets meet the features of a stencil
 _POINTS = 1000  # single observations over which the covariance of an additive gradient is taken
 
 
@@ -104,14 +105,18 @@ class Information:
         return self.evaluator.nodes[self.k].target.features(*self._populations, np)
 
     def _along_stencil(self, observed: Floats, weights: Floats) -> Floats:
-        target = self.evaluator.nodes[self.k].target.with_observed(observed, weights)
-        return np.asarray(target.outer(*self._features, xp=np))
+        target = self.evaluator.nodes[self.k].target
+        at_once = max(1, _BLOCK // sum(f.size for f in self._features)) if weights.ndim > 1 else len(weights)
+        blocks = [weights[i : i + at_once] for i in range(0, len(weights), at_once)]
+        return np.concatenate(
+            [np.atleast_1d(target.with_observed(observed, w).outer(*self._features, xp=np)) for w in blocks]
+        )
 
     @cached_property
     def noise_floor(self) -> float:
         """The mean discrepancy between the population at theta and data sets drawn from it."""
         target = self.evaluator.nodes[self.k].target
-        values, weights = (a[:1] for a in self._populations)
+        values, weights = thinned(self._populations[0][:1], self._populations[1][:1], self.evaluator.nodes[self.k])
         observed, u = self.data_set
         return float(np.mean([target.with_observed(observed[v > 0], v[v > 0]).of(values, weights) for v in u]))
 

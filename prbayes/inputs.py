@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -282,6 +283,34 @@ class PriorSampler:
                 "replace pm.Flat and pm.HalfFlat by a wide pm.Normal or pm.HalfNormal"
             ) from None
         return [np.array(column) for column in zip(*values, strict=True)]
+
+
+class PriorPoints:
+    """Points of the unit cube brought to the prior, each variable given those above it.
+
+    Raises
+    ------
+    TypeError
+        If a variable has no inverse distribution function.
+    """
+
+    def __init__(self, variables: Sequence[TensorVariable]) -> None:
+        self._shapes = [_event_shape(v) for v in variables]
+        self.size = sum(int(np.prod(s, dtype=int)) for s in self._shapes)
+        symbols = [pt.tensor(dtype="float64", shape=s) for s in self._shapes]
+        placed: dict[Variable, Variable] = {}
+        for v, u in zip(variables, symbols, strict=True):
+            placed[v] = quantiles("priors", graph_replace([v], placed, strict=False)[0], u)
+        if any(_is_random(v) for v in ancestors(list(placed.values()))):
+            raise TypeError("priors: got one that depends on a random variable which is not in the model")
+        self._function = compile_batched(symbols, list(placed.values()))
+
+    def __call__(self, cube: Floats) -> list[Floats]:
+        """Return values of each variable, shapes (k, *shape), for points of shape (k, size)."""
+        edges = np.cumsum([0, *(int(np.prod(s, dtype=int)) for s in self._shapes)])
+        parts = [cube[:, a:b] for a, b in pairwise(edges)]
+        values = self._function(*(p.reshape(len(cube), *s) for p, s in zip(parts, self._shapes, strict=True)))
+        return [np.asarray(v) for v in values]
 
 
 def prior_draws(roots: Sequence[TensorVariable], k: int, seed: int) -> list[Floats]:

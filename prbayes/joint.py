@@ -15,7 +15,7 @@ from prbayes.design import Design
 from prbayes.information import prior_scale
 from prbayes.inputs import read_inputs
 from prbayes.nulls import Case, Condition, Predictive, SimulatedNull
-from prbayes.optimize import Optimum
+from prbayes.optimum import Optimum
 from prbayes.predict import data_digest, serving, specimen_names
 from prbayes.refit import Neighbourhood
 from prbayes.resampling import groups, sets_at, simulated_points, specimens

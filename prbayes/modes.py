@@ -49,7 +49,7 @@ def rivals(
     starts: int,
     seed: int,
 ) -> list[Rival]:
-    """Descend from prior draws, all at once, and return the optima that a barrier separates from each other.
+    """Descend from points of the prior, all at once, and return the optima that a barrier separates from each other.
 
     Parameters
     ----------
@@ -70,13 +70,10 @@ def rivals(
     """
 
     def objective(thetas: Floats) -> Floats:
-        found = evaluator(thetas.reshape(-1, thetas.shape[-1]))
-        value = (found.discrepancies / scales).sum(axis=-1) - found.log_other
-        value = np.where(np.isfinite(found.log_prior), value, np.inf)
-        return np.asarray(value.reshape(thetas.shape[:-1]))
+        return evaluator.total(thetas.reshape(-1, thetas.shape[-1]), scales).reshape(thetas.shape[:-1])
 
     scale = local.scale
-    draws = evaluator.prior_thetas(8 * starts, seed)
+    draws = evaluator.prior_points(8 * starts, seed)
     first = objective(draws)
     chosen = draws[np.argsort(first, kind="stable")[::4][:starts]]  # the better half, without crowding
     size = max(float(np.ptp(np.quantile(first[np.isfinite(first)], [0.0, 0.5]))), noise)

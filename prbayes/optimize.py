@@ -4,122 +4,41 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pymc as pm
-import xarray as xr
 
-from prbayes._arrays import Floats
+from prbayes._arrays import Floats, positive_integer, positive_number
 from prbayes.information import Information, Local, prior_scale
 from prbayes.metrics import FunctionMetric
 from prbayes.modes import Rival, blind_directions, rivals
+from prbayes.optimum import Optimum, assemble, plain
 from prbayes.population import Evaluator
 from prbayes.refinement import _MAX_ROUNDS, AGREE, grow, pilot, refine_at, refuse, shortcomings, spread_around
 from prbayes.refit import Neighbourhood
 from prbayes.resimulation import FreshBound
-from prbayes.search import Search
+from prbayes.search import Scipy, Search
 from prbayes.simulator import model_on_context
 
 _log = logging.getLogger("prbayes")
 
 _LOOKS = 3  # at other optima, with a design that is refined in between
-_STARTS = 32  # prior draws from which other optima are searched for where a theta costs no response
+_STARTS = 32  # points of the prior from which other optima are searched for where a theta costs no response
 _TOLERATED = 1.5 * AGREE  # an estimate from eight blocks is itself uncertain
 _FLOOR = 0.3  # of the noise floor: about the difference of the discrepancy between the data's fit and the truth's
-_GRADIENT_FREE = {"nelder-mead", "powell", "cobyla", "cobyqa"}
-
-
-@dataclass(frozen=True, eq=False)
-class Optimum:
-    """The result of `minimize`; numerical failure is a value in it, not an exception.
-
-    Attributes
-    ----------
-    point : dict
-        Hyperparameters and deterministics by name, in the user's own units.
-    discrepancy : float
-        The minimised sum of d_k / s_k; with one simulator, its discrepancy.
-    discrepancies : dict
-        Discrepancy by simulator.
-    scales : dict
-        The s_k by simulator.
-    n_evaluations : int
-        Calls of the objective by the optimiser.
-    n_screened : int
-        Prior draws that were tried as starting points, in one batch.
-    n_responses : int
-        Scalar responses computed for this optimum, the design's included.
-    converged : bool
-    message : str
-        What the optimiser said.
-    stderr : dict
-        Standard errors by name, in the user's own units: the estimator's sampling standard deviation;
-        infinite along directions that the data do not identify; NaN where nothing is known, as at the edge
-        of a support.
-    covariance : ndarray, shape (d, d)
-        Sampling covariance in unconstrained space.
-    theta : ndarray, shape (d,)
-        The optimum in unconstrained space.
-    names : list of str
-        Names of the elements of theta.
-    support : dict
-        By simulator with `Reweighted`: ``weight_ess``, ``mean_weight`` and ``lost_mass`` at the optimum.
-    trace : dict
-        ``theta`` (n, d) and ``discrepancy`` (n,) of each evaluation.
-    seconds : float
-    design_error : float
-        How far the optimum of an independent design of the same size would be, in standard errors, along the worst
-        direction; NaN where it is not known (`Resimulated`) or is negligible (one input).
-    rivals : tuple of dict
-        Other optima, such as mirror solutions: ``point``, ``discrepancy`` (the sum of d_k / s_k), ``theta``, and
-        ``comparable``, whether the data could as well come from there.
-    warnings : tuple of str
-        What is not identified, in sentences; also logged.
-    """
-
-    point: dict[str, Any]
-    discrepancy: float
-    discrepancies: dict[str, float]
-    scales: dict[str, float]
-    n_evaluations: int
-    n_screened: int
-    n_responses: int
-    converged: bool
-    message: str
-    stderr: dict[str, Any]
-    covariance: Floats
-    theta: Floats
-    names: list[str]
-    evaluator: Evaluator = field(repr=False)
-    support: dict[str, dict[str, float]] = field(default_factory=dict)
-    trace: dict[str, Floats] = field(repr=False, default_factory=dict)
-    seconds: float = 0.0
-    design_error: float = np.nan
-    rivals: tuple[dict[str, Any], ...] = ()
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def model(self) -> pm.Model:
-        """The model."""
-        return self.evaluator.model
-
-    def to_datatree(self) -> xr.DataTree:
-        """Return the optimum as a DataTree with groups ``optimum``, ``stderr``, ``trace`` and ``calibration``."""
-        from prbayes.results import optimum_tree
-
-        return optimum_tree(self)
 
 
 def minimize(
     model: pm.Model | None = None,
     *,
     start: dict[str, Any] | None = None,
-    method: str | None = None,
+    method: Scipy | str | Callable[..., Any] | None = None,
     prior: bool = False,
-    tolerance: float = 1e-8,
-    max_evaluations: int = 2000,
+    tolerance: float = 1e-6,
+    max_evaluations: int = 5000,
     refine: bool = True,
     starts: int | None = None,
     random_seed: int = 0,
@@ -135,24 +54,27 @@ def minimize(
     model : pymc.Model, optional
         The one on the context by default.
     start : dict, optional
-        A value for each free variable, in the user's own units. By default the best of 256 prior draws where
-        they cost no response (`Reweighted`), and else the model's initial point.
-    method : str, optional
-        Any of `scipy.optimize.minimize`. BFGS by default, with exact gradients where there are any and
-        finite differences on common random numbers elsewhere.
+        A value for each free variable, in the user's own units. By default the best of 256 Sobol points of the prior
+        where they cost no response (`Reweighted`), and else the model's initial point. Where no simulated response is
+        near the data at the start, the area metric leads from there to where some are.
+    method : Scipy, str or callable, optional
+        BFGS by default, with exact gradients where there are any (`Reweighted`; `Resimulated` if the response accepts
+        PyTensor variables, which is tried) and differences on common points elsewhere. Any other method of
+        `scipy.optimize.minimize`, by its name, as `Scipy` with options, or as a function.
     prior : bool
         Add minus the log prior (then discrepancies should be divided by calibrated epsilons).
     tolerance : float
-        Relative tolerance of the standardised problem.
+        Of the standardised problem: the gradient's largest element, or the smallest step of methods without gradient,
+        with parameters in units of the prior's spread and the objective in units of its typical size.
     max_evaluations : int
-        Largest number of evaluations of the objective by the optimiser, on one design with one set of scales.
+        Largest number of evaluations of the objective by the optimiser in all, whatever the method.
     refine : bool
         Whether designs of `Reweighted` that do not support the optimum get more points.
     starts : int, optional
-        Number of prior draws from which other optima, such as mirror solutions, are searched for, all at once; 0
-        for none. By default 32 where a theta costs no response (`Reweighted`), and else none.
+        Number of Sobol points of the prior from which other optima, such as mirror solutions, are searched for, all at
+        once; 0 for none. By default 32 where a theta costs no response (`Reweighted`), and else none.
     random_seed : int
-        Seed of the starting draws.
+        Seed of the starting points.
 
     Returns
     -------
@@ -163,7 +85,7 @@ def minimize(
     TypeError
         If there is no model, or a gradient method is used on `Fresh`.
     KeyError, ValueError
-        If ``start`` does not fit the model.
+        If ``start`` does not fit the model, or there is no such method.
     DesignError
         If a design does not support the optimum after refinement.
 
@@ -199,23 +121,25 @@ def find_optimum(
     evaluator: Evaluator,
     *,
     start: dict[str, Any] | None = None,
-    method: str | None = None,
+    method: Scipy | str | Callable[..., Any] | None = None,
     prior: bool = False,
-    tolerance: float = 1e-8,
-    max_evaluations: int = 2000,
+    tolerance: float = 1e-6,
+    max_evaluations: int = 5000,
     refine: bool = True,
     starts: int | None = None,
     random_seed: int = 0,
 ) -> Optimum:
     """Do what `minimize` does, for an evaluator."""
     clock = time.perf_counter()
-    method = method or "BFGS"
-    gradient = method.lower() not in _GRADIENT_FREE
+    method = Scipy.of(method)
+    positive_number(tolerance, "tolerance")
+    positive_integer(max_evaluations, "max_evaluations")
     fresh = [n.name for n in evaluator.nodes if isinstance(n.bound, FreshBound)]
-    if gradient and fresh:
+    if fresh and method.gradient and isinstance(method.method, str):
         raise TypeError(
-            f"{fresh[0]}: prb.Fresh draws new responses at every evaluation, so the method {method} has no gradient to "
-            "follow; use prb.minimize(method='Nelder-Mead'), or propagation=prb.Reweighted() or prb.Resimulated()"
+            f"{fresh[0]}: prb.Fresh draws new responses at every evaluation, so the method {method.name} has no "
+            "gradient to follow; use prb.minimize(method='Nelder-Mead'), or propagation=prb.Reweighted() or "
+            "prb.Resimulated()"
         )
     scale = prior_scale(evaluator, seed=random_seed)
     already = evaluator.n_responses
@@ -223,8 +147,9 @@ def find_optimum(
     several = len(evaluator.nodes) > 1
     natural = np.array([n.target.scale for n in evaluator.nodes]) if several or prior else np.ones(1)
     natural = np.where(np.isnan(evaluator.epsilon) | (not (several or prior)), natural, evaluator.epsilon)
-    search = Search(evaluator, scale, method, gradient, prior, tolerance, max_evaluations)
+    search = Search(evaluator, scale, method, prior, tolerance, max_evaluations)
     theta, screened = search.start(start, natural, random_seed)
+    theta = search.approach(theta, natural, random_seed)
     scales = natural
     cloud: Floats | None = None
     error, rounds = np.nan, 0
@@ -276,7 +201,7 @@ def find_optimum(
     warnings = _warnings(evaluator, local, others, error)
     for line in warnings:
         _log.warning("%s", line)
-    found = _optimum(evaluator, theta, scales, local, search, result, screened, already - stored, clock)
+    found = assemble(evaluator, theta, scales, local, search, result, screened, already - stored, clock)
     return replace(found, design_error=error, rivals=tuple(_described(evaluator, o) for o in others), warnings=warnings)
 
 
@@ -303,7 +228,7 @@ def _rivals(
 
 
 def _described(evaluator: Evaluator, rival: Rival) -> dict[str, Any]:
-    point = {name: _plain(v[0]) for name, v in evaluator.constrained(rival.theta[None]).items()}
+    point = {name: plain(v[0]) for name, v in evaluator.constrained(rival.theta[None]).items()}
     return {"point": point, "discrepancy": rival.value, "theta": rival.theta, "comparable": rival.comparable}
 
 
@@ -333,68 +258,3 @@ def _warnings(evaluator: Evaluator, local: Local | None, others: list[Rival], er
             for direction in blind_directions(local, evaluator.names)
         ]
     return tuple(lines)
-
-
-def _optimum(
-    evaluator: Evaluator,
-    theta: Floats,
-    scales: Floats,
-    local: Local | None,
-    search: Search,
-    result: Any,
-    screened: int,
-    computed: int,
-    clock: float,
-) -> Optimum:
-    covariance = np.full((theta.size, theta.size), np.nan) if local is None else local.in_theta
-    step = 1e-4 * search.scale
-    rows = np.vstack([theta, *(theta + s * e for e in np.diag(step) for s in (1, -1))])
-    values = evaluator.constrained(rows)
-    stderr = {}
-    for name, v in values.items():
-        slopes = np.moveaxis((v[1::2] - v[2::2]), 0, -1) / (2 * step)
-        blind = np.isinf(covariance)
-        variance = np.einsum("...i,ij,...j->...", slopes, np.where(blind, 0.0, covariance), slopes)
-        touched = np.einsum("...i,ij,...j->...", np.abs(slopes), blind.astype(float), np.abs(slopes))
-        at_edge = blind.any() & (slopes == 0).all(axis=-1)
-        variance = np.where(at_edge, np.nan, np.where(touched > 0, np.inf, np.maximum(variance, 0)))
-        stderr[name] = _plain(np.sqrt(variance))
-    variance = np.diag(covariance) / search.scale**2  # where nothing changes, that of rounding errors
-    flat = bool((np.isinf(variance) | (variance < 1e-16)).all()) and _flat(evaluator, theta, search.scale)
-    lost = " No hyperparameter changes the discrepancy here, far from the data: try another start." if flat else ""
-    found = evaluator(theta[None])
-    discrepancies = dict(zip([n.name for n in evaluator.nodes], map(float, found.discrepancies[0]), strict=True))
-    return Optimum(
-        point={name: _plain(v[0]) for name, v in values.items()},
-        discrepancy=float((found.discrepancies[0] / scales).sum()),
-        discrepancies=discrepancies,
-        scales=dict(zip(discrepancies, map(float, scales), strict=True)),
-        n_evaluations=len(search.values),
-        n_screened=screened,
-        n_responses=evaluator.n_responses - computed,
-        converged=bool(result.success) and not flat,
-        message=f"{result.message}{lost}",
-        stderr=stderr,
-        covariance=covariance,
-        theta=theta,
-        names=evaluator.names,
-        evaluator=evaluator,
-        support={
-            name: {key: float(value[0]) for key, value in support.items()}
-            for name, support in evaluator.support(theta[None]).items()
-        },
-        trace={"theta": np.array(search.thetas), "discrepancy": np.array(search.values)},
-        seconds=time.perf_counter() - clock,
-    )
-
-
-def _flat(evaluator: Evaluator, theta: Floats, scale: Floats) -> bool:
-    """Whether no discrepancy changes around theta, as where populations and observed values do not overlap."""
-    around = np.vstack([theta, *(theta + s * e for e in np.diag(0.01 * scale) for s in (1, -1))])
-    found = evaluator(around).discrepancies
-    with np.errstate(invalid="ignore"):
-        return bool(((found == found[0]) | (np.abs(found - found[0]) <= 1e-12 * np.abs(found[0]))).all())
-
-
-def _plain(value: Any) -> Any:
-    return float(value) if np.ndim(value) == 0 else np.asarray(value)

@@ -20,7 +20,9 @@ from pytensor.graph.replace import graph_replace, vectorize_graph
 
 from prbayes._arrays import Floats, real_array
 from prbayes.design import Design
-from prbayes.inputs import PLAIN, PriorSampler, ninf_for_invalid
+from prbayes.discrepancy import Metric
+from prbayes.inputs import PLAIN, PriorPoints, PriorSampler, ninf_for_invalid
+from prbayes.propagation import sobol
 from prbayes.simulator import Node, log_kernel, required_nodes
 
 _CHUNK = 1 << 22  # design points times particles evaluated at a time: bounds memory
@@ -180,43 +182,37 @@ class Evaluator:
 
         return counted
 
-    def observing(self, data: dict[str, Floats]) -> Evaluator:
+    def observing(self, data: dict[str, Floats], metric: Metric | None = None) -> Evaluator:
         """Return an evaluator of the same model with other observed responses, by the names of simulators.
 
-        Metrics choose bandwidths and cells anew; designs and epsilons are the same objects.
+        Metrics choose bandwidths and cells anew; designs and epsilons are the same objects. With ``metric`` all
+        simulators have that one.
         """
         _ = self._evaluate, self._constrain, self._roots, self._transform  # compiled once, for all copies
         other = copy.copy(self)
         other.nodes = [
             replace(
                 n,
-                target=n.metric.against(
+                target=(metric or n.metric).against(
                     data[n.name], n.target.weights if n.target.observed.size == np.size(data[n.name]) else None
                 ),
             )
             for n in self.nodes
         ]
-        other.__dict__["objective"] = other._differenced
+        other.__dict__["objective"] = other._uncompiled
         return other
 
-    def _differenced(self, *, prior: bool, gradient: bool) -> Any:
-        """Return the objective without compiling it; gradients are differences of one batch."""
-        if prior:
-            raise NotImplementedError("the prior's density is not part of an objective on other data")
-        spread = np.subtract(*np.quantile(self.prior_thetas(256, 0), [0.84, 0.16], axis=0)) / 2
-        step = 1e-4 * np.where(spread > 0, spread, 1.0)
-        stencil = np.concatenate([np.zeros((1, self.size)), np.diag(step), -np.diag(step)])
+    def _uncompiled(self, *, prior: bool, gradient: bool) -> Any:
+        if prior or gradient:
+            raise NotImplementedError("on other data the objective is evaluated, not compiled")
+        return lambda theta, scales: (self.total(theta[None], scales)[0],)
 
-        def objective(theta: Floats, scales: Floats) -> Any:
-            found = self(theta + stencil if gradient else theta[None])
-            with np.errstate(invalid="ignore"):
-                total = (found.discrepancies / scales).sum(axis=-1) - found.log_other
-                value = np.where(np.isfinite(found.log_prior[0]), total[0], np.inf)
-                if not gradient:
-                    return (value,)
-                return value, (total[1 : 1 + self.size] - total[1 + self.size :]) / (2 * step)
-
-        return objective
+    def total(self, thetas: Floats, scales: Floats) -> Floats:
+        """Return the sum of d_k / scale_k - log of ordinary terms, shape (P,); +inf outside the priors' support."""
+        found = self(thetas)
+        with np.errstate(invalid="ignore"):
+            value = (found.discrepancies / scales).sum(axis=-1) - found.log_other
+        return np.where(np.isfinite(found.log_prior) & np.isfinite(value), value, np.inf)
 
     def in_support(self, thetas: Floats) -> Any:
         """Return which thetas have a finite log prior, shape (P,)."""
@@ -297,6 +293,20 @@ class Evaluator:
         if (size, seed) not in self._drawn:
             self._drawn[size, seed] = self.thetas_of(self._sampler(size, seed))
         return self._drawn[size, seed].copy()
+
+    @cached_property
+    def _points(self) -> PriorPoints | None:
+        try:
+            return PriorPoints(self.model.free_RVs)
+        except TypeError:  # a prior without inverse distribution function
+            return None
+
+    def prior_points(self, size: int, seed: int) -> Floats:
+        """Return thetas spread evenly over the prior, shape (size, d): Sobol points, or draws where there are none."""
+        if self._points is None:
+            return self.prior_thetas(size, seed)
+        thetas = self.thetas_of(self._points(sobol(size, self._points.size, seed)))
+        return np.where(np.isfinite(thetas), thetas, self.initial)
 
     @cached_property
     def _transform(self) -> Any:

@@ -19,7 +19,7 @@ from prbayes._arrays import Floats, positive_integer
 from prbayes.calling import ResponseError
 from prbayes.design import Design
 from prbayes.inputs import Inputs, PopulationSampler, compile_batched, quantiles, read_inputs
-from prbayes.optimize import Optimum
+from prbayes.optimum import Optimum
 from prbayes.propagation import base_points
 from prbayes.refinement import DesignError
 from prbayes.responses import Responses, refuse_uncallable

@@ -7,7 +7,7 @@ the discrepancy as a graph of the hyperparameters and knows how many responses w
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -235,6 +235,48 @@ class Reweighted(Propagation):
         return Design(name, inputs, target, responses, self)
 
 
+def sobol(n: int, dimensions: int, seed: int) -> Floats:
+    """Return n scrambled Sobol points in the open unit cube, shape (n, dimensions).
+
+    Parameters
+    ----------
+    n, dimensions, seed : int
+
+    References
+    ----------
+    .. [1] A. B. Owen (1998), Scrambling Sobol and Niederreiter-Xing points, doi:10.1006/jcom.1998.0487.
+
+    Examples
+    --------
+    >>> sobol(4, 1, 0).shape
+    (4, 1)
+    """
+    from scipy.stats import qmc  # takes longer to import than the whole package
+
+    engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
+    points = engine.random_base2(int(np.ceil(np.log2(n))))[:n] if n > 1 else engine.random(1)
+    return np.asarray(np.clip(points, 1e-12, 1 - 1e-12, out=points))
+
+
+def monte_carlo(n: int, dimensions: int, seed: int) -> Floats:
+    """Return n independent random points in the open unit cube, shape (n, dimensions); for `Resimulated`.
+
+    Parameters
+    ----------
+    n, dimensions, seed : int
+
+    References
+    ----------
+    .. [1] Oh et al. (2019), doi:10.1007/s00158-019-02288-6, whose case study has a million of them.
+
+    Examples
+    --------
+    >>> Resimulated(1000, points=monte_carlo).n
+    1000
+    """
+    return np.clip(np.random.default_rng(seed).random((n, dimensions)), 1e-12, 1 - 1e-12)
+
+
 @dataclass(frozen=True)
 class Resimulated(Propagation):
     """Fixed scrambled Sobol points through the inputs' inverse distribution functions, for each theta anew.
@@ -245,6 +287,9 @@ class Resimulated(Propagation):
         Number of points, best a power of two; n responses are computed for each theta.
     seed : int
         Seed of the scrambling.
+    points : callable
+        ``points(n, dimensions, seed)``, the points in the unit cube, shape (n, dimensions): `sobol`, or `monte_carlo`
+        for random numbers that are the same for each theta.
 
     Examples
     --------
@@ -254,10 +299,16 @@ class Resimulated(Propagation):
 
     n: int = 1024
     seed: int = 0
+    points: Callable[[int, int, int], Floats] = field(default=sobol, repr=False)
 
     def __post_init__(self) -> None:
         self.check()
         positive_integer(self.n, "Resimulated: n", minimum=2)
+        if not callable(self.points):
+            raise TypeError(
+                f"Resimulated: points: got {type(self.points).__name__}, expected prb.sobol, prb.monte_carlo or a "
+                "function (n, dimensions, seed) -> points"
+            )
         positive_integer(self.seed, "Resimulated: seed", minimum=0)
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
@@ -309,20 +360,13 @@ def refuse_nested(name: str, inputs: Inputs) -> None:
         )
 
 
-def sobol(n: int, dimensions: int, seed: int) -> Floats:
-    """Return n scrambled Sobol points in the open unit cube, shape (n, dimensions)."""
-    from scipy.stats import qmc  # takes longer to import than the whole package
-
-    engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
-    points = engine.random_base2(int(np.ceil(np.log2(n))))[:n] if n > 1 else engine.random(1)
-    return np.asarray(np.clip(points, 1e-12, 1 - 1e-12, out=points))
-
-
-def base_points(inputs: Inputs, n: int, seed: int) -> tuple[Floats, list[Floats]]:
-    """Return one spare Sobol coordinate, shape (n,), and one array of points, (n, *event), per aleatory input."""
+def base_points(
+    inputs: Inputs, n: int, seed: int, points: Callable[[int, int, int], Floats] = sobol
+) -> tuple[Floats, list[Floats]]:
+    """Return one spare coordinate, shape (n,), and one array of points, (n, *event), per aleatory input."""
     shapes = inputs.event_shapes
     sizes = [int(np.prod(s, dtype=int)) for s in shapes]
-    u = sobol(n, 1 + sum(sizes), seed)
+    u = points(n, 1 + sum(sizes), seed)
     edges = np.cumsum([1, *sizes])
     parts = [u[:, a:b].reshape(n, *s).copy() for a, b, s in zip(edges[:-1], edges[1:], shapes, strict=True)]
     return u[:, 0].copy(), parts

@@ -18,6 +18,7 @@ from prbayes.inputs import PopulationSampler
 from prbayes.population import Evaluator
 from prbayes.simulator import Node
 
+_MOST = 1 << 15  # points of a resimulated population from which data sets are drawn
 _SPARE = 4  # draws for each specimen that is needed, in case responses are not finite
 
 
@@ -89,7 +90,8 @@ def aligned(nodes: list[Node]) -> bool:
 def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int = 0) -> DataSets:
     """Draw data sets of the observed sizes from the populations at theta (parametric bootstrap).
 
-    Only responses that are finite can be observed. Repeated observations of one specimen within a simulator
+    Only responses that are finite can be observed. Of populations of more than 2^15 points that many, the first of a
+    Sobol sequence, stand for all. Repeated observations of one specimen within a simulator
     are equal, as the model has them.
 
     Raises
@@ -98,7 +100,7 @@ def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int =
         If specimens are shared by simulators whose inputs are not the same ``.dist()`` objects, or whose
         designs differ, so that the model does not say how their responses depend on each other.
     """
-    populations = [evaluator.populations(theta[None], k) for k in range(len(evaluator.nodes))]
+    populations = [thinned(*evaluator.populations(theta[None], k), n) for k, n in enumerate(evaluator.nodes)]
     return sets_at(evaluator, populations, simulated_points(evaluator, populations, n_sets, seed))
 
 
@@ -143,6 +145,13 @@ def sets_at(evaluator: Evaluator, populations: list[tuple[Floats, Floats]], poin
         values.append(responses[finite])
         weights.append(count.reshape(n_sets, size))
     return DataSets(values, weights)
+
+
+def thinned(values: Floats, weights: Floats, node: Node) -> tuple[Floats, Floats]:
+    """Return the first 2^15 points of resimulated populations, (k, n) each, which all have equal weights."""
+    if isinstance(node.bound, Design) or values.shape[-1] <= _MOST:
+        return values, weights
+    return values[:, :_MOST], np.broadcast_to(1 / _MOST, (len(values), _MOST))
 
 
 def _refuse_unlike(nodes: list[Node]) -> None:

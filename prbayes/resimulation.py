@@ -32,7 +32,7 @@ class ResimulatedBound(Bound):
     ) -> None:
         super().__init__(name, inputs, target, responses)
         self.n_per_theta = config.n
-        _, points = base_points(inputs, config.n, config.seed)
+        _, points = base_points(inputs, config.n, config.seed, config.points)
         # What depends on constants alone, PyTensor computes once and keeps: fast, unless it is too large to keep.
         self._points: list[Any] = points if config.n <= _KEPT else [shared(u) for u in points]
         for dist, u in zip(inputs.aleatory, self._points, strict=True):

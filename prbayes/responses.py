@@ -15,7 +15,7 @@ from pytensor.graph.replace import _vectorize_node
 
 from prbayes._arrays import Floats
 from prbayes.calling import Caller, ResponseError, checked, scalar
-from prbayes.density import Cells
+from prbayes.cells import Cells
 from prbayes.discrepancy import Discrepancy
 from prbayes.failures import Abort, OnFailure
 from prbayes.inputs import Inputs
@@ -230,21 +230,32 @@ class DensityOp(Op):
             raise NotImplementedError(
                 "a Histogram has no gradient under prb.Resimulated: use GaussianKDE, or prb.Reweighted"
             )
-        return DensityPullbackOp(self.cells)(*inputs, *cotangents)
+        (sample, weights), (cotangent,) = inputs, cotangents
+        slope, value = (CotangentOp(self.cells, order)(sample, cotangent) for order in (1, 0))
+        return [weights * slope, value]
 
 
-class DensityPullbackOp(DensityOp):
-    """Derivatives of a density on cells: (n), (n), (m) -> (n), (n)."""
+class CotangentOp(Op):
+    """A cotangent of a density on cells at the sample, (..., n), (..., m) -> (..., n): itself or its derivative."""
 
-    def make_node(self, sample: Any, weights: Any, cotangent: Any = None) -> Apply[Any, Any]:
-        """Apply to a sample, its weights and the cotangent of the density."""
-        tensors = [pt.as_tensor(x) for x in (sample, weights, cotangent)]
+    def __init__(self, cells: Cells, order: int) -> None:
+        self.cells, self.order = cells, order
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, CotangentOp) and self.cells is other.cells and self.order == other.order
+
+    def __hash__(self) -> int:
+        return hash((type(self), id(self.cells), self.order))
+
+    def make_node(self, sample: Any, cotangent: Any) -> Apply[Any, Any]:
+        """Apply to a sample and the cotangent of the density."""
+        tensors = [pt.as_tensor(x) for x in (sample, cotangent)]
         ndim = max(t.type.ndim for t in tensors)
-        return Apply(self, tensors, [pt.tensor(dtype="float64", shape=(None,) * ndim) for _ in range(2)])
+        return Apply(self, tensors, [pt.tensor(dtype="float64", shape=(None,) * ndim)])
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Gather."""
-        outputs[0][0], outputs[1][0] = (np.array(g) for g in self.cells.pullback(*inputs))
+        outputs[0][0] = (self.cells.slope if self.order else self.cells.value)(*inputs)
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
         """Refuse second derivatives."""
@@ -288,7 +299,7 @@ def _on_batches(op: Any, node: Apply[Any, Any], *batched: Variable) -> Any:
     return op.make_node(*batched)
 
 
-for _op in (ResponseOp, DensityOp, OpaqueOp):
+for _op in (ResponseOp, DensityOp, CotangentOp, OpaqueOp):
     _vectorize_node.register(_op, _on_batches)
 
 

@@ -15,7 +15,7 @@ from prbayes.population import Evaluator
 _ENVELOPE = 0.95  # probability that the ECDF of uniform ranks stays inside
 
 if TYPE_CHECKING:
-    from prbayes.optimize import Optimum
+    from prbayes.optimum import Optimum
 
 
 def versions() -> dict[str, str]:
@@ -277,6 +277,7 @@ def optimum_tree(optimum: Optimum) -> xr.DataTree:
                 {
                     "theta": (["evaluation", "element"], optimum.trace["theta"]),
                     "discrepancy": ("evaluation", optimum.trace["discrepancy"]),
+                    "evaluations": ("evaluation", optimum.trace["evaluations"]),
                 },
                 coords={"element": optimum.names},
             ),

@@ -1,63 +1,209 @@
-"""Runs scipy's optimisers on the standardised objective, and decides whether they have converged."""
+"""Runs minimisers on the standardised objective, and decides whether they have converged.
+
+Standardised: parameters in units of the prior's spread, the objective in units of its typical size. A tolerance then
+means the same for every model, metric and method.
+"""
 
 from __future__ import annotations
 
-import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from prbayes._arrays import Floats
+from prbayes.discrepancy import DensityDiscrepancy
+from prbayes.metrics import AreaMetric, FunctionMetric
 from prbayes.population import Evaluator
-
-_log = logging.getLogger("prbayes")
+from prbayes.resimulation import FreshBound
 
 _SETTLED = 1e-4  # relative gain of a simplex below which a stalled line search counts as converged
 _SCREENED = 256  # prior draws tried as starts where a theta costs no response
+_PATIENCE, _PROGRESS = 15, 1e-10  # evaluations in a line search without such a gain, in units of the objective
+_STEP = 1e-4  # of differences, in units of the prior's spread
+_OVERLAP = 0.02  # of two densities, below which the area metric leads
+_THIN = 2.0  # weight effective sample size below which a design does not reach a population at all
+_ENOUGH = 0.5  # overlap from which on the metric itself is followed
+_COARSE = 1e-2  # tolerance of the area metric as a guide
+_GRADIENT_FREE = ("Nelder-Mead", "Powell", "COBYLA", "COBYQA")
+_WITH_GRADIENT = ("BFGS", "CG", "L-BFGS-B", "Newton-CG", "SLSQP", "TNC", "trust-constr")
+
+
+@dataclass(frozen=True)
+class Scipy:
+    """A minimiser of `scipy.optimize.minimize`, with options of its own.
+
+    Parameters
+    ----------
+    method : str or callable
+        Scipy's name of a method that needs no Hessian, or a function as `scipy.optimize.minimize` takes it:
+        ``method(fun, x0, args, jac=..., callback=..., **options) -> OptimizeResult``. It works on standardised
+        parameters, that start at zero; ``jac`` is None under `Fresh`.
+    options : mapping
+        For scipy's ``options=``, in units of the standardised problem; they replace those that `minimize` would set.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If there is no such method, or the options are no mapping.
+
+    References
+    ----------
+    .. [1] J. Nocedal and S. J. Wright (2006), Numerical Optimization, doi:10.1007/978-0-387-40065-5.
+
+    Examples
+    --------
+    >>> Scipy("L-BFGS-B", {"maxcor": 5})
+    Scipy(method='L-BFGS-B', options={'maxcor': 5})
+    """
+
+    method: str | Callable[..., Any] = "BFGS"
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        known = (*_WITH_GRADIENT, *_GRADIENT_FREE)
+        if isinstance(self.method, str):
+            if self.method.lower() not in {name.lower() for name in known}:
+                raise ValueError(
+                    f"method: got {self.method!r}, expected one of {', '.join(known)}, or a function that "
+                    "scipy.optimize.minimize takes as its method"
+                )
+        elif not callable(self.method) or isinstance(self.method, type):
+            raise TypeError(
+                f"method: got {self.method!r:.60}, expected prb.Scipy(...), the name of a scipy method, or a function"
+            )
+        if not isinstance(self.options, Mapping):
+            raise TypeError(f"options: got {type(self.options).__name__}, expected a mapping of names to values")
+
+    @classmethod
+    def of(cls, method: Scipy | str | Callable[..., Any] | None) -> Scipy:
+        """Return what a user meant by ``method=``."""
+        return method if isinstance(method, Scipy) else cls() if method is None else cls(method)
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return self.method if isinstance(self.method, str) else getattr(self.method, "__name__", repr(self.method))
+
+    @property
+    def gradient(self) -> bool:
+        """Whether the method is given gradients."""
+        return not isinstance(self.method, str) or self.method.lower() not in {n.lower() for n in _GRADIENT_FREE}
+
+    def settings(self, tolerance: float, size: int) -> dict[str, Any]:
+        """Return scipy's options for a standardised problem; the budget of evaluations alone limits iterations."""
+        most = 10**9
+        simplex = np.vstack([np.zeros(size), 0.2 * np.eye(size)])
+        known: dict[str, dict[str, Any]] = {
+            "bfgs": {"gtol": tolerance, "maxiter": most},
+            "cg": {"gtol": tolerance, "maxiter": most},
+            "l-bfgs-b": {"gtol": tolerance, "ftol": tolerance**2, "maxfun": most, "maxiter": most},
+            "newton-cg": {"xtol": tolerance, "maxiter": most},
+            "slsqp": {"ftol": tolerance**2, "maxiter": most},
+            "tnc": {"gtol": tolerance, "ftol": tolerance**2, "xtol": 0.0, "maxfun": most},
+            "trust-constr": {"gtol": tolerance, "xtol": tolerance**2, "maxiter": most},
+            "nelder-mead": {
+                "xatol": tolerance,
+                "fatol": tolerance / 100,
+                "initial_simplex": simplex,
+                "maxfev": most,
+                "maxiter": most,
+            },
+            "powell": {"xtol": tolerance, "ftol": tolerance**2, "maxfev": most, "maxiter": most},
+            "cobyla": {"tol": tolerance, "rhobeg": 0.2, "maxiter": most},
+            "cobyqa": {"final_tr_radius": tolerance, "initial_tr_radius": 0.2, "maxfev": most, "maxiter": most},
+        }
+        return {**known.get(self.name.lower() if isinstance(self.method, str) else "", {}), **self.options}
 
 
 class SpentError(Exception):
     """The budget of evaluations is spent."""
 
 
-class _Counted:
-    """The objective on standardised parameters; records every evaluation, at most ``most`` of them."""
+class StalledError(Exception):
+    """A line search has made no progress for some time."""
 
-    def __init__(self, function: Any, center: Floats, scale: Floats, *, gradient: bool, most: int) -> None:
-        self.function, self.center, self.scale, self.gradient = function, center, scale, gradient
-        self.most = most
+
+class Objective:
+    """The standardised objective of one minimisation; records every point, at most ``most`` evaluations."""
+
+    def __init__(self, function: Any, center: Floats, scale: Floats, size: float, *, gradient: bool, most: int) -> None:
+        self.function, self.center, self.scale, self.size = function, center, scale, size
+        self.gradient, self.most, self.count = gradient, most, 0
+        self.patience, self._lowest, self._since = 10**9, np.inf, 0
         self.thetas: list[Floats] = []
         self.values: list[float] = []
-        self.gradients: list[Floats] = []
+        self.counts: list[int] = []
 
     def __call__(self, t: Floats) -> Any:
-        if len(self.values) >= self.most:
+        """Return the value, and the gradient where there is one, at standardised parameters."""
+        if self.count >= self.most:
             raise SpentError
-        theta = self.center + t * self.scale
-        value, *gradient = self.function(theta)
-        value = float(value)
+        theta = self.center + np.asarray(t) * self.scale
+        value, gradient, cost = self.function(theta)
+        self.count += cost
         self.thetas.append(theta)
-        self.values.append(value)
+        self.values.append(float(value))
+        self.counts.append(self.count)
+        value = float(value) / self.size
+        self._since = 0 if value < self._lowest - _PROGRESS else self._since + 1
+        self._lowest = min(self._lowest, value)
+        if self._since > self.patience:
+            raise StalledError
         if not self.gradient:
             return value if np.isfinite(value) else 1e300
-        g = np.asarray(gradient[0]) * self.scale
-        self.gradients.append(g)
+        g = np.asarray(gradient) * self.scale / self.size
         if not np.isfinite(value) or not np.isfinite(g).all():
             return 1e10 + float(t @ t), 2 * t  # back towards the start, without breaking a line search
         return value, g
 
+    @property
+    def best(self) -> Floats:
+        """The point with the smallest value so far, or the center."""
+        if not self.values:
+            return self.center
+        return self.thetas[int(np.argmin(np.nan_to_num(self.values, nan=np.inf, posinf=np.inf)))]
+
+    @property
+    def lowest(self) -> float:
+        """The smallest value so far."""
+        return min((v for v in self.values if np.isfinite(v)), default=np.inf)
+
+
+def differences(values: Callable[[Floats], Floats], step: Floats) -> Callable[[Floats], Any]:
+    """Return a function of theta that gives value, gradient by central differences, and number of evaluations.
+
+    Where one of two neighbours is infinite, as at the edge of a support, the difference is one-sided.
+    """
+
+    def function(theta: Floats) -> Any:
+        found = values(np.vstack([theta, theta + np.diag(step), theta - np.diag(step)]))
+        middle, up, down = found[0], found[1 : 1 + step.size], found[1 + step.size :]
+        with np.errstate(invalid="ignore"):
+            forward, backward = (up - middle) / step, (middle - down) / step
+            central = np.where(np.isfinite(down), (up - down) / (2 * step), forward)
+        return middle, np.where(np.isfinite(up), central, backward), len(found)
+
+    return function
+
 
 class Search:
-    """Runs scipy on the objective, as often as scales or designs change."""
+    """Runs a minimiser on the objective, as often as scales or designs change, within one budget of evaluations."""
 
     def __init__(
-        self, evaluator: Evaluator, scale: Floats, method: str, gradient: bool, prior: bool, tolerance: float, most: int
+        self, evaluator: Evaluator, scale: Floats, method: Scipy, prior: bool, tolerance: float, most: int
     ) -> None:
         self.evaluator, self.scale, self.method = evaluator, scale, method
-        self.gradient, self.prior, self.tolerance, self.most = gradient, prior, tolerance, most
+        self.prior, self.tolerance, self.most = prior, tolerance, most
+        self.fresh = any(isinstance(n.bound, FreshBound) for n in evaluator.nodes)
+        self.gradient = method.gradient and not self.fresh
         self.thetas: list[Floats] = []
         self.values: list[float] = []
+        self.counts: list[int] = []
+        self.count = 0
         self.best = np.empty(0)
+        self.remark = ""
 
     def start(self, start: dict[str, Any] | None, scales: Floats, seed: int) -> tuple[Floats, int]:
         """Return where to begin and how many draws were screened for it."""
@@ -65,86 +211,141 @@ class Search:
             return self.evaluator.unconstrained(start), 0
         if self.evaluator.responses_per_theta:
             return self.evaluator.initial, 0
-        draws = np.concatenate([self.evaluator.initial[None], self.evaluator.prior_thetas(_SCREENED, seed)])
+        draws = np.concatenate([self.evaluator.initial[None], self.evaluator.prior_points(_SCREENED, seed)])
         return self.best_of(draws, scales), len(draws)
 
     def best_of(self, thetas: Floats, scales: Floats) -> Floats:
         """Return the theta with the smallest objective, evaluated in one batch."""
-        found = self.evaluator(thetas)
-        value = (found.discrepancies / scales).sum(axis=-1) - found.log_other
-        return np.asarray(thetas[np.argmin(np.where(np.isfinite(value), value, np.inf))])
+        value = self.evaluator.total(thetas, scales)
+        return np.asarray(thetas[np.argmin(value)])
+
+    def size(self, theta: Floats, scales: Floats) -> float:
+        """Return a typical size of the objective; of a user's metric it is the value at theta."""
+        if not any(isinstance(n.metric, FunctionMetric) for n in self.evaluator.nodes):
+            return float(sum(n.target.scale / s for n, s in zip(self.evaluator.nodes, scales, strict=True)))
+        first = float(np.abs(self.evaluator.total(theta[None], scales)[0]))
+        return first if 0 < first < np.inf else 1.0
+
+    def _function(self, scales: Floats, *, gradient: bool) -> Callable[[Floats], Any]:
+        """Return theta -> value, gradient, number of evaluations: exact where it can be had, or by differences."""
+        if gradient:
+            try:
+                exact = self.evaluator.objective(prior=self.prior, gradient=True)
+                return lambda theta: (*exact(theta, scales), 1)
+            except NotImplementedError:
+                step = _STEP * self.scale
+        if gradient and not self.prior:
+            return differences(lambda thetas: self.evaluator.total(thetas, scales), step)
+        plain = self.evaluator.objective(prior=self.prior, gradient=False)
+        if gradient:
+            return differences(lambda thetas: np.array([float(plain(t, scales)[0]) for t in thetas]), step)
+        return lambda theta: (plain(theta, scales)[0], None, 1)
 
     def __call__(self, theta: Floats, scales: Floats) -> Any:
         """Minimise from theta; sets ``best``."""
-        exact = self.gradient
-        try:
-            compiled = self.evaluator.objective(prior=self.prior, gradient=exact)
-        except NotImplementedError as error:
-            _log.info("no exact gradient (%s): finite differences on common random numbers", error)
-            exact = False
-            compiled = self.evaluator.objective(prior=self.prior, gradient=False)
-        counted = _Counted(lambda theta: compiled(theta, scales), theta, self.scale, gradient=exact, most=self.most)
-        zero = np.zeros_like(theta)
-        first = counted(zero)
-        size = max(abs(first[0] if exact else first), 1e-12)
-        options: dict[str, Any] = {}
-        name = self.method.lower()
-        if name in {"bfgs", "cg"}:
-            options = {"gtol": self.tolerance * size, "maxiter": self.most}
-            if not exact:
-                options["finite_diff_rel_step"] = None
-                options["eps"] = 1e-5
-        elif name == "l-bfgs-b":
-            options = {"gtol": self.tolerance * size, "ftol": self.tolerance**2, "maxfun": self.most}
-        elif name == "nelder-mead":
-            options = {"xatol": 1e-6, "fatol": self.tolerance * size, "maxfev": self.most}
-            options["initial_simplex"] = np.vstack([zero, 0.2 * np.eye(zero.size)])
-        result = self._run(counted, zero, jac=exact if self.gradient else None, method=self.method, options=options)
-        self._record(counted)
-        self._last = counted, size, exact
+        self.best = theta
+        function, size = self._function(scales, gradient=self.gradient), self.size(theta, scales)
+        objective = Objective(function, theta, self.scale, size, gradient=self.gradient, most=self.most - self.count)
+        if self.method.name.lower() in {"bfgs", "cg", "l-bfgs-b"}:
+            objective.patience = _PATIENCE
+        options = self.method.settings(self.tolerance, theta.size)
+        result = self._run(
+            objective, np.zeros_like(theta), jac=self.gradient or None, method=self.method.method, options=options
+        )
+        self._record(objective)
+        self.best = objective.best
+        self._last = objective, scales
         return result
 
-    def _run(self, counted: _Counted, start: Floats, **settings: Any) -> Any:
+    def approach(self, theta: Floats, scales: Floats, seed: int) -> Floats:
+        """Go to where simulated responses overlap with the data, by the area metric, whose gradient does not vanish.
+
+        Without overlap a density metric hardly changes, or changes so that populations get wider without end. Where a
+        theta costs no response, the prior's draws are looked at first. Returns theta itself where there is overlap.
+        """
+        thin = any(s["weight_ess"][0] < _THIN for s in self.evaluator.support(theta[None]).values())
+        if self.fresh or (not thin and self.overlap(*self._populations(theta[None]))[0] > _OVERLAP):
+            return theta
+        areas = [AreaMetric().against(n.target.observed, n.target.weights) for n in self.evaluator.nodes]
+        seen: dict[bytes, tuple[float, float]] = {}
+
+        def area(thetas: Floats) -> Floats:
+            populations = self._populations(thetas)
+            values = [a.of(v, w) / a.scale for a, v, w in zip(areas, *populations, strict=True)]
+            total = np.where(self.evaluator.in_support(thetas), np.sum(values, axis=0), np.inf)
+            parts = zip(self.evaluator.nodes, scales, *populations, strict=True)
+            own = sum(n.target.of(v, w) / s for n, s, v, w in parts)
+            for row, both in zip(thetas, zip(self.overlap(*populations), own, strict=True), strict=True):
+                seen[row.tobytes()] = both
+            return np.asarray(np.nan_to_num(total, nan=np.inf, posinf=np.inf))
+
+        if not self.evaluator.responses_per_theta:
+            candidates = np.vstack([theta, self.evaluator.prior_points(_SCREENED, seed)])
+            theta = candidates[np.argmin(area(candidates))]
+        guide, left = differences(area, _STEP * self.scale), self.most - self.count
+        objective = Objective(guide, theta, self.scale, len(areas), gradient=True, most=left)
+
+        def near(t: Floats) -> None:
+            if seen[(theta + t * self.scale).tobytes()][0] > _ENOUGH:
+                raise StopIteration
+
+        self._run(objective, np.zeros_like(theta), jac=True, method="BFGS", options={"gtol": _COARSE}, callback=near)
+        reached = objective.best
+        found = [seen[t.tobytes()] for t in objective.thetas]
+        objective.values = [own for _, own in found]
+        self._record(objective)
+        self.remark = (
+            f" At the start hardly any simulated response was near the data: the area metric led from there, in "
+            f"{objective.count} evaluations."
+        )
+        return reached
+
+    def _populations(self, thetas: Floats) -> tuple[list[Floats], list[Floats]]:
+        """Return responses and weights, (P, n) each, by simulator."""
+        found = [self.evaluator.populations(thetas, k) for k in range(len(self.evaluator.nodes))]
+        return [v for v, _ in found], [w for _, w in found]
+
+    def overlap(self, values: list[Floats], weights: list[Floats]) -> Floats:
+        """Return the smallest overlap over the simulators with densities, shape (P,); one where there is none."""
+        overlaps = [
+            n.target.overlap(v, w)
+            for n, v, w in zip(self.evaluator.nodes, values, weights, strict=True)
+            if isinstance(n.target, DensityDiscrepancy)
+        ]
+        return np.min([np.ones(len(values[0])), *overlaps], axis=0)
+
+    def _run(self, objective: Objective, start: Floats, **settings: Any) -> Any:
         from scipy import optimize  # takes longer to import than the whole package
 
         try:
-            return optimize.minimize(counted, start, **settings)
+            return optimize.minimize(objective, start, **settings)
         except SpentError:
             message = f"max_evaluations = {self.most} was reached before convergence."
-            return optimize.OptimizeResult(success=False, message=message, fun=np.nanmin(counted.values))
+        except StalledError:
+            message = f"The line search gained nothing in {objective.patience} evaluations."
+        return optimize.OptimizeResult(success=False, message=message, fun=objective.lowest / objective.size)
 
-    def _record(self, counted: _Counted) -> None:
-        self.thetas += counted.thetas
-        self.values += counted.values
-        values = np.array(counted.values)
-        self.best = counted.thetas[int(np.argmin(np.where(np.isfinite(values), values, np.inf)))]
+    def _record(self, objective: Objective) -> None:
+        self.thetas += objective.thetas
+        self.values += objective.values
+        self.counts += [self.count + c for c in objective.counts]
+        self.count += objective.count
 
     def settle(self, result: Any) -> Any:
         """Decide on a line search that gave up: at a kink or at rounding that is the minimum, if a simplex agrees."""
-        counted, size, exact = self._last
-        if result.success or not self.gradient or len(counted.values) >= self.most:
+        (last, scales), left = self._last, self.most - self.count
+        if result.success or not self.gradient or left <= 0:
             return result
-        start = (self.best - counted.center) / self.scale
-        before = min(v for v in counted.values if np.isfinite(v))
-        again = _Counted(
-            counted.function if not exact else (lambda theta: counted.function(theta)[:1]),
-            counted.center,
-            self.scale,
-            gradient=False,
-            most=self.most - len(counted.values),
-        )
+        plain = self._function(scales, gradient=False)
+        again = Objective(plain, last.center, self.scale, last.size, gradient=False, most=left)
+        start, before = (self.best - last.center) / self.scale, last.lowest
         simplex = np.vstack([start, start + 0.01 * np.eye(start.size)])
-        polished = self._run(
-            again,
-            start,
-            method="Nelder-Mead",
-            options={"initial_simplex": simplex, "xatol": 1e-5, "fatol": 1e-9 * size, "maxfev": 60 * start.size},
-        )
-        self.thetas += again.thetas
-        self.values += again.values
-        if polished.fun <= before:
-            self.best = again.thetas[int(np.nanargmin(again.values))]
-        gain = (before - polished.fun) / max(abs(before), 1e-300)
+        options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-7, "maxfev": 60 * start.size}
+        polished = self._run(again, start, method="Nelder-Mead", options=options)
+        self._record(again)
+        if again.lowest <= before:
+            self.best = again.best
+        gain = (before - again.lowest) / max(abs(before), 1e-300)
         polished.success = bool(polished.success or gain < _SETTLED)
         polished.message = f"{result.message} A simplex from there gained {max(gain, 0):.1e}: {polished.message}"
         return polished

@@ -20,7 +20,8 @@ from prbayes.adjust import Affine, inapplicable
 from prbayes.checkpoint import Checkpoint, stored_identity
 from prbayes.epsilon import calibrate_epsilon
 from prbayes.kernel import BatchedKernel
-from prbayes.optimize import Optimum, find_optimum
+from prbayes.optimize import find_optimum
+from prbayes.optimum import Optimum
 from prbayes.population import Evaluator
 from prbayes.refinement import _MAX_ROUNDS, refine_at, refuse, shortcomings
 from prbayes.resimulation import FreshBound

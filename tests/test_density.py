@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from prbayes import cells as cells_module
 from prbayes import density
 from prbayes._arrays import Floats
-from prbayes.density import GaussianKDE, Histogram, KernelCells, likelihood_bandwidth, silverman, spread
+from prbayes.cells import KernelCells
+from prbayes.density import GaussianKDE, Histogram, likelihood_bandwidth, silverman, spread
 
 H, INF, NAN = 0.5, np.inf, np.nan
 OBSERVED = np.array([-2.0, -0.3, 0.1, 0.7, 2.1])
@@ -80,7 +82,7 @@ def test_mass_outside_goes_to_the_last_two_cells_and_nan_nowhere(estimator: Any)
 
 @both
 @pytest.mark.parametrize("batch", [(1,), (3,), (2, 3), (2, 1, 3)])
-@pytest.mark.parametrize("chunk", [1, 5, 12, density._CHUNK])
+@pytest.mark.parametrize("chunk", [1, 5, 12, cells_module._CHUNK])
 def test_batches_and_chunks_equal_a_loop(
     estimator: Any, batch: tuple[int, ...], chunk: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -88,7 +90,7 @@ def test_batches_and_chunks_equal_a_loop(
     x, w = draw(5, *batch, 11)
     expected = np.array([cells.density(x[i], w[i]) for i in np.ndindex(*batch)])
     shared = np.array([cells.density(x[i], w[(0,) * len(batch)]) for i in np.ndindex(*batch)])
-    monkeypatch.setattr(density, "_CHUNK", chunk)
+    monkeypatch.setattr(cells_module, "_CHUNK", chunk)
     np.testing.assert_allclose(cells.density(x, w), expected.reshape(*batch, -1), rtol=1e-12, atol=1e-15)
     result = cells.density(x, w[(0,) * len(batch)])
     np.testing.assert_allclose(result, shared.reshape(*batch, -1), rtol=1e-12, atol=1e-15)
@@ -96,7 +98,7 @@ def test_batches_and_chunks_equal_a_loop(
 
 @both
 def test_a_sample_longer_than_a_chunk_is_the_sum_of_its_parts(estimator: Any) -> None:
-    n = 2 * density._CHUNK + 17
+    n = 2 * cells_module._CHUNK + 17
     x = 3 * np.random.default_rng(3).normal(size=n)
     cells = estimator.cells(OBSERVED, EQUAL)
     parts = sum(cells.density(part, np.full(part.size, 1 / n)) for part in np.array_split(x, 7))
@@ -121,7 +123,7 @@ def test_pullback_equals_finite_differences(estimator: Any, batch: tuple[int, ..
     x, w = draw(9, *batch, 8)
     x[..., :4] = -40.0, 50.0, INF, cells.centers[1] + 0.3 * cells.widths[0]
     cotangent = rng.normal(size=(*batch, cells.widths.size))
-    for_sample, for_weights = cells.pullback(x, w, cotangent)
+    for_sample, for_weights = w * cells.slope(x, cotangent), cells.value(x, cotangent)
     assert for_sample.shape == for_weights.shape == x.shape
 
     def objective(sample: Floats, weights: Floats) -> float:

@@ -14,11 +14,11 @@ FILES = sorted(PACKAGE.glob("*.py"))
 
 # A file may import those before it.
 ORDER = [
-    "_arrays", "density", "discrepancy", "metrics", "failures", "store", "calling", "inputs", "responses",
+    "_arrays", "cells", "density", "discrepancy", "metrics", "failures", "store", "calling", "inputs", "responses",
     "propagation", "resimulation", "design", "simulator", "population", "resampling", "information", "descent",
-    "refit", "modes", "refinement", "search", "optimize", "epsilon", "adjust", "results", "bootstrap", "checkpoint",
-    "kernel", "smc", "sbc", "diagnose", "compare",
-    "heldout", "predict", "nulls", "joint", "validity", "plots",
+    "refit", "modes", "refinement", "search", "optimum", "optimize", "epsilon", "adjust", "results", "bootstrap",
+    "checkpoint", "kernel", "smc", "sbc", "diagnose", "compare", "heldout", "predict", "nulls", "joint", "validity",
+    "plots",
 ]  # fmt: skip
 
 # Upwards, inside a function or for types only, with the reason.
@@ -26,8 +26,8 @@ UPWARDS = {
     ("propagation", "design"),  # a propagation's bind makes its own moving part
     ("propagation", "resimulation"),
     ("refinement", "optimize"),  # the public refine() looks around the optimum
-    ("optimize", "results"),  # Optimum.to_datatree
-    ("results", "optimize"),  # annotation of optimum_tree
+    ("optimum", "results"),  # Optimum.to_datatree
+    ("results", "optimum"),  # annotation of optimum_tree
 }
 
 # Results, errors and base classes, which nobody makes; and a kernel that is passed to PyMC.

@@ -16,6 +16,7 @@ import prbayes as prb
 from prbayes._arrays import Floats
 from prbayes.density import GaussianKDE
 from prbayes.population import Evaluator
+from prbayes.search import Search
 from prbayes.simulator import nodes
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
@@ -317,15 +318,41 @@ def test_a_start_out_of_an_untransformed_support_is_refused() -> None:
         prb.minimize(model, start={"mu": 6.0})
 
 
-@pytest.mark.parametrize("name", ["pr", "area"])
-def test_a_start_where_nothing_changes_is_no_convergence(name: str) -> None:
-    # The gradient vanishes where supports do not overlap; under Reweighted also that of the area metric, because all
-    # weight is on the outermost design point.
-    far = {"mu": 30.0, "sigma": 0.1}
-    optimum = prb.minimize(normal_model(METRICS[name]), start=far, refine=False, starts=0)
+@pytest.mark.parametrize("name", ["pr", "kl", "area"])
+def test_data_that_no_population_reaches_are_no_convergence(name: str) -> None:
+    # All weight is on the outermost design point: nothing changes any more.
+    optimum = prb.minimize(normal_model(METRICS[name], observed=OBSERVED + 1000), refine=False, starts=0)
     assert not optimum.converged
     assert "try another start" in optimum.message
-    assert np.isinf(errors(optimum)).all()
+
+
+@pytest.mark.parametrize("propagation", [R256, prb.Resimulated(1024)], ids=["reweighted", "resimulated"])
+@pytest.mark.parametrize("name", ["pr", "kl"])
+@pytest.mark.parametrize("start", [(-3.0, 0.5), (30.0, 0.1)])  # 8 sd of the data away, and 58
+def test_far_starts_converge(name: str, propagation: Any, start: tuple[float, float]) -> None:
+    model = far_model(name, propagation)
+    optimum = prb.minimize(model, start=dict(zip(NORMAL, start, strict=True)), refine=False, starts=0)
+    assert optimum.converged
+    assert "the area metric led from there" in optimum.message
+    best = prb.minimize(model, start={"mu": MEAN, "sigma": SD}, refine=False, starts=0)
+    assert "the area metric" not in best.message
+    np.testing.assert_allclose(optimum.theta, best.theta, atol=1e-4)
+    assert optimum.n_evaluations == optimum.trace["evaluations"][-1] > len(optimum.trace["theta"])
+    if propagation is not R256:  # the first point is the start itself, and not a draw of the prior that costs nothing
+        np.testing.assert_allclose(optimum.trace["theta"][0], [start[0], np.log(start[1])], rtol=1e-12)
+    np.testing.assert_allclose(optimum.trace["discrepancy"].min(), optimum.discrepancy, rtol=1e-9)
+
+
+@cache
+def far_model(name: str, propagation: Any) -> pm.Model:
+    return normal_model(METRICS[name], propagation)
+
+
+@pytest.mark.parametrize("propagation", [R256, prb.Resimulated(1024)], ids=["reweighted", "resimulated"])
+def test_without_the_area_metric_a_far_start_does_not_arrive(propagation: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Search, "approach", lambda self, theta, *_: theta)
+    optimum = prb.minimize(far_model("pr", propagation), start={"mu": 30.0, "sigma": 0.1}, refine=False, starts=0)
+    assert abs(optimum.point["mu"] - MEAN) > 1.0
 
 
 # -- standard errors -------------------------------------------------------------------------------------

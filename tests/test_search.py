@@ -1,0 +1,273 @@
+"""Methods as objects, budgets and tolerances, starting points, and a million responses."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+from scipy import optimize, stats
+
+import prbayes as prb
+from prbayes._arrays import Floats
+from prbayes.population import Evaluator
+from prbayes.search import Objective, Search, StalledError, differences
+
+OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
+
+
+def normal_model(propagation: Any, response: Callable[..., Any] = lambda x: x, unit: float = 1.0) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2 * unit), pm.HalfNormal("sigma", unit))
+        metric = prb.ProbabilityResidual()
+        prb.Simulator("y", response, x, metric=metric, observed=unit * OBSERVED, propagation=propagation)
+    return model
+
+
+@cache
+def model() -> pm.Model:
+    return normal_model(prb.Resimulated(256))
+
+
+@cache
+def best() -> prb.Optimum:
+    return prb.minimize(model(), start={"mu": 0.5, "sigma": 0.8})
+
+
+def pair(optimum: prb.Optimum) -> Floats:
+    return np.array([optimum.point["mu"], optimum.point["sigma"]])
+
+
+# -- methods ---------------------------------------------------------------------------------------------
+
+
+def steepest_descent(
+    fun: Any, x0: Floats, args: Any, jac: Any = None, steps: int = 2000, **_: Any
+) -> optimize.OptimizeResult:
+    x = np.array(x0)
+    for _i in range(steps):
+        g = jac(x)
+        if np.abs(g).max() < 1e-7:
+            break
+        x = x - 0.05 * g
+    return optimize.OptimizeResult(x=x, fun=fun(x), success=True, message="down")
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        prb.Scipy("L-BFGS-B", {"maxcor": 3}),
+        "slsqp",
+        "TNC",
+        "trust-constr",
+        "Newton-CG",
+        "COBYQA",
+        "COBYLA",
+        steepest_descent,
+        prb.Scipy(steepest_descent, {"steps": 1500}),
+    ],
+    ids=str,
+)
+def test_any_method_finds_the_optimum(method: Any) -> None:
+    # The callable descends in small steps and takes hundreds.
+    found = prb.minimize(model(), start={"mu": 0.5, "sigma": 0.8}, method=method)
+    assert found.converged
+    np.testing.assert_allclose(pair(found), pair(best()), atol=3e-4)
+
+
+def test_options_replace_defaults_and_are_not_changed() -> None:
+    options = {"xatol": 0.3, "fatol": 10.0}
+    loose = prb.minimize(model(), start={"mu": 0.5, "sigma": 0.8}, method=prb.Scipy("Nelder-Mead", options))
+    tight = prb.minimize(model(), start={"mu": 0.5, "sigma": 0.8}, method="Nelder-Mead")
+    assert loose.n_evaluations < tight.n_evaluations / 3
+    assert options == {"xatol": 0.3, "fatol": 10.0}
+
+
+@pytest.mark.parametrize(
+    ("method", "error", "words"),
+    [
+        ("bfsg", ValueError, r"got 'bfsg', expected one of BFGS, CG, .*, or a function"),
+        ("dogleg", ValueError, "got 'dogleg'"),  # needs a Hessian
+        (3, TypeError, "method: got 3, expected prb.Scipy"),
+        (prb.Scipy, TypeError, "expected prb.Scipy"),
+    ],
+)
+def test_an_unknown_method_is_refused_before_any_work(method: Any, error: type[Exception], words: str) -> None:
+    calls = []
+    other = normal_model(prb.Resimulated(64), lambda x: calls.append(1) or np.array(x))
+    calls.clear()
+    with pytest.raises(error, match=words):
+        prb.minimize(other, method=method)
+    assert not calls
+
+
+def test_options_must_be_a_mapping() -> None:
+    with pytest.raises(TypeError, match="options: got list, expected a mapping"):
+        prb.Scipy("BFGS", [1])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("keywords", "words"), [({"tolerance": 0.0}, "tolerance"), ({"max_evaluations": 0}, "max_evaluations")]
+)
+def test_tolerance_and_budget_are_checked(keywords: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        prb.minimize(model(), **keywords)
+
+
+# -- budgets, tolerances, trace --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["BFGS", "L-BFGS-B", "Nelder-Mead", "Powell"])
+@pytest.mark.parametrize("box", [False, True], ids=["symbolic", "black box"])
+def test_the_budget_means_the_same_for_all_methods(method: str, box: bool) -> None:
+    response = (lambda x: np.array(x, dtype=float)) if box else (lambda x: x)
+    other = normal_model(prb.Resimulated(64), response)
+    found = prb.minimize(other, method=method, max_evaluations=7, start={"mu": -1.0, "sigma": 1.5})
+    assert not found.converged
+    assert "max_evaluations = 7" in found.message
+    # A gradient by differences is five evaluations, and is not cut short.
+    assert 7 <= found.n_evaluations < 7 + 5
+    assert found.trace["evaluations"][-1] == found.n_evaluations
+    steps = np.diff(found.trace["evaluations"], prepend=0)
+    assert set(steps) == ({5} if box and method in {"BFGS", "L-BFGS-B"} else {1})
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_units_do_not_matter(unit: float) -> None:
+    found = prb.minimize(normal_model(prb.Resimulated(256), unit=unit), start={"mu": 0.5 * unit, "sigma": 0.8 * unit})
+    assert found.converged
+    assert found.n_evaluations == best().n_evaluations <= 15
+    np.testing.assert_allclose(pair(found) / unit, pair(best()), rtol=1e-6)
+
+
+def test_the_tolerance_is_that_of_the_standardised_gradient() -> None:
+    evaluator = Evaluator(model())
+    size = evaluator.nodes[0].target.scale
+    last = 0
+    for tolerance in (1e-1, 1e-3, 1e-6):
+        found = prb.minimize(model(), start={"mu": -1.0, "sigma": 1.5}, tolerance=tolerance)
+        gradient = evaluator.objective(prior=False, gradient=True)(found.theta, np.ones(1))[1]
+        scale = np.subtract(*np.quantile(evaluator.prior_thetas(256, 0), [0.84, 0.16], axis=0)) / 2
+        assert np.abs(gradient * scale).max() / size <= tolerance
+        assert found.n_evaluations >= last
+        last = found.n_evaluations
+
+
+def test_exact_and_differenced_gradients_agree() -> None:
+    evaluator, scales = Evaluator(model()), np.array([0.7])
+    theta = np.array([0.4, -0.3])
+    exact = evaluator.objective(prior=False, gradient=True)(theta, scales)
+    value, gradient, cost = differences(lambda t: evaluator.total(t, scales), np.array([2e-4, 1e-4]))(theta)
+    assert cost == 5
+    np.testing.assert_allclose(value, exact[0], rtol=1e-12)
+    np.testing.assert_allclose(gradient, exact[1], rtol=1e-5)
+
+
+def test_differences_at_an_edge_are_one_sided() -> None:
+    def values(thetas: Floats) -> Floats:
+        return np.where(thetas[:, 0] > 1.0, np.inf, thetas[:, 0] ** 2 + thetas[:, 1])
+
+    _, gradient, _ = differences(values, np.array([1e-4, 1e-4]))(np.array([1.0, 3.0]))
+    np.testing.assert_allclose(gradient, [2.0, 1.0], rtol=1e-3)
+
+
+def test_a_line_search_without_progress_is_stopped() -> None:
+    objective = Objective(lambda t: (1.0, np.zeros(1), 1), np.zeros(1), np.ones(1), 1.0, gradient=True, most=100)
+    objective.patience = 4
+    for _ in range(5):
+        objective(np.zeros(1))
+    with pytest.raises(StalledError):
+        objective(np.zeros(1))
+
+
+# -- starting points -------------------------------------------------------------------------------------
+
+
+def test_points_of_the_prior_are_spread_evenly_and_follow_hierarchies() -> None:
+    with pm.Model() as hierarchical:
+        center = pm.Normal("center", 3.0, 2.0)
+        means = pm.Normal("means", center, 0.1, shape=2)
+        x = pm.Normal.dist(means[0] + means[1], pm.Gamma("sigma", 2, 1))
+        prb.Simulator("y", lambda x: x, x, metric=prb.AreaMetric(), observed=OBSERVED, propagation=prb.Resimulated(8))
+    evaluator = Evaluator(hierarchical)
+    thetas = evaluator.prior_points(256, 0)
+    assert thetas.shape == (256, 4)
+    named = dict(zip(evaluator.names, thetas.T, strict=True))
+    for name, frozen in (("center", stats.norm(3, 2)), ("sigma_log__", stats.gamma(2))):
+        values = named[name] if name == "center" else np.exp(named[name])
+        # A net: one point in each of 256 intervals of equal probability; independent draws leave a third of them empty.
+        assert np.unique((frozen.cdf(values) * 256).astype(int)).size > 250
+    for i in range(2):
+        np.testing.assert_allclose(np.std(named[f"means[{i}]"] - named["center"]), 0.1, rtol=0.05)
+    np.testing.assert_array_equal(thetas, evaluator.prior_points(256, 0))
+
+
+def test_priors_without_inverse_distribution_function_are_drawn() -> None:
+    with pm.Model() as other:
+        mu = pm.VonMises("mu", 0.0, 1.0)
+        prb.Simulator("y", lambda x: x, pm.Normal.dist(mu, 1.0), metric=prb.AreaMetric(), observed=OBSERVED)
+    evaluator = Evaluator(other)
+    np.testing.assert_array_equal(evaluator.prior_points(16, 3), evaluator.prior_thetas(16, 3))
+
+
+def test_overlap_is_one_for_equal_and_zero_for_disjoint_densities() -> None:
+    target = prb.ProbabilityResidual().against(OBSERVED)
+    values = np.array([OBSERVED, OBSERVED + 50, OBSERVED + 1.0])
+    one, zero, between = target.overlap(values, np.full(values.shape, 0.02))  # type: ignore[attr-defined]
+    np.testing.assert_allclose([one, zero], [1.0, 0.0], atol=1e-12)
+    assert 0.05 < between < 0.95
+
+
+@pytest.mark.parametrize("propagation", [prb.Reweighted(256), prb.Resimulated(256)], ids=["stored", "anew"])
+def test_where_there_is_overlap_the_start_is_left_alone(propagation: Any) -> None:
+    evaluator = Evaluator(normal_model(propagation))
+    search = Search(evaluator, np.ones(2), prb.Scipy(), prior=False, tolerance=1e-6, most=100)
+    theta = np.array([0.3, 0.0])
+    assert search.approach(theta, np.ones(1), 0) is theta
+    assert search.count == 0
+    far = np.array([9.0, -1.0])
+    reached = search.approach(far, np.ones(1), 0)
+    assert search.overlap(*search._populations(reached[None]))[0] > 0.5
+    assert search.count > 0
+
+
+# -- a million responses ---------------------------------------------------------------------------------
+
+
+def test_monte_carlo_points_agree_with_sobol_points() -> None:
+    random = prb.minimize(normal_model(prb.Resimulated(20_000, points=prb.monte_carlo)), start=best().point)
+    # The error of independent points is sqrt(N / n) standard errors.
+    limit = 4 * np.sqrt(50 / 20_000)
+    assert (np.abs(pair(random) - pair(best())) < limit * np.array([best().stderr["mu"], best().stderr["sigma"]])).all()
+    assert (pair(random) != pair(best())).all()
+
+
+def test_points_must_be_a_function() -> None:
+    with pytest.raises(TypeError, match=r"points: got str, expected prb.sobol, prb.monte_carlo"):
+        prb.Resimulated(64, points="sobol")  # type: ignore[arg-type]
+
+
+MILLION = """
+import resource, sys
+import numpy as np, pymc as pm, prbayes as prb
+data = np.random.default_rng(0).normal(1.0, 0.5, 100)
+with pm.Model():
+    x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+    metric = getattr(prb, sys.argv[1])()
+    prb.Simulator("y", lambda x: x**2 + x, x, metric=metric, observed=data**2 + data,
+                  propagation=prb.Resimulated(1_000_000))
+    optimum = prb.minimize(start={"mu": 0.8, "sigma": 0.7})
+assert optimum.converged, optimum.message
+assert abs(optimum.point["mu"] - 1) < 4 * optimum.stderr["mu"], optimum
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
+"""
+
+
+@pytest.mark.parametrize("metric", ["ProbabilityResidual", pytest.param("AreaMetric", marks=pytest.mark.slow)])
+def test_a_million_responses_with_gradients_and_standard_errors_take_less_than_a_gibibyte(metric: str) -> None:
+    run = subprocess.run([sys.executable, "-c", MILLION, metric], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert float(run.stdout) < 1.0
