@@ -27,6 +27,8 @@ from prbayes.sbc import simulation_based_calibration
 from prbayes.simulator import Simulator, abc_distance, set_epsilon
 from prbayes.smc import sample_smc
 from prbayes.store import StoreError
+from prbayes.surfaces import Polynomial, RadialBasis, SurrogateError
+from prbayes.surrogate import Surrogate
 
 __version__ = version("prbayes")
 
@@ -45,7 +47,9 @@ __all__ = [
     "LogLikelihood",
     "Metric",
     "Optimum",
+    "Polynomial",
     "ProbabilityResidual",
+    "RadialBasis",
     "Replace",
     "Resimulated",
     "ResponseError",
@@ -53,6 +57,8 @@ __all__ = [
     "Reweighted",
     "Simulator",
     "StoreError",
+    "Surrogate",
+    "SurrogateError",
     "abc_distance",
     "bootstrap",
     "calibrate_epsilon",

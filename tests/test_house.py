@@ -15,7 +15,8 @@ FILES = sorted(PACKAGE.glob("*.py"))
 # A file may import those before it.
 ORDER = [
     "_arrays", "density", "discrepancy", "metrics", "failures", "store", "calling", "inputs", "responses",
-    "propagation", "resimulation", "design", "simulator", "population", "resampling", "information", "descent",
+    "propagation", "resimulation", "design", "simulator", "surfaces", "region", "surrogate",
+    "population", "resampling", "information", "descent",
     "refit", "modes", "refinement", "search", "optimize", "epsilon", "adjust", "results", "bootstrap", "checkpoint",
     "kernel", "smc", "sbc", "diagnose", "compare",
 ]  # fmt: skip
@@ -30,7 +31,16 @@ UPWARDS = {
 }
 
 # Results, errors and base classes, which nobody makes; and a kernel that is passed to PyMC.
-WITHOUT_EXAMPLE = {"BatchedKernel", "DesignError", "Diagnosis", "Metric", "Optimum", "ResponseError", "StoreError"}
+WITHOUT_EXAMPLE = {
+    "BatchedKernel",
+    "DesignError",
+    "Diagnosis",
+    "Metric",
+    "Optimum",
+    "ResponseError",
+    "StoreError",
+    "SurrogateError",
+}
 
 INNER = ("pymc.logprob", "pymc.smc", "pymc.pytensorf", "pymc.distributions", "pymc.model.core", "pymc.backends")
 MAY_TOUCH_PYMC = {"inputs", "simulator", "population", "kernel"}
