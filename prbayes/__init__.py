@@ -12,6 +12,8 @@ from prbayes.diagnose import Diagnosis, diagnose
 from prbayes.discrepancy import Metric
 from prbayes.epsilon import calibrate_epsilon
 from prbayes.failures import Abort, Replace, Retry
+from prbayes.heldout import held_out
+from prbayes.joint import JointNull
 from prbayes.kernel import BatchedKernel
 from prbayes.metrics import (
     AreaMetric,
@@ -20,7 +22,10 @@ from prbayes.metrics import (
     LogLikelihood,
     ProbabilityResidual,
 )
+from prbayes.nulls import ExactModel, PosteriorNull
 from prbayes.optimize import Optimum, minimize
+from prbayes.plots import plot_validity
+from prbayes.predict import predict
 from prbayes.propagation import Fresh, Resimulated, Reweighted
 from prbayes.refinement import DesignError, refine
 from prbayes.sbc import simulation_based_calibration
@@ -29,6 +34,7 @@ from prbayes.smc import sample_smc
 from prbayes.store import StoreError
 from prbayes.surfaces import Polynomial, RadialBasis, SurrogateError
 from prbayes.surrogate import Surrogate
+from prbayes.validity import ValidityTest, area_test, u_values
 
 __version__ = version("prbayes")
 
@@ -39,15 +45,18 @@ __all__ = [
     "BatchedKernel",
     "DesignError",
     "Diagnosis",
+    "ExactModel",
     "Fresh",
     "FunctionMetric",
     "GaussianKDE",
     "Histogram",
+    "JointNull",
     "KullbackLeibler",
     "LogLikelihood",
     "Metric",
     "Optimum",
     "Polynomial",
+    "PosteriorNull",
     "ProbabilityResidual",
     "RadialBasis",
     "Replace",
@@ -59,16 +68,22 @@ __all__ = [
     "StoreError",
     "Surrogate",
     "SurrogateError",
+    "ValidityTest",
     "abc_distance",
+    "area_test",
     "bootstrap",
     "calibrate_epsilon",
     "compare",
     "datasets",
     "diagnose",
+    "held_out",
     "minimize",
+    "plot_validity",
+    "predict",
     "refine",
     "sample_smc",
     "scalar",
     "set_epsilon",
     "simulation_based_calibration",
+    "u_values",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
@@ -16,17 +17,17 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._arrays import Floats
 from prbayes.discrepancy import Discrepancy
-from prbayes.inputs import PopulationSampler, compile_batched, log_density, prior_draws, quantiles
+from prbayes.inputs import Inputs, PopulationSampler, compile_batched, log_density, prior_draws, quantiles
 from prbayes.metrics import FunctionMetric
-from prbayes.propagation import Bound, Reweighted, base_points, refuse_all_nan
+from prbayes.propagation import N_BLOCKS, Bound, Reweighted, base_points, refuse_all_nan
 from prbayes.responses import OpaqueOp, Responses
 
 _log = logging.getLogger("prbayes")
 
 _MAX_THETAS = 512  # components of a batch's mixture density
-N_BLOCKS = 8  # parts of a batch whose differences tell its error
 _DRAFT = 16  # draft points, whose response is not computed, for each point of a one-dimensional design
 
+_OTHERS = 32  # responses under other conditions that are kept
 _MANY = 4  # inputs beyond which reweighting is seldom worth its while
 _REFINED = "prb.minimize and prb.sample_smc refine it themselves, before pm.sample call prb.refine(model)"
 _TOO_MANY = "{} inputs are many for stored responses: rather use propagation=prb.Resimulated(n), which has no design"
@@ -49,6 +50,7 @@ class Design(Bound):
         self.values = np.empty(0)
         self._shared: list[Any] = []
         self._basis: tuple[Any, int, Any] = (None, 0, None)
+        self._others: deque[tuple[Responses, Floats]] = deque(maxlen=_OTHERS)
         thetas = prior_draws(inputs.roots, min(config.n, _MAX_THETAS), config.seed)
         size = self.add(thetas)
         refuse_all_nan(name, self.values)
@@ -95,13 +97,28 @@ class Design(Bound):
 
     @property
     def blocks(self) -> NDArray[np.intp]:
-        """Which of eight coarser designs each point belongs to, shape (n,); 0 for all on a line.
+        """Which of eight coarser designs each point belongs to, shape (n,).
 
-        Consecutive points of a Sobol sequence, of which each stretch is a net of its own.
+        Consecutive points of a Sobol sequence, of which each stretch is a net of its own; on a line every eighth.
         """
-        if self._is_line:
-            return np.zeros(self.n_points, dtype=int)
+        if self.is_line:
+            return np.arange(self.n_points) % N_BLOCKS
         return np.concatenate([np.arange(n) * N_BLOCKS // n for n in self._sizes])
+
+    def points_of(self, inputs: Inputs) -> list[Floats]:
+        """Return the points of some of the design's aleatory inputs, shapes (n, *event)."""
+        points = dict(zip(map(id, self.inputs.aleatory), self._points, strict=True))
+        return [points[id(x)] for x in inputs.aleatory]
+
+    def values_of(self, responses: Responses) -> Floats:
+        """Return another response of the design's specimens, shape (n,); none that is known is computed again."""
+        if responses.same_as(self.responses):
+            return self.values
+        known = next((v for r, v in self._others if responses.same_as(r)), np.empty(0))
+        if known.size < self.n_points:
+            known = np.concatenate([known, responses([p[known.size :] for p in self.points_of(responses.inputs)], [])])
+            self._others.append((responses, known))
+        return known
 
     def same_points(self, other: Bound) -> bool:
         """Return whether another design has the same points, so that their responses belong together."""
@@ -125,7 +142,7 @@ class Design(Bound):
         """
         n, seed = n or self.config.n, self.config.seed + 7919 * self.batches
         thetas = self.valid_only(thetas)
-        if self._is_line:
+        if self.is_line:
             points, counts = self._equal_mass(thetas, n, seed)
         else:
             points, counts = self._place(thetas, n, seed)
@@ -180,7 +197,7 @@ class Design(Bound):
         return compile_batched([*symbols, *uniforms], placed)
 
     @property
-    def _is_line(self) -> bool:
+    def is_line(self) -> bool:
         """Whether there is one continuous aleatory input of one dimension."""
         x = self.inputs.aleatory[0]
         return len(self.inputs.aleatory) == 1 and x.type.ndim == 0 and x.dtype.startswith("float")

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
+from numpy.typing import NDArray
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
@@ -31,6 +32,8 @@ from prbayes.inputs import (
     valid,
 )
 from prbayes.responses import Responses
+
+N_BLOCKS = 8  # parts of a population's points whose differences tell its error
 
 
 class Bound(ABC):
@@ -85,6 +88,22 @@ class Bound(ABC):
             values, weights = self.populations([p[ok] for p in params])
             result[ok] = target.of(values, weights)
         return result
+
+    @property
+    def blocks(self) -> NDArray[np.intp]:
+        """Which of eight smaller sets of the same kind each point belongs to, shape (n_points,)."""
+        return np.arange(self.n_points) * N_BLOCKS // self.n_points
+
+    def discrepancy_error(self, params: Sequence[Any]) -> float:
+        """Return the standard error of the discrepancy at given roots, shapes (1, ...), from leaving out each eighth.
+
+        Right for random draws (`Fresh`), and an upper bound for common points, which are better than random ones.
+        """
+        values, weights = self.populations(params)
+        left = np.where(self.blocks == np.arange(N_BLOCKS)[:, None], 0.0, weights)
+        left = left / left.sum(axis=1, keepdims=True)
+        found = self.target.of(np.broadcast_to(values, left.shape), left)
+        return float(np.sqrt((N_BLOCKS - 1) * found.var()))
 
     @cached_property
     def _valid(self) -> Any:

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from prbayes._arrays import Floats
 from prbayes.descent import descend
-from prbayes.design import N_BLOCKS, Design
+from prbayes.design import Design
 from prbayes.information import Information, Local, first_order_shifts, local_sampling
 from prbayes.population import Evaluator
+from prbayes.propagation import N_BLOCKS
 from prbayes.resampling import DataSets, observed_set
 
 _STEP = 0.02  # of differences, in standard errors
@@ -91,7 +92,7 @@ class Neighbourhood:
         their parts tell: they count as exact.
         """
         bounds = [n.bound for n in self.evaluator.nodes]
-        blocks = [b.blocks for b in bounds if isinstance(b, Design)]
+        blocks = [b.blocks * (not b.is_line) for b in bounds if isinstance(b, Design)]
         if len(blocks) < len(bounds) or all((b == 0).all() for b in blocks):
             return np.nan
         x, converged = self._refit(observed_set(self.evaluator), np.zeros(N_BLOCKS, dtype=int), blocks)

@@ -98,23 +98,47 @@ def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int =
         If specimens are shared by simulators whose inputs are not the same ``.dist()`` objects, or whose
         designs differ, so that the model does not say how their responses depend on each other.
     """
+    populations = [evaluator.populations(theta[None], k) for k in range(len(evaluator.nodes))]
+    return sets_at(evaluator, populations, simulated_points(evaluator, populations, n_sets, seed))
+
+
+def simulated_points(
+    evaluator: Evaluator, populations: list[tuple[Floats, Floats]], n_sets: int, seed: int = 0, *, more: int = 0
+) -> list[NDArray[np.intp]]:
+    """Draw the specimens of data sets: by simulator the points of its population, (n_sets, specimens + more).
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    populations : list of (ndarray, ndarray)
+        By simulator: responses and weights, shapes (1, n).
+    n_sets, seed : int
+    more : int
+        Specimens besides those observed.
+    """
     nodes = evaluator.nodes
     rng = np.random.default_rng([seed, 1])
-    populations = [evaluator.populations(theta[None], k) for k in range(len(nodes))]
-    numbers, total = specimens(nodes)
+    _, total = specimens(nodes)
     draws: dict[int, NDArray[np.intp]] = {}
     for group in groups(nodes):
         _refuse_unlike([nodes[k] for k in group])
         ok = np.all([np.isfinite(populations[k][0][0]) for k in group], axis=0)
-        drawn = _draw(populations[group[0]][1][0], ok, (n_sets, total), rng)
+        drawn = _draw(populations[group[0]][1][0], ok, (n_sets, total + more), rng)
         draws |= dict.fromkeys(group, drawn)
+    return [draws[k] for k in range(len(nodes))]
+
+
+def sets_at(evaluator: Evaluator, populations: list[tuple[Floats, Floats]], points: list[NDArray[np.intp]]) -> DataSets:
+    """Return the data sets that are measured on specimens, given by `simulated_points`."""
+    numbers, _ = specimens(evaluator.nodes)
+    n_sets = len(points[0])
     values, weights = [], []
-    for k, node in enumerate(nodes):
+    for k, node in enumerate(evaluator.nodes):
         responses = populations[k][0][0]
         finite = np.isfinite(responses)
         where = np.cumsum(finite) - 1
         size = int(finite.sum())
-        cells = where[draws[k][:, numbers[k]]] + size * np.arange(n_sets)[:, None]
+        cells = where[points[k][:, numbers[k]]] + size * np.arange(n_sets)[:, None]
         count = np.bincount(cells.ravel(), np.tile(node.target.weights, n_sets), n_sets * size)
         values.append(responses[finite])
         weights.append(count.reshape(n_sets, size))

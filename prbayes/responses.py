@@ -96,6 +96,16 @@ class Responses:
         """Points whose response failed and was replaced."""
         return 0 if self._caller is None else self._caller.failures
 
+    def same_as(self, other: Responses) -> bool:
+        """Return whether another has the same function, aleatory inputs and constants."""
+        a, b = self.inputs, other.inputs
+        if self.function is not other.function or len(a.arguments) != len(b.arguments):
+            return False
+        pairs = list(zip(a.arguments, b.arguments, strict=True))
+        return all(isinstance(x, int) is isinstance(y, int) and not isinstance(x, Variable) for x, y in pairs) and all(
+            a.aleatory[x] is b.aleatory[y] if isinstance(x, int) else np.array_equal(x, y) for x, y in pairs
+        )
+
     def __call__(self, aleatory: Sequence[Floats], epistemic: Sequence[Floats]) -> Floats:
         """Return responses, shape (...), for aleatory values (..., *event) and epistemic ones (..., *event).
 

@@ -52,6 +52,7 @@ def posterior_tree(
     unadjusted: Floats | None = None,
     adjustment: str = "none",
     warnings: tuple[str, ...] = (),
+    errors: Floats | None = None,
     seed: int | None,
     n_responses: int,
     seconds: float,
@@ -71,6 +72,8 @@ def posterior_tree(
         What was done to the draws.
     warnings : tuple of str
         What is not identified.
+    errors : ndarray, shape (k,), or None
+        Monte Carlo errors of the discrepancies.
     seed : int or None
     n_responses : int
         Scalar responses computed, the designs' included.
@@ -103,8 +106,9 @@ def posterior_tree(
         "warnings": "\n".join(warnings),
         **versions(),
     }
-    posterior.attrs.update({"inference_library": "prbayes", **attrs})
-    names = [n.name for n in evaluator.nodes]
+    evidence = _evidence(stats)
+    posterior.attrs.update({"inference_library": "prbayes", **attrs, **evidence})
+    names, designs = [n.name for n in evaluator.nodes], evaluator.designs
     where = ["chain", "draw", "simulator"]
     shape = (chains, draws, len(names))
     support = evaluator.support(flat)
@@ -123,6 +127,9 @@ def posterior_tree(
             },
             "theta": (["chain", "draw", "element"], thetas),
             "epsilon": ("simulator", evaluator.epsilon),
+            "discrepancy_error": ("simulator", np.full(len(names), np.nan) if errors is None else errors),
+            "required_ess": ("simulator", [designs[n].required_ess if n in designs else np.nan for n in names]),
+            "max_lost": ("simulator", [designs[n].config.max_lost if n in designs else np.nan for n in names]),
             "metric": ("simulator", [_described(n.metric) for n in evaluator.nodes]),
             "propagation": ("simulator", [_described(n.propagation) for n in evaluator.nodes]),
             "n_points": ("simulator", [n.bound.n_points for n in evaluator.nodes]),
@@ -139,6 +146,19 @@ def posterior_tree(
     if unadjusted is not None:
         groups["unadjusted"] = _draws(evaluator, unadjusted)
     return xr.DataTree.from_dict(groups)
+
+
+def _evidence(stats: list[dict[str, list[float]]]) -> dict[str, float]:
+    """Return the logarithm of the mean marginal likelihood of the chains, and their standard deviation in logs."""
+    logs = np.array([s["log_marginal_likelihood"][-1] for s in stats if "log_marginal_likelihood" in s])
+    if not logs.size:
+        return {}
+    spread = float(logs.std(ddof=1)) if logs.size > 1 else np.nan
+    top = logs.max()
+    return {
+        "log_marginal_likelihood": float(top + np.log(np.exp(logs - top).mean())),
+        "log_marginal_likelihood_sd": spread,
+    }
 
 
 def bootstrap_tree(

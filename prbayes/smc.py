@@ -77,8 +77,11 @@ def sample_smc(
     xarray.DataTree
         Groups ``posterior`` (chain, draw), ``unadjusted`` (the draws before the adjustment, if there was one),
         ``sample_stats`` (chain, stage; NaN after the last stage),
-        ``calibration`` (discrepancy, epsilon, weight effective sample size, mean raw weight, lost mass; by
-        simulator) and ``observed_data``; ArviZ takes it, ``to_netcdf`` saves it.
+        ``calibration`` (discrepancy, epsilon, weight effective sample size, mean raw weight, lost mass,
+        ``discrepancy_error``: the Monte Carlo error of the discrepancy at the best draw; by simulator) and
+        ``observed_data``; ArviZ takes it, ``to_netcdf`` saves it. Attributes of ``posterior``:
+        ``log_marginal_likelihood``, from all chains, and ``log_marginal_likelihood_sd``, the spread of the
+        chains' own; a number to compare models by with one metric and one epsilon, and with no others.
 
     Raises
     ------
@@ -183,6 +186,9 @@ def sample(
             _log.info("sampling again on the refined design")
         if note.startswith("none: "):
             _log.warning("the draws are not adjusted: %s; their width is epsilon's", note.removeprefix("none: "))
+        best = plain[np.unravel_index((discrepancies / evaluator.epsilon).sum(axis=-1).argmin(), plain.shape[:2])]
+        roots = [evaluator.roots(best[None], k) for k in range(len(evaluator.nodes))]
+        errors = [node.bound.discrepancy_error(r) for node, r in zip(evaluator.nodes, roots, strict=True)]
         return posterior_tree(
             evaluator,
             thetas,
@@ -191,6 +197,7 @@ def sample(
             unadjusted=None if thetas is plain else plain,
             adjustment=note,
             warnings=() if optimum is None else optimum.warnings,
+            errors=np.array(errors),
             seed=random_seed,
             n_responses=evaluator.n_responses - computed,
             seconds=time.perf_counter() - clock,

@@ -19,6 +19,7 @@ ORDER = [
     "population", "resampling", "information", "descent",
     "refit", "modes", "refinement", "search", "optimize", "epsilon", "adjust", "results", "bootstrap", "checkpoint",
     "kernel", "smc", "sbc", "diagnose", "compare",
+    "heldout", "predict", "nulls", "joint", "validity", "plots",
 ]  # fmt: skip
 
 # Upwards, inside a function or for types only, with the reason.
@@ -31,16 +32,8 @@ UPWARDS = {
 }
 
 # Results, errors and base classes, which nobody makes; and a kernel that is passed to PyMC.
-WITHOUT_EXAMPLE = {
-    "BatchedKernel",
-    "DesignError",
-    "Diagnosis",
-    "Metric",
-    "Optimum",
-    "ResponseError",
-    "StoreError",
-    "SurrogateError",
-}
+WITHOUT_EXAMPLE = {"BatchedKernel", "DesignError", "Diagnosis", "Metric", "Optimum", "ResponseError", "StoreError",
+                    "SurrogateError", "ValidityTest"}  # fmt: skip
 
 INNER = ("pymc.logprob", "pymc.smc", "pymc.pytensorf", "pymc.distributions", "pymc.model.core", "pymc.backends")
 MAY_TOUCH_PYMC = {"inputs", "simulator", "population", "kernel"}

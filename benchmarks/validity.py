@@ -1,0 +1,194 @@
+"""Size and power of the area test on fresh data, after a calibration on n0 data.
+
+Sizes: n0 normal data give the exact posterior under Jeffreys' prior; n fresh data of the same population are tested
+at nominal 1, 5 and 10%: by the default null, and by the constructions that it replaces (the best fit taken as exact;
+u-values in the posterior's pool taken as uniform). The same through prbayes itself: `minimize`, `sample_smc`, `predict`
+with the area metric, and `JointNull` on the calibration's own data.
+
+Power: the same test against shifts of the mean and ratios of the standard deviation, beside Kolmogorov-Smirnov,
+Cramer-von Mises, Anderson-Darling and ArviZ's tests of uniformity, all on the same u-values in the posterior's pool (in
+closed form, Student's t), and all with critical values from the same simulation of a right model, so that each has
+the nominal size.
+
+    uv run python -m benchmarks.validity [--replicates 2000] [--pipeline 200] [--out validity.json]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pymc as pm
+from scipy.special import ndtr, ndtri, stdtr
+
+import prbayes as prb
+from prbayes.nulls import area
+from prbayes.optimize import find_optimum
+from prbayes.population import Evaluator
+from prbayes.smc import sample
+
+LEVELS = (0.01, 0.05, 0.10)
+FITTED = (15, 30, 100)
+FRESH = (10, 20, 50)
+POWER_AT = (30, 20)  # n0 and n
+ALTERNATIVES = {f"mean + {d:g} sd": (d, 1.0) for d in (0.5, 0.75, 1.0)} | {
+    f"sd x {r:g}": (0.0, r) for r in (0.5, 1.5, 2.0)
+}
+ARVIZ = ("pot_c", "prit_c", "piet_c")
+
+
+def posterior_populations(data: Any, rng: np.random.Generator, draws: int = 400, n_samples: int = 100) -> Any:
+    """Return one population per draw of the exact posterior of a normal sample under Jeffreys' prior."""
+    n = data.size
+    sd = data.std(ddof=1) * np.sqrt((n - 1) / rng.chisquare(n - 1, (draws, 1)))
+    mean = data.mean() + sd / np.sqrt(n) * rng.normal(size=(draws, 1))
+    return mean + sd * ndtri((np.arange(n_samples) + rng.random((draws, 1))) / n_samples)
+
+
+def sizes(n0: int, replicates: int) -> dict[str, dict[str, Any]]:
+    """Return p-values of a right model, by the number of fresh data and the null."""
+    exact = prb.ExactModel()
+    found: dict[str, dict[str, Any]] = {str(n): {"default": [], "best fit": [], "pool, uniform": []} for n in FRESH}
+    for i in range(replicates):
+        rng = np.random.default_rng([7, n0, i])
+        data = rng.normal(size=n0)
+        predicted = posterior_populations(data, rng)
+        for n in FRESH:
+            fresh = rng.normal(size=n)
+            test = prb.area_test(fresh, predicted, null=prb.PosteriorNull(1999, seed=i))
+            p = found[str(n)]
+            p["default"].append(test.p_value)
+            p["best fit"].append(exact.p_value(float(area(ndtr((fresh - data.mean()) / data.std(ddof=1)))), n))
+            p["pool, uniform"].append(exact.p_value(test.statistic, n))
+    return found
+
+
+def same(x: Any) -> Any:
+    """Return the input."""
+    return x
+
+
+def pipeline_model(n0: int) -> tuple[Evaluator, Any]:
+    """Return an evaluator of a normal population, to be given data, and its input."""
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 10, 3), pm.HalfNormal("sigma", 3))
+        prb.Simulator(
+            "y", same, x, metric=prb.AreaMetric(), observed=np.random.default_rng(0).normal(10, 1, n0),
+            propagation=prb.Reweighted(512),
+        )  # fmt: skip
+    return Evaluator(model), x
+
+
+def pipeline(n0: int, n: int, replicates: int) -> dict[str, Any]:
+    """Return p-values of a right model through prbayes: fresh data, and the calibration's own."""
+    evaluator, x = pipeline_model(n0)
+    found: dict[str, Any] = {
+        "default": [],
+        "optimum, ExactModel": [],
+        "own data, JointNull": [],
+        "own data, ExactModel": [],
+    }
+    for i in range(replicates):
+        rng = np.random.default_rng([8, n0, i])
+        data, fresh = rng.normal(10, 1, n0), rng.normal(10, 1, n)
+        other = evaluator.observing({"y": data})
+        optimum = find_optimum(other)
+        posterior = sample(other, draws=400, optimum=optimum, random_seed=i)
+        predicted = prb.predict(posterior, same, x, model=evaluator.model, random_seed=i)
+        best = prb.predict(optimum, same, x, random_seed=i)
+        found["default"].append(prb.area_test(fresh, predicted, null=prb.PosteriorNull(1999, seed=i)).p_value)
+        found["optimum, ExactModel"].append(prb.area_test(fresh, best).p_value)
+        own = prb.area_test(data, best, null=prb.JointNull(optimum, replicates=199, seed=i))
+        found["own data, JointNull"].append(own.p_value)
+        found["own data, ExactModel"].append(prb.ExactModel().p_value(own.statistic, n0))
+    return found
+
+
+def u_in_pool(n0: int, n: int, shift: float, ratio: float, replicates: int, seed: int) -> Any:
+    """Return u-values of fresh data in the posterior predictive distribution, sorted, shape (replicates, n)."""
+    rng = np.random.default_rng([9, seed])
+    data = rng.normal(size=(replicates, n0))
+    fresh = shift + ratio * rng.normal(size=(replicates, n))
+    scale = data.std(axis=1, ddof=1, keepdims=True) * np.sqrt(1 + 1 / n0)
+    u = stdtr(n0 - 1, (fresh - data.mean(axis=1, keepdims=True)) / scale)
+    return np.sort(np.clip(u, 1e-12, 1 - 1e-12), axis=1)
+
+
+def statistics(u: Any) -> dict[str, Any]:
+    """Return the statistic of each test, large where uniformity is doubtful, shape (replicates,)."""
+    from arviz_stats.base.array import array_stats
+    from scipy.stats import cramervonmises, kstest
+
+    n = u.shape[1]
+    i = np.arange(1, n + 1)
+    return {
+        "area": area(u),
+        "area of |2u - 1|": area(np.abs(2 * u - 1)),
+        "Kolmogorov-Smirnov": np.array([kstest(row, "uniform").statistic for row in u]),
+        "Cramer-von Mises": np.array([cramervonmises(row, "uniform").statistic for row in u]),
+        "Anderson-Darling": -n - ((2 * i - 1) / n * (np.log(u) + np.log1p(-u[:, ::-1]))).sum(axis=1),
+        **{f"ArviZ {m}": -array_stats.uniformity_test(u, method=m)[0] for m in ARVIZ},
+    }
+
+
+def power(replicates: int, level: float = 0.05) -> dict[str, dict[str, float]]:
+    """Return the share of rejections by test and alternative, at critical values from right models."""
+    null = statistics(u_in_pool(*POWER_AT, 0.0, 1.0, 5 * replicates, 0))
+    critical = {name: np.quantile(values, 1 - level) for name, values in null.items()}
+    table: dict[str, dict[str, float]] = {name: {} for name in null}
+    for k, (label, (shift, ratio)) in enumerate({"none": (0.0, 1.0), **ALTERNATIVES}.items(), start=1):
+        for name, values in statistics(u_in_pool(*POWER_AT, shift, ratio, replicates, k)).items():
+            table[name][label] = float((values > critical[name]).mean())
+    return table
+
+
+def shares(p_values: Any) -> dict[str, float]:
+    """Return the shares of p-values at or below the nominal levels."""
+    return {f"{level:g}": float(np.mean(np.array(p_values) <= level)) for level in LEVELS}
+
+
+def main() -> None:
+    """Print tables and write JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--replicates", type=int, default=2000)
+    parser.add_argument("--pipeline", type=int, default=200)
+    parser.add_argument("--out", type=Path, default=Path("validity.json"))
+    arguments = parser.parse_args()
+    logging.getLogger("prbayes").setLevel(logging.ERROR)
+    clock = time.perf_counter()
+    result: dict[str, Any] = {"replicates": arguments.replicates, "pipeline_replicates": arguments.pipeline}
+    header = " ".join(f"{level:>6.0%}" for level in LEVELS)
+    print(f"rejections of a right model, {arguments.replicates} replicates\n{'n0':>4s} {'n':>4s} {'null':24s} {header}")
+    result["size"] = {}
+    for n0 in FITTED:
+        for n, nulls in sizes(n0, arguments.replicates).items():
+            for name, p_values in nulls.items():
+                found = result["size"][f"{n0}/{n}/{name}"] = shares(p_values)
+                row = " ".join(f"{share:6.3f}" for share in found.values())
+                print(f"{n0:4d} {n:>4s} {name:24s} {row}", flush=True)
+    result["size_through_prbayes"] = {}
+    n = POWER_AT[1]
+    print(f"\nthrough prbayes, {arguments.pipeline} replicates\n{'n0':>4s} {'n':>4s} {'null':24s} {header}")
+    for n0 in FITTED[:2]:
+        for name, p_values in pipeline(n0, n, arguments.pipeline).items():
+            found = result["size_through_prbayes"][f"{n0}/{n}/{name}"] = shares(p_values)
+            row = " ".join(f"{share:6.3f}" for share in found.values())
+            print(f"{n0:4d} {n:4d} {name:24s} {row}", flush=True)
+    table = result["power"] = power(arguments.replicates)
+    labels = list(next(iter(table.values())))
+    print(f"\npower at 5%, n0 = {POWER_AT[0]}, n = {POWER_AT[1]}, {arguments.replicates} replicates")
+    print(f"{'test':20s} " + " ".join(f"{label:>13s}" for label in labels))
+    for name, row_ in table.items():
+        print(f"{name:20s} " + " ".join(f"{row_[label]:13.3f}" for label in labels))
+    result["seconds"] = round(time.perf_counter() - clock)
+    print(f"\n{result['seconds']} s")
+    arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

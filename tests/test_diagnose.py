@@ -1,0 +1,205 @@
+"""Diagnostics of a sampler's result: sentences, silence, and what ArviZ draws of our trees."""
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import arviz as az
+import matplotlib.pyplot as plt
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+
+import prbayes as prb
+from prbayes.population import Evaluator
+
+OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
+
+
+def same(x: Any) -> Any:
+    return x
+
+
+def build(propagation: Any = None, metric: Any = None) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
+        prb.Simulator(
+            "y", same, x, metric=metric or prb.AreaMetric(), observed=OBSERVED,
+            propagation=propagation or prb.Reweighted(256),
+        )  # fmt: skip
+    return model
+
+
+@cache
+def sampled() -> tuple[pm.Model, xr.DataTree]:
+    model = build()
+    return model, prb.sample_smc(500, chains=4, model=model, random_seed=1, progressbar=False)
+
+
+@cache
+def stuck() -> xr.DataTree:
+    """Classic ABC with an epsilon that hardly any simulated sample meets."""
+    return prb.sample_smc(300, chains=2, model=build(prb.Fresh(40)), epsilon=0.002, random_seed=1, progressbar=False)
+
+
+def normal_tree(means: Any, draws: int = 500) -> xr.DataTree:
+    """Draws of chains with given means."""
+    rng = np.random.default_rng(3)
+    values = {
+        "mu": 1 + 0.05 * (rng.normal(size=(len(means), draws)) + np.array(means)[:, None]),
+        "sigma": rng.uniform(0.45, 0.55, (len(means), draws)),
+    }
+    return xr.DataTree.from_dict({"posterior": xr.Dataset({k: (("chain", "draw"), v) for k, v in values.items()})})
+
+
+# -- sentences -------------------------------------------------------------------------------------------
+
+
+def test_silent_when_nothing_is_wrong(tmp_path: Path) -> None:
+    model, idata = sampled()
+    for found in (prb.diagnose(idata), prb.diagnose(idata, model=model)):
+        assert found.ok
+        assert str(found) == "No problem was found."
+    idata.to_netcdf(tmp_path / "tree.nc")
+    with xr.open_datatree(tmp_path / "tree.nc") as loaded:
+        assert prb.diagnose(loaded).ok
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        few = normal_tree(np.zeros(4), 50)
+        few["posterior"]["mu"].values[:] = 1 + 0.05 * rng.normal(size=(4, 50))
+        assert prb.diagnose(few, model=model).ok
+
+
+def test_without_a_model_the_sampler_s_own_numbers_serve() -> None:
+    model, idata = sampled()
+    stored, computed = prb.diagnose(idata).support, prb.diagnose(idata, model=model).support
+    assert stored.sizes == computed.sizes == {"simulator": 1, "sample": 2000}
+    for key in ("weight_ess", "mean_weight", "lost_mass"):
+        np.testing.assert_allclose(stored[key], computed[key], rtol=1e-9)
+    thin = idata.copy(deep=True)
+    thin["calibration"]["weight_ess"][:] = 3.0
+    (message,) = prb.diagnose(thin).messages
+    assert message.startswith("y: the design does not support the answer: weight effective sample size 3 (5% quantile)")
+
+
+def test_chains_that_disagree() -> None:
+    model, _ = sampled()
+    messages = prb.diagnose(normal_tree([0, 0, 0, 3]), model=model).messages
+    assert messages[0].startswith("R-hat is 1.")
+    assert "for mu, expected at most 1.01" in messages[0]
+    assert "sigma" not in messages[0]
+    assert "az.plot_rank(idata)" in messages[0]
+    # A shift of a tenth of a standard deviation is seen with enough draws.
+    assert prb.diagnose(normal_tree([0, 0, 0, 0.1], 100), model=model).ok
+    assert not prb.diagnose(normal_tree([0, 0, 0, 0.5], 2000), model=model).ok
+
+
+def test_few_independent_draws() -> None:
+    model, _ = sampled()
+    tree = normal_tree([0, 0])
+    walk = np.random.default_rng(5).normal(size=(2, 500))
+    for i in range(1, 500):
+        walk[:, i] = 0.97 * walk[:, i - 1] + np.sqrt(1 - 0.97**2) * walk[:, i]
+    tree["posterior"]["mu"].values[:] = 1 + 0.05 * walk
+    assert "for mu of 1000 draws: too few for means and intervals" in str(prb.diagnose(tree, model=model))
+
+
+def test_particles_that_stick() -> None:
+    text = str(prb.diagnose(stuck()))
+    assert "Particles hardly moved in the last stage of chains 0, 1 (0.0" in text
+    assert "The discrepancy is too noisy (its Monte Carlo error is 1" in text
+    assert "R-hat is" in text
+
+
+def test_deterministics_do_not_count_twice() -> None:
+    model, _ = sampled()
+    tree = normal_tree([0, 0, 0, 3])
+    tree["posterior"]["twice"] = 2 * tree["posterior"]["mu"]
+    assert "twice" not in str(prb.diagnose(tree, model=model))
+
+
+def test_one_chain_and_hardly_any_draws_raise_nothing() -> None:
+    model, _ = sampled()
+    assert prb.diagnose(normal_tree([0.0]), model=model).ok
+    assert prb.diagnose(normal_tree([0.0, 0.0], 3), model=model).ok
+    assert prb.diagnose(prb.bootstrap(prb.minimize(model), draws=100), model=model).ok
+
+
+# -- numbers that reach the user --------------------------------------------------------------------------
+
+
+def test_acceptance_and_beta_of_each_stage() -> None:
+    stats = sampled()[1]["sample_stats"]
+    for name in ("accept_rate", "beta", "n_steps"):
+        assert stats[name].dims == ("chain", "stage")
+    beta = stats["beta"].values
+    last = [row[~np.isnan(row)] for row in beta]
+    assert all(row[-1] == 1 and (np.diff(row) > 0).all() for row in last)
+
+
+def test_the_evidence_is_a_plain_number_with_its_spread() -> None:
+    """For a likelihood known in closed form: one normal mean, exp(-d / epsilon) integrated on a grid."""
+    model, idata = sampled()
+    attrs = idata["posterior"].attrs
+    by_chain = idata["sample_stats"]["log_marginal_likelihood"].max("stage").values
+    assert attrs["log_marginal_likelihood"] == pytest.approx(np.log(np.exp(by_chain).mean()))
+    assert attrs["log_marginal_likelihood_sd"] == pytest.approx(by_chain.std(ddof=1))
+    evaluator = Evaluator(model)
+    thetas = evaluator.prior_thetas(20_000, seed=9)
+    logs = -evaluator(thetas).discrepancies[:, 0] / float(idata["calibration"]["epsilon"][0])
+    likelihood = np.exp(logs)
+    exact, error = np.log(likelihood.mean()), likelihood.std() / likelihood.mean() / np.sqrt(likelihood.size)
+    spread = attrs["log_marginal_likelihood_sd"] / np.sqrt(4)
+    assert attrs["log_marginal_likelihood"] == pytest.approx(exact, abs=4 * (error + spread) + 0.02)
+    assert 0 < attrs["log_marginal_likelihood_sd"] < 0.3
+    single = prb.sample_smc(50, chains=1, model=model, random_seed=1, progressbar=False)
+    assert np.isnan(single["posterior"].attrs["log_marginal_likelihood_sd"])
+
+
+def test_monte_carlo_error_of_the_discrepancy_of_fresh_responses() -> None:
+    evaluator = Evaluator(build(prb.Fresh(128), prb.KullbackLeibler()))
+    theta = evaluator.unconstrained({"mu": 1.1, "sigma": 0.5})[None]
+    values = [float(evaluator(theta).discrepancies[0, 0]) for _ in range(100)]
+    roots = evaluator.roots(theta, 0)
+    errors = [evaluator.nodes[0].bound.discrepancy_error(roots) for _ in range(50)]
+    # Standard errors: 7% of the spread, about 5% of the mean of the errors; the jackknife's own bias is of order 1/8.
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(values, ddof=1), rel=0.45)
+
+
+@pytest.mark.parametrize("propagation", [prb.Resimulated, prb.Reweighted])
+def test_monte_carlo_error_of_common_points_is_a_bound(propagation: Any) -> None:
+    found = []
+    for n in (4096, 128):
+        evaluator = Evaluator(build(propagation(n), prb.KullbackLeibler()))
+        theta = evaluator.unconstrained({"mu": 1.1, "sigma": 0.5})[None]
+        error = evaluator.nodes[0].bound.discrepancy_error(evaluator.roots(theta, 0))
+        found.append((float(evaluator(theta).discrepancies[0, 0]), error))
+    (exact, small), (value, error) = found
+    assert small < 0.2 * error
+    assert abs(value - exact) < error < 0.5 * value
+
+
+def test_the_monte_carlo_error_is_kept_with_the_draws() -> None:
+    _, idata = sampled()
+    assert 0 < float(idata["calibration"]["discrepancy_error"][0]) < 0.2 * float(idata["calibration"]["epsilon"][0])
+    noisy = stuck()["calibration"]
+    assert float(noisy["discrepancy_error"][0]) > 3 * float(noisy["epsilon"][0])
+
+
+# -- ArviZ -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("plot", ["plot_rank", "plot_trace", "plot_ess", "plot_forest"])
+def test_arviz_plots_take_our_trees(plot: str, tmp_path: Path) -> None:
+    _, idata = sampled()
+    pc = getattr(az, plot)(idata, backend="matplotlib")
+    pc.savefig(tmp_path / "figure.png")
+    plt.close("all")
+    assert (tmp_path / "figure.png").stat().st_size > 5000
+
+
+def test_arviz_summary_has_r_hat_and_ess() -> None:
+    summary = az.summary(sampled()[1])
+    assert {"r_hat", "ess_bulk"} <= set(summary.columns)
+    assert list(summary.index) == ["mu", "sigma"]

@@ -1,0 +1,164 @@
+"""Pictures: what is drawn, and that ArviZ's predictive checks take our trees."""
+
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import arviz as az
+import matplotlib.pyplot as plt
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+from matplotlib.image import imread
+
+import prbayes as prb
+from prbayes.nulls import area
+
+RNG = np.random.default_rng(1)
+PREDICTED = RNG.normal(RNG.normal(0, 0.25, (200, 1)), 1.0, (200, 500))
+FRESH = RNG.normal(0, 1, 20)
+QUICK = prb.PosteriorNull(999)
+
+
+@pytest.fixture(autouse=True)
+def _close() -> Any:
+    yield
+    plt.close("all")
+
+
+@cache
+def validity(shift: float = 0.0, folded: bool = False) -> prb.ValidityTest:
+    return prb.area_test(FRESH + shift, PREDICTED, null=QUICK, folded=folded)
+
+
+def polygon(artist: Any) -> np.ndarray[Any, Any]:
+    return np.asarray(artist.get_paths()[0].vertices)
+
+
+def shoelace(corners: np.ndarray[Any, Any]) -> float:
+    """The area of a polygon whose loops all turn the same way."""
+    x, y = corners.T
+    return float(abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2)
+
+
+# -- plot_validity ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("shift", "folded"), [(0.0, False), (1.2, False), (0.0, True)])
+def test_the_shaded_area_is_the_statistic(shift: float, folded: bool) -> None:
+    test = validity(shift, folded)
+    pc = prb.plot_validity(test, backend="matplotlib")
+    assert isinstance(pc, az.PlotCollection)
+    assert shoelace(polygon(pc.viz["area"]["u"].item())) == pytest.approx(test.statistic, abs=1e-9)
+    line = pc.viz["ecdf"]["u"].item()
+    tested = np.abs(2 * test.u_values - 1) if folded else test.u_values
+    x, y = line.get_xdata(), line.get_ydata()
+    np.testing.assert_allclose(np.interp(0.5, x, y), (tested <= 0.5).mean(), atol=1e-12)
+    np.testing.assert_array_equal(pc.viz["identity"]["u"].item().get_xdata(), [0, 1])
+
+
+def test_the_verdict_stands_in_the_title() -> None:
+    for shift, verdict, sign in ((0.0, "not rejected", "<"), (1.2, "rejected", ">")):
+        test = validity(shift)
+        axis = prb.plot_validity(test, backend="matplotlib").viz["plot"]["u"].item()
+        expected = f"area {test.statistic:.3f} {sign} critical {test.critical_value:.3f}: {verdict}"
+        assert axis.get_title() == f"p = {test.p_value:.2g}, level 5%\n{expected}"
+        assert axis.get_xlabel() == "u-value"
+    assert (
+        prb.plot_validity(validity(0.0, True), backend="matplotlib").viz["plot"]["u"].item().get_xlabel() == "|2u - 1|"
+    )
+
+
+def test_the_envelope_holds_the_ecdf_of_a_right_model() -> None:
+    for shift, inside in ((0.0, True), (1.2, False)):
+        test = validity(shift)
+        pc = prb.plot_validity(test, backend="matplotlib")
+        band = polygon(pc.viz["envelope"]["u"].item())
+        half = len(band) // 2
+        v = np.linspace(0.011, 0.989, 200)
+        sides = [np.sort(part[:, 0]) for part in (band[:half], band[half:])]
+        assert all(side[0] == 0 for side in sides)
+        low, high = (np.searchsorted(test.envelope[i], v, side="right") / 20 for i in (1, 0))
+        ecdf = np.searchsorted(np.sort(test.u_values), v, side="right") / 20
+        assert ((low <= ecdf) & (ecdf <= high)).all() == inside
+        path = pc.viz["envelope"]["u"].item().get_paths()[0]
+        middle = path.contains_points(np.column_stack([v, (low + high) / 2 + 1e-9]))
+        assert middle[high > low].all()
+        assert not path.contains_points(np.column_stack([v, high + 0.03]))[high < 0.96].any()
+    assert "envelope" not in prb.plot_validity(validity(), backend="matplotlib", envelope=False).viz
+
+
+def test_several_tests_of_different_sizes_get_a_panel_each(tmp_path: Path) -> None:
+    small = prb.area_test(FRESH[:7], PREDICTED, null=QUICK)
+    pc = prb.plot_validity({"all": validity(), "some": small}, backend="matplotlib")
+    axes = pc.viz["plot"]
+    assert [axes[n].item().get_title().split(",")[0] for n in ("all", "some")] == ["all", "some"]
+    assert [axes[n].item().get_ylabel() for n in ("all", "some")] == ["share of 20 values", "share of 7 values"]
+    pc.savefig(tmp_path / "v.png")
+    image = imread(tmp_path / "v.png")[..., :3]
+    assert (image.min(axis=2) < 0.9).mean() > 0.05
+
+
+def test_without_a_plotting_library_the_elements_are_described() -> None:
+    pc = prb.plot_validity(validity(), backend="none")
+    assert set(pc.viz.children) >= {"area", "ecdf", "envelope", "identity"}
+
+
+def test_refusals() -> None:
+    for bad in (3, {}, {"a": 3}):
+        with pytest.raises(TypeError, match=r"expected a ValidityTest from prb\.area_test"):
+            prb.plot_validity(bad)  # type: ignore[arg-type]
+
+
+def test_importing_the_package_imports_no_plotting() -> None:
+    code = "import sys, prbayes; print({'arviz', 'arviz_plots', 'arviz_stats', 'matplotlib'} & set(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
+
+
+# -- predictive checks of ArviZ --------------------------------------------------------------------------
+
+
+@cache
+def checked() -> xr.DataTree:
+    """A posterior with predictive draws of as many specimens as were measured."""
+    with pm.Model():
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
+        observed = np.random.default_rng(2).normal(1, 0.5, 40)
+        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=observed)
+        idata = prb.sample_smc(200, chains=2, random_seed=1, progressbar=False)
+        pm.sample_posterior_predictive(idata, extend_inferencedata=True, random_seed=1, progressbar=False)
+    return idata
+
+
+@pytest.mark.parametrize(
+    ("plot", "keywords"),
+    [
+        ("plot_ppc_dist", {}),
+        ("plot_ppc_dist", {"kind": "ecdf"}),
+        ("plot_ppc_tstat", {"t_stat": "std"}),
+        ("plot_ppc_pit", {}),
+    ],
+)
+def test_predictive_checks_take_our_trees(plot: str, keywords: dict[str, Any], tmp_path: Path) -> None:
+    pc = getattr(az, plot)(checked(), backend="matplotlib", **keywords)
+    pc.savefig(tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").stat().st_size > 5000
+
+
+def test_predictive_draws_are_of_the_right_population() -> None:
+    drawn = checked()["posterior_predictive"]["y"]
+    assert drawn.sizes["y_dim_0" if "y_dim_0" in drawn.dims else drawn.dims[-1]] == 40
+    assert float(drawn.mean()) == pytest.approx(float(checked()["observed_data"]["y"].mean()), abs=0.1)
+
+
+def test_predictions_of_unequal_size_give_u_values_that_arviz_draws(tmp_path: Path) -> None:
+    """20 measured and 100 000 predicted responses: the PIT-ECDF with our envelope, and ArviZ's own test of u."""
+    test = validity()
+    tree = xr.DataTree.from_dict({"posterior": xr.Dataset({"u": ("observation", test.u_values)})})
+    pc = az.plot_ecdf_pit(tree, group="posterior", sample_dims="observation", backend="matplotlib")
+    pc.savefig(tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").stat().st_size > 5000
+    assert area(test.u_values) == test.statistic
