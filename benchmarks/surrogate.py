@@ -1,9 +1,9 @@
 """How many runs of the rotor does a calibration need, with a surrogate and without one, and what error is left?
 
-The contact stiffness of examples/rotor is calibrated from 15 crest factors by PR, with the populations of bearing stiffness
-and damping known: three inputs. The error is that of the optimum (root mean square over both hyperparameters and four
-designs) in standard errors, against a reference with 16384 runs and no surrogate. At the end, the fit of the
-first natural frequency to its stated distribution for two families of stiffness.
+The contact stiffness of examples/rotor is calibrated from 15 crest factors by PR, with the populations of bearing
+stiffness and damping known: three inputs. The error is that of the optimum (root mean square over both
+hyperparameters and four designs) in standard errors, against a reference with 16384 runs and no surrogate. At the
+end, the fit of the first natural frequency to its stated distribution for two families of stiffness.
 
 Run: uv run python -m benchmarks.surrogate
 """
@@ -67,7 +67,7 @@ def main():
         }  # fmt: skip
         rows.append(row)
         print(f"{what:58s} {row['runs']:6d} runs  cv error {row['cross_validated']:7.2%}  "
-              f"error {row['error']:.3f} standard errors ({time.perf_counter() - clock:.0f} s)", flush=True)  # fmt: skip
+              f"error {row['error']:.3f} se ({time.perf_counter() - clock:.0f} s)", flush=True)  # fmt: skip
 
     for model, sizes in ((prb.RadialBasis(), (16, 32, 64, 128)), (prb.Polynomial(4), (64, 128))):
         for n in sizes:

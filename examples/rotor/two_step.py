@@ -31,9 +31,13 @@ METRICS = {
     "log-likelihood": prb.LogLikelihood(),
 }
 COLORS = dict(zip(METRICS, ["#0072B2", "#009E73", "#D55E00", "#CC79A7"], strict=True))
-RANGES = {"k": (205, 325), "c": (3, 26), "contact": (0, 1.8)}  # of the surrogates
-STORED = prb.Reweighted(1024, max_points=4096)  # step 1: runs of the model, reweighted
-CHEAP = prb.Resimulated(256)  # step 2: the surrogate costs nothing, so every theta gets its own responses
+RANGES = {"k": (205, 325), "c": (3, 26), "contact": (0, 1.8)}  # of the surrogates: kN/m, N s/m, MN/m
+BEARINGS = {"k": (160, 380), "c": (2, 26)}
+
+
+def cheap(metric):
+    """A surrogate costs nothing, so every theta gets responses of its own; more of them for narrow kernels."""
+    return prb.Resimulated(1024 if isinstance(metric, prb.LogLikelihood) else 256)
 
 
 def crest_factor_heavy(k, c, contact):
@@ -53,7 +57,7 @@ def stated_values(mean, sd, n=201):
     return mean + sd * z / z.std()
 
 
-def bearings(metric, observed):
+def bearings(metric, observed, surrogate):
     """Step 1: the model, and its inputs."""
     with pm.Model() as model:
         mu_k = pm.Normal("mu_k", 266, 40)  # kN/m
@@ -61,7 +65,7 @@ def bearings(metric, observed):
         mu_c = pm.Uniform("mu_c", 5, 16)  # N s/m; coefficient of variation 10%
         k = pm.Gamma.dist(mu=mu_k, sigma=sd_k)
         c = pm.Gamma.dist(mu=mu_c, sigma=0.1 * mu_c)
-        prb.Simulator("frequency", first_frequency, k, c, metric=metric, observed=observed, propagation=STORED)
+        prb.Simulator("frequency", surrogate, k, c, metric=metric, observed=observed, propagation=cheap(metric))
     return model, (k, c)
 
 
@@ -84,13 +88,14 @@ def rub(metric, observed, surrogate, first, knowledge):
             mu_c = pm.math.exp(carried[2])
             k = pm.Gamma.dist(mu=carried[0], sigma=pm.math.exp(carried[1]))
             c = pm.Gamma.dist(mu=mu_c, sigma=0.1 * mu_c)
-        prb.Simulator("crest", surrogate, k, c, contact, metric=metric, observed=observed, propagation=CHEAP)
+        prb.Simulator("crest", surrogate, k, c, contact, metric=metric, observed=observed, propagation=cheap(metric))
     return model, (k, c, contact)
 
 
-def sampled(model, optimum, **keywords):
+def sampled(model, metric, optimum, **keywords):
     """Return the posterior."""
-    return prb.sample_smc(500, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False, **keywords)
+    draws = 250 if isinstance(metric, prb.LogLikelihood) else 500
+    return prb.sample_smc(draws, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False, **keywords)
 
 
 def carried_through(metric, observed, surrogate, first):
@@ -102,7 +107,7 @@ def carried_through(metric, observed, surrogate, first):
     prb.set_epsilon(whole, epsilon)
     # The crest factor does not see what was carried: only the prior holds it.
     center = prb.minimize(whole, prior=True)
-    posterior = sampled(whole, center, adjust=prb.Affine())
+    posterior = sampled(whole, metric, center, adjust=prb.Affine())
     return (model, inputs, optimum), (whole, whole_inputs, posterior)
 
 
@@ -137,6 +142,19 @@ def table(title, stated, fits, calibrated):
         cells = [f"{m:8.4f} {100 * (m / mean - 1):+6.3f}%  {s:6.4f} {100 * (s / sd - 1):+6.2f}%"
                  for m, s in (fits[label], calibrated[label])]  # fmt: skip
         print(f"  {label:14s}{'     '.join(cells)}")
+
+
+def verify(title, optimum, response, surrogate, inputs):
+    """Compute the response itself for 512 specimens of the calibrated population, and compare."""
+    direct, through = (
+        prb.predict(optimum, f, *inputs, n_samples=512, random_seed=3).values.ravel() for f in (response, surrogate)
+    )  # of the same specimens
+    both = np.isfinite(through)
+    off = through[both] - direct[both]
+    print(f"  {title}: mean {direct[both].mean():.4f} directly, {through[both].mean():.4f} through the surrogate; "
+          f"sd {direct[both].std():.4f} and {through[both].std():.4f}")  # fmt: skip
+    print(f"    difference: rms {np.sqrt(np.mean(off**2)):.1e}, largest {np.abs(off).max():.1e}; "
+          f"{(~both).sum()} of 512 specimens outside the surrogate's ranges")  # fmt: skip
 
 
 def spread(values, q):
@@ -235,14 +253,16 @@ def main():
     crests = synthetic_tests(*CREST, 15, seed=2020)
 
     print("\nSTEP 1: bearing stiffness and damping from 15 first natural frequencies")
+    frequency = prb.Surrogate.fit(first_frequency, BEARINGS, 64, model=prb.Polynomial(5))
+    print(f"surrogate: {frequency.n_runs} model runs; cross-validated error {frequency.error}, in Hz")
     steps, frequency_moments, first_inputs = {}, {}, {}
     for label, metric in METRICS.items():
-        model, inputs = bearings(metric, frequencies)
+        model, inputs = bearings(metric, frequencies, frequency)
         optimum = prb.minimize(model)
-        posterior = sampled(model, optimum)
+        posterior = sampled(model, metric, optimum)
         steps[label], first_inputs[label] = [(optimum, posterior)], inputs
-        frequency_moments[label] = moments(optimum, first_frequency, inputs)
-        print(f"\n{label}: {optimum.n_responses} model runs")
+        frequency_moments[label] = moments(optimum, frequency, inputs)
+        print(f"\n{label}")
         shown = prb.compare({"optimum": optimum, "ABC": posterior}, model=model)
         print(shown[["estimate", "sd", "lower", "upper"]].to_dataframe().round(2).to_string())
         for line in optimum.warnings:
@@ -272,7 +292,7 @@ def main():
             model, inputs, posterior = whole["PR"]
         else:
             model, inputs = rub(METRICS["PR"], crests, surrogate, first, knowledge)
-            posterior = sampled(model, prb.minimize(model))
+            posterior = sampled(model, METRICS["PR"], prb.minimize(model))
         crest = prb.predict(posterior, surrogate, *inputs, model=model, random_seed=2)
         cells = [(float(posterior.posterior[n].mean()), float(posterior.posterior[n].std())) for n in ("mu_r", "sd_r")]
         cells.append(spread(crest, 0.95))
@@ -283,8 +303,7 @@ def main():
             k = np.random.default_rng(0).gamma((k0 / s0) ** 2, s0**2 / k0, 4000)
             cells.append((float(np.quantile(first_frequency(k, 10.0), 0.05)), 0.0))
         else:
-            size = {"draws": 100, "n_samples": 200}
-            predicted = prb.predict(posterior, first_frequency, *inputs[:2], model=model, random_seed=2, **size)
+            predicted = prb.predict(posterior, frequency, *inputs[:2], model=model, random_seed=2)
             cells.append(spread(predicted, 0.05))
         print(f"  {knowledge:14s} " + " ".join(f"{m:7.3f} ± {s:5.3f} " for m, s in cells))
 
@@ -296,16 +315,8 @@ def main():
     print(f"This rub gives no crest factor below sqrt(2), that of a sine; {share:.1%} of the stated normal is there.")
 
     print(f"\nDIRECT MODEL RUNS AT THE PR OPTIMUM ({time.perf_counter() - clock:.0f} s)")
-    model, inputs, optimum = known["PR"]
-    same = {"model": model, "n_samples": 512, "random_seed": 3}  # the same specimens
-    direct = prb.predict(optimum, crest_factor, *inputs, **same).values.ravel()
-    through = prb.predict(optimum, surrogate, *inputs, **same).values.ravel()
-    both = np.isfinite(through)
-    difference = through[both] - direct[both]
-    print(f"  512 runs: mean {direct.mean():.4f} directly, {through[both].mean():.4f} through the surrogate; "
-          f"sd {direct.std():.4f} and {through[both].std():.4f}")  # fmt: skip
-    print(f"  difference: rms {np.sqrt(np.mean(difference**2)):.1e}, largest {np.abs(difference).max():.1e}; "
-          f"{(~both).sum()} of 512 outside the surrogate's ranges")  # fmt: skip
+    verify("first natural frequency, Hz", steps["PR"][0][0], first_frequency, frequency, first_inputs["PR"])
+    verify("crest factor", known["PR"][2], crest_factor, surrogate, known["PR"][1])
 
     print("\nVALIDITY: 20 fresh crest factors with an unbalance of 0.95 g")
     # Synthetic: the population that fits the stated distribution, at the new unbalance, through the model itself.
@@ -328,8 +339,8 @@ def main():
     rng = np.random.default_rng(1)
     before = {name: rng.normal(*INITIAL[name], 2000) for name in INITIAL}
     model = steps["PR"][0][0].model
-    after = prb.predict(first, first_frequency, *first_inputs["PR"], model=model, random_seed=5)
-    best = prb.predict(steps["PR"][0][0], first_frequency, *first_inputs["PR"], random_seed=5).values.ravel()
+    after = prb.predict(first, frequency, *first_inputs["PR"], model=model, random_seed=5)
+    best = prb.predict(steps["PR"][0][0], frequency, *first_inputs["PR"], random_seed=5).values.ravel()
     picture_calibration(out / "rotor_frequency.png", frequencies, FREQUENCY, first_frequency(before["k"], before["c"]),
                         after, best, "first natural frequency, Hz")  # fmt: skip
     model, inputs, posterior = whole["PR"]
