@@ -10,7 +10,7 @@ Cramer-von Mises, Anderson-Darling and ArviZ's tests of uniformity, all on the s
 closed form, Student's t), and all with critical values from the same simulation of a right model, so that each has
 the nominal size.
 
-    uv run python -m benchmarks.validity [--replicates 2000] [--pipeline 200] [--out validity.json]
+    uv run python -m benchmarks.validity [--parts size pipeline power] [--out validity.json]
 """
 
 from __future__ import annotations
@@ -155,39 +155,58 @@ def shares(p_values: Any) -> dict[str, float]:
 def main() -> None:
     """Print tables and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--replicates", type=int, default=2000)
-    parser.add_argument("--pipeline", type=int, default=200)
-    parser.add_argument("--out", type=Path, default=Path("validity.json"))
+    parser.add_argument("--replicates", type=int, default=5000)
+    parser.add_argument("--pipeline", type=int, default=700)
+    parser.add_argument(
+        "--parts", nargs="+", choices=("size", "pipeline", "power"), default=("size", "pipeline", "power")
+    )
+    parser.add_argument("--out", type=Path, default=Path("validity.json"), help="other parts that it has are kept")
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
-    clock = time.perf_counter()
-    result: dict[str, Any] = {"replicates": arguments.replicates, "pipeline_replicates": arguments.pipeline}
-    header = " ".join(f"{level:>6.0%}" for level in LEVELS)
-    print(f"rejections of a right model, {arguments.replicates} replicates\n{'n0':>4s} {'n':>4s} {'null':24s} {header}")
-    result["size"] = {}
+    result: dict[str, Any] = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
+    for part in arguments.parts:
+        clock = time.perf_counter()
+        {"size": run_sizes, "pipeline": run_pipeline, "power": run_power}[part](result, arguments)
+        result[f"{part}_seconds"] = round(time.perf_counter() - clock)
+        print(f"{result[f'{part}_seconds']} s\n", flush=True)
+        arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+
+
+HEADER = f"{'n0':>4s} {'n':>4s} {'null':24s} " + " ".join(f"{level:>6.0%}" for level in LEVELS)
+
+
+def report(table: dict[str, Any], n0: int, n: Any, found: dict[str, Any]) -> None:
+    """Print and keep shares of rejections by null."""
+    for name, p_values in found.items():
+        row = table[f"{n0}/{n}/{name}"] = shares(p_values)
+        print(f"{n0:4d} {n!s:>4s} {name:24s} " + " ".join(f"{share:6.3f}" for share in row.values()), flush=True)
+
+
+def run_sizes(result: dict[str, Any], arguments: argparse.Namespace) -> None:
+    """Sizes with the exact posterior."""
+    print(f"rejections of a right model, {arguments.replicates} replicates\n{HEADER}")
+    result["replicates"], result["size"] = arguments.replicates, {}
     for n0 in FITTED:
         for n, nulls in sizes(n0, arguments.replicates).items():
-            for name, p_values in nulls.items():
-                found = result["size"][f"{n0}/{n}/{name}"] = shares(p_values)
-                row = " ".join(f"{share:6.3f}" for share in found.values())
-                print(f"{n0:4d} {n:>4s} {name:24s} {row}", flush=True)
-    result["size_through_prbayes"] = {}
-    n = POWER_AT[1]
-    print(f"\nthrough prbayes, {arguments.pipeline} replicates\n{'n0':>4s} {'n':>4s} {'null':24s} {header}")
+            report(result["size"], n0, n, nulls)
+
+
+def run_pipeline(result: dict[str, Any], arguments: argparse.Namespace) -> None:
+    """Sizes through prbayes."""
+    print(f"through prbayes, {arguments.pipeline} replicates\n{HEADER}")
+    result["pipeline_replicates"], result["size_through_prbayes"] = arguments.pipeline, {}
     for n0 in FITTED[:2]:
-        for name, p_values in pipeline(n0, n, arguments.pipeline).items():
-            found = result["size_through_prbayes"][f"{n0}/{n}/{name}"] = shares(p_values)
-            row = " ".join(f"{share:6.3f}" for share in found.values())
-            print(f"{n0:4d} {n:4d} {name:24s} {row}", flush=True)
+        report(result["size_through_prbayes"], n0, POWER_AT[1], pipeline(n0, POWER_AT[1], arguments.pipeline))
+
+
+def run_power(result: dict[str, Any], arguments: argparse.Namespace) -> None:
+    """Power beside other tests."""
     table = result["power"] = power(arguments.replicates)
     labels = list(next(iter(table.values())))
-    print(f"\npower at 5%, n0 = {POWER_AT[0]}, n = {POWER_AT[1]}, {arguments.replicates} replicates")
+    print(f"power at 5%, n0 = {POWER_AT[0]}, n = {POWER_AT[1]}, {arguments.replicates} replicates")
     print(f"{'test':20s} " + " ".join(f"{label:>13s}" for label in labels))
-    for name, row_ in table.items():
-        print(f"{name:20s} " + " ".join(f"{row_[label]:13.3f}" for label in labels))
-    result["seconds"] = round(time.perf_counter() - clock)
-    print(f"\n{result['seconds']} s")
-    arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+    for name, row in table.items():
+        print(f"{name:20s} " + " ".join(f"{row[label]:13.3f}" for label in labels))
 
 
 if __name__ == "__main__":

@@ -68,10 +68,12 @@ def plot_validity(
     pc_kwargs.setdefault("col_wrap", 3)
     columns = min(len(named), pc_kwargs["col_wrap"])
     figsize = (4.6 * columns, 4.8 * -(-len(named) // columns))
-    figure = {"figsize": figsize, "figsize_units": "inches", **pc_kwargs.pop("figure_kwargs", {})}
-    pc = arviz.PlotCollection.wrap(
-        data, backend=backend or arviz.rcParams["plot.backend"], figure_kwargs=figure, **pc_kwargs
-    )
+    backend = backend or arviz.rcParams["plot.backend"]
+    figure: dict[str, Any] = {"figsize": figsize, "figsize_units": "inches"}
+    if backend == "matplotlib":
+        figure["layout"] = "constrained"
+    figure |= pc_kwargs.pop("figure_kwargs", {})
+    pc = arviz.PlotCollection.wrap(data, backend=backend, figure_kwargs=figure, **pc_kwargs)
 
     def draw(what: str, function: Any, keywords: Callable[[str, ValidityTest], dict[str, Any]], **same: Any) -> None:
         own = {name or "u": keywords(name, test) for name, test in named.items()}

@@ -203,3 +203,15 @@ def test_arviz_summary_has_r_hat_and_ess() -> None:
     summary = az.summary(sampled()[1])
     assert {"r_hat", "ess_bulk"} <= set(summary.columns)
     assert list(summary.index) == ["mu", "sigma"]
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_loo_speaks_of_one_observation() -> None:
+    """What the docs warn of: a discrepancy is one value per draw, and `az.loo` does not refuse it."""
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
+        prb.Simulator("y", same, x, metric=prb.KullbackLeibler(), observed=OBSERVED, propagation=prb.Reweighted(256))
+    idata = prb.sample_smc(100, chains=2, model=model, random_seed=1, progressbar=False)
+    pm.compute_log_likelihood(idata, model=model, progressbar=False)
+    assert idata["log_likelihood"]["y"].shape == (2, 100)
+    assert az.loo(idata).n_data_points == 1

@@ -301,8 +301,8 @@ def test_folded_u_values_have_the_same_exact_null_and_their_own_for_a_posterior(
     exact = [prb.area_test(y, GRID, folded=f, null=prb.PosteriorNull(19_999)).critical_value for f in (False, True)]
     np.testing.assert_allclose(exact, EXACT.critical_value(20), atol=0.004)
     plain, folded = (prb.area_test(y, posterior(), folded=f).critical_value for f in (False, True))
-    # Doubt about the mean hardly moves the folded values.
-    assert EXACT.critical_value(20) < folded < 0.95 * plain
+    # Doubt about the spread moves the folded values, doubt about the mean hardly; by simulation .1725 and .182 +- .001.
+    assert 1.2 * EXACT.critical_value(20) < folded < plain
 
 
 # -- specimens and conditions ----------------------------------------------------------------------------
