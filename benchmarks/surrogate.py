@@ -63,10 +63,11 @@ def main():
         off = np.array([([o.point[n] for n in names] - center) / error for _, _, o in results])
         row = {
             "what": what, "runs": int(np.mean([r for r, _, _ in results])),
-            "cross_validated": float(np.mean([e for _, e, _ in results])), "error": float(np.sqrt(np.mean(off**2))),
+            "cross_validated": None if np.isnan(results[0][1]) else float(np.mean([e for _, e, _ in results])), "error": float(np.sqrt(np.mean(off**2))),
         }  # fmt: skip
         rows.append(row)
-        print(f"{what:58s} {row['runs']:6d} runs  cv error {row['cross_validated']:7.2%}  "
+        shown = "      -" if row["cross_validated"] is None else f"{row['cross_validated']:7.2%}"
+        print(f"{what:58s} {row['runs']:6d} runs  cv error {shown}  "
               f"error {row['error']:.3f} se ({time.perf_counter() - clock:.0f} s)", flush=True)  # fmt: skip
 
     for model, sizes in ((prb.RadialBasis(), (16, 32, 64, 128)), (prb.Polynomial(4), (64, 128))):

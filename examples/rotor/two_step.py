@@ -92,22 +92,22 @@ def rub(metric, observed, surrogate, first, knowledge):
     return model, (k, c, contact)
 
 
-def sampled(model, metric, optimum, **keywords):
-    """Return the posterior."""
+def sampled(model, metric, epsilon):
+    """Return the posterior, around an optimum that the prior holds where the data are blind."""
+    prb.set_epsilon(model, epsilon)
+    center = prb.minimize(model, prior=True)
     draws = 250 if isinstance(metric, prb.LogLikelihood) else 500
-    return prb.sample_smc(draws, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False, **keywords)
+    return prb.sample_smc(
+        draws, chains=2, model=model, optimum=center, adjust=prb.Affine(), random_seed=1, progressbar=False
+    )
 
 
 def carried_through(metric, observed, surrogate, first):
     """Return the optimum with step 1 known as a population, and the posterior with that of step 1 as prior."""
     model, inputs = rub(metric, observed, surrogate, first, "population")
     optimum = prb.minimize(model)
-    epsilon = prb.calibrate_epsilon(optimum)
     whole, whole_inputs = rub(metric, observed, surrogate, first, "posterior")
-    prb.set_epsilon(whole, epsilon)
-    # The crest factor does not see what was carried: only the prior holds it.
-    center = prb.minimize(whole, prior=True)
-    posterior = sampled(whole, metric, center, adjust=prb.Affine())
+    posterior = sampled(whole, metric, prb.calibrate_epsilon(optimum))
     return (model, inputs, optimum), (whole, whole_inputs, posterior)
 
 
@@ -259,7 +259,7 @@ def main():
     for label, metric in METRICS.items():
         model, inputs = bearings(metric, frequencies, frequency)
         optimum = prb.minimize(model)
-        posterior = sampled(model, metric, optimum)
+        posterior = sampled(model, metric, prb.calibrate_epsilon(optimum))
         steps[label], first_inputs[label] = [(optimum, posterior)], inputs
         frequency_moments[label] = moments(optimum, frequency, inputs)
         print(f"\n{label}")
@@ -292,7 +292,7 @@ def main():
             model, inputs, posterior = whole["PR"]
         else:
             model, inputs = rub(METRICS["PR"], crests, surrogate, first, knowledge)
-            posterior = sampled(model, METRICS["PR"], prb.minimize(model))
+            posterior = sampled(model, METRICS["PR"], prb.calibrate_epsilon(prb.minimize(model)))
         crest = prb.predict(posterior, surrogate, *inputs, model=model, random_seed=2)
         cells = [(float(posterior.posterior[n].mean()), float(posterior.posterior[n].std())) for n in ("mu_r", "sd_r")]
         cells.append(spread(crest, 0.95))
