@@ -63,7 +63,8 @@ def main():
         off = np.array([([o.point[n] for n in names] - center) / error for _, _, o in results])
         row = {
             "what": what, "runs": int(np.mean([r for r, _, _ in results])),
-            "cross_validated": None if np.isnan(results[0][1]) else float(np.mean([e for _, e, _ in results])), "error": float(np.sqrt(np.mean(off**2))),
+            "cross_validated": None if np.isnan(results[0][1]) else float(np.mean([e for _, e, _ in results])),
+            "error": float(np.sqrt(np.mean(off**2))),
         }  # fmt: skip
         rows.append(row)
         shown = "      -" if row["cross_validated"] is None else f"{row['cross_validated']:7.2%}"
