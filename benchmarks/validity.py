@@ -156,7 +156,7 @@ def main() -> None:
     """Print tables and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--replicates", type=int, default=5000)
-    parser.add_argument("--pipeline", type=int, default=700)
+    parser.add_argument("--pipeline", type=int, default=300)
     parser.add_argument(
         "--parts", nargs="+", choices=("size", "pipeline", "power"), default=("size", "pipeline", "power")
     )

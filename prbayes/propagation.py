@@ -99,11 +99,14 @@ class Bound(ABC):
 
         Right for random draws (`Fresh`), and an upper bound for common points, which are better than random ones.
         """
+        if self.n_points < 2 * N_BLOCKS:
+            return np.nan
         values, weights = self.populations(params)
-        left = np.where(self.blocks == np.arange(N_BLOCKS)[:, None], 0.0, weights)
-        left = left / left.sum(axis=1, keepdims=True)
-        found = self.target.of(np.broadcast_to(values, left.shape), left)
-        return float(np.sqrt((N_BLOCKS - 1) * found.var()))
+        found = []
+        for block in range(N_BLOCKS):
+            left = self.blocks != block
+            found.append(self.target.of(values[:, left], weights[:, left] / weights[:, left].sum())[0])
+        return float(np.sqrt((N_BLOCKS - 1) * np.var(found)))
 
     @cached_property
     def _valid(self) -> Any:

@@ -180,6 +180,16 @@ def test_monte_carlo_error_of_common_points_is_a_bound(propagation: Any) -> None
     assert abs(value - exact) < error < 0.5 * value
 
 
+def test_monte_carlo_error_of_a_function_that_takes_no_weights_and_of_few_points() -> None:
+    metric = prb.FunctionMetric(lambda simulated, observed: np.abs(simulated.mean(axis=-1) - observed.mean()))
+    for n in (60, 8):
+        evaluator = Evaluator(build(prb.Fresh(n), metric))
+        theta = evaluator.unconstrained({"mu": 3.0, "sigma": 0.5})[None]
+        error = evaluator.nodes[0].bound.discrepancy_error(evaluator.roots(theta, 0))
+        # The standard error of a mean; the jackknife's own is a quarter of it.
+        assert np.isnan(error) if n == 8 else error == pytest.approx(0.5 / np.sqrt(60), rel=0.9)
+
+
 def test_the_monte_carlo_error_is_kept_with_the_draws() -> None:
     _, idata = sampled()
     assert 0 < float(idata["calibration"]["discrepancy_error"][0]) < 0.2 * float(idata["calibration"]["epsilon"][0])
