@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -226,6 +227,14 @@ def test_executors_give_the_same_and_a_store_computes_nothing_twice(tmp_path: Pa
     plain = prb.Surrogate.fit(bent, BOX, 32, seed=2)
     assert plain.n_runs == 32
     with ThreadPoolExecutor(2) as threads, ProcessPoolExecutor(2) as processes:
+        names = set()
+
+        def told(x: float, y: float) -> float:
+            names.add(threading.current_thread().name)
+            return float(bent(x, y))
+
+        prb.Surrogate.fit(prb.scalar(told), BOX, 32, executor=threads)
+        assert threading.main_thread().name not in names
         for executor, response in ((threads, prb.scalar(bent)), (processes, bent)):
             other = prb.Surrogate.fit(response, BOX, 32, seed=2, executor=executor)
             np.testing.assert_array_equal(other.responses, plain.responses)
