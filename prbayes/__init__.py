@@ -34,6 +34,8 @@ from prbayes.search import Scipy
 from prbayes.simulator import Simulator, abc_distance, set_epsilon
 from prbayes.smc import sample_smc
 from prbayes.store import StoreError
+from prbayes.surfaces import Polynomial, RadialBasis, SurrogateError
+from prbayes.surrogate import Surrogate
 from prbayes.validity import ValidityTest, area_test, u_values
 
 __version__ = version("prbayes")
@@ -55,8 +57,10 @@ __all__ = [
     "LogLikelihood",
     "Metric",
     "Optimum",
+    "Polynomial",
     "PosteriorNull",
     "ProbabilityResidual",
+    "RadialBasis",
     "Replace",
     "Resimulated",
     "ResponseError",
@@ -65,6 +69,8 @@ __all__ = [
     "Scipy",
     "Simulator",
     "StoreError",
+    "Surrogate",
+    "SurrogateError",
     "ValidityTest",
     "abc_distance",
     "area_test",

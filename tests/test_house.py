@@ -15,10 +15,10 @@ FILES = sorted(PACKAGE.glob("*.py"))
 # A file may import those before it.
 ORDER = [
     "_arrays", "cells", "density", "discrepancy", "metrics", "failures", "store", "calling", "inputs", "responses",
-    "propagation", "resimulation", "design", "simulator", "population", "resampling", "information", "descent",
-    "refit", "modes", "refinement", "search", "optimum", "optimize", "epsilon", "adjust", "results", "bootstrap",
-    "checkpoint", "kernel", "smc", "sbc", "diagnose", "compare", "heldout", "predict", "nulls", "joint", "validity",
-    "plots",
+    "propagation", "resimulation", "design", "simulator", "surfaces", "region", "surrogate", "population",
+    "resampling", "information", "descent", "refit", "modes", "refinement", "search", "optimum", "optimize", "epsilon",
+    "adjust", "results", "bootstrap", "checkpoint", "kernel", "smc", "sbc", "diagnose", "compare", "heldout", "predict",
+    "nulls", "joint", "validity", "plots",
 ]  # fmt: skip
 
 # Upwards, inside a function or for types only, with the reason.
@@ -32,7 +32,7 @@ UPWARDS = {
 
 # Results, errors and base classes, which nobody makes; and a kernel that is passed to PyMC.
 WITHOUT_EXAMPLE = {"BatchedKernel", "DesignError", "Diagnosis", "Metric", "Optimum", "ResponseError", "StoreError",
-                   "ValidityTest"}  # fmt: skip
+                    "SurrogateError", "ValidityTest"}  # fmt: skip
 
 INNER = ("pymc.logprob", "pymc.smc", "pymc.pytensorf", "pymc.distributions", "pymc.model.core", "pymc.backends")
 MAY_TOUCH_PYMC = {"inputs", "simulator", "population", "kernel"}
