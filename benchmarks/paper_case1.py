@@ -17,6 +17,7 @@ import argparse
 import json
 import logging
 import time
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -72,19 +73,19 @@ def work(arguments: argparse.Namespace) -> dict[str, Any]:
         if points not in arguments.points:
             continue
         evaluators = {name: system.evaluator(propagation) for name, system in SYSTEMS.items()}
-        for seed in range(arguments.seeds if points == "sobol" else arguments.mc_seeds):
-            for n in SIZES:
-                for index, (name, system) in enumerate(SYSTEMS.items()):
-                    observed = system.data(np.random.default_rng([seed, n, index]), n)
-                    scale = prior_scale(evaluators[name])
-                    for metric in METRICS:
-                        key = f"{points}/{name}/{n}/{seed}/{metric}"
-                        if key in done:
-                            continue
-                        done[key] = fits(evaluators[name], scale, system.initial, observed, metric)
-                        if time.perf_counter() - saved > 20:
-                            saved = save(arguments.out, done)
-            print(f"{points}: seed {seed}, {time.perf_counter() - clock:.0f} s", flush=True)
+        seeds = range(arguments.seeds if points == "sobol" else arguments.mc_seeds)
+        for n in sorted(SIZES, key=lambda n: n != 1000):  # in case the run is not finished
+            for seed, (index, (name, system)) in product(seeds, enumerate(SYSTEMS.items())):
+                observed = system.data(np.random.default_rng([seed, n, index]), n)
+                scale = prior_scale(evaluators[name])
+                for metric in METRICS:
+                    key = f"{points}/{name}/{n}/{seed}/{metric}"
+                    if key in done:
+                        continue
+                    done[key] = fits(evaluators[name], scale, system.initial, observed, metric)
+                    if time.perf_counter() - saved > 20:
+                        saved = save(arguments.out, done)
+            print(f"{points}: N = {n}, {time.perf_counter() - clock:.0f} s", flush=True)
     save(arguments.out, done)
     return done
 
