@@ -73,9 +73,9 @@ class Surrogate:
     Examples
     --------
     >>> import numpy as np, prbayes as prb
-    >>> surrogate = prb.Surrogate.fit(lambda x, y: np.sin(x) * y, {"x": (0, 3), "y": (1, 2)}, 64)
-    >>> surrogate(1.0, np.array([1.0, 1.5])).round(3)
-    array([0.841, 1.262])
+    >>> surrogate = prb.Surrogate.fit(lambda x, y: np.sin(x) * y, {"x": (0, 3), "y": (1, 2)}, 128)
+    >>> surrogate(1.0, np.array([1.2, 1.5])).round(2)
+    array([1.01, 1.26])
     >>> bool(surrogate.error.relative < 0.01)
     True
     """
