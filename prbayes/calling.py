@@ -171,7 +171,7 @@ class Caller:
         kept = f"; {len(self.store)} responses are kept in {self.store.folder}" if self.store is not None else ""
         raise ResponseError(
             f"{self.name}: the response failed at {len(messages)} point(s): {next(iter(messages.values()))}{kept}; "
-            "repair it, or pass on_failure=prb.Replace() or prb.Retry() to the propagation"
+            "repair it, or pass on_failure=prb.Replace() or prb.Retry() to the propagation or surrogate"
         )
 
     def _computed(
