@@ -69,7 +69,7 @@ def steepest_descent(
         steepest_descent,
         prb.Scipy(steepest_descent, {"steps": 1500}),
     ],
-    ids=str,
+    ids=lambda method: prb.Scipy.of(method).name,
 )
 def test_any_method_finds_the_optimum(method: Any) -> None:
     # The callable descends in small steps and takes hundreds.
