@@ -31,8 +31,8 @@ LEVELS = (np.arange(N) + 0.5) / N
 PROBLEMS = ("linear", "quadratic")
 SYSTEMS = ("reweighted", "resimulated", "pymc", "pyabc")
 DRAWS, CHAINS = 1000, 4
-# Before the clock starts; the last three are imported by xarray, PyTensor and SciPy when they are first used.
-_IMPORTED = ("arviz", "pymc", "prbayes", "dask.array", "setuptools", "scipy.optimize")
+# Before the clock starts; the last four are imported by xarray, PyTensor and SciPy when they are first used.
+_IMPORTED = ("arviz", "pymc", "prbayes", "dask.array", "setuptools", "scipy.optimize", "scipy.stats")
 # Largest epsilons, and draws by chain, that were found accurate enough: the discrepancy of 50 against 50 values. At
 # the next larger (0.020, 0.012, 0.2, 0.2) they were not; stock PyMC's second problem at 0.010 needs 2000 draws.
 SETTINGS = {
@@ -44,17 +44,21 @@ SETTINGS = {
 calls = 0  # scalar responses
 
 
+def _count(x: Any) -> None:
+    """Count numbers; not the variables of a graph, which prbayes counts."""
+    global calls
+    calls += np.size(x) if isinstance(x, np.ndarray | float) else 0
+
+
 def linear(x: Any) -> Any:
     """Return x."""
-    global calls
-    calls += np.size(x)
+    _count(x)
     return x
 
 
 def quadratic(x: Any) -> Any:
     """Return x^2 - 2x + 1."""
-    global calls
-    calls += np.size(x)
+    _count(x)
     return x**2 - 2 * x + 1
 
 
@@ -130,7 +134,7 @@ def with_prbayes(problem: str, propagation: str) -> dict[str, Any]:
     optimum = prb.minimize(model, starts=0)
     setup = clock()
     tree = prb.sample_smc(DRAWS, chains=CHAINS, optimum=optimum, model=model, random_seed=1, progressbar=False)
-    return _summary(tree.posterior, setup, clock())
+    return _summary(tree.posterior, setup, clock()) | {"responses": optimum.evaluator.n_responses}
 
 
 def with_pymc(problem: str) -> dict[str, Any]:
@@ -236,11 +240,15 @@ def _summary(posterior: Any, setup: tuple[float, float], total: tuple[float, flo
     return out | _costs(setup, total)
 
 
-def one(system: str, problem: str) -> dict[str, Any]:
-    """Run one system on one problem in this process."""
+def _import() -> None:
     for module in _IMPORTED:
         with suppress(ImportError):
             import_module(module)
+
+
+def one(system: str, problem: str) -> dict[str, Any]:
+    """Run one system on one problem in this process."""
+    _import()
     if system in ("reweighted", "resimulated"):
         return with_prbayes(problem, system)
     return with_pymc(problem) if system == "pymc" else with_pyabc(problem)
@@ -255,6 +263,7 @@ def slow(system: str) -> dict[str, float]:
 
     import prbayes as prb
 
+    _import()
     inside, lock = [0.0], threading.Lock()
 
     def response(x: float) -> float:

@@ -234,8 +234,11 @@ class Search:
                 return lambda theta: (*exact(theta, scales), 1)
             except NotImplementedError:
                 step = _STEP * self.scale
-        if gradient and not self.prior:
-            return differences(lambda thetas: self.evaluator.total(thetas, scales), step)
+        if not self.prior:
+            total = self.evaluator.total  # needs no compilation
+            if gradient:
+                return differences(lambda thetas: total(thetas, scales), step)
+            return lambda theta: (total(theta[None], scales)[0], None, 1)
         plain = self.evaluator.objective(prior=self.prior, gradient=False)
         if gradient:
             return differences(lambda thetas: np.array([float(plain(t, scales)[0]) for t in thetas]), step)
