@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
@@ -18,9 +19,13 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._arrays import Floats
 from prbayes.discrepancy import Discrepancy
 from prbayes.inputs import PLAIN, Inputs, PopulationSampler, compile_batched, ninf_for_invalid, quantiles, valid
+from prbayes.metrics import LikelihoodDiscrepancy
 from prbayes.propagation import Bound, Fresh, Resimulated, base_points, probe
 from prbayes.responses import ResponseOp, Responses, symbolic_discrepancy
 
+_log = logging.getLogger("prbayes")
+
+_TAILS = 300  # responses for each observation from which a log-likelihood's standard errors are right to a tenth
 _KEPT = 1 << 21  # base points whose transforms may stay in memory
 
 
@@ -32,6 +37,14 @@ class ResimulatedBound(Bound):
     ) -> None:
         super().__init__(name, inputs, target, responses)
         self.n_per_theta = config.n
+        enough = _TAILS * target.n_effective
+        if isinstance(target, LikelihoodDiscrepancy) and config.n < enough:
+            _log.warning(
+                "%s: the log-likelihood of %d resimulated responses sees too little of the tails: its standard errors "
+                "and posterior come out too narrow, expected at least %.0f responses, %d for each observation; use "
+                "prb.Reweighted(n), prb.KullbackLeibler() or a larger n",
+                name, config.n, enough, _TAILS,
+            )  # fmt: skip
         _, points = base_points(inputs, config.n, config.seed, config.points)
         # What depends on constants alone, PyTensor computes once and keeps: fast, unless it is too large to keep.
         self._points: list[Any] = points if config.n <= _KEPT else [shared(u) for u in points]

@@ -486,3 +486,25 @@ def test_diagnose_needs_the_models_variables() -> None:
         prb.diagnose(posterior(mu=np.zeros((1, 5))), model=once())
     with pytest.raises(TypeError, match="no model on the context"):
         prb.diagnose(posterior(mu=np.zeros((1, 5))))
+
+
+def test_a_log_likelihood_of_few_resimulated_responses_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    observed = np.random.default_rng(1).normal(10, 1, 50)
+
+    def error(metric: prb.Metric, propagation: prb.Reweighted | prb.Resimulated) -> float:
+        with pm.Model() as model:
+            x = pm.Normal.dist(pm.Normal("mu", 10, 3), pm.HalfNormal("sigma", 3))
+            prb.Simulator("y", lambda x: x, x, metric=metric, observed=observed, propagation=propagation)
+        return float(prb.minimize(model).stderr["sigma"])
+
+    likelihood = prb.LogLikelihood()
+    right = error(likelihood, prb.Reweighted(1024))
+    assert not caplog.records
+    few = error(likelihood, prb.Resimulated(1024))
+    assert "1024 resimulated responses sees too little of the tails" in caplog.text
+    assert "expected at least 15000" in caplog.text
+    assert few < 0.6 * right
+    caplog.clear()
+    assert 0.88 < error(likelihood, prb.Resimulated(16_384)) / right < 1.05
+    assert error(prb.KullbackLeibler(), prb.Resimulated(1024)) > 0.9 * right
+    assert not caplog.records

@@ -37,7 +37,7 @@ BEARINGS = {"k": (160, 380), "c": (2, 26)}
 
 def cheap(metric):
     """A surrogate costs nothing, so every theta gets responses of its own; more of them for narrow kernels."""
-    return prb.Resimulated(1024 if isinstance(metric, prb.LogLikelihood) else 256)
+    return prb.Resimulated(4608 if isinstance(metric, prb.LogLikelihood) else 256)
 
 
 def crest_factor_heavy(k, c, contact):
