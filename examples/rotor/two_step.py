@@ -96,7 +96,7 @@ def sampled(model, metric, epsilon):
     """Return the posterior, around an optimum that the prior holds where the data are blind."""
     prb.set_epsilon(model, epsilon)
     center = prb.minimize(model, prior=True)
-    draws = 250 if isinstance(metric, prb.LogLikelihood) else 500
+    draws = 150 if isinstance(metric, prb.LogLikelihood) else 500
     return prb.sample_smc(
         draws, chains=2, model=model, optimum=center, adjust=prb.Affine(), random_seed=1, progressbar=False
     )
