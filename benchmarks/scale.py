@@ -28,6 +28,7 @@ import numpy as np
 N = 50
 SIZES = (1_000, 10_000, 100_000, 1_000_000, 10_000_000)
 PARTICLES = (100, 1_000, 10_000, 100_000)
+KINDS = ("n resimulated", "n reweighted", "particles resimulated", "particles reweighted")
 METRICS = ("ProbabilityResidual", "AreaMetric")
 TASKS = (1_000, 10_000)
 THETAS = 8
@@ -145,15 +146,18 @@ def main() -> None:
     """Run everything, print a table and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("scale.json"))
+    parser.add_argument("--only", choices=(*KINDS, "tasks"), help="replace these rows of what is in --out")
     parser.add_argument("--child", nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.child:
         kind, metric, size = arguments.child
         print(json.dumps(tasks(int(size)) if kind == "tasks" else one(kind, metric, int(size))))
         return
-    table = []
+    only = arguments.only
+    kept = json.loads(arguments.out.read_text()) if only and arguments.out.exists() else []
+    table: list[dict[str, Any]] = [row for row in kept if row["kind"] != only]
     print(f"{'':48} set-up s      s  growth  sampling s    MiB   responses")
-    for kind in ("n resimulated", "n reweighted", "particles resimulated", "particles reweighted"):
+    for kind in [k for k in KINDS if only in (None, k)]:
         for metric in METRICS:
             last = np.nan
             for size in SIZES if kind == "n resimulated" else SIZES[:-1] if kind == "n reweighted" else PARTICLES:
@@ -168,7 +172,7 @@ def main() -> None:
                     flush=True,
                 )
     print(f"importing takes {np.median([row['import MiB'] for row in table if 'import MiB' in row]):.0f} MiB")
-    for size in TASKS:
+    for size in TASKS if only in (None, "tasks") else ():
         found = {"kind": "tasks", **child("tasks", "-", size)}
         table.append(found)
         print(
