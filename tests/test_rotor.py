@@ -203,3 +203,25 @@ def test_the_crest_factor_hears_the_contact_until_it_is_hard() -> None:
     assert values[0] < 1.5 < 1.73 < values[3]
     bearings = rotor.crest_factor(np.array([234.0, 298.0]), 10.0, 0.5)
     assert abs(np.diff(bearings)[0]) < 0.02
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_whirl_speeds_are_those_of_ross() -> None:
+    """Where it is installed: pip install ross-rotordynamics "plotly<6"."""
+    ross = pytest.importorskip("ross")
+    kit = rotor.ROTOR
+    steel = ross.Material("shaft", rho=kit.shaft.density, E=kit.shaft.youngs_modulus, Poisson=kit.shaft.poisson)
+    lengths = np.repeat([kit.overhang / 2, kit.span / 16, kit.overhang / 2], [2, 16, 2])
+    elements = [ross.ShaftElement(float(x), 0, kit.shaft.diameter, material=steel) for x in lengths]
+    bearings = [ross.BearingElement(node, kxx=kit.stiffness, cxx=0) for node in kit.bearings]
+    r, h = kit.disc_radius, kit.disc_thickness
+    diametral, polar = kit.disc_mass * (3 * r**2 + h**2) / 12, kit.disc_mass * r**2 / 2
+    other = ross.Rotor(elements, [ross.DiskElement(kit.disc, kit.disc_mass, diametral, polar)], bearings)
+    mass, gyro, stiffness, pattern = kit.matrices()
+    stiffness = stiffness + kit.stiffness * pattern
+    zero, one = np.zeros_like(mass), np.eye(len(mass))
+    for speed in (0.0, kit.speed):
+        left = np.block([[zero, one], [-stiffness, 1j * speed * gyro]])
+        values = eig(left, np.block([[one, zero], [zero, mass]]), right=False)
+        ours = np.sort(np.abs(values.imag))[:6]
+        np.testing.assert_allclose(ours, np.sort(other.run_modal(speed, num_modes=24).wn)[:6], rtol=1e-3)
