@@ -161,14 +161,15 @@ def test_widths_are_those_of_the_bootstrap_with_the_prior(name: str) -> None:
     idata = adjusted(name)
     # Another seed: two sets of 1000 data sets, each with a standard error of 2.2%, and 600 draws matched exactly.
     sampling = prb.bootstrap(fit(name), 1000, parametric=True, random_seed=7).posterior
+    changes = []
     for variable, log, prior in (("mu", False, 2.0), ("sigma", True, 1.11)):  # sd of the log of a half-normal
         minimisers, draws = (np.log(d[variable]) if log else d[variable] for d in (sampling, idata.posterior))
         expected = (1 / float(minimisers.var()) + 1 / prior**2) ** -0.5
         np.testing.assert_allclose(float(draws.std()), expected, rtol=4 * 0.032)
-        # The pseudo-posterior was not there before, or else this says nothing; the log-likelihood's is close.
         before = idata.unadjusted[variable]
-        if name != "ll":
-            assert abs(float((np.log(before) if log else before).std()) / expected - 1) > 0.1
+        changes.append(abs(float((np.log(before) if log else before).std()) / expected - 1))
+    # The pseudo-posterior was not there before, or else this says nothing; the log-likelihood's is close.
+    assert max(changes) > 4 * 0.032 or name == "ll"
 
 
 @pytest.mark.parametrize("name", [slow("ll"), "kl"])
