@@ -57,7 +57,8 @@ def main():
         posterior = prb.sample_smc(500, chains=2, optimum=optimum, random_seed=1, progressbar=False)
     print(f"{optimum.n_responses} runs of the program in all; sample mean {modulus.mean():.1f} GPa, "
           f"sd {modulus.std(ddof=1):.1f} GPa")  # fmt: skip
-    print(prb.compare({"optimum": optimum, "ABC": posterior}, model=model).to_dataframe().round(3))
+    table = prb.compare({"optimum": optimum, "ABC": posterior}, model=model)
+    print(table[["estimate", "sd", "lower", "upper"]].to_dataframe().round(3))
 
 
 if __name__ == "__main__":
