@@ -57,7 +57,7 @@ def bootstrap(
 
     References
     ----------
-    .. [1] S. P. Lyddon, C. C. Holmes and S. G. Walker (2019), General Bayesian updating and the
+    .. [1] Lyddon, S. P., C. C. Holmes and S. G. Walker (2019), General Bayesian updating and the
        loss-likelihood bootstrap, Biometrika 106, 465-478, doi:10.1093/biomet/asz006.
 
     Examples

@@ -80,9 +80,9 @@ def simulation_based_calibration(
 
     References
     ----------
-    .. [1] S. Talts et al. (2018), Validating Bayesian inference algorithms with simulation-based calibration,
+    .. [1] Talts, S. et al. (2018), Validating Bayesian inference algorithms with simulation-based calibration,
        arXiv:1804.06788.
-    .. [2] T. Säilynoja, P.-C. Bürkner and A. Vehtari (2022), Graphical test for discrete uniformity and its
+    .. [2] Säilynoja, T., P.-C. Bürkner and A. Vehtari (2022), Graphical test for discrete uniformity and its
        applications in goodness-of-fit evaluation, Stat. Comput. 32, doi:10.1007/s11222-022-10090-6.
 
     Examples

@@ -51,7 +51,7 @@ class Scipy:
 
     References
     ----------
-    .. [1] J. Nocedal and S. J. Wright (2006), Numerical Optimization, doi:10.1007/978-0-387-40065-5.
+    .. [1] Nocedal, J. and S. J. Wright (2006), Numerical Optimization, doi:10.1007/978-0-387-40065-5.
 
     Examples
     --------

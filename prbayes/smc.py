@@ -95,7 +95,7 @@ def sample_smc(
 
     References
     ----------
-    .. [1] P. Del Moral, A. Doucet and A. Jasra (2006), Sequential Monte Carlo samplers, J. R. Stat. Soc. B
+    .. [1] Del Moral, P., A. Doucet and A. Jasra (2006), Sequential Monte Carlo samplers, J. R. Stat. Soc. B
        68, 411-436, doi:10.1111/j.1467-9868.2006.00553.x.
 
     Examples
