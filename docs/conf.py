@@ -26,6 +26,7 @@ html_css_files = ["prbayes.css"]
 # Pages are notebooks: a page whose code fails stops the build. Results are kept, so that only changed pages run again.
 nb_execution_mode = "cache"
 nb_execution_raise_on_error = True
+nb_execution_show_tb = True
 nb_execution_timeout = 600
 nb_merge_streams = True
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]

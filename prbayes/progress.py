@@ -58,4 +58,5 @@ def progress(what: str, total: int | None = None) -> Iterator[Callable[[int, str
     try:
         yield advance
     finally:
-        bar.stop()
+        if bar.live.is_started:  # else a line would be printed where there is no terminal
+            bar.stop()

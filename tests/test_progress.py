@@ -46,7 +46,9 @@ def test_without_a_total_it_appears_when_the_time_has_passed(screen: io.StringIO
     assert "nearer" in screen.getvalue()
 
 
-def test_short_work_shows_nothing(screen: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("terminal", [True, False])
+def test_short_work_shows_nothing(screen: io.StringIO, monkeypatch: pytest.MonkeyPatch, terminal: bool) -> None:
+    monkeypatch.setattr(prbayes.progress, "CONSOLE", Console(file=screen, force_terminal=terminal))
     monkeypatch.setattr(prbayes.progress, "_SHOWN_FROM", 2.0)
     for total in (100, None):
         with progress("quick", total) as report:
