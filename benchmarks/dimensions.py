@@ -1,9 +1,10 @@
-"""How many responses a design takes when populations of 1 to 8 inputs are unknown, and how exact it then is.
+"""How many responses a design takes when the population of 1 to 8 inputs is unknown, and how exact it then is.
 
-The response is the root of the mean square of d inputs, all normal with the same unknown mean and standard deviation; N = 50. Reweighted(n) grows until another design's optimum would be within a tenth of a standard
-error, or says that it does not get there; Resimulated(65 536) is the reference for the discrepancy's minimiser.
+The response is the root of the mean square of d inputs, all normal with the same unknown mean and standard deviation;
+N = 50. Reweighted(n) grows until another design's optimum would be within a tenth of a standard error, or says that it
+does not get there; Resimulated(65 536) is the reference for the minimiser.
 
-Run: uv run python -m benchmarks.dimensions [--seeds 3] [--out benchmarks/results/dimensions.json]
+Run: uv run python -m benchmarks.dimensions [--seeds 2] [--out benchmarks/results/dimensions.json]
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def case(d: int, n: int, metric: str, seed: int) -> dict[str, Any]:
 def main() -> None:
     """Print a table and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--n", type=int, default=1024)
     parser.add_argument("--out", type=Path, default=Path("dimensions.json"))
     arguments = parser.parse_args()
