@@ -1,0 +1,161 @@
+"""Pictures of a report: which ones, of what, and in what words."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+from prbayes import plots
+from prbayes.material import Material
+from prbayes.section import Section
+
+_log = logging.getLogger("prbayes")
+
+
+@dataclass(frozen=True)
+class Illustration:
+    """A picture that a report shows where it has what the picture needs.
+
+    Attributes
+    ----------
+    after : str
+        Title of the section that it belongs to.
+    function : str
+        In `prbayes.plots`.
+    arguments : callable
+        Of the material: arguments and keywords; None where something is lacking.
+    title, alt, caption : str
+    """
+
+    after: str
+    function: str
+    arguments: Callable[[Material], tuple[tuple[Any, ...], dict[str, Any]] | None]
+    title: str
+    alt: str
+    caption: str
+
+
+def _answer(m: Material) -> Any:
+    """Return the first posterior, or else the first optimum that is not from a file."""
+    return next(iter((*m.posteriors.values(), *m.found.values())), None)
+
+
+def _with_model(m: Material) -> Any:
+    answer = _answer(m)
+    return None if m.model is None or answer is None else ((answer,), {"model": m.model})
+
+
+def _posterior(m: Material) -> Any:
+    if not m.posteriors:
+        return None
+    optimum = next(iter(m.found.values()), None)
+    return (next(iter(m.posteriors.values())), optimum), {"model": m.model}
+
+
+def _stages(m: Material) -> Any:
+    first = next(iter(m.posteriors.values()), None)
+    return None if first is None or "stage" not in getattr(first.get("sample_stats"), "dims", ()) else ((first,), {})
+
+
+def _optimizer(m: Material) -> Any:
+    return ((next(iter(m.found.values())),), {}) if m.found else None
+
+
+def _landscape(m: Material) -> Any:
+    return ((next(iter(m.found.values())),), {"model": m.model}) if m.found and m.model is not None else None
+
+
+def _comparison(m: Material) -> Any:
+    return None if m.comparison is None else ((m.comparison,), {})
+
+
+def _validity(m: Material) -> Any:
+    single = len(m.tests) == 1
+    return ((next(iter(m.tests.values())) if single else m.tests,), {}) if m.tests else None
+
+
+ILLUSTRATIONS = (
+    Illustration(
+        "Data", "plot_responses", _with_model, "Measured and calibrated responses",
+        "Distribution of the measured responses with that of the calibrated population, one panel per simulator.",
+        "Measured responses and the calibrated population.",
+    ),
+    Illustration(
+        "Optimum", "plot_optimizer", _optimizer, "Path of the optimiser",
+        "Discrepancy, and hyperparameters, against the number of evaluations.",
+        "The objective at the points that the optimiser asked for.",
+    ),
+    Illustration(
+        "Optimum", "plot_landscape", _landscape, "Discrepancy around the optimum",
+        "Discrepancy over the hyperparameters, with the optimum marked.",
+        "How the discrepancy rises around the optimum.",
+    ),
+    Illustration(
+        "Posterior", "plot_posterior", _posterior, "Marginal posteriors",
+        "Posterior density of each hyperparameter, with its interval.",
+        "What is known of each hyperparameter after the calibration.",
+    ),
+    Illustration(
+        "Posterior", "plot_population", _with_model, "Calibrated population of the inputs",
+        "Distribution of each input over the specimens, with a band for its uncertainty.",
+        "How the inputs vary from specimen to specimen.",
+    ),
+    Illustration(
+        "Posterior", "plot_stages", _stages, "Stages of the sampler",
+        "Tempering, acceptance rate and moves against the stages of the sampler, one line per chain.",
+        "How the sampler went from the prior to the posterior.",
+    ),
+    Illustration(
+        "Comparison", "plot_comparison", _comparison, "Estimates side by side",
+        "Estimate and interval of each result, one panel per hyperparameter.",
+        "Estimates with their intervals.",
+    ),
+    Illustration(
+        "Validity", "plot_validity", _validity, "Distribution of the u-values",
+        "Step curve of the sorted u-values against the diagonal, with the area between them and an acceptance band.",
+        "Where the measured responses stand in the predicted distribution. A right model keeps near the diagonal; the "
+        "shaded area is the statistic, and the band holds the whole curve with the stated probability.",
+    ),
+)  # fmt: skip
+
+
+def illustrate(sections: tuple[Section, ...], material: Material) -> tuple[Section, ...]:
+    """Return the sections with pictures after those that they belong to."""
+    made: list[Section] = []
+    pending: list[Section] = []
+    for section in sections:
+        if section.level == 2:
+            made += pending
+            pending = [s for i in ILLUSTRATIONS if i.after == section.title for s in _made(i, material)]
+        made.append(section)
+    return (*made, *pending)
+
+
+def _made(illustration: Illustration, material: Material) -> list[Section]:
+    # AT THE MERGE with the branch of pictures: getattr with a default, and the two lines after it, become a plain
+    # `getattr(plots, illustration.function)`.
+    function = getattr(plots, illustration.function, None)
+    if function is None:
+        return []
+    found = illustration.arguments(material)
+    if found is None:
+        return []
+    # Heavy, and partly annotated.
+    pyplot: Any = import_module("matplotlib.pyplot")
+    arviz: Any = import_module("arviz")
+    arguments, keywords = found
+    before = set(pyplot.get_fignums())
+    try:
+        with arviz.rc_context({"plot.backend": "matplotlib"}):
+            picture = function(*arguments, **keywords)
+        alt, caption = illustration.alt, illustration.caption
+        return [Section(illustration.title, picture=picture, alt=alt, caption=caption, level=3)]
+    except (TypeError, ValueError, NotImplementedError) as error:
+        _log.warning("report: no picture by %s: %s", illustration.function, error)
+        return [Section(illustration.title, f"This picture could not be made: {error}", level=3)]
+    finally:
+        for number in set(pyplot.get_fignums()) - before:
+            pyplot.close(number)
