@@ -142,7 +142,7 @@ def _column(label: str, result: Any) -> tuple[dict[str, tuple[float, ...]], floa
 def _normal(point: Mapping[Any, Any], stderr: Mapping[Any, Any]) -> dict[str, tuple[float, ...]]:
     """Return (estimate, sd, lower, upper) by element of an optimum."""
     z = 1.5982  # the normal's quantile at (1 + 0.89) / 2
-    rows = {}
+    rows: dict[str, tuple[float, ...]] = {}
     for name, value in point.items():
         for i in np.ndindex(np.shape(value)):
             estimate, sd = float(np.asarray(value)[i]), float(np.asarray(stderr[name])[i])

@@ -46,8 +46,9 @@ def describe(model: pm.Model) -> dict[str, Any]:
 
 
 def without_addresses(configuration: object) -> str:
-    """Return the representation of a metric or propagation, the same in every session."""
-    return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(configuration))
+    """Return the representation of a metric or propagation, the same in every session; functions by their names."""
+    text = re.sub(r" at 0x[0-9a-fA-F]+", "", repr(configuration))
+    return re.sub(r"<function ((?:[\w.]|<locals>|<lambda>)+)>", r"\1", text)
 
 
 def as_attribute(model: pm.Model) -> dict[str, str]:

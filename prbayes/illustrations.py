@@ -6,11 +6,15 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
+from subprocess import CalledProcessError
 from typing import Any
+
+import pymc as pm
 
 from prbayes import plots
 from prbayes.material import Material
 from prbayes.section import Section
+from prbayes.simulator import nodes
 
 _log = logging.getLogger("prbayes")
 
@@ -159,3 +163,42 @@ def _made(illustration: Illustration, material: Material) -> list[Section]:
     finally:
         for number in set(pyplot.get_fignums()) - before:
             pyplot.close(number)
+
+
+def with_graph(sections: tuple[Section, ...], m: Material) -> tuple[Section, ...]:
+    """Add the model's graph after the parts of the section on the model; or say why there is none."""
+    if m.model is None:
+        return sections
+    place = next(i for i, s in enumerate(sections) if s.title == "Model") + 1
+    while place < len(sections) and sections[place].level == 3:
+        place += 1
+    try:
+        import_module("graphviz")
+        drawn = _graph(m.model)
+        names = ", ".join(v["name"] for v in (m.description or {"variables": []})["variables"])
+        alt = f"Graph of the model: arrows from its variables ({names}) to the simulators."
+        caption = "Variables of the model; filled: compared with measured responses."
+        section = Section("Graph", picture=drawn, alt=alt, caption=caption, level=3)
+    except ImportError:
+        section = Section("Graph", "The model's graph is not drawn: there is no Python package graphviz.", level=3)
+    except (RuntimeError, OSError, CalledProcessError) as error:
+        lacking = isinstance(error, RuntimeError | OSError)
+        why = "there is no program dot of Graphviz" if lacking else "Graphviz does not take a name in it"
+        section = Section("Graph", f"The model's graph is not drawn: {why}.", level=3)
+    return (*sections[:place], section, *sections[place:])
+
+
+def _graph(model: Any) -> bytes:
+    graphs: Any = import_module("pymc.model_graph")
+    own = {node.name for node in nodes(model).values()}
+    plain = graphs.DEFAULT_NODE_FORMATTERS[graphs.NodeType.OBSERVED_RV]
+
+    def observed(rv: Any) -> dict[str, Any]:
+        style: dict[str, Any] = plain(rv)
+        return {**style, "label": f"{rv.name}\n~\nSimulator"} if rv.name in own else style
+
+    graph = pm.model_to_graphviz(model, node_formatters={"Observed Random Variable": observed})
+    for attributes in (graph.graph_attr, graph.node_attr):
+        attributes.update(fontname="Helvetica,Arial,sans-serif", fontsize="11")
+    svg: bytes = graph.pipe(format="svg")
+    return svg

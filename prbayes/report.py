@@ -22,7 +22,7 @@ from prbayes.validity import ValidityTest
 
 # What Markdown, or HTML inside it, would read as markup.
 _MARKUP = re.compile(r"([\\`*_{}\[\]<>|&~$!])")
-_AT_START = re.compile(r"^(\s*)([#+\-=]|\d+(?=[.)]))")
+_AT_START = re.compile(r"^(?:#+|[-+](?=\s|$)|-{2,}|={1,}|\d{1,9}(?=[.)](?:\s|$)))")
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,9 @@ class Report:
         files = [
             None if s.picture is None else f"{i:02d}-{_slug(s.title)}.{s.kind}" for i, s in enumerate(self.sections, 1)
         ]
-        text = _markdown().get_template("report.md.j2").render(report=self, byline=self._byline, cells=cells, files=files)
+        text = (
+            _markdown().get_template("report.md.j2").render(report=self, byline=self._byline, cells=cells, files=files)
+        )
         folder.mkdir(parents=True, exist_ok=True)
         for section, name in zip(self.sections, files, strict=True):
             if name is not None:
@@ -182,15 +184,13 @@ def _markdown() -> Any:
     def escaped(value: Any) -> str:
         return str(value) if isinstance(value, Markup) else _literal(str(value))
 
-    return Environment(  # noqa: S701 (Markdown, escaped by `finalize`)
-        loader=PackageLoader("prbayes"), autoescape=False, finalize=escaped, undefined=StrictUndefined
-    )
+    return Environment(loader=PackageLoader("prbayes"), autoescape=False, finalize=escaped, undefined=StrictUndefined)
 
 
 def _literal(text: str) -> str:
     """Return a text, in one line, that Markdown shows as it is."""
     line = _MARKUP.sub(r"\\\1", " ".join(text.split()))
-    return _AT_START.sub(lambda m: f"{m[1]}\\{m[2]}" if not m[2].isdigit() else m[0] + "\\", line)
+    return _AT_START.sub(lambda m: f"{m[0]}\\" if m[0].isdigit() else f"\\{m[0]}", line)
 
 
 def _slug(title: str) -> str:

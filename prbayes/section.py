@@ -7,6 +7,7 @@ import re
 import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,8 @@ import xarray as xr
 
 DIGITS = 4
 _LARGEST_SVG = 500_000  # bytes; a picture with more elements is kept as pixels
-_NUMBER = re.compile(r"[-−]?[\d ]*\.?\d+(e[-+]?\d+)?|∞|−∞")
-_NOTHING = "–"
+_NUMBER = re.compile(r"-?\d*\.?\d+(e[-+]?\d+)?%?|-?∞")
+NOTHING = "\u2013"  # a dash
 _KINDS = ((b"\x89PNG\r\n", "png", "image/png"), (b"\xff\xd8\xff", "jpg", "image/jpeg"))
 
 
@@ -80,7 +81,7 @@ class Section:
             cells(self.table)  # raises what is wrong with it now
         if self.picture is not None:
             if not self.alt.strip():
-                raise ValueError(f"Section {self.title!r}: alt: got nothing, expected a sentence that says what is seen")
+                raise ValueError(f"Section {self.title!r}: alt: got nothing, expected a sentence on what is seen")
             object.__setattr__(self, "picture", image(self.picture))
 
     @property
@@ -143,19 +144,27 @@ def cells(table: Any) -> Cells:
     return Cells(header, rows, tuple(_is_numeric(column) for column in columns))
 
 
+def rows_table(rows: list[dict[str, Any]]) -> Any:
+    """Return a table without the columns that have nothing in them."""
+    pandas: Any = import_module("pandas")
+    frame = pandas.DataFrame(rows)
+    empty = [c for c in frame.columns if all(v is None or v == "" or v != v for v in frame[c])]
+    return frame.drop(columns=empty).reset_index(drop=True)
+
+
 def _is_numeric(column: Sequence[str]) -> bool:
-    known = [c for c in column if c != _NOTHING]
+    known = [c for c in column if c != NOTHING]
     return bool(known) and all(all(_NUMBER.fullmatch(part) for part in c.split(" ± ")) for c in known)
 
 
 def _padded(column: Sequence[str]) -> list[str]:
-    if any("e" in cell for cell in column):
-        return list(column)
     places = [len(cell.rpartition(".")[2]) if "." in cell else -1 for cell in column]
     most = max(places)
+    if most < 0 or any("e" in cell for cell in column):
+        return list(column)
     # A figure space is as wide as a digit, a punctuation space as a point.
     return [
-        cell + ("\u2008" if p < 0 <= most else "") + "\u2007" * (most - max(p, 0) if most > 0 else 0)
+        cell if cell == NOTHING else cell + ("\u2008" if p < 0 else "") + "\u2007" * (most - max(p, 0))
         for cell, p in zip(column, places, strict=True)
     ]
 
@@ -167,12 +176,12 @@ def number(value: Any, digits: int = DIGITS) -> str:
     if isinstance(value, int | np.integer):
         return str(value)
     if not isinstance(value, float | np.floating):
-        return _NOTHING if value is None else str(value)
+        return NOTHING if value is None else str(value)
     x = float(value)
     if math.isnan(x):
-        return _NOTHING
+        return NOTHING
     if math.isinf(x):
-        return "∞" if x > 0 else "−∞"
+        return "∞" if x > 0 else "-∞"
     if x == 0:
         return "0"
     size = math.floor(math.log10(abs(x)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,8 @@ _MOST = 6  # hyperparameters that the summary lists
 
 def summary(m: Material) -> list[str]:
     """Return the sentences, as paragraphs."""
-    said = [_what(m), _answer(m), _agreement(m), _trust(m), *(verdict(label, t, m) for label, t in m.tests.items())]
-    return [s for s in said if s]
+    said = [_what(m), f"{_answer(m)} {_agreement(m)}", _trust(m)]
+    return [s.strip() for s in (*said, *(verdict(label, t, m) for label, t in m.tests.items())) if s.strip()]
 
 
 def counted(n: int, what: str) -> str:
@@ -63,9 +64,14 @@ def _metrics(m: Material) -> list[str]:
     if m.description is not None:
         found = [str(s["metric"]) for s in m.description["simulators"]]
     else:
-        trees = [tree["calibration"] for tree in m.results.values() if "calibration" in tree]
+        trees = [tree["calibration"].to_dataset() for tree in m.results.values() if "calibration" in tree]
         found = [str(v) for tree in trees[:1] for v in tree["metric"].values.tolist()]
-    return list(dict.fromkeys(name.partition("(")[0] for name in found))
+    return list(dict.fromkeys(_in_words(name.partition("(")[0]) for name in found))
+
+
+def _in_words(name: str) -> str:
+    """Return the name of a class, such as 'ProbabilityResidual', in words."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower() if name.isidentifier() else name
 
 
 def _listed(items: list[str]) -> str:

@@ -19,7 +19,7 @@ ORDER = [
     "resampling", "information", "descent", "refit", "modes", "refinement", "search", "optimum", "optimize", "epsilon",
     "adjust", "results", "bootstrap", "checkpoint", "kernel", "smc", "sbc", "diagnose", "compare", "heldout", "predict",
     "nulls", "joint", "validity", "plots",
-    "section", "material", "summary", "illustrations", "contents", "report", "demo", "__main__",
+    "section", "material", "summary", "illustrations", "assessment", "contents", "report", "demo", "__main__",
 ]  # fmt: skip
 
 # Upwards, inside a function or for types only, with the reason.
