@@ -200,5 +200,5 @@ def _graph(model: Any) -> bytes:
     graph = pm.model_to_graphviz(model, node_formatters={"Observed Random Variable": observed})
     for attributes in (graph.graph_attr, graph.node_attr):
         attributes.update(fontname="Helvetica,Arial,sans-serif", fontsize="11")
-    svg: bytes = graph.pipe(format="svg")
+    svg: bytes = graph.pipe(format="svg", quiet=True)
     return svg

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,12 @@ from prbayes.section import number, plus_minus
 from prbayes.validity import ValidityTest
 
 _MOST = 6  # hyperparameters that the summary lists
+_WORDS = {
+    "ProbabilityResidual": "probability residual",
+    "KullbackLeibler": "Kullback-Leibler divergence",
+    "AreaMetric": "area metric",
+    "LogLikelihood": "log-likelihood",
+}
 
 
 def summary(m: Material) -> list[str]:
@@ -52,7 +57,9 @@ def _what(m: Material) -> str:
     data = [f"{counted(v.size, 'measured response')} of {name}" for name, v in m.observed.items()]
     on = f" on {_listed(data)}" if data else ""
     metrics = _metrics(m)
-    by = f", with the metric {_listed(metrics)}" if metrics else ""
+    by = f", by the {_listed(metrics)}" if metrics else ""
+    if not m.results:
+        return f"The model has {counted(len(names), 'hyperparameter')}{few}. No result of a calibration was given."
     return f"{counted(len(names), 'hyperparameter')}{few} of the model {_were(len(names))} calibrated{on}{by}."
 
 
@@ -66,12 +73,7 @@ def _metrics(m: Material) -> list[str]:
     else:
         trees = [tree["calibration"].to_dataset() for tree in m.results.values() if "calibration" in tree]
         found = [str(v) for tree in trees[:1] for v in tree["metric"].values.tolist()]
-    return list(dict.fromkeys(_in_words(name.partition("(")[0]) for name in found))
-
-
-def _in_words(name: str) -> str:
-    """Return the name of a class, such as 'ProbabilityResidual', in words."""
-    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower() if name.isidentifier() else name
+    return list(dict.fromkeys(_WORDS.get(called := name.partition("(")[0], called) for name in found))
 
 
 def _listed(items: list[str]) -> str:
