@@ -147,7 +147,7 @@ def origin(m: Material) -> list[Section]:
             {
                 "result": label,
                 "by": str(attrs.get("sampler", "minimize" if label in m.optima else "")),
-                "responses": int(attrs["n_responses"]) if "n_responses" in attrs else None,
+                "responses": str(int(attrs["n_responses"])) if "n_responses" in attrs else None,
                 "seconds": shown(float(attrs["seconds"])) if "seconds" in attrs else None,
                 "seed": None if seed is None else str(seed),
             }

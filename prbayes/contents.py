@@ -76,20 +76,15 @@ def _model(m: Material) -> list[Section]:
 def _data(m: Material) -> list[Section]:
     if not m.observed:
         return []
-    rows = []
-    for name, values in m.observed.items():
-        y = values[np.isfinite(values)]
+    rows: list[dict[str, Any]] = []
+    for name, y in m.observed.items():
         sd = float(y.std(ddof=1)) if y.size > 1 else math.nan
-        low, high, mean, spread = alike((y.min(), y.max(), y.mean(), sd) if y.size else [math.nan] * 4, sd)
-        failed = int((~np.isfinite(values)).sum())
-        row = {"simulator": name, "N": values.size, "failed": failed or None}
-        rows.append(row | {"smallest": low, "largest": high, "mean": mean, "sd": spread})
+        low, high, mean, spread = alike((y.min(), y.max(), y.mean(), sd), sd)
+        row = {"simulator": name, "N": y.size, "smallest": low, "largest": high, "mean": mean, "sd": spread}
+        rows.append(row)
     known = (m.description or {"simulators": []})["simulators"]
     labels = [f"{s['name']}: {s['specimens']}." for s in known if s["specimens"]]
-    text = ["Measured responses, one per specimen, in the units of the response."]
-    if any(row["failed"] for row in rows):
-        text[0] += " Failed specimens count above all others; range, mean and sd are of the rest."
-    return [Section("Data", (*text, *labels), rows_table(rows))]
+    return [Section("Data", ("Measured responses, in the units of the response.", *labels), rows_table(rows))]
 
 
 def _metric(m: Material) -> list[Section]:
@@ -106,9 +101,9 @@ def _metric(m: Material) -> list[Section]:
                     "result": label,
                     "simulator": name,
                     "discrepancy": float(mean.sel(simulator=name)),
-                    "its error": _item(own, "discrepancy_error"),
+                    "Monte Carlo error": _item(own, "discrepancy_error"),
                     "epsilon": _item(own, "epsilon"),
-                    "points": int(own["n_points"]) if "n_points" in own else None,
+                    "points": str(int(own["n_points"])) if "n_points" in own else None,
                 }
             )
     metrics = _metrics(m)

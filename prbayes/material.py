@@ -100,7 +100,7 @@ def gather(model: Any, optimum: Any, posterior: Any, validity: Any, comparison: 
     results = optima | posteriors
     description = describe(model) if model is not None else _stored_description(results)
     if comparison is None and len(results) > 1:
-        comparison = compare(results | found, model=model)
+        comparison = _free_only(compare(results | found, model=model), description)
     return Material(
         model=model,
         description=description,
@@ -135,6 +135,14 @@ def _require(label: str, tree: Any, group: str, dims: tuple[str, ...], origin: s
 def _stored_description(results: dict[str, xr.DataTree]) -> dict[str, Any] | None:
     groups = [tree[g] for tree in results.values() for g in ("posterior", "optimum") if g in tree]
     return next((d for d in (from_attributes(g.attrs) for g in groups) if d is not None), None)
+
+
+def _free_only(comparison: xr.Dataset, description: dict[str, Any] | None) -> xr.Dataset:
+    """Leave out deterministics, as `compare` does where it has the model."""
+    roles = {v["name"]: v["role"] for v in (description or {"variables": []})["variables"]}
+    names = comparison["hyperparameter"].values.tolist()
+    kept = [n for n in names if roles.get(n.split("[")[0], "hyperparameter") == "hyperparameter"]
+    return comparison.sel(hyperparameter=kept or names)
 
 
 def _observed(model: pm.Model | None, results: dict[str, xr.DataTree]) -> dict[str, Floats]:
