@@ -198,8 +198,8 @@ def _posterior(m: Material) -> list[Section]:
                 text.append(f"The draws are not adjusted{f' ({why})' if why else ''}: their width is that of epsilon.")
             else:
                 text.append(
-                    f"The draws are adjusted, by {adjustment}, to the width that the data warrant: that of the "
-                    "metric's own estimate over repeated sets of specimens, combined with the prior."
+                    "The draws are adjusted to the width that the data warrant: that of the metric's own estimate over "
+                    f"repeated sets of specimens, combined with the prior ({adjustment})."
                 )
         sections.append(Section(_titled("Posterior", label, m.posteriors), tuple(text), rows_table(rows)))
     return sections
