@@ -16,7 +16,7 @@ def comparison(m: Material) -> list[Section]:
     """Return the results side by side."""
     if m.comparison is None:
         return []
-    table, rows, scores = m.comparison, [], []
+    table, rows = m.comparison, []
     for name in table["hyperparameter"].values.tolist():
         for label in table["result"].values.tolist():
             own = table.sel(hyperparameter=name, result=label)
@@ -24,14 +24,16 @@ def comparison(m: Material) -> list[Section]:
             estimate, sd, lower, upper = alike(values, values[1])
             row = {"hyperparameter": name, "result": label, "estimate": estimate, "sd": sd}
             rows.append(row | {"89% from": lower, "to": upper, "shift in sd": _shift(float(own["shift"]))})
-    for label in table["result"].values.tolist():
-        own = table.sel(result=label)
-        named = {str(key): own[key].item() for key, v in table.data_vars.items() if v.dims == ("result",)}
-        scores.append({"result": label} | {k: v for k, v in named.items() if k not in ("n_responses", "seconds")})
-    first = table["result"].values.tolist()[0]
+    labels = table["result"].values.tolist()
+    scores = [
+        {"under the metric": str(key)} | dict(zip(labels, values.values.tolist(), strict=True))
+        for key, values in table.data_vars.items()
+        if values.dims == ("result",) and key not in ("n_responses", "seconds")
+    ]
+    first = labels[0]
     text = f"The shift is the distance from the estimate of {first}, in standard deviations of the result in the row."
     sections = [Section("Comparison", text, rows_table(rows))]
-    if len(scores[0]) > 1:
+    if scores:
         text = "Discrepancy of the population at each estimate, under each metric, whatever it was calibrated with."
         sections.append(Section("Scores under each metric", text, rows_table(scores), level=3))
     return sections

@@ -145,11 +145,10 @@ def cells(table: Any) -> Cells:
 
 
 def rows_table(rows: list[dict[str, Any]]) -> Any:
-    """Return a table without the columns that have nothing in them."""
+    """Return a table without the columns in which no row has anything; NaN is something."""
     pandas: Any = import_module("pandas")
-    frame = pandas.DataFrame(rows)
-    empty = [c for c in frame.columns if all(v is None or v == "" or v != v for v in frame[c])]
-    return frame.drop(columns=empty).reset_index(drop=True)
+    kept = [key for key in rows[0] if any(row[key] is not None and row[key] != "" for row in rows)]
+    return pandas.DataFrame([{key: row[key] for key in kept} for row in rows])
 
 
 def _is_numeric(column: Sequence[str]) -> bool:
