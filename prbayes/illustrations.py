@@ -11,7 +11,6 @@ from typing import Any
 
 import pymc as pm
 
-from prbayes import plots
 from prbayes.material import Material
 from prbayes.section import Section
 from prbayes.simulator import nodes
@@ -28,7 +27,7 @@ class Illustration:
     after : str
         Title of the section that it belongs to.
     function : str
-        In `prbayes.plots`.
+        A public name of the package.
     arguments : callable
         Of the material: arguments and keywords; None where something is lacking.
     title, alt, caption : str
@@ -50,6 +49,13 @@ def _answer(m: Material) -> Any:
 def _with_model(m: Material) -> Any:
     answer = _answer(m)
     return None if m.model is None or answer is None else ((answer,), {"model": m.model})
+
+
+def _responses(m: Material) -> Any:
+    """Return the same, unless the picture would compute responses: a report spends none."""
+    if m.model is not None and any(node.bound.n_per_theta for node in nodes(m.model).values()):
+        raise NotImplementedError("it would compute responses anew; call prb.plot_responses for it")
+    return _with_model(m)
 
 
 def _posterior(m: Material) -> Any:
@@ -83,7 +89,7 @@ def _validity(m: Material) -> Any:
 
 ILLUSTRATIONS = (
     Illustration(
-        "Data", "plot_responses", _with_model, "Measured and calibrated responses",
+        "Data", "plot_responses", _responses, "Measured and calibrated responses",
         "Distribution of the measured responses with that of the calibrated population, one panel per simulator.",
         "Measured responses and the calibrated population.",
     ),
@@ -139,20 +145,20 @@ def illustrate(sections: tuple[Section, ...], material: Material) -> tuple[Secti
 
 
 def _made(illustration: Illustration, material: Material) -> list[Section]:
-    # AT THE MERGE with the branch of pictures: getattr with a default, and the two lines after it, become a plain
-    # `getattr(plots, illustration.function)`.
-    function = getattr(plots, illustration.function, None)
+    # MERGE: with all pictures in the package, `function` in the table above becomes the function itself, imported from
+    # its room, and these three lines go.
+    function = getattr(import_module("prbayes"), illustration.function, None)
     if function is None:
-        return []
-    found = illustration.arguments(material)
-    if found is None:
         return []
     # Heavy, and partly annotated.
     pyplot: Any = import_module("matplotlib.pyplot")
     arviz: Any = import_module("arviz")
-    arguments, keywords = found
     before = set(pyplot.get_fignums())
     try:
+        found = illustration.arguments(material)
+        if found is None:
+            return []
+        arguments, keywords = found
         with arviz.rc_context({"plot.backend": "matplotlib"}):
             picture = function(*arguments, **keywords)
         alt, caption = illustration.alt, illustration.caption

@@ -22,7 +22,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes import illustrations, plots
+from prbayes import illustrations
 from prbayes.section import cells, number, plus_minus
 
 HOSTILE = ["<script>alert(1)", "a|b", "x & y &lt;", "**bold** [link](x) `code` $y$", "_it_ ![p](q)"]
@@ -557,7 +557,7 @@ def test_a_picture_that_fails_leaves_a_sentence(monkeypatch: pytest.MonkeyPatch)
         plt.figure()
         raise ValueError("three hyperparameters")
 
-    monkeypatch.setattr(plots, "plot_validity", fails)
+    monkeypatch.setattr(prb, "plot_validity", fails)
     before = plt.get_fignums()
     made = prb.Report("x", validity=calibrated()[3])
     assert made.sections[-1].text == ("This picture could not be made: three hyperparameters",)
@@ -580,7 +580,7 @@ def test_each_illustration_gets_what_it_needs(monkeypatch: pytest.MonkeyPatch) -
             called[_name] = (*arguments, *keywords.values())
             return Picture()
 
-        monkeypatch.setattr(plots, illustration.function, made, raising=False)
+        monkeypatch.setattr(prb, illustration.function, made, raising=False)
     full = prb.Report("x", model=model, optimum=optimum, posterior=posterior, validity=test)
     assert set(called) == {i.function for i in illustrations.ILLUSTRATIONS}
     assert called["plot_responses"] == called["plot_population"] == (posterior, model)
