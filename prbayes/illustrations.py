@@ -51,9 +51,14 @@ def _with_model(m: Material) -> Any:
     return None if m.model is None or answer is None else ((answer,), {"model": m.model})
 
 
+def _spends(model: pm.Model) -> bool:
+    """Return whether a draw of the model's simulators computes responses."""
+    return any(node.bound.n_per_theta for node in nodes(model).values())
+
+
 def _responses(m: Material) -> Any:
     """Return the same, unless the picture would compute responses: a report spends none."""
-    if m.model is not None and any(node.bound.n_per_theta for node in nodes(m.model).values()):
+    if m.model is not None and _spends(m.model):
         raise NotImplementedError("it would compute responses anew; call prb.plot_responses for it")
     return _with_model(m)
 
@@ -180,6 +185,8 @@ def with_graph(sections: tuple[Section, ...], m: Material) -> tuple[Section, ...
         place += 1
     try:
         import_module("graphviz")
+        if _spends(m.model):  # PyMC draws each variable once for its shape
+            raise NotImplementedError
         drawn = _graph(m.model)
         names = ", ".join(v["name"] for v in (m.description or {"variables": []})["variables"])
         alt = f"Graph of the model: arrows from its variables ({names}) to the simulators."
@@ -187,6 +194,9 @@ def with_graph(sections: tuple[Section, ...], m: Material) -> tuple[Section, ...
         section = Section("Graph", picture=drawn, alt=alt, caption=caption, level=3)
     except ImportError:
         section = Section("Graph", "The model's graph is not drawn: there is no Python package graphviz.", level=3)
+    except NotImplementedError:
+        text = "The model's graph is not drawn: PyMC would compute responses for it. See pm.model_to_graphviz(model)."
+        section = Section("Graph", text, level=3)
     except (RuntimeError, OSError, CalledProcessError) as error:
         lacking = isinstance(error, RuntimeError | OSError)
         why = "there is no program dot of Graphviz" if lacking else "Graphviz does not take a name in it"

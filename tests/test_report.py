@@ -597,6 +597,28 @@ def test_each_illustration_gets_what_it_needs(monkeypatch: pytest.MonkeyPatch) -
     assert set(called) == {"plot_posterior", "plot_stages", "plot_comparison"}
 
 
+def test_a_report_computes_no_response(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(prb, "plot_responses", lambda *_, **__: pytest.fail("drawn"), raising=False)
+    calls = 0
+
+    def response(x: Any) -> Any:
+        nonlocal calls
+        calls += np.size(x)
+        return 2 * x
+
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        once = prb.Resimulated(64)
+        prb.Simulator("y", response, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0], propagation=once)
+    optimum = prb.minimize(model)
+    before, counted = calls, optimum.evaluator.n_responses
+    made = prb.Report("x", model=model, optimum=optimum)
+    assert (calls, optimum.evaluator.n_responses) == (before, counted)
+    assert "PyMC would compute responses" in section(made, "Graph").text[0]
+    text = section(made, "Measured and calibrated responses").text
+    assert text == ("This picture could not be made: it would compute responses anew; call prb.plot_responses for it",)
+
+
 @pytest.mark.parametrize("lacking", ["package", "program"])
 def test_without_graphviz_a_sentence_says_so(lacking: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     if lacking == "package":
