@@ -189,6 +189,16 @@ def test_comparison() -> None:
             assert float(scores[label]) == pytest.approx(float(table[key].sel(result=label)), rel=1e-3)
 
 
+def test_saved_optima_compare_as_they_do_in_memory() -> None:
+    _, optimum, _, _ = calibrated()
+    table = prb.compare({"memory": optimum, "saved": optimum.to_datatree()})
+    for key in ("estimate", "sd", "lower", "upper"):
+        np.testing.assert_array_equal(*table[key].values)
+    mu = table.sel(hyperparameter="mu", result="saved")
+    np.testing.assert_allclose(float(mu["upper"]), optimum.point["mu"] + 1.59819 * optimum.stderr["mu"], rtol=1e-5)
+    assert table["n_responses"].values.tolist() == [optimum.n_responses] * 2
+
+
 def test_diagnostics_are_those_of_diagnose() -> None:
     model, _, posterior, _ = calibrated()
     text = " ".join(section(report(), "Diagnostics").text)
@@ -200,6 +210,10 @@ def test_diagnostics_are_those_of_diagnose() -> None:
     stages = (~np.isnan(stats["beta"].values)).sum(axis=1)
     span = str(stages[0]) if stages[0] == stages[1] else f"{stages.min()} to {stages.max()}"
     assert f"in {span} stages" in text
+    last = [float((stats["accept_rate"] * stats["n_steps"])[i, n - 1]) for i, n in enumerate(stages)]
+    moved = re.findall(r"each particle moved ([\d.]+)(?: to ([\d.]+))? times", text)[0]
+    assert float(moved[0]) == pytest.approx(min(last), abs=0.06)
+    assert float(moved[1] or moved[0]) == pytest.approx(max(last), abs=0.06)
     evidence = posterior["posterior"].attrs["log_marginal_likelihood"]
     assert float(re.findall(r"log marginal likelihood (-?[\d.]+)", text)[0]) == pytest.approx(evidence, abs=0.06)
 
