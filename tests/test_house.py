@@ -15,11 +15,11 @@ FILES = sorted(PACKAGE.glob("*.py"))
 # A file may import those before it.
 ORDER = [
     "_arrays", "progress", "cells", "density", "discrepancy", "metrics", "failures", "store", "calling", "inputs",
-    "responses", "propagation", "resimulation", "design", "simulator", "describe", "surfaces", "region", "surrogate",
-    "population", "resampling", "information", "descent", "refit", "modes", "refinement", "search", "optimum", "optimize", "epsilon",
-    "adjust", "results", "bootstrap", "checkpoint", "kernel", "smc", "sbc", "diagnose", "compare", "heldout", "predict",
-    "nulls", "joint", "validity", "plots",
-    "section", "material", "summary", "illustrations", "assessment", "contents", "report", "demo", "__main__",
+    "responses", "propagation", "resimulation", "design", "simulator", "describe", "surfaces", "region",
+    "surrogate", "population", "resampling", "information", "descent", "refit", "modes", "refinement", "search",
+    "optimum", "optimize", "epsilon", "adjust", "results", "bootstrap", "checkpoint", "kernel", "smc", "sbc",
+    "diagnose", "compare", "heldout", "predict", "nulls", "joint", "validity", "plots", "section", "material",
+    "summary", "illustrations", "assessment", "contents", "report", "demo", "__main__",
 ]  # fmt: skip
 
 # Upwards, inside a function or for types only, with the reason.
