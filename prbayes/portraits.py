@@ -208,8 +208,9 @@ def _reach(node: Node, values: Floats, weights: Floats, earlier: tuple[Floats, F
     low, high = central_range(values, weights, 0.005)
     low, high = min(low, finite.min()), max(high, finite.max())
     if earlier is not None:
-        first, last = central_range(*earlier, 0.02)
-        low, high = max(min(first, low), low - (high - low)), min(max(last, high), high + (high - low))
+        first, last = central_range(*earlier, 0.05)
+        room = (high - low) / 2
+        low, high = max(min(first, low), low - room), min(max(last, high), high + room)
     margin = 0.03 * (high - low)
     return float(low - margin), float(high + margin)
 
@@ -234,4 +235,5 @@ def _measured(canvas: Canvas, node: Node, low: float, high: float, *, ecdf: bool
         return
     x, y = histogram(observed, weights)
     canvas.band(node.name, "measured", x, (np.zeros_like(y), y), GREY, legend=text)
+    canvas.line(node.name, "bars", x, y, GREY, width=0.7)
     canvas.points(node.name, "rug", observed[np.isfinite(observed)], 0.0, INK, marker="|", size=60)
