@@ -36,7 +36,7 @@ def grid_settings(
 ) -> dict[str, Any]:
     """Return keywords of `PlotCollection.wrap` for so many panels of a size in inches, one for each variable."""
     arviz: Any = import_module("arviz")
-    settings: dict[str, Any] = {"cols": ["__variable__"], "col_wrap": 3} | pc_kwargs
+    settings: dict[str, Any] = {"cols": ["__variable__"], "col_wrap": 2 if panels == 4 else 3} | pc_kwargs
     backend = backend or arviz.rcParams["plot.backend"]
     columns = min(panels, settings["col_wrap"])
     rows = -(-panels // columns)

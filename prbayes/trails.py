@@ -49,7 +49,9 @@ def plot_optimizer(
 
     The first panel has the objective, the sum of d_k / s_k, of each point and the lowest so far, with logarithmic
     ticks where it falls over more than a decade; a panel for each hyperparameter follows, in the user's own units,
-    with the optimum as a dashed line.
+    with the optimum as a dashed line. With `Reweighted` the objective is that of the final design and scales,
+    evaluated anew without a response; elsewhere it is what the optimiser saw, and with several simulators, whose
+    scales may have changed on the way, nothing says which was lowest.
 
     Parameters
     ----------
@@ -82,7 +84,10 @@ def plot_optimizer(
     ['discrepancy', 'mu']
     """
     _check_optimum(optimum, "plot_optimizer")
-    values, x = optimum.trace["discrepancy"], optimum.trace["evaluations"].astype(np.float64)
+    evaluator, x = optimum.evaluator, optimum.trace["evaluations"].astype(np.float64)
+    scales = np.array([optimum.scales[n.name] for n in evaluator.nodes])
+    free = not evaluator.responses_per_theta
+    values = evaluator.total(optimum.trace["theta"], scales) if free else optimum.trace["discrepancy"]
     path = elements(optimum.evaluator, optimum.trace["theta"])
     canvas = Canvas(["discrepancy", *path], size=(4.6, 3.4), backend=backend, pc_kwargs=pc_kwargs)
     shown = np.where(np.isfinite(values), values, np.nan)
@@ -92,7 +97,8 @@ def plot_optimizer(
         shown, best = np.log10(shown), np.log10(best)
     known = np.isfinite(shown)
     canvas.points("discrepancy", "asked", x[known], shown[known], GREY, size=16, legend="evaluated")
-    canvas.line("discrepancy", "best", x[known], best[known], BLUE, legend="lowest so far")
+    if free or len(scales) == 1:
+        canvas.line("discrepancy", "best", x[known], best[known], BLUE, legend="lowest so far")
     canvas.axes("discrepancy", x="evaluations", y=_objective(optimum), yticks=ticks)
     ends = np.array([x[0], x[-1]])
     for name, at in path.items():
@@ -118,9 +124,9 @@ def plot_landscape(
     """Draw the objective over two hyperparameters around the optimum, with the optimiser's path and other optima.
 
     Darker is lower; contours are at even steps of the root of the objective over its lowest value, so that they crowd
-    towards the optimum; the title has the values at the ends. With one hyperparameter, or one name, it is a curve. All other
-    hyperparameters stand at the optimum, as the title says. Where stored responses do not support a
-    population the picture is blank.
+    towards the optimum; the title has the values at the ends. With one hyperparameter, or one name, it is a curve. All
+    other hyperparameters stand at the optimum, as the title says. Where stored responses do not support a population
+    the picture is blank.
 
     Parameters
     ----------
@@ -285,7 +291,6 @@ def plot_stages(
     tables = {n: np.asarray(v.transpose("chain", "stage"), dtype=np.float64) for n, v in stats.items()}
     single = {name: bool((np.isfinite(rows).sum(axis=1) <= 1).all()) for name, rows in tables.items()}
     names = sorted(stats, key=lambda name: single[name])
-    pc_kwargs = {"col_wrap": 2} | pc_kwargs
     canvas = Canvas(names, size=(4.6, 3.4), backend=backend, pc_kwargs=pc_kwargs)
     for name in names:
         rows, once, values = tables[name], single[name], stats[name]
