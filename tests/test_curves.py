@@ -227,7 +227,7 @@ def test_before_is_what_it_says() -> None:
     started = prb.minimize(model, start={"mu": -1.0, "sigma": 1.5})
     theta, text = read_before(started, evaluator, None)
     np.testing.assert_allclose(theta[0], [-1, np.log(1.5)])
-    assert text == "optimiser's start"
+    assert text == "optimiser's first point"
     theta, text = read_before(optimum, evaluator, {"mu": 2.0, "sigma": 1.0})
     np.testing.assert_allclose(theta, [[2, 0]])
     assert len(read_before(optimum, evaluator, False)[0]) == 0
