@@ -1,5 +1,6 @@
 """Numbers behind the pictures, against closed forms."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -262,6 +263,17 @@ def test_the_landscape_has_the_objective_at_its_places() -> None:
     (only,) = landscape(optimum, evaluator, ["mu"], 9).axes
     np.testing.assert_allclose(only, m)
     assert list(elements(evaluator, optimum.theta[None])) == ["mu", "sigma"]
+
+
+def test_the_landscape_is_blank_where_the_design_does_not_reach() -> None:
+    wide = replace(normal_optimum(), stderr={"mu": 0.1, "sigma": 0.12})
+    found = landscape(wide, wide.evaluator, ["mu", "sigma"], 9)
+    m, s = found.axes
+    thetas = np.array([[x, np.log(y)] for x in m for y in s])
+    ess = wide.evaluator.support(thetas)["y"]["weight_ess"].reshape(9, 9)
+    assert 0 < np.isnan(found.heights).sum() < 40
+    assert np.isnan(found.heights[ess < 10]).all()
+    assert np.isfinite(found.heights[ess > 40]).all()
 
 
 def test_roots_of_heights_are_even_around_a_parabola() -> None:

@@ -401,6 +401,10 @@ def test_every_backend_draws_the_same(picture: str, backend: str) -> None:
                 continue
             np.testing.assert_allclose(xy(other, visual, panel), xy(ours, visual, panel), err_msg=visual)
             compared += 1
+            if hasattr(artist(ours, visual, panel), "get_sizes") and visual != "rug":
+                drawn = artist(other, visual, panel)
+                size = drawn.marker.size if backend == "plotly" else drawn.glyph.size
+                assert size**2 == pytest.approx(artist(ours, visual, panel).get_sizes()[0])
     assert compared
     figure = other.viz["figure"].item()
     wanted = [t.get_text() for legend in ours.viz["figure"].item().legends for t in legend.get_texts()]
