@@ -11,7 +11,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._arrays import Floats, positive_number
-from prbayes.canvas import BLUE, DASHED, GREY, INK, VERMILION, Canvas, named
+from prbayes.canvas import BLUE, DASHED, INK, VERMILION, Canvas, named
 from prbayes.curves import (
     central_range,
     densities,
@@ -45,9 +45,10 @@ def plot_responses(
 ) -> Any:
     """Draw the responses before and after a calibration against the measured ones, one panel per simulator.
 
-    Measured responses are a histogram with a mark for each, or steps. The calibrated curve is the posterior
-    predictive distribution, or the optimum's population. The band holds the share ``level`` of the populations at
-    each response: those of the posterior's draws, or of the optimum's sampling distribution where it is known.
+    Measured responses are a histogram, in outline, with a mark for each, or steps. The calibrated curve is the
+    posterior predictive distribution, or the optimum's population. The band holds the share ``level`` of the
+    populations at each response: those of the posterior's draws, or of the optimum's sampling distribution where it
+    is known.
 
     Parameters
     ----------
@@ -240,7 +241,6 @@ def _measured(canvas: Canvas, node: Node, low: float, high: float, *, ecdf: bool
         canvas.line(node.name, "measured", *staircase(observed, weights, low, high), INK, width=1.4, legend="measured")
         return 1.0
     x, y = histogram(observed, weights)
-    canvas.band(node.name, "measured", x, (np.zeros_like(y), y), GREY, legend="measured")
-    canvas.line(node.name, "bars", x, y, GREY, width=0.7)
+    canvas.line(node.name, "measured", x, y, INK, width=0.9, legend="measured")
     canvas.points(node.name, "rug", observed[np.isfinite(observed)], 0.0, INK, marker="|", size=60)
     return float(y.max())

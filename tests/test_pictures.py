@@ -127,7 +127,7 @@ def test_responses_are_the_closed_forms() -> None:
     at_start = np.exp(optimum().evaluator.initial[1])
     np.testing.assert_allclose(y, stats.norm.pdf(x, 0, at_start), atol=0.02)
     np.testing.assert_allclose(xy(pc, "rug", "y"), [OBSERVED, np.zeros(30)])
-    np.testing.assert_allclose(np.trapezoid(*xy(pc, "bars", "y")[::-1]), 1)
+    np.testing.assert_allclose(np.trapezoid(*xy(pc, "measured", "y")[::-1]), 1)
 
 
 def test_the_legend_says_what_is_before_and_after() -> None:
@@ -394,7 +394,7 @@ def test_every_backend_draws_the_same(picture: str, backend: str) -> None:
     assert isinstance(other, az.PlotCollection)
     compared = 0
     for visual in ours.viz.children:
-        if visual in {"plot", "row_index", "col_index", "band", "measured", "landscape_lines"}:
+        if visual in {"plot", "row_index", "col_index", "band", "landscape_lines"}:
             continue
         for panel in ours.viz[visual].data_vars:
             if hasattr(artist(ours, visual, panel), "levels"):
@@ -408,7 +408,7 @@ def test_every_backend_draws_the_same(picture: str, backend: str) -> None:
     assert compared
     figure = other.viz["figure"].item()
     wanted = [t.get_text() for legend in ours.viz["figure"].item().legends for t in legend.get_texts()]
-    shaded = {"responses": 2, "ecdf": 1, "population": 1}.get(picture, 0)
+    shaded = {"responses": 1, "ecdf": 1, "population": 1}.get(picture, 0)
     if backend == "plotly":
         assert [t.name for t in figure.data if t.showlegend] == wanted
         assert sum(getattr(t, "fill", None) == "tonexty" for t in figure.data) == shaded
