@@ -12,8 +12,11 @@ from typing import Any
 import pymc as pm
 
 from prbayes.material import Material
+from prbayes.plots import plot_comparison, plot_posterior, plot_validity
+from prbayes.portraits import plot_population, plot_responses
 from prbayes.section import Section
 from prbayes.simulator import nodes
+from prbayes.trails import plot_landscape, plot_optimizer, plot_stages
 
 _log = logging.getLogger("prbayes")
 
@@ -26,15 +29,15 @@ class Illustration:
     ----------
     after : str
         Title of the section that it belongs to.
-    function : str
-        A public name of the package.
+    function : callable
+        Returns an ArviZ `PlotCollection`.
     arguments : callable
         Of the material: arguments and keywords; None where something is lacking.
     title, alt, caption : str
     """
 
     after: str
-    function: str
+    function: Callable[..., Any]
     arguments: Callable[[Material], tuple[tuple[Any, ...], dict[str, Any]] | None]
     title: str
     alt: str
@@ -76,7 +79,7 @@ def _stages(m: Material) -> Any:
 
 
 def _optimizer(m: Material) -> Any:
-    return ((next(iter(m.found.values())),), {}) if m.found else None
+    return ((next(iter(m.found.values())),), {"col_wrap": 2}) if m.found else None
 
 
 def _landscape(m: Material) -> Any:
@@ -94,42 +97,42 @@ def _validity(m: Material) -> Any:
 
 ILLUSTRATIONS = (
     Illustration(
-        "Data", "plot_responses", _responses, "Measured and calibrated responses",
+        "Data", plot_responses, _responses, "Measured and calibrated responses",
         "Distribution of the measured responses with that of the calibrated population, one panel per simulator.",
         "Measured responses and the calibrated population.",
     ),
     Illustration(
-        "Optimum", "plot_optimizer", _optimizer, "Path of the optimiser",
+        "Optimum", plot_optimizer, _optimizer, "Path of the optimiser",
         "Discrepancy, and hyperparameters, against the number of evaluations.",
         "The objective at the points that the optimiser asked for.",
     ),
     Illustration(
-        "Optimum", "plot_landscape", _landscape, "Discrepancy around the optimum",
+        "Optimum", plot_landscape, _landscape, "Discrepancy around the optimum",
         "Discrepancy over the hyperparameters, with the optimum marked.",
         "How the discrepancy rises around the optimum.",
     ),
     Illustration(
-        "Posterior", "plot_posterior", _posterior, "Marginal posteriors",
+        "Posterior", plot_posterior, _posterior, "Marginal posteriors",
         "Posterior density of each hyperparameter, with its interval.",
         "What is known of each hyperparameter after the calibration.",
     ),
     Illustration(
-        "Posterior", "plot_population", _with_model, "Calibrated population of the inputs",
+        "Posterior", plot_population, _with_model, "Calibrated population of the inputs",
         "Distribution of each input over the specimens, with a band for its uncertainty.",
         "How the inputs vary from specimen to specimen.",
     ),
     Illustration(
-        "Posterior", "plot_stages", _stages, "Stages of the sampler",
+        "Posterior", plot_stages, _stages, "Stages of the sampler",
         "Tempering, acceptance rate and moves against the stages of the sampler, one line per chain.",
         "How the sampler went from the prior to the posterior.",
     ),
     Illustration(
-        "Comparison", "plot_comparison", _comparison, "Estimates side by side",
+        "Comparison", plot_comparison, _comparison, "Estimates side by side",
         "Estimate and interval of each result, one panel per hyperparameter.",
         "Estimates with their intervals.",
     ),
     Illustration(
-        "Validity", "plot_validity", _validity, "Distribution of the u-values",
+        "Validity", plot_validity, _validity, "Distribution of the u-values",
         "Step curve of the sorted u-values against the diagonal, with the area between them and an acceptance band.",
         "Where the measured responses stand in the predicted distribution. A right model keeps near the diagonal; the "
         "shaded area is the statistic, and the band holds the whole curve with the stated probability.",
@@ -150,11 +153,6 @@ def illustrate(sections: tuple[Section, ...], material: Material) -> tuple[Secti
 
 
 def _made(illustration: Illustration, material: Material) -> list[Section]:
-    # MERGE: with all pictures in the package, `function` in the table above becomes the function itself, imported from
-    # its room, and these three lines go.
-    function = getattr(import_module("prbayes"), illustration.function, None)
-    if function is None:
-        return []
     # Heavy, and partly annotated.
     pyplot: Any = import_module("matplotlib.pyplot")
     arviz: Any = import_module("arviz")
@@ -165,11 +163,11 @@ def _made(illustration: Illustration, material: Material) -> list[Section]:
             return []
         arguments, keywords = found
         with arviz.rc_context({"plot.backend": "matplotlib"}):
-            picture = function(*arguments, **keywords)
+            picture = illustration.function(*arguments, **keywords)
         alt, caption = illustration.alt, illustration.caption
         return [Section(illustration.title, picture=picture, alt=alt, caption=caption, level=3)]
     except (TypeError, ValueError, NotImplementedError) as error:
-        _log.warning("report: no picture by %s: %s", illustration.function, error)
+        _log.warning("report: no picture by %s: %s", illustration.function.__name__, error)
         return [Section(illustration.title, f"This picture could not be made: {error}", level=3)]
     finally:
         for number in set(pyplot.get_fignums()) - before:

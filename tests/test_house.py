@@ -18,8 +18,9 @@ ORDER = [
     "responses", "propagation", "resimulation", "design", "simulator", "describe", "surfaces", "region",
     "surrogate", "population", "resampling", "information", "descent", "refit", "modes", "refinement", "search",
     "optimum", "optimize", "epsilon", "adjust", "results", "bootstrap", "checkpoint", "kernel", "smc", "sbc",
-    "diagnose", "compare", "heldout", "predict", "nulls", "joint", "validity", "plots", "section", "material",
-    "summary", "illustrations", "assessment", "contents", "report", "demo", "__main__",
+    "diagnose", "compare", "heldout", "predict", "nulls", "joint", "validity", "curves", "ensemble", "margins",
+    "landscape", "canvas", "plots", "portraits", "trails", "section", "material", "summary", "illustrations",
+    "assessment", "contents", "report", "demo", "__main__",
 ]  # fmt: skip
 
 # Upwards, inside a function or for types only, with the reason.
