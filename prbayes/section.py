@@ -33,7 +33,7 @@ class Section:
     table : pandas.DataFrame, xarray.Dataset or xarray.DataArray, optional
         Numbers are written with four significant digits, text as it is; named indices become columns.
     picture : bytes or object with ``savefig``, optional
-        SVG, PNG or JPEG; or a matplotlib figure or ArviZ `PlotCollection`, which is saved at once, and left open.
+        SVG, PNG or JPEG; or a matplotlib figure or ArviZ ``PlotCollection``, which is saved at once, and left open.
     alt : str
         What the picture shows, for those who do not see it; needed with a picture.
     caption : str

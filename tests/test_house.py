@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -133,6 +134,12 @@ def test_public_names_are_documented(name: str) -> None:
     text = getattr(prbayes, name).__doc__
     assert text
     assert text.strip().splitlines()[0].endswith("."), "the summary is one sentence"
+
+
+def test_public_names_are_in_the_reference() -> None:
+    page = (PACKAGE.parent / "docs" / "api.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^   (\w+)$", page, flags=re.MULTILINE))
+    assert listed == set(prbayes.__all__) - {"datasets"}
 
 
 def test_the_sign_of_a_discrepancy_changes_in_one_place() -> None:
