@@ -184,6 +184,7 @@ class Canvas:
         figure = self._collection.viz["figure"].item()
         characters = sum(len(text) + 8 for text in handles)
         columns = max(1, min(len(handles), int(len(handles) * 11.5 * figure.get_figwidth() / characters)))
+        columns = -(-len(handles) // -(-len(handles) // columns))  # rows of equal length
         figure.legend(handles.values(), handles, loc="outside lower center", ncols=columns, frameon=False)
 
     def _legend_plotly(self) -> None:

@@ -120,7 +120,9 @@ def plot_posterior(
         canvas.points(name, "mean", x.mean(), rows[0], BLUE, size=40, legend="posterior mean")
         if known:
             normal = normal_density(grid, center, error)
-            canvas.line(name, "normal", grid, normal, VERMILION, style=DASHED, legend="normal with its standard error")
+            canvas.line(
+                name, "normal", grid, normal, VERMILION, style=DASHED, legend="normal with the optimum's standard error"
+            )
             ends = center + z * error * np.array([-1, 1])
             canvas.line(name, "stderr", ends, np.repeat(rows[1], 2), VERMILION, width=4)
         if best:
@@ -299,7 +301,7 @@ def plot_validity(
     pictures = (visuals.fill_between_y, visuals.line_xy)
     diagonal = np.array([0.0, 1.0])
     if envelope:
-        draw("envelope", visuals.fill_between_y, lambda _, t: _band(t), color=GREY, alpha=0.4)
+        draw("envelope", visuals.fill_between_y, lambda _, t: _band(t), color="B3", alpha=0.4)
     draw("area", visuals.fill_between_y, lambda _, t: _between(t) | {"color": _color(t)}, alpha=0.4)
     draw("identity", visuals.line_xy, lambda _, t: {"x": diagonal, "y": diagonal}, color=INK, linestyle=DASHED)
     draw("ecdf", visuals.line_xy, lambda _, t: _ecdf(t) | {"color": _color(t)})

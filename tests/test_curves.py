@@ -41,8 +41,9 @@ def test_what_is_not_finite_is_missing_from_the_area() -> None:
 
 
 def test_rows_have_their_own_weights_and_values() -> None:
-    shared = np.broadcast_to(QUANTILES, (2, 1000))
-    tilted = np.exp(0.7 * QUANTILES)
+    mixed = np.random.default_rng(1).permutation(QUANTILES)
+    shared = np.broadcast_to(mixed, (2, 1000))
+    tilted = np.exp(0.7 * mixed)
     weights = np.stack([EQUAL, tilted / tilted.sum()])
     expected = stats.norm.cdf(GRID - np.array([[0], [0.7]]))
     np.testing.assert_allclose(curves.distribution_functions(shared, weights, GRID), expected, atol=6e-3)
@@ -227,7 +228,7 @@ def test_before_is_what_it_says() -> None:
     started = prb.minimize(model, start={"mu": -1.0, "sigma": 1.5})
     theta, text = read_before(started, evaluator, None)
     np.testing.assert_allclose(theta[0], [-1, np.log(1.5)])
-    assert text == "optimiser's start"
+    assert text == "optimiser's first point"
     theta, text = read_before(optimum, evaluator, {"mu": 2.0, "sigma": 1.0})
     np.testing.assert_allclose(theta, [[2, 0]])
     assert len(read_before(optimum, evaluator, False)[0]) == 0

@@ -199,6 +199,14 @@ def test_what_the_stored_responses_do_not_reach(caplog: pytest.LogCaptureFixture
         prb.plot_responses(far, model=optimum().model, backend="none")
 
 
+def test_a_narrow_peak_before_does_not_flatten_the_data() -> None:
+    pc = prb.plot_responses(optimum(), before={"mu": 1.0, "sigma": 0.05}, backend="matplotlib")
+    low, high = pc.viz["plot"]["y"].item().get_ylim()
+    assert high < 3
+    assert low < 0
+    assert xy(pc, "before", "y")[1].max() > high
+
+
 # -- population ------------------------------------------------------------------------------------------
 
 
@@ -326,6 +334,25 @@ def test_a_landscape_that_costs_responses_says_how_many() -> None:
     assert "landscape" in prb.plot_landscape(found, points=5, responses=1600, backend="none").viz
     with pytest.raises(KeyError, match=r"pair: got \['mu', 'nu'\], expected one or two of \['mu', 'sigma'\]"):
         prb.plot_landscape(found, pair=["mu", "nu"])
+
+
+def test_the_landscape_of_another_metric() -> None:
+    with pm.Model() as other:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
+        prb.Simulator("y", np.positive, x, metric=prb.ProbabilityResidual(), observed=OBSERVED)
+    pc = prb.plot_landscape(optimum(), model=other, pair="mu", points=9, backend="matplotlib")
+    x, y = xy(pc, "landscape", "landscape")
+    thetas = np.column_stack([x, np.full(x.size, optimum().theta[1])])
+    np.testing.assert_allclose(y, prb.population.Evaluator(other)(thetas).discrepancies[:, 0])
+    with pytest.raises(ValueError, match=r"got hyperparameters and simulators .* expected \['mu', 'sigma_log__'\]"):
+        prb.plot_landscape(optimum(), model=two())
+
+
+def two() -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.3)
+        prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=OBSERVED)
+    return model
 
 
 # -- stages, comparison ----------------------------------------------------------------------------------
