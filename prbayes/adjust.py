@@ -19,6 +19,7 @@ _FEWEST = 50  # draws of a mode below which it is left as it is
 _APART = 1.5  # ratio of distances to two modes below which a draw is between them
 _BETWEEN = 0.05  # share of such draws above which modes are not separate
 _FAR = 6.0  # standard deviations to which draws farther out are drawn in
+_WEAKEST = 2.0  # standard error, in units of the prior's spread, up to which refits follow a direction
 _WIDTH = 3.2  # of the middle 89% of a normal distribution, in standard deviations
 
 
@@ -30,7 +31,8 @@ class Affine:
     minimisers is the inverse of A, the (Godambe) information in the data, and their mean shift is the bias
     b of the minimiser. With prior mean :math:`\theta_0` and precision P the draws get covariance
     :math:`(A + P)^{-1}` and mean :math:`(A + P)^{-1} (A (\hat\theta - b) + P \theta_0)`, in the directions
-    about which the data tell more than the prior; along the others they keep their distribution given those.
+    about which the data tell at least a quarter of what the prior does; along the others they keep their distribution
+    given those.
 
     Parameters
     ----------
@@ -61,8 +63,9 @@ class Affine:
         evaluator, r = hood.evaluator, hood.sd.size
         (center,), _ = hood.refit(observed_set(evaluator))
         x, ok = hood.refit(simulated_sets(evaluator, hood.thetas(center), self.n_sets, self.seed))
-        information = np.linalg.inv(np.cov(x[ok], rowvar=False).reshape(r, r))
-        bias = x[ok].mean(axis=0) - center
+        x = _drawn_in(x[ok])
+        information = np.linalg.inv(np.cov(x, rowvar=False).reshape(r, r))
+        bias = x.mean(axis=0) - center
         prior, _ = hood.coordinates(evaluator.prior_thetas(1024, self.seed))
         precision = np.linalg.inv(np.cov(prior, rowvar=False).reshape(r, r))
         covariance = np.linalg.inv(information + precision)
@@ -89,7 +92,7 @@ class Affine:
         if reason:
             return thetas, f"none: {reason}"
         flat, scale = thetas.reshape(-1, thetas.shape[-1]), prior_scale(evaluator)
-        hoods = [Neighbourhood.of(evaluator, theta, evaluator.epsilon, scale) for theta in optima]
+        hoods = [Neighbourhood.of(evaluator, theta, evaluator.epsilon, scale, _WEAKEST) for theta in optima]
         hoods = [h for h in hoods if h.sd.size]
         if not hoods:
             return thetas, "none: the data tell less than the prior about every hyperparameter"
@@ -104,6 +107,7 @@ class Affine:
         for m, hood in enumerate(hoods):
             mine = nearest == m
             if mine.sum() >= _FEWEST:
+                hood = _among(hood, flat[mine])
                 x, rest = hood.coordinates(flat[mine])
                 out[mine] = moved(hood, x, rest, *self.target(hood))
                 far += int((_drawn_in(x) != x).any(axis=1).sum())
@@ -138,6 +142,20 @@ def moved(hood: Neighbourhood, x: Floats, rest: Floats, mean: Floats, covariance
     to = mean + (x - center) @ (inverse @ _root(root @ covariance @ root) @ inverse).T
     slopes = np.linalg.solve(now, (x - center).T @ (rest - rest.mean(axis=0)) / (len(x) - 1))
     return hood.thetas(to, rest + (to - x) @ slopes)
+
+
+def _among(hood: Neighbourhood, thetas: Floats) -> Neighbourhood:
+    """Return the neighbourhood at the median of draws, (n, d), along the blind directions.
+
+    The optimum is anywhere along them, where the prior may hardly be; refits hold them at one place.
+    """
+    local = hood.local
+    if not local.blind.size:
+        return hood
+    t = (np.median(thetas, axis=0) - hood.theta) / local.scale
+    place = hood.theta + (t - local.directions @ (local.directions.T @ t)) * local.scale
+    found = Neighbourhood.of(hood.evaluator, place, hood.scales, local.scale, _WEAKEST)
+    return found if found.sd.size == hood.sd.size else hood
 
 
 def _drawn_in(x: Floats) -> Floats:

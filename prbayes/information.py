@@ -244,7 +244,7 @@ class Local:
     scale : ndarray, shape (d,)
         The prior's spread.
     directions : ndarray, shape (d, r)
-        Orthonormal directions about which the data tell more than the prior.
+        Orthonormal directions about which the data tell enough, by default more than the prior.
     blind : ndarray, shape (d, d - r)
         The other directions.
     covariance : ndarray, shape (r, r)
@@ -265,8 +265,10 @@ class Local:
         return np.asarray(covariance)
 
 
-def local_sampling(parts: list[Information], scales: Floats) -> Local:
+def local_sampling(parts: list[Information], scales: Floats, weakest: float = 1.0) -> Local:
     """Return the sampling distribution of the minimiser of sum of d_k / scale_k.
+
+    Directions along which its standard error is above ``weakest``, in units of the prior's spread, are blind.
 
     Raises
     ------
@@ -285,15 +287,16 @@ def local_sampling(parts: list[Information], scales: Floats) -> Local:
             noise = unit * np.atleast_2d(np.cov(together, rowvar=False))
         else:
             noise = unit * sum(p.sampling_covariance / s**2 for p, s in zip(parts, scales, strict=True))
-        values, vectors, seen = seen_by_curvature(hessian, noise)
+        values, vectors, seen = seen_by_curvature(hessian, noise, weakest)
         inverse = vectors[:, seen] / values[seen]
         return Local(scale, vectors[:, seen], vectors[:, ~seen], inverse.T @ noise @ inverse)
-    seen_by = [
-        np.linalg.eigh(p.hessian * unit)[1][:, seen_by_curvature(p.hessian * unit, p.sampling_covariance * unit)[2]]
-        if m.smooth
-        else seen_by_area(p)
-        for p, m in zip(parts, metrics, strict=True)
-    ]
+    seen_by = []
+    for p, m in zip(parts, metrics, strict=True):
+        if m.smooth:
+            _, vectors, seen = seen_by_curvature(p.hessian * unit, p.sampling_covariance * unit, weakest)
+            seen_by.append(vectors[:, seen])
+        else:
+            seen_by.append(seen_by_area(p))
     left, strength, _ = np.linalg.svd(np.concatenate([np.zeros((len(unit), 1)), *seen_by], axis=1))
     rank = int((strength > 0.1).sum())
     basis, blind = left[:, :rank], left[:, rank:]
@@ -304,14 +307,14 @@ def local_sampling(parts: list[Information], scales: Floats) -> Local:
     return Local(scale, basis, blind, covariance)
 
 
-def seen_by_curvature(hessian: Floats, noise: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Return eigenvalues and eigenvectors of the Hessian, and along which the data tell more than the prior.
+def seen_by_curvature(hessian: Floats, noise: Floats, weakest: float = 1.0) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Return eigenvalues and eigenvectors of the Hessian, and along which the data tell enough.
 
-    Both matrices are in units of the prior's spread: there the estimator's variance has to be below one.
+    Both matrices are in units of the prior's spread: the standard error has to be below ``weakest``.
     """
     values, vectors = np.linalg.eigh((hessian + hessian.T) / 2)
     along = np.einsum("ik,ij,jk->k", vectors, noise, vectors)
     # Where the data see nothing both are rounding errors, and small against their ratio elsewhere.
     total = float(np.trace(hessian))
     floor = _ROUNDING * float(np.trace(noise)) / total if total > 0 else 0.0
-    return values, vectors, (values > floor) & (along < values**2)
+    return values, vectors, (values > floor) & (along < (weakest * values) ** 2)

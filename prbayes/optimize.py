@@ -259,7 +259,7 @@ def _warnings(evaluator: Evaluator, local: Local | None, others: list[Rival], er
     if local is not None:
         lines += [
             f"the data tell less than the prior about {direction} (in units of the priors' standard deviations): it is "
-            "not identified, and its posterior is its prior"
+            "not identified by them, and its posterior rests on the prior"
             for direction in blind_directions(local, evaluator.names)
         ]
     return tuple(lines)

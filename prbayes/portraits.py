@@ -56,7 +56,7 @@ def plot_responses(
         From `minimize`; or with a ``posterior`` group, from any sampler.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
-    before : dict or False, optional
+    before : dict or bool, optional
         Hyperparameters before the calibration, in the user's own units; False for none. By default the
         optimiser's first point, if it was given a start or did not look for one, and else the prior's initial point;
         the legend says which.

@@ -51,10 +51,12 @@ class Neighbourhood:
     sd: Floats
 
     @classmethod
-    def of(cls, evaluator: Evaluator, theta: Floats, scales: Floats, scale: Floats) -> Neighbourhood:
-        """Look around theta; ``scale`` is the prior's spread."""
+    def of(
+        cls, evaluator: Evaluator, theta: Floats, scales: Floats, scale: Floats, weakest: float = 1.0
+    ) -> Neighbourhood:
+        """Look around theta; ``scale`` is the prior's spread, ``weakest`` the largest standard error in units of it."""
         parts = [Information(evaluator, k, theta, scale) for k in range(len(evaluator.nodes))]
-        local = local_sampling(parts, scales)
+        local = local_sampling(parts, scales, weakest)
         values, vectors = np.linalg.eigh(local.covariance)
         return cls(
             evaluator, theta, scales, parts, local, local.directions @ vectors, np.sqrt(np.maximum(values, 1e-300))

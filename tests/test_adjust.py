@@ -153,6 +153,55 @@ def test_the_target_combines_data_and_prior() -> None:
     assert abs(float(idata.posterior["mu"].mean()) - expected) < 0.05
 
 
+# -- priors as tight as the data, and tighter ---------------------------------------------------------------
+
+
+@cache
+def with_prior(name: str, shift: float, tightness: float) -> tuple[Any, xr.Dataset]:
+    """Few data; the prior of mu has a mean and a spread in standard errors; infinitely tight, mu is a constant."""
+    few = np.random.default_rng(12).normal(1.0, 0.5, 10)
+    se = 0.5 / np.sqrt(10)
+    with pm.Model() as model:
+        mean = few.mean() + shift * se
+        mu = mean if np.isinf(tightness) else pm.Normal("mu", mean, se / tightness)
+        x = pm.Normal.dist(mu, pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", same, x, metric=METRICS[name], observed=few, propagation=R256)
+    return model, sample(model)["posterior"].to_dataset()
+
+
+@pytest.mark.parametrize("name", ["pr", "kl"])
+def test_the_posterior_changes_smoothly_as_the_prior_gets_as_tight_as_the_data(name: str) -> None:
+    found = [with_prior(name, 1.0, t)[1] for t in (0.7, 0.9, 1.1, 1.4)]
+    for variable, most in (("mu", 0.15), ("sigma", 0.08)):
+        sd = np.array([float(f[variable].std()) for f in found])
+        means = np.array([float(f[variable].mean()) for f in found])
+        assert np.abs(np.diff(np.log(sd))).max() < most + 0.1
+        assert np.abs(np.diff(means) / sd[1:]).max() < most + 0.1
+
+
+@pytest.mark.parametrize("name", ["pr", "kl", "area"])
+def test_a_prior_far_tighter_than_the_data_is_a_constant(name: str) -> None:
+    """The optimum is elsewhere along the blind direction, and what is seen has to be judged where the prior is."""
+    loose, fixed = (with_prior(name, 1.5, t)[1]["sigma"] for t in (5.0, np.inf))
+    assert abs(float(loose.mean() - fixed.mean())) < 0.3 * float(fixed.std())
+    assert float(loose.std()) == pytest.approx(float(fixed.std()), rel=0.2)
+
+
+def test_refits_that_ran_away_do_not_decide_the_width(monkeypatch: pytest.MonkeyPatch) -> None:
+    hood = blind_hood()
+    before = prb.Affine().target(hood)[1]
+    refit = Neighbourhood.refit
+
+    def some_lost(self: Neighbourhood, sets: Any) -> Any:
+        x, ok = refit(self, sets)
+        x[: len(x) // 100] -= 300.0
+        return x, ok
+
+    monkeypatch.setattr(Neighbourhood, "refit", some_lost)
+    after = prb.Affine().target(hood)[1]
+    np.testing.assert_allclose(np.sqrt(np.diag(after)), np.sqrt(np.diag(before)), rtol=0.3)
+
+
 # -- widths and centres ----------------------------------------------------------------------------------
 
 

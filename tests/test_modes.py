@@ -252,7 +252,7 @@ def test_a_hyperparameter_without_effect_is_named_and_makes_no_rivals() -> None:
     assert optimum.rivals == ()
     (line,) = optimum.warnings
     assert "about idle (" in line
-    assert line.endswith("it is not identified, and its posterior is its prior")
+    assert line.endswith("it is not identified by them, and its posterior rests on the prior")
 
 
 def test_rivals_stand_where_the_optimum_does_along_blind_directions() -> None:
