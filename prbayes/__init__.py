@@ -25,7 +25,8 @@ from prbayes.metrics import (
 from prbayes.nulls import ExactModel, PosteriorNull
 from prbayes.optimize import minimize
 from prbayes.optimum import Optimum
-from prbayes.plots import plot_validity
+from prbayes.plots import plot_comparison, plot_posterior, plot_validity
+from prbayes.portraits import plot_population, plot_responses
 from prbayes.predict import predict
 from prbayes.propagation import Fresh, Resimulated, Reweighted, monte_carlo, sobol
 from prbayes.refinement import DesignError, refine
@@ -36,6 +37,7 @@ from prbayes.smc import sample_smc
 from prbayes.store import StoreError
 from prbayes.surfaces import Polynomial, RadialBasis, SurrogateError
 from prbayes.surrogate import Surrogate
+from prbayes.trails import plot_landscape, plot_optimizer, plot_stages
 from prbayes.validity import ValidityTest, area_test, u_values
 
 __version__ = version("prbayes")
@@ -82,6 +84,13 @@ __all__ = [
     "held_out",
     "minimize",
     "monte_carlo",
+    "plot_comparison",
+    "plot_landscape",
+    "plot_optimizer",
+    "plot_population",
+    "plot_posterior",
+    "plot_responses",
+    "plot_stages",
     "plot_validity",
     "predict",
     "refine",

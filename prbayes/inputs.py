@@ -195,12 +195,13 @@ def log_density(inputs: Inputs, aleatory: Sequence[TensorVariable], values: Sequ
     """Return log p(x), shape (n,), of values x, shapes (n, *event), summed over the aleatory inputs."""
     total: Any = 0.0
     for dist, x, shape in zip(aleatory, values, inputs.event_shapes, strict=True):
-        logp = _mvnormal_logp(dist, x, shape[0]) if _is_mvnormal(dist) else pm.logp(dist, x, warn_rvs=False)
+        logp = _mvnormal_logp(dist, x, shape[0]) if is_mvnormal(dist) else pm.logp(dist, x, warn_rvs=False)
         total = total + (logp.sum(axis=tuple(range(1, logp.type.ndim))) if logp.type.ndim > 1 else logp)
     return total
 
 
-def _is_mvnormal(dist: TensorVariable) -> bool:
+def is_mvnormal(dist: TensorVariable) -> bool:
+    """Whether a distribution is a multivariate normal."""
     return isinstance(dist.owner.op, type(MvNormal.rv_op))
 
 
@@ -228,7 +229,7 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
     op = dist.owner.op
     if dist.dtype.startswith(("int", "uint", "bool")):
         raise TypeError(f"{name}: {op} is discrete; use propagation=prb.Reweighted() or prb.Fresh()")
-    if _is_mvnormal(dist):
+    if is_mvnormal(dist):
         mean, covariance = op.dist_params(dist.owner)
         z = pm.icdf(pm.Normal.dist(0.0, 1.0), u)
         return mean + z @ pt.linalg.cholesky(covariance).T

@@ -119,7 +119,7 @@ def predict(
     label = name or str(getattr(response, "__name__", type(response).__name__))
     if store is not None and name is None and not label.isidentifier():
         raise ValueError(f"name: got a store for a function called {label}, expected a name to keep its responses by")
-    points, coords = _populations(result, model, draws)
+    points, coords = populations_of(result, model, draws, "prb.predict")
     sorted_inputs = read_inputs(label, inputs, model)
     responses = Responses(label, response, sorted_inputs, executor=executor, store=store)
     rng = np.random.default_rng(random_seed)
@@ -157,7 +157,9 @@ def predict(
     )
 
 
-def _populations(result: Any, model: pm.Model, draws: int) -> tuple[dict[str, Floats], dict[str, NDArray[Any]]]:
+def populations_of(
+    result: Any, model: pm.Model, draws: int, caller: str
+) -> tuple[dict[str, Floats], dict[str, NDArray[Any]]]:
     """Return values of the free variables, (k, *shape) by name, and coordinates of chain and draw."""
     names = [str(rv.name) for rv in model.free_RVs]
     if isinstance(result, Optimum):
@@ -171,12 +173,12 @@ def _populations(result: Any, model: pm.Model, draws: int) -> tuple[dict[str, Fl
         coords = {dim: np.asarray(known[dim]) for dim in ("chain", "draw")}
     else:
         raise TypeError(
-            f"prb.predict: got {type(result).__name__}, expected an Optimum from prb.minimize, or a DataTree with a "
+            f"{caller}: got {type(result).__name__}, expected an Optimum from prb.minimize, or a DataTree with a "
             "posterior group, such as prb.sample_smc returns"
         )
     missing = [n for n in names if n not in known]
     if missing:
-        raise KeyError(f"prb.predict: got a result without {missing}, expected the model's free variables {names}")
+        raise KeyError(f"{caller}: got a result without {missing}, expected the model's free variables {names}")
     if isinstance(result, Optimum):
         return {n: np.asarray(known[n], dtype=np.float64)[None] for n in names}, coords
     arrays = {n: known[n].transpose("chain", "draw", ...).values for n in names}

@@ -18,7 +18,8 @@ ORDER = [
     "propagation", "resimulation", "design", "simulator", "surfaces", "region", "surrogate", "population",
     "resampling", "information", "descent", "refit", "modes", "refinement", "search", "optimum", "optimize", "epsilon",
     "adjust", "results", "bootstrap", "checkpoint", "kernel", "smc", "sbc", "diagnose", "compare", "heldout", "predict",
-    "nulls", "joint", "validity", "plots",
+    "nulls", "joint", "validity", "curves", "ensemble", "margins", "landscape", "canvas", "plots", "portraits",
+    "trails",
 ]  # fmt: skip
 
 # Upwards, inside a function or for types only, with the reason.

@@ -1,0 +1,128 @@
+"""Curves behind the pictures, as numbers: densities, distribution functions, bands, ticks of logarithms."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prbayes._arrays import Floats
+from prbayes.density import GaussianKDE, Histogram, silverman, weighted_quantile
+
+
+def typical_bandwidth(values: Floats, weights: Floats) -> float:
+    """Return the median of Silverman's bandwidths of weighted samples, shapes (P, n), leaving out what is not finite.
+
+    The effective number of values is that of the weights, so that uneven weights are smoothed more.
+    """
+    found = []
+    for row, w in zip(np.broadcast_to(values, weights.shape), weights, strict=True):
+        used = np.isfinite(row) & (w > 0)
+        if used.any():
+            found.append(silverman(row[used], w[used] / w[used].sum()))
+    return float(np.median(found)) if found else 0.0
+
+
+def densities(values: Floats, weights: Floats, grid: Floats, bandwidth: float) -> Floats:
+    """Return Gaussian kernel densities of weighted samples, shapes (..., n), on a grid, shape (g,): (..., g).
+
+    What is not finite keeps its weight and appears nowhere: the area under the curve is the share of the rest.
+    """
+    ends = np.array([grid[0], grid[-1]])
+    # Grids of kernels have a limited number of nodes.
+    cells = GaussianKDE(max(bandwidth, 2e-3 * float(np.ptp(ends)))).cells(ends, np.array([0.5, 0.5]))
+    found = cells.density(np.broadcast_to(values, weights.shape), weights)[..., : cells.centers.size]
+    at = np.clip(np.searchsorted(cells.centers, grid) - 1, 0, cells.centers.size - 2)
+    part = (grid - cells.centers[at]) / np.diff(cells.centers)[at]
+    return np.asarray(np.maximum(found[..., at] * (1 - part) + found[..., at + 1] * part, 0.0))
+
+
+def bounded_density(draws: Floats, grid: Floats) -> Floats:
+    """Return the density of draws, shape (n,), on a grid, zero outside their range and without a dip at its ends.
+
+    Draws are mirrored at the smallest and the largest, which matters where a bound of the support cuts the density.
+    """
+    low, high = float(draws.min()), float(draws.max())
+    mirrored = np.concatenate([draws, 2 * low - draws, 2 * high - draws])
+    h = silverman(draws, np.full(draws.size, 1 / draws.size))
+    if not h > 0:
+        return np.full(grid.shape, np.nan)
+    found = densities(mirrored, np.full(mirrored.size, 1 / draws.size), grid, h)
+    return np.where((grid >= low) & (grid <= high), found, 0.0)
+
+
+def distribution_functions(values: Floats, weights: Floats, grid: Floats) -> Floats:
+    """Return the weight of values not above each point of a grid: shapes (P, n), (P, n), (g,) -> (P, g)."""
+    rows = np.broadcast_to(values, weights.shape)
+    out = np.empty((len(weights), grid.size))
+    shared = values.ndim == 1 or values.strides[0] == 0
+    order: NDArray[np.intp] | None = None
+    for i, (row, w) in enumerate(zip(rows, weights, strict=True)):
+        if order is None or not shared:
+            order = np.argsort(row, kind="stable")  # NaN last, above everything
+            at = np.searchsorted(row[order], grid, side="right")
+        out[i] = np.concatenate([[0.0], np.cumsum(w[order])])[at]
+    return out
+
+
+def pointwise_band(curves: Floats, level: float) -> tuple[Floats, Floats]:
+    """Return the two sides between which the share ``level`` of curves, shape (P, g), lies at each point."""
+    low, high = np.quantile(curves, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    return low, high
+
+
+def central_range(values: Floats, weights: Floats, tail: float) -> tuple[float, float]:
+    """Return the quantiles at ``tail`` and ``1 - tail`` of weighted samples, (P, n), widest over the samples."""
+    ends = []
+    for row, w in zip(np.broadcast_to(values, weights.shape), weights, strict=True):
+        used = np.isfinite(row) & (w > 0)
+        if used.any():
+            share = w[used] / w[used].sum()
+            ends.append([weighted_quantile(row[used], share, p) for p in (tail, 1 - tail)])
+    found = np.array(ends)
+    return float(found[:, 0].min()), float(found[:, 1].max())
+
+
+def histogram(observed: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """Return the corners of a histogram's outline; its area is the share of values that are finite."""
+    finite = np.isfinite(observed)
+    values, w = observed[finite], weights[finite]
+    if not np.ptp(values) > 0:
+        middle, half = values[0], max(abs(values[0]), 1.0) / 100
+        return np.repeat([middle - half, middle + half], 2), np.array([0, 1, 1, 0]) * w.sum() / (2 * half)
+    cells = Histogram().cells(values, w / w.sum())
+    heights = cells.density(values, w)[:-2]
+    half = cells.widths[0] / 2
+    edges = np.append(cells.centers - half, cells.centers[-1] + half)
+    return np.repeat(edges, 2), np.concatenate([[0.0], np.repeat(heights, 2), [0.0]])
+
+
+def staircase(observed: Floats, weights: Floats, low: float, high: float) -> tuple[Floats, Floats]:
+    """Return the corners of the distribution function of weighted values, from ``low`` to ``high``."""
+    order = np.argsort(observed, kind="stable")
+    finite = np.isfinite(observed[order])
+    values, height = observed[order][finite], np.concatenate([[0.0], np.cumsum(weights[order])[finite]])
+    return np.concatenate([[low], np.repeat(values, 2), [high]]), np.repeat(height, 2)
+
+
+def normal_density(x: Floats, mean: float, sd: float) -> Floats:
+    """Return the density of a normal distribution."""
+    return np.asarray(np.exp(-0.5 * ((x - mean) / sd) ** 2) / (sd * np.sqrt(2 * np.pi)))
+
+
+def spans_decades(values: Floats) -> bool:
+    """Whether a logarithm shows values better: all positive, the largest more than twenty times the smallest."""
+    finite = values[np.isfinite(values)]
+    return bool(finite.size and finite.min() > 0 and finite.max() > 20 * finite.min())
+
+
+def log_ticks(values: Floats) -> tuple[list[float], list[str]]:
+    """Return positions, as base-10 logarithms, and labels of ticks for positive values: powers, or 1, 2, 5."""
+    finite = values[np.isfinite(values) & (values > 0)]
+    low, high = np.log10(finite.min()), np.log10(finite.max())
+    powers = np.arange(np.floor(low), np.ceil(high) + 1)
+    step = max(1, int(np.ceil(powers.size / 6)))
+    factors = (1, 2, 5) if high - low < 2 else (1,)
+    found = [(p + np.log10(f), f * 10.0**p) for p in powers[::step] for f in factors]
+    slack = 0.05 * (high - low) + 1e-9
+    kept = [(float(at), f"{value:g}") for at, value in found if low - slack <= at <= high + slack]
+    return [at for at, _ in kept], [text for _, text in kept]

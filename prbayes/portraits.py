@@ -1,0 +1,237 @@
+"""Pictures of the calibrated population: `plot_responses`, `plot_population`."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+
+from prbayes._arrays import Floats, positive_number
+from prbayes.canvas import BLUE, DASHED, GREY, INK, VERMILION, Canvas, named
+from prbayes.curves import (
+    central_range,
+    densities,
+    distribution_functions,
+    histogram,
+    pointwise_band,
+    staircase,
+    typical_bandwidth,
+)
+from prbayes.ensemble import Ensemble, read_before, read_result, supported
+from prbayes.margins import chosen, margin_densities, margins
+from prbayes.optimum import Optimum
+from prbayes.simulator import Node
+
+_log = logging.getLogger("prbayes")
+
+_GRID, _SOME = 257, 40  # points of a curve; populations that set the bandwidth
+
+
+def plot_responses(
+    result: Optimum | xr.DataTree,
+    *,
+    model: pm.Model | None = None,
+    before: Mapping[str, Any] | bool | None = None,
+    ecdf: bool = False,
+    level: float = 0.89,
+    draws: int | None = None,
+    labels: Mapping[str, str] | None = None,
+    backend: str | None = None,
+    **pc_kwargs: Any,
+) -> Any:
+    """Draw the responses before and after a calibration against the measured ones, one panel per simulator.
+
+    Measured responses are a histogram with a mark for each, or steps. The calibrated curve is the posterior
+    predictive distribution, or the optimum's population. The band holds the share ``level`` of the populations at
+    each response: those of the posterior's draws, or of the optimum's sampling distribution where it is known.
+
+    Parameters
+    ----------
+    result : Optimum or xarray.DataTree
+        From `minimize`; or with a ``posterior`` group, from any sampler.
+    model : pymc.Model, optional
+        That of the optimum, or the one on the context, by default.
+    before : dict or False, optional
+        Hyperparameters before the calibration, in the user's own units; False for none. By default the point that
+        the optimiser was started from, if it was given one, and else the prior's initial point; the legend says which.
+    ecdf : bool
+        Draw distribution functions, which need no bandwidth, in place of densities.
+    level : float
+    draws : int, optional
+        Number of populations in the band; 200 where they cost no response (`Reweighted`), 40 elsewhere, where each
+        costs n responses per simulator.
+    labels : mapping, optional
+        What a reader calls a simulator, by its name, with units: ``{"crack": "relative crack length"}``.
+    backend : {"matplotlib", "bokeh", "plotly"}, optional
+        That of ArviZ's settings by default.
+    **pc_kwargs
+        For ``arviz.PlotCollection.wrap``, such as ``figure_kwargs`` or ``col_wrap``.
+
+    Returns
+    -------
+    arviz.PlotCollection
+        Its ``viz`` has the artists ``measured``, ``rug`` (densities only), ``before``, ``band`` and ``after``.
+
+    Raises
+    ------
+    TypeError, KeyError, ValueError
+        If an argument is not as described, or the result lacks a free variable of the model.
+    DesignError
+        If stored responses do not support the populations.
+
+    Notes
+    -----
+    Densities of responses are Gaussian kernel densities with Silverman's bandwidth, widened where weights are
+    uneven. Specimens that failed (+inf) are missing from the area under a curve.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    >>> prb.plot_responses(prb.minimize(model), backend="none").viz["after"].name
+    'after'
+    """
+    _check_level(level)
+    shown = read_result(result, model, "prb.plot_responses", draws)
+    theta, what = read_before(result, shown.evaluator, before)
+    if len(theta) and not supported(shown.evaluator, theta)[0]:
+        _log.warning("plot_responses: before (%s): left out, because stored responses do not reach there", what)
+        theta = theta[:0]
+    center = shown.thetas[:0] if shown.center is None else shown.center
+    nodes = shown.evaluator.nodes
+    canvas = Canvas([n.name for n in nodes], size=(5.4, 4.2), backend=backend, pc_kwargs=pc_kwargs)
+    for k, node in enumerate(nodes):
+        earlier = shown.evaluator.populations(theta, k) if len(theta) else None
+        values, weights = shown.evaluator.populations(np.vstack([center, shown.thetas]), k)
+        low, high = _reach(node, values, weights, earlier)
+        grid = np.linspace(low, high, _GRID)
+        curves = distribution_functions(values, weights, grid) if ecdf else _density(values, weights, grid)
+        after, band = _middle_and_band(curves, len(center), level)
+        _measured(canvas, node, low, high, ecdf=ecdf)
+        if earlier is not None:
+            y = distribution_functions(*earlier, grid) if ecdf else _density(*earlier, grid)
+            canvas.line(node.name, "before", grid, y[0], VERMILION, style=DASHED, legend=f"before: {what}")
+        _calibrated(canvas, node.name, grid, after, band, shown, level)
+        title = named(node.name, labels)
+        canvas.axes(node.name, x=title, y="share of specimens" if ecdf else "density", xlim=(low, high))
+    return canvas.finish()
+
+
+def plot_population(
+    result: Optimum | xr.DataTree,
+    *,
+    model: pm.Model | None = None,
+    inputs: Sequence[Any] | None = None,
+    level: float = 0.89,
+    draws: int | None = None,
+    labels: Mapping[str, str] | None = None,
+    backend: str | None = None,
+    **pc_kwargs: Any,
+) -> Any:
+    """Draw the calibrated population of each aleatory input, with its uncertainty; of a multivariate one, its margins.
+
+    The curve is the posterior predictive density of the input, or its density at the optimum; the band holds
+    the share ``level`` of the densities at each value. It computes no response.
+
+    Parameters
+    ----------
+    result : Optimum or xarray.DataTree
+        From `minimize`; or with a ``posterior`` group, from any sampler.
+    model : pymc.Model, optional
+        That of the optimum, or the one on the context, by default.
+    inputs : sequence, optional
+        Names, or ``.dist()`` objects; all by default. An input is called as the response's argument that takes it.
+    level : float
+    draws : int, optional
+        Number of populations in the band; 200 by default.
+    labels : mapping, optional
+        What a reader calls an input, by its name, with units.
+    backend : {"matplotlib", "bokeh", "plotly"}, optional
+        That of ArviZ's settings by default.
+    **pc_kwargs
+        For ``arviz.PlotCollection.wrap``.
+
+    Returns
+    -------
+    arviz.PlotCollection
+        Its ``viz`` has the artists ``band`` and ``after``.
+
+    Raises
+    ------
+    TypeError, KeyError, ValueError
+        If an argument is not as described, there is no such input, or the result lacks a free variable.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+    ...     y = prb.Simulator("y", lambda load: 2 * load, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    >>> list(prb.plot_population(prb.minimize(model), backend="none").viz["after"])
+    ['load']
+    """
+    _check_level(level)
+    shown = read_result(result, model, "prb.plot_population", draws, free=True)
+    wanted = chosen(margins(shown.evaluator), inputs)
+    center = shown.thetas[:0] if shown.center is None else shown.center
+    found = margin_densities(shown.evaluator, wanted, np.vstack([center, shown.thetas]))
+    canvas = Canvas([m.name for m in wanted], size=(4.6, 3.9), backend=backend, pc_kwargs=pc_kwargs)
+    for margin in wanted:
+        grid, curves = found[margin.name]
+        after, band = _middle_and_band(curves, len(center), level)
+        _calibrated(canvas, margin.name, grid, after, band, shown, level)
+        y = "probability" if margin.discrete else "density"
+        canvas.axes(margin.name, x=named(margin.name, labels), y=y)
+    return canvas.finish()
+
+
+def _check_level(level: float) -> None:
+    if positive_number(level, "level") >= 1:
+        raise ValueError(f"level: got {level}, expected a number between 0 and 1")
+
+
+def _middle_and_band(curves: Floats, centers: int, level: float) -> tuple[Floats, tuple[Floats, Floats] | None]:
+    """Return the optimum's curve, or else the mean of the posterior's, and a band of the others."""
+    others = curves[centers:]
+    return curves[0] if centers else others.mean(axis=0), pointwise_band(others, level) if len(others) else None
+
+
+def _reach(node: Node, values: Floats, weights: Floats, earlier: tuple[Floats, Floats] | None) -> tuple[float, float]:
+    """Return what the axis covers: the data, the calibrated populations, and the earlier one unless it is far off."""
+    finite = node.target.observed[np.isfinite(node.target.observed)]
+    low, high = central_range(values, weights, 0.005)
+    low, high = min(low, finite.min()), max(high, finite.max())
+    if earlier is not None:
+        first, last = central_range(*earlier, 0.02)
+        low, high = max(min(first, low), low - (high - low)), min(max(last, high), high + (high - low))
+    margin = 0.03 * (high - low)
+    return float(low - margin), float(high + margin)
+
+
+def _density(values: Floats, weights: Floats, grid: Floats) -> Floats:
+    return densities(values, weights, grid, typical_bandwidth(values[:_SOME], weights[:_SOME]))
+
+
+def _calibrated(
+    canvas: Canvas, panel: str, grid: Floats, after: Floats, band: Any, shown: Ensemble, level: float
+) -> None:
+    if band is not None:
+        canvas.band(panel, "band", grid, band, BLUE, legend=f"{level:.0%} band of the {shown.spread}")
+    canvas.line(panel, "after", grid, after, BLUE, width=2.2, legend=f"calibrated: {shown.label}")
+
+
+def _measured(canvas: Canvas, node: Node, low: float, high: float, *, ecdf: bool) -> None:
+    observed, weights = node.target.observed, node.target.weights
+    text = f"measured ({observed.size})"
+    if ecdf:
+        canvas.line(node.name, "measured", *staircase(observed, weights, low, high), INK, width=1.4, legend=text)
+        return
+    x, y = histogram(observed, weights)
+    canvas.band(node.name, "measured", x, (np.zeros_like(y), y), GREY, legend=text)
+    canvas.points(node.name, "rug", observed[np.isfinite(observed)], 0.0, INK, marker="|", size=60)
