@@ -21,6 +21,8 @@ CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE)
 SOLID, DASHED, DOTTED, DASHDOT = "C0", "C1", "C2", "C3"
 CIRCLE, CROSS, DIAMOND = "C0", "C3", "C4"
 
+Ticks = tuple[Sequence[float], Sequence[str]]  # positions and labels
+
 
 def named(name: str, labels: Mapping[str, str] | None) -> str:
     """Return what a reader calls a variable: its label, that of the variable it is an element of, or its name."""
@@ -34,14 +36,16 @@ def grid_settings(
 ) -> dict[str, Any]:
     """Return keywords of `PlotCollection.wrap` for so many panels of a size in inches, one for each variable."""
     arviz: Any = import_module("arviz")
-    settings: dict[str, Any] = {"cols": ["__variable__"], "col_wrap": 3} | pc_kwargs
+    settings: dict[str, Any] = {"cols": ["__variable__"], "col_wrap": 2 if panels == 4 else 3} | pc_kwargs
     backend = backend or arviz.rcParams["plot.backend"]
     columns = min(panels, settings["col_wrap"])
-    width, height = size[0] * columns, size[1] * -(-panels // columns)
+    rows = -(-panels // columns)
+    width, height = size[0] * columns, size[1] * rows
     if backend == "matplotlib":
         figure: dict[str, Any] = {"figsize": (width, height), "figsize_units": "inches", "layout": "constrained"}
     else:
-        figure = {"figsize": (100 * width, 100 * height), "figsize_units": "dots"}
+        room = 70 * rows if backend == "bokeh" else 60  # for the legend, which bokeh has below each panel
+        figure = {"figsize": (100 * width, 100 * height + room), "figsize_units": "dots"}
     return settings | {"backend": backend, "figure_kwargs": figure | dict(settings.get("figure_kwargs", {}))}
 
 
@@ -119,12 +123,15 @@ class Canvas:
     ) -> None:
         """Draw markers."""
         x, y = np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(y))
+        size = size**0.5 if self.backend == "bokeh" else size  # a diameter there, an area elsewhere
         self._add(visual, panel, "scatter", x, y, color=color, marker=marker, size=size, legend=legend)
 
     def heights(self, panel: str, visual: str, axes: tuple[Floats, Floats], z: Floats, levels: Floats) -> None:
-        """Draw heights over a plane, z of shape (x, y): pale colours from dark to light, and contours."""
-        capped = np.minimum(z, levels[-1])
-        self._add(visual, panel, "contourf", *axes, capped, levels=levels, cmap="cividis", alpha=0.45)
+        """Draw heights over a plane, z of shape (x, y): pale colours from dark to light, and contours; even levels."""
+        how: dict[str, Any] = {"levels": levels, "cmap": "cividis", "alpha": 0.45}
+        if self.backend == "plotly":  # would choose levels of its own
+            how["contours"] = {"start": levels[0], "end": levels[-1], "size": levels[1] - levels[0]}
+        self._add(visual, panel, "contourf", *axes, np.minimum(z, levels[-1]), **how)
         self._add(f"{visual}_lines", panel, "contour", *axes, z, levels=levels[1:-1], color=GREY, alpha=0.6)
 
     def axes(
@@ -136,7 +143,8 @@ class Canvas:
         title: str = "",
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
-        yticks: tuple[Sequence[float], Sequence[str]] | None = None,
+        xticks: Ticks | None = None,
+        yticks: Ticks | None = None,
     ) -> None:
         """Name the axes of a panel, and say what they cover."""
         for function, text in (("title", title), ("xlabel", x), ("ylabel", y)):
@@ -145,8 +153,9 @@ class Canvas:
         for function, limits in (("xlim", xlim), ("ylim", ylim)):
             if limits is not None:
                 self._add(function, panel, function, limits)
-        if yticks is not None:
-            self._add("yticks", panel, "yticks", *map(list, yticks))
+        for function, ticks in (("xticks", xticks), ("yticks", yticks)):
+            if ticks is not None:
+                self._add(function, panel, function, *map(list, ticks))
 
     def finish(self) -> Any:
         """Draw everything, with a legend below the panels, and return the `PlotCollection`."""
@@ -157,7 +166,7 @@ class Canvas:
                 drawn = getattr(self._library, function)(*data, target, **how)
                 return None if isinstance(drawn, list) else drawn  # plotly's contours, one for each level
 
-            kept = visual not in {"title", "xlabel", "ylabel", "xlim", "ylim", "yticks"}
+            kept = visual not in {"title", "xlabel", "ylabel", "xlim", "ylim", "xticks", "yticks"}
             names = list(panels)
             self._collection.map(one, visual, data=self._collection.data[names], subset_info=True, store_artist=kept)
         if self._legend:
@@ -180,7 +189,7 @@ class Canvas:
     def _legend_plotly(self) -> None:
         figure = self._collection.viz["figure"].item()
         below = {"orientation": "h", "xanchor": "center", "x": 0.5, "yanchor": "bottom", "yref": "container", "y": 0.02}
-        figure.update_layout(legend=below, margin={"b": 110})
+        figure.update_layout(legend=below, margin={"l": 70, "r": 20, "t": 55, "b": 110})
 
     def _legend_bokeh(self) -> None:
         for target in self._targets():

@@ -71,29 +71,30 @@ def pointwise_band(curves: Floats, level: float) -> tuple[Floats, Floats]:
 
 
 def central_range(values: Floats, weights: Floats, tail: float) -> tuple[float, float]:
-    """Return the quantiles at ``tail`` and ``1 - tail`` of weighted samples, (P, n), widest over the samples."""
+    """Return the quantiles at ``tail`` and ``1 - tail`` of weighted samples, (P, n), wide enough for most of them."""
     ends = []
     for row, w in zip(np.broadcast_to(values, weights.shape), weights, strict=True):
         used = np.isfinite(row) & (w > 0)
         if used.any():
             share = w[used] / w[used].sum()
             ends.append([weighted_quantile(row[used], share, p) for p in (tail, 1 - tail)])
-    found = np.array(ends)
-    return float(found[:, 0].min()), float(found[:, 1].max())
+    low, high = np.array(ends).T
+    return float(np.quantile(low, 0.1)), float(np.quantile(high, 0.9))
 
 
 def histogram(observed: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Return the corners of a histogram's outline; its area is the share of values that are finite."""
+    """Return the corners of a histogram's bars, one after the other; their area is the share of finite values."""
     finite = np.isfinite(observed)
     values, w = observed[finite], weights[finite]
     if not np.ptp(values) > 0:
         middle, half = values[0], max(abs(values[0]), 1.0) / 100
-        return np.repeat([middle - half, middle + half], 2), np.array([0, 1, 1, 0]) * w.sum() / (2 * half)
+        return np.repeat([middle - half, middle + half], 2), np.array([0.0, 1.0, 1.0, 0.0]) * w.sum() / (2 * half)
     cells = Histogram().cells(values, w / w.sum())
     heights = cells.density(values, w)[:-2]
     half = cells.widths[0] / 2
     edges = np.append(cells.centers - half, cells.centers[-1] + half)
-    return np.repeat(edges, 2), np.concatenate([[0.0], np.repeat(heights, 2), [0.0]])
+    x = np.stack([edges[:-1], edges[:-1], edges[1:], edges[1:]], axis=1).ravel()
+    return x, (np.array([0.0, 1.0, 1.0, 0.0]) * heights[:, None]).ravel()
 
 
 def staircase(observed: Floats, weights: Floats, low: float, high: float) -> tuple[Floats, Floats]:
@@ -107,6 +108,15 @@ def staircase(observed: Floats, weights: Floats, low: float, high: float) -> tup
 def normal_density(x: Floats, mean: float, sd: float) -> Floats:
     """Return the density of a normal distribution."""
     return np.asarray(np.exp(-0.5 * ((x - mean) / sd) ** 2) / (sd * np.sqrt(2 * np.pi)))
+
+
+def round_ticks(low: float, high: float, most: int = 5) -> tuple[list[float], list[str]]:
+    """Return at most so many round numbers within a range, and their labels."""
+    raw = max(high - low, 1e-300) / most
+    power = 10.0 ** np.floor(np.log10(raw))
+    step = next(f * power for f in (1.0, 2.0, 2.5, 5.0, 10.0) if f * power >= raw)
+    found = step * np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1)
+    return [float(x) for x in found], [f"{0.0 if abs(x) < step / 2 else x:.12g}" for x in found]
 
 
 def spans_decades(values: Floats) -> bool:

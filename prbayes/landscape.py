@@ -99,8 +99,11 @@ def _stderr(optimum: Optimum, name: str) -> float:
     return float(np.asarray(optimum.stderr[stem])[index])
 
 
-def contour_levels(heights: Floats) -> Floats:
-    """Return levels that crowd towards the lowest height and stop where nine tenths of the plane are below."""
+def rooted(heights: Floats) -> tuple[Floats, float, float]:
+    """Return the root of heights over the lowest, in units of where nine tenths of the plane are below; and both.
+
+    Even levels of the root crowd towards the optimum, and are evenly spaced around it where it is a parabola.
+    """
     finite = heights[np.isfinite(heights)]
     low, high = float(finite.min()), float(np.quantile(finite, 0.9))
-    return low + max(high - low, 1e-12) * np.linspace(0, 1, 11) ** 2
+    return np.sqrt(np.maximum(heights - low, 0.0) / max(high - low, 1e-300)), low, high

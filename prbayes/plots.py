@@ -12,7 +12,7 @@ import xarray as xr
 
 from prbayes._arrays import Floats, positive_number
 from prbayes.canvas import BLUE, DASHED, DIAMOND, DOTTED, GREY, INK, VERMILION, Canvas, grid_settings, named
-from prbayes.curves import bounded_density, normal_density
+from prbayes.curves import bounded_density, normal_density, round_ticks
 from prbayes.optimum import Optimum
 from prbayes.population import Evaluator
 from prbayes.validity import ValidityTest
@@ -125,7 +125,7 @@ def plot_posterior(
             canvas.line(name, "stderr", ends, np.repeat(rows[1], 2), VERMILION, width=4)
         if best:
             canvas.points(name, "optimum", center, rows[1], VERMILION, marker=DIAMOND, size=50, legend="optimum")
-        canvas.axes(name, x=named(name, labels), y="density")
+        canvas.axes(name, x=named(name, labels), y="density", yticks=round_ticks(0.0, top))
     return canvas.finish()
 
 
@@ -191,6 +191,7 @@ def plot_comparison(
         panels = [str(n) for n, v in comparison.data_vars.items() if v.dims == ("result",) and n not in _TOLD]
         if not panels:
             raise ValueError("plot_comparison: got no scores, expected those of prb.compare(results, model=model)")
+    interval = f"{comparison.attrs.get('interval', 0.89):.0%} interval"
     height = 1.6 + 0.34 * len(results)
     canvas = Canvas(panels, size=(4.8, height), backend=backend, pc_kwargs=pc_kwargs)
     for name in panels:
@@ -200,13 +201,37 @@ def plot_comparison(
             canvas.points(name, "score", at[known], rows[known], BLUE, size=45)
         else:
             row = comparison.sel(hyperparameter=name)
+            first = row.estimate.values[:1]
+            if len(results) > 1:
+                text = f"estimate of {named(results[0], labels)}"
+                canvas.line(
+                    name,
+                    "first",
+                    np.repeat(first, 2),
+                    [-0.6, len(results) - 0.4],
+                    GREY,
+                    style=DOTTED,
+                    width=1.2,
+                    legend=text,
+                )
             for i, (low, high) in enumerate(zip(row.lower.values, row.upper.values, strict=True)):
                 if np.isfinite([low, high]).all():
-                    canvas.line(name, f"interval_{i}", [low, high], [rows[i]] * 2, BLUE, width=3)
-            canvas.points(name, "estimate", row.estimate.values, rows, INK, size=45)
-        title = "" if scores else f"estimate and {comparison.attrs.get('interval', 0.89):.0%} interval"
+                    canvas.line(name, f"interval_{i}", [low, high], [rows[i]] * 2, BLUE, width=3, legend=interval)
+            canvas.points(name, "estimate", row.estimate.values, rows, INK, size=45, legend="estimate")
+        known = comparison[name].values if scores else np.concatenate([row.lower, row.upper, row.estimate])
+        known = known[np.isfinite(known)]
+        low, high = (known.min(), known.max()) if known.size else (0.0, 1.0)
+        room = 0.06 * (high - low) or 0.01 * max(abs(low), 1.0)
+        limits = (float(low - room), float(high + room))
         ticks = (rows.tolist(), [named(r, labels) for r in results])
-        canvas.axes(name, x=named(name, labels), title=title, yticks=ticks, ylim=(-0.6, len(results) - 0.4))
+        canvas.axes(
+            name,
+            x=named(name, labels),
+            xlim=limits,
+            xticks=round_ticks(*limits),
+            yticks=ticks,
+            ylim=(-0.6, len(results) - 0.4),
+        )
     return canvas.finish()
 
 

@@ -118,8 +118,9 @@ def plot_responses(
             y = distribution_functions(*earlier, grid) if ecdf else _density(*earlier, grid)
             canvas.line(node.name, "before", grid, y[0], VERMILION, style=DASHED, legend=f"before: {what}")
         _calibrated(canvas, node.name, grid, after, band, shown, level)
-        title = named(node.name, labels)
-        canvas.axes(node.name, x=title, y="share of specimens" if ecdf else "density", xlim=(low, high))
+        count = f"{node.target.observed.size} measured values"
+        y_axis = "share of specimens" if ecdf else "density"
+        canvas.axes(node.name, x=named(node.name, labels), y=y_axis, title=count, xlim=(low, high))
     return canvas.finish()
 
 
@@ -208,8 +209,9 @@ def _reach(node: Node, values: Floats, weights: Floats, earlier: tuple[Floats, F
     low, high = central_range(values, weights, 0.005)
     low, high = min(low, finite.min()), max(high, finite.max())
     if earlier is not None:
-        first, last = central_range(*earlier, 0.02)
-        low, high = max(min(first, low), low - (high - low)), min(max(last, high), high + (high - low))
+        first, last = central_range(*earlier, 0.05)
+        room = (high - low) / 2
+        low, high = max(min(first, low), low - room), min(max(last, high), high + room)
     margin = 0.03 * (high - low)
     return float(low - margin), float(high + margin)
 
@@ -228,10 +230,10 @@ def _calibrated(
 
 def _measured(canvas: Canvas, node: Node, low: float, high: float, *, ecdf: bool) -> None:
     observed, weights = node.target.observed, node.target.weights
-    text = f"measured ({observed.size})"
     if ecdf:
-        canvas.line(node.name, "measured", *staircase(observed, weights, low, high), INK, width=1.4, legend=text)
+        canvas.line(node.name, "measured", *staircase(observed, weights, low, high), INK, width=1.4, legend="measured")
         return
     x, y = histogram(observed, weights)
-    canvas.band(node.name, "measured", x, (np.zeros_like(y), y), GREY, legend=text)
+    canvas.band(node.name, "measured", x, (np.zeros_like(y), y), GREY, legend="measured")
+    canvas.line(node.name, "bars", x, y, GREY, width=0.7)
     canvas.points(node.name, "rug", observed[np.isfinite(observed)], 0.0, INK, marker="|", size=60)

@@ -26,7 +26,7 @@ from prbayes.canvas import (
     named,
 )
 from prbayes.curves import log_ticks, spans_decades
-from prbayes.landscape import Landscape, contour_levels, elements, landscape
+from prbayes.landscape import Landscape, elements, landscape, rooted
 from prbayes.optimum import Optimum
 from prbayes.population import Evaluator
 
@@ -49,7 +49,9 @@ def plot_optimizer(
 
     The first panel has the objective, the sum of d_k / s_k, of each point and the lowest so far, with logarithmic
     ticks where it falls over more than a decade; a panel for each hyperparameter follows, in the user's own units,
-    with the optimum as a dashed line.
+    with the optimum as a dashed line. With `Reweighted` the objective is that of the final design and scales,
+    evaluated anew without a response; elsewhere it is what the optimiser saw, and with several simulators, whose
+    scales may have changed on the way, nothing says which was lowest.
 
     Parameters
     ----------
@@ -82,7 +84,10 @@ def plot_optimizer(
     ['discrepancy', 'mu']
     """
     _check_optimum(optimum, "plot_optimizer")
-    values, x = optimum.trace["discrepancy"], optimum.trace["evaluations"].astype(np.float64)
+    evaluator, x = optimum.evaluator, optimum.trace["evaluations"].astype(np.float64)
+    scales = np.array([optimum.scales[n.name] for n in evaluator.nodes])
+    free = not evaluator.responses_per_theta
+    values = evaluator.total(optimum.trace["theta"], scales) if free else optimum.trace["discrepancy"]
     path = elements(optimum.evaluator, optimum.trace["theta"])
     canvas = Canvas(["discrepancy", *path], size=(4.6, 3.4), backend=backend, pc_kwargs=pc_kwargs)
     shown = np.where(np.isfinite(values), values, np.nan)
@@ -92,7 +97,8 @@ def plot_optimizer(
         shown, best = np.log10(shown), np.log10(best)
     known = np.isfinite(shown)
     canvas.points("discrepancy", "asked", x[known], shown[known], GREY, size=16, legend="evaluated")
-    canvas.line("discrepancy", "best", x[known], best[known], BLUE, legend="lowest so far")
+    if free or len(scales) == 1:
+        canvas.line("discrepancy", "best", x[known], best[known], BLUE, legend="lowest so far")
     canvas.axes("discrepancy", x="evaluations", y=_objective(optimum), yticks=ticks)
     ends = np.array([x[0], x[-1]])
     for name, at in path.items():
@@ -117,9 +123,10 @@ def plot_landscape(
 ) -> Any:
     """Draw the objective over two hyperparameters around the optimum, with the optimiser's path and other optima.
 
-    Darker is lower; contours crowd towards the optimum. With one hyperparameter, or one name, it is a curve. All other
-    hyperparameters stand at the optimum, as the title says. Where stored responses do not support a
-    population the picture is blank.
+    Darker is lower; contours are at even steps of the root of the objective over its lowest value, so that they crowd
+    towards the optimum; the title has the values at the ends. With one hyperparameter, or one name, it is a curve. All
+    other hyperparameters stand at the optimum, as the title says. Where stored responses do not support a population
+    the picture is blank.
 
     Parameters
     ----------
@@ -187,14 +194,14 @@ def plot_landscape(
         _curve(canvas, found, alone=not rest)
         y = _objective(optimum)
     else:
-        levels = contour_levels(found.heights)
-        canvas.heights("landscape", "landscape", (found.axes[0], found.axes[1]), found.heights, levels)
+        roots, low, high = rooted(found.heights)
+        canvas.heights("landscape", "landscape", (found.axes[0], found.axes[1]), roots, np.linspace(0, 1, 11))
         x, y = found.path.T
         canvas.line("landscape", "path", x, y, INK, width=1.0)
         canvas.points("landscape", "asked", x, y, INK, size=14, legend="path of the optimiser")
         _marks(canvas, found.optimum.T, found.rivals.T)
         y = named(wanted[1], labels)
-        held = f"{_objective(optimum)} from {levels[0]:.3g} (dark)" + (f"; {held}" if held else "")
+        held = "\n".join([f"{_objective(optimum)}: {low:.3g} dark, {high:.3g} light", *([held] if held else [])])
     canvas.axes(
         "landscape",
         x=named(wanted[0], labels),
@@ -239,6 +246,7 @@ def plot_stages(
 ) -> Any:
     """Draw the stages of a sequential Monte Carlo run, one line per chain and one panel per statistic.
 
+    A statistic that is known at the end only, such as the log marginal likelihood, stands against the chain.
     Beta goes from the prior, 0, to the posterior, 1; chains that need very different numbers of stages, or whose log
     marginal likelihoods end far apart, have not seen the same posterior.
 
@@ -280,18 +288,28 @@ def plot_stages(
     stats = {str(n): v for n, v in posterior["sample_stats"].data_vars.items() if set(v.dims) == {"chain", "stage"}}
     if not stats:
         raise ValueError("plot_stages: got sample_stats without dims (chain, stage), expected those of prb.sample_smc")
-    pc_kwargs = {"col_wrap": 2} | pc_kwargs
-    canvas = Canvas(list(stats), size=(4.6, 3.4), backend=backend, pc_kwargs=pc_kwargs)
-    for name, values in stats.items():
-        rows = np.asarray(values.transpose("chain", "stage"), dtype=np.float64)
+    tables = {n: np.asarray(v.transpose("chain", "stage"), dtype=np.float64) for n, v in stats.items()}
+    single = {name: bool((np.isfinite(rows).sum(axis=1) <= 1).all()) for name, rows in tables.items()}
+    names = sorted(stats, key=lambda name: single[name])
+    canvas = Canvas(names, size=(4.6, 3.4), backend=backend, pc_kwargs=pc_kwargs)
+    for name in names:
+        rows, once, values = tables[name], single[name], stats[name]
         ticks = log_ticks(rows) if name == "beta" and spans_decades(rows) else None
         for c, (chain, row) in enumerate(zip(values.chain.values, rows, strict=True)):
             known = np.isfinite(row)
             y = np.log10(row[known]) if ticks is not None else row[known]
-            x, color = np.flatnonzero(known) + 1.0, CYCLE[c % len(CYCLE)]
-            style = (SOLID, DASHED, DOTTED, DASHDOT)[c % 4]
-            canvas.line(name, f"chain_{chain}", x, y, color, style=style, legend=f"chain {chain}")
-        canvas.axes(name, x="stage", y=named(name, _STAGES | dict(labels or {})), yticks=ticks)
+            color, style = CYCLE[c % len(CYCLE)], (SOLID, DASHED, DOTTED, DASHDOT)[c % 4]
+            if once:
+                canvas.points(name, f"chain_{chain}", [c + 1.0], y[-1:], color, size=45)
+            else:
+                x = np.flatnonzero(known) + 1.0
+                canvas.line(name, f"chain_{chain}", x, y, color, style=style, legend=f"chain {chain}")
+        count = len(rows) if once else rows.shape[1]
+        whole = np.arange(1, count + 1, max(1, -(-count // 10)))
+        x_axis = "chain" if once else "stage"
+        numbers = (whole.tolist(), [str(values.chain.values[i - 1] if once else i) for i in whole])
+        y_axis = named(name, _STAGES | dict(labels or {}))
+        canvas.axes(name, x=x_axis, y=y_axis, xticks=numbers, yticks=ticks)
     return canvas.finish()
 
 
