@@ -15,15 +15,14 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import os
 import resource
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from benchmarks.processes import child
 
 N = 50
 SIZES = (1_000, 10_000, 100_000, 1_000_000, 10_000_000)
@@ -127,21 +126,6 @@ def tasks(size: int) -> dict[str, float]:
     return {"seconds a task": spent / size, "bytes a task": len(task), "MiB more": peak() - before, "tasks": size}
 
 
-def child(kind: str, metric: str, size: int) -> dict[str, float]:
-    """Measure in a process of its own."""
-    done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.scale", "--child", kind, metric, str(size)],
-        env=os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        raise RuntimeError(done.stderr[-2000:])
-    found: dict[str, float] = json.loads(done.stdout.strip().splitlines()[-1])
-    return found
-
-
 def main() -> None:
     """Run everything, print a table and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -161,7 +145,12 @@ def main() -> None:
         for metric in METRICS:
             last = np.nan
             for size in SIZES if kind == "n resimulated" else SIZES[:-1] if kind == "n reweighted" else PARTICLES:
-                found: dict[str, Any] = {"kind": kind, "metric": metric, "size": size, **child(kind, metric, size)}
+                found: dict[str, Any] = {
+                    "kind": kind,
+                    "metric": metric,
+                    "size": size,
+                    **child("benchmarks.scale", kind, metric, str(size)),
+                }
                 found["growth"] = found["s"] / last
                 last = found["s"]
                 table.append(found)
@@ -173,7 +162,7 @@ def main() -> None:
                 )
     print(f"importing takes {np.median([row['import MiB'] for row in table if 'import MiB' in row]):.0f} MiB")
     for size in TASKS if only in (None, "tasks") else ():
-        found = {"kind": "tasks", **child("tasks", "-", size)}
+        found = {"kind": "tasks", **child("benchmarks.scale", "tasks", "-", str(size))}
         table.append(found)
         print(
             f"{size} tasks: {1e3 * found['seconds a task']:.2f} ms and {found['bytes a task']} bytes each, "

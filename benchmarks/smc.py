@@ -14,9 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
-import sys
 import tempfile
 import time
 from contextlib import suppress
@@ -25,6 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from benchmarks.processes import child
 
 N = 50
 LEVELS = (np.arange(N) + 0.5) / N
@@ -291,25 +290,6 @@ def slow(system: str) -> dict[str, float]:
     return {"share of the time inside the response": share}
 
 
-def child(*arguments: str, cold: bool = False) -> dict[str, Any]:
-    """Run this module in a process of its own and return what it prints."""
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    with tempfile.TemporaryDirectory() as folder:
-        if cold:
-            environment["PYTENSOR_FLAGS"] = f"base_compiledir={folder}"
-        done = subprocess.run(
-            [sys.executable, "-m", "benchmarks.smc", "--child", *arguments],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-    if done.returncode:
-        raise RuntimeError(done.stderr[-2000:])
-    found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
-    return found
-
-
 def main() -> None:
     """Run everything, print a table and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -328,10 +308,10 @@ def main() -> None:
     for problem in PROBLEMS:
         reference = exact(problem)
         for system in [s for s in SYSTEMS if arguments.only in (None, s)]:
-            runs = [child(system, problem) for _ in range(arguments.runs)]
+            runs = [child("benchmarks.smc", system, problem) for _ in range(arguments.runs)]
             found = runs[0] | {k: float(np.median([r[k] for r in runs])) for k in runs[0] if "wall" in k or "cpu" in k}
             if system in ("reweighted", "resimulated"):
-                found["wall, cold"] = child(system, problem, cold=True)["wall"]
+                found["wall, cold"] = child("benchmarks.smc", system, problem, cold=True)["wall"]
             off = [(found[f"{n} mean"] - reference[f"{n} mean"]) / reference[f"{n} sd"] for n in ("mu", "sigma")]
             ratio = [found[f"{n} sd"] / reference[f"{n} sd"] for n in ("mu", "sigma")]
             found |= {"mean off": off, "sd ratio": ratio}
@@ -347,7 +327,7 @@ def main() -> None:
                 flush=True,
             )
     if arguments.only in (None, "10ms"):
-        table["10 ms"] = {system: child(system) for system in ("reweighted", "resimulated")}
+        table["10 ms"] = {system: child("benchmarks.smc", system) for system in ("reweighted", "resimulated")}
         print("response of 10 ms, two workers:", table["10 ms"])
     arguments.out.write_text(json.dumps(table, indent=1) + "\n")
 

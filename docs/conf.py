@@ -16,6 +16,7 @@ extensions = [
     "numpydoc",
     "myst_nb",
 ]
+templates_path = ["_templates"]
 exclude_patterns = ["_build", "inventories"]
 html_theme = "furo"
 html_title = "prbayes"
@@ -25,6 +26,7 @@ html_css_files = ["prbayes.css"]
 # Pages are notebooks: a page whose code fails stops the build. Results are kept, so that only changed pages run again.
 nb_execution_mode = "cache"
 nb_execution_raise_on_error = True
+nb_execution_show_tb = True
 nb_execution_timeout = 600
 nb_merge_streams = True
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
@@ -32,9 +34,20 @@ myst_heading_anchors = 4
 
 autosummary_generate = True
 autodoc_typehints = "none"  # numpydoc's parameter sections say it
-autodoc_default_options = {"members": True, "inherited-members": False}
 numpydoc_show_class_members = False
-numpydoc_xref_param_type = False
+numpydoc_xref_param_type = True
+numpydoc_xref_ignore = "all"  # but these
+numpydoc_xref_aliases = {name: f"prbayes.{name}" for name in prbayes.__all__} | {
+    "Executor": "concurrent.futures.Executor",
+    "array_like": "numpy.typing.ArrayLike",
+    "bool": "bool",
+    "sequence": "collections.abc.Sequence",
+    "Sequence": "collections.abc.Sequence",
+    "ndarray": "numpy.ndarray",
+}
+default_role = "py:obj"
+nitpicky = True
+nitpick_ignore_regex = [("py:obj", r"prbayes\.\w+\.\w+")]  # attributes are listed with their class
 
 # Names of other projects that these pages refer to, in files kept here: the documentation builds without a network.
 intersphinx_mapping = {

@@ -40,7 +40,7 @@ class Affine:
 
     References
     ----------
-    .. [1] B. A. Shaby (2014), The open-faced sandwich adjustment for MCMC using estimating functions,
+    .. [1] Shaby, B. A. (2014), The open-faced sandwich adjustment for MCMC using estimating functions,
        J. Comput. Graph. Stat. 23, 853-876, doi:10.1080/10618600.2013.842174.
 
     Examples

@@ -12,12 +12,15 @@ from prbayes.adjust import inapplicable
 from prbayes.information import prior_scale
 from prbayes.modes import blind_directions
 from prbayes.optimum import Optimum
+from prbayes.progress import shown
 from prbayes.refit import Neighbourhood
 from prbayes.resampling import reweighted_sets, simulated_sets
 from prbayes.results import bootstrap_tree
 
 
-def bootstrap(optimum: Optimum, draws: int = 1000, *, parametric: bool = False, random_seed: int = 0) -> xr.DataTree:
+def bootstrap(
+    optimum: Optimum, draws: int = 1000, *, parametric: bool = False, random_seed: int = 0, progressbar: bool = True
+) -> xr.DataTree:
     """Minimise the discrepancy once for each of many data sets that resemble the observed one.
 
     By default the observed specimens get Dirichlet weights: the loss-likelihood bootstrap, whose minimisers
@@ -35,6 +38,8 @@ def bootstrap(optimum: Optimum, draws: int = 1000, *, parametric: bool = False, 
     draws : int
     parametric : bool
     random_seed : int
+    progressbar : bool
+        Whether work of more than two seconds shows a bar on stderr.
 
     Returns
     -------
@@ -52,7 +57,7 @@ def bootstrap(optimum: Optimum, draws: int = 1000, *, parametric: bool = False, 
 
     References
     ----------
-    .. [1] S. P. Lyddon, C. C. Holmes and S. G. Walker (2019), General Bayesian updating and the
+    .. [1] Lyddon, S. P., C. C. Holmes and S. G. Walker (2019), General Bayesian updating and the
        loss-likelihood bootstrap, Biometrika 106, 465-478, doi:10.1093/biomet/asz006.
 
     Examples
@@ -84,7 +89,8 @@ def bootstrap(optimum: Optimum, draws: int = 1000, *, parametric: bool = False, 
         data = simulated_sets(evaluator, optimum.theta, draws, random_seed)
     else:
         data = reweighted_sets(evaluator, draws, random_seed)
-    x, converged = hood.refit(data)
+    with shown(progressbar):
+        x, converged = hood.refit(data)
     return bootstrap_tree(
         evaluator,
         hood.thetas(x)[None],

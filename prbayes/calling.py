@@ -7,17 +7,14 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
 from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.errors import LiveError
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from prbayes._arrays import Floats
 from prbayes.failures import Abort, OnFailure, Replace, Retry
+from prbayes.progress import progress
 from prbayes.store import Store
 
 _log = logging.getLogger("prbayes")
@@ -25,7 +22,6 @@ _log = logging.getLogger("prbayes")
 _CHUNK_SECONDS = 0.2  # that a task should take: long against sending it, short against losing it
 _ALONE_SECONDS = 0.01  # from which a response of one specimen at a time is a task of its own
 _MANY = 1024  # tasks sent out to an executor that does not tell how many workers it has
-_SHOWN_FROM = 2.0  # expected seconds from which there is a progress bar
 
 
 class ResponseError(RuntimeError):
@@ -187,7 +183,7 @@ class Caller:
         begun: dict[Future[Any], Any] = {}
         at = 0
         error: BaseException | None = None
-        with _progress(self.name, missing.size) as report:
+        with progress(f"responses of {self.name}", missing.size) as report:
             while at < missing.size or begun:
                 while at < missing.size and len(begun) < self._window:
                     rows = missing[at : at + self._chunk(missing.size - at)]
@@ -217,7 +213,7 @@ class Caller:
         self.count += rows.size
         cost = seconds / rows.size
         self._cost = cost if self._cost == 0 else 0.7 * self._cost + 0.3 * cost
-        report(rows.size, self._cost / self._workers)
+        report(rows.size, f"{self._workers / max(self._cost, 1e-9):.3g}/s")
         return rows, values, messages
 
     def _chunk(self, left: int) -> int:
@@ -325,34 +321,3 @@ def _unpacked(payload: bytes) -> Callable[..., Any]:
 
 def _remote(payload: bytes, *job: Any) -> tuple[Floats, dict[int, str], float]:
     return _compute(_unpacked(payload), *job)
-
-
-@contextmanager
-def _progress(name: str, total: int) -> Iterator[Callable[[int, float], None]]:
-    """Give a function (done, seconds for each) that shows a bar once the batch turns out to be long."""
-    columns = (
-        TextColumn(f"responses of {name}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeRemainingColumn(),
-    )
-    bar = Progress(*columns, console=Console(stderr=True))
-    task = bar.add_task("", total=total, rate="")
-    started = False
-
-    def report(done: int, each: float) -> None:
-        nonlocal started
-        bar.update(task, advance=done, rate=f"{1 / max(each, 1e-9):.3g}/s")
-        if not started and each * (total - done) > _SHOWN_FROM:
-            started = True
-            try:
-                bar.start()
-            except LiveError:  # there is one already, of whatever this is part of
-                _log.debug("%s: no second progress bar", name)
-
-    try:
-        yield report
-    finally:
-        if started:
-            bar.stop()

@@ -49,7 +49,7 @@ def silverman(sample: Floats, weights: Floats) -> float:
 
     References
     ----------
-    .. [1] B. W. Silverman (1986), Density Estimation for Statistics and Data Analysis, eq. 3.31.
+    .. [1] Silverman, B. W. (1986), Density Estimation for Statistics and Data Analysis, eq. 3.31.
 
     Examples
     --------
@@ -106,7 +106,7 @@ class GaussianKDE(DensityEstimator):
     References
     ----------
     .. [1] Oh et al. (2019), eq. 9, doi:10.1007/s00158-019-02288-6.
-    .. [2] P. Hall and M. P. Wand (1996), On the accuracy of binned kernel density estimators,
+    .. [2] Hall, P. and M. P. Wand (1996), On the accuracy of binned kernel density estimators,
        J. Multivariate Anal. 56, 165-184.
 
     Examples

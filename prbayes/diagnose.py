@@ -71,7 +71,7 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
 
     References
     ----------
-    .. [1] A. Vehtari, A. Gelman, D. Simpson, B. Carpenter and P.-C. Buerkner (2021), Rank-normalization, folding, and
+    .. [1] Vehtari, A., A. Gelman, D. Simpson, B. Carpenter and P.-C. Buerkner (2021), Rank-normalization, folding, and
        localization: an improved R-hat, Bayesian Analysis 16(2), 667-718, doi:10.1214/20-BA1221.
 
     Examples

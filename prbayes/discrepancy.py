@@ -1,6 +1,6 @@
 """What a calibration metric is: a linear map of the weights of the simulated responses, then an outer function.
 
-`Metric` is configuration; ``metric.against(observed)`` prepares a `Discrepancy`, which holds the observed side.
+`Metric` is configuration; ``metric.against(observed)`` prepares a ``Discrepancy``, which holds the observed side.
 The linear map gives a density on cells, or a difference of distribution functions; the *outer* function takes
 the array namespace, so that the direct call, the optimiser's gradient and the compiled graph of a PyMC model
 run through the same lines.
@@ -110,9 +110,9 @@ def product(weights: Floats, matrix: Floats) -> Floats:
 
 
 class Metric(ABC):
-    """A calibration metric; `against` prepares the observed side once.
+    """A calibration metric; ``against`` prepares the observed side once.
 
-    A new metric defines ``_prepare(observed, weights)``, which returns a `Discrepancy`.
+    A new metric defines ``_prepare(observed, weights)``, which returns a ``Discrepancy``.
 
     Attributes
     ----------

@@ -43,9 +43,9 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
 
     References
     ----------
-    .. [1] B. A. Shaby (2014), The open-faced sandwich adjustment for MCMC using estimating functions,
+    .. [1] Shaby, B. A. (2014), The open-faced sandwich adjustment for MCMC using estimating functions,
        J. Comput. Graph. Stat. 23, 853-876.
-    .. [2] N. Syring and R. Martin (2019), Calibrating general posterior credible regions, Biometrika 106,
+    .. [2] Syring, N. and R. Martin (2019), Calibrating general posterior credible regions, Biometrika 106,
        479-486, doi:10.1093/biomet/asy054.
 
     Examples

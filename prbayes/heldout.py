@@ -46,7 +46,7 @@ def held_out(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) -> xr.Da
 
     References
     ----------
-    .. [1] S. Geisser (1975), The predictive sample reuse method with applications, J. Am. Stat. Assoc. 70, 320-328,
+    .. [1] Geisser, S. (1975), The predictive sample reuse method with applications, J. Am. Stat. Assoc. 70, 320-328,
        doi:10.1080/01621459.1975.10479865.
 
     Examples

@@ -1,6 +1,6 @@
 """Calibration metrics: how much the simulated responses disagree with the measured ones. Smaller is better.
 
-A new metric is a `Metric` with ``_prepare`` and a `Discrepancy` with ``outer``: this file is all it touches.
+A new metric is a `Metric` with ``_prepare`` and a ``Discrepancy`` with ``outer``: this file is all it touches.
 
 References
 ----------
@@ -113,7 +113,7 @@ class KullbackLeibler(Metric):
     r"""Kullback-Leibler divergence between the observed density q and the simulated density p.
 
     Forward (default): :math:`\int q \log(q / p)\,dz`; reverse: :math:`\int p \log(p / q)\,dz`. Both
-    densities have the same bandwidth and the floor of `DensityDiscrepancy.floored`; the reverse one
+    densities have the same bandwidth and the floor of ``DensityDiscrepancy.floored``; the reverse one
     depends on it, because the observed density vanishes quickly outside the data.
 
     Eq. 4 of [1]_ as printed, :math:`\sum_i p(z_i) \log(p(z_i)/q(z_i))` over the observed points with p

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._arrays import Floats, positive_integer
+from prbayes.progress import progress
 
 _BLOCK = 1 << 22  # u-values held at a time
 _ENVELOPED = 999  # replicates from which an envelope is made
@@ -189,10 +190,12 @@ class SimulatedNull(Null):
         """Count the observed data among the replicates: p = (1 + number as large) / (1 + number)."""
         some: Floats | None = None
         parts = []
-        for u in self.replicates_of(case):
-            tested = case.tested(u)
-            some = tested[:_ENVELOPED] if some is None else some
-            parts.append(area(tested))
+        with progress("replicates") as report:
+            for u in self.replicates_of(case):
+                tested = case.tested(u)
+                some = tested[:_ENVELOPED] if some is None else some
+                parts.append(area(tested))
+                report(len(tested), "")
         assert some is not None
         found = np.sort(np.concatenate(parts))
         allowed = int(np.floor(level * (found.size + 1) + 1e-9)) - 1

@@ -17,6 +17,7 @@ from prbayes.metrics import FunctionMetric
 from prbayes.modes import Rival, blind_directions, rivals
 from prbayes.optimum import Optimum, assemble, plain
 from prbayes.population import Evaluator
+from prbayes.progress import shown
 from prbayes.refinement import _MAX_ROUNDS, AGREE, grow, pilot, refine_at, refuse, shortcomings, spread_around
 from prbayes.refit import Neighbourhood
 from prbayes.resimulation import FreshBound
@@ -42,6 +43,7 @@ def minimize(
     refine: bool = True,
     starts: int | None = None,
     random_seed: int = 0,
+    progressbar: bool = True,
 ) -> Optimum:
     """Find the hyperparameters with the smallest discrepancy, inside the support of their priors.
 
@@ -75,6 +77,8 @@ def minimize(
         once; 0 for none. By default 32 where a theta costs no response (`Reweighted`), and else none.
     random_seed : int
         Seed of the starting points.
+    progressbar : bool
+        Whether work of more than two seconds shows a bar on stderr.
 
     Returns
     -------
@@ -104,17 +108,18 @@ def minimize(
     True
     """
     evaluator = Evaluator(model_on_context(model, "prb.minimize"))
-    return find_optimum(
-        evaluator,
-        start=start,
-        method=method,
-        prior=prior,
-        tolerance=tolerance,
-        max_evaluations=max_evaluations,
-        refine=refine,
-        starts=starts,
-        random_seed=random_seed,
-    )
+    with shown(progressbar):
+        return find_optimum(
+            evaluator,
+            start=start,
+            method=method,
+            prior=prior,
+            tolerance=tolerance,
+            max_evaluations=max_evaluations,
+            refine=refine,
+            starts=starts,
+            random_seed=random_seed,
+        )
 
 
 def find_optimum(

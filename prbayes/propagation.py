@@ -143,18 +143,7 @@ class Bound(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Propagation(ABC):
-    """How a population of inputs becomes responses, and all that concerns calling the response.
-
-    Parameters
-    ----------
-    executor : concurrent.futures.Executor, optional
-        Where the response is computed: threads, processes, loky, ``dask.distributed.Client().get_executor()``,
-        ``mpi4py.futures.MPIPoolExecutor()``. In this process by default.
-    store : path-like, optional
-        A folder that keeps every computed response, by simulator: none is computed again, also in another run.
-    on_failure : OnFailure
-        What to do with a response that raises or is NaN: `Abort` (default), `Replace` or `Retry`.
-    """
+    """How a population of inputs becomes responses, and all that concerns calling the response."""
 
     executor: Executor | None = field(default=None, repr=False)
     store: str | PathLike[str] | None = field(default=None, repr=False)
@@ -192,10 +181,17 @@ class Reweighted(Propagation):
         Largest share of a population's weight that may fall on points whose response is NaN.
     max_points : int, optional
         Largest number of design points, refinement included; 32 n by default.
+    executor : Executor, optional
+        Where the response is computed: threads, processes, loky, ``dask.distributed.Client().get_executor()``,
+        ``mpi4py.futures.MPIPoolExecutor()``. In this process by default.
+    store : path-like, optional
+        A folder that keeps every computed response, by simulator: none is computed again, also in another run.
+    on_failure : Abort, Replace or Retry
+        What to do with a response that raises or is NaN.
 
     References
     ----------
-    .. [1] A. B. Owen, Monte Carlo theory, methods and examples, chapter 9 (mixture importance sampling).
+    .. [1] Owen, A. B., Monte Carlo theory, methods and examples, chapter 9 (mixture importance sampling).
 
     Examples
     --------
@@ -244,7 +240,7 @@ def sobol(n: int, dimensions: int, seed: int) -> Floats:
 
     References
     ----------
-    .. [1] A. B. Owen (1998), Scrambling Sobol and Niederreiter-Xing points, doi:10.1006/jcom.1998.0487.
+    .. [1] Owen, A. B. (1998), Scrambling Sobol and Niederreiter-Xing points, doi:10.1006/jcom.1998.0487.
 
     Examples
     --------
@@ -290,6 +286,8 @@ class Resimulated(Propagation):
     points : callable
         ``points(n, dimensions, seed)``, the points in the unit cube, shape (n, dimensions): `sobol`, or `monte_carlo`
         for random numbers that are the same for each theta.
+    executor, store, on_failure
+        As for `Reweighted`.
 
     Examples
     --------
@@ -329,6 +327,8 @@ class Fresh(Propagation):
         Number of draws for each theta.
     seed : int
         Seed of the generator that belongs to the simulator.
+    executor, store, on_failure
+        As for `Reweighted`.
 
     Examples
     --------

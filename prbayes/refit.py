@@ -14,6 +14,7 @@ from prbayes.descent import descend
 from prbayes.design import Design
 from prbayes.information import Information, Local, first_order_shifts, local_sampling
 from prbayes.population import Evaluator
+from prbayes.progress import progress
 from prbayes.propagation import N_BLOCKS
 from prbayes.resampling import DataSets, observed_set
 
@@ -80,7 +81,11 @@ class Neighbourhood:
         size = len(sets.weights[0])
         points = max(n.bound.n_points + v.size for n, v in zip(self.evaluator.nodes, sets.values, strict=True))
         block = max(1, _BLOCK // (points * (2 * self.sd.size + 1)))
-        found = [self._refit(sets, np.arange(i, min(i + block, size))) for i in range(0, size, block)]
+        found = []
+        with progress("refits", size) as report:
+            for i in range(0, size, block):
+                found.append(self._refit(sets, np.arange(i, min(i + block, size))))
+                report(len(found[-1][1]), "")
         return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
 
     def design_error(self) -> float:

@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import xarray as xr
-from rich.console import Console
-from rich.progress import Progress
 
 from prbayes._arrays import Floats, positive_integer
 from prbayes.adjust import Affine
 from prbayes.population import Evaluator
+from prbayes.progress import progress, shown
 from prbayes.resampling import fresh_data
 from prbayes.results import calibration_tree
 from prbayes.simulator import model_on_context, nodes, revive
@@ -81,9 +80,9 @@ def simulation_based_calibration(
 
     References
     ----------
-    .. [1] S. Talts et al. (2018), Validating Bayesian inference algorithms with simulation-based calibration,
+    .. [1] Talts, S. et al. (2018), Validating Bayesian inference algorithms with simulation-based calibration,
        arXiv:1804.06788.
-    .. [2] T. Säilynoja, P.-C. Bürkner and A. Vehtari (2022), Graphical test for discrete uniformity and its
+    .. [2] Säilynoja, T., P.-C. Bürkner and A. Vehtari (2022), Graphical test for discrete uniformity and its
        applications in goodness-of-fit evaluation, Stat. Comput. 32, doi:10.1007/s11222-022-10090-6.
 
     Examples
@@ -106,10 +105,9 @@ def simulation_based_calibration(
             "whose data cannot be drawn; expected prb.Simulator nodes only"
         )
     jobs = [(range(i, min(i + _CHUNK, n)), draws, adjust, random_seed) for i in range(0, n, _CHUNK)]
-    with Progress(console=Console(stderr=True), disable=not progressbar) as progress:
-        task = progress.add_task("data sets", total=n)
+    with shown(progressbar), progress("data sets", n) as report:
         if executor is None:
-            rows = [row for job in jobs for row in _analyse(evaluator, *job, lambda: progress.advance(task))]
+            rows = [row for job in jobs for row in _analyse(evaluator, *job, lambda: report(1, ""))]
         else:
             import cloudpickle
 
@@ -117,7 +115,7 @@ def simulation_based_calibration(
             with _classes_kept(model):
                 futures: list[Future[Any]] = [executor.submit(_remote, sent, *job) for job in jobs]
                 for done in as_completed(futures):
-                    progress.advance(task, len(done.result()))
+                    report(len(done.result()), "")
                 rows = [row for future in futures for row in future.result()]
     failed = [row for row in rows if isinstance(row, str)]
     good = [row for row in rows if not isinstance(row, str)]
@@ -162,6 +160,7 @@ def _analyse(
     for i in which:
         rng = np.random.default_rng([seed, i])
         with ExitStack() as stack:
+            stack.enter_context(shown(False))
             for design in evaluator.designs.values():
                 stack.enter_context(design.undone())
             try:

@@ -16,6 +16,7 @@ from prbayes._arrays import Floats
 from prbayes.discrepancy import DensityDiscrepancy
 from prbayes.metrics import AreaMetric, FunctionMetric
 from prbayes.population import Evaluator
+from prbayes.progress import progress
 from prbayes.resimulation import FreshBound
 
 _SETTLED = 1e-4  # relative gain of a simplex below which a stalled line search counts as converged
@@ -50,7 +51,7 @@ class Scipy:
 
     References
     ----------
-    .. [1] J. Nocedal and S. J. Wright (2006), Numerical Optimization, doi:10.1007/978-0-387-40065-5.
+    .. [1] Nocedal, J. and S. J. Wright (2006), Numerical Optimization, doi:10.1007/978-0-387-40065-5.
 
     Examples
     --------
@@ -135,6 +136,7 @@ class Objective:
         self.thetas: list[Floats] = []
         self.values: list[float] = []
         self.counts: list[int] = []
+        self.report: Callable[[int, str], None] = lambda done, note: None
 
     def __call__(self, t: Floats) -> Any:
         """Return the value, and the gradient where there is one, at standardised parameters."""
@@ -149,6 +151,7 @@ class Objective:
         value = float(value) / self.size
         self._since = 0 if value < self._lowest - _PROGRESS else self._since + 1
         self._lowest = min(self._lowest, value)
+        self.report(cost, f"discrepancy {self._lowest * self.size:.4g}")
         if self._since > self.patience:
             raise StalledError
         if not self.gradient:
@@ -321,7 +324,8 @@ class Search:
         from scipy import optimize  # takes longer to import than the whole package
 
         try:
-            return optimize.minimize(objective, start, **settings)
+            with progress("evaluations") as objective.report:
+                return optimize.minimize(objective, start, **settings)
         except SpentError:
             message = f"max_evaluations = {self.most} was reached before convergence."
         except StalledError:

@@ -151,7 +151,7 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     References
     ----------
     .. [1] Oh et al. (2019), doi:10.1007/s00158-019-02288-6.
-    .. [2] P. G. Bissiri, C. C. Holmes and S. G. Walker (2016), A general framework for updating belief
+    .. [2] Bissiri, P. G., C. C. Holmes and S. G. Walker (2016), A general framework for updating belief
        distributions, J. R. Stat. Soc. B 78, 1103-1130, doi:10.1111/rssb.12158.
 
     Examples

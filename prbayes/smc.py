@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import xarray as xr
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from prbayes._arrays import Floats, positive_integer, positive_number
@@ -23,6 +22,7 @@ from prbayes.kernel import BatchedKernel
 from prbayes.optimize import find_optimum
 from prbayes.optimum import Optimum
 from prbayes.population import Evaluator
+from prbayes.progress import CONSOLE, shown
 from prbayes.refinement import _MAX_ROUNDS, refine_at, refuse, shortcomings
 from prbayes.resimulation import FreshBound
 from prbayes.results import posterior_tree
@@ -95,7 +95,7 @@ def sample_smc(
 
     References
     ----------
-    .. [1] P. Del Moral, A. Doucet and A. Jasra (2006), Sequential Monte Carlo samplers, J. R. Stat. Soc. B
+    .. [1] Del Moral, P., A. Doucet and A. Jasra (2006), Sequential Monte Carlo samplers, J. R. Stat. Soc. B
        68, 411-436, doi:10.1111/j.1467-9868.2006.00553.x.
 
     Examples
@@ -115,19 +115,20 @@ def sample_smc(
         raise TypeError(f"adjust: got {type(adjust).__name__} {adjust!r:.60}, expected prb.Affine(), True or False")
     if optimum is not None and not isinstance(optimum, Optimum):
         raise TypeError(f"optimum: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first")
-    return sample(
-        Evaluator(model) if optimum is None else optimum.evaluator,
-        draws=draws,
-        chains=chains,
-        epsilon=epsilon,
-        optimum=optimum,
-        adjust=adjust,
-        threshold=threshold,
-        refine=refine,
-        random_seed=random_seed,
-        checkpoint=checkpoint,
-        progressbar=progressbar,
-    )
+    with shown(progressbar):
+        return sample(
+            Evaluator(model) if optimum is None else optimum.evaluator,
+            draws=draws,
+            chains=chains,
+            epsilon=epsilon,
+            optimum=optimum,
+            adjust=adjust,
+            threshold=threshold,
+            refine=refine,
+            random_seed=random_seed,
+            checkpoint=checkpoint,
+            progressbar=progressbar,
+        )
 
 
 def sample(
@@ -275,7 +276,7 @@ class _Run:
         done: list[tuple[Floats, Floats]] = []
         stats: list[dict[str, list[float]]] = []
         saved = self._saved()
-        with Progress(*columns, console=Console(stderr=True), disable=not progressbar) as progress:
+        with shown(progressbar) as visible, Progress(*columns, console=CONSOLE, disable=not visible) as progress:
             for chain, seed in enumerate(seeds):
                 task = progress.add_task("", total=1.0, chain=chain, rate=0.0)
                 kernel = BatchedKernel(

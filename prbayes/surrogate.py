@@ -40,7 +40,7 @@ _PROBES = 64
 
 @dataclass(frozen=True, eq=False)
 class Surrogate:
-    """A surface through runs of an expensive response, to be called in its place; made by `fit` or `load`.
+    """A surface through runs of an expensive response, to be called in its place; made by ``fit`` or ``load``.
 
     Called with arrays of any leading shape, like the response; can be given to `Simulator` and `predict`. Inside its
     ranges only: outside, and where the nearest design point failed, it gives what ``outside`` says, and says so.
@@ -68,7 +68,7 @@ class Surrogate:
 
     References
     ----------
-    .. [1] A. Forrester, A. Sobester and A. Keane (2008), Engineering Design via Surrogate Modelling, Wiley.
+    .. [1] Forrester, A., A. Sobester and A. Keane (2008), Engineering Design via Surrogate Modelling, Wiley.
 
     Examples
     --------
@@ -205,7 +205,8 @@ class Surrogate:
 
         Parameters
         ----------
-        *inputs : array_like, shapes (..., *event)
+        *inputs : array_like
+            One per input, of the shape of a batch, a multivariate one with its event axis last.
 
         Returns
         -------

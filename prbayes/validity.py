@@ -127,7 +127,7 @@ def u_values(
 
     References
     ----------
-    .. [1] C. Czado, T. Gneiting and L. Held (2009), Predictive model assessment for count data, Biometrics 65,
+    .. [1] Czado, C., T. Gneiting and L. Held (2009), Predictive model assessment for count data, Biometrics 65,
        1254-1261, doi:10.1111/j.1541-0420.2009.01191.x.
 
     Examples
@@ -191,7 +191,7 @@ def area_test(
 
     References
     ----------
-    .. [1] S. Ferson, W. L. Oberkampf and L. Ginzburg (2008), Model validation and predictive capability for the
+    .. [1] Ferson, S., W. L. Oberkampf and L. Ginzburg (2008), Model validation and predictive capability for the
        thermal challenge problem, Comput. Methods Appl. Mech. Eng. 197, 2408-2430, doi:10.1016/j.cma.2007.07.030.
 
     Examples

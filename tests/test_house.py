@@ -14,8 +14,8 @@ FILES = sorted(PACKAGE.glob("*.py"))
 
 # A file may import those before it.
 ORDER = [
-    "_arrays", "cells", "density", "discrepancy", "metrics", "failures", "store", "calling", "inputs", "responses",
-    "propagation", "resimulation", "design", "simulator", "surfaces", "region", "surrogate", "population",
+    "_arrays", "progress", "cells", "density", "discrepancy", "metrics", "failures", "store", "calling", "inputs",
+    "responses", "propagation", "resimulation", "design", "simulator", "surfaces", "region", "surrogate", "population",
     "resampling", "information", "descent", "refit", "modes", "refinement", "search", "optimum", "optimize", "epsilon",
     "adjust", "results", "bootstrap", "checkpoint", "kernel", "smc", "sbc", "diagnose", "compare", "heldout", "predict",
     "nulls", "joint", "validity", "curves", "ensemble", "margins", "landscape", "canvas", "plots", "portraits",

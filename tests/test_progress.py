@@ -1,0 +1,126 @@
+"""Progress bars: they appear for long work only, on stderr, and stay away where they are not wanted."""
+
+import io
+import time
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+from rich.console import Console
+
+import prbayes as prb
+import prbayes.progress
+from prbayes.progress import progress, shown
+
+
+@pytest.fixture
+def screen(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
+    """A terminal that all bars are drawn on, and patience of a hundredth of a second."""
+    text = io.StringIO()
+    console = Console(file=text, force_terminal=True, width=120)
+    monkeypatch.setattr(prbayes.progress, "CONSOLE", console)
+    monkeypatch.setattr("prbayes.smc.CONSOLE", console)
+    monkeypatch.setattr(prbayes.progress, "_SHOWN_FROM", 0.01)
+    return text
+
+
+def test_a_bar_appears_when_the_work_turns_out_to_be_long(screen: io.StringIO) -> None:
+    with progress("walking", 3) as report:
+        assert screen.getvalue() == ""
+        for _ in range(3):
+            time.sleep(0.02)
+            report(1, "on foot")
+    assert "walking" in screen.getvalue()
+    assert "3/3" in screen.getvalue()
+    assert "on foot" in screen.getvalue()
+
+
+def test_without_a_total_it_appears_when_the_time_has_passed(screen: io.StringIO) -> None:
+    with progress("looking") as report:
+        report(1, "")
+        assert screen.getvalue() == ""
+        time.sleep(0.02)
+        report(1, "nearer")
+    assert "looking" in screen.getvalue()
+    assert "nearer" in screen.getvalue()
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_short_work_shows_nothing(screen: io.StringIO, monkeypatch: pytest.MonkeyPatch, terminal: bool) -> None:
+    monkeypatch.setattr(prbayes.progress, "CONSOLE", Console(file=screen, force_terminal=terminal))
+    monkeypatch.setattr(prbayes.progress, "_SHOWN_FROM", 2.0)
+    for total in (100, None):
+        with progress("quick", total) as report:
+            for _ in range(100):
+                report(1, "")
+    assert screen.getvalue() == ""
+
+
+def test_what_is_hidden_outside_stays_hidden_inside(screen: io.StringIO) -> None:
+    with shown(False) as outer, shown(True) as inner, progress("hidden", 2) as report:
+        time.sleep(0.02)
+        report(1, "")
+        assert not outer
+        assert not inner
+    assert screen.getvalue() == ""
+    with shown(True) as visible:
+        assert visible
+
+
+def test_a_bar_is_taken_away_when_the_work_fails(screen: io.StringIO) -> None:
+    def fail() -> None:
+        with progress("failing", 2) as report:
+            time.sleep(0.02)
+            report(1, "")
+            raise ValueError("lost")
+
+    with pytest.raises(ValueError, match="lost"):
+        fail()
+    with progress("next", 2) as report:
+        time.sleep(0.02)
+        report(1, "")
+    assert "next" in screen.getvalue()
+
+
+def slow(x: Any) -> Any:
+    time.sleep(0.02)
+    return 2 * x
+
+
+def build(propagation: Any) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        observed = np.linspace(-1, 3, 20)
+        prb.Simulator("y", slow, x, metric=prb.AreaMetric(), observed=observed, propagation=propagation)
+    return model
+
+
+@pytest.mark.parametrize("visible", [True, False])
+def test_the_optimiser_shows_its_evaluations(screen: io.StringIO, visible: bool) -> None:
+    prb.minimize(build(prb.Resimulated(16)), method="Nelder-Mead", progressbar=visible)
+    assert ("evaluations" in screen.getvalue()) == visible
+    assert ("discrepancy" in screen.getvalue()) == visible
+
+
+@pytest.mark.parametrize("visible", [True, False])
+def test_everything_inside_the_sampler_follows_its_keyword(screen: io.StringIO, visible: bool) -> None:
+    prb.sample_smc(60, chains=1, model=build(prb.Resimulated(16)), random_seed=1, progressbar=visible)
+    assert ("SMC chain 0" in screen.getvalue()) == visible
+    assert ("evaluations" in screen.getvalue()) == visible
+    if not visible:
+        assert screen.getvalue() == ""
+
+
+@pytest.mark.parametrize("visible", [True, False])
+def test_refits_are_counted(screen: io.StringIO, visible: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("prbayes.refit._BLOCK", 20_000)
+    model = build(prb.Reweighted(64))
+    prb.bootstrap(prb.minimize(model, progressbar=False), draws=1000, progressbar=visible)
+    assert ("refits" in screen.getvalue()) == visible
+
+
+def test_a_calibration_of_the_sampler_shows_one_bar(screen: io.StringIO) -> None:
+    prb.simulation_based_calibration(2, model=build(prb.Reweighted(32)), draws=50)
+    assert "data sets" in screen.getvalue()
+    assert not {"SMC", "refits", "evaluations"} & set(screen.getvalue().split())
