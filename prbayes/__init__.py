@@ -30,8 +30,10 @@ from prbayes.portraits import plot_population, plot_responses
 from prbayes.predict import predict
 from prbayes.propagation import Fresh, Resimulated, Reweighted, monte_carlo, sobol
 from prbayes.refinement import DesignError, refine
+from prbayes.report import Report
 from prbayes.sbc import simulation_based_calibration
 from prbayes.search import Scipy
+from prbayes.section import Section
 from prbayes.simulator import Simulator, abc_distance, set_epsilon
 from prbayes.smc import sample_smc
 from prbayes.store import StoreError
@@ -64,11 +66,13 @@ __all__ = [
     "ProbabilityResidual",
     "RadialBasis",
     "Replace",
+    "Report",
     "Resimulated",
     "ResponseError",
     "Retry",
     "Reweighted",
     "Scipy",
+    "Section",
     "Simulator",
     "StoreError",
     "Surrogate",

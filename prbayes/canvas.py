@@ -184,16 +184,18 @@ class Canvas:
         figure = self._collection.viz["figure"].item()
         characters = sum(len(text) + 8 for text in handles)
         columns = max(1, min(len(handles), int(len(handles) * 11.5 * figure.get_figwidth() / characters)))
+        columns = -(-len(handles) // -(-len(handles) // columns))  # rows of equal length
         figure.legend(handles.values(), handles, loc="outside lower center", ncols=columns, frameon=False)
 
     def _legend_plotly(self) -> None:
         figure = self._collection.viz["figure"].item()
         below = {"orientation": "h", "xanchor": "center", "x": 0.5, "yanchor": "bottom", "yref": "container", "y": 0.02}
-        figure.update_layout(legend=below, margin={"l": 70, "r": 20, "t": 55, "b": 110})
+        figure.update_layout(legend=below, margin={"l": 70, "r": 20, "t": 70, "b": 110})
 
     def _legend_bokeh(self) -> None:
         for target in self._targets():
             if target.legend:
                 legend = target.legend[0]
-                legend.ncols = 2
+                widths = sorted(7 * len(i.label.value) + 40 for i in legend.items)
+                legend.ncols = 2 if sum(widths[-2:]) < target.width - 60 else 1
                 target.add_layout(legend, "below")

@@ -32,7 +32,7 @@ def compare(
     Parameters
     ----------
     results : mapping
-        `Optimum` objects and DataTrees with a ``posterior`` group, by the label they get.
+        `Optimum` objects, their DataTrees, and DataTrees with a ``posterior`` group, by the label they get.
     model : pymc.Model, optional
         Restricts the table to the model's free variables; by default all that the results share. Its data, and
         its populations, score the results.
@@ -119,19 +119,16 @@ def _scores(
 
 def _column(label: str, result: Any) -> tuple[dict[str, tuple[float, ...]], float, float]:
     """Return (estimate, sd, lower, upper) by element, responses, seconds."""
-    rows: dict[str, tuple[float, ...]] = {}
     if isinstance(result, Optimum):
-        z = 1.5982  # the normal's quantile at (1 + 0.89) / 2
-        for name, value in result.point.items():
-            for i in np.ndindex(np.shape(value)):
-                estimate, sd = float(np.asarray(value)[i]), float(np.asarray(result.stderr[name])[i])
-                rows[_element(name, i)] = (estimate, sd, estimate - z * sd, estimate + z * sd)
-        return rows, float(result.n_responses), result.seconds
-    if not isinstance(result, xr.DataTree) or "posterior" not in result:
+        return _normal(result.point, result.stderr), float(result.n_responses), result.seconds
+    if not isinstance(result, xr.DataTree) or not {"posterior", "optimum"} & set(result.children):
         raise TypeError(
             f"{label}: got {type(result).__name__}, expected an Optimum or a DataTree with a posterior group"
         )
+    if "posterior" not in result:
+        return _normal(result["optimum"].data_vars, result["stderr"].data_vars), *_cost(result["optimum"].attrs)
     posterior = result["posterior"]
+    rows: dict[str, tuple[float, ...]] = {}
     for key, variable in posterior.data_vars.items():
         name = str(key)
         draws = variable.stack(sample=("chain", "draw")).transpose("sample", ...).values
@@ -139,8 +136,22 @@ def _column(label: str, result: Any) -> tuple[dict[str, tuple[float, ...]], floa
             x = draws[(slice(None), *i)]
             lower, upper = np.quantile(x, [(1 - _INTERVAL) / 2, (1 + _INTERVAL) / 2])
             rows[_element(name, i)] = (float(x.mean()), float(x.std(ddof=1)), float(lower), float(upper))
-    attrs = posterior.attrs
-    return rows, float(attrs.get("n_responses", np.nan)), float(attrs.get("seconds", np.nan))
+    return rows, *_cost(posterior.attrs)
+
+
+def _normal(point: Mapping[Any, Any], stderr: Mapping[Any, Any]) -> dict[str, tuple[float, ...]]:
+    """Return (estimate, sd, lower, upper) by element of an optimum."""
+    z = 1.5982  # the normal's quantile at (1 + 0.89) / 2
+    rows: dict[str, tuple[float, ...]] = {}
+    for name, value in point.items():
+        for i in np.ndindex(np.shape(value)):
+            estimate, sd = float(np.asarray(value)[i]), float(np.asarray(stderr[name])[i])
+            rows[_element(str(name), i)] = (estimate, sd, estimate - z * sd, estimate + z * sd)
+    return rows
+
+
+def _cost(attrs: Mapping[Any, Any]) -> tuple[float, float]:
+    return float(attrs.get("n_responses", np.nan)), float(attrs.get("seconds", np.nan))
 
 
 def _element(name: str, index: tuple[int, ...]) -> str:

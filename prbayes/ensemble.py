@@ -117,8 +117,8 @@ def read_before(
 ) -> tuple[Floats, str]:
     """Return theta before a calibration, shape (1, d) or (0, d) where there is none, and what it is.
 
-    By default that is the point which the optimiser was started from, if it was given one; else the prior's initial
-    point, where PyMC's samplers start.
+    By default that is the optimiser's first point, if it was given a start or did not look for one; else the prior's
+    initial point, where PyMC's samplers start.
     """
     if before is False:
         return np.empty((0, evaluator.size)), ""
@@ -129,5 +129,5 @@ def read_before(
             f"before: got {type(before).__name__}, expected a dict with a value for each hyperparameter, None or False"
         )
     if isinstance(result, Optimum) and not result.n_screened and len(result.trace.get("theta", ())):
-        return result.trace["theta"][:1], "optimiser's start"
+        return result.trace["theta"][:1], "optimiser's first point"
     return evaluator.initial[None], "prior's initial point"

@@ -116,15 +116,17 @@ def plot_posterior(
             canvas.line(name, "prior", grid, bounded_density(prior[name], grid), GREY, style=DOTTED, legend="prior")
         canvas.line(name, "posterior", grid, y, BLUE, width=2.2, legend="posterior")
         rows = np.array([-0.07, -0.15]) * top
-        canvas.line(name, "interval", interval, np.repeat(rows[0], 2), BLUE, width=4, legend=f"{level:.0%} intervals")
-        canvas.points(name, "mean", x.mean(), rows[0], BLUE, size=40, legend="posterior mean")
+        canvas.line(name, "interval", interval, np.repeat(rows[0], 2), BLUE, width=3, legend=f"{level:.0%} intervals")
+        canvas.points(name, "mean", x.mean(), rows[0], BLUE, size=90, legend="posterior mean")
         if known:
             normal = normal_density(grid, center, error)
-            canvas.line(name, "normal", grid, normal, VERMILION, style=DASHED, legend="normal with its standard error")
+            canvas.line(
+                name, "normal", grid, normal, VERMILION, style=DASHED, legend="normal with the optimum's standard error"
+            )
             ends = center + z * error * np.array([-1, 1])
-            canvas.line(name, "stderr", ends, np.repeat(rows[1], 2), VERMILION, width=4)
+            canvas.line(name, "stderr", ends, np.repeat(rows[1], 2), VERMILION, width=3)
         if best:
-            canvas.points(name, "optimum", center, rows[1], VERMILION, marker=DIAMOND, size=50, legend="optimum")
+            canvas.points(name, "optimum", center, rows[1], VERMILION, marker=DIAMOND, size=110, legend="optimum")
         canvas.axes(name, x=named(name, labels), y="density", yticks=round_ticks(0.0, top))
     return canvas.finish()
 
@@ -299,7 +301,7 @@ def plot_validity(
     pictures = (visuals.fill_between_y, visuals.line_xy)
     diagonal = np.array([0.0, 1.0])
     if envelope:
-        draw("envelope", visuals.fill_between_y, lambda _, t: _band(t), color=GREY, alpha=0.4)
+        draw("envelope", visuals.fill_between_y, lambda _, t: _band(t), color="B3", alpha=0.4)
     draw("area", visuals.fill_between_y, lambda _, t: _between(t) | {"color": _color(t)}, alpha=0.4)
     draw("identity", visuals.line_xy, lambda _, t: {"x": diagonal, "y": diagonal}, color=INK, linestyle=DASHED)
     draw("ecdf", visuals.line_xy, lambda _, t: _ecdf(t) | {"color": _color(t)})

@@ -11,7 +11,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._arrays import Floats, positive_number
-from prbayes.canvas import BLUE, DASHED, GREY, INK, VERMILION, Canvas, named
+from prbayes.canvas import BLUE, DASHED, INK, VERMILION, Canvas, named
 from prbayes.curves import (
     central_range,
     densities,
@@ -45,9 +45,10 @@ def plot_responses(
 ) -> Any:
     """Draw the responses before and after a calibration against the measured ones, one panel per simulator.
 
-    Measured responses are a histogram with a mark for each, or steps. The calibrated curve is the posterior
-    predictive distribution, or the optimum's population. The band holds the share ``level`` of the populations at
-    each response: those of the posterior's draws, or of the optimum's sampling distribution where it is known.
+    Measured responses are a histogram, in outline, with a mark for each, or steps. The calibrated curve is the
+    posterior predictive distribution, or the optimum's population. The band holds the share ``level`` of the
+    populations at each response: those of the posterior's draws, or of the optimum's sampling distribution where it
+    is known.
 
     Parameters
     ----------
@@ -56,8 +57,9 @@ def plot_responses(
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
     before : dict or False, optional
-        Hyperparameters before the calibration, in the user's own units; False for none. By default the point that
-        the optimiser was started from, if it was given one, and else the prior's initial point; the legend says which.
+        Hyperparameters before the calibration, in the user's own units; False for none. By default the
+        optimiser's first point, if it was given a start or did not look for one, and else the prior's initial point;
+        the legend says which.
     ecdf : bool
         Draw distribution functions, which need no bandwidth, in place of densities.
     level : float
@@ -113,14 +115,18 @@ def plot_responses(
         grid = np.linspace(low, high, _GRID)
         curves = distribution_functions(values, weights, grid) if ecdf else _density(values, weights, grid)
         after, band = _middle_and_band(curves, len(center), level)
-        _measured(canvas, node, low, high, ecdf=ecdf)
+        top = _measured(canvas, node, low, high, ecdf=ecdf)
+        top = max(top, after.max(), 0.0 if band is None else band[1].max())
+        ylim = None
         if earlier is not None:
             y = distribution_functions(*earlier, grid) if ecdf else _density(*earlier, grid)
             canvas.line(node.name, "before", grid, y[0], VERMILION, style=DASHED, legend=f"before: {what}")
+            if y.max() > 2 * top:  # a narrow peak is cut off, not the rest flattened
+                ylim = (-0.05 * top, 2 * top)
         _calibrated(canvas, node.name, grid, after, band, shown, level)
         count = f"{node.target.observed.size} measured values"
         y_axis = "share of specimens" if ecdf else "density"
-        canvas.axes(node.name, x=named(node.name, labels), y=y_axis, title=count, xlim=(low, high))
+        canvas.axes(node.name, x=named(node.name, labels), y=y_axis, title=count, xlim=(low, high), ylim=ylim)
     return canvas.finish()
 
 
@@ -228,12 +234,13 @@ def _calibrated(
     canvas.line(panel, "after", grid, after, BLUE, width=2.2, legend=f"calibrated: {shown.label}")
 
 
-def _measured(canvas: Canvas, node: Node, low: float, high: float, *, ecdf: bool) -> None:
+def _measured(canvas: Canvas, node: Node, low: float, high: float, *, ecdf: bool) -> float:
+    """Draw the data; return how high they reach."""
     observed, weights = node.target.observed, node.target.weights
     if ecdf:
         canvas.line(node.name, "measured", *staircase(observed, weights, low, high), INK, width=1.4, legend="measured")
-        return
+        return 1.0
     x, y = histogram(observed, weights)
-    canvas.band(node.name, "measured", x, (np.zeros_like(y), y), GREY, legend="measured")
-    canvas.line(node.name, "bars", x, y, GREY, width=0.7)
+    canvas.line(node.name, "measured", x, y, INK, width=0.9, legend="measured")
     canvas.points(node.name, "rug", observed[np.isfinite(observed)], 0.0, INK, marker="|", size=60)
+    return float(y.max())

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import importlib.metadata
-import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
 from prbayes._arrays import Floats
+from prbayes.describe import as_attribute, without_addresses
 from prbayes.population import Evaluator
 
 _ENVELOPE = 0.95  # probability that the ECDF of uniform ranks stays inside
@@ -21,11 +21,6 @@ if TYPE_CHECKING:
 def versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
     return {f"{name}_version": importlib.metadata.version(name) for name in ("prbayes", "pymc", "numpy")}
-
-
-def _described(configuration: object) -> str:
-    """Return the representation of a metric or propagation, the same in every session."""
-    return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(configuration))
 
 
 def _dataset(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, int]) -> xr.Dataset:
@@ -107,7 +102,7 @@ def posterior_tree(
         **versions(),
     }
     evidence = _evidence(stats)
-    posterior.attrs.update({"inference_library": "prbayes", **attrs, **evidence})
+    posterior.attrs.update({"inference_library": "prbayes", **attrs, **evidence, **as_attribute(evaluator.model)})
     names, designs = [n.name for n in evaluator.nodes], evaluator.designs
     where = ["chain", "draw", "simulator"]
     shape = (chains, draws, len(names))
@@ -130,8 +125,8 @@ def posterior_tree(
             "discrepancy_error": ("simulator", np.full(len(names), np.nan) if errors is None else errors),
             "required_ess": ("simulator", [designs[n].required_ess if n in designs else np.nan for n in names]),
             "max_lost": ("simulator", [designs[n].config.max_lost if n in designs else np.nan for n in names]),
-            "metric": ("simulator", [_described(n.metric) for n in evaluator.nodes]),
-            "propagation": ("simulator", [_described(n.propagation) for n in evaluator.nodes]),
+            "metric": ("simulator", [without_addresses(n.metric) for n in evaluator.nodes]),
+            "propagation": ("simulator", [without_addresses(n.propagation) for n in evaluator.nodes]),
             "n_points": ("simulator", [n.bound.n_points for n in evaluator.nodes]),
         },
         coords={"simulator": names, "element": evaluator.names, **{k: np.arange(v) for k, v in leading.items()}},
@@ -182,6 +177,7 @@ def bootstrap_tree(
             "seconds": seconds,
             "random_seed": str(seed),
             **versions(),
+            **as_attribute(evaluator.model),
         }
     )
     return xr.DataTree.from_dict({"posterior": posterior, "observed_data": _observed(evaluator)})
@@ -267,6 +263,7 @@ def optimum_tree(optimum: Optimum) -> xr.DataTree:
         "seconds": optimum.seconds,
         "warnings": "\n".join(optimum.warnings),
         **versions(),
+        **as_attribute(optimum.model),
     }
     elements = {"element": optimum.names, "other_element": optimum.names}
     return xr.DataTree.from_dict(
@@ -291,7 +288,7 @@ def optimum_tree(optimum: Optimum) -> xr.DataTree:
                     },
                     "theta": ("element", optimum.theta),
                     "covariance": (["element", "other_element"], optimum.covariance),
-                    "metric": ("simulator", [_described(n.metric) for n in evaluator.nodes]),
+                    "metric": ("simulator", [without_addresses(n.metric) for n in evaluator.nodes]),
                 },
                 coords={"simulator": names, **elements},
             ),

@@ -37,6 +37,13 @@ _STAGES = {
     "log_marginal_likelihood": "log marginal likelihood",
 }
 
+_METRICS = {
+    "AreaMetric": "area metric",
+    "KullbackLeibler": "Kullback-Leibler",
+    "LogLikelihood": "log-likelihood",
+    "ProbabilityResidual": "probability residual",
+}
+
 
 def plot_optimizer(
     optimum: Optimum,
@@ -115,7 +122,7 @@ def plot_landscape(
     *,
     model: pm.Model | None = None,
     pair: Sequence[str] | None = None,
-    points: int = 41,
+    points: int | None = None,
     responses: int = 0,
     labels: Mapping[str, str] | None = None,
     backend: str | None = None,
@@ -126,7 +133,7 @@ def plot_landscape(
     Darker is lower; contours are at even steps of the root of the objective over its lowest value, so that they crowd
     towards the optimum; the title has the values at the ends. With one hyperparameter, or one name, it is a curve. All
     other hyperparameters stand at the optimum, as the title says. Where stored responses do not support a population
-    the picture is blank.
+    the picture is blank. Path and other optima are those of all hyperparameters, projected.
 
     Parameters
     ----------
@@ -136,8 +143,8 @@ def plot_landscape(
         That of the optimum; another one with the same hyperparameters may be given, such as one with another metric.
     pair : sequence of str, optional
         One or two names, such as ``("mu", "sigma")`` or ``("mu[0]", "mu[1]")``; the first two by default.
-    points : int
-        Along each axis.
+    points : int, optional
+        Along each axis; 41, or 161 for a curve.
     responses : int
         Largest number of responses that may be computed. With `Reweighted` none is; with `Resimulated` and `Fresh`
         every point of the picture costs n for each simulator.
@@ -168,12 +175,17 @@ def plot_landscape(
     'optimum'
     """
     _check_optimum(optimum, "plot_landscape")
-    positive_integer(points, "points", minimum=5)
     evaluator = optimum.evaluator if model is None or model is optimum.model else Evaluator(model)
+    if evaluator.names != optimum.names or [n.name for n in evaluator.nodes] != list(optimum.scales):
+        got = f"{evaluator.names} and {[n.name for n in evaluator.nodes]}"
+        raise ValueError(
+            f"model: got hyperparameters and simulators {got}, expected {optimum.names} and {list(optimum.scales)}"
+        )
     known = list(elements(optimum.evaluator, optimum.theta[None]))
     wanted = list(known[:2] if pair is None else [pair] if isinstance(pair, str) else pair)
     if not 1 <= len(wanted) <= 2 or len(set(wanted)) != len(wanted) or not set(wanted) <= set(known):
         raise KeyError(f"pair: got {pair}, expected one or two of {known}")
+    points = (41 if len(wanted) == 2 else 161) if points is None else positive_integer(points, "points", minimum=5)
     cost = points ** len(wanted) * evaluator.responses_per_theta
     if cost > responses:
         raise ValueError(
@@ -314,11 +326,10 @@ def plot_stages(
 
 
 def _objective(optimum: Optimum) -> str:
-    metrics = {type(n.metric).__name__ for n in optimum.evaluator.nodes}
     if len(optimum.scales) > 1:
         return "sum of d / s"
-    name = metrics.pop()
-    return "discrepancy (" + "".join(f" {c.lower()}" if c.isupper() else c for c in name).strip() + ")"
+    name = type(optimum.evaluator.nodes[0].metric).__name__
+    return f"discrepancy ({_METRICS.get(name, name)})"
 
 
 def _check_optimum(optimum: Any, caller: str) -> None:

@@ -1,5 +1,6 @@
 """Numbers behind the pictures, against closed forms."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -41,8 +42,9 @@ def test_what_is_not_finite_is_missing_from_the_area() -> None:
 
 
 def test_rows_have_their_own_weights_and_values() -> None:
-    shared = np.broadcast_to(QUANTILES, (2, 1000))
-    tilted = np.exp(0.7 * QUANTILES)
+    mixed = np.random.default_rng(1).permutation(QUANTILES)
+    shared = np.broadcast_to(mixed, (2, 1000))
+    tilted = np.exp(0.7 * mixed)
     weights = np.stack([EQUAL, tilted / tilted.sum()])
     expected = stats.norm.cdf(GRID - np.array([[0], [0.7]]))
     np.testing.assert_allclose(curves.distribution_functions(shared, weights, GRID), expected, atol=6e-3)
@@ -227,7 +229,7 @@ def test_before_is_what_it_says() -> None:
     started = prb.minimize(model, start={"mu": -1.0, "sigma": 1.5})
     theta, text = read_before(started, evaluator, None)
     np.testing.assert_allclose(theta[0], [-1, np.log(1.5)])
-    assert text == "optimiser's start"
+    assert text == "optimiser's first point"
     theta, text = read_before(optimum, evaluator, {"mu": 2.0, "sigma": 1.0})
     np.testing.assert_allclose(theta, [[2, 0]])
     assert len(read_before(optimum, evaluator, False)[0]) == 0
@@ -261,6 +263,17 @@ def test_the_landscape_has_the_objective_at_its_places() -> None:
     (only,) = landscape(optimum, evaluator, ["mu"], 9).axes
     np.testing.assert_allclose(only, m)
     assert list(elements(evaluator, optimum.theta[None])) == ["mu", "sigma"]
+
+
+def test_the_landscape_is_blank_where_the_design_does_not_reach() -> None:
+    wide = replace(normal_optimum(), stderr={"mu": 0.1, "sigma": 0.12})
+    found = landscape(wide, wide.evaluator, ["mu", "sigma"], 9)
+    m, s = found.axes
+    thetas = np.array([[x, np.log(y)] for x in m for y in s])
+    ess = wide.evaluator.support(thetas)["y"]["weight_ess"].reshape(9, 9)
+    assert 0 < np.isnan(found.heights).sum() < 40
+    assert np.isnan(found.heights[ess < 10]).all()
+    assert np.isfinite(found.heights[ess > 40]).all()
 
 
 def test_roots_of_heights_are_even_around_a_parabola() -> None:

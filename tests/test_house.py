@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -15,11 +16,12 @@ FILES = sorted(PACKAGE.glob("*.py"))
 # A file may import those before it.
 ORDER = [
     "_arrays", "progress", "cells", "density", "discrepancy", "metrics", "failures", "store", "calling", "inputs",
-    "responses", "propagation", "resimulation", "design", "simulator", "surfaces", "region", "surrogate", "population",
-    "resampling", "information", "descent", "refit", "modes", "refinement", "search", "optimum", "optimize", "epsilon",
-    "adjust", "results", "bootstrap", "checkpoint", "kernel", "smc", "sbc", "diagnose", "compare", "heldout", "predict",
-    "nulls", "joint", "validity", "curves", "ensemble", "margins", "landscape", "canvas", "plots", "portraits",
-    "trails",
+    "responses", "propagation", "resimulation", "design", "simulator", "describe", "surfaces", "region",
+    "surrogate", "population", "resampling", "information", "descent", "refit", "modes", "refinement", "search",
+    "optimum", "optimize", "epsilon", "adjust", "results", "bootstrap", "checkpoint", "kernel", "smc", "sbc",
+    "diagnose", "compare", "heldout", "predict", "nulls", "joint", "validity", "curves", "ensemble", "margins",
+    "landscape", "canvas", "plots", "portraits", "trails", "section", "material", "summary", "illustrations",
+    "assessment", "contents", "report", "demo", "__main__",
 ]  # fmt: skip
 
 # Upwards, inside a function or for types only, with the reason.
@@ -132,6 +134,12 @@ def test_public_names_are_documented(name: str) -> None:
     text = getattr(prbayes, name).__doc__
     assert text
     assert text.strip().splitlines()[0].endswith("."), "the summary is one sentence"
+
+
+def test_public_names_are_in_the_reference() -> None:
+    page = (PACKAGE.parent / "docs" / "api.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^   (\w+)$", page, flags=re.MULTILINE))
+    assert listed == set(prbayes.__all__) - {"datasets"}
 
 
 def test_the_sign_of_a_discrepancy_changes_in_one_place() -> None:

@@ -127,7 +127,7 @@ def test_responses_are_the_closed_forms() -> None:
     at_start = np.exp(optimum().evaluator.initial[1])
     np.testing.assert_allclose(y, stats.norm.pdf(x, 0, at_start), atol=0.02)
     np.testing.assert_allclose(xy(pc, "rug", "y"), [OBSERVED, np.zeros(30)])
-    np.testing.assert_allclose(np.trapezoid(*xy(pc, "bars", "y")[::-1]), 1)
+    np.testing.assert_allclose(np.trapezoid(*xy(pc, "measured", "y")[::-1]), 1)
 
 
 def test_the_legend_says_what_is_before_and_after() -> None:
@@ -197,6 +197,14 @@ def test_what_the_stored_responses_do_not_reach(caplog: pytest.LogCaptureFixture
     far["posterior"]["mu"] = far["posterior"]["mu"] + 50
     with pytest.raises(prb.DesignError, match="support 0 of 200 populations of the posterior"):
         prb.plot_responses(far, model=optimum().model, backend="none")
+
+
+def test_a_narrow_peak_before_does_not_flatten_the_data() -> None:
+    pc = prb.plot_responses(optimum(), before={"mu": 1.0, "sigma": 0.05}, backend="matplotlib")
+    low, high = pc.viz["plot"]["y"].item().get_ylim()
+    assert high < 3
+    assert low < 0
+    assert xy(pc, "before", "y")[1].max() > high
 
 
 # -- population ------------------------------------------------------------------------------------------
@@ -328,6 +336,25 @@ def test_a_landscape_that_costs_responses_says_how_many() -> None:
         prb.plot_landscape(found, pair=["mu", "nu"])
 
 
+def test_the_landscape_of_another_metric() -> None:
+    with pm.Model() as other:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
+        prb.Simulator("y", np.positive, x, metric=prb.ProbabilityResidual(), observed=OBSERVED)
+    pc = prb.plot_landscape(optimum(), model=other, pair="mu", points=9, backend="matplotlib")
+    x, y = xy(pc, "landscape", "landscape")
+    thetas = np.column_stack([x, np.full(x.size, optimum().theta[1])])
+    np.testing.assert_allclose(y, prb.population.Evaluator(other)(thetas).discrepancies[:, 0])
+    with pytest.raises(ValueError, match=r"got hyperparameters and simulators .* expected \['mu', 'sigma_log__'\]"):
+        prb.plot_landscape(optimum(), model=two())
+
+
+def two() -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.3)
+        prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=OBSERVED)
+    return model
+
+
 # -- stages, comparison ----------------------------------------------------------------------------------
 
 
@@ -367,17 +394,21 @@ def test_every_backend_draws_the_same(picture: str, backend: str) -> None:
     assert isinstance(other, az.PlotCollection)
     compared = 0
     for visual in ours.viz.children:
-        if visual in {"plot", "row_index", "col_index", "band", "measured", "landscape_lines"}:
+        if visual in {"plot", "row_index", "col_index", "band", "landscape_lines"}:
             continue
         for panel in ours.viz[visual].data_vars:
             if hasattr(artist(ours, visual, panel), "levels"):
                 continue
             np.testing.assert_allclose(xy(other, visual, panel), xy(ours, visual, panel), err_msg=visual)
             compared += 1
+            if hasattr(artist(ours, visual, panel), "get_sizes") and visual != "rug":
+                drawn = artist(other, visual, panel)
+                size = drawn.marker.size if backend == "plotly" else drawn.glyph.size
+                assert size**2 == pytest.approx(artist(ours, visual, panel).get_sizes()[0])
     assert compared
     figure = other.viz["figure"].item()
     wanted = [t.get_text() for legend in ours.viz["figure"].item().legends for t in legend.get_texts()]
-    shaded = {"responses": 2, "ecdf": 1, "population": 1}.get(picture, 0)
+    shaded = {"responses": 1, "ecdf": 1, "population": 1}.get(picture, 0)
     if backend == "plotly":
         assert [t.name for t in figure.data if t.showlegend] == wanted
         assert sum(getattr(t, "fill", None) == "tonexty" for t in figure.data) == shaded

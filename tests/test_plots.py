@@ -102,6 +102,13 @@ def test_several_tests_of_different_sizes_get_a_panel_each(tmp_path: Path) -> No
     assert (image.min(axis=2) < 0.9).mean() > 0.05
 
 
+@pytest.mark.parametrize("backend", ["plotly", "bokeh"])
+def test_other_backends_draw_the_same_steps(backend: str) -> None:
+    ours, other = (prb.plot_validity(validity(), backend=b).viz["ecdf"]["u"].item() for b in ("matplotlib", backend))
+    found = (other.x, other.y) if backend == "plotly" else [other.data_source.data[k] for k in ("x", "y")]
+    np.testing.assert_allclose(found, ours.get_data())
+
+
 def test_without_a_plotting_library_the_elements_are_described() -> None:
     pc = prb.plot_validity(validity(), backend="none")
     assert set(pc.viz.children) >= {"area", "ecdf", "envelope", "identity"}

@@ -104,7 +104,7 @@ def test_the_tree_of_a_sampler() -> None:
 def test_metrics_are_described_the_same_in_every_session() -> None:
     expected = [
         "AreaMetric()",
-        "KullbackLeibler(density=GaussianKDE(bandwidth=<function twice_silverman>), reverse=False)",
+        "KullbackLeibler(density=GaussianKDE(bandwidth=twice_silverman), reverse=False)",
     ]
     for tree in (optimum().to_datatree(), idata()):
         assert list(tree["calibration"]["metric"].values) == expected

@@ -95,7 +95,7 @@ def rub(metric, observed, surrogate, first, knowledge):
 def sampled(model, metric, epsilon):
     """Return the posterior, around an optimum that the prior holds where the data are blind."""
     prb.set_epsilon(model, epsilon)
-    center = prb.minimize(model, prior=True)
+    center = prb.minimize(model, prior=True, progressbar=False)
     draws = 150 if isinstance(metric, prb.LogLikelihood) else 500
     return prb.sample_smc(
         draws, chains=2, model=model, optimum=center, adjust=prb.Affine(), random_seed=1, progressbar=False
@@ -105,7 +105,7 @@ def sampled(model, metric, epsilon):
 def carried_through(metric, observed, surrogate, first):
     """Return the optimum with step 1 known as a population, and the posterior with that of step 1 as prior."""
     model, inputs = rub(metric, observed, surrogate, first, "population")
-    optimum = prb.minimize(model)
+    optimum = prb.minimize(model, progressbar=False)
     whole, whole_inputs = rub(metric, observed, surrogate, first, "posterior")
     posterior = sampled(whole, metric, prb.calibrate_epsilon(optimum))
     return (model, inputs, optimum), (whole, whole_inputs, posterior)
@@ -122,12 +122,12 @@ def fit_to_stated(metric):
     with pm.Model() as model:
         k = pm.Gamma.dist(mu=pm.Normal("mu", 266, 40), sigma=pm.HalfNormal("sd", 30))
         prb.Simulator("f", first_frequency, k, 10.55, metric=metric, observed=stated_values(*FREQUENCY))
-    frequency = moments(prb.minimize(model), first_frequency, (k, 10.55))
+    frequency = moments(prb.minimize(model, progressbar=False), first_frequency, (k, 10.55))
     with pm.Model() as model:
         mu, sd = pm.Normal("mu", 0.5, 0.3), pm.HalfNormal("sd", 0.3)
         contact = pm.TruncatedNormal.dist(mu, sd, lower=0)
         prb.Simulator("r", crest_factor, 266.0, 10.55, contact, metric=metric, observed=stated_values(*CREST))
-    optimum = prb.minimize(model)
+    optimum = prb.minimize(model, progressbar=False)
     return frequency, moments(optimum, crest_factor, (266.0, 10.55, contact)), optimum.point
 
 
@@ -258,7 +258,7 @@ def main():
     steps, frequency_moments, first_inputs = {}, {}, {}
     for label, metric in METRICS.items():
         model, inputs = bearings(metric, frequencies, frequency)
-        optimum = prb.minimize(model)
+        optimum = prb.minimize(model, progressbar=False)
         posterior = sampled(model, metric, prb.calibrate_epsilon(optimum))
         steps[label], first_inputs[label] = [(optimum, posterior)], inputs
         frequency_moments[label] = moments(optimum, frequency, inputs)
@@ -294,7 +294,7 @@ def main():
             model, inputs, posterior = whole["PR"]
         else:
             model, inputs = rub(METRICS["PR"], crests, surrogate, first, knowledge)
-            posterior = sampled(model, METRICS["PR"], prb.calibrate_epsilon(prb.minimize(model)))
+            posterior = sampled(model, METRICS["PR"], prb.calibrate_epsilon(prb.minimize(model, progressbar=False)))
         crest = prb.predict(posterior, surrogate, *inputs, model=model, random_seed=2)
         cells = [(float(posterior.posterior[n].mean()), float(posterior.posterior[n].std())) for n in ("mu_r", "sd_r")]
         cells.append(spread(crest, 0.95))

@@ -1,0 +1,169 @@
+"""The command line: what it writes, what it says, and that a mistake gets one line."""
+
+import logging
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+
+import prbayes as prb
+from prbayes.__main__ import main
+
+
+@pytest.fixture(autouse=True)
+def _logging() -> Iterator[None]:
+    """Leave the package's logger as it was."""
+    log = logging.getLogger("prbayes")
+    before = log.handlers[:], log.propagate, log.level
+    yield
+    log.handlers[:], log.propagate = before[:2]
+    log.setLevel(before[2])
+
+
+def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "prbayes", *arguments]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd, env=environment)
+
+
+@cache
+def results() -> dict[str, xr.DataTree | xr.Dataset]:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0, 4.0, 5.0])
+    optimum = prb.minimize(model)
+    posterior = prb.sample_smc(100, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False)
+    later = prb.predict(posterior, lambda x: 2 * x, x, model=model, random_seed=1)
+    test = prb.area_test(np.array([1.0, 2.0, 3.0]), later, null=prb.PosteriorNull(199))
+    return {"p.nc": posterior, "o.nc": optimum.to_datatree(), "v.nc": test.to_dataset()}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for name, tree in results().items():
+        tree.to_netcdf(tmp_path / name, engine="h5netcdf")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_report_of_saved_results(folder: Path) -> None:
+    done = run("report", "p.nc", "o.nc", "v.nc", "--title", "A < B", "--date", "2 May", "--out", "r.html", cwd=folder)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "r.html\n", "")
+    text = (folder / "r.html").read_text(encoding="utf-8")
+    assert "<h1>A &lt; B</h1>" in text
+    for title in ("Model", "Data", "Optimum", "Posterior", "Comparison", "Diagnostics", "Validity", "Cost and origin"):
+        assert f">{title}</h2>" in text
+    draws = results()["p.nc"]["posterior"]["mu"].values
+    assert f"mu = {draws.mean():.2f} ± {draws.std(ddof=1):.2f}" in text
+
+
+def test_markdown_and_defaults(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", "p.nc", "--markdown", "md", "--no-pictures"]) == 0
+    assert capsys.readouterr().out == f"{Path('md', 'report.md')}\n"
+    assert (folder / "md" / "report.md").read_text(encoding="utf-8").startswith("# p\n")
+    assert not (folder / "report.html").exists()
+    assert main(["report", "p.nc", "--no-pictures"]) == 0
+    assert capsys.readouterr().out == "report.html\n"
+    assert (folder / "report.html").stat().st_size > 5000
+
+
+def test_several_posteriors_are_compared_by_the_names_of_their_files(folder: Path) -> None:
+    (folder / "b").mkdir()
+    for name in ("q.nc", "b/p.nc"):
+        (folder / name).write_bytes((folder / "p.nc").read_bytes())
+    assert main(["report", "p.nc", "q.nc", "b/p.nc", "p.nc", "--no-pictures", "--markdown", "md"]) == 0
+    text = (folder / "md" / "report.md").read_text(encoding="utf-8")
+    other = Path("b", "p.nc")
+    for label in ("p.nc", "q", str(other)):
+        assert f"## Posterior: {label}\n" in text
+    assert text.count("## Posterior: ") == 3
+
+
+def test_a_saved_validity_test_comes_back_whole(folder: Path) -> None:
+    from prbayes.__main__ import _opened, _test_of
+
+    found = _test_of(Path("v.nc"), _opened(Path("v.nc")).to_dataset()).to_dataset()
+    xr.testing.assert_identical(found.drop_attrs(), results()["v.nc"].drop_attrs())
+    assert found.attrs["null"] == results()["v.nc"].attrs["null"]
+
+
+def test_mistakes_get_one_line_and_exit_code_2(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "text.nc").write_text("no netCDF")
+    (folder / "empty.nc").write_bytes(b"")
+    (folder / "cut.nc").write_bytes((folder / "p.nc").read_bytes()[:5000])
+    xr.Dataset({"a": 1.0}).to_netcdf(folder / "other.nc", engine="h5netcdf")
+    xr.Dataset({"u": 1.0}).to_netcdf(folder / "u.nc", engine="h5netcdf")
+    xr.DataTree.from_dict({"posterior": xr.Dataset({"mu": 1.0})}).to_netcdf(folder / "nodims.nc", engine="h5netcdf")
+    stranger = xr.Dataset({"nu": (("chain", "draw"), np.random.default_rng(1).normal(size=(2, 50)))})
+    xr.DataTree.from_dict({"posterior": stranger}).to_netcdf(folder / "stranger.nc", engine="h5netcdf")
+    cases = [
+        (["missing.nc"], "missing.nc: there is no such file"),
+        (["."], "there is no such file"),
+        (["text.nc"], "no netCDF file that can be read"),
+        (["empty.nc"], "no netCDF file that can be read"),
+        (["cut.nc"], "no netCDF file that can be read"),
+        (["other.nc"], "expected results of prbayes"),
+        (["u.nc"], "expected a validity test"),
+        (["nodims.nc"], "without the dimensions"),
+        (["p.nc", "stranger.nc"], "share no hyperparameter"),
+        (["p.nc", "--out", "p.nc/report.html"], "cannot write"),
+        (["p.nc", "--title", " "], "title"),
+    ]
+    for arguments, message in cases:
+        assert main(["report", *arguments, "--no-pictures"]) == 2, arguments
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert message in err, arguments
+        assert err.startswith("prbayes: ")
+        assert err.count("\n") == 1
+    assert main(["demo", "--out", "p.nc/x"]) == 2
+    assert not (folder / "report.html").exists()
+
+
+def test_nothing_read_is_executed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tree = results()["p.nc"].copy()
+    assert isinstance(tree, xr.DataTree)
+    tree["posterior"].attrs["model"] = "__import__('pathlib').Path('owned').touch()"
+    tree["posterior"].attrs["warnings"] = "<script>alert(1)</script> | is here"
+    tree.to_netcdf(folder / "bad.nc", engine="h5netcdf")
+    assert main(["report", "bad.nc", "--no-pictures"]) == 0
+    assert "<script" not in (folder / "report.html").read_text(encoding="utf-8")
+    assert not (folder / "owned").exists()
+
+
+def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, expected in (
+        (["--help"], "report"),
+        (["report", "--help"], "prbayes report results.nc optimum.nc validity.nc --title"),
+        (["demo", "--help"], "prbayes demo --out demo"),
+        (["--version"], f"prbayes {prb.__version__}"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        assert stop.value.code == 0
+        assert expected in capsys.readouterr().out
+    for arguments in ([], ["report"], ["demo", "--draws", "3"], ["demo", "--draws", "many"], ["nothing"]):
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        assert stop.value.code == 2
+        assert "usage:" in capsys.readouterr().err
+
+
+def test_demo(tmp_path: Path) -> None:
+    done = run("demo", "--out", "here", "--draws", "50", "--chains", "2", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    names = ["results.nc", "optimum.nc", "validity.nc", "report.html"]
+    assert done.stdout.splitlines() == [str(Path("here", n)) for n in names]
+    assert "prbayes: writing the report" in done.stderr
+    text = (tmp_path / "here" / "report.html").read_text(encoding="utf-8")
+    for title in ("Model", "Data", "Optimum", "Posterior", "Comparison", "Diagnostics", "Validity"):
+        assert f">{title}</h2>" in text
+    again = run("report", *(f"here/{n}" for n in names[:3]), "--quiet", cwd=tmp_path)
+    assert (again.returncode, again.stdout) == (0, "report.html\n")
