@@ -143,8 +143,8 @@ def find_optimum(
     if fresh and method.gradient and isinstance(method.method, str):
         raise TypeError(
             f"{fresh[0]}: prb.Fresh draws new responses at every evaluation, so the method {method.name} has no "
-            "gradient to follow; use prb.minimize(method='Nelder-Mead'), or propagation=prb.Reweighted() or "
-            "prb.Resimulated()"
+            "gradient to follow; pass epsilon= to prb.sample_smc, which then needs no optimum, use "
+            "prb.minimize(method='Nelder-Mead'), or propagation=prb.Reweighted() or prb.Resimulated()"
         )
     scale = prior_scale(evaluator, seed=random_seed)
     already = evaluator.n_responses

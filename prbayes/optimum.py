@@ -36,7 +36,8 @@ class Optimum:
     n_screened : int
         Points of the prior that were tried as starting points, in one batch.
     n_responses : int
-        Scalar responses computed for this optimum, the design's included.
+        Scalar responses that this optimum took, the design's included, and those found in a store; `n_computed` has
+        how many were computed.
     converged : bool
     message : str
         What the optimiser said.
@@ -91,6 +92,11 @@ class Optimum:
     def model(self) -> pm.Model:
         """The model."""
         return self.evaluator.model
+
+    @property
+    def n_computed(self) -> int:
+        """Responses computed for the model so far: without those found in a store, with those computed again."""
+        return sum(node.bound.responses.computed for node in self.evaluator.nodes)
 
     def to_datatree(self) -> xr.DataTree:
         """Return the optimum as a DataTree with groups ``optimum``, ``stderr``, ``trace`` and ``calibration``."""

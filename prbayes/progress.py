@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from importlib.util import find_spec
 
 from rich.console import Console
 from rich.errors import LiveError
@@ -15,7 +16,14 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeE
 _log = logging.getLogger("prbayes")
 
 _SHOWN_FROM = 2.0  # expected seconds from which there is a bar
-CONSOLE = Console(stderr=True)  # one for all, so that a bar inside another is drawn below it
+
+
+def _console() -> Console:
+    """Return a console on stderr, that of a notebook only where rich finds its widgets: it warns without them."""
+    return Console(stderr=True, force_jupyter=None if find_spec("ipywidgets") else False)
+
+
+CONSOLE = _console()  # one for all, so that a bar inside another is drawn below it
 
 _hidden: ContextVar[bool] = ContextVar("hidden", default=False)
 

@@ -257,6 +257,13 @@ def test_nothing_is_computed_twice(tmp_path: Path) -> None:
         np.testing.assert_array_equal(data["inputs"][:, 1], 2.0)
 
 
+def test_an_optimum_tells_what_was_computed_and_what_it_rests_on(tmp_path: Path) -> None:
+    first = prb.minimize(model(prb.scalar(times), store=tmp_path))
+    again = prb.minimize(model(prb.scalar(times), store=tmp_path))
+    assert first.n_computed == first.n_responses == again.n_responses >= N
+    assert (again.n_computed, again.point) == (0, first.point)
+
+
 def test_another_constant_is_another_input(tmp_path: Path) -> None:
     model(times, store=tmp_path)
     with pm.Model() as other:

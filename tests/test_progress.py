@@ -1,6 +1,7 @@
 """Progress bars: they appear for long work only, on stderr, and stay away where they are not wanted."""
 
 import io
+import sys
 import time
 from typing import Any
 
@@ -124,3 +125,9 @@ def test_a_calibration_of_the_sampler_shows_one_bar(screen: io.StringIO) -> None
     prb.simulation_based_calibration(2, model=build(prb.Reweighted(32)), draws=50)
     assert "data sets" in screen.getvalue()
     assert not {"SMC", "refits", "evaluations"} & set(screen.getvalue().split())
+
+
+def test_a_notebook_without_widgets_gets_plain_bars(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    monkeypatch.setitem(sys.modules, "ipywidgets", None)
+    assert not prbayes.progress._console().is_jupyter
