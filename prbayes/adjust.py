@@ -19,6 +19,7 @@ _FEWEST = 50  # draws of a mode below which it is left as it is
 _APART = 1.5  # ratio of distances to two modes below which a draw is between them
 _BETWEEN = 0.05  # share of such draws above which modes are not separate
 _FAR = 6.0  # standard deviations to which draws farther out are drawn in
+_REACH = 3.0  # standard errors beyond which a refit counts as so far away, and no farther
 _WEAKEST = 2.0  # standard error, in units of the prior's spread, up to which refits follow a direction
 _WIDTH = 3.2  # of the middle 89% of a normal distribution, in standard deviations
 
@@ -27,12 +28,12 @@ _WIDTH = 3.2  # of the middle 89% of a normal distribution, in standard deviatio
 class Affine:
     r"""An affine map of the draws, in unconstrained space, to the covariance and centre that the data warrant.
 
-    Data sets are drawn from the model at the optimum, and each is fitted anew. The covariance of the
-    minimisers is the inverse of A, the (Godambe) information in the data, and their mean shift is the bias
-    b of the minimiser. With prior mean :math:`\theta_0` and precision P the draws get covariance
-    :math:`(A + P)^{-1}` and mean :math:`(A + P)^{-1} (A (\hat\theta - b) + P \theta_0)`, in the directions
-    about which the data tell at least a quarter of what the prior does; along the others they keep their distribution
-    given those.
+    Data sets are drawn from the model at the optimum, and each is fitted anew. The covariance of the minimisers is the
+    inverse of A, the (Godambe) information in the data, and their median shift is the bias b of the minimiser; those
+    that run away, as where a scale may be zero, count as three standard errors off. With prior mean :math:`\theta_0`
+    and precision P the draws get covariance :math:`(A + P)^{-1}` and mean
+    :math:`(A + P)^{-1} (A (\hat\theta - b) + P \theta_0)`, in the directions about which the data tell at least a quarter
+    of what the prior does; along the others they keep their distribution given those.
 
     Parameters
     ----------
@@ -63,9 +64,9 @@ class Affine:
         evaluator, r = hood.evaluator, hood.sd.size
         (center,), _ = hood.refit(observed_set(evaluator))
         x, ok = hood.refit(simulated_sets(evaluator, hood.thetas(center), self.n_sets, self.seed))
-        x = _drawn_in(x[ok])
-        information = np.linalg.inv(np.cov(x, rowvar=False).reshape(r, r))
-        bias = x.mean(axis=0) - center
+        shifts = np.clip(x[ok] - center, -_REACH, _REACH)
+        information = np.linalg.inv(np.cov(shifts, rowvar=False).reshape(r, r))
+        bias = np.median(shifts, axis=0)  # the same in every parametrisation, as where a scale comes near zero
         prior, _ = hood.coordinates(evaluator.prior_thetas(1024, self.seed))
         precision = np.linalg.inv(np.cov(prior, rowvar=False).reshape(r, r))
         covariance = np.linalg.inv(information + precision)
