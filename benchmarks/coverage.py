@@ -203,6 +203,7 @@ def analyse(
     ev = evaluator.observing({"y": data})
     optimum = find_optimum(ev, tolerance=1e-6, starts=0)
     epsilon = np.array([calibrate_epsilon(optimum)["y"]])
+    ev.nodes[0].epsilon.set_value(epsilon[0])
     hood = Neighbourhood.of(ev, optimum.theta, epsilon, prior_scale(ev))
     r = hood.sd.size
     spread = 2.0 * (hood.frame * hood.sd**2) @ hood.frame.T + hood.local.blind @ hood.local.blind.T
@@ -216,7 +217,7 @@ def analyse(
     posteriors = {
         "plain": draws,
         "sandwich": moved(hood, x, rest, np.zeros(r), first_order),
-        "affine": moved(hood, x, rest, *Affine(n_sets=100).target(hood)),
+        "affine": Affine(n_sets=100)(ev, draws, [optimum.theta])[0],
         "exact": exact,
     }
     if bootstrap:

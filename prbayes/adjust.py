@@ -31,9 +31,9 @@ class Affine:
     Data sets are drawn from the model at the optimum, and each is fitted anew. The covariance of the minimisers is the
     inverse of A, the (Godambe) information in the data, and their median shift is the bias b of the minimiser; those
     that run away, as where a scale may be zero, count as three standard errors off. With prior mean :math:`\theta_0`
-    and precision P the draws get covariance :math:`(A + P)^{-1}` and mean
-    :math:`(A + P)^{-1} (A (\hat\theta - b) + P \theta_0)`, in the directions about which the data tell at least a quarter
-    of what the prior does; along the others they keep their distribution given those.
+    and precision P the draws get covariance :math:`(A + P)^{-1}` and median
+    :math:`(A + P)^{-1} (A (\hat\theta - b) + P \theta_0)`, in the directions about which the data tell at least a
+    quarter of what the prior does; along the others they keep their distribution given those.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class Affine:
         positive_integer(self.seed, "Affine: seed", minimum=0)
 
     def target(self, hood: Neighbourhood) -> tuple[Floats, Floats]:
-        """Return the mean (r,) and covariance (r, r) that draws should have, in the coordinates of ``hood``."""
+        """Return the centre (r,) and covariance (r, r) that draws should have, in the coordinates of ``hood``."""
         evaluator, r = hood.evaluator, hood.sd.size
         (center,), _ = hood.refit(observed_set(evaluator))
         x, ok = hood.refit(simulated_sets(evaluator, hood.thetas(center), self.n_sets, self.seed))
@@ -111,7 +111,7 @@ class Affine:
                 hood = _among(hood, flat[mine])
                 x, rest = hood.coordinates(flat[mine])
                 out[mine] = moved(hood, x, rest, *self.target(hood))
-                far += int((_drawn_in(x) != x).any(axis=1).sum())
+                far += int((_drawn_in(x, _FAR) != x).any(axis=1).sum())
                 count += 1
         if not count:
             return thetas, f"none: there are fewer than {_FEWEST} draws of a mode"
@@ -132,16 +132,18 @@ def inapplicable(evaluator: Evaluator) -> str:
     return ""
 
 
-def moved(hood: Neighbourhood, x: Floats, rest: Floats, mean: Floats, covariance: Floats) -> Floats:
-    """Move draws to a mean and covariance along the frame; what is left follows as its regression on them says."""
+def moved(hood: Neighbourhood, x: Floats, rest: Floats, center: Floats, covariance: Floats) -> Floats:
+    """Move draws to a median and covariance along the frame; what is left follows as its regression on them says.
+
+    Draws count as refits do: their median, and no farther from it than three standard deviations.
+    """
     r = hood.sd.size
-    x = _drawn_in(x)
-    now = np.cov(x, rowvar=False).reshape(r, r)
-    center = x.mean(axis=0)
-    root = _root(now)
+    x = _drawn_in(x, _FAR)
+    root = _root(np.cov(_drawn_in(x, _REACH), rowvar=False).reshape(r, r))
     inverse = np.linalg.inv(root)
-    to = mean + (x - center) @ (inverse @ _root(root @ covariance @ root) @ inverse).T
-    slopes = np.linalg.solve(now, (x - center).T @ (rest - rest.mean(axis=0)) / (len(x) - 1))
+    to = center + (x - np.median(x, axis=0)) @ (inverse @ _root(root @ covariance @ root) @ inverse).T
+    apart = x - x.mean(axis=0)
+    slopes = np.linalg.solve(apart.T @ apart, apart.T @ (rest - rest.mean(axis=0)))
     return hood.thetas(to, rest + (to - x) @ slopes)
 
 
@@ -159,14 +161,14 @@ def _among(hood: Neighbourhood, thetas: Floats) -> Neighbourhood:
     return found if found.sd.size == hood.sd.size else hood
 
 
-def _drawn_in(x: Floats) -> Floats:
-    """Return draws, (n, r), at most six standard deviations from the median, as the middle 89% tells them.
+def _drawn_in(x: Floats, most: float) -> Floats:
+    """Return draws, (n, r), at most so many standard deviations from the median, as the middle 89% tells them.
 
     A few in a thousand far out, as where a bounded parameter comes near its bound, would otherwise decide how
     all others are moved.
     """
     low, middle, high = np.quantile(x, [0.055, 0.5, 0.945], axis=0)
-    far = _FAR * (high - low) / _WIDTH
+    far = most * (high - low) / _WIDTH
     return np.clip(x, middle - far, middle + far)
 
 
