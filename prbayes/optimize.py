@@ -260,6 +260,6 @@ def _warnings(evaluator: Evaluator, local: Local | None, others: list[Rival], er
         lines += [
             f"the data tell less than the prior about {direction} (in units of the priors' standard deviations): it is "
             "not identified by them, and its posterior rests on the prior"
-            for direction in blind_directions(local, evaluator.names)
+            for direction in blind_directions(local, evaluator.readable_names)
         ]
     return tuple(lines)

@@ -16,7 +16,7 @@ from prbayes.population import Evaluator
 from prbayes.search import Search
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Optimum:
     """The result of `minimize`; numerical failure is a value in it, not an exception.
 
@@ -80,13 +80,20 @@ class Optimum:
     covariance: Floats
     theta: Floats
     names: list[str]
-    evaluator: Evaluator = field(repr=False)
+    evaluator: Evaluator
     support: dict[str, dict[str, float]] = field(default_factory=dict)
-    trace: dict[str, Floats] = field(repr=False, default_factory=dict)
+    trace: dict[str, Floats] = field(default_factory=dict)
     seconds: float = 0.0
     design_error: float = np.nan
     rivals: tuple[dict[str, Any], ...] = ()
     warnings: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        """Show the answer, what it cost, and what is to be said of it."""
+        found = [f"{name} = {_short(value)} ± {_short(self.stderr[name])}" for name, value in self.point.items()]
+        state = "converged" if self.converged else "NOT converged"
+        cost = f"{self.n_evaluations} evaluations, {self.n_responses} responses, {state}"
+        return "\n  ".join([f"Optimum: discrepancy {self.discrepancy:.4g} after {cost}", *found, *self.warnings])
 
     @property
     def model(self) -> pm.Model:
@@ -103,6 +110,10 @@ class Optimum:
         from prbayes.results import optimum_tree
 
         return optimum_tree(self)
+
+
+def _short(value: Any) -> str:
+    return np.array2string(np.asarray(value), precision=4, threshold=8, formatter={"float_kind": "{:.4g}".format})
 
 
 def assemble(

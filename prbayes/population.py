@@ -80,8 +80,16 @@ class Evaluator:
     @property
     def names(self) -> list[str]:
         """Names of the elements of theta, such as 'sigma_log__' or 'mu[1]'."""
+        return self._elements(list(self.shapes))
+
+    @property
+    def readable_names(self) -> list[str]:
+        """The same with the variables' own names, such as 'sigma'; elements of theta are transformed nevertheless."""
+        return self._elements([str(self.model.values_to_rvs[v].name) for v in self.model.value_vars])
+
+    def _elements(self, names: list[str]) -> list[str]:
         out: list[str] = []
-        for name, shape in self.shapes.items():
+        for name, shape in zip(names, self.shapes.values(), strict=True):
             out += [f"{name}[{','.join(map(str, i))}]" for i in np.ndindex(shape)] if shape else [name]
         return out
 

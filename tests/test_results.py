@@ -258,3 +258,15 @@ def test_the_support_of_an_optimum_is_part_of_it() -> None:
         assert support["weight_ess"] > 30
         assert 0.8 < support["mean_weight"] < 1.25
         assert support["lost_mass"] == 0
+
+
+def test_an_optimum_shows_its_answer_in_a_few_lines() -> None:
+    found = optimum()
+    lines = repr(found).splitlines()
+    assert lines[0].startswith(f"Optimum: discrepancy {found.discrepancy:.4g} after {found.n_evaluations} evaluations")
+    assert lines[0].endswith("converged")
+    assert len(lines) == 1 + len(found.point) + len(found.warnings)
+    for line, (name, value) in zip(lines[1:], found.point.items(), strict=False):
+        assert line.strip().startswith(f"{name} = ")
+        assert f"{np.ravel(value)[0]:.4g}" in line
+        assert f"{np.ravel(found.stderr[name])[-1]:.4g}" in line.partition("±")[2]
