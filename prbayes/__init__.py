@@ -25,21 +25,21 @@ from prbayes.metrics import (
 from prbayes.nulls import ExactModel, PosteriorNull
 from prbayes.optimize import minimize
 from prbayes.optimum import Optimum
-from prbayes.plots import plot_comparison, plot_posterior, plot_validity
-from prbayes.portraits import plot_population, plot_responses
+from prbayes.pictures.plots import plot_comparison, plot_posterior, plot_validity
+from prbayes.pictures.portraits import plot_population, plot_responses
+from prbayes.pictures.trails import plot_landscape, plot_optimizer, plot_stages
 from prbayes.predict import predict
 from prbayes.propagation import Fresh, Resimulated, Reweighted, monte_carlo, sobol
 from prbayes.refinement import DesignError, refine
-from prbayes.report import Report
+from prbayes.reports.report import Report
+from prbayes.reports.section import Section
 from prbayes.sbc import simulation_based_calibration
 from prbayes.search import Scipy
-from prbayes.section import Section
 from prbayes.simulator import Simulator, abc_distance, set_epsilon
 from prbayes.smc import sample_smc
 from prbayes.store import StoreError
 from prbayes.surfaces import Polynomial, RadialBasis, SurrogateError
 from prbayes.surrogate import Surrogate
-from prbayes.trails import plot_landscape, plot_optimizer, plot_stages
 from prbayes.validity import ValidityTest, area_test, u_values
 
 __version__ = version("prbayes")

@@ -12,8 +12,8 @@ from typing import Any
 
 import xarray as xr
 
-from prbayes.demo import run_demo
-from prbayes.report import Report
+from prbayes.reports.demo import run_demo
+from prbayes.reports.report import Report
 from prbayes.validity import ValidityTest
 
 _REPORT = """examples:

@@ -9,10 +9,10 @@ import pytest
 from scipy import stats
 
 import prbayes as prb
-from prbayes import curves
-from prbayes.ensemble import read_before, read_result, supported
-from prbayes.landscape import elements, landscape, rooted
-from prbayes.margins import chosen, margin_densities, margins
+from prbayes.pictures import curves
+from prbayes.pictures.ensemble import read_before, read_result, supported
+from prbayes.pictures.landscape import elements, landscape, rooted
+from prbayes.pictures.margins import chosen, margin_densities, margins
 from prbayes.population import Evaluator
 
 QUANTILES = stats.norm.ppf((np.arange(1000) + 0.5) / 1000)

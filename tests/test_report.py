@@ -23,8 +23,8 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes import illustrations
-from prbayes.section import cells, number, plus_minus
+from prbayes.reports import illustrations
+from prbayes.reports.section import cells, number, plus_minus
 
 HOSTILE = ["<script>alert(1)", "a|b", "x & y &lt;", "**bold** [link](x) `code` $y$", "_it_ ![p](q)"]
 VOID = {"meta", "img", "br", "hr", "link"}

@@ -15,7 +15,7 @@ from prbayes import datasets
 from prbayes.metrics import ProbabilityResidual
 from prbayes.optimize import minimize
 from prbayes.predict import predict
-from prbayes.report import Report
+from prbayes.reports.report import Report
 from prbayes.simulator import Simulator
 from prbayes.smc import sample_smc
 from prbayes.validity import area_test

@@ -11,8 +11,9 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._arrays import Floats, positive_number
-from prbayes.canvas import BLUE, DASHED, INK, VERMILION, Canvas, named
-from prbayes.curves import (
+from prbayes.optimum import Optimum
+from prbayes.pictures.canvas import BLUE, DASHED, INK, VERMILION, Canvas, named
+from prbayes.pictures.curves import (
     central_range,
     densities,
     distribution_functions,
@@ -21,9 +22,8 @@ from prbayes.curves import (
     staircase,
     typical_bandwidth,
 )
-from prbayes.ensemble import Ensemble, read_before, read_result, supported
-from prbayes.margins import chosen, margin_densities, margins
-from prbayes.optimum import Optimum
+from prbayes.pictures.ensemble import Ensemble, read_before, read_result, supported
+from prbayes.pictures.margins import chosen, margin_densities, margins
 from prbayes.simulator import Node
 
 _log = logging.getLogger("prbayes")

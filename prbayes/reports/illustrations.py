@@ -11,12 +11,12 @@ from typing import Any
 
 import pymc as pm
 
-from prbayes.material import Material
-from prbayes.plots import plot_comparison, plot_posterior, plot_validity
-from prbayes.portraits import plot_population, plot_responses
-from prbayes.section import Section
+from prbayes.pictures.plots import plot_comparison, plot_posterior, plot_validity
+from prbayes.pictures.portraits import plot_population, plot_responses
+from prbayes.pictures.trails import plot_landscape, plot_optimizer, plot_stages
+from prbayes.reports.material import Material
+from prbayes.reports.section import Section
 from prbayes.simulator import nodes
-from prbayes.trails import plot_landscape, plot_optimizer, plot_stages
 
 _log = logging.getLogger("prbayes")
 

@@ -13,8 +13,8 @@ import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._arrays import Floats
-from prbayes.curves import central_range, densities, typical_bandwidth
 from prbayes.inputs import PopulationSampler, compile_batched, is_mvnormal
+from prbayes.pictures.curves import central_range, densities, typical_bandwidth
 from prbayes.population import Evaluator
 
 _SPECIMENS, _SOME = 400, 40  # random draws of inputs, never of responses, and from how many populations

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from prbayes.material import Material, elements
-from prbayes.section import number, plus_minus
+from prbayes.reports.material import Material, elements
+from prbayes.reports.section import number, plus_minus
 from prbayes.validity import ValidityTest
 
 _MOST = 6  # hyperparameters that the summary lists

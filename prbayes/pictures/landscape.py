@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from prbayes._arrays import Floats
-from prbayes.ensemble import supported
 from prbayes.optimum import Optimum
+from prbayes.pictures.ensemble import supported
 from prbayes.population import Evaluator
 
 _SDS, _DRAWS, _STEPS = 4.0, 1000, 33

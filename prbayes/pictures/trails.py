@@ -10,7 +10,8 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._arrays import Floats, positive_integer
-from prbayes.canvas import (
+from prbayes.optimum import Optimum
+from prbayes.pictures.canvas import (
     BLUE,
     CROSS,
     CYCLE,
@@ -25,9 +26,8 @@ from prbayes.canvas import (
     Canvas,
     named,
 )
-from prbayes.curves import log_ticks, spans_decades
-from prbayes.landscape import Landscape, elements, landscape, rooted
-from prbayes.optimum import Optimum
+from prbayes.pictures.curves import log_ticks, spans_decades
+from prbayes.pictures.landscape import Landscape, elements, landscape, rooted
 from prbayes.population import Evaluator
 
 _STAGES = {

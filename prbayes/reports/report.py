@@ -15,9 +15,9 @@ from typing import Any
 import pymc as pm
 import xarray as xr
 
-from prbayes.contents import contents
 from prbayes.optimum import Optimum
-from prbayes.section import Section, cells
+from prbayes.reports.contents import contents
+from prbayes.reports.section import Section, cells
 from prbayes.validity import ValidityTest
 
 # What Markdown, or HTML inside it, would read as markup.
@@ -173,7 +173,7 @@ class Report:
 def _environment() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    return Environment(loader=PackageLoader("prbayes"), autoescape=True, undefined=StrictUndefined)
+    return Environment(loader=PackageLoader("prbayes.reports"), autoescape=True, undefined=StrictUndefined)
 
 
 @cache
@@ -184,7 +184,9 @@ def _markdown() -> Any:
     def escaped(value: Any) -> str:
         return str(value) if isinstance(value, Markup) else _literal(str(value))
 
-    return Environment(loader=PackageLoader("prbayes"), autoescape=False, finalize=escaped, undefined=StrictUndefined)
+    return Environment(
+        loader=PackageLoader("prbayes.reports"), autoescape=False, finalize=escaped, undefined=StrictUndefined
+    )
 
 
 def _literal(text: str) -> str:

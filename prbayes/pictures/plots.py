@@ -11,9 +11,9 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._arrays import Floats, positive_number
-from prbayes.canvas import BLUE, DASHED, DIAMOND, DOTTED, GREY, INK, VERMILION, Canvas, grid_settings, named
-from prbayes.curves import bounded_density, normal_density, round_ticks
 from prbayes.optimum import Optimum
+from prbayes.pictures.canvas import BLUE, DASHED, DIAMOND, DOTTED, GREY, INK, VERMILION, Canvas, grid_settings, named
+from prbayes.pictures.curves import bounded_density, normal_density, round_ticks
 from prbayes.population import Evaluator
 from prbayes.validity import ValidityTest
 

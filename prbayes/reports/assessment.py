@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from prbayes.material import Material
-from prbayes.section import Section, alike, number, plus_minus, rows_table
-from prbayes.summary import shown, verdict
+from prbayes.reports.material import Material
+from prbayes.reports.section import Section, alike, number, plus_minus, rows_table
+from prbayes.reports.summary import shown, verdict
 
 
 def comparison(m: Material) -> list[Section]:

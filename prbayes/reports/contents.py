@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes.assessment import comparison as comparison_of
-from prbayes.assessment import diagnostics, origin
-from prbayes.assessment import validity as validity_of
-from prbayes.illustrations import illustrate, with_graph
-from prbayes.material import Material, elements, gather
-from prbayes.section import NOTHING, Section, alike, number, places, rows_table
-from prbayes.summary import counted, summary
+from prbayes.reports.assessment import comparison as comparison_of
+from prbayes.reports.assessment import diagnostics, origin
+from prbayes.reports.assessment import validity as validity_of
+from prbayes.reports.illustrations import illustrate, with_graph
+from prbayes.reports.material import Material, elements, gather
+from prbayes.reports.section import NOTHING, Section, alike, number, places, rows_table
+from prbayes.reports.summary import counted, summary
 
 _COLUMNS = {
     "mean": "mean",

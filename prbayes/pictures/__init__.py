@@ -1,0 +1,1 @@
+"""Pictures of results: numbers first, then panels that are drawn alike on every backend."""
