@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -134,6 +136,11 @@ def test_public_names_are_documented(name: str) -> None:
     text = getattr(prbayes, name).__doc__
     assert text
     assert text.strip().splitlines()[0].endswith("."), "the summary is one sentence"
+
+
+def test_the_package_imports_nothing_that_draws_or_renders() -> None:
+    code = "import sys, prbayes; print({'arviz', 'arviz_plots', 'graphviz', 'jinja2', 'matplotlib'} & set(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
 
 
 def test_public_names_are_in_the_reference() -> None:

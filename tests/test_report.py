@@ -661,11 +661,6 @@ def test_the_graph_shows_the_variables() -> None:
     assert all(f">{name}</text>".encode() in found.picture for name in ("mu", "sigma", "y", "Simulator"))
 
 
-def test_importing_the_package_imports_no_templates() -> None:
-    code = "import sys, prbayes; print({'jinja2', 'matplotlib', 'arviz', 'graphviz'} & set(sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
-
-
 # -- in a browser ----------------------------------------------------------------------------------------
 
 
