@@ -22,6 +22,7 @@ _STEP = 1e-3  # of the prior's standard deviation; densities are twice different
 _WIDE_STEP = 0.05  # where a distribution function of simulated values, a step function, is differenced
 _KNOTS = 400  # on which distribution functions are linearised
 _IRLS = 30
+_AGREEMENT = 0.35  # correlation of the changes of two halves of the points from which a change is taken as real
 _LOADING = 0.02  # share of a hyperparameter in unseen directions above which it is not identified
 _ROUNDING = 0.01  # curvature, in units of the gradient's variance over the curvature, that is a rounding error
 _BLOCK = 1 << 20  # numbers held at a time where data sets meet the features of a stencil
@@ -152,8 +153,10 @@ class Information:
                 row += 4
         return np.asarray(out)
 
-    def area(self, observed: Floats, weights: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return a linear model of the area metric for data sets (n,), (n_sets, n).
+    def area(
+        self, observed: Floats, weights: Floats, among: NDArray[np.bool_] | None = None
+    ) -> tuple[Floats, Floats, Floats]:
+        """Return a linear model of the area metric for data sets (n,), (n_sets, n), from all points or from some.
 
         Returns
         -------
@@ -161,6 +164,8 @@ class Information:
             Gaps between distribution functions (n_sets, m), their slopes (d, m), lengths (m,).
         """
         values, w = self._populations
+        if among is not None:
+            w = w * among / (w * among).sum(axis=-1, keepdims=True)
         knots = np.unique(np.concatenate([values[0][np.isfinite(values[0])], observed]))
         knots = knots[np.unique(np.linspace(0, knots.size - 1, _KNOTS).astype(int))]
         if np.array_equal(values[0], values[-1], equal_nan=True):
@@ -184,13 +189,19 @@ def seen_by_area(part: Information) -> Floats:
     """Return the directions that an area metric sees, orthonormal in units of the prior's spread, shape (d, r).
 
     A direction is not seen if one prior standard deviation along it changes the area by less than half the
-    noise floor: then derivatives along it are mostly the design's own error.
+    noise floor, or if two halves of the points do not agree on the change: then it is the points' own error.
     """
     _, slopes, lengths = part.area(*part.data_set)
     slopes = slopes * part.scale[:, None]
     _, vectors = np.linalg.eigh((slopes * lengths) @ slopes.T)
     change = (np.abs(vectors.T @ slopes) * lengths).sum(axis=-1)
-    return np.asarray(vectors[:, change > 0.5 * part.noise_floor])
+    first = part.evaluator.nodes[part.k].bound.blocks % 2 == 0
+    a, b = (vectors.T @ (part.area(*part.data_set, half)[1] * part.scale[:, None]) for half in (first, ~first))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        agreement = (a * b * lengths).sum(axis=-1) / np.sqrt(
+            (a**2 * lengths).sum(axis=-1) * (b**2 * lengths).sum(axis=-1)
+        )
+    return np.asarray(vectors[:, (change > 0.5 * part.noise_floor) & (agreement > _AGREEMENT)])
 
 
 def first_order_shifts(parts: list[Information], scales: Floats, basis: Floats, sets: DataSets) -> Floats:

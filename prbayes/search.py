@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from pytensor.gradient import NullTypeGradError
 
 from prbayes._arrays import Floats
 from prbayes.discrepancy import DensityDiscrepancy
@@ -235,7 +236,7 @@ class Search:
             try:
                 exact = self.evaluator.objective(prior=self.prior, gradient=True)
                 return lambda theta: (*exact(theta, scales), 1)
-            except NotImplementedError:
+            except (NotImplementedError, NullTypeGradError):  # of the response, or of an inverse distribution function
                 step = _STEP * self.scale
         if not self.prior:
             total = self.evaluator.total  # needs no compilation

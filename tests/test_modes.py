@@ -265,3 +265,29 @@ def test_rivals_stand_where_the_optimum_does_along_blind_directions() -> None:
     assert len(comparable) == 1
     assert comparable[0]["point"]["idle"] == pytest.approx(optimum.point["idle"], abs=1e-6)
     assert len(optimum.warnings) == 2
+
+
+@pytest.mark.parametrize("n", [256, 1024])
+def test_a_ridge_under_the_area_metric_is_seen_through_few_points(n: int) -> None:
+    """Two sources of scatter, of which only the sum is measured: what tells them apart is the points' own error."""
+    with pm.Model() as model:
+        u = pm.Normal.dist(1, pm.HalfNormal("sigma", 1))
+        v = pm.Normal.dist(0, pm.HalfNormal("noise", 1))
+        keywords = {"metric": prb.AreaMetric(), "observed": OBSERVED, "propagation": prb.Resimulated(n)}
+        prb.Simulator("y", lambda u, v: u + v, u, v, **keywords)
+    optimum = prb.minimize(model)
+    assert all(np.isinf(optimum.stderr[name]) for name in ("sigma", "noise"))
+    (line,) = optimum.warnings
+    assert "sigma" in line
+    assert "noise" in line
+
+
+def test_what_is_seen_under_the_area_metric_is_seen_through_few_points_as_well() -> None:
+    with pm.Model() as model:
+        u = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        v = pm.Normal.dist(0, 0.2)
+        keywords = {"metric": prb.AreaMetric(), "observed": OBSERVED, "propagation": prb.Resimulated(256)}
+        prb.Simulator("y", lambda u, v: u + v, u, v, **keywords)
+    optimum = prb.minimize(model)
+    assert all(np.isfinite(optimum.stderr[name]) for name in ("mu", "sigma"))
+    assert optimum.warnings == ()

@@ -276,3 +276,16 @@ def test_a_million_responses_with_gradients_and_standard_errors_take_less_than_a
     run = subprocess.run([sys.executable, "-c", MILLION, metric], capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     assert float(run.stdout) < 1.0
+
+
+def test_an_inverse_distribution_function_without_gradient_is_differenced() -> None:
+    """PyTensor has no gradient of the gamma distribution's in its shape, and says so by an error of its own."""
+    observed = np.random.default_rng(5).gamma(16, 1 / 16, 60)
+    with pm.Model() as model:
+        x = pm.Gamma.dist(mu=pm.HalfNormal("mu", 2), sigma=pm.HalfNormal("sigma", 1))
+        keywords = {"metric": prb.KullbackLeibler(), "observed": observed, "propagation": prb.Resimulated(512)}
+        prb.Simulator("y", lambda x: 2 * x - x, x, **keywords)
+    optimum = prb.minimize(model)
+    assert optimum.converged
+    assert optimum.point["mu"] == pytest.approx(observed.mean(), abs=0.05)
+    assert optimum.point["sigma"] == pytest.approx(observed.std(), rel=0.15)
