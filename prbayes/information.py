@@ -197,11 +197,8 @@ def seen_by_area(part: Information) -> Floats:
     change = (np.abs(vectors.T @ slopes) * lengths).sum(axis=-1)
     first = part.evaluator.nodes[part.k].bound.blocks % 2 == 0
     a, b = (vectors.T @ (part.area(*part.data_set, half)[1] * part.scale[:, None]) for half in (first, ~first))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        agreement = (a * b * lengths).sum(axis=-1) / np.sqrt(
-            (a**2 * lengths).sum(axis=-1) * (b**2 * lengths).sum(axis=-1)
-        )
-    return np.asarray(vectors[:, (change > 0.5 * part.noise_floor) & (agreement > _AGREEMENT)])
+    both, one, other = ((x * lengths).sum(axis=-1) for x in (a * b, a**2, b**2))
+    return np.asarray(vectors[:, (change > 0.5 * part.noise_floor) & (both > _AGREEMENT * np.sqrt(one * other))])
 
 
 def first_order_shifts(parts: list[Information], scales: Floats, basis: Floats, sets: DataSets) -> Floats:
