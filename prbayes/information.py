@@ -22,6 +22,7 @@ _STEP = 1e-3  # of the prior's standard deviation; densities are twice different
 _WIDE_STEP = 0.05  # where a distribution function of simulated values, a step function, is differenced
 _KNOTS = 400  # on which distribution functions are linearised
 _IRLS = 30
+_HALVED = 256  # points from which two halves can be held against each other
 _AGREEMENT = 0.35  # correlation of the changes of two halves of the points from which a change is taken as real
 _LOADING = 0.02  # share of a hyperparameter in unseen directions above which it is not identified
 _ROUNDING = 0.01  # curvature, in units of the gradient's variance over the curvature, that is a rounding error
@@ -195,10 +196,14 @@ def seen_by_area(part: Information) -> Floats:
     slopes = slopes * part.scale[:, None]
     _, vectors = np.linalg.eigh((slopes * lengths) @ slopes.T)
     change = (np.abs(vectors.T @ slopes) * lengths).sum(axis=-1)
-    first = part.evaluator.nodes[part.k].bound.blocks % 2 == 0
-    a, b = (vectors.T @ (part.area(*part.data_set, half)[1] * part.scale[:, None]) for half in (first, ~first))
-    both, one, other = ((x * lengths).sum(axis=-1) for x in (a * b, a**2, b**2))
-    return np.asarray(vectors[:, (change > 0.5 * part.noise_floor) & (both > _AGREEMENT * np.sqrt(one * other))])
+    enough = change > 0.5 * part.noise_floor
+    blocks = part.evaluator.nodes[part.k].bound.blocks
+    if blocks.size >= _HALVED:
+        halves = (part.area(*part.data_set, blocks % 2 == i)[1] * part.scale[:, None] for i in (0, 1))
+        a, b = (vectors.T @ s for s in halves)
+        both, one, other = ((x * lengths).sum(axis=-1) for x in (a * b, a**2, b**2))
+        enough &= both > _AGREEMENT * np.sqrt(one * other)
+    return np.asarray(vectors[:, enough])
 
 
 def first_order_shifts(parts: list[Information], scales: Floats, basis: Floats, sets: DataSets) -> Floats:
