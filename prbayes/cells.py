@@ -14,13 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._arrays import Floats
-
-_CHUNK = 1 << 16  # sample values binned at a time: bounds memory, stays in cache
-# The four cubic B-splines that reach a point at fraction t between two nodes: coefficients of 1, t, t^2, t^3.
-_SPLINE = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6
+from prbayes.loops import SPLINE, count, read, smooth
 
 NDArrayInt = NDArray[np.intp]
-NDArrayBool = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,91 +69,35 @@ class KernelCells(Cells):
     step: float
     kernel: Floats
 
-    def _locate(self, sample: Floats, rows: int = 1) -> tuple[NDArrayInt, Floats, NDArrayBool | None]:
-        """Return the node below each value, the fraction of a step beyond it, and which are off the grid, if any.
-
-        Values off the grid, and NaN, are said to be at the first node, where no value of the grid is. With several
-        rows, each has its own nodes.
-        """
-        with np.errstate(invalid="ignore"):
-            t = np.multiply(sample, 1 / self.step)
-            t -= self.centers[0] / self.step
-            off = None
-            if not (t.min(initial=1) >= 1 and t.max(initial=1) < self.centers.size - 2):
-                off = ~((t >= 1) & (t < self.centers.size - 2))
-                t[off] = 0.0
-        node = t.astype(np.intp)
-        t -= node
-        if rows > 1:
-            node += self.centers.size * np.arange(rows)[:, None]
-        return node, t, off
-
-    def _below(self, sample: Floats) -> NDArrayBool:
-        return np.asarray(sample < self.centers[0] + self.step)  # of those off the grid
+    @property
+    def _low(self) -> float:
+        return float(self.centers[0] / self.step)
 
     def density(self, sample: Floats, weights: Floats) -> Floats:
         """Return densities at the nodes, then mass below and above divided by the width of a cluster."""
         batch, n, g = sample.shape[:-1], sample.shape[-1], self.centers.size
         rows = int(np.prod(batch, dtype=int))
-        flat = sample.reshape(rows, n)
-        equal = bool(weights.size) and weights.min() == weights.max()
-        w = np.broadcast_to(weights, (*batch, n)).reshape(rows, n) if not equal else None
-        counts = np.empty((rows, g))
-        outside = np.zeros((rows, 2))
-        rows_at_once = max(1, min(_CHUNK // n, 4 * _CHUNK // g))
-        for r in range(0, rows, rows_at_once):
-            moments = np.zeros((4, len(counts[r : r + rows_at_once]), g))
-            for i in range(0, n, _CHUNK):
-                block = np.s_[r : r + rows_at_once, i : i + _CHUNK]
-                moments += self._moments(flat[block], None if w is None else w[block], outside[r : r + rows_at_once])
-            counts[r : r + rows_at_once] = self._counted(moments)
-        if equal:
-            counts *= weights.flat[0]
-            outside *= weights.flat[0]
+        equal = bool(weights.size) and (not any(weights.strides) or weights.min() == weights.max())
+        w = weights.ravel()[:1] if equal else np.broadcast_to(weights, (*batch, n)).ravel()
+        counts, outside = np.zeros((rows, g)), np.zeros((rows, 2))
+        flat = np.ascontiguousarray(sample, dtype=np.float64).reshape(rows, n)
+        count(flat, w, equal, self._low, 1 / self.step, counts, outside)
         grid = self._smooth(counts)
         return np.concatenate([grid, outside / self.widths[-1]], axis=-1).reshape(*batch, g + 2)
 
-    def _smooth(self, counts: Floats) -> Floats:
-        from scipy.ndimage import convolve1d  # takes longer to import than the whole package
-
-        return np.asarray(convolve1d(counts, self.kernel, axis=-1, mode="constant"))
-
-    def _moments(self, sample: Floats, weights: Floats | None, outside: Floats) -> Floats:
-        """Return the sums of 1, t, t^2, t^3 beyond each node, shape (4, rows, g), without weights of one each."""
-        rows, g = len(sample), self.centers.size
-        node, t, off = self._locate(sample, rows)
-        if off is not None:
-            each = np.ones_like(sample) if weights is None else weights
-            off &= ~np.isnan(sample)
-            below = off & self._below(sample)
-            outside[:, 0] += np.where(below, each, 0.0).sum(axis=-1)
-            outside[:, 1] += np.where(off & ~below, each, 0.0).sum(axis=-1)
-        at, fraction, size = node.ravel(), t.ravel(), rows * g
-        w = None if weights is None else weights.ravel()
-        sums = [np.bincount(at, w, size)]
-        power = fraction if w is None else fraction * w
-        for _ in range(3):
-            sums.append(np.bincount(at, power, size))
-            power = power * fraction
-        found = np.array(sums, dtype=np.float64).reshape(4, rows, g)
-        found[:, :, 0] = 0.0
-        return found
-
-    def _counted(self, moments: Floats) -> Floats:
-        """Return the counts at the nodes, shape (rows, g), with cubic B-spline weights."""
-        parts = np.tensordot(_SPLINE, moments, axes=1)
-        counts = np.zeros(parts.shape[1:])
-        for k, part in enumerate(parts):
-            counts[:, max(0, k - 1) : counts.shape[1] + min(0, k - 1)] += part[
-                :, max(0, 1 - k) : part.shape[1] + min(0, 1 - k)
-            ]
-        return counts
+    def _smooth(self, values: Floats) -> Floats:
+        rows = np.ascontiguousarray(values).reshape(-1, self.centers.size)
+        out = np.zeros_like(rows)
+        smooth(rows, self.kernel, out)
+        return out.reshape(values.shape)
 
     def reading(self, points: Floats, weights: Floats) -> Floats:
         """Return cubic convolution weights (Keys 1981), which interpolate and are exact for parabolas."""
-        node, t, off = self._locate(points)
-        inside = True if off is None else ~off
-        node = np.maximum(node, 1)
+        t = points / self.step - self._low
+        inside = (t >= 1) & (t < self.centers.size - 2)
+        t = np.where(inside, t, 1.0)
+        node = t.astype(np.intp)
+        t -= node
         s = 1 - t
         keys = (-t * s**2 / 2, 1 - 2.5 * t**2 + 1.5 * t**3, 1 - 2.5 * s**2 + 1.5 * s**3, -s * t**2 / 2)
         each = np.zeros((points.size, self.widths.size))
@@ -168,35 +108,25 @@ class KernelCells(Cells):
 
     def value(self, sample: Floats, cotangent: Floats) -> Floats:
         """Return the smoothed cotangent at the sample; the smoothing kernel is its own transpose."""
-        return self._interpolated(sample, cotangent, _SPLINE, cotangent[..., -2:] / self.widths[-1])
+        return self._interpolated(sample, cotangent, SPLINE, cotangent[..., -2:] / self.widths[-1])
 
     def slope(self, sample: Floats, cotangent: Floats) -> Floats:
         """Return the derivative of the smoothed cotangent at the sample."""
-        return self._interpolated(sample, cotangent, _SPLINE[:, 1:] * [1, 2, 3] / self.step)
+        slopes = np.pad(SPLINE[:, 1:] * [1, 2, 3] / self.step, [(0, 0), (0, 1)])
+        return self._interpolated(sample, cotangent, slopes, np.zeros(2))
 
-    def _interpolated(self, sample: Floats, cotangent: Floats, spline: Floats, outer: Floats | None = None) -> Floats:
+    def _interpolated(self, sample: Floats, cotangent: Floats, spline: Floats, outer: Floats) -> Floats:
         """Evaluate the splines whose coefficients are a smoothed cotangent's; ``outer`` is for values off the grid."""
         batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
         rows, n, g = int(np.prod(batch, dtype=int)), sample.shape[-1], self.centers.size
-        values = np.broadcast_to(sample, (*batch, n)).reshape(rows, n)
+        values = sample if sample.ndim == 1 else np.broadcast_to(sample, (*batch, n))
         c = np.broadcast_to(self._smooth(cotangent[..., :-2]), (*batch, g)).reshape(rows, g)
         near = np.pad(c, [(0, 0), (1, 2)])
-        powers = np.tensordot(spline.T, np.array([near[:, k : k + g] for k in range(4)]), axes=1)
-        powers[:, :, 0] = 0.0
+        powers = np.stack([near[:, k : k + g] for k in range(4)], axis=-1) @ spline
+        edge = np.ascontiguousarray(np.broadcast_to(outer, (*batch, 2)).reshape(rows, 2))
         out = np.empty((rows, n))
-        for r in range(rows):
-            edge = None if outer is None else np.broadcast_to(outer, (*batch, 2)).reshape(rows, 2)[r]
-            for i in range(0, n, _CHUNK):
-                part = values[r, i : i + _CHUNK]
-                node, t, off = self._locate(part)
-                total = powers[-1, r].take(node)
-                for p in powers[-2::-1, r]:
-                    total *= t
-                    total += p.take(node)
-                if off is not None and edge is not None:
-                    total[off] = np.where(self._below(part[off]), edge[0], edge[1])
-                    total[np.isnan(part)] = 0.0
-                out[r, i : i + _CHUNK] = total
+        flat = np.ascontiguousarray(values, dtype=np.float64).reshape(-1, n)
+        read(flat, powers, edge, self._low, 1 / self.step, out)
         return out.reshape(*batch, n)
 
 

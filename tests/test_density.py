@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from prbayes import cells as cells_module
 from prbayes import density
 from prbayes._arrays import Floats
 from prbayes.cells import KernelCells
@@ -82,23 +81,19 @@ def test_mass_outside_goes_to_the_last_two_cells_and_nan_nowhere(estimator: Any)
 
 @both
 @pytest.mark.parametrize("batch", [(1,), (3,), (2, 3), (2, 1, 3)])
-@pytest.mark.parametrize("chunk", [1, 5, 12, cells_module._CHUNK])
-def test_batches_and_chunks_equal_a_loop(
-    estimator: Any, batch: tuple[int, ...], chunk: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_batches_equal_a_loop(estimator: Any, batch: tuple[int, ...]) -> None:
     cells = estimator.cells(OBSERVED, EQUAL)
     x, w = draw(5, *batch, 11)
     expected = np.array([cells.density(x[i], w[i]) for i in np.ndindex(*batch)])
     shared = np.array([cells.density(x[i], w[(0,) * len(batch)]) for i in np.ndindex(*batch)])
-    monkeypatch.setattr(cells_module, "_CHUNK", chunk)
     np.testing.assert_allclose(cells.density(x, w), expected.reshape(*batch, -1), rtol=1e-12, atol=1e-15)
     result = cells.density(x, w[(0,) * len(batch)])
     np.testing.assert_allclose(result, shared.reshape(*batch, -1), rtol=1e-12, atol=1e-15)
 
 
 @both
-def test_a_sample_longer_than_a_chunk_is_the_sum_of_its_parts(estimator: Any) -> None:
-    n = 2 * cells_module._CHUNK + 17
+def test_a_long_sample_is_the_sum_of_its_parts(estimator: Any) -> None:
+    n = (1 << 17) + 17
     x = 3 * np.random.default_rng(3).normal(size=n)
     cells = estimator.cells(OBSERVED, EQUAL)
     parts = sum(cells.density(part, np.full(part.size, 1 / n)) for part in np.array_split(x, 7))

@@ -17,8 +17,8 @@ FILES = sorted(p for p in PACKAGE.rglob("*.py") if p.parent.name != "datasets")
 
 # A file may import those before it.
 ORDER = [
-    "_arrays", "progress", "cells", "density", "discrepancy", "metrics", "failures", "store", "calling", "inputs",
-    "responses", "propagation", "resimulation", "design", "simulator", "describe", "surfaces", "region",
+    "_arrays", "progress", "loops", "cells", "density", "discrepancy", "metrics", "failures", "store", "calling",
+    "inputs", "responses", "propagation", "resimulation", "design", "simulator", "describe", "surfaces", "region",
     "surrogate", "population", "resampling", "information", "descent", "refit", "modes", "refinement", "search",
     "optimum", "optimize", "epsilon", "adjust", "results", "bootstrap", "checkpoint", "kernel", "smc", "sbc",
     "diagnose", "compare", "heldout", "predict", "nulls", "joint", "validity", "curves", "ensemble", "margins",
