@@ -15,7 +15,7 @@ from prbayes._arrays import Floats, positive_integer, positive_number
 from prbayes.information import Information, Local, prior_scale
 from prbayes.metrics import FunctionMetric
 from prbayes.modes import Rival, blind_directions, rivals
-from prbayes.optimum import Optimum, assemble, plain
+from prbayes.optimum import Optimum, assemble, edge_words, flat, plain
 from prbayes.population import Evaluator
 from prbayes.progress import shown
 from prbayes.refinement import _MAX_ROUNDS, AGREE, grow, pilot, refine_at, refuse, shortcomings, spread_around
@@ -29,6 +29,8 @@ _log = logging.getLogger("prbayes")
 _LOOKS = 3  # at other optima, with a design that is refined in between
 _STARTS = 32  # points of the prior from which other optima are searched for where a theta costs no response
 _TOLERATED = 1.5 * AGREE  # an estimate from eight blocks is itself uncertain
+_FAR = 4.0  # prior standard deviations from the prior's middle, from where on the edge of a support is thought of
+_SAME = 1e-6  # of the objective's typical size: a change that is none
 _FLOOR = 0.3  # of the noise floor: about the difference of the discrepancy between the data's fit and the truth's
 
 
@@ -203,11 +205,21 @@ def find_optimum(
     theta = search.best
     if hood is not None and (np.isnan(error) or not np.array_equal(theta, hood.theta)):
         error = hood.design_error()
-    warnings = _warnings(evaluator, local, others, error)
+    edge = () if local is None else _at_edge(evaluator, theta, scales, local, search.size(theta, scales), random_seed)
+    if edge:
+        local, others = None, []
+    warnings = (*([edge_words(edge)] if edge else []), *_warnings(evaluator, local, others, error))
     for line in warnings:
         _log.warning("%s", line)
     found = assemble(evaluator, theta, scales, local, search, result, screened, already - stored, clock)
-    return replace(found, design_error=error, rivals=tuple(_described(evaluator, o) for o in others), warnings=warnings)
+    return replace(
+        found,
+        converged=found.converged and not edge,
+        design_error=error,
+        rivals=tuple(_described(evaluator, o) for o in others),
+        warnings=warnings,
+        at_edge=edge,
+    )
 
 
 def _hood(evaluator: Evaluator, theta: Floats, scale: Floats, scales: Floats) -> Neighbourhood | None:
@@ -230,6 +242,22 @@ def _rivals(
             break
         refine_at(evaluator, thin[0].theta[None])
     return [r for r in found if not shortcomings(evaluator, r.theta[None])]
+
+
+def _at_edge(
+    evaluator: Evaluator, theta: Floats, scales: Floats, local: Local, size: float, seed: int
+) -> tuple[str, ...]:
+    """Return the elements that went far out and could go on without any change: their best value is at an edge.
+
+    Data drawn from such a population tell much, so that the standard errors are small there, and mean nothing.
+    """
+    away = theta - np.median(evaluator.prior_thetas(256, seed), axis=0)
+    far = np.flatnonzero((np.abs(away) > _FAR * local.scale) & np.isfinite(np.diag(local.in_theta)))
+    if not far.size or flat(evaluator, theta, local.scale):
+        return ()
+    further = np.diag(np.sign(away) * local.scale)[far]
+    here, *there = evaluator.total(np.vstack([theta, theta + further]), scales)
+    return tuple(evaluator.readable_names[i] for i, f in zip(far, there, strict=True) if abs(f - here) < _SAME * size)
 
 
 def _described(evaluator: Evaluator, rival: Rival) -> dict[str, Any]:

@@ -65,6 +65,9 @@ class Optimum:
         ``comparable``, whether the data could as well come from there.
     warnings : tuple of str
         What is not identified, in sentences; also logged.
+    at_edge : tuple of str
+        Elements that went far out, where no change of them changes the discrepancy: their best value is at the edge of
+        the support, the optimiser has not converged, and nothing is known of standard errors.
     """
 
     point: dict[str, Any]
@@ -87,6 +90,7 @@ class Optimum:
     design_error: float = np.nan
     rivals: tuple[dict[str, Any], ...] = ()
     warnings: tuple[str, ...] = ()
+    at_edge: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """Show the answer, what it cost, and what is to be said of it."""
@@ -142,8 +146,8 @@ def assemble(
         variance = np.where(at_edge, np.nan, np.where(touched > 0, np.inf, np.maximum(variance, 0)))
         stderr[name] = plain(np.sqrt(variance))
     variance = np.diag(covariance) / search.scale**2  # where nothing changes, that of rounding errors
-    flat = bool((np.isinf(variance) | (variance < 1e-16)).all()) and _flat(evaluator, theta, search.scale)
-    lost = " No hyperparameter changes the discrepancy here, far from the data: try another start." if flat else ""
+    nowhere = bool((np.isinf(variance) | (variance < 1e-16)).all()) and flat(evaluator, theta, search.scale)
+    lost = " No hyperparameter changes the discrepancy here, far from the data: try another start." if nowhere else ""
     found = evaluator(theta[None])
     discrepancies = dict(zip([n.name for n in evaluator.nodes], map(float, found.discrepancies[0]), strict=True))
     return Optimum(
@@ -154,7 +158,7 @@ def assemble(
         n_evaluations=search.count,
         n_screened=screened,
         n_responses=evaluator.n_responses - computed,
-        converged=bool(result.success) and not flat,
+        converged=bool(result.success) and not nowhere,
         message=f"{result.message}{search.remark}{lost}",
         stderr=stderr,
         covariance=covariance,
@@ -174,7 +178,32 @@ def assemble(
     )
 
 
-def _flat(evaluator: Evaluator, theta: Floats, scale: Floats) -> bool:
+def away_from_edge(optimum: Optimum, caller: str) -> Optimum:
+    """Return the optimum, or raise where data drawn from its population would not resemble the measured ones.
+
+    Raises
+    ------
+    ValueError
+        If it is at the edge of a support.
+    """
+    if optimum.at_edge:
+        raise ValueError(
+            f"{caller}: got an optimum around which nothing is known: {edge_words(optimum.at_edge)}. "
+            "prb.sample_smc(epsilon=..., adjust=False) makes no use of it"
+        )
+    return optimum
+
+
+def edge_words(names: tuple[str, ...]) -> str:
+    """Say that elements are at the edge of their support."""
+    return (
+        f"{', '.join(names)} ran to the edge of the support, where the discrepancy no longer changes; perhaps the "
+        "population has collapsed within the bandwidth of the metric: use a smaller bandwidth, or prb.AreaMetric(), "
+        "which has none"
+    )
+
+
+def flat(evaluator: Evaluator, theta: Floats, scale: Floats) -> bool:
     """Whether no discrepancy changes around theta, as where populations and observed values do not overlap."""
     around = np.vstack([theta, *(theta + s * e for e in np.diag(0.01 * scale) for s in (1, -1))])
     found = evaluator(around).discrepancies

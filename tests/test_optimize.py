@@ -285,6 +285,47 @@ def test_an_optimum_at_the_edge_of_a_support_stays_inside(transform: str | None)
     np.testing.assert_allclose(optimum.stderr["sigma"], errors(fitted("kl"))[1], rtol=0.1)
 
 
+def two_modes(x: Any, coin: Any) -> Any:
+    return x + np.where(coin < 0.5, -16.0, 16.0)
+
+
+def test_a_population_that_collapsed_within_the_bandwidth_is_no_convergence() -> None:
+    """The log-likelihood's bandwidth follows the spread between the modes, and prefers a point in either."""
+    rng = np.random.default_rng(3)
+    observed = two_modes(rng.normal(1.5, 0.1, 20), rng.random(20))
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1.5, 0.5), pm.HalfNormal("sigma", 0.3))
+        coin, propagation = pm.Uniform.dist(0, 1), prb.Resimulated(512)
+        prb.Simulator("y", two_modes, x, coin, metric=METRICS["ll"], observed=observed, propagation=propagation)
+    optimum = prb.minimize(model)
+    assert optimum.point["sigma"] < 1e-3
+    assert not optimum.converged
+    assert optimum.at_edge == ("sigma",)
+    assert np.isnan(errors(optimum)).all()
+    assert "sigma ran to the edge of the support" in repr(optimum)
+    said = prb.diagnose(optimum).messages
+    assert "collapsed" in said[0]
+    assert not any("did not converge" in line for line in said)
+    for call in (prb.calibrate_epsilon, prb.bootstrap, prb.held_out, prb.JointNull):
+        with pytest.raises(ValueError, match=f"{call.__name__}: .*sigma ran to the edge"):
+            call(optimum)
+    with pytest.raises(ValueError, match=r"sample_smc: .*sigma ran to the edge .*adjust=False"):
+        prb.sample_smc(50, chains=1, optimum=optimum, model=model, random_seed=1, progressbar=False)
+    tree = prb.sample_smc(50, chains=1, epsilon=1 / 20, adjust=False, optimum=optimum, model=model, random_seed=1)
+    assert tree.posterior["sigma"].mean() > 10 * optimum.point["sigma"]
+
+
+@pytest.mark.parametrize("name", ["ll", "pr"])
+def test_an_optimum_far_outside_the_prior_is_not_taken_for_an_edge(name: str) -> None:
+    observed = 1.0 + 0.002 * (OBSERVED - 1.0)
+    model = normal_model(METRICS[name], prb.Resimulated(1024), observed=observed)
+    optimum = prb.minimize(model, start={"mu": 1.0, "sigma": 0.002})
+    assert optimum.converged
+    assert optimum.at_edge == ()
+    np.testing.assert_allclose(optimum.point["sigma"], 0.002 * fitted(name).point["sigma"], rtol=0.1)
+    np.testing.assert_allclose(errors(optimum), 0.002 * errors(fitted(name)), rtol=0.5)
+
+
 def test_the_start_is_honoured() -> None:
     model = fitted("pr").model
     optimum = prb.minimize(model, start={"mu": 0.5, "sigma": 0.9})
