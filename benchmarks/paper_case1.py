@@ -140,6 +140,16 @@ def tables(done: dict[str, Any]) -> None:
                 every = [np.concatenate(fs) for fs in found]
                 cells = [f"{np.median(f[:, 2]):.0f} ({int(f[:, 3].sum())} failed)" for f in every]
                 print(f"{name:12s} {method:8s} " + " ".join(f"{c:>16s}" for c in cells))
+    print("\nPR, BFGS: largest difference of mean and sd between the points, over data sets: median, maximum in %")
+    for name, n in product(SYSTEMS, SIZES):
+        both = [
+            [done[f"{points}/{rest}"]["BFGS"][:2] for points in POINTS]
+            for key in done
+            if (rest := key.removeprefix("monte carlo/")).startswith(f"{name}/{n}/") and rest.endswith("/PR")
+        ]
+        if both:
+            apart = [100 * np.max(np.abs(np.divide(*pair) - 1)) for pair in both]
+            print(f"{name:12s} {n:7d} {np.median(apart):8.3f} {np.max(apart):8.2f}   of {len(apart)}")
 
 
 def main() -> None:

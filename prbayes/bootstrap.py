@@ -11,7 +11,7 @@ from prbayes._arrays import positive_integer
 from prbayes.adjust import inapplicable
 from prbayes.information import prior_scale
 from prbayes.modes import blind_directions
-from prbayes.optimum import Optimum, away_from_edge
+from prbayes.optimum import Optimum, surveyed
 from prbayes.progress import shown
 from prbayes.refit import Neighbourhood
 from prbayes.resampling import reweighted_sets, simulated_sets
@@ -73,7 +73,7 @@ def bootstrap(
     if not isinstance(optimum, Optimum):
         raise TypeError(f"bootstrap: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first")
     positive_integer(draws, "draws", minimum=2)
-    evaluator = away_from_edge(optimum, "bootstrap").evaluator
+    evaluator = surveyed(optimum, "bootstrap").evaluator
     reason = inapplicable(evaluator)
     if reason:
         raise ValueError(f"bootstrap: {reason}; use prb.sample_smc")

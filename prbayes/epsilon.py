@@ -6,7 +6,7 @@ import numpy as np
 
 from prbayes.information import Information, first_order_shifts, prior_scale, seen_by_area, seen_by_curvature
 from prbayes.metrics import FunctionMetric
-from prbayes.optimum import Optimum, away_from_edge
+from prbayes.optimum import Optimum, surveyed
 from prbayes.resimulation import FreshBound
 
 _CLOUD = 500  # thetas that carry each simulated data set's posterior
@@ -41,7 +41,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
     TypeError
         For simulators with a `FunctionMetric` or `Fresh`, whose epsilon has to be given.
     ValueError
-        If the optimum is at the edge of a support, or nothing is identified.
+        If nothing is known around the optimum (`Optimum.at_edge`, `Optimum.at_jump`), or nothing is identified.
 
     References
     ----------
@@ -64,7 +64,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
             f"calibrate_epsilon: got {type(optimum).__name__}, expected an Optimum; call "
             "prb.calibrate_epsilon(prb.minimize(model))"
         )
-    evaluator = away_from_edge(optimum, "calibrate_epsilon").evaluator
+    evaluator = surveyed(optimum, "calibrate_epsilon").evaluator
     scale = prior_scale(evaluator)
     return {
         node.name: _epsilon(Information(evaluator, k, optimum.theta, scale, n_sets=_SETS))

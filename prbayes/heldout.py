@@ -8,7 +8,7 @@ import xarray as xr
 from prbayes._arrays import positive_integer
 from prbayes.adjust import inapplicable
 from prbayes.information import prior_scale
-from prbayes.optimum import Optimum, away_from_edge
+from prbayes.optimum import Optimum, surveyed
 from prbayes.refit import Neighbourhood
 from prbayes.resampling import DataSets, specimens
 from prbayes.results import versions
@@ -62,7 +62,7 @@ def held_out(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) -> xr.Da
     """
     if not isinstance(optimum, Optimum):
         raise TypeError(f"held_out: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first")
-    evaluator = away_from_edge(optimum, "held_out").evaluator
+    evaluator = surveyed(optimum, "held_out").evaluator
     reason = inapplicable(evaluator)
     if reason:
         raise ValueError(f"held_out: {reason}, so that the model cannot be calibrated anew")

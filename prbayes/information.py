@@ -19,7 +19,7 @@ from prbayes.population import Evaluator
 from prbayes.resampling import DataSets, dependent, simulated_sets, thinned
 
 _STEP = 1e-3  # of the prior's standard deviation; densities are twice differentiable
-_WIDE_STEP = 0.05  # where a distribution function of simulated values, a step function, is differenced
+_WIDE_STEP = 0.05  # where a distribution function of simulated values, a step function, or a jump is differenced
 _KNOTS = 400  # on which distribution functions are linearised
 _IRLS = 30
 _HALVED = 256  # points from which two halves can be held against each other
@@ -52,6 +52,8 @@ class Information:
     n_sets : int
         Number of simulated data sets, each of the observed size.
     seed : int
+    wide : float
+        Step in units of the scale where the discrepancy is a step function of theta, or jumps.
     """
 
     evaluator: Evaluator
@@ -60,28 +62,51 @@ class Information:
     scale: Floats
     n_sets: int = 200
     seed: int = 0
+    wide: float = _WIDE_STEP
 
-    @cached_property
-    def _step(self) -> Floats:
+    @property
+    def _smooth(self) -> bool:
         node = self.evaluator.nodes[self.k]
         cells = getattr(node.target, "cells", None)
-        smooth = node.metric.smooth and (cells is None or cells.smooth)
-        rough = not smooth and node.bound.n_per_theta > 0
-        return (_WIDE_STEP if rough else _STEP) * self.scale
+        return bool(node.metric.smooth and (cells is None or cells.smooth))
+
+    @property
+    def jumps(self) -> bool:
+        """Whether points lose their response close to theta, where a smooth discrepancy jumps."""
+        return self._smooth and self._around[0] > _STEP
 
     @cached_property
-    def _stencil(self) -> Floats:
+    def _around(self) -> tuple[float, tuple[Floats, Floats]]:
+        """The step, in prior standard deviations, and the populations around theta."""
+
+        def look(step: float) -> tuple[float, tuple[Floats, Floats]]:
+            return step, self.evaluator.populations(self.theta + self._stencil(step), self.k)
+
+        if not self.evaluator.nodes[self.k].bound.n_per_theta:
+            return look(_STEP)
+        if self._smooth:
+            narrow = look(_STEP)
+            finite = np.isfinite(narrow[1][0])
+            if (finite == finite[0]).all():
+                return narrow
+        return look(self.wide)
+
+    @property
+    def _step(self) -> Floats:
+        return self._around[0] * self.scale
+
+    @property
+    def _populations(self) -> tuple[Floats, Floats]:
+        return self._around[1]
+
+    def _stencil(self, step: float) -> Floats:
         """Displacements: none, +- each, and the four corners of each pair."""
         d = self.theta.size
-        unit = np.diag(self._step)
+        unit = step * np.diag(self.scale)
         rows = [np.zeros(d), *(s * u for u in unit for s in (1, -1))]
         for i in range(d):
             rows += [a * unit[i] + b * unit[j] for j in range(i) for a in (1, -1) for b in (1, -1)]
         return np.array(rows)
-
-    @cached_property
-    def _populations(self) -> tuple[Floats, Floats]:
-        return self.evaluator.populations(self.theta + self._stencil, self.k)
 
     @cached_property
     def _center(self) -> tuple[Floats, Floats]:

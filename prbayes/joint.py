@@ -15,7 +15,7 @@ from prbayes.design import Design
 from prbayes.information import prior_scale
 from prbayes.inputs import read_inputs
 from prbayes.nulls import Case, Condition, Predictive, SimulatedNull
-from prbayes.optimum import Optimum, away_from_edge
+from prbayes.optimum import Optimum, surveyed
 from prbayes.predict import data_digest, serving, specimen_names
 from prbayes.refit import Neighbourhood
 from prbayes.resampling import groups, sets_at, simulated_points, specimens
@@ -77,7 +77,7 @@ class JointNull(SimulatedNull):
             raise TypeError(
                 f"JointNull: got {type(self.optimum).__name__}, expected an Optimum; call prb.minimize() first"
             )
-        reason = inapplicable(away_from_edge(self.optimum, "JointNull").evaluator)
+        reason = inapplicable(surveyed(self.optimum, "JointNull").evaluator)
         if reason:
             raise ValueError(f"JointNull: {reason}, so that the model cannot be calibrated anew; use PosteriorNull()")
         positive_integer(self.replicates, "JointNull: replicates", minimum=19)

@@ -15,7 +15,7 @@ from prbayes._arrays import Floats, positive_integer, positive_number
 from prbayes.information import Information, Local, prior_scale
 from prbayes.metrics import FunctionMetric
 from prbayes.modes import Rival, blind_directions, rivals
-from prbayes.optimum import Optimum, assemble, edge_words, flat, plain
+from prbayes.optimum import Optimum, assemble, flat, plain, trouble
 from prbayes.population import Evaluator
 from prbayes.progress import shown
 from prbayes.refinement import _MAX_ROUNDS, AGREE, grow, pilot, refine_at, refuse, shortcomings, spread_around
@@ -29,6 +29,7 @@ _log = logging.getLogger("prbayes")
 _LOOKS = 3  # at other optima, with a design that is refined in between
 _STARTS = 32  # points of the prior from which other optima are searched for where a theta costs no response
 _TOLERATED = 1.5 * AGREE  # an estimate from eight blocks is itself uncertain
+_MOVED = 0.01  # prior standard deviations from which what is known of an optimum is looked up again
 _FAR = 4.0  # prior standard deviations from the prior's middle, from where on the edge of a support is thought of
 _SAME = 1e-6  # of the objective's typical size: a change that is none
 _FLOOR = 0.3  # of the noise floor: about the difference of the discrepancy between the data's fit and the truth's
@@ -203,22 +204,29 @@ def find_optimum(
             )
     result = search.settle(result)
     theta = search.best
-    if hood is not None and (np.isnan(error) or not np.array_equal(theta, hood.theta)):
+    if hood is not None and not np.array_equal(theta, hood.theta):
+        if (np.abs(theta - hood.theta) > _MOVED * scale).any():
+            hood = _hood(evaluator, theta, scale, scales)
+            local = None if hood is None else hood.local
+        error = np.nan
+    if hood is not None and np.isnan(error):
         error = hood.design_error()
     edge = () if local is None else _at_edge(evaluator, theta, scales, local, search.size(theta, scales), random_seed)
-    if edge:
+    jump = () if hood is None else tuple(evaluator.nodes[k].name for k in hood.unsettled())
+    if edge or jump:
         local, others = None, []
-    warnings = (*([edge_words(edge)] if edge else []), *_warnings(evaluator, local, others, error))
+    warnings = (*trouble(edge, jump), *_warnings(evaluator, local, others, error))
     for line in warnings:
         _log.warning("%s", line)
     found = assemble(evaluator, theta, scales, local, search, result, screened, already - stored, clock)
     return replace(
         found,
-        converged=found.converged and not edge,
+        converged=found.converged and not edge and not (jump and search.gradient),
         design_error=error,
         rivals=tuple(_described(evaluator, o) for o in others),
         warnings=warnings,
         at_edge=edge,
+        at_jump=jump,
     )
 
 

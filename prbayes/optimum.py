@@ -68,6 +68,9 @@ class Optimum:
     at_edge : tuple of str
         Elements that went far out, where no change of them changes the discrepancy: their best value is at the edge of
         the support, the optimiser has not converged, and nothing is known of standard errors.
+    at_jump : tuple of str
+        Simulators whose discrepancy jumps at the optimum, since points lose their response there: nothing is known of
+        standard errors, and an optimiser that follows gradients has not converged.
     """
 
     point: dict[str, Any]
@@ -91,6 +94,7 @@ class Optimum:
     rivals: tuple[dict[str, Any], ...] = ()
     warnings: tuple[str, ...] = ()
     at_edge: tuple[str, ...] = ()
+    at_jump: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """Show the answer, what it cost, and what is to be said of it."""
@@ -178,29 +182,39 @@ def assemble(
     )
 
 
-def away_from_edge(optimum: Optimum, caller: str) -> Optimum:
-    """Return the optimum, or raise where data drawn from its population would not resemble the measured ones.
+def surveyed(optimum: Optimum, caller: str) -> Optimum:
+    """Return the optimum, or raise where nothing is known of the discrepancy around it.
 
     Raises
     ------
     ValueError
-        If it is at the edge of a support.
+        If it is at the edge of a support, or at a jump.
     """
-    if optimum.at_edge:
+    lines = trouble(optimum.at_edge, optimum.at_jump)
+    if lines:
         raise ValueError(
-            f"{caller}: got an optimum around which nothing is known: {edge_words(optimum.at_edge)}. "
+            f"{caller}: got an optimum around which nothing is known: {'; '.join(lines)}. "
             "prb.sample_smc(epsilon=..., adjust=False) makes no use of it"
         )
     return optimum
 
 
-def edge_words(names: tuple[str, ...]) -> str:
-    """Say that elements are at the edge of their support."""
-    return (
-        f"{', '.join(names)} ran to the edge of the support, where the discrepancy no longer changes; perhaps the "
-        "population has collapsed within the bandwidth of the metric: use a smaller bandwidth, or prb.AreaMetric(), "
-        "which has none"
-    )
+def trouble(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> list[str]:
+    """Say that elements are at the edge of their support, and that simulators jump."""
+    lines = []
+    if at_edge:
+        lines.append(
+            f"{', '.join(at_edge)} ran to the edge of the support, where the discrepancy no longer changes; perhaps "
+            "the population has collapsed within the bandwidth of the metric: use a smaller bandwidth, or "
+            "prb.AreaMetric(), which has none"
+        )
+    if at_jump:
+        lines.append(
+            f"{', '.join(at_jump)}: points lose their response here, and the discrepancy jumps by more than it changes "
+            "otherwise; the optimiser may have stopped at a jump: use prb.AreaMetric(), prb.Reweighted(), more "
+            "responses, or method='Nelder-Mead'"
+        )
+    return lines
 
 
 def flat(evaluator: Evaluator, theta: Floats, scale: Floats) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ _STEP = 0.02  # of differences, in standard errors
 _TOLERANCE = 1e-4  # gain, in units of the curvature along a standard error, that is left on the table
 _TYPICAL = 50  # data sets from which the curvature is guessed
 _BLOCK = 1 << 23  # weights held at a time
+_SETTLED = 1.5  # ratio of standard errors from one step of the differences and from its double
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +62,18 @@ class Neighbourhood:
         return cls(
             evaluator, theta, scales, parts, local, local.directions @ vectors, np.sqrt(np.maximum(values, 1e-300))
         )
+
+    def unsettled(self) -> list[int]:
+        """Return the simulators whose discrepancy jumps here, if that matters: twice the step gives other errors.
+
+        Second differences over a jump are the smaller the wider the step, those of a smooth function are not.
+        """
+        jumping = [p.k for p in self.parts if p.jumps]
+        if not jumping:
+            return []
+        wider = local_sampling([replace(p, wide=2 * p.wide) for p in self.parts], self.scales)
+        ratio = np.sqrt(np.diag(local_sampling(self.parts, self.scales).in_theta) / np.diag(wider.in_theta))
+        return [] if ((ratio > 1 / _SETTLED) & (ratio < _SETTLED)).all() else jumping
 
     def coordinates(self, thetas: Floats) -> tuple[Floats, Floats]:
         """Return coordinates along the frame in standard errors, (..., r), and what is left in theta, (..., d)."""

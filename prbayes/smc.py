@@ -20,7 +20,7 @@ from prbayes.checkpoint import Checkpoint, stored_identity
 from prbayes.epsilon import calibrate_epsilon
 from prbayes.kernel import BatchedKernel
 from prbayes.optimize import find_optimum
-from prbayes.optimum import Optimum, away_from_edge
+from prbayes.optimum import Optimum, surveyed
 from prbayes.population import Evaluator
 from prbayes.progress import CONSOLE, shown
 from prbayes.refinement import _MAX_ROUNDS, refine_at, refuse, shortcomings
@@ -87,8 +87,8 @@ def sample_smc(
     Raises
     ------
     TypeError, ValueError
-        If an argument is not as described, no prior draw has a finite discrepancy, or the optimum is at the edge of a
-        support and is needed for epsilon or the adjustment.
+        If an argument is not as described, no prior draw has a finite discrepancy, or nothing is known around the
+        optimum (`Optimum.at_edge`, `Optimum.at_jump`) and it is needed for epsilon or the adjustment.
     DesignError
         If a design does not support the posterior after refinement.
     StoreError
@@ -158,7 +158,7 @@ def sample(
         if optimum is None and (unset or (isinstance(adjust, Affine) and not inapplicable(evaluator))):
             optimum = find_optimum(evaluator, refine=refine)
         if optimum is not None and isinstance(adjust, Affine):
-            away_from_edge(optimum, "sample_smc")
+            surveyed(optimum, "sample_smc")
         if unset and optimum is not None:
             calibrated = calibrate_epsilon(optimum)
             for node in unset:
