@@ -85,7 +85,7 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     """
     if isinstance(result, Optimum):
         messages = list(map(_sentence, result.warnings))
-        if not result.converged and not (result.at_edge or result.at_jump):
+        if not result.converged and not result.at_edge:
             messages.append(f"The optimiser did not converge ({result.message}); try another start or method.")
         found = _computed(result.evaluator, result.theta[None])
     else:

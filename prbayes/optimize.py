@@ -221,7 +221,7 @@ def find_optimum(
     found = assemble(evaluator, theta, scales, local, search, result, screened, already - stored, clock)
     return replace(
         found,
-        converged=found.converged and not edge and not (jump and search.gradient),
+        converged=found.converged and not edge,
         design_error=error,
         rivals=tuple(_described(evaluator, o) for o in others),
         warnings=warnings,

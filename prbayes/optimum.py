@@ -70,7 +70,7 @@ class Optimum:
         the support, the optimiser has not converged, and nothing is known of standard errors.
     at_jump : tuple of str
         Simulators whose discrepancy jumps at the optimum, since points lose their response there: nothing is known of
-        standard errors, and an optimiser that follows gradients has not converged.
+        standard errors.
     """
 
     point: dict[str, Any]
@@ -210,9 +210,8 @@ def trouble(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> list[str]:
         )
     if at_jump:
         lines.append(
-            f"{', '.join(at_jump)}: points lose their response here, and the discrepancy jumps by more than it changes "
-            "otherwise; the optimiser may have stopped at a jump: use prb.AreaMetric(), prb.Reweighted(), more "
-            "responses, or method='Nelder-Mead'"
+            f"{', '.join(at_jump)}: points lose their response at the optimum, and the discrepancy jumps there by more "
+            "than it changes otherwise: use prb.AreaMetric(), prb.Reweighted(), or more responses"
         )
     return lines
 

@@ -20,6 +20,7 @@ from prbayes.population import Evaluator
 from prbayes.progress import progress
 from prbayes.resimulation import FreshBound
 
+_OVER = 0.5  # prior standard deviations: the simplex where the discrepancy jumps
 _SETTLED = 1e-4  # relative gain of a simplex below which a stalled line search counts as converged
 _SCREENED = 256  # prior draws tried as starts where a theta costs no response
 _PATIENCE, _PROGRESS = 15, 1e-10  # evaluations in a line search without such a gain, in units of the objective
@@ -340,14 +341,17 @@ class Search:
         self.count += objective.count
 
     def settle(self, result: Any) -> Any:
-        """Decide on a line search that gave up: at a kink or at rounding that is the minimum, if a simplex agrees."""
+        """Decide on a line search that gave up: at a kink or at rounding that is the minimum, if a simplex agrees.
+
+        Where the discrepancy jumps, since points lose their response there, the simplex is wide enough to step over it.
+        """
         (last, scales), left = self._last, self.most - self.count
         if result.success or not self.gradient or left <= 0:
             return result
         plain = self._function(scales, gradient=False)
         again = Objective(plain, last.center, self.scale, last.size, gradient=False, most=left)
         start, before = (self.best - last.center) / self.scale, last.lowest
-        simplex = np.vstack([start, start + 0.01 * np.eye(start.size)])
+        simplex = np.vstack([start, start + (_OVER if self._jumps() else 0.01) * np.eye(start.size)])
         options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-7, "maxfev": 60 * start.size}
         polished = self._run(again, start, method="Nelder-Mead", options=options)
         self._record(again)
@@ -357,3 +361,11 @@ class Search:
         polished.success = bool(polished.success or gain < _SETTLED)
         polished.message = f"{result.message} A simplex from there gained {max(gain, 0):.1e}: {polished.message}"
         return polished
+
+    def _jumps(self) -> bool:
+        """Whether a smooth discrepancy loses or wins simulated responses close to the best theta."""
+        if not all(n.metric.smooth for n in self.evaluator.nodes):
+            return False
+        near = self.best + np.vstack([0 * self.scale, *(s * e for e in np.diag(_STEP * self.scale) for s in (1, -1))])
+        lost = [~np.isfinite(v) for v in self._populations(near)[0]]
+        return any((rows != rows[0]).any() for rows in lost)

@@ -15,7 +15,9 @@ from scipy.stats import norm
 import prbayes as prb
 from prbayes._arrays import Floats
 from prbayes.density import GaussianKDE
+from prbayes.information import prior_scale
 from prbayes.population import Evaluator
+from prbayes.refit import Neighbourhood
 from prbayes.search import Search
 from prbayes.simulator import nodes
 
@@ -313,6 +315,69 @@ def test_a_population_that_collapsed_within_the_bandwidth_is_no_convergence() ->
         prb.sample_smc(50, chains=1, optimum=optimum, model=model, random_seed=1, progressbar=False)
     tree = prb.sample_smc(50, chains=1, epsilon=1 / 20, adjust=False, optimum=optimum, model=model, random_seed=1)
     assert tree.posterior["sigma"].mean() > 10 * optimum.point["sigma"]
+
+
+@cache
+def lossy(name: str, seed: int, n: int) -> pm.Model:
+    """Model eq. 14 of the paper, which has no response where |x - 2| > 1."""
+
+    def response(x: Any, coin: Any) -> Any:
+        with np.errstate(invalid="ignore"):
+            return 10 + np.where(coin < 0.5, -16.0, 16.0) * np.sqrt(1 - (x - 2) ** 2)
+
+    rng = np.random.default_rng([seed, 20, 3])
+    x, coin = rng.normal(1.5, 0.1, 40), rng.random(40)
+    observed = response(x, coin)[:20]
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1.65, 0.5), pm.HalfNormal("sigma", 0.3))
+        coin, propagation = pm.Uniform.dist(0, 1), prb.Resimulated(n)
+        prb.Simulator("y", response, x, coin, metric=METRICS[name], observed=observed, propagation=propagation)
+    return model
+
+
+START = {"mu": 1.65, "sigma": 0.15}
+
+
+@pytest.mark.parametrize(("name", "seed"), [("kl", 0), ("kl", 1), ("pr", 0)])
+def test_bfgs_steps_over_the_jumps_of_points_that_lose_their_response(name: str, seed: int) -> None:
+    model = lossy(name, seed, 4096)
+    simplex = prb.minimize(model, start=START, method="Nelder-Mead")
+    optimum = prb.minimize(model, start=START)
+    assert optimum.discrepancy < simplex.discrepancy * (1 + 1e-4)
+    assert optimum.converged
+
+
+def test_at_a_jump_there_are_no_standard_errors() -> None:
+    optimum = prb.minimize(lossy("kl", 1, 1024), start=START)
+    assert optimum.at_jump == ("y",)
+    assert np.isnan(errors(optimum)).all()
+    assert "the discrepancy jumps" in repr(optimum)
+    assert "points lose their response" in str(prb.diagnose(optimum))
+    with pytest.raises(ValueError, match=r"calibrate_epsilon: .* points lose their response"):
+        prb.calibrate_epsilon(optimum)
+
+
+def test_standard_errors_are_those_of_where_the_simplex_ended() -> None:
+    model = lossy("pr", 1, 4096)
+    optimum = prb.minimize(model, start=START)
+    assert "A simplex from there" in optimum.message
+    hood = Neighbourhood.of(optimum.evaluator, optimum.theta, np.ones(1), prior_scale(optimum.evaluator))
+    np.testing.assert_allclose(optimum.covariance, hood.local.in_theta, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["kl", "pr"])
+def test_a_jump_that_hardly_matters_leaves_standard_errors_alone(name: str) -> None:
+    """A response that is lost beyond three standard deviations, from a hundred thousand points, and one that is not."""
+    found = []
+    for edge in (3.0, np.inf):
+        model = normal_model(
+            METRICS[name], prb.Resimulated(100_000), lambda x, e=edge: np.where(np.abs(x - MEAN) < e * SD, x, np.nan)
+        )
+        found.append(prb.minimize(model))
+    cut, whole = found
+    assert cut.converged
+    assert cut.at_jump == ()
+    np.testing.assert_allclose(errors(cut), errors(whole), rtol=0.25)  # a cut response does tell more about sigma
 
 
 @pytest.mark.parametrize("name", ["ll", "pr"])
