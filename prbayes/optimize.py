@@ -222,6 +222,7 @@ def find_optimum(
     return replace(
         found,
         converged=found.converged and not edge,
+        message=found.message + (f" {', '.join(edge)} ran to the edge of the support." if edge else ""),
         design_error=error,
         rivals=tuple(_described(evaluator, o) for o in others),
         warnings=warnings,

@@ -305,6 +305,7 @@ def test_a_population_that_collapsed_within_the_bandwidth_is_no_convergence() ->
     assert optimum.at_edge == ("sigma",)
     assert np.isnan(errors(optimum)).all()
     assert "sigma ran to the edge of the support" in repr(optimum)
+    assert optimum.message.endswith("sigma ran to the edge of the support.")
     said = prb.diagnose(optimum).messages
     assert "collapsed" in said[0]
     assert not any("did not converge" in line for line in said)
