@@ -41,7 +41,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
     TypeError
         For simulators with a `FunctionMetric` or `Fresh`, whose epsilon has to be given.
     ValueError
-        If nothing is known around the optimum (`Optimum.at_edge`, `Optimum.at_jump`), or nothing is identified.
+        If nothing is known around the optimum (``at_edge`` and ``at_jump`` of `Optimum`), or nothing is identified.
 
     References
     ----------

@@ -88,7 +88,7 @@ def sample_smc(
     ------
     TypeError, ValueError
         If an argument is not as described, no prior draw has a finite discrepancy, or nothing is known around the
-        optimum (`Optimum.at_edge`, `Optimum.at_jump`) and it is needed for epsilon or the adjustment.
+        optimum (``at_edge`` and ``at_jump`` of `Optimum`) and it is needed for epsilon or the adjustment.
     DesignError
         If a design does not support the posterior after refinement.
     StoreError
