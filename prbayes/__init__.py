@@ -7,21 +7,19 @@ from prbayes.adjust import Affine
 from prbayes.bootstrap import bootstrap
 from prbayes.calling import ResponseError, scalar
 from prbayes.compare import compare
-from prbayes.density import GaussianKDE, Histogram
 from prbayes.diagnose import Diagnosis, diagnose
-from prbayes.discrepancy import Metric
 from prbayes.epsilon import calibrate_epsilon
 from prbayes.failures import Abort, Replace, Retry
 from prbayes.heldout import held_out
 from prbayes.joint import JointNull
 from prbayes.kernel import BatchedKernel
-from prbayes.metrics import (
-    AreaMetric,
-    FunctionMetric,
-    KullbackLeibler,
-    LogLikelihood,
-    ProbabilityResidual,
-)
+from prbayes.metrics.area import AreaMetric
+from prbayes.metrics.base import Metric
+from prbayes.metrics.density import GaussianKDE, Histogram
+from prbayes.metrics.divergence import KullbackLeibler
+from prbayes.metrics.function import FunctionMetric
+from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.metrics.residual import ProbabilityResidual
 from prbayes.nulls import ExactModel, PosteriorNull
 from prbayes.optimize import minimize
 from prbayes.optimum import Optimum

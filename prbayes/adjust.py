@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prbayes._arrays import Floats, positive_integer
+from prbayes._checks import Floats, positive_integer
 from prbayes.information import prior_scale
-from prbayes.metrics import FunctionMetric
+from prbayes.metrics.function import FunctionMetric
 from prbayes.population import Evaluator
 from prbayes.refit import Neighbourhood
 from prbayes.resampling import observed_set, simulated_sets

@@ -7,12 +7,12 @@ import time
 import numpy as np
 import xarray as xr
 
-from prbayes._arrays import positive_integer
+from prbayes._checks import positive_integer
+from prbayes._progress import shown
 from prbayes.adjust import inapplicable
 from prbayes.information import prior_scale
 from prbayes.modes import blind_directions
 from prbayes.optimum import Optimum, surveyed
-from prbayes.progress import shown
 from prbayes.refit import Neighbourhood
 from prbayes.resampling import reweighted_sets, simulated_sets
 from prbayes.results import bootstrap_tree

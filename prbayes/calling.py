@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
+from prbayes._progress import progress
 from prbayes.failures import Abort, OnFailure, Replace, Retry
-from prbayes.progress import progress
 from prbayes.store import Store
 
 _log = logging.getLogger("prbayes")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.store import StoreError
 
 

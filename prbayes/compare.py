@@ -9,9 +9,12 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._arrays import Floats
-from prbayes.discrepancy import Metric
-from prbayes.metrics import AreaMetric, KullbackLeibler, LogLikelihood, ProbabilityResidual
+from prbayes._checks import Floats
+from prbayes.metrics.area import AreaMetric
+from prbayes.metrics.base import Metric
+from prbayes.metrics.divergence import KullbackLeibler
+from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.metrics.residual import ProbabilityResidual
 from prbayes.optimum import Optimum
 from prbayes.population import Evaluator
 from prbayes.refinement import shortcomings

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 
 _HALVINGS = 8
 _LONGEST = 3.0  # of a step, in the units of the parameters

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from pytensor.gradient import disconnected_grad
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._arrays import Floats
-from prbayes.discrepancy import Discrepancy
+from prbayes._checks import Floats
 from prbayes.inputs import Inputs, PopulationSampler, compile_batched, log_density, prior_draws, quantiles
-from prbayes.metrics import FunctionMetric
+from prbayes.metrics.base import Discrepancy
+from prbayes.metrics.function import FunctionMetric
 from prbayes.propagation import N_BLOCKS, Bound, Reweighted, base_points, refuse_all_nan
 from prbayes.responses import OpaqueOp, Responses
 

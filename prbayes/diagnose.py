@@ -10,7 +10,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.optimum import Optimum
 from prbayes.population import Evaluator
 from prbayes.refinement import shortcoming

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from prbayes.information import Information, first_order_shifts, prior_scale, seen_by_area, seen_by_curvature
-from prbayes.metrics import FunctionMetric
+from prbayes.metrics.function import FunctionMetric
 from prbayes.optimum import Optimum, surveyed
 from prbayes.resimulation import FreshBound
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from prbayes._arrays import positive_integer
+from prbayes._checks import positive_integer
 
 
 class OnFailure:

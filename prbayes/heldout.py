@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from prbayes._arrays import positive_integer
+from prbayes._checks import positive_integer
 from prbayes.adjust import inapplicable
 from prbayes.information import prior_scale
 from prbayes.optimum import Optimum, surveyed

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._arrays import Floats
-from prbayes.metrics import FunctionMetric
+from prbayes._checks import Floats
+from prbayes.metrics.function import FunctionMetric
 from prbayes.population import Evaluator
 from prbayes.resampling import DataSets, dependent, simulated_sets, thinned
 

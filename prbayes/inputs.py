@@ -27,7 +27,7 @@ from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._arrays import Floats, real_array
+from prbayes._checks import Floats, real_array
 
 # Batched NumPy calls: nothing here runs often enough to repay a heavy compilation. Without fusion every
 # elementwise operation is one NumPy ufunc; with it, the Python linker would loop over scalars.
@@ -82,7 +82,7 @@ class Inputs:
     @cached_property
     def event_shapes(self) -> tuple[tuple[int, ...], ...]:
         """Event shape of each aleatory input, evaluated where it is not static."""
-        return tuple(_event_shape(x) for x in self.aleatory)
+        return tuple(event_shape(x) for x in self.aleatory)
 
     @property
     def event_ndims(self) -> tuple[int, ...]:
@@ -118,7 +118,7 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
             continue
         above = list(walk([x], lambda v: None if v in known or v.owner is None else v.owner.inputs))
         roots.update((v, None) for v in above if v in known)
-        latent = [v for v in above if v not in known and _is_random(v)]
+        latent = [v for v in above if v not in known and is_random(v)]
         # PyMC gives a `str_repr` to the variables of a model, and none to a `.dist()`.
         foreign = [v for v in latent if hasattr(v, "str_repr")]
         strays = [v for v in above if v.owner is None and not _is_bound(v)] + foreign
@@ -130,7 +130,7 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
         if x in known or not latent:
             arguments.append(x)
             continue
-        if not _is_random(x):
+        if not is_random(x):
             raise TypeError(
                 f"{label}: got an expression of a `.dist()` ({x}), expected the `.dist()` itself; "
                 "write the expression inside the response"
@@ -164,7 +164,7 @@ def _constant(x: object, label: str) -> Any:
     return float(array) if array.ndim == 0 else array
 
 
-def _is_random(variable: Variable) -> bool:
+def is_random(variable: Variable) -> bool:
     if variable.owner is None:
         return False
     op = variable.owner.op
@@ -242,7 +242,7 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
         ) from None
 
 
-def _event_shape(dist: TensorVariable) -> tuple[int, ...]:
+def event_shape(dist: TensorVariable) -> tuple[int, ...]:
     """Return the event shape of an aleatory input, evaluated."""
     if dist.type.ndim == 0:
         return ()
@@ -296,13 +296,13 @@ class PriorPoints:
     """
 
     def __init__(self, variables: Sequence[TensorVariable]) -> None:
-        self._shapes = [_event_shape(v) for v in variables]
+        self._shapes = [event_shape(v) for v in variables]
         self.size = sum(int(np.prod(s, dtype=int)) for s in self._shapes)
         symbols = [pt.tensor(dtype="float64", shape=s) for s in self._shapes]
         placed: dict[Variable, Variable] = {}
         for v, u in zip(variables, symbols, strict=True):
             placed[v] = quantiles("priors", graph_replace([v], placed, strict=False)[0], u)
-        if any(_is_random(v) for v in ancestors(list(placed.values()))):
+        if any(is_random(v) for v in ancestors(list(placed.values()))):
             raise TypeError("priors: got one that depends on a random variable which is not in the model")
         self._function = compile_batched(symbols, list(placed.values()))
 
@@ -348,7 +348,7 @@ class PopulationSampler:
         }
         # Distributions without any root above them are not batched by their parameters: resize them.
         for v in ancestors(dists):
-            if _is_random(v) and not any(a in symbols or (a is not v and _is_random(a)) for a in ancestors([v])):
+            if is_random(v) and not any(a in symbols or (a is not v and is_random(a)) for a in ancestors([v])):
                 per_specimen[v] = change_dist_size(v, size, expand=True)
         self._batched = True
         try:

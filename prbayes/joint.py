@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._arrays import Floats, positive_integer
+from prbayes._checks import Floats, positive_integer
 from prbayes.adjust import inapplicable
 from prbayes.design import Design
 from prbayes.information import prior_scale

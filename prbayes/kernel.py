@@ -8,7 +8,7 @@ import numpy as np
 import pymc as pm
 from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.population import Evaluation, Evaluator
 from prbayes.simulator import model_on_context
 

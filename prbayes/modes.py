@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.descent import descend
 from prbayes.information import Local
 from prbayes.population import Evaluator

@@ -17,8 +17,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._arrays import Floats, positive_integer
-from prbayes.progress import progress
+from prbayes._checks import Floats, positive_integer
+from prbayes._progress import progress
 
 _BLOCK = 1 << 22  # u-values held at a time
 _ENVELOPED = 999  # replicates from which an envelope is made

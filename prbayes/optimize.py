@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pymc as pm
 
-from prbayes._arrays import Floats, positive_integer, positive_number
+from prbayes._checks import Floats, positive_integer, positive_number
+from prbayes._progress import shown
 from prbayes.information import Information, Local, prior_scale
-from prbayes.metrics import FunctionMetric
+from prbayes.metrics.function import FunctionMetric
 from prbayes.modes import Rival, blind_directions, rivals
 from prbayes.optimum import Optimum, assemble, flat, plain, trouble
 from prbayes.population import Evaluator
-from prbayes.progress import shown
 from prbayes.refinement import _MAX_ROUNDS, AGREE, grow, pilot, refine_at, refuse, shortcomings, spread_around
 from prbayes.refit import Neighbourhood
 from prbayes.resimulation import FreshBound

@@ -10,7 +10,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.information import Local
 from prbayes.population import Evaluator
 from prbayes.search import Search

@@ -18,10 +18,10 @@ import pytensor.tensor as pt
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.replace import graph_replace, vectorize_graph
 
-from prbayes._arrays import Floats, real_array
+from prbayes._checks import Floats, real_array
 from prbayes.design import Design
-from prbayes.discrepancy import Metric
 from prbayes.inputs import PLAIN, PriorPoints, PriorSampler, ninf_for_invalid
+from prbayes.metrics.base import Metric
 from prbayes.propagation import sobol
 from prbayes.simulator import Node, log_kernel, required_nodes
 

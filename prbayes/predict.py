@@ -15,7 +15,7 @@ import pytensor.tensor as pt
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from prbayes._arrays import Floats, positive_integer
+from prbayes._checks import Floats, positive_integer
 from prbayes.calling import ResponseError
 from prbayes.design import Design
 from prbayes.inputs import Inputs, PopulationSampler, compile_batched, quantiles, read_inputs

@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._arrays import Floats, positive_integer, positive_number
+from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes.calling import ResponseError
-from prbayes.discrepancy import Discrepancy
 from prbayes.failures import Abort, OnFailure
 from prbayes.inputs import (
     Inputs,
@@ -31,6 +30,7 @@ from prbayes.inputs import (
     prior_draws,
     valid,
 )
+from prbayes.metrics.base import Discrepancy
 from prbayes.responses import Responses
 
 N_BLOCKS = 8  # parts of a population's points whose differences tell its error

@@ -7,7 +7,7 @@ import logging
 import numpy as np
 import pymc as pm
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.design import Design
 from prbayes.information import Information
 from prbayes.population import Evaluator

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
+from prbayes._progress import progress
 from prbayes.descent import descend
 from prbayes.design import Design
 from prbayes.information import Information, Local, first_order_shifts, local_sampling
 from prbayes.population import Evaluator
-from prbayes.progress import progress
 from prbayes.propagation import N_BLOCKS
 from prbayes.resampling import DataSets, observed_set
 

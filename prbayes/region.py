@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pytensor.graph.basic import Variable
 
-from prbayes._arrays import Floats, real_array
+from prbayes._checks import Floats, real_array
 from prbayes.inputs import PopulationSampler, compile_batched, prior_draws, read_inputs, valid
 from prbayes.propagation import sobol
 from prbayes.simulator import model_on_context

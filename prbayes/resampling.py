@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.design import Design
 from prbayes.inputs import PopulationSampler
 from prbayes.population import Evaluator

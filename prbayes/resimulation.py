@@ -16,10 +16,10 @@ from pytensor.graph.op import Op
 from pytensor.graph.replace import _vectorize_node
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._arrays import Floats
-from prbayes.discrepancy import Discrepancy
+from prbayes._checks import Floats
 from prbayes.inputs import PLAIN, Inputs, PopulationSampler, compile_batched, ninf_for_invalid, quantiles, valid
-from prbayes.metrics import LikelihoodDiscrepancy
+from prbayes.metrics.base import Discrepancy
+from prbayes.metrics.likelihood import LikelihoodDiscrepancy
 from prbayes.propagation import Bound, Fresh, Resimulated, base_points, probe
 from prbayes.responses import ResponseOp, Responses, symbolic_discrepancy
 

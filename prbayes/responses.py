@@ -13,12 +13,12 @@ from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.op import Op
 from pytensor.graph.replace import _vectorize_node
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.calling import Caller, ResponseError, checked, scalar
-from prbayes.cells import Cells
-from prbayes.discrepancy import Discrepancy
 from prbayes.failures import Abort, OnFailure
 from prbayes.inputs import Inputs
+from prbayes.metrics.base import Discrepancy
+from prbayes.metrics.cells import Cells
 from prbayes.store import Store
 
 # Calls of the user's functions have no compiled form; nothing is gained by saying so at every compilation.

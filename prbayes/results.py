@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.describe import as_attribute, without_addresses
 from prbayes.population import Evaluator
 
@@ -23,7 +23,7 @@ def versions() -> dict[str, str]:
     return {f"{name}_version": importlib.metadata.version(name) for name in ("prbayes", "pymc", "numpy")}
 
 
-def _dataset(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, int]) -> xr.Dataset:
+def labelled(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, int]) -> xr.Dataset:
     """Label values, shapes (*leading, *shape), with the model's own dimensions and coordinates."""
     dims = evaluator.model.named_vars_to_dims
     coords: dict[str, Any] = {name: np.arange(size) for name, size in leading.items()}
@@ -136,7 +136,7 @@ def posterior_tree(
         "posterior": posterior,
         "sample_stats": sample_stats,
         "calibration": calibration,
-        "observed_data": _observed(evaluator),
+        "observed_data": observed_dataset(evaluator),
     }
     if unadjusted is not None:
         groups["unadjusted"] = _draws(evaluator, unadjusted)
@@ -180,7 +180,7 @@ def bootstrap_tree(
             **as_attribute(evaluator.model),
         }
     )
-    return xr.DataTree.from_dict({"posterior": posterior, "observed_data": _observed(evaluator)})
+    return xr.DataTree.from_dict({"posterior": posterior, "observed_data": observed_dataset(evaluator)})
 
 
 def calibration_tree(
@@ -190,7 +190,7 @@ def calibration_tree(
     stacked = {name: np.stack([row[name] for row in rows])[None] for name in rows[0]}
     leading = {"chain": 1, "draw": len(rows)}
     groups = {
-        group: _dataset(evaluator, {name: v[:, :, i] for name, v in stacked.items()}, leading)
+        group: labelled(evaluator, {name: v[:, :, i] for name, v in stacked.items()}, leading)
         for i, group in enumerate(("prior_sbc", "truth", "posterior_sd"))
     }
     groups["envelope"], outside = _envelopes(groups["prior_sbc"])
@@ -238,15 +238,15 @@ def _draws(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
     """Return draws, shape (chains, draws, d), as labelled variables."""
     chains, draws, d = thetas.shape
     values = evaluator.constrained(thetas.reshape(-1, d)).items()
-    return _dataset(
+    return labelled(
         evaluator,
         {n: v.reshape(chains, draws, *v.shape[1:]) for n, v in values},
         {"chain": chains, "draw": draws},
     )
 
 
-def _observed(evaluator: Evaluator) -> xr.Dataset:
-    return _dataset(evaluator, {n.name: n.target.observed for n in evaluator.nodes}, {})
+def observed_dataset(evaluator: Evaluator) -> xr.Dataset:
+    return labelled(evaluator, {n.name: n.target.observed for n in evaluator.nodes}, {})
 
 
 def optimum_tree(optimum: Optimum) -> xr.DataTree:
@@ -268,8 +268,8 @@ def optimum_tree(optimum: Optimum) -> xr.DataTree:
     elements = {"element": optimum.names, "other_element": optimum.names}
     return xr.DataTree.from_dict(
         {
-            "optimum": _dataset(evaluator, optimum.point, {}).assign_attrs(attrs),
-            "stderr": _dataset(evaluator, optimum.stderr, {}),
+            "optimum": labelled(evaluator, optimum.point, {}).assign_attrs(attrs),
+            "stderr": labelled(evaluator, optimum.stderr, {}),
             "trace": xr.Dataset(
                 {
                     "theta": (["evaluation", "element"], optimum.trace["theta"]),
@@ -292,6 +292,6 @@ def optimum_tree(optimum: Optimum) -> xr.DataTree:
                 },
                 coords={"simulator": names, **elements},
             ),
-            "observed_data": _observed(evaluator),
+            "observed_data": observed_dataset(evaluator),
         }
     )

@@ -13,10 +13,10 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._arrays import Floats, positive_integer
+from prbayes._checks import Floats, positive_integer
+from prbayes._progress import progress, shown
 from prbayes.adjust import Affine
 from prbayes.population import Evaluator
-from prbayes.progress import progress, shown
 from prbayes.resampling import fresh_data
 from prbayes.results import calibration_tree
 from prbayes.simulator import model_on_context, nodes, revive

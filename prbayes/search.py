@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from pytensor.gradient import NullTypeGradError
 
-from prbayes._arrays import Floats
-from prbayes.discrepancy import DensityDiscrepancy
-from prbayes.metrics import AreaMetric, FunctionMetric
+from prbayes._checks import Floats
+from prbayes._progress import progress
+from prbayes.metrics.area import AreaMetric
+from prbayes.metrics.base import DensityDiscrepancy
+from prbayes.metrics.function import FunctionMetric
 from prbayes.population import Evaluator
-from prbayes.progress import progress
 from prbayes.resimulation import FreshBound
 
 _OVER = 0.5  # prior standard deviations: the simplex where the discrepancy jumps

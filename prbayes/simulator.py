@@ -17,9 +17,9 @@ from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._arrays import Floats, observed_sample, positive_number
-from prbayes.discrepancy import Discrepancy, Metric
+from prbayes._checks import Floats, observed_sample, positive_number
 from prbayes.inputs import read_inputs
+from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.propagation import Bound, Propagation, Reweighted
 from prbayes.responses import Responses, refuse_uncallable
 

@@ -14,7 +14,8 @@ import pymc as pm
 import xarray as xr
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from prbayes._arrays import Floats, positive_integer, positive_number
+from prbayes._checks import Floats, positive_integer, positive_number
+from prbayes._progress import CONSOLE, shown
 from prbayes.adjust import Affine, inapplicable
 from prbayes.checkpoint import Checkpoint, stored_identity
 from prbayes.epsilon import calibrate_epsilon
@@ -22,7 +23,6 @@ from prbayes.kernel import BatchedKernel
 from prbayes.optimize import find_optimum
 from prbayes.optimum import Optimum, surveyed
 from prbayes.population import Evaluator
-from prbayes.progress import CONSOLE, shown
 from prbayes.refinement import _MAX_ROUNDS, refine_at, refuse, shortcomings
 from prbayes.resimulation import FreshBound
 from prbayes.results import posterior_tree

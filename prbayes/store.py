@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 
 _MAGIC = b"prbayes1"
 _HEADER = struct.Struct("<III")  # columns, rows, crc of the payload

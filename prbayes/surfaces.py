@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._arrays import Floats, positive_integer
+from prbayes._checks import Floats, positive_integer
 
 _FOLDS = 10
 _KERNELS = {"linear": 0, "thin_plate_spline": 1, "cubic": 1, "quintic": 2}  # and the degree that each needs

@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from prbayes._arrays import Floats, positive_integer
+from prbayes._checks import Floats, positive_integer
 from prbayes.calling import Caller, ResponseError
 from prbayes.failures import Abort, OnFailure, Replace
 from prbayes.propagation import sobol

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from prbayes._arrays import Floats, positive_integer, real_array
+from prbayes._checks import Floats, positive_integer, real_array
 from prbayes.nulls import Case, Condition, ExactModel, Null, PosteriorNull, area
 from prbayes.predict import data_digest, specimen_names
 from prbayes.results import versions

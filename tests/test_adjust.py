@@ -13,7 +13,7 @@ from scipy.special import digamma
 from scipy.stats import gamma, norm
 
 import prbayes as prb
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.adjust import _drawn_in, inapplicable, moved
 from prbayes.information import prior_scale
 from prbayes.population import Evaluator

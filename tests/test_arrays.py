@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from prbayes._arrays import (
+from prbayes._checks import (
     observed_sample,
     positive_integer,
     positive_number,

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from prbayes import density
-from prbayes._arrays import Floats
-from prbayes.cells import KernelCells
-from prbayes.density import GaussianKDE, Histogram, likelihood_bandwidth, silverman, spread
+from prbayes._checks import Floats
+from prbayes.metrics import density
+from prbayes.metrics.cells import KernelCells
+from prbayes.metrics.density import GaussianKDE, Histogram, likelihood_bandwidth, silverman, spread
 
 H, INF, NAN = 0.5, np.inf, np.nan
 OBSERVED = np.array([-2.0, -0.3, 0.1, 0.7, 2.1])

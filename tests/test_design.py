@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.design import Design
 from prbayes.population import Evaluator
 from prbayes.refinement import shortcomings

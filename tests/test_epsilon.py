@@ -10,9 +10,9 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes._arrays import Floats
-from prbayes.density import Histogram
+from prbayes._checks import Floats
 from prbayes.information import Information, prior_scale
+from prbayes.metrics.density import Histogram
 from prbayes.population import Evaluator
 from prbayes.simulator import nodes
 

@@ -4,9 +4,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-import prbayes.loops as loops
-from prbayes._arrays import Floats
-from prbayes.density import GaussianKDE
+import prbayes.metrics._loops as loops
+from prbayes._checks import Floats
+from prbayes.metrics.density import GaussianKDE
 
 
 def test_without_a_folder_for_it_the_compiled_loop_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:

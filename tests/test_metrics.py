@@ -6,9 +6,13 @@ import pytensor.tensor as pt
 import pytest
 from scipy.stats import norm, wasserstein_distance
 
-from prbayes._arrays import Floats
-from prbayes.density import GaussianKDE, Histogram, likelihood_bandwidth
-from prbayes.metrics import AreaMetric, FunctionMetric, KullbackLeibler, LogLikelihood, ProbabilityResidual
+from prbayes._checks import Floats
+from prbayes.metrics.area import AreaMetric
+from prbayes.metrics.density import GaussianKDE, Histogram, likelihood_bandwidth
+from prbayes.metrics.divergence import KullbackLeibler
+from prbayes.metrics.function import FunctionMetric
+from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.metrics.residual import ProbabilityResidual
 
 H, INF, NAN = 0.4, np.inf, np.nan
 PYTHON = pytensor.compile.mode.Mode(linker="py", optimizer="fast_compile")

@@ -13,9 +13,9 @@ from scipy import optimize
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes._arrays import Floats
-from prbayes.density import GaussianKDE
+from prbayes._checks import Floats
 from prbayes.information import prior_scale
+from prbayes.metrics.density import GaussianKDE
 from prbayes.population import Evaluator
 from prbayes.refit import Neighbourhood
 from prbayes.search import Search

@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 
 import prbayes as prb
-import prbayes.progress
-from prbayes.progress import progress, shown
+import prbayes._progress
+from prbayes._progress import progress, shown
 
 
 @pytest.fixture
@@ -20,9 +20,9 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
     """A terminal that all bars are drawn on, and patience of a hundredth of a second."""
     text = io.StringIO()
     console = Console(file=text, force_terminal=True, width=120)
-    monkeypatch.setattr(prbayes.progress, "CONSOLE", console)
+    monkeypatch.setattr(prbayes._progress, "CONSOLE", console)
     monkeypatch.setattr("prbayes.smc.CONSOLE", console)
-    monkeypatch.setattr(prbayes.progress, "_SHOWN_FROM", 0.01)
+    monkeypatch.setattr(prbayes._progress, "_SHOWN_FROM", 0.01)
     return text
 
 
@@ -49,8 +49,8 @@ def test_without_a_total_it_appears_when_the_time_has_passed(screen: io.StringIO
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_short_work_shows_nothing(screen: io.StringIO, monkeypatch: pytest.MonkeyPatch, terminal: bool) -> None:
-    monkeypatch.setattr(prbayes.progress, "CONSOLE", Console(file=screen, force_terminal=terminal))
-    monkeypatch.setattr(prbayes.progress, "_SHOWN_FROM", 2.0)
+    monkeypatch.setattr(prbayes._progress, "CONSOLE", Console(file=screen, force_terminal=terminal))
+    monkeypatch.setattr(prbayes._progress, "_SHOWN_FROM", 2.0)
     for total in (100, None):
         with progress("quick", total) as report:
             for _ in range(100):
@@ -130,4 +130,4 @@ def test_a_calibration_of_the_sampler_shows_one_bar(screen: io.StringIO) -> None
 def test_a_notebook_without_widgets_gets_plain_bars(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
     monkeypatch.setitem(sys.modules, "ipywidgets", None)
-    assert not prbayes.progress._console().is_jupyter
+    assert not prbayes._progress._console().is_jupyter

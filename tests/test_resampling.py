@@ -10,7 +10,7 @@ from scipy import optimize
 
 import prbayes as prb
 from prbayes import refit
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.descent import _updated, descend
 from prbayes.information import prior_scale
 from prbayes.population import Evaluator

@@ -12,7 +12,7 @@ import xarray as xr
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.population import Evaluator
 from prbayes.results import posterior_tree, versions
 

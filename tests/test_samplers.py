@@ -17,9 +17,9 @@ from pymc.model.transform.optimization import freeze_dims_and_data
 from scipy import stats
 
 import prbayes as prb
-from prbayes._arrays import Floats
-from prbayes.discrepancy import Metric
+from prbayes._checks import Floats
 from prbayes.inputs import PLAIN
+from prbayes.metrics.base import Metric
 from prbayes.population import Evaluator
 from prbayes.propagation import Propagation
 from prbayes.simulator import Node, nodes

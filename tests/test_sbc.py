@@ -16,7 +16,7 @@ import xarray as xr
 
 import prbayes as prb
 from prbayes import sbc
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.population import Evaluator
 from prbayes.simulator import nodes
 

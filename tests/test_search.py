@@ -13,7 +13,7 @@ import pytest
 from scipy import optimize, stats
 
 import prbayes as prb
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.population import Evaluator
 from prbayes.search import Objective, Search, StalledError, differences
 

@@ -15,7 +15,7 @@ from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.population import Evaluator
 from prbayes.simulator import nodes
 

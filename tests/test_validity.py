@@ -13,7 +13,7 @@ import xarray as xr
 from scipy.special import ndtr, ndtri
 
 import prbayes as prb
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.nulls import Case, Condition, Predictive, SimulatedNull, _table, area, envelope
 
 sys.path.insert(0, str(Path(__file__).parents[1]))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 
 # Okabe and Ito's colours, which colour-blind readers tell apart; line styles tell them apart in grey.
 BLUE, ORANGE, GREEN, VERMILION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"

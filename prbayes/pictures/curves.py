@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._arrays import Floats
-from prbayes.density import GaussianKDE, Histogram, silverman, weighted_quantile
+from prbayes._checks import Floats
+from prbayes.metrics.density import GaussianKDE, Histogram, silverman, weighted_quantile
 
 
 def typical_bandwidth(values: Floats, weights: Floats) -> float:

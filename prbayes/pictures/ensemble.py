@@ -11,7 +11,7 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.optimum import Optimum
 from prbayes.population import Evaluator
 from prbayes.predict import populations_of

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.optimum import Optimum
 from prbayes.pictures.ensemble import supported
 from prbayes.population import Evaluator

@@ -12,7 +12,7 @@ import pymc as pm
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.inputs import PopulationSampler, compile_batched, is_mvnormal
 from prbayes.pictures.curves import central_range, densities, typical_bandwidth
 from prbayes.population import Evaluator

@@ -10,7 +10,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._arrays import Floats, positive_number
+from prbayes._checks import Floats, positive_number
 from prbayes.optimum import Optimum
 from prbayes.pictures.canvas import BLUE, DASHED, INK, VERMILION, Canvas, named
 from prbayes.pictures.curves import (

@@ -9,7 +9,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._arrays import Floats, positive_integer
+from prbayes._checks import Floats, positive_integer
 from prbayes.optimum import Optimum
 from prbayes.pictures.canvas import (
     BLUE,

@@ -12,7 +12,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes import datasets
-from prbayes.metrics import ProbabilityResidual
+from prbayes.metrics.residual import ProbabilityResidual
 from prbayes.optimize import minimize
 from prbayes.predict import predict
 from prbayes.reports.report import Report

@@ -10,7 +10,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 from prbayes.compare import compare
 from prbayes.describe import describe, from_attributes
 from prbayes.diagnose import Diagnosis, diagnose

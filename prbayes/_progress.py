@@ -14,7 +14,6 @@ from rich.errors import LiveError
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 _log = logging.getLogger("prbayes")
-
 _SHOWN_FROM = 2.0  # expected seconds from which there is a bar
 
 

@@ -13,8 +13,8 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._arrays import Floats
-from prbayes.loops import SPLINE, count, read, smooth
+from prbayes._checks import Floats
+from prbayes.metrics._loops import SPLINE, count, read, smooth
 
 NDArrayInt = NDArray[np.intp]
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prbayes._arrays import Floats, positive_integer, positive_number
-from prbayes.cells import BinCells, Cells, KernelCells
+from prbayes._checks import Floats, positive_integer, positive_number
+from prbayes.metrics.cells import BinCells, Cells, KernelCells
 
 _MARGIN = 6.0  # bandwidths of grid beyond the outermost observation, at least
 _PER_BANDWIDTH = 4  # grid nodes per bandwidth
@@ -204,3 +204,9 @@ class Histogram(DensityEstimator):
             centers=low + width * (np.arange(bins, dtype=np.float64) + 0.5),
             smooth=False,
         )
+
+
+def density_estimator(density: object) -> None:
+    if not isinstance(density, DensityEstimator):
+        got = f"the class {density.__name__}" if isinstance(density, type) else f"{type(density).__name__} {density!r}"
+        raise TypeError(f"density: got {got}, expected prb.GaussianKDE() or prb.Histogram(), perhaps with arguments")

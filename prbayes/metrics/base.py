@@ -16,8 +16,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from prbayes._arrays import Floats, observed_sample, sample_weights, simulated_sample
-from prbayes.cells import Cells
+from prbayes._checks import Floats, observed_sample, sample_weights, simulated_sample
+from prbayes.metrics.cells import Cells
 
 _FLOOR = 1e-9
 

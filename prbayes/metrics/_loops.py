@@ -10,7 +10,7 @@ from functools import cache, update_wrapper
 
 import numpy as np
 
-from prbayes._arrays import Floats
+from prbayes._checks import Floats
 
 # The four cubic B-splines that reach a point at fraction t between two nodes: coefficients of 1, t, t^2, t^3.
 SPLINE = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6

@@ -1,0 +1,94 @@
+"""PLACEHOLDER of metrics.function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prbayes._checks import Floats
+from prbayes.metrics.base import Discrepancy, Metric
+
+
+@dataclass(frozen=True)
+class FunctionMetric(Metric):
+    """A user's own metric from a function; samplers that need gradients refuse it.
+
+    Parameters
+    ----------
+    function : callable
+        ``function(simulated, observed) -> discrepancy``, shapes (..., n), (N,) -> (...); smaller is better.
+    weighted : bool
+        Whether the function takes the weights of the simulated values, shape (..., n), as a third
+        argument. `Reweighted` needs that; the other propagations do not.
+
+    Raises
+    ------
+    TypeError
+        If ``function`` is not callable.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> metric = FunctionMetric(lambda simulated, observed: abs(np.mean(simulated, -1) - observed.mean()))
+    >>> metric([0.0, 2.0], [4.0])
+    3.0
+    """
+
+    function: Callable[..., Any]
+    weighted: bool = False
+    smooth: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if not callable(self.function):
+            raise TypeError(f"function: got {type(self.function).__name__}, expected f(simulated, observed)")
+
+    def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
+        if not np.allclose(weights, weights[0]):
+            raise ValueError("observed weights: got unequal ones, expected none; a FunctionMetric has no use for them")
+        return FunctionDiscrepancy(self, observed, weights)
+
+
+class FunctionDiscrepancy(Discrepancy):
+    """A user's metric against fixed observed values."""
+
+    metric: FunctionMetric
+
+    @property
+    def scale(self) -> float:
+        """One: nothing is known about the function."""
+        return 1.0
+
+    def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
+        """Return the value of the function."""
+        if self.metric.weighted:
+            value = self.metric.function(simulated, self.observed, np.broadcast_to(weights, simulated.shape))
+        elif not np.allclose(weights, np.asarray(weights)[..., :1]):
+            raise ValueError(
+                "weights: got unequal ones for a FunctionMetric whose function takes none; write "
+                "function(simulated, observed, weights) and pass weighted=True, or use prb.Resimulated"
+            )
+        else:
+            value = self.metric.function(simulated, self.observed)
+        value = np.asarray(value, dtype=np.float64)
+        if value.shape != simulated.shape[:-1]:
+            raise ValueError(
+                f"FunctionMetric: got a result of shape {value.shape} for simulated values of shape "
+                f"{simulated.shape}, expected {simulated.shape[:-1]}; reduce over the last axis"
+            )
+        return (value,)
+
+    def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
+        """Return the simulated values themselves."""
+        return (simulated,)
+
+    def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
+        """Return the value of the function."""
+        return self.features(np.broadcast_to(basis[0], weights.shape), weights, xp)
+
+    def outer(self, *features: Any, xp: Any) -> Any:
+        """Return the value of the function."""
+        return features[0]
