@@ -105,8 +105,8 @@ def tasks(size: int) -> dict[str, float]:
     import cloudpickle
     import distributed
 
-    from prbayes.calling import Caller, _compute, _packed, scalar
-    from prbayes.failures import Abort
+    from prbayes.response.calling import Caller, _compute, _packed, scalar
+    from prbayes.response.failures import Abort
 
     points = np.random.default_rng(1).normal(size=(size, 5))
     function = scalar(lambda *x: sum(x))

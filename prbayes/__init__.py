@@ -5,11 +5,9 @@ from importlib.metadata import version
 from prbayes import datasets
 from prbayes.adjust import Affine
 from prbayes.bootstrap import bootstrap
-from prbayes.calling import ResponseError, scalar
 from prbayes.compare import compare
 from prbayes.diagnose import Diagnosis, diagnose
 from prbayes.epsilon import calibrate_epsilon
-from prbayes.failures import Abort, Replace, Retry
 from prbayes.heldout import held_out
 from prbayes.joint import JointNull
 from prbayes.kernel import BatchedKernel
@@ -27,15 +25,20 @@ from prbayes.pictures.plots import plot_comparison, plot_posterior, plot_validit
 from prbayes.pictures.portraits import plot_population, plot_responses
 from prbayes.pictures.trails import plot_landscape, plot_optimizer, plot_stages
 from prbayes.predict import predict
-from prbayes.propagation import Fresh, Resimulated, Reweighted, monte_carlo, sobol
+from prbayes.propagation.fresh import Fresh
+from prbayes.propagation.points import monte_carlo, sobol
+from prbayes.propagation.resimulated import Resimulated
+from prbayes.propagation.reweighted import Reweighted
 from prbayes.refinement import DesignError, refine
 from prbayes.reports.report import Report
 from prbayes.reports.section import Section
+from prbayes.response.calling import ResponseError, scalar
+from prbayes.response.failures import Abort, Replace, Retry
+from prbayes.response.store import StoreError
 from prbayes.sbc import simulation_based_calibration
 from prbayes.search import Scipy
 from prbayes.simulator import Simulator, abc_distance, set_epsilon
 from prbayes.smc import sample_smc
-from prbayes.store import StoreError
 from prbayes.surfaces import Polynomial, RadialBasis, SurrogateError
 from prbayes.surrogate import Surrogate
 from prbayes.validity import ValidityTest, area_test, u_values

@@ -79,7 +79,7 @@ def bootstrap(
         raise ValueError(f"bootstrap: {reason}; use prb.sample_smc")
     scales = np.array(list(optimum.scales.values()))
     hood = Neighbourhood.of(evaluator, optimum.theta, scales, prior_scale(evaluator))
-    blind = blind_directions(hood.local, evaluator.readable_names)
+    blind = blind_directions(hood.local.blind, evaluator.readable_names)
     if blind:
         raise ValueError(
             f"bootstrap: the data tell less than the prior about {', '.join(blind)}, along which the minimiser is "

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from prbayes._checks import Floats
-from prbayes.store import StoreError
+from prbayes.response.store import StoreError
 
 
 class Checkpoint:

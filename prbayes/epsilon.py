@@ -7,7 +7,7 @@ import numpy as np
 from prbayes.information import Information, first_order_shifts, prior_scale, seen_by_area, seen_by_curvature
 from prbayes.metrics.function import FunctionMetric
 from prbayes.optimum import Optimum, surveyed
-from prbayes.resimulation import FreshBound
+from prbayes.propagation.fresh import FreshBound
 
 _CLOUD = 500  # thetas that carry each simulated data set's posterior
 _SETS = 200

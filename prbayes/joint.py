@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.adjust import inapplicable
-from prbayes.design import Design
 from prbayes.information import prior_scale
-from prbayes.inputs import read_inputs
 from prbayes.nulls import Case, Condition, Predictive, SimulatedNull
 from prbayes.optimum import Optimum, surveyed
 from prbayes.predict import data_digest, serving, specimen_names
+from prbayes.propagation.reweighted import Design
 from prbayes.refit import Neighbourhood
 from prbayes.resampling import groups, sets_at, simulated_points, specimens
-from prbayes.responses import Responses, refuse_uncallable
+from prbayes.response.inputs import read_inputs
+from prbayes.response.response import Responses, refuse_uncallable
 
 _DIFFERENT = 0.1  # between distribution functions of predicted values and of the population at the optimum
 

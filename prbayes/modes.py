@@ -106,11 +106,11 @@ def _separate(
     return bool(np.max(between) - max(value_a, value_b) > _BARRIER * noise)
 
 
-def blind_directions(local: Local, names: list[str]) -> list[str]:
+def blind_directions(blind: Floats, names: list[str]) -> list[str]:
     """Name the directions about which the data tell less than the prior, such as 'mu[0] - 0.8 mu[1]'."""
     found = []
     # Rotated so that elements stand alone where they can.
-    basis = local.blind
+    basis = blind
     while basis.shape[1]:
         projector = basis @ basis.T
         i = int(np.argmax(np.diag(projector)))

@@ -18,9 +18,9 @@ from prbayes.metrics.function import FunctionMetric
 from prbayes.modes import Rival, blind_directions, rivals
 from prbayes.optimum import Optimum, assemble, flat, plain, trouble
 from prbayes.population import Evaluator
-from prbayes.refinement import _MAX_ROUNDS, AGREE, grow, pilot, refine_at, refuse, shortcomings, spread_around
+from prbayes.propagation.fresh import FreshBound
+from prbayes.refinement import AGREE, MAX_ROUNDS, grow, pilot, refine_at, refuse, shortcomings, spread_around
 from prbayes.refit import Neighbourhood
-from prbayes.resimulation import FreshBound
 from prbayes.search import Scipy, Search
 from prbayes.simulator import model_on_context
 
@@ -181,7 +181,7 @@ def find_optimum(
             error = np.nan if hood is None else hood.design_error()
             if not error > AGREE or not grow(evaluator, near, error):
                 break
-        elif rounds == _MAX_ROUNDS:
+        elif rounds == MAX_ROUNDS:
             refuse(short, evaluator)
         elif cloud is None:
             cloud = near = pilot(evaluator, scales, scale, seed=random_seed)
@@ -297,6 +297,6 @@ def _warnings(evaluator: Evaluator, local: Local | None, others: list[Rival], er
         lines += [
             f"the data tell less than the prior about {direction} (in units of the priors' standard deviations): it is "
             "not identified by them, and its posterior rests on the prior"
-            for direction in blind_directions(local, evaluator.readable_names)
+            for direction in blind_directions(local.blind, evaluator.readable_names)
         ]
     return tuple(lines)

@@ -19,10 +19,11 @@ from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.replace import graph_replace, vectorize_graph
 
 from prbayes._checks import Floats, real_array
-from prbayes.design import Design
-from prbayes.inputs import PLAIN, PriorPoints, PriorSampler, ninf_for_invalid
 from prbayes.metrics.base import Metric
-from prbayes.propagation import sobol
+from prbayes.propagation.points import sobol
+from prbayes.propagation.reweighted import Design
+from prbayes.response.compilation import PLAIN, ninf_for_invalid
+from prbayes.response.distributions import PriorPoints, PriorSampler
 from prbayes.simulator import Node, log_kernel, required_nodes
 
 _CHUNK = 1 << 22  # design points times particles evaluated at a time: bounds memory

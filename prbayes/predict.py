@@ -16,13 +16,15 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats, positive_integer
-from prbayes.calling import ResponseError
-from prbayes.design import Design
-from prbayes.inputs import Inputs, PopulationSampler, compile_batched, quantiles, read_inputs
 from prbayes.optimum import Optimum
-from prbayes.propagation import base_points
+from prbayes.propagation.points import base_points
+from prbayes.propagation.reweighted import Design
 from prbayes.refinement import DesignError
-from prbayes.responses import Responses, refuse_uncallable
+from prbayes.response.calling import ResponseError
+from prbayes.response.compilation import compile_batched
+from prbayes.response.distributions import PopulationSampler, quantiles
+from prbayes.response.inputs import Inputs, read_inputs
+from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.results import versions
 from prbayes.simulator import Node, model_on_context, nodes
 

@@ -8,15 +8,15 @@ import numpy as np
 import pymc as pm
 
 from prbayes._checks import Floats
-from prbayes.design import Design
 from prbayes.information import Information
 from prbayes.population import Evaluator
+from prbayes.propagation.reweighted import Design
 from prbayes.resampling import siblings
 from prbayes.simulator import model_on_context
 
 _log = logging.getLogger("prbayes")
 
-_MAX_ROUNDS = 8
+MAX_ROUNDS = 8
 _THETAS = 256
 AGREE = 0.1  # standard errors within which the optima of two independent designs are to be
 _RATE = 0.65  # the power of its size with which the error of a design of several inputs falls, about
@@ -120,7 +120,7 @@ def pilot(evaluator: Evaluator, scales: Floats, scale: Floats, *, seed: int = 0)
     """
     rng = np.random.default_rng(seed)
     thetas = evaluator.prior_thetas(4 * _THETAS, seed)
-    for _ in range(2 * _MAX_ROUNDS):
+    for _ in range(2 * MAX_ROUNDS):
         found = evaluator(thetas)
         value = (found.discrepancies / scales).sum(axis=-1) - found.log_other
         value = np.where(np.isfinite(found.log_prior), value, np.inf)
@@ -131,7 +131,7 @@ def pilot(evaluator: Evaluator, scales: Floats, scale: Floats, *, seed: int = 0)
             for name, support in evaluator.support(best).items()
             if np.median(support["weight_ess"]) < evaluator.designs[name].required_ess
         }
-        _add(evaluator, best, {name for name in thin if evaluator.designs[name].batches <= _MAX_ROUNDS})
+        _add(evaluator, best, {name for name in thin if evaluator.designs[name].batches <= MAX_ROUNDS})
         noise = sum(Information(evaluator, k, best[0], scale, n_sets=50).noise_floor / s for k, s in enumerate(scales))
         if not thin and value[order[-1]] - value[order[0]] < noise:
             break
@@ -208,7 +208,7 @@ def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[
     if thetas is None:
         minimize(model)
     else:
-        for _ in range(_MAX_ROUNDS):
+        for _ in range(MAX_ROUNDS):
             if not refine_at(evaluator, np.asarray(thetas, dtype=np.float64)):
                 break
         refuse(shortcomings(evaluator, thetas), evaluator)

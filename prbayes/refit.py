@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 from prbayes._progress import progress
 from prbayes.descent import descend
-from prbayes.design import Design
 from prbayes.information import Information, Local, first_order_shifts, local_sampling
 from prbayes.population import Evaluator
-from prbayes.propagation import N_BLOCKS
+from prbayes.propagation.base import N_BLOCKS
+from prbayes.propagation.reweighted import Design
 from prbayes.resampling import DataSets, observed_set
 
 _STEP = 0.02  # of differences, in standard errors

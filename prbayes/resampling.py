@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
-from prbayes.design import Design
-from prbayes.inputs import PopulationSampler
 from prbayes.population import Evaluator
+from prbayes.propagation.reweighted import Design
+from prbayes.response.distributions import PopulationSampler
 from prbayes.simulator import Node
 
 _MOST = 1 << 15  # points of a resimulated population from which data sets are drawn

@@ -19,12 +19,13 @@ from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import DensityDiscrepancy
 from prbayes.metrics.function import FunctionMetric
 from prbayes.population import Evaluator
-from prbayes.resimulation import FreshBound
+from prbayes.propagation.fresh import FreshBound
 
 _OVER = 0.5  # prior standard deviations: the simplex where the discrepancy jumps
 _SETTLED = 1e-4  # relative gain of a simplex below which a stalled line search counts as converged
 _SCREENED = 256  # prior draws tried as starts where a theta costs no response
-_PATIENCE, _PROGRESS = 15, 1e-10  # evaluations in a line search without such a gain, in units of the objective
+_PATIENCE = 15  # evaluations in a line search without progress
+_PROGRESS = 1e-10  # of the objective, in its typical size: a smaller gain is none
 _STEP = 1e-4  # of differences, in units of the prior's spread
 _OVERLAP = 0.02  # of two densities, below which the area metric leads
 _THIN = 2.0  # weight effective sample size below which a design does not reach a population at all

@@ -18,10 +18,11 @@ from pytensor.graph.op import Op
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats, observed_sample, positive_number
-from prbayes.inputs import read_inputs
 from prbayes.metrics.base import Discrepancy, Metric
-from prbayes.propagation import Bound, Propagation, Reweighted
-from prbayes.responses import Responses, refuse_uncallable
+from prbayes.propagation.base import Bound, Propagation
+from prbayes.propagation.reweighted import Reweighted
+from prbayes.response.inputs import read_inputs
+from prbayes.response.response import Responses, refuse_uncallable
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,8 +23,8 @@ from prbayes.kernel import BatchedKernel
 from prbayes.optimize import find_optimum
 from prbayes.optimum import Optimum, surveyed
 from prbayes.population import Evaluator
-from prbayes.refinement import _MAX_ROUNDS, refine_at, refuse, shortcomings
-from prbayes.resimulation import FreshBound
+from prbayes.propagation.fresh import FreshBound
+from prbayes.refinement import MAX_ROUNDS, refine_at, refuse, shortcomings
 from prbayes.results import posterior_tree
 from prbayes.simulator import model_on_context
 
@@ -166,7 +166,7 @@ def sample(
         saved = _checkpoint(checkpoint, evaluator, draws, chains, threshold, random_seed)
         seeds = np.random.SeedSequence(random_seed if saved is None else int(saved.identity["entropy"]))
         run = _Run(evaluator, draws, threshold, saved)
-        for round_ in range(_MAX_ROUNDS + 1):
+        for round_ in range(MAX_ROUNDS + 1):
             children = seeds.spawn(chains)
             if saved is not None and round_ < saved.note.get("round", 0):
                 run.refined.append(saved.arrays[f"refined{round_}_thetas"])
@@ -183,7 +183,7 @@ def sample(
                 break
             both = np.concatenate([plain, thetas]).reshape(-1, evaluator.size)
             some = np.random.default_rng(seeds).permutation(both)[:256]
-            if round_ == _MAX_ROUNDS:
+            if round_ == MAX_ROUNDS:
                 refuse(shortcomings(evaluator, some), evaluator)
             elif not refine_at(evaluator, some):
                 break

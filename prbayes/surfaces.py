@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
 
-_FOLDS = 10
+FOLDS = 10
 _KERNELS = {"linear": 0, "thin_plate_spline": 1, "cubic": 1, "quintic": 2}  # and the degree that each needs
 
 Predict = Callable[[Floats], Floats]
@@ -182,7 +182,7 @@ def cross_validated(model: Any, x: Floats, y: Floats, seed: int) -> Floats:
     """Return responses less what the surface says that was fitted without their tenth of the points, shape (n,)."""
     order = np.random.default_rng(seed).permutation(len(y))
     residuals = np.empty(len(y))
-    for fold in np.array_split(order, min(_FOLDS, len(y))):
+    for fold in np.array_split(order, min(FOLDS, len(y))):
         rest = np.setdiff1d(order, fold)
         residuals[fold] = y[fold] - fitted(model, x[rest], y[rest])(x[fold])
     return residuals
@@ -192,7 +192,7 @@ def required(model: Any, dimensions: int) -> int:
     """Return how many design points a surface needs, so that nine tenths of them determine it."""
     terms = model.terms(dimensions) if isinstance(model, Surface) else 1
     n = terms + 2
-    while n - -(-n // min(_FOLDS, n)) < terms + 1:
+    while n - -(-n // min(FOLDS, n)) < terms + 1:
         n += 1
     return n
 

@@ -15,11 +15,11 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from prbayes._checks import Floats, positive_integer
-from prbayes.calling import Caller, ResponseError
-from prbayes.failures import Abort, OnFailure, Replace
-from prbayes.propagation import sobol
+from prbayes.propagation.points import sobol
 from prbayes.region import Input, Region, read_region
-from prbayes.store import Store, StoreError
+from prbayes.response.calling import Caller, ResponseError
+from prbayes.response.failures import Abort, OnFailure, Replace
+from prbayes.response.store import Store, StoreError
 from prbayes.surfaces import (
     Polynomial,
     Predict,

@@ -14,8 +14,8 @@ from pymc.logprob.utils import ParameterValueError
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes.inputs import PLAIN
 from prbayes.population import Evaluator
+from prbayes.response.compilation import PLAIN
 from prbayes.simulator import nodes
 
 OBSERVED = 0.75 * (2.0 + 0.8 * norm.ppf((np.arange(30) + 0.5) / 30))

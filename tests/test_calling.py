@@ -21,10 +21,10 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.calling import Caller
-from prbayes.failures import Abort, OnFailure
+from prbayes.response.calling import Caller
+from prbayes.response.failures import Abort, OnFailure
+from prbayes.response.store import Store
 from prbayes.simulator import nodes
-from prbayes.store import Store
 
 N = 64
 

@@ -13,7 +13,7 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
-from prbayes.calling import _capacity
+from prbayes.response.calling import _capacity
 from prbayes.simulator import nodes
 
 distributed = pytest.importorskip("distributed")

@@ -14,8 +14,8 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.design import Design
 from prbayes.population import Evaluator
+from prbayes.propagation.reweighted import Design
 from prbayes.refinement import shortcomings
 from prbayes.simulator import nodes
 

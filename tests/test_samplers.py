@@ -18,10 +18,10 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.inputs import PLAIN
 from prbayes.metrics.base import Metric
 from prbayes.population import Evaluator
-from prbayes.propagation import Propagation
+from prbayes.propagation.base import Propagation
+from prbayes.response.compilation import PLAIN
 from prbayes.simulator import Node, nodes
 
 N, MU, SIGMA, EPSILON, POINTS = 30, 2.0, 0.8, 0.02, 128

@@ -13,9 +13,10 @@ import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats
-from prbayes.inputs import PopulationSampler, compile_batched, is_mvnormal
 from prbayes.pictures.curves import central_range, densities, typical_bandwidth
 from prbayes.population import Evaluator
+from prbayes.response.compilation import compile_batched
+from prbayes.response.distributions import PopulationSampler, is_mvnormal
 
 _SPECIMENS, _SOME = 400, 40  # random draws of inputs, never of responses, and from how many populations
 _TAIL = 0.002

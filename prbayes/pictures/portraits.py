@@ -99,7 +99,7 @@ def plot_responses(
     >>> prb.plot_responses(prb.minimize(model), backend="none").viz["after"].name
     'after'
     """
-    _check_level(level)
+    check_level(level)
     shown = read_result(result, model, "prb.plot_responses", draws)
     theta, what = read_before(result, shown.evaluator, before)
     if len(theta) and not supported(shown.evaluator, theta)[0]:
@@ -114,7 +114,7 @@ def plot_responses(
         low, high = _reach(node, values, weights, earlier)
         grid = np.linspace(low, high, _GRID)
         curves = distribution_functions(values, weights, grid) if ecdf else _density(values, weights, grid)
-        after, band = _middle_and_band(curves, len(center), level)
+        after, band = middle_and_band(curves, len(center), level)
         top = _measured(canvas, node, low, high, ecdf=ecdf)
         top = max(top, after.max(), 0.0 if band is None else band[1].max())
         ylim = None
@@ -123,7 +123,7 @@ def plot_responses(
             canvas.line(node.name, "before", grid, y[0], VERMILION, style=DASHED, legend=f"before: {what}")
             if y.max() > 2 * top:  # a narrow peak is cut off, not the rest flattened
                 ylim = (-0.05 * top, 2 * top)
-        _calibrated(canvas, node.name, grid, after, band, shown, level)
+        calibrated(canvas, node.name, grid, after, band, shown, level)
         count = f"{node.target.observed.size} measured values"
         y_axis = "share of specimens" if ecdf else "density"
         canvas.axes(node.name, x=named(node.name, labels), y=y_axis, title=count, xlim=(low, high), ylim=ylim)
@@ -183,7 +183,7 @@ def plot_population(
     >>> list(prb.plot_population(prb.minimize(model), backend="none").viz["after"])
     ['load']
     """
-    _check_level(level)
+    check_level(level)
     shown = read_result(result, model, "prb.plot_population", draws, free=True)
     wanted = chosen(margins(shown.evaluator), inputs)
     center = shown.thetas[:0] if shown.center is None else shown.center
@@ -191,19 +191,19 @@ def plot_population(
     canvas = Canvas([m.name for m in wanted], size=(4.6, 3.9), backend=backend, pc_kwargs=pc_kwargs)
     for margin in wanted:
         grid, curves = found[margin.name]
-        after, band = _middle_and_band(curves, len(center), level)
-        _calibrated(canvas, margin.name, grid, after, band, shown, level)
+        after, band = middle_and_band(curves, len(center), level)
+        calibrated(canvas, margin.name, grid, after, band, shown, level)
         y = "probability" if margin.discrete else "density"
         canvas.axes(margin.name, x=named(margin.name, labels), y=y)
     return canvas.finish()
 
 
-def _check_level(level: float) -> None:
+def check_level(level: float) -> None:
     if positive_number(level, "level") >= 1:
         raise ValueError(f"level: got {level}, expected a number between 0 and 1")
 
 
-def _middle_and_band(curves: Floats, centers: int, level: float) -> tuple[Floats, tuple[Floats, Floats] | None]:
+def middle_and_band(curves: Floats, centers: int, level: float) -> tuple[Floats, tuple[Floats, Floats] | None]:
     """Return the optimum's curve, or else the mean of the posterior's, and a band of the others."""
     others = curves[centers:]
     return curves[0] if centers else others.mean(axis=0), pointwise_band(others, level) if len(others) else None
@@ -226,7 +226,7 @@ def _density(values: Floats, weights: Floats, grid: Floats) -> Floats:
     return densities(values, weights, grid, typical_bandwidth(values[:_SOME], weights[:_SOME]))
 
 
-def _calibrated(
+def calibrated(
     canvas: Canvas, panel: str, grid: Floats, after: Floats, band: Any, shown: Ensemble, level: float
 ) -> None:
     if band is not None:

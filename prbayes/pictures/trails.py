@@ -90,7 +90,7 @@ def plot_optimizer(
     >>> list(prb.plot_optimizer(prb.minimize(model), backend="none").viz["asked"])
     ['discrepancy', 'mu']
     """
-    _check_optimum(optimum, "plot_optimizer")
+    check_optimum(optimum, "plot_optimizer")
     evaluator, x = optimum.evaluator, optimum.trace["evaluations"].astype(np.float64)
     scales = np.array([optimum.scales[n.name] for n in evaluator.nodes])
     free = not evaluator.responses_per_theta
@@ -106,7 +106,7 @@ def plot_optimizer(
     canvas.points("discrepancy", "asked", x[known], shown[known], GREY, size=16, legend="evaluated")
     if free or len(scales) == 1:
         canvas.line("discrepancy", "best", x[known], best[known], BLUE, legend="lowest so far")
-    canvas.axes("discrepancy", x="evaluations", y=_objective(optimum), yticks=ticks)
+    canvas.axes("discrepancy", x="evaluations", y=objective_of(optimum), yticks=ticks)
     ends = np.array([x[0], x[-1]])
     for name, at in path.items():
         canvas.line(name, "path", x, at, GREY, width=0.8)
@@ -174,7 +174,7 @@ def plot_landscape(
     >>> prb.plot_landscape(prb.minimize(model), backend="none").viz["optimum"].name
     'optimum'
     """
-    _check_optimum(optimum, "plot_landscape")
+    check_optimum(optimum, "plot_landscape")
     evaluator = optimum.evaluator if model is None or model is optimum.model else Evaluator(model)
     if evaluator.names != optimum.names or [n.name for n in evaluator.nodes] != list(optimum.scales):
         got = f"{evaluator.names} and {[n.name for n in evaluator.nodes]}"
@@ -204,7 +204,7 @@ def plot_landscape(
     limits = [(float(axis[0]), float(axis[-1])) for axis in found.axes]
     if len(wanted) == 1:
         _curve(canvas, found, alone=not rest)
-        y = _objective(optimum)
+        y = objective_of(optimum)
     else:
         roots, low, high = rooted(found.heights)
         canvas.heights("landscape", "landscape", (found.axes[0], found.axes[1]), roots, np.linspace(0, 1, 11))
@@ -213,7 +213,7 @@ def plot_landscape(
         canvas.points("landscape", "asked", x, y, INK, size=14, legend="path of the optimiser")
         _marks(canvas, found.optimum.T, found.rivals.T)
         y = named(wanted[1], labels)
-        held = "\n".join([f"{_objective(optimum)}: {low:.3g} dark, {high:.3g} light", *([held] if held else [])])
+        held = "\n".join([f"{objective_of(optimum)}: {low:.3g} dark, {high:.3g} light", *([held] if held else [])])
     canvas.axes(
         "landscape",
         x=named(wanted[0], labels),
@@ -325,14 +325,14 @@ def plot_stages(
     return canvas.finish()
 
 
-def _objective(optimum: Optimum) -> str:
+def objective_of(optimum: Optimum) -> str:
     if len(optimum.scales) > 1:
         return "sum of d / s"
     name = type(optimum.evaluator.nodes[0].metric).__name__
     return f"discrepancy ({_METRICS.get(name, name)})"
 
 
-def _check_optimum(optimum: Any, caller: str) -> None:
+def check_optimum(optimum: Any, caller: str) -> None:
     if not isinstance(optimum, Optimum):
         raise TypeError(f"{caller}: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first")
     if not len(optimum.trace.get("theta", ())):

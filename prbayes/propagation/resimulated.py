@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -11,19 +12,65 @@ import numpy as np
 import pytensor.tensor as pt
 from pytensor import shared
 from pytensor.compile import function
-from pytensor.graph.basic import Apply
-from pytensor.graph.op import Op
-from pytensor.graph.replace import _vectorize_node
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats
-from prbayes.inputs import PLAIN, Inputs, PopulationSampler, compile_batched, ninf_for_invalid, quantiles, valid
+from prbayes._checks import Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
 from prbayes.metrics.likelihood import LikelihoodDiscrepancy
-from prbayes.propagation import Bound, Fresh, Resimulated, base_points, probe
-from prbayes.responses import ResponseOp, Responses, symbolic_discrepancy
+from prbayes.propagation.base import Bound, Propagation, probe, refuse_nested
+from prbayes.propagation.ops import ResponseOp, symbolic_discrepancy
+from prbayes.propagation.points import base_points, sobol
+from prbayes.response.compilation import PLAIN, compile_batched, ninf_for_invalid
+from prbayes.response.distributions import PopulationSampler, quantiles, valid
+from prbayes.response.inputs import Inputs
+from prbayes.response.response import Responses
 
 _log = logging.getLogger("prbayes")
+
+
+@dataclass(frozen=True)
+class Resimulated(Propagation):
+    """Fixed scrambled Sobol points through the inputs' inverse distribution functions, for each theta anew.
+
+    Parameters
+    ----------
+    n : int
+        Number of points, best a power of two; n responses are computed for each theta.
+    seed : int
+        Seed of the scrambling.
+    points : callable
+        ``points(n, dimensions, seed)``, the points in the unit cube, shape (n, dimensions): `sobol`, or `monte_carlo`
+        for random numbers that are the same for each theta.
+    executor, store, on_failure
+        As for `Reweighted`.
+
+    Examples
+    --------
+    >>> Resimulated(512)
+    Resimulated(n=512, seed=0)
+    """
+
+    n: int = 1024
+    seed: int = 0
+    points: Callable[[int, int, int], Floats] = field(default=sobol, repr=False)
+
+    def __post_init__(self) -> None:
+        self.check()
+        positive_integer(self.n, "Resimulated: n", minimum=2)
+        if not callable(self.points):
+            raise TypeError(
+                f"Resimulated: points: got {type(self.points).__name__}, expected prb.sobol, prb.monte_carlo or a "
+                "function (n, dimensions, seed) -> points"
+            )
+        positive_integer(self.seed, "Resimulated: seed", minimum=0)
+
+    def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
+        """Lay out the base points and find out whether the response accepts PyTensor variables."""
+        from prbayes.propagation.resimulated import ResimulatedBound
+
+        refuse_nested(name, inputs)
+        return ResimulatedBound(name, inputs, target, responses, self)
+
 
 _TAILS = 300  # responses for each observation from which a log-likelihood's standard errors are right to a tenth
 _KEPT = 1 << 21  # base points whose transforms may stay in memory
@@ -92,67 +139,3 @@ class ResimulatedBound(Bound):
         if self.symbolic:
             self.responses.count += values.size
         return values, np.broadcast_to(1 / self.n_per_theta, values.shape)
-
-
-class FreshBound(Bound):
-    """New random draws at every evaluation.
-
-    Attributes
-    ----------
-    used : int
-        Number of evaluations so far; with the seed it determines the next draws.
-    """
-
-    def __init__(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses, config: Fresh) -> None:
-        super().__init__(name, inputs, target, responses)
-        self.n_per_theta = config.n
-        self._seed = config.seed
-        self.used = 0
-        self._sampler = PopulationSampler(inputs)
-        probe(self, self._sampler, config.seed)
-
-    def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
-        """Return an operation that draws and evaluates."""
-        return FreshOp(self)(*params)
-
-    def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
-        """Return fresh responses with equal weights."""
-        self.used += 1
-        rng = np.random.default_rng([self._seed, self.used])
-        values = self.responses(*self._sampler(params, self.n_per_theta, rng))
-        return values, np.broadcast_to(1 / self.n_per_theta, values.shape)
-
-
-class FreshOp(Op):
-    """Draws a population and returns its discrepancy, () ... -> ()."""
-
-    def __init__(self, bound: FreshBound) -> None:
-        self.bound = bound
-
-    def make_node(self, *params: Any) -> Apply[Any, Any]:
-        """Apply to the roots' values."""
-        tensors = [pt.as_tensor(p) for p in params]
-        ndims = [r.type.ndim for r in self.bound.inputs.roots]
-        batch = max(t.type.ndim - d for t, d in zip(tensors, ndims, strict=True))
-        return Apply(self, tensors, [pt.tensor(dtype="float64", shape=(None,) * batch)])
-
-    def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
-        """Draw, call the response, compare."""
-        ndims = [r.type.ndim for r in self.bound.inputs.roots]
-        batch = np.broadcast_shapes(*(p.shape[: p.ndim - d] for p, d in zip(inputs, ndims, strict=True)))
-        params = [
-            np.broadcast_to(p, batch + p.shape[p.ndim - d :]).reshape(-1, *p.shape[p.ndim - d :])
-            for p, d in zip(inputs, ndims, strict=True)
-        ]
-        outputs[0][0] = self.bound.discrepancies(params, self.bound.target).reshape(batch)
-
-    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
-        """Refuse by name; not as NotImplementedError, which PyMC takes as leave to use a slice sampler."""
-        raise TypeError(
-            f"{self.bound.name}: prb.Fresh draws new responses at every evaluation, so its log-density is random and "
-            "has no gradient: pm.sample, pm.find_MAP and gradient methods of prb.minimize would be wrong; use "
-            "propagation=prb.Reweighted() or prb.Resimulated(), or prb.sample_smc"
-        )
-
-
-_vectorize_node.register(FreshOp, lambda op, node, *batched: op.make_node(*batched))

@@ -7,188 +7,24 @@ Everything that is read off a PyMC distribution stands here: which model variabl
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pymc as pm
-import pytensor
 import pytensor.tensor as pt
 from pymc.distributions.multivariate import MvNormal
 from pymc.distributions.shape_utils import change_dist_size
-from pytensor.compile.mode import Mode
 from pytensor.graph.basic import Variable
 from pytensor.graph.replace import graph_replace, vectorize_graph
-from pytensor.graph.traversal import ancestors, walk
+from pytensor.graph.traversal import ancestors
 from pytensor.graph.utils import MissingInputError
-from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats, real_array
-
-# Batched NumPy calls: nothing here runs often enough to repay a heavy compilation. Without fusion every
-# elementwise operation is one NumPy ufunc; with it, the Python linker would loop over scalars.
-PLAIN = Mode(linker="py", optimizer="fast_run").excluding(
-    "fusion", "inplace", "BlasOpt", "c_blas", "symbolic_op_recognition"
-)
-
-
-@dataclass(frozen=True, eq=False)
-class Inputs:
-    """The inputs of one response, in the order of its arguments.
-
-    Attributes
-    ----------
-    arguments : tuple
-        One entry per argument: an int (position in ``aleatory``), a variable (epistemic), or an array.
-    aleatory : tuple of random variables
-        The distinct ``.dist()`` objects.
-    roots : tuple of variables
-        The model's random variables above the aleatory and epistemic inputs.
-    nested : bool
-        Whether a ``.dist()`` depends on another one.
-    """
-
-    arguments: tuple[Any, ...]
-    aleatory: tuple[TensorVariable, ...]
-    roots: tuple[TensorVariable, ...]
-    nested: bool
-
-    @property
-    def epistemic(self) -> tuple[TensorVariable, ...]:
-        """The arguments that are model variables, or functions of them."""
-        return tuple(a for a in self.arguments if isinstance(a, Variable))
-
-    def rebuilt(self, params: Sequence[Any]) -> tuple[list[TensorVariable], list[TensorVariable]]:
-        """Return the aleatory and epistemic inputs with the roots replaced by ``params``."""
-        # In two steps, because params may themselves depend on the roots.
-        symbols = self.placeholders()
-        new: Any = [*self.aleatory, *self.epistemic]
-        for old, to in ((self.roots, symbols), (symbols, params)):
-            swap = {a: pt.as_tensor(b) for a, b in zip(old, to, strict=True)}
-            new = graph_replace(new, swap, strict=False)
-        return new[: len(self.aleatory)], new[len(self.aleatory) :]
-
-    def fill(self, aleatory: Sequence[Any], epistemic: Sequence[Any]) -> list[Any]:
-        """Return the response's arguments from values for the aleatory and the epistemic inputs."""
-        rest = iter(epistemic)
-        return [
-            next(rest) if isinstance(a, Variable) else aleatory[a] if isinstance(a, int) else a for a in self.arguments
-        ]
-
-    @cached_property
-    def event_shapes(self) -> tuple[tuple[int, ...], ...]:
-        """Event shape of each aleatory input, evaluated where it is not static."""
-        return tuple(event_shape(x) for x in self.aleatory)
-
-    @property
-    def event_ndims(self) -> tuple[int, ...]:
-        """Number of event axes of each aleatory input."""
-        return tuple(x.type.ndim for x in self.aleatory)
-
-    def core(self, params: Sequence[Any]) -> list[Any]:
-        """Drop the leading axes of length one that PyMC adds to a node's parameters."""
-        return [p[(0,) * (p.ndim - r.type.ndim)] for p, r in zip(params, self.roots, strict=True)]
-
-    def placeholders(self) -> list[TensorVariable]:
-        """Return a fresh symbol for each root."""
-        return [r.type(name=r.name) for r in self.roots]
-
-
-def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
-    """Sort the inputs of a response into aleatory, epistemic and constant ones.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If one is none of the three, if none is aleatory, or if no model variable is above any of them.
-    """
-    known = set(model.basic_RVs)
-    arguments: list[Any] = []
-    aleatory: list[TensorVariable] = []
-    roots: dict[TensorVariable, None] = {}
-    nested = False
-    for i, x in enumerate(inputs):
-        label = f"{name}: input {i + 1}"
-        if not isinstance(x, Variable):
-            arguments.append(_constant(x, label))
-            continue
-        above = list(walk([x], lambda v: None if v in known or v.owner is None else v.owner.inputs))
-        roots.update((v, None) for v in above if v in known)
-        latent = [v for v in above if v not in known and is_random(v)]
-        # PyMC gives a `str_repr` to the variables of a model, and none to a `.dist()`.
-        foreign = [v for v in latent if hasattr(v, "str_repr")]
-        strays = [v for v in above if v.owner is None and not _is_bound(v)] + foreign
-        if strays:
-            raise TypeError(
-                f"{label}: got {x} which depends on {strays[0]}, expected a `.dist()`, a variable of this model "
-                "or a constant; create the variables it depends on inside the same `with pm.Model()`"
-            )
-        if x in known or not latent:
-            arguments.append(x)
-            continue
-        if not is_random(x):
-            raise TypeError(
-                f"{label}: got an expression of a `.dist()` ({x}), expected the `.dist()` itself; "
-                "write the expression inside the response"
-            )
-        nested = nested or len(latent) > 1
-        if x not in aleatory:
-            aleatory.append(x)
-        arguments.append(aleatory.index(x))
-    if not aleatory:
-        raise ValueError(
-            f"{name}: got {len(inputs)} inputs, none of them aleatory, expected at least one that varies between "
-            "specimens; pass a distribution made with `.dist()`, such as pm.Normal.dist(mu, sigma)"
-        )
-    if not roots:
-        raise ValueError(
-            f"{name}: got inputs that depend on no variable of the model, expected hyperparameters to calibrate; "
-            "give the `.dist()` parameters that are model variables, such as mu = pm.Normal('mu', 0, 1)"
-        )
-    return Inputs(tuple(arguments), tuple(aleatory), tuple(roots), nested)
-
-
-def _constant(x: object, label: str) -> Any:
-    try:
-        array = real_array(x, label)  # type: ignore[arg-type]
-    except TypeError as error:
-        raise TypeError(
-            f"{error}; an input is a `.dist()` (varies between specimens), a model variable (common to all) or a number"
-        ) from None
-    if not np.isfinite(array).all():
-        raise ValueError(f"{label}: got a constant that is not finite ({x!r:.60}), expected a number")
-    return float(array) if array.ndim == 0 else array
-
-
-def is_random(variable: Variable) -> bool:
-    if variable.owner is None:
-        return False
-    op = variable.owner.op
-    return (
-        isinstance(op, RandomVariable | pm.distributions.distribution.SymbolicRandomVariable)
-        and variable is variable.owner.outputs[op.default_output or 0]
-    )
-
-
-def _is_bound(variable: Variable) -> bool:
-    """Whether a graph's leaf has a value: constants, shared variables, generators."""
-    return hasattr(variable, "data") or hasattr(variable, "get_value") or not isinstance(variable, TensorVariable)
-
-
-def ninf_for_invalid(graphs: Sequence[TensorVariable]) -> list[TensorVariable]:
-    """Replace PyMC's parameter checks by -inf, so that one invalid theta of a batch leaves the others alone."""
-    from pymc.logprob.utils import CheckParameterValue
-
-    checks: dict[Variable, Variable] = {}
-    for v in ancestors(graphs):
-        if v.owner is not None and isinstance(v.owner.op, CheckParameterValue):
-            value, *conditions = v.owner.inputs
-            checks[v] = pt.switch(pt.all([pt.all(c) for c in conditions]), value, -np.inf)
-    return list(graph_replace(list(graphs), checks, strict=False)) if checks else list(graphs)
+from prbayes._checks import Floats
+from prbayes.response.compilation import PLAIN, compile_batched
+from prbayes.response.inputs import Inputs, event_shape, is_random
 
 
 def log_density(inputs: Inputs, aleatory: Sequence[TensorVariable], values: Sequence[Any]) -> TensorVariable:
@@ -240,16 +76,6 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
             f"{name}: {op} has no inverse distribution function in PyMC; "
             "use propagation=prb.Reweighted() or prb.Fresh()"
         ) from None
-
-
-def event_shape(dist: TensorVariable) -> tuple[int, ...]:
-    """Return the event shape of an aleatory input, evaluated."""
-    if dist.type.ndim == 0:
-        return ()
-    shape = dist.type.shape
-    if None not in shape:
-        return tuple(int(s) for s in shape if s is not None)
-    return tuple(int(s) for s in pm.draw(dist, random_seed=0, mode=PLAIN).shape)
 
 
 class PriorSampler:
@@ -378,15 +204,3 @@ class PopulationSampler:
             values = [np.stack(column) for column in zip(*rows, strict=True)]
         common = zip(values[self._n_aleatory :], self._epistemic_ndims, strict=True)
         return values[: self._n_aleatory], [v[:, None] if v.ndim > d else v for v, d in common]
-
-
-def compile_batched(
-    core_inputs: Sequence[TensorVariable], core_outputs: Sequence[TensorVariable], extra: Sequence[TensorVariable] = ()
-) -> Any:
-    """Compile a graph for a batch: every core input gets a leading axis, ``extra`` inputs stay as they are."""
-    outputs = ninf_for_invalid(core_outputs)
-    batched = [pt.tensor(name=v.name, dtype=v.dtype, shape=(None, *v.type.shape)) for v in core_inputs]
-    vectorized = vectorize_graph(outputs, dict(zip(core_inputs, batched, strict=True)))
-    return pytensor.function(
-        [*batched, *extra], vectorized, mode=PLAIN, on_unused_input="ignore", allow_input_downcast=True
-    )

@@ -7,7 +7,7 @@ the discrepancy as a graph of the hyperparameters and knows how many responses w
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,18 +20,14 @@ from numpy.typing import NDArray
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats, positive_integer, positive_number
-from prbayes.calling import ResponseError
-from prbayes.failures import Abort, OnFailure
-from prbayes.inputs import (
-    Inputs,
-    PopulationSampler,
-    compile_batched,
-    prior_draws,
-    valid,
-)
+from prbayes._checks import Floats
 from prbayes.metrics.base import Discrepancy
-from prbayes.responses import Responses
+from prbayes.response.calling import ResponseError
+from prbayes.response.compilation import compile_batched
+from prbayes.response.distributions import PopulationSampler, prior_draws, valid
+from prbayes.response.failures import Abort, OnFailure
+from prbayes.response.inputs import Inputs
+from prbayes.response.response import Responses
 
 N_BLOCKS = 8  # parts of a population's points whose differences tell its error
 
@@ -166,191 +162,6 @@ class Propagation(ABC):
         """Return the moving part for one simulator; raises what this propagation cannot do."""
 
 
-@dataclass(frozen=True)
-class Reweighted(Propagation):
-    """Simulate once: stored responses at design points get weights p(x given theta) / g(x) for each theta.
-
-    Parameters
-    ----------
-    n : int
-        Number of design points, drawn from the inputs' prior predictive distribution; the response is
-        computed n times, once. `refine` adds batches where they are needed.
-    seed : int
-        Seed of the design.
-    max_lost : float
-        Largest share of a population's weight that may fall on points whose response is NaN.
-    max_points : int, optional
-        Largest number of design points, refinement included; 32 n by default.
-    executor : Executor, optional
-        Where the response is computed: threads, processes, loky, ``dask.distributed.Client().get_executor()``,
-        ``mpi4py.futures.MPIPoolExecutor()``. In this process by default.
-    store : path-like, optional
-        A folder that keeps every computed response, by simulator: none is computed again, also in another run.
-    on_failure : Abort, Replace or Retry
-        What to do with a response that raises or is NaN.
-
-    References
-    ----------
-    .. [1] Owen, A. B., Monte Carlo theory, methods and examples, chapter 9 (mixture importance sampling).
-
-    Examples
-    --------
-    >>> Reweighted(256)
-    Reweighted(n=256, seed=0, max_lost=0.05, max_points=None)
-    """
-
-    n: int = 1024
-    seed: int = 0
-    max_lost: float = 0.05
-    max_points: int | None = None
-
-    def __post_init__(self) -> None:
-        self.check()
-        positive_integer(self.n, "Reweighted: n", minimum=16)
-        positive_integer(self.seed, "Reweighted: seed", minimum=0)
-        if self.max_lost != 0 and positive_number(self.max_lost, "Reweighted: max_lost") >= 1:
-            raise ValueError(f"Reweighted: max_lost: got {self.max_lost}, expected a share below 1")
-        if self.max_points is not None and positive_integer(self.max_points, "Reweighted: max_points") < self.n:
-            raise ValueError(f"Reweighted: max_points: got {self.max_points}, expected n = {self.n} or more")
-
-    def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
-        """Compute the responses at the first design points."""
-        from prbayes.design import Design
-
-        if inputs.epistemic:
-            raise TypeError(
-                f"{name}: {', '.join(str(e.name or e) for e in inputs.epistemic)} goes into the response as a model "
-                "variable (epistemic), so stored responses cannot be reweighted; use propagation=prb.Resimulated()"
-            )
-        refuse_nested(name, inputs)
-        if getattr(target.metric, "weighted", True) is False:
-            raise TypeError(
-                f"{name}: a FunctionMetric without weights cannot be used with prb.Reweighted; write "
-                "function(simulated, observed, weights) with weighted=True, or use propagation=prb.Resimulated()"
-            )
-        return Design(name, inputs, target, responses, self)
-
-
-def sobol(n: int, dimensions: int, seed: int) -> Floats:
-    """Return n scrambled Sobol points in the open unit cube, shape (n, dimensions).
-
-    Parameters
-    ----------
-    n, dimensions, seed : int
-
-    References
-    ----------
-    .. [1] Owen, A. B. (1998), Scrambling Sobol and Niederreiter-Xing points, doi:10.1006/jcom.1998.0487.
-
-    Examples
-    --------
-    >>> sobol(4, 1, 0).shape
-    (4, 1)
-    """
-    from scipy.stats import qmc  # takes longer to import than the whole package
-
-    engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
-    points = engine.random_base2(int(np.ceil(np.log2(n))))[:n] if n > 1 else engine.random(1)
-    return np.asarray(np.clip(points, 1e-12, 1 - 1e-12, out=points))
-
-
-def monte_carlo(n: int, dimensions: int, seed: int) -> Floats:
-    """Return n independent random points in the open unit cube, shape (n, dimensions); for `Resimulated`.
-
-    Parameters
-    ----------
-    n, dimensions, seed : int
-
-    References
-    ----------
-    .. [1] Oh et al. (2019), doi:10.1007/s00158-019-02288-6, whose case study has a million of them.
-
-    Examples
-    --------
-    >>> Resimulated(1000, points=monte_carlo).n
-    1000
-    """
-    return np.clip(np.random.default_rng(seed).random((n, dimensions)), 1e-12, 1 - 1e-12)
-
-
-@dataclass(frozen=True)
-class Resimulated(Propagation):
-    """Fixed scrambled Sobol points through the inputs' inverse distribution functions, for each theta anew.
-
-    Parameters
-    ----------
-    n : int
-        Number of points, best a power of two; n responses are computed for each theta.
-    seed : int
-        Seed of the scrambling.
-    points : callable
-        ``points(n, dimensions, seed)``, the points in the unit cube, shape (n, dimensions): `sobol`, or `monte_carlo`
-        for random numbers that are the same for each theta.
-    executor, store, on_failure
-        As for `Reweighted`.
-
-    Examples
-    --------
-    >>> Resimulated(512)
-    Resimulated(n=512, seed=0)
-    """
-
-    n: int = 1024
-    seed: int = 0
-    points: Callable[[int, int, int], Floats] = field(default=sobol, repr=False)
-
-    def __post_init__(self) -> None:
-        self.check()
-        positive_integer(self.n, "Resimulated: n", minimum=2)
-        if not callable(self.points):
-            raise TypeError(
-                f"Resimulated: points: got {type(self.points).__name__}, expected prb.sobol, prb.monte_carlo or a "
-                "function (n, dimensions, seed) -> points"
-            )
-        positive_integer(self.seed, "Resimulated: seed", minimum=0)
-
-    def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
-        """Lay out the base points and find out whether the response accepts PyTensor variables."""
-        from prbayes.resimulation import ResimulatedBound
-
-        refuse_nested(name, inputs)
-        return ResimulatedBound(name, inputs, target, responses, self)
-
-
-@dataclass(frozen=True)
-class Fresh(Propagation):
-    """New random draws at every evaluation, as in classic ABC; the discrepancy is noisy and has no gradient.
-
-    Parameters
-    ----------
-    n : int
-        Number of draws for each theta.
-    seed : int
-        Seed of the generator that belongs to the simulator.
-    executor, store, on_failure
-        As for `Reweighted`.
-
-    Examples
-    --------
-    >>> Fresh(50)
-    Fresh(n=50, seed=0)
-    """
-
-    n: int = 1024
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        self.check()
-        positive_integer(self.n, "Fresh: n", minimum=1)
-        positive_integer(self.seed, "Fresh: seed", minimum=0)
-
-    def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
-        """Prepare the generator of draws."""
-        from prbayes.resimulation import FreshBound
-
-        return FreshBound(name, inputs, target, responses, self)
-
-
 def refuse_nested(name: str, inputs: Inputs) -> None:
     """Refuse a `.dist()` that depends on another one."""
     if inputs.nested:
@@ -358,18 +169,6 @@ def refuse_nested(name: str, inputs: Inputs) -> None:
             f"{name}: an input is a `.dist()` that depends on another `.dist()`; its density is not that of "
             "independent inputs; use one multivariate distribution, or propagation=prb.Fresh()"
         )
-
-
-def base_points(
-    inputs: Inputs, n: int, seed: int, points: Callable[[int, int, int], Floats] = sobol
-) -> tuple[Floats, list[Floats]]:
-    """Return one spare coordinate, shape (n,), and one array of points, (n, *event), per aleatory input."""
-    shapes = inputs.event_shapes
-    sizes = [int(np.prod(s, dtype=int)) for s in shapes]
-    u = points(n, 1 + sum(sizes), seed)
-    edges = np.cumsum([1, *sizes])
-    parts = [u[:, a:b].reshape(n, *s).copy() for a, b, s in zip(edges[:-1], edges[1:], shapes, strict=True)]
-    return u[:, 0].copy(), parts
 
 
 def probe(bound: Bound, sampler: PopulationSampler, seed: int) -> tuple[Any, ...]:

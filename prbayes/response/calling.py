@@ -14,11 +14,10 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes._progress import progress
-from prbayes.failures import Abort, OnFailure, Replace, Retry
-from prbayes.store import Store
+from prbayes.response.failures import Abort, OnFailure, Replace, Retry
+from prbayes.response.store import Store
 
 _log = logging.getLogger("prbayes")
-
 _CHUNK_SECONDS = 0.2  # that a task should take: long against sending it, short against losing it
 _ALONE_SECONDS = 0.01  # from which a response of one specimen at a time is a task of its own
 _MANY = 1024  # tasks sent out to an executor that does not tell how many workers it has

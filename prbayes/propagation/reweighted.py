@@ -6,6 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -16,14 +17,84 @@ from numpy.typing import NDArray
 from pytensor.gradient import disconnected_grad
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats
-from prbayes.inputs import Inputs, PopulationSampler, compile_batched, log_density, prior_draws, quantiles
+from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes.metrics.base import Discrepancy
 from prbayes.metrics.function import FunctionMetric
-from prbayes.propagation import N_BLOCKS, Bound, Reweighted, base_points, refuse_all_nan
-from prbayes.responses import OpaqueOp, Responses
+from prbayes.propagation.base import N_BLOCKS, Bound, Propagation, refuse_all_nan, refuse_nested
+from prbayes.propagation.ops import OpaqueOp
+from prbayes.propagation.points import base_points
+from prbayes.response.compilation import compile_batched
+from prbayes.response.distributions import PopulationSampler, log_density, prior_draws, quantiles
+from prbayes.response.inputs import Inputs
+from prbayes.response.response import Responses
 
 _log = logging.getLogger("prbayes")
+
+
+@dataclass(frozen=True)
+class Reweighted(Propagation):
+    """Simulate once: stored responses at design points get weights p(x given theta) / g(x) for each theta.
+
+    Parameters
+    ----------
+    n : int
+        Number of design points, drawn from the inputs' prior predictive distribution; the response is
+        computed n times, once. `refine` adds batches where they are needed.
+    seed : int
+        Seed of the design.
+    max_lost : float
+        Largest share of a population's weight that may fall on points whose response is NaN.
+    max_points : int, optional
+        Largest number of design points, refinement included; 32 n by default.
+    executor : Executor, optional
+        Where the response is computed: threads, processes, loky, ``dask.distributed.Client().get_executor()``,
+        ``mpi4py.futures.MPIPoolExecutor()``. In this process by default.
+    store : path-like, optional
+        A folder that keeps every computed response, by simulator: none is computed again, also in another run.
+    on_failure : Abort, Replace or Retry
+        What to do with a response that raises or is NaN.
+
+    References
+    ----------
+    .. [1] Owen, A. B., Monte Carlo theory, methods and examples, chapter 9 (mixture importance sampling).
+
+    Examples
+    --------
+    >>> Reweighted(256)
+    Reweighted(n=256, seed=0, max_lost=0.05, max_points=None)
+    """
+
+    n: int = 1024
+    seed: int = 0
+    max_lost: float = 0.05
+    max_points: int | None = None
+
+    def __post_init__(self) -> None:
+        self.check()
+        positive_integer(self.n, "Reweighted: n", minimum=16)
+        positive_integer(self.seed, "Reweighted: seed", minimum=0)
+        if self.max_lost != 0 and positive_number(self.max_lost, "Reweighted: max_lost") >= 1:
+            raise ValueError(f"Reweighted: max_lost: got {self.max_lost}, expected a share below 1")
+        if self.max_points is not None and positive_integer(self.max_points, "Reweighted: max_points") < self.n:
+            raise ValueError(f"Reweighted: max_points: got {self.max_points}, expected n = {self.n} or more")
+
+    def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
+        """Compute the responses at the first design points."""
+        from prbayes.propagation.reweighted import Design
+
+        if inputs.epistemic:
+            raise TypeError(
+                f"{name}: {', '.join(str(e.name or e) for e in inputs.epistemic)} goes into the response as a model "
+                "variable (epistemic), so stored responses cannot be reweighted; use propagation=prb.Resimulated()"
+            )
+        refuse_nested(name, inputs)
+        if getattr(target.metric, "weighted", True) is False:
+            raise TypeError(
+                f"{name}: a FunctionMetric without weights cannot be used with prb.Reweighted; write "
+                "function(simulated, observed, weights) with weighted=True, or use propagation=prb.Resimulated()"
+            )
+        return Design(name, inputs, target, responses, self)
+
 
 _MAX_THETAS = 512  # components of a batch's mixture density
 _DRAFT = 16  # draft points, whose response is not computed, for each point of a one-dimensional design

@@ -1,0 +1,119 @@
+"""PLACEHOLDER of propagation.fresh."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytensor.tensor as pt
+from pytensor.graph.basic import Apply
+from pytensor.graph.op import Op
+from pytensor.graph.replace import _vectorize_node
+from pytensor.tensor.variable import TensorVariable
+
+from prbayes._checks import Floats, positive_integer
+from prbayes.metrics.base import Discrepancy
+from prbayes.propagation.base import Bound, Propagation, probe
+from prbayes.response.distributions import PopulationSampler
+from prbayes.response.inputs import Inputs
+from prbayes.response.response import Responses
+
+
+@dataclass(frozen=True)
+class Fresh(Propagation):
+    """New random draws at every evaluation, as in classic ABC; the discrepancy is noisy and has no gradient.
+
+    Parameters
+    ----------
+    n : int
+        Number of draws for each theta.
+    seed : int
+        Seed of the generator that belongs to the simulator.
+    executor, store, on_failure
+        As for `Reweighted`.
+
+    Examples
+    --------
+    >>> Fresh(50)
+    Fresh(n=50, seed=0)
+    """
+
+    n: int = 1024
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self.check()
+        positive_integer(self.n, "Fresh: n", minimum=1)
+        positive_integer(self.seed, "Fresh: seed", minimum=0)
+
+    def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
+        """Prepare the generator of draws."""
+        from prbayes.propagation.fresh import FreshBound
+
+        return FreshBound(name, inputs, target, responses, self)
+
+
+class FreshBound(Bound):
+    """New random draws at every evaluation.
+
+    Attributes
+    ----------
+    used : int
+        Number of evaluations so far; with the seed it determines the next draws.
+    """
+
+    def __init__(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses, config: Fresh) -> None:
+        super().__init__(name, inputs, target, responses)
+        self.n_per_theta = config.n
+        self._seed = config.seed
+        self.used = 0
+        self._sampler = PopulationSampler(inputs)
+        probe(self, self._sampler, config.seed)
+
+    def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
+        """Return an operation that draws and evaluates."""
+        return FreshOp(self)(*params)
+
+    def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
+        """Return fresh responses with equal weights."""
+        self.used += 1
+        rng = np.random.default_rng([self._seed, self.used])
+        values = self.responses(*self._sampler(params, self.n_per_theta, rng))
+        return values, np.broadcast_to(1 / self.n_per_theta, values.shape)
+
+
+class FreshOp(Op):
+    """Draws a population and returns its discrepancy, () ... -> ()."""
+
+    def __init__(self, bound: FreshBound) -> None:
+        self.bound = bound
+
+    def make_node(self, *params: Any) -> Apply[Any, Any]:
+        """Apply to the roots' values."""
+        tensors = [pt.as_tensor(p) for p in params]
+        ndims = [r.type.ndim for r in self.bound.inputs.roots]
+        batch = max(t.type.ndim - d for t, d in zip(tensors, ndims, strict=True))
+        return Apply(self, tensors, [pt.tensor(dtype="float64", shape=(None,) * batch)])
+
+    def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
+        """Draw, call the response, compare."""
+        ndims = [r.type.ndim for r in self.bound.inputs.roots]
+        batch = np.broadcast_shapes(*(p.shape[: p.ndim - d] for p, d in zip(inputs, ndims, strict=True)))
+        params = [
+            np.broadcast_to(p, batch + p.shape[p.ndim - d :]).reshape(-1, *p.shape[p.ndim - d :])
+            for p, d in zip(inputs, ndims, strict=True)
+        ]
+        outputs[0][0] = self.bound.discrepancies(params, self.bound.target).reshape(batch)
+
+    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
+        """Refuse by name; not as NotImplementedError, which PyMC takes as leave to use a slice sampler."""
+        raise TypeError(
+            f"{self.bound.name}: prb.Fresh draws new responses at every evaluation, so its log-density is random and "
+            "has no gradient: pm.sample, pm.find_MAP and gradient methods of prb.minimize would be wrong; use "
+            "propagation=prb.Reweighted() or prb.Resimulated(), or prb.sample_smc"
+        )
+
+
+_vectorize_node.register(FreshOp, lambda op, node, *batched: op.make_node(*batched))

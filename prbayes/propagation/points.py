@@ -1,0 +1,64 @@
+"""PLACEHOLDER of propagation.points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from prbayes._checks import Floats
+from prbayes.response.inputs import Inputs
+
+
+def sobol(n: int, dimensions: int, seed: int) -> Floats:
+    """Return n scrambled Sobol points in the open unit cube, shape (n, dimensions).
+
+    Parameters
+    ----------
+    n, dimensions, seed : int
+
+    References
+    ----------
+    .. [1] Owen, A. B. (1998), Scrambling Sobol and Niederreiter-Xing points, doi:10.1006/jcom.1998.0487.
+
+    Examples
+    --------
+    >>> sobol(4, 1, 0).shape
+    (4, 1)
+    """
+    from scipy.stats import qmc  # takes longer to import than the whole package
+
+    engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
+    points = engine.random_base2(int(np.ceil(np.log2(n))))[:n] if n > 1 else engine.random(1)
+    return np.asarray(np.clip(points, 1e-12, 1 - 1e-12, out=points))
+
+
+def monte_carlo(n: int, dimensions: int, seed: int) -> Floats:
+    """Return n independent random points in the open unit cube, shape (n, dimensions); for `Resimulated`.
+
+    Parameters
+    ----------
+    n, dimensions, seed : int
+
+    References
+    ----------
+    .. [1] Oh et al. (2019), doi:10.1007/s00158-019-02288-6, whose case study has a million of them.
+
+    Examples
+    --------
+    >>> Resimulated(1000, points=monte_carlo).n
+    1000
+    """
+    return np.clip(np.random.default_rng(seed).random((n, dimensions)), 1e-12, 1 - 1e-12)
+
+
+def base_points(
+    inputs: Inputs, n: int, seed: int, points: Callable[[int, int, int], Floats] = sobol
+) -> tuple[Floats, list[Floats]]:
+    """Return one spare coordinate, shape (n,), and one array of points, (n, *event), per aleatory input."""
+    shapes = inputs.event_shapes
+    sizes = [int(np.prod(s, dtype=int)) for s in shapes]
+    u = points(n, 1 + sum(sizes), seed)
+    edges = np.cumsum([1, *sizes])
+    parts = [u[:, a:b].reshape(n, *s).copy() for a, b, s in zip(edges[:-1], edges[1:], shapes, strict=True)]
+    return u[:, 0].copy(), parts
