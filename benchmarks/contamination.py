@@ -20,7 +20,7 @@ import numpy as np
 import pymc as pm
 
 import prbayes as prb
-from prbayes.population import Evaluator
+from prbayes.model.evaluator import Evaluator
 from prbayes.smc import sample
 
 SIZE = 50

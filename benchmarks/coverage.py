@@ -154,7 +154,7 @@ def build(problem: str, metric: str, size: int) -> Any:
     import pymc as pm
 
     import prbayes as prb
-    from prbayes.population import Evaluator
+    from prbayes.model.evaluator import Evaluator
 
     p = PROBLEMS[problem]
     some = p.response(p.draw(np.random.default_rng(0), size))
@@ -195,10 +195,10 @@ def analyse(
     """Calibrate one data set; return the estimate, and by posterior: probability below the truth, mean, sd."""
     from prbayes.adjust import Affine, moved
     from prbayes.epsilon import calibrate_epsilon
-    from prbayes.information import prior_scale
-    from prbayes.optimize import find_optimum
-    from prbayes.refit import Neighbourhood
-    from prbayes.resampling import reweighted_sets
+    from prbayes.estimate.data_sets import reweighted_sets
+    from prbayes.estimate.minimize import find_optimum
+    from prbayes.estimate.refit import Neighbourhood
+    from prbayes.estimate.sandwich import prior_scale
 
     ev = evaluator.observing({"y": data})
     optimum = find_optimum(ev, tolerance=1e-6, starts=0)

@@ -25,7 +25,8 @@ import numpy as np
 
 import prbayes as prb
 from benchmarks.systems import METRICS, SYSTEMS
-from prbayes.search import Scipy, Search
+from prbayes.estimate.methods import Scipy
+from prbayes.estimate.search import Search
 
 SIZE = 1000
 REACH = {"linear": (-12.0, 12.0), "nonlinear A": (-12.0, 8.0)}  # of mu, in standard deviations from the truth

@@ -23,8 +23,9 @@ from scipy import stats
 
 import prbayes as prb
 from benchmarks.systems import METRICS
-from prbayes.population import Evaluator
-from prbayes.search import Scipy, Search
+from prbayes.estimate.methods import Scipy
+from prbayes.estimate.search import Search
+from prbayes.model.evaluator import Evaluator
 
 SIZES = (20, 50, 1000, 100_000)
 LEVELS = (np.arange(100_000) + 0.5) / 100_000

@@ -28,7 +28,7 @@ import pymc as pm
 
 import prbayes as prb
 from benchmarks.systems import METRICS, SYSTEMS, System
-from prbayes.population import Evaluator
+from prbayes.model.evaluator import Evaluator
 
 MILLION = 1_000_000
 SIZE = 1000

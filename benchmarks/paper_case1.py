@@ -25,8 +25,9 @@ import numpy as np
 
 import prbayes as prb
 from benchmarks.systems import METRICS, SYSTEMS
-from prbayes.information import prior_scale
-from prbayes.search import Scipy, Search
+from prbayes.estimate.methods import Scipy
+from prbayes.estimate.sandwich import prior_scale
+from prbayes.estimate.search import Search
 
 SIZES = (20, 50, 1000, 100_000)
 POINTS = {"sobol": prb.Resimulated(4096), "monte carlo": prb.Resimulated(1_000_000, points=prb.monte_carlo)}

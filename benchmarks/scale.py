@@ -61,7 +61,7 @@ def one(kind: str, metric: str, size: int) -> dict[str, float]:
     import pymc
 
     import prbayes as prb
-    from prbayes.population import Evaluator
+    from prbayes.model.evaluator import Evaluator
 
     del pymc
     logging.getLogger("prbayes").setLevel(logging.ERROR)

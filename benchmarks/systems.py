@@ -15,7 +15,7 @@ import numpy as np
 import pymc as pm
 
 import prbayes as prb
-from prbayes.population import Evaluator
+from prbayes.model.evaluator import Evaluator
 
 METRICS: dict[str, prb.Metric] = {
     "PR": prb.ProbabilityResidual(),

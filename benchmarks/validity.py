@@ -27,9 +27,9 @@ import pymc as pm
 from scipy.special import ndtr, ndtri, stdtr
 
 import prbayes as prb
+from prbayes.estimate.minimize import find_optimum
+from prbayes.model.evaluator import Evaluator
 from prbayes.nulls import area
-from prbayes.optimize import find_optimum
-from prbayes.population import Evaluator
 from prbayes.smc import sample
 
 LEVELS = (0.01, 0.05, 0.10)

@@ -8,6 +8,9 @@ from prbayes.bootstrap import bootstrap
 from prbayes.compare import compare
 from prbayes.diagnose import Diagnosis, diagnose
 from prbayes.epsilon import calibrate_epsilon
+from prbayes.estimate.methods import Scipy
+from prbayes.estimate.minimize import minimize, refine
+from prbayes.estimate.optimum import Optimum
 from prbayes.heldout import held_out
 from prbayes.joint import JointNull
 from prbayes.kernel import BatchedKernel
@@ -18,9 +21,9 @@ from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.function import FunctionMetric
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual
+from prbayes.model.simulator import Simulator, abc_distance, set_epsilon
+from prbayes.model.support import DesignError
 from prbayes.nulls import ExactModel, PosteriorNull
-from prbayes.optimize import minimize
-from prbayes.optimum import Optimum
 from prbayes.pictures.plots import plot_comparison, plot_posterior, plot_validity
 from prbayes.pictures.portraits import plot_population, plot_responses
 from prbayes.pictures.trails import plot_landscape, plot_optimizer, plot_stages
@@ -29,15 +32,12 @@ from prbayes.propagation.fresh import Fresh
 from prbayes.propagation.points import monte_carlo, sobol
 from prbayes.propagation.resimulated import Resimulated
 from prbayes.propagation.reweighted import Reweighted
-from prbayes.refinement import DesignError, refine
 from prbayes.reports.report import Report
 from prbayes.reports.section import Section
 from prbayes.response.calling import ResponseError, scalar
 from prbayes.response.failures import Abort, Replace, Retry
 from prbayes.response.store import StoreError
 from prbayes.sbc import simulation_based_calibration
-from prbayes.search import Scipy
-from prbayes.simulator import Simulator, abc_distance, set_epsilon
 from prbayes.smc import sample_smc
 from prbayes.surfaces import Polynomial, RadialBasis, SurrogateError
 from prbayes.surrogate import Surrogate

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from prbayes._checks import Floats, positive_integer
-from prbayes.information import prior_scale
+from prbayes.estimate.data_sets import observed_set, simulated_sets
+from prbayes.estimate.refit import Neighbourhood
+from prbayes.estimate.sandwich import prior_scale
 from prbayes.metrics.function import FunctionMetric
-from prbayes.population import Evaluator
+from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.fresh import FreshBound
-from prbayes.refit import Neighbourhood
-from prbayes.resampling import observed_set, simulated_sets
 
 _FEWEST = 50  # draws of a mode below which it is left as it is
 _APART = 1.5  # ratio of distances to two modes below which a draw is between them

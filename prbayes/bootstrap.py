@@ -10,12 +10,12 @@ import xarray as xr
 from prbayes._checks import positive_integer
 from prbayes._progress import shown
 from prbayes.adjust import inapplicable
-from prbayes.information import prior_scale
-from prbayes.modes import blind_directions
-from prbayes.optimum import Optimum, surveyed
-from prbayes.refit import Neighbourhood
-from prbayes.resampling import reweighted_sets, simulated_sets
-from prbayes.results import bootstrap_tree
+from prbayes.estimate.data_sets import reweighted_sets, simulated_sets
+from prbayes.estimate.identifiability import blind_directions
+from prbayes.estimate.optimum import Optimum, surveyed
+from prbayes.estimate.refit import Neighbourhood
+from prbayes.estimate.sandwich import prior_scale
+from prbayes.posterior.trees import bootstrap_tree
 
 
 def bootstrap(

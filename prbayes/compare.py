@@ -10,15 +10,15 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._checks import Floats
+from prbayes.estimate.optimum import Optimum
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual
-from prbayes.optimum import Optimum
-from prbayes.population import Evaluator
-from prbayes.refinement import shortcomings
-from prbayes.simulator import nodes
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.simulator import nodes
+from prbayes.model.support import shortcomings
 
 _INTERVAL = 0.89
 _METRICS = (ProbabilityResidual(), KullbackLeibler(), AreaMetric(), LogLikelihood())

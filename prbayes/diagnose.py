@@ -11,10 +11,10 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._checks import Floats
-from prbayes.optimum import Optimum
-from prbayes.population import Evaluator
-from prbayes.refinement import shortcoming
-from prbayes.simulator import model_on_context
+from prbayes.estimate.optimum import Optimum
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.simulator import model_on_context
+from prbayes.model.support import shortcoming
 
 _RHAT = 1.01
 _NOISE = 11.0  # R-hat of independent draws is below 1 + _NOISE / (chains x draws) in 999 of 1000 cases, and a bit more

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from prbayes.information import Information, first_order_shifts, prior_scale, seen_by_area, seen_by_curvature
+from prbayes.estimate.identifiability import seen_by_area, seen_by_curvature
+from prbayes.estimate.optimum import Optimum, surveyed
+from prbayes.estimate.sampling import first_order_shifts
+from prbayes.estimate.sandwich import Information, prior_scale
 from prbayes.metrics.function import FunctionMetric
-from prbayes.optimum import Optimum, surveyed
 from prbayes.propagation.fresh import FreshBound
 
 _CLOUD = 500  # thetas that carry each simulated data set's posterior

@@ -7,11 +7,11 @@ import xarray as xr
 
 from prbayes._checks import positive_integer
 from prbayes.adjust import inapplicable
-from prbayes.information import prior_scale
-from prbayes.optimum import Optimum, surveyed
-from prbayes.refit import Neighbourhood
-from prbayes.resampling import DataSets, specimens
-from prbayes.results import versions
+from prbayes.estimate.data_sets import DataSets, specimens
+from prbayes.estimate.optimum import Optimum, surveyed
+from prbayes.estimate.refit import Neighbourhood
+from prbayes.estimate.sandwich import prior_scale
+from prbayes.model.labels import versions
 
 
 def held_out(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) -> xr.Dataset:

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.adjust import inapplicable
-from prbayes.information import prior_scale
+from prbayes.estimate.data_sets import groups, sets_at, simulated_points, specimens
+from prbayes.estimate.optimum import Optimum, surveyed
+from prbayes.estimate.refit import Neighbourhood
+from prbayes.estimate.sandwich import prior_scale
 from prbayes.nulls import Case, Condition, Predictive, SimulatedNull
-from prbayes.optimum import Optimum, surveyed
 from prbayes.predict import data_digest, serving, specimen_names
 from prbayes.propagation.reweighted import Design
-from prbayes.refit import Neighbourhood
-from prbayes.resampling import groups, sets_at, simulated_points, specimens
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 

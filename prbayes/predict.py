@@ -16,17 +16,17 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats, positive_integer
-from prbayes.optimum import Optimum
+from prbayes.estimate.optimum import Optimum
+from prbayes.model.labels import versions
+from prbayes.model.simulator import Node, model_on_context, nodes
+from prbayes.model.support import DesignError
 from prbayes.propagation.points import base_points
 from prbayes.propagation.reweighted import Design
-from prbayes.refinement import DesignError
 from prbayes.response.calling import ResponseError
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, quantiles
 from prbayes.response.inputs import Inputs, read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
-from prbayes.results import versions
-from prbayes.simulator import Node, model_on_context, nodes
 
 _log = logging.getLogger("prbayes")
 

@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from pytensor.graph.basic import Variable
 
 from prbayes._checks import Floats, real_array
+from prbayes.model.simulator import model_on_context
 from prbayes.propagation.points import sobol
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, prior_draws, valid
 from prbayes.response.inputs import read_inputs
-from prbayes.simulator import model_on_context
 
 _POPULATIONS, _SPECIMENS = 512, 64  # of the prior predictive, by which inputs get their ranges
 _ROUNDING = 1e-9  # of a range

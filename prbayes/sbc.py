@@ -16,10 +16,10 @@ import xarray as xr
 from prbayes._checks import Floats, positive_integer
 from prbayes._progress import progress, shown
 from prbayes.adjust import Affine
-from prbayes.population import Evaluator
-from prbayes.resampling import fresh_data
-from prbayes.results import calibration_tree
-from prbayes.simulator import model_on_context, nodes, revive
+from prbayes.estimate.data_sets import fresh_data
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.simulator import model_on_context, nodes, revive
+from prbayes.posterior.trees import calibration_tree
 from prbayes.smc import sample
 
 _log = logging.getLogger("prbayes")

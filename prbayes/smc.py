@@ -19,14 +19,15 @@ from prbayes._progress import CONSOLE, shown
 from prbayes.adjust import Affine, inapplicable
 from prbayes.checkpoint import Checkpoint, stored_identity
 from prbayes.epsilon import calibrate_epsilon
+from prbayes.estimate.minimize import find_optimum
+from prbayes.estimate.optimum import Optimum, surveyed
+from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse
 from prbayes.kernel import BatchedKernel
-from prbayes.optimize import find_optimum
-from prbayes.optimum import Optimum, surveyed
-from prbayes.population import Evaluator
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.simulator import model_on_context
+from prbayes.model.support import shortcomings
+from prbayes.posterior.trees import posterior_tree
 from prbayes.propagation.fresh import FreshBound
-from prbayes.refinement import MAX_ROUNDS, refine_at, refuse, shortcomings
-from prbayes.results import posterior_tree
-from prbayes.simulator import model_on_context
 
 _log = logging.getLogger("prbayes")
 

@@ -15,9 +15,9 @@ from scipy.stats import gamma, norm
 import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.adjust import _drawn_in, inapplicable, moved
-from prbayes.information import prior_scale
-from prbayes.population import Evaluator
-from prbayes.refit import Neighbourhood
+from prbayes.estimate.refit import Neighbourhood
+from prbayes.estimate.sandwich import prior_scale
+from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N = OBSERVED.size

@@ -14,9 +14,9 @@ from pymc.logprob.utils import ParameterValueError
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes.population import Evaluator
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.simulator import nodes
 from prbayes.response.compilation import PLAIN
-from prbayes.simulator import nodes
 
 OBSERVED = 0.75 * (2.0 + 0.8 * norm.ppf((np.arange(30) + 0.5) / 30))
 SMALL = (prb.Reweighted(64), prb.Resimulated(64), prb.Fresh(64))

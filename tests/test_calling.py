@@ -21,10 +21,10 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
+from prbayes.model.simulator import nodes
 from prbayes.response.calling import Caller
 from prbayes.response.failures import Abort, OnFailure
 from prbayes.response.store import Store
-from prbayes.simulator import nodes
 
 N = 64
 

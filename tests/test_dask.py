@@ -13,8 +13,8 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
+from prbayes.model.simulator import nodes
 from prbayes.response.calling import _capacity
-from prbayes.simulator import nodes
 
 distributed = pytest.importorskip("distributed")
 

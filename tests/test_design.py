@@ -14,10 +14,10 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.population import Evaluator
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.simulator import nodes
+from prbayes.model.support import shortcomings
 from prbayes.propagation.reweighted import Design
-from prbayes.refinement import shortcomings
-from prbayes.simulator import nodes
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 KL, PR, AREA = prb.KullbackLeibler(), prb.ProbabilityResidual(), prb.AreaMetric()

@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.population import Evaluator
+from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 

@@ -11,10 +11,10 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.information import Information, prior_scale
+from prbayes.estimate.sandwich import Information, prior_scale
 from prbayes.metrics.density import Histogram
-from prbayes.population import Evaluator
-from prbayes.simulator import nodes
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.simulator import nodes
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N = OBSERVED.size

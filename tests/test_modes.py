@@ -10,9 +10,10 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.information import Local, seen_by_curvature
-from prbayes.modes import blind_directions, rivals
-from prbayes.population import Evaluator
+from prbayes.estimate.identifiability import blind_directions, seen_by_curvature
+from prbayes.estimate.rivals import rivals
+from prbayes.estimate.sampling import Local
+from prbayes.model.evaluator import Evaluator
 
 DATA = (np.random.default_rng(3).normal(2.0, 0.3, 40) - 1) ** 2
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)

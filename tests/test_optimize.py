@@ -14,12 +14,12 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.information import prior_scale
+from prbayes.estimate.refit import Neighbourhood
+from prbayes.estimate.sandwich import prior_scale
+from prbayes.estimate.search import Search
 from prbayes.metrics.density import GaussianKDE
-from prbayes.population import Evaluator
-from prbayes.refit import Neighbourhood
-from prbayes.search import Search
-from prbayes.simulator import nodes
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.simulator import nodes
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N, MEAN, SD = OBSERVED.size, float(OBSERVED.mean()), float(OBSERVED.std())

@@ -9,13 +9,10 @@ import pytest
 from scipy import optimize
 
 import prbayes as prb
-from prbayes import refit
 from prbayes._checks import Floats
-from prbayes.descent import _updated, descend
-from prbayes.information import prior_scale
-from prbayes.population import Evaluator
-from prbayes.refit import Neighbourhood, _mean_hessian
-from prbayes.resampling import (
+from prbayes.estimate import refit
+from prbayes.estimate.batch_bfgs import _updated, descend
+from prbayes.estimate.data_sets import (
     DataSets,
     aligned,
     dependent,
@@ -27,7 +24,10 @@ from prbayes.resampling import (
     simulated_sets,
     specimens,
 )
-from prbayes.search import differences
+from prbayes.estimate.objective import differences
+from prbayes.estimate.refit import Neighbourhood, _mean_hessian
+from prbayes.estimate.sandwich import prior_scale
+from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 N = OBSERVED.size

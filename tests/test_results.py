@@ -13,8 +13,9 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.population import Evaluator
-from prbayes.results import posterior_tree, versions
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.labels import versions
+from prbayes.posterior.trees import posterior_tree
 
 DATA = np.random.default_rng(1).normal([1.0, 3.0], 0.5, (40, 2))
 

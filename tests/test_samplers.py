@@ -19,10 +19,10 @@ from scipy import stats
 import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.metrics.base import Metric
-from prbayes.population import Evaluator
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.simulator import Node, nodes
 from prbayes.propagation.base import Propagation
 from prbayes.response.compilation import PLAIN
-from prbayes.simulator import Node, nodes
 
 N, MU, SIGMA, EPSILON, POINTS = 30, 2.0, 0.8, 0.02, 128
 OBSERVED = np.random.default_rng(3).permutation(0.75 * stats.norm(MU, SIGMA).ppf((np.arange(N) + 0.5) / N))

@@ -17,8 +17,8 @@ import xarray as xr
 import prbayes as prb
 from prbayes import sbc
 from prbayes._checks import Floats
-from prbayes.population import Evaluator
-from prbayes.simulator import nodes
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.simulator import nodes
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N, SD = OBSERVED.size, float(OBSERVED.std())

@@ -14,8 +14,9 @@ from scipy import optimize, stats
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.population import Evaluator
-from prbayes.search import Objective, Search, StalledError, differences
+from prbayes.estimate.objective import Objective, StalledError, differences
+from prbayes.estimate.search import Search
+from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 

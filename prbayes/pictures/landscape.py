@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes.optimum import Optimum
+from prbayes.estimate.optimum import Optimum
+from prbayes.model.evaluator import Evaluator
 from prbayes.pictures.ensemble import supported
-from prbayes.population import Evaluator
 
 _SDS, _DRAWS, _STEPS = 4.0, 1000, 33
 

@@ -11,10 +11,10 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._checks import Floats, positive_number
-from prbayes.optimum import Optimum
+from prbayes.estimate.optimum import Optimum
+from prbayes.model.evaluator import Evaluator
 from prbayes.pictures.canvas import BLUE, DASHED, DIAMOND, DOTTED, GREY, INK, VERMILION, Canvas, grid_settings, named
 from prbayes.pictures.curves import bounded_density, normal_density, round_ticks
-from prbayes.population import Evaluator
 from prbayes.validity import ValidityTest
 
 _PRIOR_DRAWS = 4000

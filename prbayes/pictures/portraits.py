@@ -11,7 +11,8 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._checks import Floats, positive_number
-from prbayes.optimum import Optimum
+from prbayes.estimate.optimum import Optimum
+from prbayes.model.simulator import Node
 from prbayes.pictures.canvas import BLUE, DASHED, INK, VERMILION, Canvas, named
 from prbayes.pictures.curves import (
     central_range,
@@ -24,7 +25,6 @@ from prbayes.pictures.curves import (
 )
 from prbayes.pictures.ensemble import Ensemble, read_before, read_result, supported
 from prbayes.pictures.margins import chosen, margin_densities, margins
-from prbayes.simulator import Node
 
 _log = logging.getLogger("prbayes")
 

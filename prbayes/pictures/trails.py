@@ -10,7 +10,8 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._checks import Floats, positive_integer
-from prbayes.optimum import Optimum
+from prbayes.estimate.optimum import Optimum
+from prbayes.model.evaluator import Evaluator
 from prbayes.pictures.canvas import (
     BLUE,
     CROSS,
@@ -28,7 +29,6 @@ from prbayes.pictures.canvas import (
 )
 from prbayes.pictures.curves import log_ticks, spans_decades
 from prbayes.pictures.landscape import Landscape, elements, landscape, rooted
-from prbayes.population import Evaluator
 
 _STAGES = {
     "beta": "beta (1: posterior)",

@@ -12,11 +12,11 @@ import pymc as pm
 import xarray as xr
 
 from prbayes import datasets
+from prbayes.estimate.minimize import minimize
 from prbayes.metrics.residual import ProbabilityResidual
-from prbayes.optimize import minimize
+from prbayes.model.simulator import Simulator
 from prbayes.predict import predict
 from prbayes.reports.report import Report
-from prbayes.simulator import Simulator
 from prbayes.smc import sample_smc
 from prbayes.validity import area_test
 

@@ -11,12 +11,12 @@ from typing import Any
 
 import pymc as pm
 
+from prbayes.model.simulator import nodes
 from prbayes.pictures.plots import plot_comparison, plot_posterior, plot_validity
 from prbayes.pictures.portraits import plot_population, plot_responses
 from prbayes.pictures.trails import plot_landscape, plot_optimizer, plot_stages
 from prbayes.reports.material import Material
 from prbayes.reports.section import Section
-from prbayes.simulator import nodes
 
 _log = logging.getLogger("prbayes")
 

@@ -12,10 +12,10 @@ import xarray as xr
 
 from prbayes._checks import Floats
 from prbayes.compare import compare
-from prbayes.describe import describe, from_attributes
 from prbayes.diagnose import Diagnosis, diagnose
-from prbayes.optimum import Optimum
-from prbayes.simulator import nodes
+from prbayes.estimate.optimum import Optimum
+from prbayes.model.description import describe, from_attributes
+from prbayes.model.simulator import nodes
 from prbayes.validity import ValidityTest
 
 

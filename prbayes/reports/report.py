@@ -15,7 +15,7 @@ from typing import Any
 import pymc as pm
 import xarray as xr
 
-from prbayes.optimum import Optimum
+from prbayes.estimate.optimum import Optimum
 from prbayes.reports.contents import contents
 from prbayes.reports.section import Section, cells
 from prbayes.validity import ValidityTest

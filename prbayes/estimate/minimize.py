@@ -13,18 +13,74 @@ import pymc as pm
 
 from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes._progress import shown
-from prbayes.information import Information, Local, prior_scale
+from prbayes.estimate.caveats import flat, trouble
+from prbayes.estimate.identifiability import blind_directions
+from prbayes.estimate.methods import Scipy
+from prbayes.estimate.optimum import Optimum, assemble, plain
+from prbayes.estimate.refinement import AGREE, MAX_ROUNDS, grow, pilot, refine_at, refuse, spread_around
+from prbayes.estimate.refit import Neighbourhood
+from prbayes.estimate.rivals import Rival, rivals
+from prbayes.estimate.sampling import Local
+from prbayes.estimate.sandwich import Information, prior_scale
+from prbayes.estimate.search import Search
 from prbayes.metrics.function import FunctionMetric
-from prbayes.modes import Rival, blind_directions, rivals
-from prbayes.optimum import Optimum, assemble, flat, plain, trouble
-from prbayes.population import Evaluator
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.simulator import model_on_context
+from prbayes.model.support import shortcomings
 from prbayes.propagation.fresh import FreshBound
-from prbayes.refinement import AGREE, MAX_ROUNDS, grow, pilot, refine_at, refuse, shortcomings, spread_around
-from prbayes.refit import Neighbourhood
-from prbayes.search import Scipy, Search
-from prbayes.simulator import model_on_context
 
 _log = logging.getLogger("prbayes")
+
+
+def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[str, int]:
+    """Add design points where the posterior's populations live, until the designs support them.
+
+    `minimize` and `sample_smc` call it; call it yourself before `pymc.sample` on models with several
+    aleatory inputs or wide priors.
+
+    Parameters
+    ----------
+    model : pymc.Model, optional
+        The one on the context by default.
+    thetas : ndarray, shape (P, d), optional
+        Unconstrained hyperparameters whose populations matter; by default those around the optimum.
+
+    Returns
+    -------
+    dict
+        The number of stored responses by simulator.
+
+    Raises
+    ------
+    DesignError
+        If a design does not support them after eight more batches, or at ``max_points``.
+
+    References
+    ----------
+    .. [1] Owen, A. and Y. Zhou (2000), Safe and effective importance sampling, J. Am. Stat. Assoc. 95, 135-143.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu"), 1.0)
+    ...     y = prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=[0.5, 1.0, 4.0])
+    >>> prb.refine(model)
+    {'y': 1024}
+    """
+    from prbayes.estimate.minimize import minimize
+
+    model = model_on_context(model, "prb.refine")
+    evaluator = Evaluator(model)
+    if thetas is None:
+        minimize(model)
+    else:
+        for _ in range(MAX_ROUNDS):
+            if not refine_at(evaluator, np.asarray(thetas, dtype=np.float64)):
+                break
+        refuse(shortcomings(evaluator, thetas), evaluator)
+    return {name: design.n_points for name, design in evaluator.designs.items()}
+
 
 _LOOKS = 3  # at other optima, with a design that is refined in between
 _STARTS = 32  # points of the prior from which other optima are searched for where a theta costs no response

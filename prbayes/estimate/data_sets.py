@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
-from prbayes.population import Evaluator
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.simulator import Node
 from prbayes.propagation.reweighted import Design
 from prbayes.response.distributions import PopulationSampler
-from prbayes.simulator import Node
 
 _MOST = 1 << 15  # points of a resimulated population from which data sets are drawn
 _SPARE = 4  # draws for each specimen that is needed, in case responses are not finite

@@ -6,8 +6,7 @@ means the same for every model, metric and method.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,184 +14,23 @@ from pytensor.gradient import NullTypeGradError
 
 from prbayes._checks import Floats
 from prbayes._progress import progress
+from prbayes.estimate.methods import Scipy
+from prbayes.estimate.objective import Objective, SpentError, StalledError, differences
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import DensityDiscrepancy
 from prbayes.metrics.function import FunctionMetric
-from prbayes.population import Evaluator
+from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.fresh import FreshBound
 
 _OVER = 0.5  # prior standard deviations: the simplex where the discrepancy jumps
 _SETTLED = 1e-4  # relative gain of a simplex below which a stalled line search counts as converged
 _SCREENED = 256  # prior draws tried as starts where a theta costs no response
 _PATIENCE = 15  # evaluations in a line search without progress
-_PROGRESS = 1e-10  # of the objective, in its typical size: a smaller gain is none
 _STEP = 1e-4  # of differences, in units of the prior's spread
 _OVERLAP = 0.02  # of two densities, below which the area metric leads
 _THIN = 2.0  # weight effective sample size below which a design does not reach a population at all
 _ENOUGH = 0.5  # overlap from which on the metric itself is followed
 _COARSE = 1e-2  # tolerance of the area metric as a guide
-_GRADIENT_FREE = ("Nelder-Mead", "Powell", "COBYLA", "COBYQA")
-_WITH_GRADIENT = ("BFGS", "CG", "L-BFGS-B", "Newton-CG", "SLSQP", "TNC", "trust-constr")
-
-
-@dataclass(frozen=True)
-class Scipy:
-    """A minimiser of `scipy.optimize.minimize`, with options of its own.
-
-    Parameters
-    ----------
-    method : str or callable
-        Scipy's name of a method that needs no Hessian, or a function as `scipy.optimize.minimize` takes it:
-        ``method(fun, x0, args, jac=..., callback=..., **options) -> OptimizeResult``. It works on standardised
-        parameters, that start at zero; ``jac`` is None under `Fresh`.
-    options : mapping
-        For scipy's ``options=``, in units of the standardised problem; they replace those that `minimize` would set.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If there is no such method, or the options are no mapping.
-
-    References
-    ----------
-    .. [1] Nocedal, J. and S. J. Wright (2006), Numerical Optimization, doi:10.1007/978-0-387-40065-5.
-
-    Examples
-    --------
-    >>> Scipy("L-BFGS-B", {"maxcor": 5})
-    Scipy(method='L-BFGS-B', options={'maxcor': 5})
-    """
-
-    method: str | Callable[..., Any] = "BFGS"
-    options: Mapping[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        known = (*_WITH_GRADIENT, *_GRADIENT_FREE)
-        if isinstance(self.method, str):
-            if self.method.lower() not in {name.lower() for name in known}:
-                raise ValueError(
-                    f"method: got {self.method!r}, expected one of {', '.join(known)}, or a function that "
-                    "scipy.optimize.minimize takes as its method"
-                )
-        elif not callable(self.method) or isinstance(self.method, type):
-            raise TypeError(
-                f"method: got {self.method!r:.60}, expected prb.Scipy(...), the name of a scipy method, or a function"
-            )
-        if not isinstance(self.options, Mapping):
-            raise TypeError(f"options: got {type(self.options).__name__}, expected a mapping of names to values")
-
-    @classmethod
-    def of(cls, method: Scipy | str | Callable[..., Any] | None) -> Scipy:
-        """Return what a user meant by ``method=``."""
-        return method if isinstance(method, Scipy) else cls() if method is None else cls(method)
-
-    @property
-    def name(self) -> str:
-        """What messages call it."""
-        return self.method if isinstance(self.method, str) else getattr(self.method, "__name__", repr(self.method))
-
-    @property
-    def gradient(self) -> bool:
-        """Whether the method is given gradients."""
-        return not isinstance(self.method, str) or self.method.lower() not in {n.lower() for n in _GRADIENT_FREE}
-
-    def settings(self, tolerance: float, size: int) -> dict[str, Any]:
-        """Return scipy's options for a standardised problem; the budget of evaluations alone limits iterations."""
-        most = 10**9
-        simplex = np.vstack([np.zeros(size), 0.2 * np.eye(size)])
-        known: dict[str, dict[str, Any]] = {
-            "bfgs": {"gtol": tolerance, "maxiter": most},
-            "cg": {"gtol": tolerance, "maxiter": most},
-            "l-bfgs-b": {"gtol": tolerance, "ftol": tolerance**2, "maxfun": most, "maxiter": most},
-            "newton-cg": {"xtol": tolerance, "maxiter": most},
-            "slsqp": {"ftol": tolerance**2, "maxiter": most},
-            "tnc": {"gtol": tolerance, "ftol": tolerance**2, "xtol": 0.0, "maxfun": most},
-            "trust-constr": {"gtol": tolerance, "xtol": tolerance**2, "maxiter": most},
-            "nelder-mead": {
-                "xatol": tolerance,
-                "fatol": tolerance / 100,
-                "initial_simplex": simplex,
-                "maxfev": most,
-                "maxiter": most,
-            },
-            "powell": {"xtol": tolerance, "ftol": tolerance**2, "maxfev": most, "maxiter": most},
-            "cobyla": {"tol": tolerance, "rhobeg": 0.2, "maxiter": most},
-            "cobyqa": {"final_tr_radius": tolerance, "initial_tr_radius": 0.2, "maxfev": most, "maxiter": most},
-        }
-        return {**known.get(self.name.lower() if isinstance(self.method, str) else "", {}), **self.options}
-
-
-class SpentError(Exception):
-    """The budget of evaluations is spent."""
-
-
-class StalledError(Exception):
-    """A line search has made no progress for some time."""
-
-
-class Objective:
-    """The standardised objective of one minimisation; records every point, at most ``most`` evaluations."""
-
-    def __init__(self, function: Any, center: Floats, scale: Floats, size: float, *, gradient: bool, most: int) -> None:
-        self.function, self.center, self.scale, self.size = function, center, scale, size
-        self.gradient, self.most, self.count = gradient, most, 0
-        self.patience, self._lowest, self._since = 10**9, np.inf, 0
-        self.thetas: list[Floats] = []
-        self.values: list[float] = []
-        self.counts: list[int] = []
-        self.report: Callable[[int, str], None] = lambda done, note: None
-
-    def __call__(self, t: Floats) -> Any:
-        """Return the value, and the gradient where there is one, at standardised parameters."""
-        if self.count >= self.most:
-            raise SpentError
-        theta = self.center + np.asarray(t) * self.scale
-        value, gradient, cost = self.function(theta)
-        self.count += cost
-        self.thetas.append(theta)
-        self.values.append(float(value))
-        self.counts.append(self.count)
-        value = float(value) / self.size
-        self._since = 0 if value < self._lowest - _PROGRESS else self._since + 1
-        self._lowest = min(self._lowest, value)
-        self.report(cost, f"discrepancy {self._lowest * self.size:.4g}")
-        if self._since > self.patience:
-            raise StalledError
-        if not self.gradient:
-            return value if np.isfinite(value) else 1e300
-        g = np.asarray(gradient) * self.scale / self.size
-        if not np.isfinite(value) or not np.isfinite(g).all():
-            return 1e10 + float(t @ t), 2 * t  # back towards the start, without breaking a line search
-        return value, g
-
-    @property
-    def best(self) -> Floats:
-        """The point with the smallest value so far, or the center."""
-        if not self.values:
-            return self.center
-        return self.thetas[int(np.argmin(np.nan_to_num(self.values, nan=np.inf, posinf=np.inf)))]
-
-    @property
-    def lowest(self) -> float:
-        """The smallest value so far."""
-        return min((v for v in self.values if np.isfinite(v)), default=np.inf)
-
-
-def differences(values: Callable[[Floats], Floats], step: Floats) -> Callable[[Floats], Any]:
-    """Return a function of theta that gives value, gradient by central differences, and number of evaluations.
-
-    Where one of two neighbours is infinite, as at the edge of a support, the difference is one-sided.
-    """
-
-    def function(theta: Floats) -> Any:
-        found = values(np.vstack([theta, theta + np.diag(step), theta - np.diag(step)]))
-        middle, up, down = found[0], found[1 : 1 + step.size], found[1 + step.size :]
-        with np.errstate(invalid="ignore"):
-            forward, backward = (up - middle) / step, (middle - down) / step
-            central = np.where(np.isfinite(down), (up - down) / (2 * step), forward)
-        return middle, np.where(np.isfinite(up), central, backward), len(found)
-
-    return function
 
 
 class Search:

@@ -2,40 +2,21 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 
 from prbayes._checks import Floats
-from prbayes.describe import as_attribute, without_addresses
-from prbayes.population import Evaluator
-
-_ENVELOPE = 0.95  # probability that the ECDF of uniform ranks stays inside
+from prbayes.model.description import as_attribute, without_addresses
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.labels import labelled, observed_dataset, versions
 
 if TYPE_CHECKING:
-    from prbayes.optimum import Optimum
+    pass
 
 
-def versions() -> dict[str, str]:
-    """Return the versions that a result depends on."""
-    return {f"{name}_version": importlib.metadata.version(name) for name in ("prbayes", "pymc", "numpy")}
-
-
-def labelled(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, int]) -> xr.Dataset:
-    """Label values, shapes (*leading, *shape), with the model's own dimensions and coordinates."""
-    dims = evaluator.model.named_vars_to_dims
-    coords: dict[str, Any] = {name: np.arange(size) for name, size in leading.items()}
-    variables = {}
-    for name, value in values.items():
-        rest = np.ndim(value) - len(leading)
-        own = [d or f"{name}_dim_{i}" for i, d in enumerate(dims.get(name) or [None] * rest)]
-        for d in own:
-            if evaluator.model.coords.get(d) is not None:
-                coords[d] = np.asarray(evaluator.model.coords[d])
-        variables[name] = ([*leading, *own], np.asarray(value))
-    return xr.Dataset(variables, coords=coords)
+_ENVELOPE = 0.95  # probability that the ECDF of uniform ranks stays inside
 
 
 def posterior_tree(
@@ -242,56 +223,4 @@ def _draws(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
         evaluator,
         {n: v.reshape(chains, draws, *v.shape[1:]) for n, v in values},
         {"chain": chains, "draw": draws},
-    )
-
-
-def observed_dataset(evaluator: Evaluator) -> xr.Dataset:
-    return labelled(evaluator, {n.name: n.target.observed for n in evaluator.nodes}, {})
-
-
-def optimum_tree(optimum: Optimum) -> xr.DataTree:
-    """Return the DataTree of an optimum."""
-    evaluator = optimum.evaluator
-    names = list(optimum.discrepancies)
-    attrs = {
-        "discrepancy": optimum.discrepancy,
-        "converged": int(optimum.converged),
-        "message": optimum.message,
-        "n_evaluations": optimum.n_evaluations,
-        "n_screened": optimum.n_screened,
-        "n_responses": optimum.n_responses,
-        "seconds": optimum.seconds,
-        "warnings": "\n".join(optimum.warnings),
-        **versions(),
-        **as_attribute(optimum.model),
-    }
-    elements = {"element": optimum.names, "other_element": optimum.names}
-    return xr.DataTree.from_dict(
-        {
-            "optimum": labelled(evaluator, optimum.point, {}).assign_attrs(attrs),
-            "stderr": labelled(evaluator, optimum.stderr, {}),
-            "trace": xr.Dataset(
-                {
-                    "theta": (["evaluation", "element"], optimum.trace["theta"]),
-                    "discrepancy": ("evaluation", optimum.trace["discrepancy"]),
-                    "evaluations": ("evaluation", optimum.trace["evaluations"]),
-                },
-                coords={"element": optimum.names},
-            ),
-            "calibration": xr.Dataset(
-                {
-                    "discrepancy": ("simulator", list(optimum.discrepancies.values())),
-                    "scale": ("simulator", list(optimum.scales.values())),
-                    **{
-                        key: ("simulator", [optimum.support.get(n, {}).get(key, np.nan) for n in names])
-                        for key in ("weight_ess", "mean_weight", "lost_mass")
-                    },
-                    "theta": ("element", optimum.theta),
-                    "covariance": (["element", "other_element"], optimum.covariance),
-                    "metric": ("simulator", [without_addresses(n.metric) for n in evaluator.nodes]),
-                },
-                coords={"simulator": names, **elements},
-            ),
-            "observed_data": observed_dataset(evaluator),
-        }
     )

@@ -5,57 +5,19 @@ from __future__ import annotations
 import logging
 
 import numpy as np
-import pymc as pm
 
 from prbayes._checks import Floats
-from prbayes.information import Information
-from prbayes.population import Evaluator
+from prbayes.estimate.data_sets import siblings
+from prbayes.estimate.sandwich import Information
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.support import DesignError, shortcomings
 from prbayes.propagation.reweighted import Design
-from prbayes.resampling import siblings
-from prbayes.simulator import model_on_context
 
 _log = logging.getLogger("prbayes")
-
 MAX_ROUNDS = 8
 _THETAS = 256
 AGREE = 0.1  # standard errors within which the optima of two independent designs are to be
 _RATE = 0.65  # the power of its size with which the error of a design of several inputs falls, about
-
-
-class DesignError(RuntimeError):
-    """A design that cannot support the answer, even after refinement."""
-
-
-def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, str]:
-    """Say, by simulator, in what its design does not support the populations at thetas, shape (P, d)."""
-    designs = evaluator.designs
-    found = {
-        name: shortcoming(support, designs[name].required_ess, designs[name].config.max_lost, designs[name].n_points)
-        for name, support in evaluator.support(thetas).items()
-    }
-    return {name: what for name, what in found.items() if what}
-
-
-def shortcoming(support: dict[str, Floats], need: float, max_lost: float, n_points: int) -> str:
-    """Say in what a design with such support, arrays of shape (P,), falls short; nothing where it does not."""
-    ess, mass, lost = (support[key] for key in ("weight_ess", "mean_weight", "lost_mass"))
-    low, middle = np.quantile(ess, [0.05, 0.5])
-    mass_low, mass_high = np.quantile(mass, [0.05, 0.95])
-    most_lost = float(np.quantile(lost, 0.95))
-    if most_lost > max_lost:
-        return (
-            f"lost mass: {most_lost:.1%} of a population's weight is on points whose response is NaN, expected at "
-            f"most max_lost = {max_lost:.1%}"
-        )
-    complaints = []
-    if middle < need or low < need / 10:
-        complaints.append(
-            f"weight effective sample size {low:.0f} (5% quantile) and {middle:.0f} (median) of {n_points} "
-            f"points, expected {need / 10:.0f} and {need:.0f}"
-        )
-    if mass_low < 0.8 or mass_high > 1.25:
-        complaints.append(f"mean raw weight from {mass_low:.2f} to {mass_high:.2f}, expected within 0.8 to 1.25")
-    return ", and ".join(complaints)
 
 
 def refine_at(evaluator: Evaluator, thetas: Floats) -> dict[str, str]:
@@ -163,53 +125,3 @@ def spread_around(center: Floats, covariance: Floats, scale: Floats, *, seed: in
     sd = np.sqrt(np.clip(values, 0, 1))
     z = np.random.default_rng(seed).standard_normal((_THETAS, center.size))
     return np.asarray(center + (z * sd) @ vectors.T * scale)
-
-
-def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[str, int]:
-    """Add design points where the posterior's populations live, until the designs support them.
-
-    `minimize` and `sample_smc` call it; call it yourself before `pymc.sample` on models with several
-    aleatory inputs or wide priors.
-
-    Parameters
-    ----------
-    model : pymc.Model, optional
-        The one on the context by default.
-    thetas : ndarray, shape (P, d), optional
-        Unconstrained hyperparameters whose populations matter; by default those around the optimum.
-
-    Returns
-    -------
-    dict
-        The number of stored responses by simulator.
-
-    Raises
-    ------
-    DesignError
-        If a design does not support them after eight more batches, or at ``max_points``.
-
-    References
-    ----------
-    .. [1] Owen, A. and Y. Zhou (2000), Safe and effective importance sampling, J. Am. Stat. Assoc. 95, 135-143.
-
-    Examples
-    --------
-    >>> import numpy as np, pymc as pm, prbayes as prb
-    >>> with pm.Model() as model:
-    ...     x = pm.Normal.dist(pm.Normal("mu"), 1.0)
-    ...     y = prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=[0.5, 1.0, 4.0])
-    >>> prb.refine(model)
-    {'y': 1024}
-    """
-    from prbayes.optimize import minimize
-
-    model = model_on_context(model, "prb.refine")
-    evaluator = Evaluator(model)
-    if thetas is None:
-        minimize(model)
-    else:
-        for _ in range(MAX_ROUNDS):
-            if not refine_at(evaluator, np.asarray(thetas, dtype=np.float64)):
-                break
-        refuse(shortcomings(evaluator, thetas), evaluator)
-    return {name: design.n_points for name, design in evaluator.designs.items()}

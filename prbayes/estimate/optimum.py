@@ -4,16 +4,70 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
 
 from prbayes._checks import Floats
-from prbayes.information import Local
-from prbayes.population import Evaluator
-from prbayes.search import Search
+from prbayes.estimate.caveats import flat, trouble
+from prbayes.estimate.sampling import Local
+from prbayes.estimate.search import Search
+from prbayes.model.description import as_attribute, without_addresses
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.labels import labelled, observed_dataset, versions
+
+if TYPE_CHECKING:
+    from prbayes.estimate.optimum import Optimum
+
+
+def optimum_tree(optimum: Optimum) -> xr.DataTree:
+    """Return the DataTree of an optimum."""
+    evaluator = optimum.evaluator
+    names = list(optimum.discrepancies)
+    attrs = {
+        "discrepancy": optimum.discrepancy,
+        "converged": int(optimum.converged),
+        "message": optimum.message,
+        "n_evaluations": optimum.n_evaluations,
+        "n_screened": optimum.n_screened,
+        "n_responses": optimum.n_responses,
+        "seconds": optimum.seconds,
+        "warnings": "\n".join(optimum.warnings),
+        **versions(),
+        **as_attribute(optimum.model),
+    }
+    elements = {"element": optimum.names, "other_element": optimum.names}
+    return xr.DataTree.from_dict(
+        {
+            "optimum": labelled(evaluator, optimum.point, {}).assign_attrs(attrs),
+            "stderr": labelled(evaluator, optimum.stderr, {}),
+            "trace": xr.Dataset(
+                {
+                    "theta": (["evaluation", "element"], optimum.trace["theta"]),
+                    "discrepancy": ("evaluation", optimum.trace["discrepancy"]),
+                    "evaluations": ("evaluation", optimum.trace["evaluations"]),
+                },
+                coords={"element": optimum.names},
+            ),
+            "calibration": xr.Dataset(
+                {
+                    "discrepancy": ("simulator", list(optimum.discrepancies.values())),
+                    "scale": ("simulator", list(optimum.scales.values())),
+                    **{
+                        key: ("simulator", [optimum.support.get(n, {}).get(key, np.nan) for n in names])
+                        for key in ("weight_ess", "mean_weight", "lost_mass")
+                    },
+                    "theta": ("element", optimum.theta),
+                    "covariance": (["element", "other_element"], optimum.covariance),
+                    "metric": ("simulator", [without_addresses(n.metric) for n in evaluator.nodes]),
+                },
+                coords={"simulator": names, **elements},
+            ),
+            "observed_data": observed_dataset(evaluator),
+        }
+    )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -115,7 +169,7 @@ class Optimum:
 
     def to_datatree(self) -> xr.DataTree:
         """Return the optimum as a DataTree with groups ``optimum``, ``stderr``, ``trace`` and ``calibration``."""
-        from prbayes.results import optimum_tree
+        from prbayes.estimate.optimum import optimum_tree
 
         return optimum_tree(self)
 
@@ -197,31 +251,6 @@ def surveyed(optimum: Optimum, caller: str) -> Optimum:
             "prb.sample_smc(epsilon=..., adjust=False) makes no use of it"
         )
     return optimum
-
-
-def trouble(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> list[str]:
-    """Say that elements are at the edge of their support, and that simulators jump."""
-    lines = []
-    if at_edge:
-        lines.append(
-            f"{', '.join(at_edge)} ran to the edge of the support, where the discrepancy no longer changes; perhaps "
-            "the population has collapsed within the bandwidth of the metric: use a smaller bandwidth, or "
-            "prb.AreaMetric(), which has none"
-        )
-    if at_jump:
-        lines.append(
-            f"{', '.join(at_jump)}: points lose their response at the optimum, and the discrepancy jumps there by more "
-            "than it changes otherwise: use prb.AreaMetric(), prb.Reweighted(), or more responses"
-        )
-    return lines
-
-
-def flat(evaluator: Evaluator, theta: Floats, scale: Floats) -> bool:
-    """Whether no discrepancy changes around theta, as where populations and observed values do not overlap."""
-    around = np.vstack([theta, *(theta + s * e for e in np.diag(0.01 * scale) for s in (1, -1))])
-    found = evaluator(around).discrepancies
-    with np.errstate(invalid="ignore"):
-        return bool(((found == found[0]) | (np.abs(found - found[0]) <= 1e-12 * np.abs(found[0]))).all())
 
 
 def plain(value: Any) -> Any:

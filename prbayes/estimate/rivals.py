@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes.descent import descend
-from prbayes.information import Local
-from prbayes.population import Evaluator
+from prbayes.estimate.batch_bfgs import descend
+from prbayes.estimate.sampling import Local
+from prbayes.model.evaluator import Evaluator
 
 _RIDGE = 9  # points looked at between two optima
 _BARRIER = 1.0  # height, in units of the noise, that separates two optima
 _COMPARABLE = 3.0  # difference, in units of the noise, up to which data could come from either optimum
-_SHARE = 0.15  # of an element in a direction below which it is not mentioned
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,29 +103,3 @@ def _separate(
     share = np.linspace(0, 1, _RIDGE + 2)[1:-1, None]
     between = objective(a + share * (b - a))
     return bool(np.max(between) - max(value_a, value_b) > _BARRIER * noise)
-
-
-def blind_directions(blind: Floats, names: list[str]) -> list[str]:
-    """Name the directions about which the data tell less than the prior, such as 'mu[0] - 0.8 mu[1]'."""
-    found = []
-    # Rotated so that elements stand alone where they can.
-    basis = blind
-    while basis.shape[1]:
-        projector = basis @ basis.T
-        i = int(np.argmax(np.diag(projector)))
-        direction = projector[i] / np.sqrt(projector[i, i])
-        found.append(_named(direction, names))
-        rest = basis - np.outer(direction, direction @ basis)
-        left, strength, _ = np.linalg.svd(rest, full_matrices=False)
-        basis = left[:, strength > 1e-6]
-    return found
-
-
-def _named(direction: Floats, names: list[str]) -> str:
-    largest = direction[np.argmax(np.abs(direction))]
-    parts = []
-    for share, name in sorted(zip(direction / largest, names, strict=True), key=lambda p: -abs(p[0])):
-        if abs(share) > _SHARE:
-            size = "" if abs(share) > 0.95 else f"{abs(share):.1f} "
-            parts.append(f"{'-' if share < 0 else '+'} {size}{name}")
-    return " ".join(parts).removeprefix("+ ")

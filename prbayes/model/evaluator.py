@@ -20,11 +20,11 @@ from pytensor.graph.replace import graph_replace, vectorize_graph
 
 from prbayes._checks import Floats, real_array
 from prbayes.metrics.base import Metric
+from prbayes.model.simulator import Node, log_kernel, required_nodes
 from prbayes.propagation.points import sobol
 from prbayes.propagation.reweighted import Design
 from prbayes.response.compilation import PLAIN, ninf_for_invalid
 from prbayes.response.distributions import PriorPoints, PriorSampler
-from prbayes.simulator import Node, log_kernel, required_nodes
 
 _CHUNK = 1 << 22  # design points times particles evaluated at a time: bounds memory
 

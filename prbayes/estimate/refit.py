@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats
 from prbayes._progress import progress
-from prbayes.descent import descend
-from prbayes.information import Information, Local, first_order_shifts, local_sampling
-from prbayes.population import Evaluator
+from prbayes.estimate.batch_bfgs import descend
+from prbayes.estimate.data_sets import DataSets, observed_set
+from prbayes.estimate.sampling import Local, first_order_shifts, local_sampling
+from prbayes.estimate.sandwich import Information
+from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.base import N_BLOCKS
 from prbayes.propagation.reweighted import Design
-from prbayes.resampling import DataSets, observed_set
 
 _STEP = 0.02  # of differences, in standard errors
 _TOLERANCE = 1e-4  # gain, in units of the curvature along a standard error, that is left on the table

@@ -1,0 +1,99 @@
+"""PLACEHOLDER of estimate.methods."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+_GRADIENT_FREE = ("Nelder-Mead", "Powell", "COBYLA", "COBYQA")
+_WITH_GRADIENT = ("BFGS", "CG", "L-BFGS-B", "Newton-CG", "SLSQP", "TNC", "trust-constr")
+
+
+@dataclass(frozen=True)
+class Scipy:
+    """A minimiser of `scipy.optimize.minimize`, with options of its own.
+
+    Parameters
+    ----------
+    method : str or callable
+        Scipy's name of a method that needs no Hessian, or a function as `scipy.optimize.minimize` takes it:
+        ``method(fun, x0, args, jac=..., callback=..., **options) -> OptimizeResult``. It works on standardised
+        parameters, that start at zero; ``jac`` is None under `Fresh`.
+    options : mapping
+        For scipy's ``options=``, in units of the standardised problem; they replace those that `minimize` would set.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If there is no such method, or the options are no mapping.
+
+    References
+    ----------
+    .. [1] Nocedal, J. and S. J. Wright (2006), Numerical Optimization, doi:10.1007/978-0-387-40065-5.
+
+    Examples
+    --------
+    >>> Scipy("L-BFGS-B", {"maxcor": 5})
+    Scipy(method='L-BFGS-B', options={'maxcor': 5})
+    """
+
+    method: str | Callable[..., Any] = "BFGS"
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        known = (*_WITH_GRADIENT, *_GRADIENT_FREE)
+        if isinstance(self.method, str):
+            if self.method.lower() not in {name.lower() for name in known}:
+                raise ValueError(
+                    f"method: got {self.method!r}, expected one of {', '.join(known)}, or a function that "
+                    "scipy.optimize.minimize takes as its method"
+                )
+        elif not callable(self.method) or isinstance(self.method, type):
+            raise TypeError(
+                f"method: got {self.method!r:.60}, expected prb.Scipy(...), the name of a scipy method, or a function"
+            )
+        if not isinstance(self.options, Mapping):
+            raise TypeError(f"options: got {type(self.options).__name__}, expected a mapping of names to values")
+
+    @classmethod
+    def of(cls, method: Scipy | str | Callable[..., Any] | None) -> Scipy:
+        """Return what a user meant by ``method=``."""
+        return method if isinstance(method, Scipy) else cls() if method is None else cls(method)
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return self.method if isinstance(self.method, str) else getattr(self.method, "__name__", repr(self.method))
+
+    @property
+    def gradient(self) -> bool:
+        """Whether the method is given gradients."""
+        return not isinstance(self.method, str) or self.method.lower() not in {n.lower() for n in _GRADIENT_FREE}
+
+    def settings(self, tolerance: float, size: int) -> dict[str, Any]:
+        """Return scipy's options for a standardised problem; the budget of evaluations alone limits iterations."""
+        most = 10**9
+        simplex = np.vstack([np.zeros(size), 0.2 * np.eye(size)])
+        known: dict[str, dict[str, Any]] = {
+            "bfgs": {"gtol": tolerance, "maxiter": most},
+            "cg": {"gtol": tolerance, "maxiter": most},
+            "l-bfgs-b": {"gtol": tolerance, "ftol": tolerance**2, "maxfun": most, "maxiter": most},
+            "newton-cg": {"xtol": tolerance, "maxiter": most},
+            "slsqp": {"ftol": tolerance**2, "maxiter": most},
+            "tnc": {"gtol": tolerance, "ftol": tolerance**2, "xtol": 0.0, "maxfun": most},
+            "trust-constr": {"gtol": tolerance, "xtol": tolerance**2, "maxiter": most},
+            "nelder-mead": {
+                "xatol": tolerance,
+                "fatol": tolerance / 100,
+                "initial_simplex": simplex,
+                "maxfev": most,
+                "maxiter": most,
+            },
+            "powell": {"xtol": tolerance, "ftol": tolerance**2, "maxfev": most, "maxiter": most},
+            "cobyla": {"tol": tolerance, "rhobeg": 0.2, "maxiter": most},
+            "cobyqa": {"final_tr_radius": tolerance, "initial_tr_radius": 0.2, "maxfev": most, "maxiter": most},
+        }
+        return {**known.get(self.name.lower() if isinstance(self.method, str) else "", {}), **self.options}
