@@ -21,7 +21,7 @@ import pymc as pm
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
-from prbayes.smc import sample
+from prbayes.posterior.smc import sample
 
 SIZE = 50
 SHARE = 0.05

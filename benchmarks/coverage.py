@@ -193,12 +193,12 @@ def analyse(
     evaluator: Any, data: Any, truth: Any, log_likelihood: Callable[[Any], Any], *, bootstrap: bool
 ) -> dict[str, Any]:
     """Calibrate one data set; return the estimate, and by posterior: probability below the truth, mean, sd."""
-    from prbayes.adjust import Affine, moved
-    from prbayes.epsilon import calibrate_epsilon
     from prbayes.estimate.data_sets import reweighted_sets
     from prbayes.estimate.minimize import find_optimum
     from prbayes.estimate.refit import Neighbourhood
     from prbayes.estimate.sandwich import prior_scale
+    from prbayes.posterior.adjustment import Affine, moved
+    from prbayes.posterior.epsilon import calibrate_epsilon
 
     ev = evaluator.observing({"y": data})
     optimum = find_optimum(ev, tolerance=1e-6, starts=0)

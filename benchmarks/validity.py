@@ -30,7 +30,7 @@ import prbayes as prb
 from prbayes.estimate.minimize import find_optimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.nulls import area
-from prbayes.smc import sample
+from prbayes.posterior.smc import sample
 
 LEVELS = (0.01, 0.05, 0.10)
 FITTED = (15, 30, 100)

@@ -3,17 +3,13 @@
 from importlib.metadata import version
 
 from prbayes import datasets
-from prbayes.adjust import Affine
-from prbayes.bootstrap import bootstrap
 from prbayes.compare import compare
 from prbayes.diagnose import Diagnosis, diagnose
-from prbayes.epsilon import calibrate_epsilon
 from prbayes.estimate.methods import Scipy
 from prbayes.estimate.minimize import minimize, refine
 from prbayes.estimate.optimum import Optimum
 from prbayes.heldout import held_out
 from prbayes.joint import JointNull
-from prbayes.kernel import BatchedKernel
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
 from prbayes.metrics.density import GaussianKDE, Histogram
@@ -27,6 +23,12 @@ from prbayes.nulls import ExactModel, PosteriorNull
 from prbayes.pictures.plots import plot_comparison, plot_posterior, plot_validity
 from prbayes.pictures.portraits import plot_population, plot_responses
 from prbayes.pictures.trails import plot_landscape, plot_optimizer, plot_stages
+from prbayes.posterior.adjustment import Affine
+from prbayes.posterior.bootstrap import bootstrap
+from prbayes.posterior.epsilon import calibrate_epsilon
+from prbayes.posterior.sbc import simulation_based_calibration
+from prbayes.posterior.smc import sample_smc
+from prbayes.posterior.smc_kernel import BatchedKernel
 from prbayes.predict import predict
 from prbayes.propagation.fresh import Fresh
 from prbayes.propagation.points import monte_carlo, sobol
@@ -37,10 +39,9 @@ from prbayes.reports.section import Section
 from prbayes.response.calling import ResponseError, scalar
 from prbayes.response.failures import Abort, Replace, Retry
 from prbayes.response.store import StoreError
-from prbayes.sbc import simulation_based_calibration
-from prbayes.smc import sample_smc
-from prbayes.surfaces import Polynomial, RadialBasis, SurrogateError
-from prbayes.surrogate import Surrogate
+from prbayes.surrogate.error import SurrogateError
+from prbayes.surrogate.surfaces import Polynomial, RadialBasis
+from prbayes.surrogate.surrogate import Surrogate
 from prbayes.validity import ValidityTest, area_test, u_values
 
 __version__ = version("prbayes")

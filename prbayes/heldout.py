@@ -6,10 +6,9 @@ import numpy as np
 import xarray as xr
 
 from prbayes._checks import positive_integer
-from prbayes.adjust import inapplicable
 from prbayes.estimate.data_sets import DataSets, specimens
 from prbayes.estimate.optimum import Optimum, surveyed
-from prbayes.estimate.refit import Neighbourhood
+from prbayes.estimate.refit import Neighbourhood, inapplicable
 from prbayes.estimate.sandwich import prior_scale
 from prbayes.model.labels import versions
 

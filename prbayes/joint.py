@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
-from prbayes.adjust import inapplicable
 from prbayes.estimate.data_sets import groups, sets_at, simulated_points, specimens
 from prbayes.estimate.optimum import Optimum, surveyed
-from prbayes.estimate.refit import Neighbourhood
+from prbayes.estimate.refit import Neighbourhood, inapplicable
 from prbayes.estimate.sandwich import prior_scale
 from prbayes.nulls import Case, Condition, Predictive, SimulatedNull
 from prbayes.predict import data_digest, serving, specimen_names

@@ -14,10 +14,10 @@ from scipy.stats import gamma, norm
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.adjust import _drawn_in, inapplicable, moved
-from prbayes.estimate.refit import Neighbourhood
+from prbayes.estimate.refit import Neighbourhood, inapplicable
 from prbayes.estimate.sandwich import prior_scale
 from prbayes.model.evaluator import Evaluator
+from prbayes.posterior.adjustment import _drawn_in, moved
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N = OBSERVED.size

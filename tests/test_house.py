@@ -71,7 +71,7 @@ def test_imports_run_downwards(path: Path) -> None:
 
 
 def test_optimiser_and_sampler_know_of_each_other_in_one_direction_only() -> None:
-    assert "prbayes.smc" not in imported(PACKAGE / "optimize.py")
+    assert "prbayes.posterior.smc" not in imported(PACKAGE / "optimize.py")
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)

@@ -15,10 +15,10 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes import sbc
 from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.simulator import nodes
+from prbayes.posterior import sbc
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N, SD = OBSERVED.size, float(OBSERVED.std())

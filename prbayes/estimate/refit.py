@@ -15,8 +15,10 @@ from prbayes.estimate.batch_bfgs import descend
 from prbayes.estimate.data_sets import DataSets, observed_set
 from prbayes.estimate.sampling import Local, first_order_shifts, local_sampling
 from prbayes.estimate.sandwich import Information
+from prbayes.metrics.function import FunctionMetric
 from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.base import N_BLOCKS
+from prbayes.propagation.fresh import FreshBound
 from prbayes.propagation.reweighted import Design
 
 _STEP = 0.02  # of differences, in standard errors
@@ -172,3 +174,15 @@ def _mean_hessian(value: Callable[[Floats], Floats], r: int) -> Floats:
     values, vectors = np.linalg.eigh(out)
     values = np.maximum(np.nan_to_num(values), 0.05 * max(np.nanmax(values), 1e-300))
     return np.asarray((vectors * values) @ vectors.T)
+
+
+def inapplicable(evaluator: Evaluator) -> str:
+    """Say why draws of a model cannot be adjusted; empty if they can."""
+    for node in evaluator.nodes:
+        if isinstance(node.metric, FunctionMetric):
+            return f"{node.name} has a FunctionMetric, of which nothing is known"
+        if isinstance(node.bound, FreshBound):
+            return f"{node.name} has prb.Fresh, whose discrepancy is random"
+    if evaluator.model.potentials or len(evaluator.model.observed_RVs) > len(evaluator.nodes):
+        return "the model has likelihood terms or potentials besides its simulators"
+    return ""

@@ -15,9 +15,9 @@ from prbayes import datasets
 from prbayes.estimate.minimize import minimize
 from prbayes.metrics.residual import ProbabilityResidual
 from prbayes.model.simulator import Simulator
+from prbayes.posterior.smc import sample_smc
 from prbayes.predict import predict
 from prbayes.reports.report import Report
-from prbayes.smc import sample_smc
 from prbayes.validity import area_test
 
 _log = logging.getLogger("prbayes")

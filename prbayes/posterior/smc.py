@@ -16,16 +16,17 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes._progress import CONSOLE, shown
-from prbayes.adjust import Affine, inapplicable
-from prbayes.checkpoint import Checkpoint, stored_identity
-from prbayes.epsilon import calibrate_epsilon
 from prbayes.estimate.minimize import find_optimum
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse
-from prbayes.kernel import BatchedKernel
+from prbayes.estimate.refit import inapplicable
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.simulator import model_on_context
 from prbayes.model.support import shortcomings
+from prbayes.posterior.adjustment import Affine
+from prbayes.posterior.checkpoint import Checkpoint, stored_identity
+from prbayes.posterior.epsilon import calibrate_epsilon
+from prbayes.posterior.smc_kernel import BatchedKernel
 from prbayes.posterior.trees import posterior_tree
 from prbayes.propagation.fresh import FreshBound
 

@@ -16,24 +16,14 @@ from numpy.typing import ArrayLike
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.propagation.points import sobol
-from prbayes.region import Input, Region, read_region
 from prbayes.response.calling import Caller, ResponseError
 from prbayes.response.failures import Abort, OnFailure, Replace
 from prbayes.response.store import Store, StoreError
-from prbayes.surfaces import (
-    Polynomial,
-    Predict,
-    RadialBasis,
-    Surface,
-    SurrogateError,
-    cross_validated,
-    fitted,
-    required,
-    scattered,
-)
+from prbayes.surrogate.error import SurrogateError, cross_validated
+from prbayes.surrogate.ranges import Input, Region, read_region
+from prbayes.surrogate.surfaces import Polynomial, Predict, RadialBasis, Surface, fitted, required, scattered
 
 _log = logging.getLogger("prbayes")
-
 _SAME = 1e-6  # of the response's spread: within which a loaded surface must repeat what was saved
 _PROBES = 64
 

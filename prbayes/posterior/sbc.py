@@ -15,15 +15,14 @@ import xarray as xr
 
 from prbayes._checks import Floats, positive_integer
 from prbayes._progress import progress, shown
-from prbayes.adjust import Affine
 from prbayes.estimate.data_sets import fresh_data
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.simulator import model_on_context, nodes, revive
+from prbayes.posterior.adjustment import Affine
+from prbayes.posterior.smc import sample
 from prbayes.posterior.trees import calibration_tree
-from prbayes.smc import sample
 
 _log = logging.getLogger("prbayes")
-
 _CHUNK = 10  # data sets that a worker analyses before it reports
 _ARRIVING = Lock()  # threads share the classes that hold the nodes, of which the last model to arrive has its own
 

@@ -9,11 +9,9 @@ import numpy as np
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.estimate.data_sets import observed_set, simulated_sets
-from prbayes.estimate.refit import Neighbourhood
+from prbayes.estimate.refit import Neighbourhood, inapplicable
 from prbayes.estimate.sandwich import prior_scale
-from prbayes.metrics.function import FunctionMetric
 from prbayes.model.evaluator import Evaluator
-from prbayes.propagation.fresh import FreshBound
 
 _FEWEST = 50  # draws of a mode below which it is left as it is
 _APART = 1.5  # ratio of distances to two modes below which a draw is between them
@@ -118,18 +116,6 @@ class Affine:
         modes = "" if len(hoods) == 1 else f", {count} modes each by itself"
         drawn_in = f", {far / len(flat):.1%} of the draws drawn in to {_FAR:.0f} standard deviations" if far else ""
         return out.reshape(thetas.shape), f"{self!r}{modes}{drawn_in}"
-
-
-def inapplicable(evaluator: Evaluator) -> str:
-    """Say why draws of a model cannot be adjusted; empty if they can."""
-    for node in evaluator.nodes:
-        if isinstance(node.metric, FunctionMetric):
-            return f"{node.name} has a FunctionMetric, of which nothing is known"
-        if isinstance(node.bound, FreshBound):
-            return f"{node.name} has prb.Fresh, whose discrepancy is random"
-    if evaluator.model.potentials or len(evaluator.model.observed_RVs) > len(evaluator.nodes):
-        return "the model has likelihood terms or potentials besides its simulators"
-    return ""
 
 
 def moved(hood: Neighbourhood, x: Floats, rest: Floats, center: Floats, covariance: Floats) -> Floats:

@@ -9,11 +9,10 @@ import xarray as xr
 
 from prbayes._checks import positive_integer
 from prbayes._progress import shown
-from prbayes.adjust import inapplicable
 from prbayes.estimate.data_sets import reweighted_sets, simulated_sets
 from prbayes.estimate.identifiability import blind_directions
 from prbayes.estimate.optimum import Optimum, surveyed
-from prbayes.estimate.refit import Neighbourhood
+from prbayes.estimate.refit import Neighbourhood, inapplicable
 from prbayes.estimate.sandwich import prior_scale
 from prbayes.posterior.trees import bootstrap_tree
 
