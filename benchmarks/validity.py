@@ -29,8 +29,8 @@ from scipy.special import ndtr, ndtri, stdtr
 import prbayes as prb
 from prbayes.estimate.minimize import find_optimum
 from prbayes.model.evaluator import Evaluator
-from prbayes.nulls import area
 from prbayes.posterior.smc import sample
+from prbayes.validation.nulls import area
 
 LEVELS = (0.01, 0.05, 0.10)
 FITTED = (15, 30, 100)

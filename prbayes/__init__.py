@@ -3,13 +3,12 @@
 from importlib.metadata import version
 
 from prbayes import datasets
-from prbayes.compare import compare
-from prbayes.diagnose import Diagnosis, diagnose
+from prbayes._compare import compare
+from prbayes._diagnose import Diagnosis, diagnose
+from prbayes._predict import predict
 from prbayes.estimate.methods import Scipy
 from prbayes.estimate.minimize import minimize, refine
 from prbayes.estimate.optimum import Optimum
-from prbayes.heldout import held_out
-from prbayes.joint import JointNull
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
 from prbayes.metrics.density import GaussianKDE, Histogram
@@ -19,7 +18,6 @@ from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual
 from prbayes.model.simulator import Simulator, abc_distance, set_epsilon
 from prbayes.model.support import DesignError
-from prbayes.nulls import ExactModel, PosteriorNull
 from prbayes.pictures.plots import plot_comparison, plot_posterior, plot_validity
 from prbayes.pictures.portraits import plot_population, plot_responses
 from prbayes.pictures.trails import plot_landscape, plot_optimizer, plot_stages
@@ -29,7 +27,6 @@ from prbayes.posterior.epsilon import calibrate_epsilon
 from prbayes.posterior.sbc import simulation_based_calibration
 from prbayes.posterior.smc import sample_smc
 from prbayes.posterior.smc_kernel import BatchedKernel
-from prbayes.predict import predict
 from prbayes.propagation.fresh import Fresh
 from prbayes.propagation.points import monte_carlo, sobol
 from prbayes.propagation.resimulated import Resimulated
@@ -42,7 +39,10 @@ from prbayes.response.store import StoreError
 from prbayes.surrogate.error import SurrogateError
 from prbayes.surrogate.surfaces import Polynomial, RadialBasis
 from prbayes.surrogate.surrogate import Surrogate
-from prbayes.validity import ValidityTest, area_test, u_values
+from prbayes.validation.cross_validation import held_out
+from prbayes.validation.joint_null import JointNull
+from prbayes.validation.nulls import ExactModel, PosteriorNull
+from prbayes.validation.validity import ValidityTest, area_test, u_values
 
 __version__ = version("prbayes")
 

@@ -14,7 +14,7 @@ import xarray as xr
 
 from prbayes.reports.demo import run_demo
 from prbayes.reports.report import Report
-from prbayes.validity import ValidityTest
+from prbayes.validation.validity import ValidityTest
 
 _REPORT = """examples:
   prbayes report results.nc

@@ -14,7 +14,7 @@ from scipy.special import ndtr, ndtri
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.nulls import Case, Condition, Predictive, SimulatedNull, _table, area, envelope
+from prbayes.validation.nulls import Case, Condition, Predictive, SimulatedNull, _table, area, envelope
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 

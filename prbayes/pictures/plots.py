@@ -15,7 +15,7 @@ from prbayes.estimate.optimum import Optimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.pictures.canvas import BLUE, DASHED, DIAMOND, DOTTED, GREY, INK, VERMILION, Canvas, grid_settings, named
 from prbayes.pictures.curves import bounded_density, normal_density, round_ticks
-from prbayes.validity import ValidityTest
+from prbayes.validation.validity import ValidityTest
 
 _PRIOR_DRAWS = 4000
 _TOLD = ("n_responses", "seconds")

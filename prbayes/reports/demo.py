@@ -12,13 +12,13 @@ import pymc as pm
 import xarray as xr
 
 from prbayes import datasets
+from prbayes._predict import predict
 from prbayes.estimate.minimize import minimize
 from prbayes.metrics.residual import ProbabilityResidual
 from prbayes.model.simulator import Simulator
 from prbayes.posterior.smc import sample_smc
-from prbayes.predict import predict
 from prbayes.reports.report import Report
-from prbayes.validity import area_test
+from prbayes.validation.validity import area_test
 
 _log = logging.getLogger("prbayes")
 

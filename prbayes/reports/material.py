@@ -11,12 +11,12 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._checks import Floats
-from prbayes.compare import compare
-from prbayes.diagnose import Diagnosis, diagnose
+from prbayes._compare import compare
+from prbayes._diagnose import Diagnosis, diagnose
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.description import describe, from_attributes
 from prbayes.model.simulator import nodes
-from prbayes.validity import ValidityTest
+from prbayes.validation.validity import ValidityTest
 
 
 @dataclass(frozen=True, eq=False)

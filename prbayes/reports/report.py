@@ -18,7 +18,7 @@ import xarray as xr
 from prbayes.estimate.optimum import Optimum
 from prbayes.reports.contents import contents
 from prbayes.reports.section import Section, cells
-from prbayes.validity import ValidityTest
+from prbayes.validation.validity import ValidityTest
 
 # What Markdown, or HTML inside it, would read as markup.
 _MARKUP = re.compile(r"([\\`*_{}\[\]<>|&~$!])")

@@ -8,7 +8,7 @@ import numpy as np
 
 from prbayes.reports.material import Material, elements
 from prbayes.reports.section import number, plus_minus
-from prbayes.validity import ValidityTest
+from prbayes.validation.validity import ValidityTest
 
 _MOST = 6  # hyperparameters that the summary lists
 _WORDS = {

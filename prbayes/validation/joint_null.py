@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
+from prbayes._predict import data_digest, serving, specimen_names
 from prbayes.estimate.data_sets import groups, sets_at, simulated_points, specimens
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refit import Neighbourhood, inapplicable
 from prbayes.estimate.sandwich import prior_scale
-from prbayes.nulls import Case, Condition, Predictive, SimulatedNull
-from prbayes.predict import data_digest, serving, specimen_names
 from prbayes.propagation.reweighted import Design
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
+from prbayes.validation.nulls import Case, Condition, Predictive, SimulatedNull
 
 _DIFFERENT = 0.1  # between distribution functions of predicted values and of the population at the optimum
 

@@ -11,9 +11,9 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats, positive_integer, real_array
+from prbayes._predict import data_digest, specimen_names
 from prbayes.model.labels import versions
-from prbayes.nulls import Case, Condition, ExactModel, Null, PosteriorNull, area
-from prbayes.predict import data_digest, specimen_names
+from prbayes.validation.nulls import Case, Condition, ExactModel, Null, PosteriorNull, area
 
 Predicted = xr.DataArray | NDArray[Any]
 
