@@ -18,9 +18,14 @@ from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual
 from prbayes.model.simulator import Simulator, abc_distance, set_epsilon
 from prbayes.model.support import DesignError
-from prbayes.pictures.plots import plot_comparison, plot_posterior, plot_validity
-from prbayes.pictures.portraits import plot_population, plot_responses
-from prbayes.pictures.trails import plot_landscape, plot_optimizer, plot_stages
+from prbayes.plots.comparison import plot_comparison
+from prbayes.plots.landscape import plot_landscape
+from prbayes.plots.optimizer import plot_optimizer
+from prbayes.plots.population import plot_population
+from prbayes.plots.posterior import plot_posterior
+from prbayes.plots.responses import plot_responses
+from prbayes.plots.stages import plot_stages
+from prbayes.plots.validity import plot_validity
 from prbayes.posterior.adjustment import Affine
 from prbayes.posterior.bootstrap import bootstrap
 from prbayes.posterior.epsilon import calibrate_epsilon

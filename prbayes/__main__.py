@@ -12,7 +12,7 @@ from typing import Any
 
 import xarray as xr
 
-from prbayes.reports.demo import run_demo
+from prbayes._demo import run_demo
 from prbayes.reports.report import Report
 from prbayes.validation.validity import ValidityTest
 

@@ -11,9 +11,9 @@ from scipy import stats
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
 from prbayes.pictures import curves
-from prbayes.pictures.ensemble import read_before, read_result, supported
-from prbayes.pictures.landscape import elements, landscape, rooted
-from prbayes.pictures.margins import chosen, margin_densities, margins
+from prbayes.plots._ensemble import read_before, read_result, supported
+from prbayes.plots._grid import elements, landscape, rooted
+from prbayes.plots._margins import chosen, margin_densities, margins
 
 QUANTILES = stats.norm.ppf((np.arange(1000) + 0.5) / 1000)
 EQUAL = np.full(1000, 1e-3)

@@ -17,7 +17,7 @@ from matplotlib.image import imread
 from scipy import stats
 
 import prbayes as prb
-from prbayes.pictures.canvas import named
+from prbayes.plots._canvas import named
 
 RNG = np.random.default_rng(4)
 MU, SIGMA = RNG.normal(1.0, 0.1, (2, 150)), RNG.normal(0.5, 0.03, (2, 150))

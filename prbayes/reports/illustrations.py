@@ -12,9 +12,14 @@ from typing import Any
 import pymc as pm
 
 from prbayes.model.simulator import nodes
-from prbayes.pictures.plots import plot_comparison, plot_posterior, plot_validity
-from prbayes.pictures.portraits import plot_population, plot_responses
-from prbayes.pictures.trails import plot_landscape, plot_optimizer, plot_stages
+from prbayes.plots.comparison import plot_comparison
+from prbayes.plots.landscape import plot_landscape
+from prbayes.plots.optimizer import plot_optimizer
+from prbayes.plots.population import plot_population
+from prbayes.plots.posterior import plot_posterior
+from prbayes.plots.responses import plot_responses
+from prbayes.plots.stages import plot_stages
+from prbayes.plots.validity import plot_validity
 from prbayes.reports.material import Material
 from prbayes.reports.section import Section
 

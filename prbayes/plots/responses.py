@@ -3,31 +3,29 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats, positive_number
+from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.simulator import Node
-from prbayes.pictures.canvas import BLUE, DASHED, INK, VERMILION, Canvas, named
-from prbayes.pictures.curves import (
+from prbayes.plots._canvas import DASHED, INK, VERMILION, Canvas, named
+from prbayes.plots._curves import (
     central_range,
     densities,
     distribution_functions,
     histogram,
-    pointwise_band,
     staircase,
     typical_bandwidth,
 )
-from prbayes.pictures.ensemble import Ensemble, read_before, read_result, supported
-from prbayes.pictures.margins import chosen, margin_densities, margins
+from prbayes.plots._ensemble import read_before, read_result, supported
+from prbayes.plots._populations import calibrated, check_level, middle_and_band
 
 _log = logging.getLogger("prbayes")
-
 _GRID, _SOME = 257, 40  # points of a curve; populations that set the bandwidth
 
 
@@ -130,85 +128,6 @@ def plot_responses(
     return canvas.finish()
 
 
-def plot_population(
-    result: Optimum | xr.DataTree,
-    *,
-    model: pm.Model | None = None,
-    inputs: Sequence[Any] | None = None,
-    level: float = 0.89,
-    draws: int | None = None,
-    labels: Mapping[str, str] | None = None,
-    backend: str | None = None,
-    **pc_kwargs: Any,
-) -> Any:
-    """Draw the calibrated population of each aleatory input, with its uncertainty; of a multivariate one, its margins.
-
-    The curve is the posterior predictive density of the input, or its density at the optimum; the band holds
-    the share ``level`` of the densities at each value. It computes no response.
-
-    Parameters
-    ----------
-    result : Optimum or xarray.DataTree
-        From `minimize`; or with a ``posterior`` group, from any sampler.
-    model : pymc.Model, optional
-        That of the optimum, or the one on the context, by default.
-    inputs : sequence, optional
-        Names, or ``.dist()`` objects; all by default. An input is called as the response's argument that takes it.
-    level : float
-    draws : int, optional
-        Number of populations in the band; 200 by default.
-    labels : mapping, optional
-        What a reader calls an input, by its name, with units.
-    backend : {"matplotlib", "bokeh", "plotly"}, optional
-        That of ArviZ's settings by default.
-    **pc_kwargs
-        For ``arviz.PlotCollection.wrap``.
-
-    Returns
-    -------
-    arviz.PlotCollection
-        Its ``viz`` has the artists ``band`` and ``after``.
-
-    Raises
-    ------
-    TypeError, KeyError, ValueError
-        If an argument is not as described, there is no such input, or the result lacks a free variable.
-
-    Examples
-    --------
-    >>> import numpy as np, pymc as pm, prbayes as prb
-    >>> with pm.Model() as model:
-    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda load: 2 * load, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
-    >>> list(prb.plot_population(prb.minimize(model), backend="none").viz["after"])
-    ['load']
-    """
-    check_level(level)
-    shown = read_result(result, model, "prb.plot_population", draws, free=True)
-    wanted = chosen(margins(shown.evaluator), inputs)
-    center = shown.thetas[:0] if shown.center is None else shown.center
-    found = margin_densities(shown.evaluator, wanted, np.vstack([center, shown.thetas]))
-    canvas = Canvas([m.name for m in wanted], size=(4.6, 3.9), backend=backend, pc_kwargs=pc_kwargs)
-    for margin in wanted:
-        grid, curves = found[margin.name]
-        after, band = middle_and_band(curves, len(center), level)
-        calibrated(canvas, margin.name, grid, after, band, shown, level)
-        y = "probability" if margin.discrete else "density"
-        canvas.axes(margin.name, x=named(margin.name, labels), y=y)
-    return canvas.finish()
-
-
-def check_level(level: float) -> None:
-    if positive_number(level, "level") >= 1:
-        raise ValueError(f"level: got {level}, expected a number between 0 and 1")
-
-
-def middle_and_band(curves: Floats, centers: int, level: float) -> tuple[Floats, tuple[Floats, Floats] | None]:
-    """Return the optimum's curve, or else the mean of the posterior's, and a band of the others."""
-    others = curves[centers:]
-    return curves[0] if centers else others.mean(axis=0), pointwise_band(others, level) if len(others) else None
-
-
 def _reach(node: Node, values: Floats, weights: Floats, earlier: tuple[Floats, Floats] | None) -> tuple[float, float]:
     """Return what the axis covers: the data, the calibrated populations, and the earlier one unless it is far off."""
     finite = node.target.observed[np.isfinite(node.target.observed)]
@@ -224,14 +143,6 @@ def _reach(node: Node, values: Floats, weights: Floats, earlier: tuple[Floats, F
 
 def _density(values: Floats, weights: Floats, grid: Floats) -> Floats:
     return densities(values, weights, grid, typical_bandwidth(values[:_SOME], weights[:_SOME]))
-
-
-def calibrated(
-    canvas: Canvas, panel: str, grid: Floats, after: Floats, band: Any, shown: Ensemble, level: float
-) -> None:
-    if band is not None:
-        canvas.band(panel, "band", grid, band, BLUE, legend=f"{level:.0%} band of the {shown.spread}")
-    canvas.line(panel, "after", grid, after, BLUE, width=2.2, legend=f"calibrated: {shown.label}")
 
 
 def _measured(canvas: Canvas, node: Node, low: float, high: float, *, ecdf: bool) -> float:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.evaluator import Evaluator
-from prbayes.pictures.ensemble import supported
+from prbayes.plots._ensemble import supported
 
 _SDS, _DRAWS, _STEPS = 4.0, 1000, 33
 
@@ -107,3 +108,25 @@ def rooted(heights: Floats) -> tuple[Floats, float, float]:
     finite = heights[np.isfinite(heights)]
     low, high = float(finite.min()), float(np.quantile(finite, 0.9))
     return np.sqrt(np.maximum(heights - low, 0.0) / max(high - low, 1e-300)), low, high
+
+
+_METRICS = {
+    "AreaMetric": "area metric",
+    "KullbackLeibler": "Kullback-Leibler",
+    "LogLikelihood": "log-likelihood",
+    "ProbabilityResidual": "probability residual",
+}
+
+
+def objective_of(optimum: Optimum) -> str:
+    if len(optimum.scales) > 1:
+        return "sum of d / s"
+    name = type(optimum.evaluator.nodes[0].metric).__name__
+    return f"discrepancy ({_METRICS.get(name, name)})"
+
+
+def check_optimum(optimum: Any, caller: str) -> None:
+    if not isinstance(optimum, Optimum):
+        raise TypeError(f"{caller}: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first")
+    if not len(optimum.trace.get("theta", ())):
+        raise ValueError(f"{caller}: got an optimum without a trace, expected one as prb.minimize returns it")

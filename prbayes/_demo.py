@@ -21,7 +21,6 @@ from prbayes.reports.report import Report
 from prbayes.validation.validity import area_test
 
 _log = logging.getLogger("prbayes")
-
 EXPONENT = 2.6
 CALIBRATED_AT, TESTED_AT = 0.05, 0.08  # million cycles
 

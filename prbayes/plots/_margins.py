@@ -14,7 +14,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluator
-from prbayes.pictures.curves import central_range, densities, typical_bandwidth
+from prbayes.plots._curves import central_range, densities, typical_bandwidth
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, is_mvnormal
 
