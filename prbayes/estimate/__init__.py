@@ -1,1 +1,1 @@
-"""PLACEHOLDER package estimate."""
+"""The deterministic optimiser, and what is known of its answer."""

@@ -1,4 +1,4 @@
-"""PLACEHOLDER of estimate.caveats."""
+"""What is to be said of an optimum: at an edge, at a jump, far from the data."""
 
 from __future__ import annotations
 

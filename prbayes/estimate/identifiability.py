@@ -1,4 +1,4 @@
-"""PLACEHOLDER of estimate.identifiability."""
+"""Which directions of the hyperparameters the data see, and the names of those they do not."""
 
 from __future__ import annotations
 

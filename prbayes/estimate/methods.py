@@ -1,4 +1,4 @@
-"""PLACEHOLDER of estimate.methods."""
+"""`Scipy`: which minimiser of scipy runs, and with which options."""
 
 from __future__ import annotations
 

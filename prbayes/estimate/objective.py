@@ -1,4 +1,4 @@
-"""PLACEHOLDER of estimate.objective."""
+"""The standardised objective of one minimisation, and differences where there is no gradient."""
 
 from __future__ import annotations
 

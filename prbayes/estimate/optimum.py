@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pymc as pm
@@ -17,57 +17,6 @@ from prbayes.estimate.search import Search
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import labelled, observed_dataset, versions
-
-if TYPE_CHECKING:
-    from prbayes.estimate.optimum import Optimum
-
-
-def optimum_tree(optimum: Optimum) -> xr.DataTree:
-    """Return the DataTree of an optimum."""
-    evaluator = optimum.evaluator
-    names = list(optimum.discrepancies)
-    attrs = {
-        "discrepancy": optimum.discrepancy,
-        "converged": int(optimum.converged),
-        "message": optimum.message,
-        "n_evaluations": optimum.n_evaluations,
-        "n_screened": optimum.n_screened,
-        "n_responses": optimum.n_responses,
-        "seconds": optimum.seconds,
-        "warnings": "\n".join(optimum.warnings),
-        **versions(),
-        **as_attribute(optimum.model),
-    }
-    elements = {"element": optimum.names, "other_element": optimum.names}
-    return xr.DataTree.from_dict(
-        {
-            "optimum": labelled(evaluator, optimum.point, {}).assign_attrs(attrs),
-            "stderr": labelled(evaluator, optimum.stderr, {}),
-            "trace": xr.Dataset(
-                {
-                    "theta": (["evaluation", "element"], optimum.trace["theta"]),
-                    "discrepancy": ("evaluation", optimum.trace["discrepancy"]),
-                    "evaluations": ("evaluation", optimum.trace["evaluations"]),
-                },
-                coords={"element": optimum.names},
-            ),
-            "calibration": xr.Dataset(
-                {
-                    "discrepancy": ("simulator", list(optimum.discrepancies.values())),
-                    "scale": ("simulator", list(optimum.scales.values())),
-                    **{
-                        key: ("simulator", [optimum.support.get(n, {}).get(key, np.nan) for n in names])
-                        for key in ("weight_ess", "mean_weight", "lost_mass")
-                    },
-                    "theta": ("element", optimum.theta),
-                    "covariance": (["element", "other_element"], optimum.covariance),
-                    "metric": ("simulator", [without_addresses(n.metric) for n in evaluator.nodes]),
-                },
-                coords={"simulator": names, **elements},
-            ),
-            "observed_data": observed_dataset(evaluator),
-        }
-    )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -169,8 +118,6 @@ class Optimum:
 
     def to_datatree(self) -> xr.DataTree:
         """Return the optimum as a DataTree with groups ``optimum``, ``stderr``, ``trace`` and ``calibration``."""
-        from prbayes.estimate.optimum import optimum_tree
-
         return optimum_tree(self)
 
 
@@ -256,3 +203,51 @@ def surveyed(optimum: Optimum, caller: str) -> Optimum:
 def plain(value: Any) -> Any:
     """Return a float, or an array where there are several numbers."""
     return float(value) if np.ndim(value) == 0 else np.asarray(value)
+
+
+def optimum_tree(optimum: Optimum) -> xr.DataTree:
+    """Return the DataTree of an optimum."""
+    evaluator = optimum.evaluator
+    names = list(optimum.discrepancies)
+    attrs = {
+        "discrepancy": optimum.discrepancy,
+        "converged": int(optimum.converged),
+        "message": optimum.message,
+        "n_evaluations": optimum.n_evaluations,
+        "n_screened": optimum.n_screened,
+        "n_responses": optimum.n_responses,
+        "seconds": optimum.seconds,
+        "warnings": "\n".join(optimum.warnings),
+        **versions(),
+        **as_attribute(optimum.model),
+    }
+    elements = {"element": optimum.names, "other_element": optimum.names}
+    return xr.DataTree.from_dict(
+        {
+            "optimum": labelled(evaluator, optimum.point, {}).assign_attrs(attrs),
+            "stderr": labelled(evaluator, optimum.stderr, {}),
+            "trace": xr.Dataset(
+                {
+                    "theta": (["evaluation", "element"], optimum.trace["theta"]),
+                    "discrepancy": ("evaluation", optimum.trace["discrepancy"]),
+                    "evaluations": ("evaluation", optimum.trace["evaluations"]),
+                },
+                coords={"element": optimum.names},
+            ),
+            "calibration": xr.Dataset(
+                {
+                    "discrepancy": ("simulator", list(optimum.discrepancies.values())),
+                    "scale": ("simulator", list(optimum.scales.values())),
+                    **{
+                        key: ("simulator", [optimum.support.get(n, {}).get(key, np.nan) for n in names])
+                        for key in ("weight_ess", "mean_weight", "lost_mass")
+                    },
+                    "theta": ("element", optimum.theta),
+                    "covariance": (["element", "other_element"], optimum.covariance),
+                    "metric": ("simulator", [without_addresses(n.metric) for n in evaluator.nodes]),
+                },
+                coords={"simulator": names, **elements},
+            ),
+            "observed_data": observed_dataset(evaluator),
+        }
+    )

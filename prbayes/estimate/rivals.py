@@ -1,4 +1,4 @@
-"""Where else the data could come from: mirror solutions, and directions that the data do not see."""
+"""Other optima of the discrepancy, such as mirror solutions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PLACEHOLDER of estimate.sampling."""
+"""The sampling distribution of the minimiser, to first order."""
 
 from __future__ import annotations
 

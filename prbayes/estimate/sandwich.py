@@ -1,7 +1,7 @@
-"""What N observations tell about the hyperparameters: Hessians, sampling covariances, bootstrap.
+"""The two halves of the sandwich at one theta: the Hessian, and the sampling covariance of the gradient.
 
-Everything is computed at one theta from the model's own population there, so that under `Reweighted` no
-response is computed. Derivatives are central differences of stored weights, exact to rounding.
+Everything is computed from the model's own population there, so that under `Reweighted` no response is
+computed. Derivatives are central differences of stored weights, exact to rounding.
 """
 
 from __future__ import annotations

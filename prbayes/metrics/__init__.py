@@ -1,1 +1,1 @@
-"""PLACEHOLDER package metrics."""
+"""Calibration metrics: how much simulated responses disagree with measured ones. Smaller is better."""

@@ -1,4 +1,4 @@
-"""PLACEHOLDER of metrics.area."""
+"""The area metric: the area between two distribution functions."""
 
 from __future__ import annotations
 

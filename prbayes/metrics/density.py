@@ -207,6 +207,7 @@ class Histogram(DensityEstimator):
 
 
 def density_estimator(density: object) -> None:
+    """Refuse what is no estimator of densities."""
     if not isinstance(density, DensityEstimator):
         got = f"the class {density.__name__}" if isinstance(density, type) else f"{type(density).__name__} {density!r}"
         raise TypeError(f"density: got {got}, expected prb.GaussianKDE() or prb.Histogram(), perhaps with arguments")

@@ -1,4 +1,4 @@
-"""PLACEHOLDER of metrics.divergence."""
+"""The Kullback-Leibler divergence, forward and reverse."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PLACEHOLDER of metrics.function."""
+"""A user's own metric from a function."""
 
 from __future__ import annotations
 

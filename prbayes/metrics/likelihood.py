@@ -1,4 +1,4 @@
-"""PLACEHOLDER of metrics.likelihood."""
+"""The negative mean log-likelihood."""
 
 from __future__ import annotations
 

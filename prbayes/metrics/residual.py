@@ -1,12 +1,4 @@
-"""Calibration metrics: how much the simulated responses disagree with the measured ones. Smaller is better.
-
-A new metric is a `Metric` with ``_prepare`` and a ``Discrepancy`` with ``outer``: this file is all it touches.
-
-References
-----------
-.. [1] Oh et al. (2019), A robust and convex metric for unconstrained optimization in statistical model
-   calibration - probability residual (PR), Struct. Multidisc. Optim., doi:10.1007/s00158-019-02288-6.
-"""
+"""The probability residual (PR): the scaled squared difference of two densities."""
 
 from __future__ import annotations
 

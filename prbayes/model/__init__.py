@@ -1,1 +1,1 @@
-"""PLACEHOLDER package model."""
+"""What stands in a PyMC model, and the evaluator that all routes ask about it."""

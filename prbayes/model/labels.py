@@ -1,17 +1,14 @@
-"""PLACEHOLDER of model.labels."""
+"""Values as labelled datasets, with the dimensions and coordinates of the model."""
 
 from __future__ import annotations
 
 import importlib.metadata
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from prbayes.model.evaluator import Evaluator
-
-if TYPE_CHECKING:
-    pass
 
 
 def versions() -> dict[str, str]:
@@ -35,4 +32,5 @@ def labelled(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, in
 
 
 def observed_dataset(evaluator: Evaluator) -> xr.Dataset:
+    """Return the observed responses of all simulators, labelled."""
     return labelled(evaluator, {n.name: n.target.observed for n in evaluator.nodes}, {})

@@ -1,4 +1,4 @@
-"""PLACEHOLDER of model.support."""
+"""Whether a design supports the populations at given hyperparameters, and in what it falls short."""
 
 from __future__ import annotations
 

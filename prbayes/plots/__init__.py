@@ -1,1 +1,1 @@
-"""PLACEHOLDER package plots."""
+"""Pictures of results, alike on every backend of ArviZ."""

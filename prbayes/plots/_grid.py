@@ -1,4 +1,4 @@
-"""The objective over one or two hyperparameters around an optimum, all others held there."""
+"""The discrepancy over a grid of two hyperparameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PLACEHOLDER of plots._populations."""
+"""What pictures of populations share: level, band, the calibrated curves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PLACEHOLDER of plots.comparison."""
+"""Results side by side."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PLACEHOLDER of plots.landscape."""
+"""The discrepancy as a landscape over one or two hyperparameters."""
 
 from __future__ import annotations
 

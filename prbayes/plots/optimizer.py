@@ -1,4 +1,4 @@
-"""Pictures of how a result was reached: `plot_optimizer`, `plot_landscape`, `plot_stages`."""
+"""The path of the optimiser."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PLACEHOLDER of plots.population."""
+"""The calibrated population of each input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of results: `plot_posterior`, `plot_comparison`, `plot_validity`."""
+"""Posteriors of the hyperparameters, beside optimum and prior."""
 
 from __future__ import annotations
 

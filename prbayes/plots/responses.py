@@ -1,4 +1,4 @@
-"""Pictures of the calibrated population: `plot_responses`, `plot_population`."""
+"""Measured responses beside those of the calibrated population."""
 
 from __future__ import annotations
 

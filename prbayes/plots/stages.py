@@ -1,4 +1,4 @@
-"""PLACEHOLDER of plots.stages."""
+"""The stages of a sampler: how it came from the prior to the posterior."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PLACEHOLDER of plots.validity."""
+"""The u-values of a validity test against their envelope."""
 
 from __future__ import annotations
 

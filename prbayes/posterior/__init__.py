@@ -1,1 +1,1 @@
-"""PLACEHOLDER package posterior."""
+"""Posterior uncertainty of the hyperparameters: epsilon, SMC-ABC, adjustment, bootstrap."""

@@ -1,8 +1,6 @@
-"""The schema of results: groups, dimensions, attributes, in one place."""
+"""The schema of posterior results: groups, dimensions, attributes."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -11,10 +9,6 @@ from prbayes._checks import Floats
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import labelled, observed_dataset, versions
-
-if TYPE_CHECKING:
-    pass
-
 
 _ENVELOPE = 0.95  # probability that the ECDF of uniform ranks stays inside
 

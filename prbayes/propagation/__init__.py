@@ -1,1 +1,1 @@
-"""PLACEHOLDER package propagation."""
+"""How a population of inputs becomes responses, and what one evaluation of it costs."""

@@ -1,4 +1,4 @@
-"""PLACEHOLDER of propagation.fresh."""
+"""`Fresh`: new random draws at every evaluation, as in classic ABC."""
 
 from __future__ import annotations
 

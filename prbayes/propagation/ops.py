@@ -1,4 +1,4 @@
-"""Calling the user's response: shapes, checks, counting; and the PyTensor operations made from it."""
+"""PyTensor operations: a response, a density of simulated values, a user's metric as nodes of a graph."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PLACEHOLDER of propagation.points."""
+"""Points of the unit cube, from which populations and designs are made."""
 
 from __future__ import annotations
 

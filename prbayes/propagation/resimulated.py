@@ -1,4 +1,4 @@
-"""`Resimulated` and `Fresh` at work: responses computed anew for every theta."""
+"""`Resimulated`: the same base points for every theta, and their responses computed anew."""
 
 from __future__ import annotations
 

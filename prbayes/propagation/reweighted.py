@@ -1,4 +1,4 @@
-"""The design of `Reweighted`: stored responses, the mixture density they were drawn from, refinement."""
+"""`Reweighted`, and its design: stored responses, the mixture density they were drawn from, weights."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PLACEHOLDER of response.compilation."""
+"""Batched compilation of graphs, so that one invalid row leaves the others alone."""
 
 from __future__ import annotations
 

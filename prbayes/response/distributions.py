@@ -1,8 +1,4 @@
-"""The inputs of a response: aleatory (a ``.dist()``), epistemic (a model variable) or constant.
-
-Everything that is read off a PyMC distribution stands here: which model variables are above it (its
-*roots*), its log-density, its inverse distribution function, its draws.
-"""
+"""What is read off PyMC distributions: log-densities, inverse distribution functions, draws."""
 
 from __future__ import annotations
 

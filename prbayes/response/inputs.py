@@ -1,4 +1,4 @@
-"""PLACEHOLDER of response.inputs."""
+"""The inputs of a response: aleatory (a ``.dist()``), epistemic (a model variable) or constant."""
 
 from __future__ import annotations
 
@@ -149,6 +149,7 @@ def _constant(x: object, label: str) -> Any:
 
 
 def is_random(variable: Variable) -> bool:
+    """Whether a variable of a graph is a random one: drawn, not computed."""
     if variable.owner is None:
         return False
     op = variable.owner.op

@@ -1,4 +1,4 @@
-"""PLACEHOLDER of response.response."""
+"""The user's response: shapes, checks, counting."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""PLACEHOLDER package surrogate."""
+"""Response surfaces that stand for a response within the ranges of their runs."""

@@ -1,4 +1,4 @@
-"""PLACEHOLDER of surrogate.error."""
+"""The cross-validated error of a surrogate."""
 
 from __future__ import annotations
 

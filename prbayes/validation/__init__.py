@@ -1,1 +1,1 @@
-"""PLACEHOLDER package validation."""
+"""Whether the calibrated model holds on data that it has not seen."""

@@ -6,11 +6,11 @@ from functools import cache
 import numpy as np
 import pymc as pm
 import pytest
+from prbayes.pictures import curves
 from scipy import stats
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
-from prbayes.pictures import curves
 from prbayes.plots._ensemble import read_before, read_result, supported
 from prbayes.plots._grid import elements, landscape, rooted
 from prbayes.plots._margins import chosen, margin_densities, margins

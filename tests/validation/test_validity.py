@@ -16,7 +16,7 @@ import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.validation.nulls import Case, Condition, Predictive, SimulatedNull, _table, area, envelope
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from benchmarks import area_null, validity
 

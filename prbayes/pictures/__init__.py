@@ -1,1 +1,0 @@
-"""Pictures of results: numbers first, then panels that are drawn alike on every backend."""
