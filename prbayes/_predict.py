@@ -42,7 +42,7 @@ def predict(
     name: str | None = None,
     executor: Executor | None = None,
     store: str | PathLike[str] | None = None,
-    random_seed: int | None = None,
+    random_seed: int | None = 0,
 ) -> xr.DataArray:
     """Draw responses of the calibrated population, also of another response or under another condition.
 

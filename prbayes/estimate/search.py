@@ -14,7 +14,7 @@ from pytensor.gradient import NullTypeGradError
 
 from prbayes._checks import Floats
 from prbayes._progress import progress
-from prbayes.estimate.methods import Scipy
+from prbayes.estimate.methods import Method
 from prbayes.estimate.objective import Objective, SpentError, StalledError, differences
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import DensityDiscrepancy
@@ -37,7 +37,7 @@ class Search:
     """Runs a minimiser on the objective, as often as scales or designs change, within one budget of evaluations."""
 
     def __init__(
-        self, evaluator: Evaluator, scale: Floats, method: Scipy, prior: bool, tolerance: float, most: int
+        self, evaluator: Evaluator, scale: Floats, method: Method, prior: bool, tolerance: float, most: int
     ) -> None:
         self.evaluator, self.scale, self.method = evaluator, scale, method
         self.prior, self.tolerance, self.most = prior, tolerance, most

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes._progress import CONSOLE, shown
-from prbayes.estimate.minimize import find_optimum
+from prbayes.estimate.minimization import find_optimum
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse
 from prbayes.estimate.refit import inapplicable
@@ -43,7 +43,7 @@ def sample_smc(
     adjust: Affine | bool = True,
     threshold: float = 0.5,
     refine: bool = True,
-    random_seed: int | None = None,
+    random_seed: int | None = 0,
     checkpoint: str | PathLike[str] | None = None,
     progressbar: bool = True,
 ) -> xr.DataTree:
@@ -144,7 +144,7 @@ def sample(
     adjust: Affine | bool = True,
     threshold: float = 0.5,
     refine: bool = True,
-    random_seed: int | None = None,
+    random_seed: int | None = 0,
     progressbar: bool = False,
     checkpoint: str | PathLike[str] | None = None,
 ) -> xr.DataTree:

@@ -40,7 +40,7 @@ class Reweighted(Propagation):
     n : int
         Number of design points, drawn from the inputs' prior predictive distribution; the response is
         computed n times, once. `refine` adds batches where they are needed.
-    seed : int
+    random_seed : int
         Seed of the design.
     max_lost : float
         Largest share of a population's weight that may fall on points whose response is NaN.
@@ -61,18 +61,18 @@ class Reweighted(Propagation):
     Examples
     --------
     >>> Reweighted(256)
-    Reweighted(n=256, seed=0, max_lost=0.05, max_points=None)
+    Reweighted(n=256, random_seed=0, max_lost=0.05, max_points=None)
     """
 
     n: int = 1024
-    seed: int = 0
+    random_seed: int = 0
     max_lost: float = 0.05
     max_points: int | None = None
 
     def __post_init__(self) -> None:
         self.check()
         positive_integer(self.n, "Reweighted: n", minimum=16)
-        positive_integer(self.seed, "Reweighted: seed", minimum=0)
+        positive_integer(self.random_seed, "Reweighted: random_seed", minimum=0)
         if self.max_lost != 0 and positive_number(self.max_lost, "Reweighted: max_lost") >= 1:
             raise ValueError(f"Reweighted: max_lost: got {self.max_lost}, expected a share below 1")
         if self.max_points is not None and positive_integer(self.max_points, "Reweighted: max_points") < self.n:
@@ -125,7 +125,7 @@ class Design(Bound):
         self._shared: list[Any] = []
         self._basis: tuple[Any, int, Any] = (None, 0, None)
         self._others: deque[tuple[Responses, Floats]] = deque(maxlen=_OTHERS)
-        thetas = prior_draws(inputs.roots, min(config.n, _MAX_THETAS), config.seed)
+        thetas = prior_draws(inputs.roots, min(config.n, _MAX_THETAS), config.random_seed)
         size = self.add(thetas)
         refuse_all_nan(name, self.values)
         if size < self.required_ess:
@@ -214,7 +214,7 @@ class Design(Bound):
         float
             The median weight effective sample size over these populations.
         """
-        n, seed = n or self.config.n, self.config.seed + 7919 * self.batches
+        n, seed = n or self.config.n, self.config.random_seed + 7919 * self.batches
         thetas = self.valid_only(thetas)
         if self.is_line:
             points, counts = self._equal_mass(thetas, n, seed)
