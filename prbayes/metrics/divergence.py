@@ -53,7 +53,8 @@ class KullbackLeibler(Metric):
         return not self.reverse
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
-        return DivergenceDiscrepancy(self, observed, weights, self.density.cells(observed, weights))
+        cells = self.density.cells(observed, weights)
+        return DivergenceDiscrepancy.on_cells(self, observed, weights, cells)
 
 
 class DivergenceDiscrepancy(DensityDiscrepancy):
@@ -63,6 +64,8 @@ class DivergenceDiscrepancy(DensityDiscrepancy):
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the integral of a log(a / b), (a, b) = (q, p) forward, (p, q) in reverse."""
-        p, q = self.floored(features[0]), self.floored(self.density)
+        p = self.floored(features[0])
+        q = self.floored(self.density)
         a, b = (p, q) if self.metric.reverse else (q, p)
-        return (a * xp.log(a / b) * self.cells.widths).sum(axis=-1)
+        each = a * xp.log(a / b) * self.cells.widths
+        return each.sum(axis=-1)

@@ -44,11 +44,15 @@ class FunctionMetric(Metric):
 
     def __post_init__(self) -> None:
         if not callable(self.function):
-            raise TypeError(f"function: got {type(self.function).__name__}, expected f(simulated, observed)")
+            got = type(self.function).__name__
+            raise TypeError(f"function: got {got}, expected f(simulated, observed)")
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         if not np.allclose(weights, weights[0]):
-            raise ValueError("observed weights: got unequal ones, expected none; a FunctionMetric has no use for them")
+            raise ValueError(
+                "observed weights: got unequal ones, expected none; "
+                "a FunctionMetric has no use for them"
+            )
         return FunctionDiscrepancy(self, observed, weights)
 
 
@@ -64,22 +68,26 @@ class FunctionDiscrepancy(Discrepancy):
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
         """Return the value of the function."""
+        value = np.asarray(self._called(simulated, weights), dtype=np.float64)
+        expected = simulated.shape[:-1]
+        if value.shape != expected:
+            raise ValueError(
+                f"FunctionMetric: got a result of shape {value.shape} for simulated values of shape "
+                f"{simulated.shape}, expected {expected}; reduce over the last axis"
+            )
+        return (value,)
+
+    def _called(self, simulated: Floats, weights: Floats) -> Any:
+        """Call the function, with weights if it takes them; equal ones it need not know."""
+        function = self.metric.function
         if self.metric.weighted:
-            value = self.metric.function(simulated, self.observed, np.broadcast_to(weights, simulated.shape))
-        elif not np.allclose(weights, np.asarray(weights)[..., :1]):
+            return function(simulated, self.observed, np.broadcast_to(weights, simulated.shape))
+        if not np.allclose(weights, np.asarray(weights)[..., :1]):
             raise ValueError(
                 "weights: got unequal ones for a FunctionMetric whose function takes none; write "
                 "function(simulated, observed, weights) and pass weighted=True, or use prb.Resimulated"
             )
-        else:
-            value = self.metric.function(simulated, self.observed)
-        value = np.asarray(value, dtype=np.float64)
-        if value.shape != simulated.shape[:-1]:
-            raise ValueError(
-                f"FunctionMetric: got a result of shape {value.shape} for simulated values of shape "
-                f"{simulated.shape}, expected {simulated.shape[:-1]}; reduce over the last axis"
-            )
-        return (value,)
+        return function(simulated, self.observed)
 
     def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
         """Return the simulated values themselves."""
@@ -87,7 +95,8 @@ class FunctionDiscrepancy(Discrepancy):
 
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return the value of the function."""
-        return self.features(np.broadcast_to(basis[0], weights.shape), weights, xp)
+        (values,) = basis
+        return self.features(np.broadcast_to(values, weights.shape), weights, xp)
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the value of the function."""

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
-from prbayes.metrics.density import GaussianKDE, Histogram, silverman, weighted_quantile
+from prbayes._weighted import quantile
+from prbayes.metrics.density import GaussianKDE, Histogram, silverman
 
 
 def typical_bandwidth(values: Floats, weights: Floats) -> float:
@@ -77,7 +78,7 @@ def central_range(values: Floats, weights: Floats, tail: float) -> tuple[float, 
         used = np.isfinite(row) & (w > 0)
         if used.any():
             share = w[used] / w[used].sum()
-            ends.append([weighted_quantile(row[used], share, p) for p in (tail, 1 - tail)])
+            ends.append([quantile(row[used], share, p) for p in (tail, 1 - tail)])
     low, high = np.array(ends).T
     return float(np.quantile(low, 0.1)), float(np.quantile(high, 0.9))
 
