@@ -14,7 +14,6 @@ from prbayes._predict import data_digest, serving, specimen_names
 from prbayes.estimate.data_sets import groups, sets_at, simulated_points, specimens
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refit import Neighbourhood, inapplicable
-from prbayes.estimate.sandwich import prior_scale
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.validation.nulls import Case, Condition, Predictive, SimulatedNull
@@ -91,7 +90,7 @@ class JointNull(SimulatedNull):
             _refuse_other(c, populations[k][0][0] if values is None else values, populations[k][1][0])
         points = simulated_points(evaluator, populations, self.replicates, self.seed, more=total)
         scales = np.array(list(self.optimum.scales.values()))
-        hood = Neighbourhood.of(evaluator, theta, scales, prior_scale(evaluator))
+        hood = Neighbourhood.of(evaluator, theta, scales, evaluator.prior_sd)
         x, converged = hood.refit(sets_at(evaluator, populations, points))
         if converged.mean() < 0.5:
             raise ValueError(
