@@ -22,16 +22,22 @@ def real_array(values: ArrayLike, name: str) -> Floats:
     try:
         array = np.asarray(values)
     except ValueError as error:
-        raise TypeError(f"{name}: got a ragged sequence, expected a regular array of numbers") from error
+        raise TypeError(
+            f"{name}: got a ragged sequence, expected a regular array of numbers"
+        ) from error
     if array.dtype.kind == "c":
-        raise TypeError(f"{name}: got complex numbers, expected real ones; pass the real part or the modulus")
+        raise TypeError(
+            f"{name}: got complex numbers, expected real ones; pass the real part or the modulus"
+        )
     if array.dtype.kind not in "fiub":
         try:
             if array.dtype.kind != "O":
                 raise TypeError
             array = array.astype(np.float64)
         except (TypeError, ValueError):
-            raise TypeError(f"{name}: got {_describe(values, array)}, expected real numbers") from None
+            raise TypeError(
+                f"{name}: got {_describe(values, array)}, expected real numbers"
+            ) from None
     return np.asarray(array, dtype=np.float64)
 
 
@@ -113,7 +119,9 @@ def sample_weights(weights: ArrayLike | None, n: int, name: str = "weights") -> 
         return np.full(n, 1.0 / n)
     array = real_array(weights, name)
     if array.ndim == 0 or array.shape[-1] != n:
-        raise ValueError(f"{name}: got shape {array.shape}, expected (..., {n}), one weight per value")
+        raise ValueError(
+            f"{name}: got shape {array.shape}, expected (..., {n}), one weight per value"
+        )
     if not np.isfinite(array).all() or (array < 0).any():
         raise ValueError(f"{name}: got negative or non-finite weights, expected weights >= 0")
     total = array.sum(axis=-1, keepdims=True)
@@ -125,7 +133,9 @@ def sample_weights(weights: ArrayLike | None, n: int, name: str = "weights") -> 
 def positive_number(value: object, name: str) -> float:
     """Return ``value`` as a float, or raise if it is not a positive finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        raise TypeError(f"{name}: got {type(value).__name__} {value!r:.60}, expected a positive number")
+        raise TypeError(
+            f"{name}: got {type(value).__name__} {value!r:.60}, expected a positive number"
+        )
     if not np.isfinite(value) or value <= 0:
         raise ValueError(f"{name}: got {value!r}, expected a positive finite number")
     return float(value)
@@ -134,7 +144,9 @@ def positive_number(value: object, name: str) -> float:
 def positive_integer(value: object, name: str, *, minimum: int = 1) -> int:
     """Return ``value`` as an int, or raise if it is not an integer of at least ``minimum``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise TypeError(f"{name}: got {type(value).__name__} {value!r:.60}, expected an integer >= {minimum}")
+        raise TypeError(
+            f"{name}: got {type(value).__name__} {value!r:.60}, expected an integer >= {minimum}"
+        )
     if value < minimum:
         raise ValueError(f"{name}: got {value}, expected an integer >= {minimum}")
     return int(value)

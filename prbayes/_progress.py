@@ -11,7 +11,14 @@ from importlib.util import find_spec
 
 from rich.console import Console
 from rich.errors import LiveError
-from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 _log = logging.getLogger("prbayes")
 _SHOWN_FROM = 2.0  # expected seconds from which there is a bar
@@ -41,11 +48,17 @@ def shown(visible: bool) -> Iterator[bool]:
 def progress(what: str, total: int | None = None) -> Iterator[Callable[[int, str], None]]:
     """Give a function (done, note) to be called as work gets done; the bar appears when two seconds are expected.
 
-    Without a total nothing is known of what is left, and the bar appears when two seconds have passed.
+    Without a total nothing is known of what is left, and the bar appears when two seconds have
+    passed.
     """
     columns: list[ProgressColumn] = [TextColumn(what), BarColumn()]
-    columns += [TextColumn("{task.completed}" if total is None else "{task.completed}/{task.total}")]
-    columns += [TextColumn("{task.fields[note]}"), TimeElapsedColumn() if total is None else TimeRemainingColumn()]
+    columns += [
+        TextColumn("{task.completed}" if total is None else "{task.completed}/{task.total}")
+    ]
+    columns += [
+        TextColumn("{task.fields[note]}"),
+        TimeElapsedColumn() if total is None else TimeRemainingColumn(),
+    ]
     bar = Progress(*columns, console=CONSOLE)
     task = bar.add_task("", total=total, note="")
     clock, completed, started = time.perf_counter(), 0, _hidden.get()
@@ -55,7 +68,11 @@ def progress(what: str, total: int | None = None) -> Iterator[Callable[[int, str
         completed += done
         bar.update(task, advance=done, note=note)
         elapsed = time.perf_counter() - clock
-        if not started and (elapsed if total is None else elapsed * (total / max(completed, 1) - 1)) > _SHOWN_FROM:
+        if (
+            not started
+            and (elapsed if total is None else elapsed * (total / max(completed, 1) - 1))
+            > _SHOWN_FROM
+        ):
             started = True
             try:
                 bar.start()

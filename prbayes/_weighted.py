@@ -1,8 +1,9 @@
 """Distribution functions and quantiles of weighted samples.
 
 A distribution function at fixed points is linear in the weights. All else depends on the values
-alone: their order, and how many of them are not above each point. So it comes in two steps, `ranked`
-and `cumulated`, the second of which takes any number of weights and is written for NumPy and PyTensor.
+alone: their order, and how many of them are not above each point. So it comes in two steps,
+`ranked` and `cumulated`, the second of which takes any number of weights and is written for NumPy
+and PyTensor.
 
 NaN stands above +inf, as it does when NumPy sorts: it keeps its weight and is below no point.
 """
@@ -16,8 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats
 
-# Which of equal values comes first decides the last digit of a sum of weights, and nothing else. "stable"
-# keeps their order, on every processor; "quicksort" is seven times faster for 100 000 values.
+# Which of equal values comes first decides the last digit of a sum of weights, and nothing else.
+# "stable" keeps their order, on every processor; "quicksort" is seven times faster for 100 000
+# values.
 Sorting = Literal["stable", "quicksort"]
 
 
@@ -91,14 +93,14 @@ def _one_row(values: Floats) -> bool:
 def quantile(values: Floats, weights: Floats, probability: ArrayLike) -> Floats:
     """Return quantiles of weighted samples, linear between the mid-points of the function's steps.
 
-    With equal weights this is Hazen's definition. Below the first mid-point it is the smallest value,
-    above the last the largest.
+    With equal weights this is Hazen's definition. Below the first mid-point it is the smallest
+    value, above the last the largest.
 
     Parameters
     ----------
     values, weights : ndarray, shape (..., n)
-        The weights of a row sum to one. A value of weight zero is a corner of the curve like any other,
-        and one that is NaN makes all quantiles beyond its neighbour NaN: leave both out.
+        The weights of a row sum to one. A value of weight zero is a corner of the curve like any
+        other, and one that is NaN makes all quantiles beyond its neighbour NaN: leave both out.
     probability : array_like, shape () or (m,)
 
     Returns

@@ -1,6 +1,7 @@
 """Loops over the values of a sample, compiled by Numba (PyTensor's default backend) when they are first called.
 
-They read a sample once and keep nothing but the result, which NumPy's passes over whole arrays do not.
+They read a sample once and keep nothing but the result, which NumPy's passes over whole arrays do
+not.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ import numpy as np
 
 from prbayes._checks import Floats
 
-# The four cubic B-splines that reach a point at fraction t between two nodes: coefficients of 1, t, t^2, t^3.
+# The four cubic B-splines that reach a point at fraction t between two nodes: coefficients of 1, t,
+# t^2, t^3.
 SPLINE = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6
 
 
@@ -36,12 +38,19 @@ def _compiled[**P](loop: Callable[P, None]) -> Callable[P, None]:
 
 @_compiled
 def count(
-    sample: Floats, weights: Floats, equal: bool, low: float, inverse: float, counts: Floats, outside: Floats
+    sample: Floats,
+    weights: Floats,
+    equal: bool,
+    low: float,
+    inverse: float,
+    counts: Floats,
+    outside: Floats,
 ) -> None:
     """Add weights at the nodes of a grid, spread by cubic B-splines, and those of values below and above.
 
-    Node k is at ``(low + k) / inverse``. The sample has shape (rows, n), the counts (rows, g), ``outside`` (rows, 2);
-    the weights are flat, and only the first counts if they are equal. NaN counts nowhere.
+    Node k is at ``(low + k) / inverse``. The sample has shape (rows, n), the counts (rows, g),
+    ``outside`` (rows, 2); the weights are flat, and only the first counts if they are equal. NaN
+    counts nowhere.
     """
     rows, n = sample.shape
     g = counts.shape[1]
@@ -85,11 +94,13 @@ def smooth(values: Floats, kernel: Floats, out: Floats) -> None:
 
 
 @_compiled
-def read(sample: Floats, coefficients: Floats, outside: Floats, low: float, inverse: float, out: Floats) -> None:
+def read(
+    sample: Floats, coefficients: Floats, outside: Floats, low: float, inverse: float, out: Floats
+) -> None:
     """Evaluate piecewise cubics at a sample, shape (1 or rows, n), into ``out``, shape (rows, n).
 
-    The coefficients of 1, t, t^2, t^3 beyond each node have shape (rows, g, 4); values below and above the grid get
-    those of ``outside``, shape (rows, 2), and NaN gets zero.
+    The coefficients of 1, t, t^2, t^3 beyond each node have shape (rows, g, 4); values below and
+    above the grid get those of ``outside``, shape (rows, 2), and NaN gets zero.
     """
     rows, n = out.shape
     g = coefficients.shape[1]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats
 from prbayes._weighted import cumulated, ranked
-from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.metrics.base import Discrepancy, Metric, Minimum
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class AreaMetric(Metric):
     0.5
     """
 
-    smooth: ClassVar[bool] = False
+    minimum: ClassVar[Minimum] = Minimum.ABSOLUTE
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         return AreaDiscrepancy(self, observed, weights)
@@ -58,7 +58,8 @@ class AreaDiscrepancy(Discrepancy):
         pooled = xp.concatenate([simulated, observed], axis=-1)
         order = xp.argsort(pooled, axis=-1)
         pooled = xp.take_along_axis(pooled, order, axis=-1)
-        # Simulated values add to the difference of the distribution functions, observed ones subtract.
+        # Simulated values add to the difference of the distribution functions, observed ones
+        # subtract.
         signed = xp.concatenate([weights, -u], axis=-1)
         signed = xp.take_along_axis(signed, order, axis=-1)
         del order  # a population of ten million is to fit into little memory

@@ -5,14 +5,15 @@ measured side and is called with simulated responses. It works in two steps:
 
 - *features*: a density on cells, or a difference of distribution functions. For responses that stay
   the same they are a linear map of the weights (`Discrepancy.basis`, `Discrepancy.from_basis`);
-- the *outer* function of the features, which takes the array namespace, so that the direct call, the
-  optimiser's gradient and the compiled graph of a PyMC model run through the same lines.
+- the *outer* function of the features, which takes the array namespace, so that the direct call,
+  the optimiser's gradient and the compiled graph of a PyMC model run through the same lines.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -26,14 +27,34 @@ from prbayes.metrics.cells import Cells, product
 _FLOOR = 1e-9
 
 
+class Minimum(Enum):
+    """How a discrepancy behaves around its minimum, as far as its metric declares it.
+
+    Attributes
+    ----------
+    QUADRATIC
+        Twice differentiable in the hyperparameters: Hessian and gradient tell the sampling
+        distribution.
+    ABSOLUTE
+        An integral of absolute differences between distribution functions, each linear in the
+        weights.
+    UNKNOWN
+        Nothing is declared; what is needed is measured by refits, or refused.
+    """
+
+    QUADRATIC = "quadratic"
+    ABSOLUTE = "absolute"
+    UNKNOWN = "unknown"
+
+
 @dataclass(frozen=True, eq=False)
 class Discrepancy(ABC):
     """A metric with its observed side prepared; call it with simulated responses.
 
-    Whoever adds a metric derives from this class, or from `DensityDiscrepancy` if the metric compares
-    densities, and defines the abstract methods. All of them are batched: the last axis runs over the
-    values, axes before it over populations. Records are immutable; another observed side makes
-    another record.
+    Whoever adds a metric derives from this class, or from `DensityDiscrepancy` if the metric
+    compares densities, and defines the abstract methods. All of them are batched: the last axis
+    runs over the values, axes before it over populations. Records are immutable; another observed
+    side makes another record.
 
     Attributes
     ----------
@@ -109,8 +130,8 @@ class Discrepancy(ABC):
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return the features of the values that the basis was made for.
 
-        Equal to ``features(simulated, weights, xp)`` up to what the outer function does not see, and
-        linear in the weights, shape (..., n), so that gradients are exact.
+        Equal to ``features(simulated, weights, xp)`` up to what the outer function does not see,
+        and linear in the weights, shape (..., n), so that gradients are exact.
         """
 
     @abstractmethod
@@ -119,6 +140,25 @@ class Discrepancy(ABC):
 
         Written with ``xp`` (`numpy` or `pytensor.tensor`), by functions that both have.
         """
+
+    @property
+    def symbolic(self) -> bool:
+        """Whether `outer` can be written as a graph; else it is called as an operation without gradient."""
+        return True
+
+    @property
+    def density_cells(self) -> Cells | None:
+        """The cells on which densities are compared, None where the features are none."""
+        return None
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether the discrepancy has second derivatives in the values and weights of the population."""
+        return self.metric.minimum is Minimum.QUADRATIC
+
+    def overlap(self, simulated: Floats, weights: Floats) -> Floats:
+        """Return the overlap of simulated and observed densities, (..., n) -> (...); one where there are none."""
+        return np.ones(np.shape(simulated)[:-1])
 
     def of(self, simulated: Floats, weights: Floats) -> Any:
         """Return the discrepancy of checked values (..., n) and weights that sum to at most one."""
@@ -155,24 +195,34 @@ class Metric(ABC):
 
     Attributes
     ----------
-    smooth : bool
-        Whether the discrepancy is twice differentiable in the hyperparameters. If so, standard errors
-        come from its second derivatives.
+    minimum : Minimum
+        How the discrepancy behaves around its minimum; unknown unless the metric declares it.
     additive : bool
         Whether its gradient in the hyperparameters is a mean over observations, as that of an outer
         function linear in the observed density. If not, standard errors come from simulated data
-        sets. Unless it is declared, smooth metrics are taken for additive.
+        sets. Metrics with a quadratic minimum are taken for additive unless they declare it.
+    takes_weights : bool
+        Whether simulated responses may have unequal weights, as under `Reweighted`.
+    tail_responses : int
+        Simulated responses for each observation, all of equal weight, below which the metric sees
+        too little of the population's tails; zero where that does not matter.
     likelihood : bool
         Whether N times the discrepancy is on the scale of a log-likelihood, so that epsilon is 1/N.
     """
 
-    smooth: ClassVar[bool] = True
+    minimum: ClassVar[Minimum] = Minimum.UNKNOWN
     likelihood: ClassVar[bool] = False
+    tail_responses: ClassVar[int] = 0
 
     @property
     def additive(self) -> bool:
         """Whether the gradient in the hyperparameters is a mean over observations."""
-        return self.smooth
+        return self.minimum is Minimum.QUADRATIC
+
+    @property
+    def takes_weights(self) -> bool:
+        """Whether simulated responses may have unequal weights, as under `Reweighted`."""
+        return True
 
     @abstractmethod
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
@@ -196,8 +246,8 @@ class Metric(ABC):
         Raises
         ------
         TypeError, ValueError
-            If the observed values are not one-dimensional, real and finite, or if the metric needs a
-            bandwidth or bins and they are all equal.
+            If the observed values are not one-dimensional, real and finite, or if the metric needs
+            a bandwidth or bins and they are all equal.
         """
         sample = observed_sample(observed)
         w = sample_weights(weights, sample.size, "observed weights")
@@ -223,8 +273,9 @@ class DensityDiscrepancy(Discrepancy):
 
     The only feature is the simulated density, shape (..., m). A metric that derives from this class
     defines `outer`, and nothing else unless it needs further fields; ``on_cells`` makes it. In
-    ``outer``, ``self.density`` is the observed density, and an integral is a sum over the last axis of
-    values times ``self.cells.widths``. The last two cells are the mass below and above all others.
+    ``outer``, ``self.density`` is the observed density, and an integral is a sum over the last axis
+    of values times ``self.cells.widths``. The last two cells are the mass below and above all
+    others.
 
     Attributes
     ----------
@@ -269,6 +320,16 @@ class DensityDiscrepancy(Discrepancy):
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return the density on the cells."""
         return (weights @ basis[0],)
+
+    @property
+    def density_cells(self) -> Cells:
+        """The cells."""
+        return self.cells
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether the densities, as functions of the simulated values, are smooth too; those of a histogram are not."""
+        return super().differentiable and self.cells.smooth
 
     @property
     def scale(self) -> float:

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 from prbayes.metrics._loops import SPLINE, count, read, smooth
 
-# Of a bin's width: by how much a value may miss the outermost edge and still be in the last bin. Edges
-# are rounded to parts in 1e16 of their size, and there are at most some thousands of them.
+# Of a bin's width: by how much a value may miss the outermost edge and still be in the last bin.
+# Edges are rounded to parts in 1e16 of their size, and there are at most some thousands of them.
 _EDGE = 1e-9
 
 
@@ -170,7 +170,8 @@ class KernelCells(Cells):
         sample : ndarray, shape (..., n)
         cotangent : ndarray, shape (..., g + 2)
         spline : ndarray, shape (4, 4)
-            Coefficients of powers of the fraction of a step, for the four splines that reach a point.
+            Coefficients of powers of the fraction of a step, for the four splines that reach a
+            point.
         outer : ndarray, shape (..., 2)
             What values below and above the grid get.
         """

@@ -1,8 +1,8 @@
 """Density estimates: Gaussian kernels, histograms, bandwidth rules.
 
 A calibration metric compares the simulated density with the observed one on the same *cells*. The
-cells are laid out once, from the observed values; afterwards a density is linear in the weights of the
-sample, which is what makes every metric of this package cheap and differentiable.
+cells are laid out once, from the observed values; afterwards a density is linear in the weights of
+the sample, which is what makes every metric of this package cheap and differentiable.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes._weighted import quantile
 from prbayes.metrics.cells import BinCells, Cells, KernelCells
 
-# Bandwidths of grid beyond the outermost observation, at least. A Gaussian kernel has 1e-9 of its mass
-# farther out, as much as the floor of logarithms (`DensityDiscrepancy.floored`).
+# Bandwidths of grid beyond the outermost observation, at least. A Gaussian kernel has 1e-9 of its
+# mass farther out, as much as the floor of logarithms (`DensityDiscrepancy.floored`).
 _MARGIN = 6.0
 
-# Grid nodes per bandwidth. The density is then exact to 3e-5 of a kernel's peak, which a test holds;
-# with three nodes to 1e-4, with six to 6e-6. The cost of comparing densities grows in proportion.
+# Grid nodes per bandwidth. The density is then exact to 3e-5 of a kernel's peak, which a test
+# holds; with three nodes to 1e-4, with six to 6e-6. The cost of comparing densities grows in
+# proportion.
 _PER_BANDWIDTH = 4
 
-# By judgement: a limit to memory, 64 kB for the density of one population. It is met where an outlier
-# stands a thousand bandwidths away from the other observations.
+# By judgement: a limit to memory, 64 kB for the density of one population. It is met where an
+# outlier stands a thousand bandwidths away from the other observations.
 _MAX_CELLS = 8192
 
 # Standard deviations at which the smoothing kernel ends: 2e-11 of its peak.
@@ -41,8 +42,8 @@ BandwidthRule = Callable[[Floats, Floats], float]
 def spread(sample: Floats, weights: Floats) -> float:
     """Return min(standard deviation, IQR / 1.34) of a weighted sample.
 
-    1.34 is the interquartile range of the standard normal distribution. Where the IQR is zero, it is
-    the standard deviation alone.
+    1.34 is the interquartile range of the standard normal distribution. Where the IQR is zero, it
+    is the standard deviation alone.
     """
     sample = sample - sample.min()  # equal values give exactly zero
     mean = weights @ sample
@@ -82,7 +83,8 @@ def likelihood_bandwidth(sample: Floats, weights: Floats) -> float:
     """Return 0.35 min(sd, IQR/1.34) n^(-1/4), the default of the log-likelihood.
 
     Only the simulated side is smoothed there, which makes the fitted population too narrow by about
-    h^2 / (2 sd^2); with this rule that is at most a tenth of the sampling error sd / sqrt(2 n) for every n.
+    h^2 / (2 sd^2); with this rule that is at most a tenth of the sampling error sd / sqrt(2 n) for
+    every n.
     """
     inverse_n = (weights**2).sum()
     return float(0.35 * spread(sample, weights) * inverse_n**0.25)
@@ -100,22 +102,22 @@ class DensityEstimator(ABC):
 class GaussianKDE(DensityEstimator):
     """Gaussian kernel density with one bandwidth, fixed by the observed side, for both sides.
 
-    The sample is binned on a regular grid of four nodes per bandwidth, with cubic B-spline weights, and
-    smoothed there; the kernel is narrowed by the spline's variance, so that the density's variance is
-    exact, its error is of fourth order in the spacing, and it is twice differentiable in the sample
-    inside the grid.
+    The sample is binned on a regular grid of four nodes per bandwidth, with cubic B-spline weights,
+    and smoothed there; the kernel is narrowed by the spline's variance, so that the density's
+    variance is exact, its error is of fourth order in the spacing, and it is twice differentiable
+    in the sample inside the grid.
 
     Parameters
     ----------
     bandwidth : float or callable, optional
-        In units of the response, or a rule ``(observed, weights) -> float``. Two Silverman bandwidths
-        by default.
+        In units of the response, or a rule ``(observed, weights) -> float``. Two Silverman
+        bandwidths by default.
 
     Raises
     ------
     ValueError
-        If the observed values are all equal, so that no rule gives a bandwidth, or if they span so many
-        bandwidths that the grid would be unreasonably long.
+        If the observed values are all equal, so that no rule gives a bandwidth, or if they span so
+        many bandwidths that the grid would be unreasonably long.
 
     References
     ----------

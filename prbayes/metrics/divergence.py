@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from prbayes._checks import Floats
-from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric
+from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric, Minimum
 from prbayes.metrics.density import DensityEstimator, GaussianKDE, density_estimator
 
 
@@ -15,13 +15,14 @@ class KullbackLeibler(Metric):
     r"""Kullback-Leibler divergence between the observed density q and the simulated density p.
 
     Forward (default): :math:`\int q \log(q / p)\,dz`; reverse: :math:`\int p \log(p / q)\,dz`. Both
-    densities have the same bandwidth and the floor of ``DensityDiscrepancy.floored``; the reverse one
-    depends on it, because the observed density vanishes quickly outside the data.
+    densities have the same bandwidth and the floor of ``DensityDiscrepancy.floored``; the reverse
+    one depends on it, because the observed density vanishes quickly outside the data.
 
-    Eq. 4 of [1]_ as printed, :math:`\sum_i p(z_i) \log(p(z_i)/q(z_i))` over the observed points with p
-    the simulated density, is ill-posed as an objective: its terms are not normalised over the points, so
-    that it goes negative, and it is made small by moving the population away from the data altogether.
-    Hence the integral, and the forward direction, which is maximum likelihood of smoothed data.
+    Eq. 4 of [1]_ as printed, :math:`\sum_i p(z_i) \log(p(z_i)/q(z_i))` over the observed points
+    with p the simulated density, is ill-posed as an objective: its terms are not normalised over
+    the points, so that it goes negative, and it is made small by moving the population away from
+    the data altogether. Hence the integral, and the forward direction, which is maximum likelihood
+    of smoothed data.
 
     Parameters
     ----------
@@ -42,6 +43,7 @@ class KullbackLeibler(Metric):
 
     density: DensityEstimator = field(default_factory=GaussianKDE)
     reverse: bool = False
+    minimum: ClassVar[Minimum] = Minimum.QUADRATIC
     likelihood: ClassVar[bool] = True
 
     def __post_init__(self) -> None:

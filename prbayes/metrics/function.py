@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,8 @@ class FunctionMetric(Metric):
     Parameters
     ----------
     function : callable
-        ``function(simulated, observed) -> discrepancy``, shapes (..., n), (N,) -> (...); smaller is better.
+        ``function(simulated, observed) -> discrepancy``, shapes (..., n), (N,) -> (...); smaller is
+        better.
     weighted : bool
         Whether the function takes the weights of the simulated values, shape (..., n), as a third
         argument. `Reweighted` needs that; the other propagations do not.
@@ -40,12 +41,16 @@ class FunctionMetric(Metric):
 
     function: Callable[..., Any]
     weighted: bool = False
-    smooth: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not callable(self.function):
             got = type(self.function).__name__
             raise TypeError(f"function: got {got}, expected f(simulated, observed)")
+
+    @property
+    def takes_weights(self) -> bool:
+        """Whether the function takes the weights of simulated responses."""
+        return self.weighted
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         if not np.allclose(weights, weights[0]):
@@ -60,6 +65,11 @@ class FunctionDiscrepancy(Discrepancy):
     """A user's metric against fixed observed values."""
 
     metric: FunctionMetric
+
+    @property
+    def symbolic(self) -> bool:
+        """No: the function is called."""
+        return False
 
     @property
     def scale(self) -> float:

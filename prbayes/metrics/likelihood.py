@@ -6,9 +6,20 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
 from prbayes._checks import Floats
-from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric, observed_density
+from prbayes.metrics.base import (
+    DensityDiscrepancy,
+    Discrepancy,
+    Metric,
+    Minimum,
+    observed_density,
+)
 from prbayes.metrics.cells import Cells
-from prbayes.metrics.density import DensityEstimator, GaussianKDE, density_estimator, likelihood_bandwidth
+from prbayes.metrics.density import (
+    DensityEstimator,
+    GaussianKDE,
+    density_estimator,
+    likelihood_bandwidth,
+)
 
 
 @dataclass(frozen=True)
@@ -36,7 +47,9 @@ class LogLikelihood(Metric):
     """
 
     density: DensityEstimator = field(default_factory=lambda: GaussianKDE(likelihood_bandwidth))
+    minimum: ClassVar[Minimum] = Minimum.QUADRATIC
     likelihood: ClassVar[bool] = True
+    tail_responses: ClassVar[int] = 300  # from which standard errors are right to a tenth
 
     def __post_init__(self) -> None:
         density_estimator(self.density)

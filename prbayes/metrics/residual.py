@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from prbayes._checks import Floats, positive_number
-from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric, observed_density
+from prbayes.metrics.base import (
+    DensityDiscrepancy,
+    Discrepancy,
+    Metric,
+    Minimum,
+    observed_density,
+)
 from prbayes.metrics.cells import Cells
 from prbayes.metrics.density import DensityEstimator, GaussianKDE, density_estimator
 
@@ -17,16 +23,18 @@ from prbayes.metrics.density import DensityEstimator, GaussianKDE, density_estim
 class ProbabilityResidual(Metric):
     r"""Probability residual: the scaled squared difference of two densities.
 
-    With a `GaussianKDE` the integral form, :math:`S \int (p - q)^2 dz`, one bandwidth for both sides; it
-    equals a squared maximum mean discrepancy with a Gaussian kernel of bandwidth :math:`\sqrt 2 h`, so
-    its minimiser is right for every bandwidth. With a `Histogram` the sum form, :math:`S \sum (p_i - q_i)^2`
-    over densities in bins. The scale factor is :math:`S = C^{-\lfloor \log_{10} \max q \rfloor}`.
+    With a `GaussianKDE` the integral form, :math:`S \int (p - q)^2 dz`, one bandwidth for both
+    sides; it equals a squared maximum mean discrepancy with a Gaussian kernel of bandwidth
+    :math:`\sqrt 2 h`, so its minimiser is right for every bandwidth. With a `Histogram` the sum
+    form, :math:`S \sum (p_i - q_i)^2` over densities in bins. The scale factor is :math:`S =
+    C^{-\lfloor \log_{10} \max q \rfloor}`.
 
     Parameters
     ----------
     density : GaussianKDE or Histogram
     scale_base : float
-        The constant C. It has no influence on the minimiser, only on an optimiser's absolute tolerances.
+        The constant C. It has no influence on the minimiser, only on an optimiser's absolute
+        tolerances.
 
     Raises
     ------
@@ -50,6 +58,7 @@ class ProbabilityResidual(Metric):
 
     density: DensityEstimator = field(default_factory=GaussianKDE)
     scale_base: float = 100.0
+    minimum: ClassVar[Minimum] = Minimum.QUADRATIC
 
     def __post_init__(self) -> None:
         density_estimator(self.density)

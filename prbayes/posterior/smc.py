@@ -28,7 +28,6 @@ from prbayes.posterior.checkpoint import Checkpoint, stored_identity
 from prbayes.posterior.epsilon import calibrate_epsilon
 from prbayes.posterior.smc_kernel import BatchedKernel
 from prbayes.posterior.trees import posterior_tree
-from prbayes.propagation.fresh import FreshBound
 
 _log = logging.getLogger("prbayes")
 
@@ -332,9 +331,9 @@ class _Run:
 
     def _generators(self) -> dict[str, Any]:
         """Return how often the generators of simulators with `Fresh` have been used."""
-        return {n.name: n.bound.used for n in self.evaluator.nodes if isinstance(n.bound, FreshBound)}
+        return {n.name: n.bound.draws for n in self.evaluator.nodes if n.bound.random}
 
     def _restore_generators(self, states: dict[str, Any]) -> None:
         for node in self.evaluator.nodes:
-            if isinstance(node.bound, FreshBound):
-                node.bound.used = states[node.name]
+            if node.bound.random:
+                node.bound.draws = states[node.name]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytensor.tensor as pt
@@ -60,15 +60,16 @@ class FreshBound(Bound):
 
     Attributes
     ----------
-    used : int
+    draws : int
         Number of evaluations so far; with the seed it determines the next draws.
     """
+
+    random: ClassVar[bool] = True
 
     def __init__(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses, config: Fresh) -> None:
         super().__init__(name, inputs, target, responses)
         self.n_per_theta = config.n
         self._seed = config.random_seed
-        self.used = 0
         self._sampler = PopulationSampler(inputs)
         probe(self, self._sampler, config.random_seed)
 
@@ -78,8 +79,8 @@ class FreshBound(Bound):
 
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
         """Return fresh responses with equal weights."""
-        self.used += 1
-        rng = np.random.default_rng([self._seed, self.used])
+        self.draws += 1
+        rng = np.random.default_rng([self._seed, self.draws])
         values = self.responses(*self._sampler(params, self.n_per_theta, rng))
         return values, np.broadcast_to(1 / self.n_per_theta, values.shape)
 

@@ -16,7 +16,6 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
-from prbayes.metrics.likelihood import LikelihoodDiscrepancy
 from prbayes.propagation.base import Bound, Propagation, probe, refuse_nested
 from prbayes.propagation.ops import ResponseOp, symbolic_discrepancy
 from prbayes.propagation.points import base_points, points_from
@@ -68,7 +67,6 @@ class Resimulated(Propagation):
         return ResimulatedBound(name, inputs, target, responses, self)
 
 
-_TAILS = 300  # responses for each observation from which a log-likelihood's standard errors are right to a tenth
 _KEPT = 1 << 21  # base points whose transforms may stay in memory
 
 
@@ -80,13 +78,13 @@ class ResimulatedBound(Bound):
     ) -> None:
         super().__init__(name, inputs, target, responses)
         self.n_per_theta = config.n
-        enough = _TAILS * target.n_effective
-        if isinstance(target, LikelihoodDiscrepancy) and config.n < enough:
+        enough = target.metric.tail_responses * target.n_effective
+        if config.n < enough:
             _log.warning(
                 "%s: the log-likelihood of %d resimulated responses sees too little of the tails: its standard errors "
                 "and posterior come out too narrow, expected at least %.0f responses, %d for each observation; use "
                 "prb.Reweighted(n), prb.KullbackLeibler() or a larger n",
-                name, config.n, enough, _TAILS,
+                name, config.n, enough, target.metric.tail_responses,
             )  # fmt: skip
         _, points = base_points(inputs, config.n, config.random_seed, points_from(config.points))
         # What depends on constants alone, PyTensor computes once and keeps: fast, unless it is too large to keep.

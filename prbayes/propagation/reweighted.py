@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytensor
@@ -19,7 +19,6 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes.metrics.base import Discrepancy
-from prbayes.metrics.function import FunctionMetric
 from prbayes.propagation.base import N_BLOCKS, Bound, Propagation, refuse_all_nan, refuse_nested
 from prbayes.propagation.ops import OpaqueOp
 from prbayes.propagation.points import base_points
@@ -88,9 +87,9 @@ class Reweighted(Propagation):
                 "variable (epistemic), so stored responses cannot be reweighted; use propagation=prb.Resimulated()"
             )
         refuse_nested(name, inputs)
-        if getattr(target.metric, "weighted", True) is False:
+        if not target.metric.takes_weights:
             raise TypeError(
-                f"{name}: a FunctionMetric without weights cannot be used with prb.Reweighted; write "
+                f"{name}: a metric that takes no weights cannot be used with prb.Reweighted; in a FunctionMetric write "
                 "function(simulated, observed, weights) with weighted=True, or use propagation=prb.Resimulated()"
             )
         return Design(name, inputs, target, responses, self)
@@ -113,6 +112,8 @@ class Design(Bound):
     The points of a batch are stratified over a finite list of roots' values; the list is kept, and g is
     exactly the mixture, over all batches, of the densities at the listed values (balance heuristic).
     """
+
+    stored: ClassVar[bool] = True
 
     def __init__(self, name: str, inputs: Any, target: Discrepancy, responses: Responses, config: Reweighted) -> None:
         super().__init__(name, inputs, target, responses)
@@ -333,7 +334,7 @@ class Design(Bound):
         raw = pt.exp(pt.switch(supported, logs - disconnected_grad(top), 0.0))
         weights = raw / raw.sum()
         basis = tuple(self._shared[len(self.inputs.aleatory) + 1 :])
-        if isinstance(self.target.metric, FunctionMetric):
+        if not self.target.symbolic:
             d = OpaqueOp(self.target)(*basis, weights)
         else:
             d = self.target.outer(*self.target.from_basis(weights, basis, pt), xp=pt)
@@ -383,6 +384,11 @@ class Design(Bound):
             "mean_weight": np.exp(total - np.log(self.values.size)),
             "lost_mass": np.nan_to_num(lost, nan=1.0),
         }
+
+
+def design_of(bound: Bound) -> Design | None:
+    """Return a bound as a design if its responses are stored, and else None."""
+    return bound if isinstance(bound, Design) else None
 
 
 def _log_sum(logs: Floats, axis: int) -> Floats:
