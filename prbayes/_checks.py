@@ -1,4 +1,7 @@
-"""Coercion and checks of samples, weights and shapes; every message says got, expected, what to do."""
+"""Coercion and checks of samples, weights and shapes.
+
+Every message says what was got, what was expected, and what to do.
+"""
 
 from __future__ import annotations
 
@@ -30,18 +33,23 @@ def real_array(values: ArrayLike, name: str) -> Floats:
             f"{name}: got complex numbers, expected real ones; pass the real part or the modulus"
         )
     if array.dtype.kind not in "fiub":
-        try:
-            if array.dtype.kind != "O":
-                raise TypeError
-            array = array.astype(np.float64)
-        except (TypeError, ValueError):
-            raise TypeError(
-                f"{name}: got {_describe(values, array)}, expected real numbers"
-            ) from None
+        array = _numbers_in_objects(values, array, name)
     return np.asarray(array, dtype=np.float64)
 
 
+def _numbers_in_objects(values: object, array: NDArray[Any], name: str) -> Floats:
+    """Return the numbers that an array of Python objects holds, or raise for any other array."""
+    if array.dtype.kind == "O":
+        try:
+            return array.astype(np.float64)
+        except (TypeError, ValueError):
+            pass
+    got = _describe(values, array)
+    raise TypeError(f"{name}: got {got}, expected real numbers")
+
+
 def _describe(values: object, array: NDArray[Any]) -> str:
+    """Return what was passed, in words for a message."""
     if array.ndim == 0:
         return f"{type(values).__name__} {values!r:.60}"
     return f"an array of dtype {array.dtype}"
@@ -88,7 +96,7 @@ def observed_sample(values: ArrayLike, name: str = "observed", *, minimum: int =
 
 
 def simulated_sample(values: ArrayLike, name: str = "simulated") -> Floats:
-    """Check simulated responses, shape (..., n); NaN and -inf are refused, +inf (a failed specimen) is not."""
+    """Check simulated responses, shape (..., n): no NaN or -inf; +inf is a failed specimen."""
     array = real_array(values, name)
     if array.ndim == 0 or array.shape[-1] == 0:
         raise ValueError(f"{name}: got shape {array.shape}, expected (..., n) with n >= 1")

@@ -16,6 +16,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats, positive_integer
+from prbayes._weighted import reached
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.labels import versions
 from prbayes.model.simulator import Node, model_on_context, nodes
@@ -212,11 +213,8 @@ def _resampled(node: Node, roots: list[Floats], n: int, rng: np.random.Generator
             "sample again, or pass stored=False, which computes responses of new specimens"
         )
     _, weights = design.populations(roots)
-    cumulative = np.cumsum(np.nan_to_num(weights), axis=1)
-    cumulative /= np.maximum(cumulative[:, -1:], 1e-300)
     places = (np.arange(n) + rng.random((len(weights), 1))) / n
-    found = np.array([np.searchsorted(c, u) for c, u in zip(cumulative, places, strict=True)])
-    return rng.permuted(np.minimum(found, design.n_points - 1), axis=1)
+    return rng.permuted(reached(np.nan_to_num(weights), places, normalized=True), axis=1)
 
 
 def _new_specimens(

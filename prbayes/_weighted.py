@@ -74,20 +74,25 @@ def distribution_function(
     -------
     ndarray, shape (..., m)
     """
-    if _one_row(values):
-        row = values[(0,) * (values.ndim - 1)]
-        order, below = ranked(row, points, kind=kind)
-        return np.asarray(cumulated(weights, order)[..., below])
+    if _is_one_row(values):
+        first = (0,) * (values.ndim - 1)
+        order, below = ranked(values[first], points, kind=kind)
+        total = cumulated(weights, order)
+        return np.asarray(total[..., below])
     rows = np.broadcast_to(values, weights.shape)
-    out = np.empty((*weights.shape[:-1], points.size))
-    for i in np.ndindex(*weights.shape[:-1]):
+    batch = weights.shape[:-1]
+    out = np.empty((*batch, points.size))
+    for i in np.ndindex(batch):
         out[i] = distribution_function(rows[i], weights[i], points, kind=kind)
     return out
 
 
-def _one_row(values: Floats) -> bool:
-    """Return whether a batch of values is a single row, repeated without copies; it is sorted once."""
-    return values.ndim == 1 or (values.size > 0 and not any(values.strides[:-1]))
+def _is_one_row(values: Floats) -> bool:
+    """Return whether a batch of values is one row repeated without copies, to be sorted once."""
+    if values.ndim == 1:
+        return True
+    repeated = not any(values.strides[:-1])
+    return repeated and values.size > 0
 
 
 def quantile(values: Floats, weights: Floats, probability: ArrayLike) -> Floats:
@@ -100,23 +105,26 @@ def quantile(values: Floats, weights: Floats, probability: ArrayLike) -> Floats:
     ----------
     values, weights : ndarray, shape (..., n)
         The weights of a row sum to one. A value of weight zero is a corner of the curve like any
-        other, and one that is NaN makes all quantiles beyond its neighbour NaN: leave both out.
+        other, and NaN makes quantiles beyond its lower neighbour NaN: leave both out.
     probability : array_like, shape () or (m,)
 
     Returns
     -------
     ndarray, shape (...) or (..., m)
     """
-    values, weights = np.broadcast_arrays(values, weights)
-    levels = np.asarray(probability, dtype=np.float64)
-    batch = values.shape[:-1]
-    out = np.empty(batch + levels.shape)
-    for i in np.ndindex(*batch):
-        order = np.argsort(values[i], kind="stable")
-        w = weights[i][order]
-        middles = np.cumsum(w) - 0.5 * w
-        out[i] = np.interp(levels, middles, values[i][order])
-    return out
+    levels = np.atleast_1d(probability)
+    found = np.asarray(_row_quantiles(values, weights, levels))
+    return found if np.ndim(probability) > 0 else found[..., 0]
+
+
+def _quantiles_of_row(values: Floats, weights: Floats, levels: Floats) -> Floats:
+    order = np.argsort(values, kind="stable")
+    ascending = weights[order]
+    middles = np.cumsum(ascending) - 0.5 * ascending
+    return np.interp(levels, middles, values[order])
+
+
+_row_quantiles = np.vectorize(_quantiles_of_row, [np.float64], signature="(n),(n),(m)->(m)")
 
 
 def reached(weights: Floats, levels: Floats, *, normalized: bool = False) -> NDArray[np.intp]:
@@ -139,11 +147,11 @@ def reached(weights: Floats, levels: Floats, *, normalized: bool = False) -> NDA
     """
     total = np.cumsum(weights, axis=-1)
     if normalized:
-        total /= np.maximum(total[..., -1:], np.finfo(np.float64).tiny)
-    batch = np.broadcast_shapes(total.shape[:-1], levels.shape[:-1])
-    rows = np.broadcast_to(total, batch + total.shape[-1:])
-    wanted = np.broadcast_to(levels, batch + levels.shape[-1:])
-    found = np.empty(wanted.shape, dtype=np.intp)
-    for i in np.ndindex(*batch):
-        found[i] = np.searchsorted(rows[i], wanted[i])
-    return np.minimum(found, weights.shape[-1] - 1)
+        whole = total[..., -1:]
+        total = total / np.where(whole > 0, whole, 1.0)
+    last = total.shape[-1] - 1
+    found = np.minimum(_row_positions(total, levels), last)
+    return np.asarray(found, dtype=np.intp)
+
+
+_row_positions = np.vectorize(np.searchsorted, [np.intp], signature="(n),(m)->(m)")

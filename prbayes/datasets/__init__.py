@@ -64,13 +64,15 @@ def crack_growth() -> xr.Dataset:
         },
         attrs={
             "description": (
-                "Fatigue crack growth in metal: crack length of 21 specimens, read every 10 000 cycles to "
-                "0.01 inch, until 1.60 inch (failure) or 120 000 cycles; NaN after failure"
+                "Fatigue crack growth in metal: crack length of 21 specimens, read every 10 000 "
+                "cycles to 0.01 inch, until 1.60 inch (failure) or 120 000 cycles; NaN after "
+                "failure"
             ),
             "source": (
-                "C. J. Lu and W. Q. Meeker (1993), Using degradation measures to estimate a time-to-failure "
-                "distribution, Technometrics 35(2), 161-174, Table 1; values read from figure 4.5.2 of "
-                "J. L. Bogdanoff and F. Kozin (1985), Probabilistic Models of Cumulative Damage, Wiley"
+                "C. J. Lu and W. Q. Meeker (1993), Using degradation measures to estimate a "
+                "time-to-failure distribution, Technometrics 35(2), 161-174, Table 1; values read "
+                "from figure 4.5.2 of J. L. Bogdanoff and F. Kozin (1985), Probabilistic Models of "
+                "Cumulative Damage, Wiley"
             ),
             "notch_inch": 0.90,
         },

@@ -1,4 +1,4 @@
-"""What a calibration metric is: features linear in the weights of the responses, then one function of them.
+"""What a calibration metric is: features of a weighted population, then one function of them.
 
 `Metric` is configuration. ``metric.against(observed)`` prepares a `Discrepancy`, which holds the
 measured side and is called with simulated responses. It works in two steps:
@@ -84,7 +84,8 @@ class Discrepancy(ABC):
             Equal by default. With several rows, each a data set, `outer` broadcasts the data sets
             against the features.
         """
-        return replace(self, observed=observed, weights=sample_weights(weights, observed.size))
+        w = sample_weights(weights, observed.size)
+        return replace(self, observed=observed, weights=w)
 
     def rows(self, index: Any) -> Self:
         """Return some of the data sets of which there are several; nothing is computed anew."""
@@ -143,7 +144,7 @@ class Discrepancy(ABC):
 
     @property
     def symbolic(self) -> bool:
-        """Whether `outer` can be written as a graph; else it is called as an operation without gradient."""
+        """Whether `outer` can be written as a graph; else it is an operation without gradient."""
         return True
 
     @property
@@ -153,16 +154,18 @@ class Discrepancy(ABC):
 
     @property
     def differentiable(self) -> bool:
-        """Whether the discrepancy has second derivatives in the values and weights of the population."""
+        """Whether the discrepancy has second derivatives in the population's values and weights."""
         return self.metric.minimum is Minimum.QUADRATIC
 
     def overlap(self, simulated: Floats, weights: Floats) -> Floats:
-        """Return the overlap of simulated and observed densities, (..., n) -> (...); one where there are none."""
-        return np.ones(np.shape(simulated)[:-1])
+        """Return the overlap of both densities, (..., n) -> (...); one where there are none."""
+        batch = np.shape(simulated)[:-1]
+        return np.ones(batch)
 
     def of(self, simulated: Floats, weights: Floats) -> Any:
         """Return the discrepancy of checked values (..., n) and weights that sum to at most one."""
-        return self.outer(*self.features(simulated, weights, np), xp=np)
+        features = self.features(simulated, weights, np)
+        return self.outer(*features, xp=np)
 
     def __call__(self, simulated: ArrayLike, weights: ArrayLike | None = None) -> Any:
         """Return the discrepancy of simulated responses.
@@ -181,7 +184,8 @@ class Discrepancy(ABC):
         values = simulated_sample(simulated)
         w = sample_weights(weights, values.shape[-1])
         shape = np.broadcast_shapes(values.shape, w.shape)
-        result = self.of(np.broadcast_to(values, shape), w)
+        values = np.broadcast_to(values, shape)
+        result = self.of(values, w)
         return float(result) if np.ndim(result) == 0 else result
 
 
@@ -328,7 +332,7 @@ class DensityDiscrepancy(Discrepancy):
 
     @property
     def differentiable(self) -> bool:
-        """Whether the densities, as functions of the simulated values, are smooth too; those of a histogram are not."""
+        """Whether the densities are smooth in the simulated values too; a histogram's are not."""
         return super().differentiable and self.cells.smooth
 
     @property
@@ -341,14 +345,18 @@ class DensityDiscrepancy(Discrepancy):
 
         One if they are equal, zero if disjoint. Mass outside the inner cells counts in neither.
         """
-        p = self.cells.density(simulated, weights)[..., :-2]
+        p = self.cells.density(simulated, weights)
+        p = p[..., :-2]
         q = self.density[..., :-2]
         dz = self.cells.widths[:-2]
+        # Integrals of p q, of p squared and of q squared.
+        mixed = (p * q * dz).sum(axis=-1)
         simulated_square = ((p**2) * dz).sum(axis=-1)
         observed_square = ((q**2) * dz).sum(axis=-1)
         size = np.sqrt(simulated_square * observed_square)
-        inner = (p * q * dz).sum(axis=-1)
-        return np.asarray(np.nan_to_num(inner / np.where(size > 0, size, 1.0)))
+        size = np.where(size > 0, size, 1.0)
+        cosine = mixed / size
+        return np.asarray(np.nan_to_num(cosine))
 
     def floored(self, density: Any) -> Any:
         """Mix a density with 1e-9 of the uniform density over all cells: the package's only floor.
@@ -361,7 +369,11 @@ class DensityDiscrepancy(Discrepancy):
 
 
 def observed_density(cells: Cells, observed: Floats, weights: Floats) -> Floats:
-    """Return the density of observed values (N,) on cells, shape (m,), or (..., m) for several rows of weights."""
+    """Return the density of observed values on cells, shapes (N,), (N,) -> (m,).
+
+    Weights of shape (..., N) are as many data sets: (..., m).
+    """
     if weights.ndim == 1:
         return cells.density(observed, weights)
-    return product(weights, cells.basis(observed))
+    basis = cells.basis(observed)
+    return product(weights, basis)

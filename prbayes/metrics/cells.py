@@ -26,8 +26,11 @@ def product(weights: Floats, matrix: Floats) -> Floats:
 
     NumPy would multiply a batch of vectors one after the other, many times slower.
     """
-    rows = weights.reshape(-1, weights.shape[-1])
-    return (rows @ matrix).reshape(*weights.shape[:-1], matrix.shape[-1])
+    *batch, n = weights.shape
+    m = matrix.shape[-1]
+    rows = weights.reshape(-1, n)
+    found = rows @ matrix
+    return found.reshape(*batch, m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +53,7 @@ class Cells(ABC):
 
     @abstractmethod
     def density(self, sample: Floats, weights: Floats) -> Floats:
-        """Return the density of weighted samples, shape (..., n) -> (..., m); NaN values count nowhere."""
+        """Return the density of weighted samples, (..., n) -> (..., m); NaN counts nowhere."""
 
     def basis(self, sample: Floats) -> Floats:
         """Return A, shape (n, m), with ``density(sample, w) == w @ A``."""
@@ -58,21 +61,22 @@ class Cells(ABC):
 
     @abstractmethod
     def reading(self, points: Floats, weights: Floats) -> Floats:
-        """Return r such that ``r @ g`` is the weighted mean at points of a function g given on the cells.
+        """Return r such that ``r @ g`` is the weighted mean at points of g, given on the cells.
 
         Shapes (n,), (..., n) -> (..., m).
         """
 
     @abstractmethod
     def value(self, sample: Floats, cotangent: Floats) -> Floats:
-        """Return the derivatives of ``(density(sample, weights) * cotangent).sum()`` for the weights.
+        """Return the derivatives of a sum over the density, for the weights.
 
-        Shapes (..., n), (..., m) -> (..., n), with as many leading axes in both.
+        The sum is ``(density(sample, weights) * cotangent).sum()``. Shapes (..., n), (..., m) ->
+        (..., n), with as many leading axes in both.
         """
 
     @abstractmethod
     def slope(self, sample: Floats, cotangent: Floats) -> Floats:
-        """Return its derivatives for the sample where all weights are one."""
+        """Return the derivatives of the same sum for the sample, where all weights are one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,22 +106,24 @@ class KernelCells(Cells):
 
     def density(self, sample: Floats, weights: Floats) -> Floats:
         """Return densities at the nodes, then mass below and above divided by a cluster's width."""
-        batch, n = sample.shape[:-1], sample.shape[-1]
-        rows, nodes = int(np.prod(batch, dtype=int)), self.centers.size
+        *batch, n = sample.shape
+        rows = int(np.prod(batch, dtype=int))
+        nodes = self.centers.size
         # Equal weights, the usual case, are passed as a single number.
         equal = _are_equal(weights)
-        if equal:
-            each = weights.ravel()[:1]
-        else:
-            each = np.broadcast_to(weights, (*batch, n)).ravel()
+        each = weights if equal else np.broadcast_to(weights, sample.shape)
+        each = each.ravel()
         # Bin the sample on the grid.
-        values = np.ascontiguousarray(sample, dtype=np.float64).reshape(rows, n)
-        counts, outside = np.zeros((rows, nodes)), np.zeros((rows, 2))
+        values = np.ascontiguousarray(sample, dtype=np.float64)
+        values = values.reshape(rows, n)
+        counts = np.zeros((rows, nodes))
+        outside = np.zeros((rows, 2))
         count(values, each, equal, self._low, 1 / self.step, counts, outside)
         # Smooth what the grid holds.
         inner = self._smooth(counts)
         outer = outside / self.widths[-1]
-        return np.concatenate([inner, outer], axis=-1).reshape(*batch, nodes + 2)
+        density = np.concatenate([inner, outer], axis=-1)
+        return density.reshape(*batch, nodes + 2)
 
     def _smooth(self, values: Floats) -> Floats:
         """Return the convolution with the kernel of values at the nodes, shape (..., g)."""
@@ -127,10 +133,11 @@ class KernelCells(Cells):
         return out.reshape(values.shape)
 
     def reading(self, points: Floats, weights: Floats) -> Floats:
-        """Return cubic convolution weights (Keys 1981), which interpolate and are exact for parabolas."""
+        """Return cubic convolution weights (Keys 1981), which are exact for parabolas."""
         # Where the points are: a node, and a fraction of a step beyond it.
         t = points / self.step - self._low
-        inside = (t >= 1) & (t < self.centers.size - 2)
+        last = self.centers.size - 2
+        inside = (t >= 1) & (t < last)
         t = np.where(inside, t, 1.0)
         node = t.astype(np.intp)
         t -= node
@@ -142,23 +149,25 @@ class KernelCells(Cells):
             1 - 2.5 * s**2 + 1.5 * s**3,
             -s * t**2 / 2,
         )
-        each = np.zeros((points.size, self.widths.size))
         row = np.arange(points.size)
+        each = np.zeros((points.size, self.widths.size))
         for k, share in enumerate(keys):
-            each[row, node - 1 + k] += np.where(inside, share, 0.0)
+            at = node - 1 + k
+            each[row, at] += np.where(inside, share, 0.0)
         return product(weights, each)
 
     def value(self, sample: Floats, cotangent: Floats) -> Floats:
-        """Return the smoothed cotangent at the sample; the smoothing kernel is its own transpose."""
+        """Return the smoothed cotangent at the sample; the kernel is its own transpose."""
         outer = cotangent[..., -2:] / self.widths[-1]
         return self._interpolated(sample, cotangent, SPLINE, outer)
 
     def slope(self, sample: Floats, cotangent: Floats) -> Floats:
         """Return the derivative of the smoothed cotangent at the sample."""
-        derivatives = SPLINE[:, 1:] * [1, 2, 3] / self.step
-        return self._interpolated(
-            sample, cotangent, np.pad(derivatives, [(0, 0), (0, 1)]), np.zeros(2)
-        )
+        powers = [1, 2, 3]
+        derivatives = SPLINE[:, 1:] * powers / self.step
+        quadratics = np.pad(derivatives, [(0, 0), (0, 1)])
+        constant = np.zeros(2)
+        return self._interpolated(sample, cotangent, quadratics, constant)
 
     def _interpolated(
         self, sample: Floats, cotangent: Floats, spline: Floats, outer: Floats
@@ -176,27 +185,38 @@ class KernelCells(Cells):
             What values below and above the grid get.
         """
         batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
-        rows, n, nodes = int(np.prod(batch, dtype=int)), sample.shape[-1], self.centers.size
-        # The cubic beyond each node, from the four coefficients around it.
-        smoothed = np.broadcast_to(self._smooth(cotangent[..., :-2]), (*batch, nodes))
-        padded = np.pad(smoothed.reshape(rows, nodes), [(0, 0), (1, 2)])
-        near = [padded[:, k : k + nodes] for k in range(4)]
-        cubics = np.stack(near, axis=-1) @ spline
+        rows = int(np.prod(batch, dtype=int))
+        n = sample.shape[-1]
+        nodes = self.centers.size
+        smoothed = self._smooth(cotangent[..., :-2])
+        smoothed = np.broadcast_to(smoothed, (*batch, nodes))
+        cubics = _cubics(smoothed.reshape(rows, nodes), spline)
         # Values that all rows share are passed once.
         values = sample if sample.ndim == 1 else np.broadcast_to(sample, (*batch, n))
-        values = np.ascontiguousarray(values, dtype=np.float64).reshape(-1, n)
-        ends = np.broadcast_to(outer, (*batch, 2)).reshape(rows, 2)
+        values = np.ascontiguousarray(values, dtype=np.float64)
+        values = values.reshape(-1, n)
+        # Read the cubics at the values.
+        ends = np.broadcast_to(outer, (*batch, 2))
+        ends = np.ascontiguousarray(ends.reshape(rows, 2))
         out = np.empty((rows, n))
-        read(values, cubics, np.ascontiguousarray(ends), self._low, 1 / self.step, out)
+        read(values, cubics, ends, self._low, 1 / self.step, out)
         return out.reshape(*batch, n)
+
+
+def _cubics(coefficients: Floats, spline: Floats) -> Floats:
+    """Return the cubic beyond each node, from the splines around: (rows, g) -> (rows, g, 4)."""
+    nodes = coefficients.shape[1]
+    padded = np.pad(coefficients, [(0, 0), (1, 2)])
+    near = [padded[:, k : k + nodes] for k in range(4)]
+    return np.stack(near, axis=-1) @ spline
 
 
 def _are_equal(weights: Floats) -> bool:
     """Return whether there are weights, and all are the same number."""
     if weights.size == 0:
         return False
-    one_number = not any(weights.strides)
-    return one_number or bool(weights.min() == weights.max())
+    broadcast = not any(weights.strides)
+    return broadcast or bool(weights.min() == weights.max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,40 +225,53 @@ class BinCells(Cells):
 
     def density(self, sample: Floats, weights: Floats) -> Floats:
         """Return the normalised frequency per unit length of each bin, then of the outer two."""
-        batch, n = sample.shape[:-1], sample.shape[-1]
+        *batch, n = sample.shape
         rows = int(np.prod(batch, dtype=int))
         # Every row has cells of its own: the bins, below, above, and NaN.
         cells = self.centers.size + 3
-        first = cells * np.arange(rows)[:, None]
-        cell = self._cell(sample).reshape(rows, n) + first
-        w = np.broadcast_to(weights, (*batch, n)).reshape(rows, n)
+        first = cells * np.arange(rows)
+        cell = self._cell(sample).reshape(rows, n)
+        cell = cell + first[:, None]
+        # Count in all rows at once.
+        w = np.broadcast_to(weights, sample.shape)
         counts = np.bincount(cell.ravel(), w.ravel(), rows * cells)
-        without_nan = counts.reshape(*batch, cells)[..., :-1]
+        counts = counts.reshape(*batch, cells)
+        without_nan = counts[..., :-1]
         return cast(Floats, without_nan / self.widths[0])
 
     def reading(self, points: Floats, weights: Floats) -> Floats:
         """Return the weight of the points in each bin."""
-        return np.asarray(weights @ self.basis(points) * self.widths)
+        density = weights @ self.basis(points)
+        return np.asarray(density * self.widths)
 
     def _cell(self, sample: Floats) -> NDArray[np.intp]:
         """Return cell numbers: bins, then below, above, and NaN."""
-        bins, width = self.centers.size, self.widths[0]
+        bins = self.centers.size
+        below, above, nowhere = bins, bins + 1, bins + 2
+        # Where the values are, in widths from the lower edge.
+        width = self.widths[0]
         low = self.centers[0] - width / 2
         position = (sample - low) / width
+        known = np.isfinite(position)
+        finite = np.where(known, position, 0.0)
         # The upper edge belongs to the last bin, also after rounding in low + bins * width.
-        finite = np.where(np.isfinite(position), position, 0.0)
-        inner = np.clip(finite, 0, bins - 1).astype(np.intp)
-        cell = np.where(position > bins + _EDGE, bins + 1, inner)
-        cell = np.where(position < -_EDGE, bins, cell)
-        return np.where(np.isnan(position), bins + 2, cell)
+        inner = np.clip(finite, 0, bins - 1)
+        cell = inner.astype(np.intp)
+        too_high = position > bins + _EDGE
+        too_low = position < -_EDGE
+        cell = np.where(too_high, above, cell)
+        cell = np.where(too_low, below, cell)
+        return np.where(np.isnan(position), nowhere, cell)
 
     def value(self, sample: Floats, cotangent: Floats) -> Floats:
         """Return the cell's cotangent."""
         for_nan = np.zeros_like(cotangent[..., :1])
-        padded = np.concatenate([cotangent, for_nan], axis=-1) / self.widths[0]
-        return np.take_along_axis(padded, self._cell(sample), axis=-1)
+        padded = np.concatenate([cotangent, for_nan], axis=-1)
+        per_width = padded / self.widths[0]
+        return np.take_along_axis(per_width, self._cell(sample), axis=-1)
 
     def slope(self, sample: Floats, cotangent: Floats) -> Floats:
         """Return zero: a step function."""
         batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
-        return np.zeros(batch + sample.shape[-1:])
+        shape = (*batch, sample.shape[-1])
+        return np.zeros(shape)

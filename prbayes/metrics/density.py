@@ -47,9 +47,12 @@ def spread(sample: Floats, weights: Floats) -> float:
     """
     sample = sample - sample.min()  # equal values give exactly zero
     mean = weights @ sample
-    sd = float(np.sqrt(weights @ (sample - mean) ** 2))
-    iqr = quantile(sample, weights, 0.75) - quantile(sample, weights, 0.25)
-    return min(sd, float(iqr / 1.34)) if iqr > 0 else sd
+    variance = weights @ (sample - mean) ** 2
+    sd = float(np.sqrt(variance))
+    upper = quantile(sample, weights, 0.75)
+    lower = quantile(sample, weights, 0.25)
+    iqr = float(upper - lower)
+    return min(sd, iqr / 1.34) if iqr > 0 else sd
 
 
 def silverman(sample: Floats, weights: Floats) -> float:
@@ -141,7 +144,7 @@ class GaussianKDE(DensityEstimator):
             positive_number(self.bandwidth, "bandwidth")
 
     def cells(self, observed: Floats, weights: Floats) -> Cells:
-        """Return a grid over the observed range plus six bandwidths, or half the range, at either side."""
+        """Return a grid over the observed range and a margin: six bandwidths, or half the range."""
         h = self._bandwidth(observed, weights)
         step = h / _PER_BANDWIDTH
         low, n_nodes = _grid(observed, h, step)
@@ -157,21 +160,19 @@ class GaussianKDE(DensityEstimator):
 
     def _bandwidth(self, observed: Floats, weights: Floats) -> float:
         """Return the bandwidth for observed values, or raise if it is not positive."""
-        if callable(self.bandwidth):
-            h = self.bandwidth(observed, weights)
-        else:
-            h = float(self.bandwidth)
+        rule = self.bandwidth
+        h = rule(observed, weights) if callable(rule) else float(rule)
         if not np.isfinite(h) or h <= 0:
             raise ValueError(
                 f"bandwidth: got {h:g} from {observed.size} observed values with spread "
-                f"{np.ptp(observed):g}, expected a positive one; pass GaussianKDE(bandwidth=...) in "
-                "units of the response, or use AreaMetric, which needs none"
+                f"{np.ptp(observed):g}, expected a positive one; pass GaussianKDE(bandwidth=...) "
+                "in units of the response, or use AreaMetric, which needs none"
             )
         return h
 
 
 def _grid(observed: Floats, h: float, step: float) -> tuple[float, int]:
-    """Return the first node of a grid over the observed values and their margins, and how many nodes."""
+    """Return the first node of a grid over observed values and their margins, and its length."""
     length = float(np.ptp(observed))
     margin = max(_MARGIN * h, length / 2)
     low = float(observed.min()) - margin
@@ -188,16 +189,19 @@ def _grid(observed: Floats, h: float, step: float) -> tuple[float, int]:
 
 
 def _narrowed_kernel(h: float, step: float) -> Floats:
-    """Return a Gaussian kernel at the nodes, narrower by the variance step^2 / 3 of a cubic B-spline."""
+    """Return a Gaussian kernel at the nodes, less the variance step^2 / 3 of a cubic B-spline."""
     s = np.sqrt(h**2 - step**2 / 3)
     reach = int(np.ceil(_KERNEL_REACH * s / step))
-    offsets = step * np.arange(-reach, reach + 1)
-    return np.asarray(np.exp(-0.5 * (offsets / s) ** 2) / (s * np.sqrt(2 * np.pi)))
+    nodes = np.arange(-reach, reach + 1)
+    u = step * nodes / s
+    height = np.exp(-0.5 * u**2)
+    area = s * np.sqrt(2 * np.pi)
+    return np.asarray(height / area)
 
 
 @dataclass(frozen=True)
 class Histogram(DensityEstimator):
-    """Normalised histogram on equal bins over the observed range, with two bins for the mass outside.
+    """Normalised histogram on equal bins over the observed range, and two for the mass outside.
 
     Parameters
     ----------
@@ -228,8 +232,8 @@ class Histogram(DensityEstimator):
         low, high = float(observed.min()), float(observed.max())
         if high <= low:
             raise ValueError(
-                f"histogram: got {observed.size} observed values, all {low:g}, expected at least two "
-                "different ones; use AreaMetric, which needs no bins"
+                f"histogram: got {observed.size} observed values, all {low:g}, expected at least "
+                "two different ones; use AreaMetric, which needs no bins"
             )
         bins = self._bins(high - low, observed, weights)
         width = (high - low) / bins
@@ -254,10 +258,9 @@ def density_estimator(density: object) -> None:
     """Refuse what is no estimator of densities."""
     if isinstance(density, DensityEstimator):
         return
+    got = f"{type(density).__name__} {density!r}"
     if isinstance(density, type):
         got = f"the class {density.__name__}"
-    else:
-        got = f"{type(density).__name__} {density!r}"
     raise TypeError(
         f"density: got {got}, expected prb.GaussianKDE() or prb.Histogram(), perhaps with arguments"
     )

@@ -69,5 +69,6 @@ class DivergenceDiscrepancy(DensityDiscrepancy):
         p = self.floored(features[0])
         q = self.floored(self.density)
         a, b = (p, q) if self.metric.reverse else (q, p)
-        each = a * xp.log(a / b) * self.cells.widths
-        return each.sum(axis=-1)
+        ratio = xp.log(a / b)
+        integrand = a * ratio
+        return (integrand * self.cells.widths).sum(axis=-1)

@@ -34,7 +34,9 @@ class FunctionMetric(Metric):
     Examples
     --------
     >>> import numpy as np
-    >>> metric = FunctionMetric(lambda simulated, observed: abs(np.mean(simulated, -1) - observed.mean()))
+    >>> def difference(simulated, observed):
+    ...     return abs(np.mean(simulated, axis=-1) - observed.mean())
+    >>> metric = FunctionMetric(difference)
     >>> metric([0.0, 2.0], [4.0])
     3.0
     """
@@ -82,8 +84,8 @@ class FunctionDiscrepancy(Discrepancy):
         expected = simulated.shape[:-1]
         if value.shape != expected:
             raise ValueError(
-                f"FunctionMetric: got a result of shape {value.shape} for simulated values of shape "
-                f"{simulated.shape}, expected {expected}; reduce over the last axis"
+                f"FunctionMetric: got a result of shape {value.shape} for simulated values of "
+                f"shape {simulated.shape}, expected {expected}; reduce over the last axis"
             )
         return (value,)
 
@@ -94,8 +96,9 @@ class FunctionDiscrepancy(Discrepancy):
             return function(simulated, self.observed, np.broadcast_to(weights, simulated.shape))
         if not np.allclose(weights, np.asarray(weights)[..., :1]):
             raise ValueError(
-                "weights: got unequal ones for a FunctionMetric whose function takes none; write "
-                "function(simulated, observed, weights) and pass weighted=True, or use prb.Resimulated"
+                "weights: got unequal ones for a FunctionMetric whose function takes none; "
+                "write function(simulated, observed, weights) and pass weighted=True, "
+                "or use prb.Resimulated"
             )
         return function(simulated, self.observed)
 

@@ -83,7 +83,8 @@ class ResidualDiscrepancy(DensityDiscrepancy):
         Against other values, by `with_observed`, it keeps this S.
         """
         density = observed_density(cells, observed, weights)
-        power = np.floor(np.log10(density.max()))
+        peak = density.max()
+        power = np.floor(np.log10(peak))
         scale_factor = float(metric.scale_base**-power)
         return cls(metric, observed, weights, cells, density, scale_factor)
 
@@ -94,13 +95,13 @@ class ResidualDiscrepancy(DensityDiscrepancy):
 
     @property
     def scale(self) -> float:
-        """The residual of a population without density anywhere: S times the integral of q squared."""
-        square = (self.density**2 * self._measure).sum()
-        return float(self.scale_factor * square)
+        """The residual of a population without any density: S times the integral of q squared."""
+        integrand = self.density**2 * self._measure
+        return float(self.scale_factor * integrand.sum())
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return S times the integral (or sum) of (p - q)^2: eq. 6, 8, 9."""
         (p,) = features
         q = self.density
-        square = ((p - q) ** 2 * self._measure).sum(axis=-1)
-        return self.scale_factor * square
+        integrand = (p - q) ** 2 * self._measure
+        return self.scale_factor * integrand.sum(axis=-1)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._checks import Floats
-from prbayes._weighted import quantile
+from prbayes._weighted import cumulated, distribution_function, quantile
 from prbayes.metrics.density import GaussianKDE, Histogram, silverman
 
 
@@ -53,16 +52,7 @@ def bounded_density(draws: Floats, grid: Floats) -> Floats:
 
 def distribution_functions(values: Floats, weights: Floats, grid: Floats) -> Floats:
     """Return the weight of values not above each point of a grid: shapes (P, n), (P, n), (g,) -> (P, g)."""
-    rows = np.broadcast_to(values, weights.shape)
-    out = np.empty((len(weights), grid.size))
-    shared = values.ndim == 1 or values.strides[0] == 0
-    order: NDArray[np.intp] | None = None
-    for i, (row, w) in enumerate(zip(rows, weights, strict=True)):
-        if order is None or not shared:
-            order = np.argsort(row, kind="stable")  # NaN last, above everything
-            at = np.searchsorted(row[order], grid, side="right")
-        out[i] = np.concatenate([[0.0], np.cumsum(w[order])])[at]
-    return out
+    return np.ascontiguousarray(distribution_function(values, weights, grid))
 
 
 def pointwise_band(curves: Floats, level: float) -> tuple[Floats, Floats]:
@@ -102,7 +92,7 @@ def staircase(observed: Floats, weights: Floats, low: float, high: float) -> tup
     """Return the corners of the distribution function of weighted values, from ``low`` to ``high``."""
     order = np.argsort(observed, kind="stable")
     finite = np.isfinite(observed[order])
-    values, height = observed[order][finite], np.concatenate([[0.0], np.cumsum(weights[order])[finite]])
+    values, height = observed[order][finite], cumulated(weights, order)[np.append(True, finite)]
     return np.concatenate([[low], np.repeat(values, 2), [high]]), np.repeat(height, 2)
 
 

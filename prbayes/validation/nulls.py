@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
 from prbayes._progress import progress
+from prbayes._weighted import cumulated
 
 _BLOCK = 1 << 22  # u-values held at a time
 _ENVELOPED = 999  # replicates from which an envelope is made
@@ -54,7 +55,7 @@ class Predictive:
             return
         order = np.argsort(values[known])
         self._values = values[known][order]
-        below = np.concatenate([[0.0], np.cumsum(weights[known][order])])
+        below = cumulated(weights[known], order)
         self._below = below / below[-1]
 
     def steps(self, y: Floats) -> tuple[Floats, Floats]:
