@@ -8,7 +8,7 @@ import pytest
 from prbayes._checks import Floats
 from prbayes.metrics.base import Minimum
 from prbayes.metrics.density import GaussianKDE, Histogram
-from prbayes.metrics.divergence import KullbackLeibler
+from prbayes.metrics.divergence import DivergenceDiscrepancy, KullbackLeibler
 
 
 @pytest.mark.parametrize(
@@ -53,3 +53,11 @@ def test_settings_that_are_no_density_are_refused() -> None:
         KullbackLeibler(0.3)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"bandwidth: got 0 .*GaussianKDE\(bandwidth=.*AreaMetric"):
         KullbackLeibler()([0.0, 1.0], [0.1])
+
+
+def test_mass_away_from_the_data_costs_the_floor_in_reverse() -> None:
+    d = KullbackLeibler(GaussianKDE(0.4), reverse=True).against([0.0, 1.0, 2.0])
+    assert isinstance(d, DivergenceDiscrepancy)
+    widths = d.cells.widths
+    expected = np.log(widths.sum() / (1e-9 * widths[-1]))
+    assert d([1e3, 1e4]) == pytest.approx(expected, rel=1e-6)

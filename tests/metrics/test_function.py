@@ -51,3 +51,8 @@ def test_unequal_weights_need_a_function_that_takes_them() -> None:
         FunctionMetric(mean_difference)(OK, OK, weights=[1, 2, 3])
     with pytest.raises(ValueError, match="observed weights: got unequal"):
         FunctionMetric(mean_difference).against(OK, [1, 2, 3])
+
+
+def test_simulated_values_come_first() -> None:
+    metric = FunctionMetric(lambda simulated, observed: simulated.mean(axis=-1) - observed.max())
+    assert metric([6.0, 8.0], [1.0, 4.0]) == pytest.approx(3.0)
