@@ -22,11 +22,12 @@ from numpy.typing import ArrayLike, NDArray
 from prbayes._checks import Floats, observed_sample, sample_weights, simulated_sample
 from prbayes.metrics.cells import Cells, product
 
-# Share of the uniform density that is mixed into densities before a logarithm is taken. Any value up
-# to 1e-6 gives the same minimum on normal data, to a thousandth of a standard error (test). It decides
-# for the forward divergence where an observation is far outside the fitted population: among 50
-# values of Student's t with three degrees of freedom, 1e-7 lets the fit leave out an outlier that
-# 1e-9 and less keep in (test). A kernel has 1e-9 of its mass beyond six bandwidths, where grids end.
+# Share of the uniform density that is mixed into densities before a logarithm is taken. Any value
+# up to 1e-6 gives the same minimum on normal data, to a thousandth of a standard error (test). It
+# decides for the forward divergence where an observation is far outside the fitted population:
+# among 50 values of Student's t with three degrees of freedom, 1e-7 lets the fit leave out an
+# outlier that 1e-9 and less keep in (test). A kernel has 1e-9 of its mass beyond six bandwidths,
+# where grids end.
 _FLOOR = 1e-9
 
 
