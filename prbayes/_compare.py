@@ -166,7 +166,7 @@ def _normal(point: Mapping[Any, Any], stderr: Mapping[Any, Any]) -> dict[str, _E
         values = np.asarray(value)
         errors = np.asarray(stderr[name])
         for index in np.ndindex(values.shape):
-            estimate, sd = values[index], errors[index]
+            estimate, sd = float(values[index]), float(errors[index])
             element = element_name(str(name), index)
             found[element] = _Estimate(estimate, sd, estimate - z * sd, estimate + z * sd)
     return found

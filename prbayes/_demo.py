@@ -27,8 +27,7 @@ from prbayes.validation.validity import ValidityTest, area_test
 
 _log = logging.getLogger("prbayes")
 
-# Paris' exponent, the same for every specimen: that of examples/crack_growth.py, whose least-squares
-# fits to whole records it comes from.
+# Paris' exponent, held at one value for all specimens, as in examples/crack_growth.py.
 EXPONENT = 2.6
 # Million cycles: the last reading before cracks fail is at 0.08, so that all are known at both, and
 # the test is one of extrapolation.
