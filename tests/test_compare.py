@@ -101,7 +101,7 @@ def test_compare_scores_each_result_under_every_metric(
     total = table["first AreaMetric"] / optimum.scales["first"]
     total = total + table["second KullbackLeibler"] / optimum.scales["second"]
     assert total.sel(result="ABC") > total.sel(result="optimum")
-    # A metric that the model does not have, by the direct call on the population at the posterior mean.
+    # A metric that the model does not have: by the direct call, at the posterior mean
     mean = {k: np.asarray(idata["posterior"][k].mean(("chain", "draw"))) for k in ("mean", "sigma")}
     values, weights = optimum.evaluator.populations(optimum.evaluator.unconstrained(mean)[None], 0)
     direct = prb.ProbabilityResidual().against(DATA[:, 0])(values, weights)

@@ -14,7 +14,7 @@ import xarray as xr
 from arviz_stats import rhat
 
 import prbayes as prb
-from prbayes._diagnose import _NOISE, _RHAT
+from prbayes._diagnose import _NOISE
 from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
@@ -60,7 +60,7 @@ def normal_tree(means: Any, draws: int = 500) -> xr.DataTree:
     )
 
 
-# -- sentences -------------------------------------------------------------------------------------------
+# -- sentences -------------------------------------------------------------------------------
 
 
 def test_silent_when_nothing_is_wrong(tmp_path: Path) -> None:
@@ -140,13 +140,11 @@ def test_one_chain_and_hardly_any_draws_raise_nothing() -> None:
 def test_independent_draws_are_almost_never_called_dependent() -> None:
     """What `_NOISE` rests on: R-hat of independent draws exceeds the limit once in a thousand."""
     rng = np.random.default_rng(0)
-    for chains, draws in ((2, 100), (4, 50), (8, 50)):
-        x = xr.Dataset({"x": (["chain", "draw", "set"], rng.normal(size=(chains, draws, 2000)))})
-        rhats = rhat(x)["x"].values
-        above = (rhats > max(_RHAT, 1 + _NOISE / (chains * draws))).mean()
-        # Two sets of 2000 are expected, five at .0025; and a limit of half the noise is crossed.
-        assert above < 0.004
-        assert (rhats > 1 + 0.5 * _NOISE / (chains * draws)).mean() > 0.01
+    x = xr.Dataset({"x": (["chain", "draw", "set"], rng.normal(size=(4, 50, 2000)))})
+    excess = 200 * (rhat(x)["x"].values - 1)
+    # Two of the 2000 sets are expected; four standard errors more are eight.
+    assert (excess > _NOISE).sum() <= 8
+    assert (excess > _NOISE / 2).sum() >= 30, "a limit of half of it would cry wolf"
 
 
 def test_a_stored_optimum_tells_what_the_optimum_does() -> None:
@@ -194,7 +192,7 @@ def test_a_posterior_without_a_free_variable_is_refused() -> None:
         prb.diagnose(tree, model=model)
 
 
-# -- numbers that reach the user --------------------------------------------------------------------------
+# -- numbers that reach the user -------------------------------------------------------------
 
 
 def test_acceptance_and_beta_of_each_stage() -> None:
@@ -207,7 +205,7 @@ def test_acceptance_and_beta_of_each_stage() -> None:
 
 
 def test_the_evidence_is_a_plain_number_with_its_spread() -> None:
-    """For a likelihood known in closed form: one normal mean, exp(-d / epsilon) integrated on a grid."""
+    """It is that of exp(-d / epsilon), averaged over draws from the prior."""
     model, idata = sampled()
     attrs = idata["posterior"].attrs
     by_chain = idata["sample_stats"]["log_marginal_likelihood"].max("stage").values
@@ -234,7 +232,8 @@ def test_monte_carlo_error_of_the_discrepancy_of_fresh_responses() -> None:
     values = [float(evaluator(theta).discrepancies[0, 0]) for _ in range(100)]
     roots = evaluator.roots(theta, 0)
     errors = [evaluator.nodes[0].bound.discrepancy_error(roots) for _ in range(50)]
-    # Standard errors: 7% of the spread, about 5% of the mean of the errors; the jackknife's own bias is of order 1/8.
+    # Standard errors: 7% of the spread, about 5% of the mean of the errors; the jackknife's own
+    # bias is of order 1/8.
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(values, ddof=1), rel=0.45)
 
 
@@ -274,7 +273,7 @@ def test_the_monte_carlo_error_is_kept_with_the_draws() -> None:
     assert float(noisy["discrepancy_error"][0]) > 3 * float(noisy["epsilon"][0])
 
 
-# -- ArviZ -----------------------------------------------------------------------------------------------
+# -- ArviZ -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("plot", ["plot_rank", "plot_trace", "plot_ess", "plot_forest"])
@@ -294,7 +293,7 @@ def test_arviz_summary_has_r_hat_and_ess() -> None:
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_loo_speaks_of_one_observation() -> None:
-    """What the docs warn of: a discrepancy is one value per draw, and `az.loo` does not refuse it."""
+    """A discrepancy is one value per draw, as the docs warn, and `az.loo` does not refuse it."""
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
         prb.Simulator(
