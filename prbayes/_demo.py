@@ -33,9 +33,8 @@ EXPONENT = 2.6
 # the test is one of extrapolation.
 CALIBRATED_AT, TESTED_AT = 0.05, 0.08
 _USED = 11  # specimens for the calibration, of the 21: about half
-_SMALLEST = (
-    1e-12  # any positive value gives the same result: where it is used, the crack is infinite
-)
+# Where it is used the crack is infinite: any small positive value keeps NumPy from a warning.
+_SMALLEST = 1e-12
 
 
 def relative_length(million_cycles: float) -> Callable[[Any, Any], Any]:

@@ -18,17 +18,17 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.simulator import model_on_context
 from prbayes.model.support import shortcoming
 
-_RHAT = 1.01  # Vehtari et al. (2021), section 4
+_RHAT = 1.01  # recommended by Vehtari et al. (2021)
 # R-hat of independent draws exceeds 1 + _NOISE / (chains x draws) about once in a thousand cases:
-# that quantile is 9 to 12 with 2 to 8 chains of 25 to 500 draws (tests/test_diagnose.py).
+# the quantile was 9 to 12 with 2 to 8 chains of 25 to 500 draws, 1500 to 4000 sets of each
+# (4 chains of 50 draws in tests/test_diagnose.py).
 _NOISE = 11.0
-_ESS = 400  # Vehtari et al. (2021), section 4: below it R-hat and ESS themselves are unreliable
+_ESS = 400  # recommended by Vehtari et al. (2021), for R-hat and ESS themselves to be reliable
 # By judgement: of few draws no more than a quarter need be independent.
 _INDEPENDENT = 0.25
 _FEWEST_DRAWS = 4  # of a chain: ArviZ gives NaN for fewer
-_FEWEST_MOVES = (
-    1  # accepted steps per particle: with fewer, copies of a particle are still the same
-)
+# Accepted steps per particle: with fewer, many copies of a particle are still the same draw.
+_FEWEST_MOVES = 1
 
 _SUPPORT = ("weight_ess", "mean_weight", "lost_mass")
 

@@ -15,7 +15,7 @@ from pytensor.graph.traversal import walk
 
 from prbayes.model.simulator import Node, nodes
 
-# Characters: an attribute of an HDF5 file holds less than 64 KiB (HDF5 user's guide, chapter 8).
+# Characters: an attribute of an HDF5 file holds less than 64 KiB, with what surrounds it.
 # JSON writes letters beyond ASCII as six characters of a byte each, so that these are bytes.
 _LONGEST = 60_000
 _MOST_LABELS = 40  # specimens that are named one by one; by judgement: three lines of a report
