@@ -130,3 +130,12 @@ def test_names_of_elements() -> None:
     assert element_name("mu", ()) == "mu"
     assert element_name("mu", (1,)) == "mu[1]"
     assert element_name("C", (0, 2)) == "C[0,2]"
+
+
+def test_a_variable_is_computed_from_those_next_above_it() -> None:
+    with pm.Model() as model:
+        first = pm.Deterministic("first", 2 * pm.Normal("mu", 0, 1))
+        pm.Deterministic("second", 3 * first)
+    texts = {v["name"]: v["distribution"] for v in describe(model)["variables"]}
+    assert texts["first"] == "computed from mu"
+    assert texts["second"] == "computed from first"

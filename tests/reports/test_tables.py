@@ -48,6 +48,7 @@ def test_what_is_no_table_is_refused(table: Any) -> None:
 def test_columns_in_which_no_row_has_anything_are_left_out() -> None:
     rows = [{"a": 1, "b": None, "c": "", "d": np.nan}, {"a": None, "b": None, "c": "", "d": np.nan}]
     assert list(rows_table(rows).columns) == ["a", "d"]
+    assert list(rows_table([{"zero": 0, "empty": ""}]).columns) == ["zero"]
     assert cells(rows_table([{"n": 3, "s": None}, {"n": None, "s": "x"}])).rows[1][1] == "x"
 
 
