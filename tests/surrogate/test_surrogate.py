@@ -77,10 +77,13 @@ def test_neighbors_are_near_the_whole_surface(surrogate: prb.Surrogate) -> None:
 
 
 def test_a_regressor_of_scikit_learn_serves_and_is_left_unfitted() -> None:
-    regressor = GaussianProcessRegressor(RBF(0.5), alpha=1e-8, random_state=0)
+    # The length of greatest likelihood is .60; it is not searched for. Responses without noise leave a matrix of
+    # condition 4e9, hence a likelihood that is rounded at 2e-7: whether the gradient falls below scikit-learn's
+    # tolerance, or the search ends with a warning, is then up to the last digits of the processor's kernels.
+    regressor = GaussianProcessRegressor(RBF(0.6), alpha=1e-8, optimizer=None)
     found = prb.Surrogate.fit(lambda x, y: 1e6 + 1e4 * bent(x, y), BOX, 64, model=regressor)
     x, y = fresh_points()
-    assert np.sqrt(np.mean((found(x, y) - 1e6 - 1e4 * bent(x, y)) ** 2)) < 100
+    assert np.sqrt(np.mean((found(x, y) - 1e6 - 1e4 * bent(x, y)) ** 2)) < 10
     assert not hasattr(regressor, "X_train_")
 
 
