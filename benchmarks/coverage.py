@@ -194,7 +194,7 @@ def analyse(
 ) -> dict[str, Any]:
     """Calibrate one data set; return the estimate, and by posterior: probability below the truth, mean, sd."""
     from prbayes.estimate.data_sets import reweighted_sets
-    from prbayes.estimate.minimize import find_optimum
+    from prbayes.estimate.minimization import find_optimum
     from prbayes.estimate.refit import Neighbourhood
     from prbayes.estimate.sandwich import prior_scale
     from prbayes.posterior.adjustment import Affine, moved

@@ -60,9 +60,7 @@ class Information:
 
     @property
     def _smooth(self) -> bool:
-        node = self.evaluator.nodes[self.k]
-        cells = getattr(node.target, "cells", None)
-        return bool(node.metric.smooth and (cells is None or cells.smooth))
+        return self.evaluator.nodes[self.k].target.differentiable
 
     @property
     def jumps(self) -> bool:
@@ -76,7 +74,7 @@ class Information:
         def look(step: float) -> tuple[float, tuple[Floats, Floats]]:
             return step, self.evaluator.populations(self.theta + self._stencil(step), self.k)
 
-        if not self.evaluator.nodes[self.k].bound.n_per_theta:
+        if self.evaluator.nodes[self.k].bound.stored:
             return look(_STEP)
         if self._smooth:
             narrow = look(_STEP)

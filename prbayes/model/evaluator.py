@@ -112,7 +112,7 @@ class Evaluator:
     @property
     def designs(self) -> dict[str, Design]:
         """The designs of the simulators that reweight stored responses, by name."""
-        return {n.name: n.bound for n in self.nodes if isinstance(n.bound, Design)}
+        return {n.name: n.design for n in self.nodes if n.design is not None}
 
     def _params(self) -> list[list[Any]]:
         """Return the simulators' roots as they stand in this model, which may be a clone."""
@@ -284,9 +284,9 @@ class Evaluator:
     def support(self, thetas: Floats) -> dict[str, dict[str, Floats]]:
         """Return how well each design supports the populations at thetas, arrays of shape (P,)."""
         return {
-            node.name: node.bound.support(self.roots(thetas, k))
+            node.name: node.design.support(self.roots(thetas, k))
             for k, node in enumerate(self.nodes)
-            if isinstance(node.bound, Design)
+            if node.design is not None
         }
 
     def thetas_of(self, draws: Sequence[Floats]) -> Floats:

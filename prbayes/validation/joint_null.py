@@ -15,7 +15,6 @@ from prbayes.estimate.data_sets import groups, sets_at, simulated_points, specim
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refit import Neighbourhood, inapplicable
 from prbayes.estimate.sandwich import prior_scale
-from prbayes.propagation.reweighted import Design
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.validation.nulls import Case, Condition, Predictive, SimulatedNull
@@ -144,8 +143,8 @@ class JointNull(SimulatedNull):
                 f"{condition.name}: responses: got inputs that no simulator with prb.Reweighted has, expected its "
                 ".dist() objects; only then is it known which responses belong to the specimens of the calibration"
             )
-        assert isinstance(node.bound, Design)
-        return nodes.index(node), node.bound.values_of(called)
+        assert node.design is not None
+        return nodes.index(node), node.design.values_of(called)
 
     def _numbers(self, case: Case, served: list[int]) -> tuple[list[NDArray[np.intp]], int]:
         """Return the specimens of each condition, those of the calibration by their numbers, and how many are new."""

@@ -64,7 +64,7 @@ def pair(a: Any, b: Any, propagation: Any = R256, *, other_input: bool = False, 
         x = pm.Normal.dist(mu, 0.5)
         z = pm.Normal.dist(mu, 0.5)
         prb.Simulator("a", same, x, metric=KL, observed=OBSERVED, specimens=a, propagation=propagation)
-        other = prb.Reweighted(256, seed=seed) if seed else propagation
+        other = prb.Reweighted(256, random_seed=seed) if seed else propagation
         prb.Simulator(
             "b", double, z if other_input else x, metric=KL, observed=2 * OBSERVED, specimens=b, propagation=other
         )

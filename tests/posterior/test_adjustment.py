@@ -329,11 +329,11 @@ def adjustment(idata: xr.DataTree) -> str:
 def test_a_given_epsilon_is_taken_at_its_word() -> None:
     optimum = prb.minimize(build(METRICS["kl"], sd=0.5))
     short = {"draws": 60, "optimum": optimum}
-    assert adjustment(sample(optimum.model, **short)) == "Affine(n_sets=200, seed=0)"  # 1/N, which nobody gave
+    assert adjustment(sample(optimum.model, **short)) == "Affine(n_sets=200, random_seed=0)"  # 1/N, which nobody gave
     assert adjustment(sample(optimum.model, epsilon=0.01, **short)) == "none"
     assert (
         adjustment(sample(optimum.model, epsilon=0.01, adjust=prb.Affine(50, 3), **short))
-        == "Affine(n_sets=50, seed=3)"
+        == "Affine(n_sets=50, random_seed=3)"
     )
     assert adjustment(sample(optimum.model, adjust=False, **short)) == "none"
     prb.set_epsilon(optimum.model, {"y": 0.05})
