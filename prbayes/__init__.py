@@ -39,7 +39,7 @@ from prbayes.reports.section import Section
 from prbayes.response.calling import ResponseError, scalar
 from prbayes.response.failures import Abort, Replace, Retry
 from prbayes.response.store import StoreError
-from prbayes.surrogate.error import SurrogateError
+from prbayes.surrogate.error import CrossValidation as SurrogateError
 from prbayes.surrogate.surfaces import Polynomial, RadialBasis
 from prbayes.surrogate.surrogate import Surrogate
 from prbayes.validation.cross_validation import held_out

@@ -92,7 +92,7 @@ def test_a_regressor_of_scikit_learn_serves_and_is_left_unfitted() -> None:
 
 def test_the_error_is_what_left_out_points_show() -> None:
     """The residuals are those of fits without each tenth of the points, done here by hand with a plane."""
-    found = prb.Surrogate.fit(bent, BOX, 20, model=prb.Polynomial(1), seed=4)
+    found = prb.Surrogate.fit(bent, BOX, 20, model=prb.Polynomial(1), random_seed=4)
     order = np.random.default_rng(4).permutation(20)
     a = np.column_stack([np.ones(20), found.points])
     for fold in np.array_split(order, 10):
@@ -227,7 +227,7 @@ def test_where_the_nearest_design_point_failed_nothing_is_invented() -> None:
 
 
 def test_executors_give_the_same_and_a_store_computes_nothing_twice(tmp_path: Path) -> None:
-    plain = prb.Surrogate.fit(bent, BOX, 32, seed=2)
+    plain = prb.Surrogate.fit(bent, BOX, 32, random_seed=2)
     assert plain.n_runs == 32
     with ThreadPoolExecutor(2) as threads, ProcessPoolExecutor(2) as processes:
         names = set()
@@ -239,7 +239,7 @@ def test_executors_give_the_same_and_a_store_computes_nothing_twice(tmp_path: Pa
         prb.Surrogate.fit(prb.scalar(told), BOX, 32, executor=threads)
         assert threading.main_thread().name not in names
         for executor, response in ((threads, prb.scalar(bent)), (processes, bent)):
-            other = prb.Surrogate.fit(response, BOX, 32, seed=2, executor=executor)
+            other = prb.Surrogate.fit(response, BOX, 32, random_seed=2, executor=executor)
             np.testing.assert_array_equal(other.responses, plain.responses)
     folder = tmp_path / "runs"
     assert prb.Surrogate.fit(bent, BOX, 32, store=folder).n_runs == 32
