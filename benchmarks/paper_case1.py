@@ -26,7 +26,6 @@ import numpy as np
 import prbayes as prb
 from benchmarks.systems import METRICS, SYSTEMS
 from prbayes.estimate.methods import Method
-from prbayes.estimate.sandwich import prior_scale
 from prbayes.estimate.search import Search
 
 SIZES = (20, 50, 1000, 100_000)
@@ -78,7 +77,7 @@ def work(arguments: argparse.Namespace) -> dict[str, Any]:
         for seed in seeds:  # outermost, in case the run is not finished
             for n, (index, (name, system)) in product(SIZES, enumerate(SYSTEMS.items())):
                 observed = system.data(np.random.default_rng([seed, n, index]), n)
-                scale = prior_scale(evaluators[name])
+                scale = evaluators[name].prior_sd
                 for metric in METRICS:
                     key = f"{points}/{name}/{n}/{seed}/{metric}"
                     if key in done:

@@ -21,7 +21,7 @@ from prbayes.estimate.refinement import AGREE, MAX_ROUNDS, grow, pilot, refine_a
 from prbayes.estimate.refit import Neighbourhood
 from prbayes.estimate.rivals import Rival, rivals
 from prbayes.estimate.sampling import Local
-from prbayes.estimate.sandwich import Information, prior_scale
+from prbayes.estimate.sandwich import Information
 from prbayes.estimate.search import Search
 from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
@@ -211,7 +211,7 @@ def find_optimum(
             "gradient to follow; pass epsilon= to prb.sample_smc, which then needs no optimum, use "
             "prb.minimize(method='Nelder-Mead'), or propagation=prb.Reweighted() or prb.Resimulated()"
         )
-    scale = prior_scale(evaluator, seed=random_seed)
+    scale = evaluator.prior_sd
     already = evaluator.n_responses
     stored = sum(d.n_points for d in evaluator.designs.values())
     several = len(evaluator.nodes) > 1

@@ -7,7 +7,7 @@ import numpy as np
 from prbayes.estimate.identifiability import seen_by_area, seen_by_curvature
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.sampling import first_order_shifts
-from prbayes.estimate.sandwich import Information, prior_scale
+from prbayes.estimate.sandwich import Information
 from prbayes.metrics.base import Minimum
 
 _CLOUD = 500  # thetas that carry each simulated data set's posterior
@@ -66,7 +66,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
             "prb.calibrate_epsilon(prb.minimize(model))"
         )
     evaluator = surveyed(optimum, "calibrate_epsilon").evaluator
-    scale = prior_scale(evaluator)
+    scale = evaluator.prior_sd
     return {
         node.name: _epsilon(Information(evaluator, k, optimum.theta, scale, n_sets=_SETS))
         for k, node in enumerate(evaluator.nodes)

@@ -8,6 +8,7 @@ from scipy.stats import norm, wasserstein_distance
 
 from prbayes._checks import Floats
 from prbayes.metrics.area import AreaMetric
+from prbayes.metrics.base import Minimum
 from prbayes.metrics.density import GaussianKDE, Histogram, likelihood_bandwidth
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.function import FunctionMetric
