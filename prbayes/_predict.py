@@ -125,7 +125,8 @@ def predict(
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     data = [0.0, 2.0, 4.0]
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=data)
     >>> squares = prb.predict(prb.minimize(model), np.square, x, random_seed=1)
     >>> squares.name, squares.shape, squares.attrs["responses"]
     ('square', (1, 1, 500), 1024)

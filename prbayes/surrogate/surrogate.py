@@ -154,7 +154,7 @@ class Surrogate:
         >>> import numpy as np, pymc as pm, prbayes as prb
         >>> with pm.Model() as model:
         ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-        ...     surrogate = prb.Surrogate.fit(np.square, [x], 32, model=prb.Polynomial(2))
+        ...     surrogate = prb.Surrogate.fit(np.square, [x], 32, model=prb.surrogate.Polynomial(2))
         ...     data = [0.5, 1.0, 4.0]
         ...     y = prb.Simulator("y", surrogate, x, metric=prb.AreaMetric(), observed=data)
         """
@@ -229,8 +229,8 @@ class Surrogate:
         text = f"surrogate: {self.domain.complaint(columns, out)}"
         if isinstance(self.outside, Abort):
             raise ValueError(
-                f"{text}; fit it on wider ranges, or with outside=prb.Replace(), which gives NaN "
-                "there"
+                f"{text}; fit it on wider ranges, or with outside=prb.response.Replace(), which "
+                "gives NaN there"
             )
         value = cast(Replace, self.outside).value
         _log.warning("%s; they give %s", text, value)
@@ -411,12 +411,14 @@ def _refuse_wrong(name: str, response: object, model: Any, outside: object, stor
     is_surface = isinstance(model, Surface) or is_regressor
     if isinstance(model, type) or not is_surface:
         raise TypeError(
-            f"{name}: model: got {model!r:.60}, expected prb.RadialBasis(), prb.Polynomial(), or a "
-            "regressor (an object, not a class) with fit(X, y) and predict(X)"
+            f"{name}: model: got {model!r:.60}, expected prb.surrogate.RadialBasis(), "
+            "prb.surrogate.Polynomial(), or a regressor (an object, not a class) with fit(X, y) "
+            "and predict(X)"
         )
     if not isinstance(outside, Abort | Replace):
         raise TypeError(
-            f"{name}: outside: got {outside!r:.60}, expected prb.Replace() or prb.Abort()"
+            f"{name}: outside: got {outside!r:.60}, expected prb.response.Replace() or "
+            "prb.response.Abort()"
         )
     if store is not None and not isinstance(store, str | PathLike):
         raise TypeError(f"{name}: store: got {type(store).__name__}, expected the path of a folder")

@@ -125,8 +125,8 @@ def _refuse_dependent(case: Case) -> None:
     if case.dependent:
         raise ValueError(
             f"null: got ExactModel() for {case.size} values of {case.n_specimens} specimens, "
-            "expected one value per specimen; use PosteriorNull(), which passes each specimen "
-            "through all conditions"
+            "expected one value per specimen; use prb.validation.PosteriorNull(), which passes "
+            "each specimen through all conditions"
         )
 
 

@@ -152,9 +152,7 @@ class JointNull(SimulatedNull):
         """Return the minimisers of the replicates that converged, (r, d), and which did."""
         evaluator = self.optimum.evaluator
         units = np.array(list(self.optimum.scales.values()))
-        neighbourhood = Neighbourhood.of(
-            evaluator, self.optimum.theta, units, evaluator.prior_sd
-        )
+        neighbourhood = Neighbourhood.of(evaluator, self.optimum.theta, units, evaluator.prior_sd)
         x, converged = neighbourhood.refit(sets_at(evaluator, populations, points))
         if converged.mean() < _CONVERGED:
             raise ValueError(

@@ -212,8 +212,9 @@ def _refuse_null(null: object) -> None:
     """Raise if it is no null distribution, such as a class of one."""
     if null is not None and not isinstance(null, Null):
         raise TypeError(
-            f"null: got {type(null).__name__} {null!r:.60}, expected prb.validation.PosteriorNull(), "
-            "prb.validation.ExactModel() or prb.validation.JointNull(optimum)"
+            f"null: got {type(null).__name__} {null!r:.60}, expected "
+            "prb.validation.PosteriorNull(), prb.validation.ExactModel() or "
+            "prb.validation.JointNull(optimum)"
         )
 
 
