@@ -27,7 +27,7 @@ def surrogate() -> prb.Surrogate:
 
 
 def test_the_error_is_what_left_out_points_show() -> None:
-    """The residuals are those of fits without each tenth of the points, done here by hand with a plane."""
+    """The residuals are those of fits without each tenth, done here by hand with a plane."""
     found = prb.Surrogate.fit(bent, BOX, 20, model=prb.surrogate.Polynomial(1), random_seed=4)
     order = np.random.default_rng(4).permutation(20)
     a = np.column_stack([np.ones(20), found.points])
