@@ -10,10 +10,11 @@ import pymc as pm
 import xarray as xr
 
 from prbayes.estimate.optimum import Optimum
-from prbayes.plots._canvas import Canvas, named
+from prbayes.plots._canvas import Canvas
 from prbayes.plots._ensemble import read_result
 from prbayes.plots._margins import chosen, margin_densities, margins
-from prbayes.plots._populations import calibrated, check_level, middle_and_band
+from prbayes.plots._names import named
+from prbayes.plots._populations import calibrated, check_level, draw_calibrated
 
 
 def plot_population(
@@ -72,13 +73,14 @@ def plot_population(
     check_level(level)
     shown = read_result(result, model, "prb.plot_population", draws, free=True)
     wanted = chosen(margins(shown.evaluator), inputs)
-    center = shown.thetas[:0] if shown.center is None else shown.center
-    found = margin_densities(shown.evaluator, wanted, np.vstack([center, shown.thetas]))
-    canvas = Canvas([m.name for m in wanted], size=(4.6, 3.9), backend=backend, pc_kwargs=pc_kwargs)
+    found = margin_densities(shown.evaluator, wanted, shown.every)
+    names = [margin.name for margin in wanted]
+    canvas = Canvas(names, size=(4.6, 3.9), backend=backend, pc_kwargs=pc_kwargs)
     for margin in wanted:
+        panel = canvas.panel(margin.name)
         grid, curves = found[margin.name]
-        after, band = middle_and_band(curves, len(center), level)
-        calibrated(canvas, margin.name, grid, after, band, shown, level)
+        after = calibrated(curves, shown, level)
+        draw_calibrated(panel, grid, after, shown, level)
         y = "probability" if margin.discrete else "density"
-        canvas.axes(margin.name, x=named(margin.name, labels), y=y)
+        panel.axes(x=named(margin.name, labels), y=y)
     return canvas.finish()
