@@ -25,6 +25,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2, norm, qmc
 
+from benchmarks import record
+
 METRICS = ("ProbabilityResidual", "KullbackLeibler", "AreaMetric", "LogLikelihood")
 SIZES = (20, 50, 200)
 STORE = Path(__file__).parent / "results" / "coverage"
@@ -196,7 +198,6 @@ def analyse(
     from prbayes.estimate.data_sets import reweighted_sets
     from prbayes.estimate.minimization import find_optimum
     from prbayes.estimate.refit import Neighbourhood
-    from prbayes.estimate.sandwich import prior_scale
     from prbayes.posterior.adjustment import Affine, moved
     from prbayes.posterior.epsilon import calibrate_epsilon
 
@@ -204,7 +205,7 @@ def analyse(
     optimum = find_optimum(ev, tolerance=1e-6, starts=0)
     epsilon = np.array([calibrate_epsilon(optimum)["y"]])
     ev.nodes[0].epsilon.set_value(epsilon[0])
-    hood = Neighbourhood.of(ev, optimum.theta, epsilon, prior_scale(ev))
+    hood = Neighbourhood.of(ev, optimum.theta, epsilon, ev.prior_sd)
     r = hood.sd.size
     spread = 2.0 * (hood.frame * hood.sd**2) @ hood.frame.T + hood.local.blind @ hood.local.blind.T
     thetas, log_q = proposal(optimum.theta, spread * np.outer(hood.local.scale, hood.local.scale))
@@ -380,7 +381,7 @@ def main() -> None:
                 path.with_suffix(".part").replace(path)
     found = table(arguments.store)
     if arguments.out:
-        arguments.out.write_text(json.dumps(found, indent=1) + "\n")
+        record.save(arguments.out, found)
 
 
 if __name__ == "__main__":

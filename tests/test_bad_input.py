@@ -216,7 +216,7 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "Reweighted function without weights": (
         simulator(metric=prb.FunctionMetric(lambda a, b: abs(a.mean(-1) - b.mean()))),
         TypeError,
-        r"y: a FunctionMetric without weights .*weighted=True, or use propagation=prb.Resimulated\(\)",
+        r"y: a metric that takes no weights .*weighted=True, or use propagation=prb.Resimulated\(\)",
     ),
     # Priors.
     "flat prior": (lambda: build(never, prior=pm.Flat), TypeError, r"got mu.*replace pm.Flat .*wide pm.Normal"),

@@ -21,13 +21,12 @@ from prbayes.estimate.refinement import AGREE, MAX_ROUNDS, grow, pilot, refine_a
 from prbayes.estimate.refit import Neighbourhood
 from prbayes.estimate.rivals import Rival, rivals
 from prbayes.estimate.sampling import Local
-from prbayes.estimate.sandwich import Information, prior_scale
+from prbayes.estimate.sandwich import Information
 from prbayes.estimate.search import Search
-from prbayes.metrics.function import FunctionMetric
+from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.simulator import model_on_context
 from prbayes.model.support import shortcomings
-from prbayes.propagation.fresh import FreshBound
 
 _log = logging.getLogger("prbayes")
 
@@ -205,14 +204,14 @@ def find_optimum(
     minimiser = Method.of(method, options)
     positive_number(tolerance, "tolerance")
     positive_integer(max_evaluations, "max_evaluations")
-    fresh = [n.name for n in evaluator.nodes if isinstance(n.bound, FreshBound)]
+    fresh = [n.name for n in evaluator.nodes if n.bound.random]
     if fresh and minimiser.gradient and isinstance(minimiser.method, str):
         raise TypeError(
             f"{fresh[0]}: prb.Fresh draws new responses at every evaluation, so the method {minimiser.name} has no "
             "gradient to follow; pass epsilon= to prb.sample_smc, which then needs no optimum, use "
             "prb.minimize(method='Nelder-Mead'), or propagation=prb.Reweighted() or prb.Resimulated()"
         )
-    scale = prior_scale(evaluator, seed=random_seed)
+    scale = evaluator.prior_sd
     already = evaluator.n_responses
     stored = sum(d.n_points for d in evaluator.designs.values())
     several = len(evaluator.nodes) > 1
@@ -296,7 +295,7 @@ def find_optimum(
 
 def _hood(evaluator: Evaluator, theta: Floats, scale: Floats, scales: Floats) -> Neighbourhood | None:
     """Return the sampling distribution of the minimiser around theta, or None where nothing is known of it."""
-    if any(isinstance(n.metric, FunctionMetric) or isinstance(n.bound, FreshBound) for n in evaluator.nodes):
+    if any(n.metric.minimum is Minimum.UNKNOWN or n.bound.random for n in evaluator.nodes):
         return None
     return Neighbourhood.of(evaluator, theta, scales, scale)
 

@@ -10,7 +10,6 @@ import numpy as np
 from prbayes._checks import Floats, positive_integer
 from prbayes.estimate.data_sets import observed_set, simulated_sets
 from prbayes.estimate.refit import Neighbourhood, inapplicable
-from prbayes.estimate.sandwich import prior_scale
 from prbayes.model.evaluator import Evaluator
 
 _FEWEST = 50  # draws of a mode below which it is left as it is
@@ -90,7 +89,7 @@ class Affine:
         reason = inapplicable(evaluator)
         if reason:
             return thetas, f"none: {reason}"
-        flat, scale = thetas.reshape(-1, thetas.shape[-1]), prior_scale(evaluator)
+        flat, scale = thetas.reshape(-1, thetas.shape[-1]), evaluator.prior_sd
         hoods = [Neighbourhood.of(evaluator, theta, evaluator.epsilon, scale, _WEAKEST) for theta in optima]
         hoods = [h for h in hoods if h.sd.size]
         if not hoods:

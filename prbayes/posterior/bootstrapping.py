@@ -13,12 +13,16 @@ from prbayes.estimate.data_sets import reweighted_sets, simulated_sets
 from prbayes.estimate.identifiability import blind_directions
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refit import Neighbourhood, inapplicable
-from prbayes.estimate.sandwich import prior_scale
 from prbayes.posterior.trees import bootstrap_tree
 
 
 def bootstrap(
-    optimum: Optimum, draws: int = 1000, *, parametric: bool = False, random_seed: int = 0, progressbar: bool = True
+    optimum: Optimum,
+    draws: int = 1000,
+    *,
+    parametric: bool = False,
+    random_seed: int = 0,
+    progressbar: bool = True,
 ) -> xr.DataTree:
     """Minimise the discrepancy once for each of many data sets that resemble the observed one.
 
@@ -70,14 +74,16 @@ def bootstrap(
     """
     clock = time.perf_counter()
     if not isinstance(optimum, Optimum):
-        raise TypeError(f"bootstrap: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first")
+        raise TypeError(
+            f"bootstrap: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first"
+        )
     positive_integer(draws, "draws", minimum=2)
     evaluator = surveyed(optimum, "bootstrap").evaluator
     reason = inapplicable(evaluator)
     if reason:
         raise ValueError(f"bootstrap: {reason}; use prb.sample_smc")
     scales = np.array(list(optimum.scales.values()))
-    hood = Neighbourhood.of(evaluator, optimum.theta, scales, prior_scale(evaluator))
+    hood = Neighbourhood.of(evaluator, optimum.theta, scales, evaluator.prior_sd)
     blind = blind_directions(hood.local.blind, evaluator.readable_names)
     if blind:
         raise ValueError(
