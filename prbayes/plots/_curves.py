@@ -23,7 +23,7 @@ _WIDE_POPULATIONS = 0.1
 
 
 def _finite_samples(values: Floats, weights: Floats) -> Iterator[tuple[Floats, Floats]]:
-    """Yield what is finite and has a weight, of samples of shape (P, n), with weights of sum one."""
+    """Yield what is finite and has a weight, of samples of shape (P, n), with weights of sum 1."""
     rows = np.broadcast_to(values, weights.shape)
     for row, w in zip(rows, weights, strict=True):
         used = np.isfinite(row) & (w > 0)

@@ -23,8 +23,8 @@ from prbayes.model.support import DesignError
 # costs responses, it is 3.6%. Never fewer than eight. By judgement.
 _FREE, _COSTLY, _FEWEST = 200, 40, 8
 _MOST_RESPONSES = 1 << 22  # held in memory at a time: 32 MiB of float64
-# A curve of fewer responses than ten, by their effective number, shows the design and no population;
-# a mean weight away from one says that the design misses a part of it. By judgement: a curve may be
+# A curve of fewer responses than ten, by their effective number, shows the design, no population; a
+# mean weight away from one says that the design misses a part of it. By judgement: a curve may be
 # worse than an estimate, which needs more (`model.support`).
 _LEAST_ESS = 10.0
 _MEAN_WEIGHTS = (0.5, 2.0)

@@ -19,8 +19,8 @@ _STANDARD_ERRORS = 4.0
 # Draws and quantiles of the prior that say how far an axis may follow the optimiser's path, by
 # judgement: ten draws lie beyond each.
 _PRIOR_DRAWS, _PRIOR_QUANTILES = 1000, (0.01, 0.99)
-# Points at which half an axis is checked against the priors' support, by judgement: its end is short
-# of the support's by less than a 32nd.
+# Points at which half an axis is checked against the priors' support, by judgement: its end is
+# short of the support's by less than a 32nd.
 _SUPPORT_POINTS = 33
 _MARGIN = 0.04  # of an axis, beyond what is marked on it; about the size of a marker
 
@@ -154,7 +154,7 @@ def _plane(optimum: Optimum, evaluator: Evaluator, names: list[str]) -> _Plane:
 
 
 def _standard_error(optimum: Optimum, name: str, bulk: Floats) -> float:
-    """Return the standard error, or where it is unknown what makes the axis as wide as the prior."""
+    """Return the standard error, or if it is unknown what makes the axis as wide as the prior."""
     error = point_elements(optimum.stderr)[name]
     if np.isfinite(error) and error > 0:
         return error

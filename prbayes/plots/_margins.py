@@ -38,7 +38,8 @@ class Margin:
     Attributes
     ----------
     name : str
-        That of the distribution if it has one, or of the response's argument; with an element's index.
+        That of the distribution if it has one, or of the response's argument; with an element's
+        index.
     dist : variable
         The ``.dist()``.
     node, position : int
@@ -99,7 +100,7 @@ def _argument_of(position: int, inputs: Inputs, arguments: list[str]) -> str:
 
 
 def chosen(known: list[Margin], inputs: Iterable[Any] | None) -> list[Margin]:
-    """Return those margins that a user asked for: by name, with or without index, or as ``.dist()``.
+    """Return those margins that a user asked for: by name, with or without index, or ``.dist()``.
 
     Raises
     ------
@@ -185,7 +186,7 @@ def _equal_weights(values: Floats) -> Floats:
 
 
 def _axis(margin: Margin, values: Floats) -> Floats:
-    """Return where a density is evaluated: what most of the draws cover, or the whole numbers there."""
+    """Return where a density is evaluated: over most draws, or at the whole numbers there."""
     low, high = central_range(values, _equal_weights(values), _TAIL)
     if margin.discrete:
         first, last = np.floor(low), np.ceil(high)

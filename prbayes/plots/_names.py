@@ -11,7 +11,7 @@ from prbayes._checks import Floats
 
 
 def element_name(name: str, index: tuple[int, ...]) -> str:
-    """Return the name of an element, such as 'mu[1]' or 'cov[0,1]'; of a scalar, the variable's own."""
+    """Return the name of an element, such as 'mu[1]'; of a scalar, the variable's own."""
     if not index:
         return name
     places = ",".join(map(str, index))
@@ -42,7 +42,7 @@ def point_elements(point: Mapping[str, Any]) -> dict[str, float]:
 
 
 def named(name: str, labels: Mapping[str, str] | None) -> str:
-    """Return what a reader calls an element: its label, its variable's with the index, or its name."""
+    """Return an element's label, or its variable's with the index, or else its name."""
     given = labels or {}
     if name in given:
         return given[name]

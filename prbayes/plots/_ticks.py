@@ -47,7 +47,7 @@ def spans_decades(values: Floats) -> bool:
 
 
 def log_ticks(values: Floats) -> Ticks:
-    """Return ticks of positive values: positions as base-10 logarithms, and labels of the values."""
+    """Return ticks of positive values: positions as base-10 logarithms, labels of the values."""
     finite = values[np.isfinite(values)]
     shown = np.log10(finite[finite > 0])
     low, high = shown.min(), shown.max()

@@ -27,15 +27,15 @@ def plot_comparison(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the estimate and the interval of each result, one row per result and one panel per hyperparameter.
+    """Draw the estimate and interval of each result, a row per result, a panel per hyperparameter.
 
     Parameters
     ----------
     comparison : xarray.Dataset
         From `compare`.
     scores : bool
-        Draw in their place the discrepancy of each result's population under each metric, one panel per metric; the
-        smaller the better, each metric in its own units.
+        Draw in their place the discrepancy of each result's population under each metric, one panel
+        per metric; the smaller the better, each metric in its own units.
     labels : mapping, optional
         What a reader calls a hyperparameter, by its name, with units; also a result or a score.
     backend : {"matplotlib", "bokeh", "plotly"}, optional
@@ -46,7 +46,8 @@ def plot_comparison(
     Returns
     -------
     arviz.PlotCollection
-        Its ``viz`` has the artists ``estimate`` and ``interval_0``, ``interval_1`` and so on by result; or ``score``.
+        Its ``viz`` has the artists ``estimate`` and ``interval_0``, ``interval_1`` and so on by
+        result; or ``score``.
 
     Raises
     ------
@@ -58,7 +59,9 @@ def plot_comparison(
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
     >>> table = prb.compare({"optimum": prb.minimize(model)}, model=model)
     >>> list(prb.plot_comparison(table, backend="none").viz["estimate"])
     ['mu']

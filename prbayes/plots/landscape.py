@@ -35,26 +35,29 @@ def plot_landscape(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the objective over two hyperparameters around the optimum, with the optimiser's path and other optima.
+    """Draw the objective around the optimum over two hyperparameters, with the optimiser's path.
 
-    Darker is lower; contours are at even steps of the root of the objective over its lowest value, so that they crowd
-    towards the optimum; the title has the values at the ends. With one hyperparameter, or one name, it is a curve. All
-    other hyperparameters stand at the optimum, as the title says. Where stored responses do not support a population
-    the picture is blank. Path and other optima are those of all hyperparameters, projected.
+    Darker is lower; contours are at even steps of the root of the objective over its lowest value,
+    so that they crowd towards the optimum; the title has the values at the ends. With one
+    hyperparameter, or one name, it is a curve. All other hyperparameters stand at the optimum, as
+    the title says. Where stored responses do not support a population the picture is blank. Path
+    and other optima are those of all hyperparameters, projected.
 
     Parameters
     ----------
     optimum : Optimum
         From `minimize`.
     model : pymc.Model, optional
-        That of the optimum; another one with the same hyperparameters may be given, such as one with another metric.
+        That of the optimum; another one with the same hyperparameters may be given, such as one
+        with another metric.
     pair : sequence of str, optional
-        One or two names, such as ``("mu", "sigma")`` or ``("mu[0]", "mu[1]")``; the first two by default.
+        One or two names, such as ``("mu", "sigma")`` or ``("mu[0]", "mu[1]")``; the first two by
+        default.
     points : int, optional
         Along each axis; 41, or 161 for a curve.
     responses : int
-        Largest number of responses that may be computed. With `Reweighted` none is; with `Resimulated` and `Fresh`
-        every point of the picture costs n for each simulator.
+        Largest number of responses that may be computed. With `Reweighted` none is; with
+        `Resimulated` and `Fresh` every point of the picture costs n for each simulator.
     labels : mapping, optional
         What a reader calls a hyperparameter, by its name, with units.
     backend : {"matplotlib", "bokeh", "plotly"}, optional
@@ -65,7 +68,8 @@ def plot_landscape(
     Returns
     -------
     arviz.PlotCollection
-        Its ``viz`` has the artists ``landscape`` (``landscape_lines``), ``path``, ``optimum`` and ``rivals``.
+        Its ``viz`` has the artists ``landscape`` (``landscape_lines``), ``path``, ``optimum`` and
+        ``rivals``.
 
     Raises
     ------
@@ -77,7 +81,9 @@ def plot_landscape(
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
     >>> prb.plot_landscape(prb.minimize(model), backend="none").viz["optimum"].name
     'optimum'
     """

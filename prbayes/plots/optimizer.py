@@ -22,13 +22,14 @@ def plot_optimizer(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the objective and the hyperparameters that an optimiser asked for, against the number of evaluations.
+    """Draw the objective and hyperparameters that an optimiser asked for, by evaluation.
 
-    The first panel has the objective, the sum of d_k / s_k, of each point and the lowest so far, with logarithmic
-    ticks where it falls over more than a decade; a panel for each hyperparameter follows, in the user's own units,
-    with the optimum as a dashed line. With `Reweighted` the objective is that of the final design and scales,
-    evaluated anew without a response; elsewhere it is what the optimiser saw, and with several simulators, whose
-    scales may have changed on the way, nothing says which was lowest.
+    The first panel has the objective, the sum of d_k / s_k, of each point and the lowest so far,
+    with logarithmic ticks where it falls over more than a decade; a panel for each hyperparameter
+    follows, in the user's own units, with the optimum as a dashed line. With `Reweighted` the
+    objective is that of the final design and scales, evaluated anew without a response; elsewhere
+    it is what the optimiser saw, and with several simulators, whose scales may have changed on the
+    way, nothing says which was lowest.
 
     Parameters
     ----------
@@ -44,7 +45,8 @@ def plot_optimizer(
     Returns
     -------
     arviz.PlotCollection
-        Its ``viz`` has the artists ``asked`` and ``path``, ``best`` (first panel) and ``optimum`` (the others).
+        Its ``viz`` has the artists ``asked`` and ``path``, ``best`` (first panel) and ``optimum``
+        (the others).
 
     Raises
     ------
@@ -56,7 +58,9 @@ def plot_optimizer(
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
     >>> list(prb.plot_optimizer(prb.minimize(model), backend="none").viz["asked"])
     ['discrepancy', 'mu']
     """

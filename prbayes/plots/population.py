@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import pymc as pm
 import xarray as xr
 
@@ -28,10 +27,12 @@ def plot_population(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the calibrated population of each aleatory input, with its uncertainty; of a multivariate one, its margins.
+    """Draw the calibrated population of each aleatory input, with its uncertainty.
 
-    The curve is the posterior predictive density of the input, or its density at the optimum; the band holds
-    the share ``level`` of the densities at each value. It computes no response.
+    Of a multivariate input each margin has a panel.
+
+    The curve is the posterior predictive density of the input, or its density at the optimum; the
+    band holds the share ``level`` of the densities at each value. It computes no response.
 
     Parameters
     ----------
@@ -40,7 +41,8 @@ def plot_population(
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
     inputs : sequence, optional
-        Names, or ``.dist()`` objects; all by default. An input is called as the response's argument that takes it.
+        Names, or ``.dist()`` objects; all by default. An input is called as the response's argument
+        that takes it.
     level : float
     draws : int, optional
         Number of populations in the band; 200 by default.
@@ -59,14 +61,17 @@ def plot_population(
     Raises
     ------
     TypeError, KeyError, ValueError
-        If an argument is not as described, there is no such input, or the result lacks a free variable.
+        If an argument is not as described, there is no such input, or the result lacks a free
+        variable.
 
     Examples
     --------
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda load: 2 * load, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator(
+    ...         "y", lambda load: 2 * load, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
     >>> list(prb.plot_population(prb.minimize(model), backend="none").viz["after"])
     ['load']
     """

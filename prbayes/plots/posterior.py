@@ -24,8 +24,8 @@ from prbayes.plots._ticks import round_ticks
 _PRIOR_DRAWS = 4000
 # Points of a curve: one or two pixels each, by judgement.
 _GRID_POINTS = 301
-# Heights of the two intervals below the axis, in units of the posterior's peak: the diamond of one does
-# not touch the dot of the other. By judgement.
+# Heights of the two intervals below the axis, in units of the posterior's peak: the diamond of one
+# does not touch the dot of the other. By judgement.
 _ROWS = (-0.07, -0.15)
 
 
@@ -39,11 +39,11 @@ def plot_posterior(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the posterior of each hyperparameter against the optimum with its standard error, and the prior.
+    """Draw the posterior of each hyperparameter against the optimum and the prior.
 
-    The bar below the posterior is its equal-tailed interval, with the mean as a dot; the bar and the diamond below
-    that are the optimum and the interval of as much probability of the normal distribution with its standard error,
-    which the dashed curve shows.
+    The bar below the posterior is its equal-tailed interval, with the mean as a dot; the bar and
+    the diamond below that are the optimum and the interval of as much probability of the normal
+    distribution with its standard error, which the dashed curve shows.
 
     Parameters
     ----------
@@ -52,8 +52,8 @@ def plot_posterior(
     optimum : Optimum, optional
         From `minimize`.
     model : pymc.Model, optional
-        Restricts the picture to the model's free variables and adds their prior; by default all variables that
-        posterior and optimum share.
+        Restricts the picture to the model's free variables and adds their prior; by default all
+        variables that posterior and optimum share.
     level : float
         Probability of the intervals.
     labels : mapping, optional
@@ -66,8 +66,8 @@ def plot_posterior(
     Returns
     -------
     arviz.PlotCollection
-        Its ``viz`` has the artists ``posterior``, ``interval``, ``mean``, ``prior``, ``normal``, ``stderr`` and
-        ``optimum``.
+        Its ``viz`` has the artists ``posterior``, ``interval``, ``mean``, ``prior``, ``normal``,
+        ``stderr`` and ``optimum``.
 
     Raises
     ------
@@ -79,9 +79,13 @@ def plot_posterior(
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
     ...     optimum = prb.minimize()
-    ...     posterior = prb.sample_smc(100, chains=2, optimum=optimum, random_seed=1, progressbar=False)
+    ...     posterior = prb.sample_smc(
+    ...         100, chains=2, optimum=optimum, random_seed=1, progressbar=False
+    ...     )
     >>> list(prb.plot_posterior(posterior, optimum, model=model, backend="none").viz["posterior"])
     ['mu']
     """

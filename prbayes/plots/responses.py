@@ -29,7 +29,7 @@ from prbayes.plots._names import named
 from prbayes.plots._populations import calibrated, check_level, draw_calibrated
 
 _log = logging.getLogger("prbayes")
-# Shares of a population beyond each end of the axis, by judgement: of the calibrated one hardly any;
+# Shares of a population beyond each end of the axis, by judgement: hardly any of the calibrated;
 # of the one before, which is there to be compared, more, and it widens the axis by at most half on
 # each side.
 _TAIL, _TAIL_BEFORE, _ROOM_BEFORE = 0.005, 0.05, 0.5
@@ -50,12 +50,12 @@ def plot_responses(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the responses before and after a calibration against the measured ones, one panel per simulator.
+    """Draw the responses before and after a calibration against the measured ones.
 
-    Measured responses are a histogram, in outline, with a mark for each, or steps. The calibrated curve is the
-    posterior predictive distribution, or the optimum's population. The band holds the share ``level`` of the
-    populations at each response: those of the posterior's draws, or of the optimum's sampling distribution where it
-    is known.
+    Measured responses are a histogram, in outline, with a mark for each, or steps. The calibrated
+    curve is the posterior predictive distribution, or the optimum's population. The band holds the
+    share ``level`` of the populations at each response: those of the posterior's draws, or of the
+    optimum's sampling distribution where it is known.
 
     Parameters
     ----------
@@ -64,17 +64,18 @@ def plot_responses(
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
     before : dict or bool, optional
-        Hyperparameters before the calibration, in the user's own units; False for none. By default the
-        optimiser's first point, if it was given a start or did not look for one, and else the prior's initial point;
-        the legend says which.
+        Hyperparameters before the calibration, in the user's own units; False for none. By default
+        the optimiser's first point, if it was given a start or did not look for one, and else the
+        prior's initial point; the legend says which.
     ecdf : bool
         Draw distribution functions, which need no bandwidth, in place of densities.
     level : float
     draws : int, optional
-        Number of populations in the band; 200 where they cost no response (`Reweighted`), 40 elsewhere, where each
-        costs n responses per simulator.
+        Number of populations in the band; 200 where they cost no response (`Reweighted`), 40
+        elsewhere, where each costs n responses per simulator.
     labels : mapping, optional
-        What a reader calls a simulator, by its name, with units: ``{"crack": "relative crack length"}``.
+        What a reader calls a simulator, by its name, with units: ``{"crack": "relative crack
+        length"}``.
     backend : {"matplotlib", "bokeh", "plotly"}, optional
         That of ArviZ's settings by default.
     **pc_kwargs
@@ -83,7 +84,8 @@ def plot_responses(
     Returns
     -------
     arviz.PlotCollection
-        Its ``viz`` has the artists ``measured``, ``rug`` (densities only), ``before``, ``band`` and ``after``.
+        Its ``viz`` has the artists ``measured``, ``rug`` (densities only), ``before``, ``band`` and
+        ``after``.
 
     Raises
     ------
@@ -94,15 +96,17 @@ def plot_responses(
 
     Notes
     -----
-    Densities of responses are Gaussian kernel densities with Silverman's bandwidth, widened where weights are
-    uneven. Specimens that failed (+inf) are missing from the area under a curve.
+    Densities of responses are Gaussian kernel densities with Silverman's bandwidth, widened where
+    weights are uneven. Specimens that failed (+inf) are missing from the area under a curve.
 
     Examples
     --------
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
     >>> prb.plot_responses(prb.minimize(model), backend="none").viz["after"].name
     'after'
     """
@@ -184,7 +188,7 @@ def _covered(node: Node, after: _Simulated, earlier: _Simulated | None) -> tuple
 
 
 def _cut(before: Floats, top: float) -> tuple[float, float] | None:
-    """Return where the axis ends if a narrow peak before would dwarf all else, as high as ``top``."""
+    """Return where the axis ends if a narrow peak before would dwarf all else, up to ``top``."""
     if before.max() <= _TALLEST * top:
         return None
     return -0.05 * top, _TALLEST * top

@@ -34,11 +34,12 @@ def plot_stages(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the stages of a sequential Monte Carlo run, one line per chain and one panel per statistic.
+    """Draw the stages of a sequential Monte Carlo run, a line per chain, a panel per statistic.
 
-    A statistic that is known at the end only, such as the log marginal likelihood, stands against the chain.
-    Beta goes from the prior, 0, to the posterior, 1; chains that need very different numbers of stages, or whose log
-    marginal likelihoods end far apart, have not seen the same posterior.
+    A statistic that is known at the end only, such as the log marginal likelihood, stands against
+    the chain. Beta goes from the prior, 0, to the posterior, 1; chains that need very different
+    numbers of stages, or whose log marginal likelihoods end far apart, have not seen the same
+    posterior.
 
     Parameters
     ----------
@@ -66,7 +67,9 @@ def plot_stages(
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
     ...     posterior = prb.sample_smc(100, chains=2, random_seed=1, progressbar=False)
     >>> "chain_1" in prb.plot_stages(posterior, backend="none").viz
     True

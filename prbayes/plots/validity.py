@@ -20,10 +20,11 @@ def plot_validity(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the ECDF of the u-values against the identity, with the area between them and the verdict.
+    """Draw the ECDF of the u-values against the identity, the area between them, the verdict.
 
-    The shaded area is the statistic. The title has the critical value and the verdict; the band holds the whole
-    ECDF with probability 1 - level if the null is true, calibration uncertainty included.
+    The shaded area is the statistic. The title has the critical value and the verdict; the band
+    holds the whole ECDF with probability 1 - level if the null is true, calibration uncertainty
+    included.
 
     Parameters
     ----------
@@ -39,7 +40,8 @@ def plot_validity(
     Returns
     -------
     arviz.PlotCollection
-        With ``savefig``; its ``viz`` has the artists ``area``, ``envelope``, ``identity`` and ``ecdf``.
+        With ``savefig``; its ``viz`` has the artists ``area``, ``envelope``, ``identity`` and
+        ``ecdf``.
 
     Raises
     ------

@@ -117,7 +117,7 @@ def read() -> SimpleNamespace:
 def pictures(
     optimum: prb.Optimum, posterior: xr.DataTree, comparison: xr.Dataset
 ) -> dict[str, Callable[..., Any]]:
-    """Return every plot function that draws on a canvas with a legend, by name, with its arguments."""
+    """Return every plot with a legend or a panel for each result, by name."""
     model = optimum.model
     return {
         "responses": lambda **k: prb.plot_responses(posterior, model=model, **k),

@@ -87,9 +87,9 @@ def test_labels_reach_the_axes(picture: str, pictures: dict[str, Callable[..., A
         "sigma": "SD",
     }
     pc = pictures[picture](backend="none", labels=labels)
-    found = {
-        text for a in pc.viz["figure"].item().axes for text in (a.get_xlabel(), a.get_ylabel())
-    }
+    panels = [pc.get_target(name, {}) for name in pc.data.data_vars]
+    calls = [call for panel in panels for call in panel]
+    found = {call["string"] for call in calls if call["function"] in ("xlabel", "ylabel")}
     assert found & set(labels.values())
     assert not found & (set(labels) - {"x", "y"})
 
