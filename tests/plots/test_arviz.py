@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.validation.nulls import area
+from prbayes.validation.statistic import area
 
 
 @cache
