@@ -34,12 +34,20 @@ def ninf_for_invalid(graphs: Sequence[TensorVariable]) -> list[TensorVariable]:
 
 
 def compile_batched(
-    core_inputs: Sequence[TensorVariable], core_outputs: Sequence[TensorVariable], extra: Sequence[TensorVariable] = ()
+    core_inputs: Sequence[TensorVariable],
+    core_outputs: Sequence[TensorVariable],
+    extra: Sequence[TensorVariable] = (),
 ) -> Any:
     """Compile a graph for a batch: every core input gets a leading axis, ``extra`` inputs stay as they are."""
     outputs = ninf_for_invalid(core_outputs)
-    batched = [pt.tensor(name=v.name, dtype=v.dtype, shape=(None, *v.type.shape)) for v in core_inputs]
+    batched = [
+        pt.tensor(name=v.name, dtype=v.dtype, shape=(None, *v.type.shape)) for v in core_inputs
+    ]
     vectorized = vectorize_graph(outputs, dict(zip(core_inputs, batched, strict=True)))
     return pytensor.function(
-        [*batched, *extra], vectorized, mode=PLAIN, on_unused_input="ignore", allow_input_downcast=True
+        [*batched, *extra],
+        vectorized,
+        mode=PLAIN,
+        on_unused_input="ignore",
+        allow_input_downcast=True,
     )

@@ -23,12 +23,20 @@ from prbayes.response.compilation import PLAIN, compile_batched
 from prbayes.response.inputs import Inputs, event_shape, is_random
 
 
-def log_density(inputs: Inputs, aleatory: Sequence[TensorVariable], values: Sequence[Any]) -> TensorVariable:
+def log_density(
+    inputs: Inputs, aleatory: Sequence[TensorVariable], values: Sequence[Any]
+) -> TensorVariable:
     """Return log p(x), shape (n,), of values x, shapes (n, *event), summed over the aleatory inputs."""
     total: Any = 0.0
     for dist, x, shape in zip(aleatory, values, inputs.event_shapes, strict=True):
-        logp = _mvnormal_logp(dist, x, shape[0]) if is_mvnormal(dist) else pm.logp(dist, x, warn_rvs=False)
-        total = total + (logp.sum(axis=tuple(range(1, logp.type.ndim))) if logp.type.ndim > 1 else logp)
+        logp = (
+            _mvnormal_logp(dist, x, shape[0])
+            if is_mvnormal(dist)
+            else pm.logp(dist, x, warn_rvs=False)
+        )
+        total = total + (
+            logp.sum(axis=tuple(range(1, logp.type.ndim))) if logp.type.ndim > 1 else logp
+        )
     return total
 
 
@@ -44,7 +52,9 @@ def _mvnormal_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
     z: list[Any] = []
     for i in range(size):
         z.append((x[..., i] - mean[i] - sum(root[i, j] * z[j] for j in range(i))) / root[i, i])
-    logp = sum(-0.5 * z_i**2 - pt.log(root[i, i]) - 0.5 * np.log(2 * np.pi) for i, z_i in enumerate(z))
+    logp = sum(
+        -0.5 * z_i**2 - pt.log(root[i, i]) - 0.5 * np.log(2 * np.pi) for i, z_i in enumerate(z)
+    )
     return pt.switch(pt.isnan(logp), -np.inf, logp)
 
 
@@ -60,7 +70,9 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
     """
     op = dist.owner.op
     if dist.dtype.startswith(("int", "uint", "bool")):
-        raise TypeError(f"{name}: {op} is discrete; use propagation=prb.Reweighted() or prb.Fresh()")
+        raise TypeError(
+            f"{name}: {op} is discrete; use propagation=prb.Reweighted() or prb.Fresh()"
+        )
     if is_mvnormal(dist):
         mean, covariance = op.dist_params(dist.owner)
         z = pm.icdf(pm.Normal.dist(0.0, 1.0), u)
@@ -83,12 +95,20 @@ class PriorSampler:
         first = [r for r in roots if not any(a in roots for a in ancestors([r]) if a is not r)]
         self._batched = True
         try:
-            outputs = vectorize_graph(list(roots), {v: change_dist_size(v, (n,), expand=True) for v in first})
+            outputs = vectorize_graph(
+                list(roots), {v: change_dist_size(v, (n,), expand=True) for v in first}
+            )
             self._function = pm.compile([n], outputs, mode=PLAIN)
-        except (NotImplementedError, ValueError, MissingInputError):  # not vectorized, or not resized: one at a time
+        except (
+            NotImplementedError,
+            ValueError,
+            MissingInputError,
+        ):  # not vectorized, or not resized: one at a time
             self._batched = False
             self._function = pm.compile([n], list(roots), mode=PLAIN, on_unused_input="ignore")
-        self._generators = [v for v in self._function.get_shared() if isinstance(v.type, RandomGeneratorType)]
+        self._generators = [
+            v for v in self._function.get_shared() if isinstance(v.type, RandomGeneratorType)
+        ]
 
     def __call__(self, k: int, seed: int) -> list[Floats]:
         """Return k draws of each variable, shapes (k, *shape)."""
@@ -125,14 +145,18 @@ class PriorPoints:
         for v, u in zip(variables, symbols, strict=True):
             placed[v] = quantiles("priors", graph_replace([v], placed, strict=False)[0], u)
         if any(is_random(v) for v in ancestors(list(placed.values()))):
-            raise TypeError("priors: got one that depends on a random variable which is not in the model")
+            raise TypeError(
+                "priors: got one that depends on a random variable which is not in the model"
+            )
         self._function = compile_batched(symbols, list(placed.values()))
 
     def __call__(self, cube: Floats) -> list[Floats]:
         """Return values of each variable, shapes (k, *shape), for points of shape (k, size)."""
         edges = np.cumsum([0, *(int(np.prod(s, dtype=int)) for s in self._shapes)])
         parts = [cube[:, a:b] for a, b in pairwise(edges)]
-        values = self._function(*(p.reshape(len(cube), *s) for p, s in zip(parts, self._shapes, strict=True)))
+        values = self._function(
+            *(p.reshape(len(cube), *s) for p, s in zip(parts, self._shapes, strict=True))
+        )
         return [np.asarray(v) for v in values]
 
 
@@ -145,7 +169,11 @@ def valid(inputs: Inputs, aleatory: Sequence[TensorVariable]) -> TensorVariable:
     """Return whether the parameters of all aleatory inputs are valid (sigma > 0 and such), a boolean scalar."""
     from pymc.logprob.utils import CheckParameterValue
 
-    logps = [pm.logp(d, pt.zeros_like(d), warn_rvs=False) for d in aleatory] if not inputs.nested else []
+    logps = (
+        [pm.logp(d, pt.zeros_like(d), warn_rvs=False) for d in aleatory]
+        if not inputs.nested
+        else []
+    )
     conditions = [
         pt.all(c)
         for v in ancestors(logps)
@@ -162,7 +190,9 @@ class PopulationSampler:
         symbols = inputs.placeholders()
         dists, epistemic = inputs.rebuilt(symbols)
         n = pt.iscalar("n")
-        batched = [pt.tensor(name=s.name, dtype=s.dtype, shape=(None, *s.type.shape)) for s in symbols]
+        batched = [
+            pt.tensor(name=s.name, dtype=s.dtype, shape=(None, *s.type.shape)) for s in symbols
+        ]
         size = (batched[0].shape[0], n)
         per_specimen: dict[Variable, Variable] = {
             s: pt.broadcast_to(b[:, None], (*size, *(b.shape[i] for i in range(1, b.ndim))))
@@ -170,26 +200,45 @@ class PopulationSampler:
         }
         # Distributions without any root above them are not batched by their parameters: resize them.
         for v in ancestors(dists):
-            if is_random(v) and not any(a in symbols or (a is not v and is_random(a)) for a in ancestors([v])):
+            if is_random(v) and not any(
+                a in symbols or (a is not v and is_random(a)) for a in ancestors([v])
+            ):
                 per_specimen[v] = change_dist_size(v, size, expand=True)
         self._batched = True
         try:
             outputs = vectorize_graph(dists, per_specimen)
-            common = vectorize_graph(epistemic, dict(zip(symbols, batched, strict=True))) if epistemic else []
-        except (NotImplementedError, ValueError):  # what PyTensor does not vectorize: one population at a time
+            common = (
+                vectorize_graph(epistemic, dict(zip(symbols, batched, strict=True)))
+                if epistemic
+                else []
+            )
+        except (
+            NotImplementedError,
+            ValueError,
+        ):  # what PyTensor does not vectorize: one population at a time
             self._batched, batched = False, symbols
             # Resized before the roots are replaced, since PyMC resizes a CustomDist with its first parameters.
             resized = [change_dist_size(d, (n,), expand=True) for d in inputs.aleatory]
-            outputs = graph_replace(resized, dict(zip(inputs.roots, symbols, strict=True)), strict=False)
+            outputs = graph_replace(
+                resized, dict(zip(inputs.roots, symbols, strict=True)), strict=False
+            )
             common = epistemic
         self._n_aleatory = len(dists)
         self._epistemic_ndims = [e.type.ndim for e in epistemic]
         self._function = pm.compile(
-            [n, *batched], [*outputs, *common], mode=PLAIN, on_unused_input="ignore", allow_input_downcast=True
+            [n, *batched],
+            [*outputs, *common],
+            mode=PLAIN,
+            on_unused_input="ignore",
+            allow_input_downcast=True,
         )
-        self._generators = [v for v in self._function.get_shared() if isinstance(v.type, RandomGeneratorType)]
+        self._generators = [
+            v for v in self._function.get_shared() if isinstance(v.type, RandomGeneratorType)
+        ]
 
-    def __call__(self, params: Sequence[Any], n: int, rng: np.random.Generator) -> tuple[list[Floats], list[Floats]]:
+    def __call__(
+        self, params: Sequence[Any], n: int, rng: np.random.Generator
+    ) -> tuple[list[Floats], list[Floats]]:
         """Return aleatory draws, shapes (k, n, *event), and epistemic values, shapes (k, 1, *event) or (*event)."""
         for shared, child in zip(self._generators, rng.spawn(len(self._generators)), strict=True):
             shared.set_value(child, borrow=True)

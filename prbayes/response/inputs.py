@@ -60,7 +60,8 @@ class Inputs:
         """Return the response's arguments from values for the aleatory and the epistemic inputs."""
         rest = iter(epistemic)
         return [
-            next(rest) if isinstance(a, Variable) else aleatory[a] if isinstance(a, int) else a for a in self.arguments
+            next(rest) if isinstance(a, Variable) else aleatory[a] if isinstance(a, int) else a
+            for a in self.arguments
         ]
 
     @cached_property
@@ -144,7 +145,9 @@ def _constant(x: object, label: str) -> Any:
             f"{error}; an input is a `.dist()` (varies between specimens), a model variable (common to all) or a number"
         ) from None
     if not np.isfinite(array).all():
-        raise ValueError(f"{label}: got a constant that is not finite ({x!r:.60}), expected a number")
+        raise ValueError(
+            f"{label}: got a constant that is not finite ({x!r:.60}), expected a number"
+        )
     return float(array) if array.ndim == 0 else array
 
 
@@ -161,7 +164,11 @@ def is_random(variable: Variable) -> bool:
 
 def _is_bound(variable: Variable) -> bool:
     """Whether a graph's leaf has a value: constants, shared variables, generators."""
-    return hasattr(variable, "data") or hasattr(variable, "get_value") or not isinstance(variable, TensorVariable)
+    return (
+        hasattr(variable, "data")
+        or hasattr(variable, "get_value")
+        or not isinstance(variable, TensorVariable)
+    )
 
 
 def event_shape(dist: TensorVariable) -> tuple[int, ...]:

@@ -144,9 +144,7 @@ class Store:
         present = np.array([value is not None for value in found], dtype=bool)
         return _numbers(_NAN if value is None else value for value in found), present
 
-    def add(
-        self, inputs: Floats, values: Floats, reasons: Mapping[int, str] | None = None
-    ) -> None:
+    def add(self, inputs: Floats, values: Floats, reasons: Mapping[int, str] | None = None) -> None:
         """Append responses, safe on disk when this returns.
 
         Parameters

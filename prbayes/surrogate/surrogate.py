@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.propagation.points import sobol
-from prbayes.response.calling import Caller, ResponseError
+from prbayes.response.calling import Calling, Points, ResponseError, Tally, respond
 from prbayes.response.failures import Abort, OnFailure, Replace
 from prbayes.response.store import Store, StoreError
 from prbayes.surrogate.error import SurrogateError, cross_validated
@@ -148,19 +148,20 @@ class Surrogate:
         positive_integer(n, f"{name}: n", minimum=required(model, region.dimensions))
         points = region.at(sobol(n, region.dimensions, seed))
         kept = None if store is None else Store(store, name, points.shape[1])
-        caller = Caller(name, response, executor, on_failure or Abort(), kept)
-        responses = caller(region.arguments(points), [not e.constant for e in region.inputs], points)
+        calling, tally = Calling(name, response, executor, kept, on_failure or Abort()), Tally()
+        wanted = Points(region.arguments(points), [not e.constant for e in region.inputs])
+        responses = respond(calling, wanted, tally)
         good = np.isfinite(responses)
         if good.sum() < required(model, region.dimensions):
             raise ResponseError(f"{name}: got {good.sum()} numbers from {n} responses, too few for a surface")
         residuals = np.full(n, np.nan)
         residuals[good] = cross_validated(model, region.scaled(points)[good], responses[good], seed)
         error = SurrogateError(residuals, float(responses[good].std()))
-        found = cls(region, points, responses, model, outside, caller.count, error)._completed()
+        found = cls(region, points, responses, model, outside, tally.computed, error)._completed()
         if predictive is not None:
             values = found._at(predictive)
             found = replace(found, error=SurrogateError(residuals, float(values[np.isfinite(values)].std())))
-        _log.info("%s: %d responses computed; cross-validated error %s", name, caller.count, found.error)
+        _log.info("%s: %d responses computed; cross-validated error %s", name, tally.computed, found.error)
         return found
 
     @property
