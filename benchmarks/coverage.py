@@ -194,9 +194,8 @@ def analyse(
 ) -> dict[str, Any]:
     """Calibrate one data set; return the estimate, and by posterior: probability below the truth, mean, sd."""
     from prbayes.estimate.data_sets import reweighted_sets
-    from prbayes.estimate.minimize import find_optimum
+    from prbayes.estimate.minimization import find_optimum
     from prbayes.estimate.refit import Neighbourhood
-    from prbayes.estimate.sandwich import prior_scale
     from prbayes.posterior.adjustment import Affine, moved
     from prbayes.posterior.epsilon import calibrate_epsilon
 
@@ -204,7 +203,7 @@ def analyse(
     optimum = find_optimum(ev, tolerance=1e-6, starts=0)
     epsilon = np.array([calibrate_epsilon(optimum)["y"]])
     ev.nodes[0].epsilon.set_value(epsilon[0])
-    hood = Neighbourhood.of(ev, optimum.theta, epsilon, prior_scale(ev))
+    hood = Neighbourhood.of(ev, optimum.theta, epsilon, ev.prior_sd)
     r = hood.sd.size
     spread = 2.0 * (hood.frame * hood.sd**2) @ hood.frame.T + hood.local.blind @ hood.local.blind.T
     thetas, log_q = proposal(optimum.theta, spread * np.outer(hood.local.scale, hood.local.scale))

@@ -25,7 +25,7 @@ import numpy as np
 
 import prbayes as prb
 from benchmarks.systems import METRICS, SYSTEMS
-from prbayes.estimate.methods import Scipy
+from prbayes.estimate.methods import Method
 from prbayes.estimate.search import Search
 
 SIZE = 1000
@@ -65,7 +65,7 @@ def basins(evaluator: Any, name: str, metric: str, *, guided: bool) -> tuple[Any
     mu, sigma = SYSTEMS[name].truth
     labels, counts = [], []
     for theta in thetas(name, STARTS):
-        search = Search(evaluator, np.array([sigma, 1.0]), Scipy("BFGS"), prior=False, tolerance=1e-5, most=500)
+        search = Search(evaluator, np.array([sigma, 1.0]), Method("BFGS"), prior=False, tolerance=1e-5, most=500)
         start = search.approach(theta, np.ones(1), 0) if guided else theta
         search.settle(search(start, np.ones(1)))
         at, spread = search.best[0], np.exp(search.best[1])

@@ -23,7 +23,7 @@ from scipy import stats
 
 import prbayes as prb
 from benchmarks.systems import METRICS
-from prbayes.estimate.methods import Scipy
+from prbayes.estimate.methods import Method
 from prbayes.estimate.search import Search
 from prbayes.model.evaluator import Evaluator
 
@@ -69,7 +69,7 @@ def fit(base: Evaluator, data: Any, metric: str) -> tuple[float, float, bool]:
         ev = base.observing({"y": data}, METRICS[metric])
     except ValueError:
         return np.nan, np.nan, False
-    search = Search(ev, np.array([1.0, 1.0]), Scipy(), prior=False, tolerance=1e-6, most=3000)
+    search = Search(ev, np.array([1.0, 1.0]), Method(), prior=False, tolerance=1e-6, most=3000)
     start = ev.unconstrained({"mu": float(np.median(data)) + 0.3, "sigma": 1.5})
     result = search.settle(search(search.approach(start, np.ones(1), 0), np.ones(1)))
     return float(search.best[0]), float(np.exp(search.best[1])), bool(result.success)

@@ -25,15 +25,14 @@ import numpy as np
 
 import prbayes as prb
 from benchmarks.systems import METRICS, SYSTEMS
-from prbayes.estimate.methods import Scipy
-from prbayes.estimate.sandwich import prior_scale
+from prbayes.estimate.methods import Method
 from prbayes.estimate.search import Search
 
 SIZES = (20, 50, 1000, 100_000)
-POINTS = {"sobol": prb.Resimulated(4096), "monte carlo": prb.Resimulated(1_000_000, points=prb.monte_carlo)}
+POINTS = {"sobol": prb.Resimulated(4096), "monte carlo": prb.Resimulated(1_000_000, points="monte_carlo")}
 METHODS = {
-    **{f"NM {x:g}": Scipy("Nelder-Mead", {"xatol": x, "fatol": x}) for x in (1e-2, 1e-3, 1e-4)},
-    "BFGS": Scipy("BFGS"),
+    **{f"NM {x:g}": Method("Nelder-Mead", {"xatol": x, "fatol": x}) for x in (1e-2, 1e-3, 1e-4)},
+    "BFGS": Method("BFGS"),
 }
 
 
@@ -78,7 +77,7 @@ def work(arguments: argparse.Namespace) -> dict[str, Any]:
         for seed in seeds:  # outermost, in case the run is not finished
             for n, (index, (name, system)) in product(SIZES, enumerate(SYSTEMS.items())):
                 observed = system.data(np.random.default_rng([seed, n, index]), n)
-                scale = prior_scale(evaluators[name])
+                scale = evaluators[name].prior_sd
                 for metric in METRICS:
                     key = f"{points}/{name}/{n}/{seed}/{metric}"
                     if key in done:

@@ -44,14 +44,14 @@ def calibrate(response, propagation, *, only_contact=False):
 def surrogate_and_optimum(n, model, seed):
     """Return runs, the surrogate's relative error, and the optimum through it."""
     surrogate = prb.Surrogate.fit(crest_factor, RANGES, n, model=model, seed=seed)
-    return surrogate.n_runs, surrogate.error.relative, calibrate(surrogate, prb.Resimulated(1024, seed=seed))
+    return surrogate.n_runs, surrogate.error.relative, calibrate(surrogate, prb.Resimulated(1024, random_seed=seed))
 
 
 def main():
     """Print the table, save it as JSON."""
     logging.getLogger("prbayes").setLevel(logging.ERROR)
     clock = time.perf_counter()
-    reference = calibrate(crest_factor, prb.Reweighted(16384, seed=99))
+    reference = calibrate(crest_factor, prb.Reweighted(16384, random_seed=99))
     names = ("mu_r", "sd_r")
     error = np.array([reference.stderr[n] for n in names])
     center = np.array([reference.point[n] for n in names])
@@ -76,10 +76,12 @@ def main():
             found = [surrogate_and_optimum(n, model, seed) for seed in range(DESIGNS)]
             add(f"surrogate, {type(model).__name__}, {n}; Resimulated(1024)", found)
     for n in (256, 1024):
-        optima = [calibrate(crest_factor, prb.Reweighted(n, seed=seed)) for seed in range(DESIGNS)]
+        optima = [calibrate(crest_factor, prb.Reweighted(n, random_seed=seed)) for seed in range(DESIGNS)]
         add(f"no surrogate, Reweighted({n}) and its refinement", [(o.n_responses, np.nan, o) for o in optima])
     for n in (32, 64, 128):
-        optima = [calibrate(crest_factor, prb.Reweighted(n, seed=seed), only_contact=True) for seed in range(DESIGNS)]
+        optima = [
+            calibrate(crest_factor, prb.Reweighted(n, random_seed=seed), only_contact=True) for seed in range(DESIGNS)
+        ]
         add(f"no surrogate, bearings at their means, Reweighted({n})", [(o.n_responses, np.nan, o) for o in optima])
     families = {"normal": pm.Normal.dist, "gamma": lambda m, s: pm.Gamma.dist(mu=m, sigma=s)}
     fits = {}

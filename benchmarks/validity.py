@@ -27,7 +27,7 @@ import pymc as pm
 from scipy.special import ndtr, ndtri, stdtr
 
 import prbayes as prb
-from prbayes.estimate.minimize import find_optimum
+from prbayes.estimate.minimization import find_optimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.smc import sample
 from prbayes.validation.nulls import area

@@ -6,8 +6,7 @@ from prbayes import datasets
 from prbayes._compare import compare
 from prbayes._diagnose import Diagnosis, diagnose
 from prbayes._predict import predict
-from prbayes.estimate.methods import Scipy
-from prbayes.estimate.minimize import minimize, refine
+from prbayes.estimate.minimization import minimize, refine
 from prbayes.estimate.optimum import Optimum
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
@@ -27,13 +26,12 @@ from prbayes.plots.responses import plot_responses
 from prbayes.plots.stages import plot_stages
 from prbayes.plots.validity import plot_validity
 from prbayes.posterior.adjustment import Affine
-from prbayes.posterior.bootstrap import bootstrap
+from prbayes.posterior.bootstrapping import bootstrap
 from prbayes.posterior.epsilon import calibrate_epsilon
 from prbayes.posterior.sbc import simulation_based_calibration
 from prbayes.posterior.smc import sample_smc
 from prbayes.posterior.smc_kernel import BatchedKernel
 from prbayes.propagation.fresh import Fresh
-from prbayes.propagation.points import monte_carlo, sobol
 from prbayes.propagation.resimulated import Resimulated
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.reports.report import Report
@@ -78,7 +76,6 @@ __all__ = [
     "ResponseError",
     "Retry",
     "Reweighted",
-    "Scipy",
     "Section",
     "Simulator",
     "StoreError",
@@ -94,7 +91,6 @@ __all__ = [
     "diagnose",
     "held_out",
     "minimize",
-    "monte_carlo",
     "plot_comparison",
     "plot_landscape",
     "plot_optimizer",
@@ -109,6 +105,5 @@ __all__ = [
     "scalar",
     "set_epsilon",
     "simulation_based_calibration",
-    "sobol",
     "u_values",
 ]

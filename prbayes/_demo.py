@@ -13,7 +13,7 @@ import xarray as xr
 
 from prbayes import datasets
 from prbayes._predict import predict
-from prbayes.estimate.minimize import minimize
+from prbayes.estimate.minimization import minimize
 from prbayes.metrics.residual import ProbabilityResidual
 from prbayes.model.simulator import Simulator
 from prbayes.posterior.smc import sample_smc

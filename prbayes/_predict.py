@@ -21,7 +21,6 @@ from prbayes.model.labels import versions
 from prbayes.model.simulator import Node, model_on_context, nodes
 from prbayes.model.support import DesignError
 from prbayes.propagation.points import base_points
-from prbayes.propagation.reweighted import Design
 from prbayes.response.calling import ResponseError
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, quantiles
@@ -42,7 +41,7 @@ def predict(
     name: str | None = None,
     executor: Executor | None = None,
     store: str | PathLike[str] | None = None,
-    random_seed: int | None = None,
+    random_seed: int | None = 0,
 ) -> xr.DataArray:
     """Draw responses of the calibrated population, also of another response or under another condition.
 
@@ -127,8 +126,8 @@ def predict(
     rng = np.random.default_rng(random_seed)
     node = serving(list(nodes(model).values()), responses) if stored else None
     if node is not None:
-        design = node.bound
-        assert isinstance(design, Design)
+        design = node.design
+        assert design is not None
         chosen = _resampled(node, [points[str(r.name)] for r in design.inputs.roots], n_samples, rng)
         values = design.values_of(responses)[chosen]
         specimens = [x[chosen] for x in design.points_of(sorted_inputs)]
@@ -193,7 +192,7 @@ def serving(among: Sequence[Node], responses: Responses) -> Node | None:
     able = [
         n
         for n in among
-        if isinstance(n.bound, Design)
+        if n.bound.stored
         and not wanted.epistemic
         and all(any(x is y for y in n.bound.inputs.aleatory) for x in wanted.aleatory)
     ]
@@ -202,8 +201,8 @@ def serving(among: Sequence[Node], responses: Responses) -> Node | None:
 
 def _resampled(node: Node, roots: list[Floats], n: int, rng: np.random.Generator) -> NDArray[np.intp]:
     """Return design points of n specimens for each population, (k, n): systematic resampling, in random order."""
-    design = node.bound
-    assert isinstance(design, Design)
+    design = node.design
+    assert design is not None
     support = design.support(roots)
     ess, mass = np.median(support["weight_ess"]), np.median(support["mean_weight"])
     if not (ess >= design.required_ess / 2 and 0.7 < mass < 1.4):

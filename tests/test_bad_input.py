@@ -216,7 +216,7 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "Reweighted function without weights": (
         simulator(metric=prb.FunctionMetric(lambda a, b: abs(a.mean(-1) - b.mean()))),
         TypeError,
-        r"y: a FunctionMetric without weights .*weighted=True, or use propagation=prb.Resimulated\(\)",
+        r"y: a metric that takes no weights .*weighted=True, or use propagation=prb.Resimulated\(\)",
     ),
     # Priors.
     "flat prior": (lambda: build(never, prior=pm.Flat), TypeError, r"got mu.*replace pm.Flat .*wide pm.Normal"),
@@ -251,7 +251,11 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "Reweighted 0": (lambda: prb.Reweighted(0), ValueError, r"Reweighted: n: got 0, expected an integer >= 16"),
     "Reweighted string": (lambda: prb.Reweighted("a"), TypeError, r"Reweighted: n: got str 'a', expected an integer"),
     "Reweighted float": (lambda: prb.Reweighted(64.0), TypeError, r"Reweighted: n: got float 64.0, expected an integ"),
-    "Reweighted seed": (lambda: prb.Reweighted(64, seed=-1), ValueError, r"Reweighted: seed: got -1, expected an int"),
+    "Reweighted seed": (
+        lambda: prb.Reweighted(64, random_seed=-1),
+        ValueError,
+        r"random_seed: got -1, expected an int",
+    ),
     "Reweighted lost": (lambda: prb.Reweighted(64, max_lost=1), ValueError, r"max_lost: got 1, expected a share below"),
     "Resimulated 1": (lambda: prb.Resimulated(1), ValueError, r"Resimulated: n: got 1, expected an integer >= 2"),
     "Fresh 0": (lambda: prb.Fresh(0), ValueError, r"Fresh: n: got 0, expected an integer >= 1"),

@@ -12,6 +12,7 @@ import xarray as xr
 from scipy.special import ndtri
 
 import prbayes as prb
+from prbayes.model.simulator import nodes
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 MEANS = np.array([[0.8, 1.0, 1.1], [0.9, 1.0, 1.2]])  # of two chains with three draws
@@ -152,7 +153,7 @@ def test_what_was_computed_for_one_prediction_serves_the_next() -> None:
     assert response.count == 512
     assert (one.attrs["responses"], two.attrs["responses"]) == (512, 0)
     assert two.attrs["source"] == "stored responses of y"
-    bound = prb.simulator.nodes(model)[model["y"]].bound
+    bound = nodes(model)[model["y"]].bound
     bound.add([np.array([0.9, 1.1]), np.array([0.5, 0.5])], 100)
     after = prb.predict(POSTERIOR, response, x, model=model, random_seed=1)
     assert response.count == 612
@@ -270,7 +271,7 @@ def test_a_seed_gives_the_same_numbers_and_none_gives_others() -> None:
     model, x = plain()
     a, b = (prb.predict(POSTERIOR, same, x, model=model, random_seed=5) for _ in range(2))
     xr.testing.assert_identical(a, b)
-    c, d = (prb.predict(POSTERIOR, same, x, model=model) for _ in range(2))
+    c, d = (prb.predict(POSTERIOR, same, x, model=model, random_seed=None) for _ in range(2))
     assert not np.array_equal(c, d)
 
 
@@ -284,7 +285,7 @@ def test_designs_of_their_own_are_told_apart() -> None:
                 x,
                 metric=prb.AreaMetric(),
                 observed=OBSERVED,
-                propagation=prb.Reweighted(256, seed=k),
+                propagation=prb.Reweighted(256, random_seed=k),
             )
     first, second = (prb.predict(POSTERIOR, f, x, model=model, random_seed=1) for f in (same, np.exp))
     assert (first.attrs["source"], second.attrs["source"]) == ("stored responses of y0", "stored responses of y1")

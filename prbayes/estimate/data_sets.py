@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.simulator import Node
-from prbayes.propagation.reweighted import Design
 from prbayes.response.distributions import PopulationSampler
 
 _MOST = 1 << 15  # points of a resimulated population from which data sets are drawn
@@ -82,7 +81,7 @@ def aligned(nodes: list[Node]) -> bool:
         list(map(id, n.bound.inputs.aleatory)) == list(map(id, first.inputs.aleatory))
         and type(n.bound) is type(first)
         and n.propagation == nodes[0].propagation
-        and (not isinstance(n.bound, Design) or n.bound.same_points(first))
+        and n.bound.same_points(first)
         for n in nodes
     )
 
@@ -149,7 +148,7 @@ def sets_at(evaluator: Evaluator, populations: list[tuple[Floats, Floats]], poin
 
 def thinned(values: Floats, weights: Floats, node: Node) -> tuple[Floats, Floats]:
     """Return the first 2^15 points of resimulated populations, (k, n) each, which all have equal weights."""
-    if isinstance(node.bound, Design) or values.shape[-1] <= _MOST:
+    if node.bound.stored or values.shape[-1] <= _MOST:
         return values, weights
     return values[:, :_MOST], np.broadcast_to(1 / _MOST, (len(values), _MOST))
 

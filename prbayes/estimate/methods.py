@@ -1,4 +1,4 @@
-"""`Scipy`: which minimiser of scipy runs, and with which options."""
+"""`Method`: which minimiser of scipy runs, and with which options."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _WITH_GRADIENT = ("BFGS", "CG", "L-BFGS-B", "Newton-CG", "SLSQP", "TNC", "trust-
 
 
 @dataclass(frozen=True)
-class Scipy:
+class Method:
     """A minimiser of `scipy.optimize.minimize`, with options of its own.
 
     Parameters
@@ -36,8 +36,8 @@ class Scipy:
 
     Examples
     --------
-    >>> Scipy("L-BFGS-B", {"maxcor": 5})
-    Scipy(method='L-BFGS-B', options={'maxcor': 5})
+    >>> Method("L-BFGS-B", {"maxcor": 5})
+    Method(method='L-BFGS-B', options={'maxcor': 5})
     """
 
     method: str | Callable[..., Any] = "BFGS"
@@ -53,15 +53,16 @@ class Scipy:
                 )
         elif not callable(self.method) or isinstance(self.method, type):
             raise TypeError(
-                f"method: got {self.method!r:.60}, expected prb.Scipy(...), the name of a scipy method, or a function"
+                f"method: got {self.method!r:.60}, expected the name of a scipy method, or a function that "
+                "scipy.optimize.minimize takes as its method"
             )
         if not isinstance(self.options, Mapping):
             raise TypeError(f"options: got {type(self.options).__name__}, expected a mapping of names to values")
 
     @classmethod
-    def of(cls, method: Scipy | str | Callable[..., Any] | None) -> Scipy:
-        """Return what a user meant by ``method=``."""
-        return method if isinstance(method, Scipy) else cls() if method is None else cls(method)
+    def of(cls, method: str | Callable[..., Any] | None, options: Mapping[str, Any] | None) -> Method:
+        """Return what a user meant by ``method=`` and ``options=``."""
+        return cls("BFGS" if method is None else method, {} if options is None else options)
 
     @property
     def name(self) -> str:

@@ -11,7 +11,6 @@ from prbayes.estimate.data_sets import siblings
 from prbayes.estimate.sandwich import Information
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.support import DesignError, shortcomings
-from prbayes.propagation.reweighted import Design
 
 _log = logging.getLogger("prbayes")
 MAX_ROUNDS = 8
@@ -58,14 +57,15 @@ def _add(evaluator: Evaluator, thetas: Floats, names: set[str], factor: float = 
     names = siblings(evaluator.nodes, names)
     added = False
     for k, node in enumerate(evaluator.nodes):
-        if node.name in names and isinstance(node.bound, Design):
-            first, now = node.bound.config.n, node.bound.n_points
+        design = node.design
+        if node.name in names and design is not None:
+            first, now = design.config.n, design.n_points
             batches = max(1, round((factor - 1) * now / first))
-            size = min(batches * first, node.bound.max_points - now)
+            size = min(batches * first, design.max_points - now)
             if size > 0:
-                node.bound.add(evaluator.roots(thetas, k), size)
+                design.add(evaluator.roots(thetas, k), size)
                 added = True
-                _log.info("%s: refined to %d responses", node.name, node.bound.n_points)
+                _log.info("%s: refined to %d responses", node.name, design.n_points)
     return added
 
 

@@ -15,11 +15,9 @@ from prbayes.estimate.batch_bfgs import descend
 from prbayes.estimate.data_sets import DataSets, observed_set
 from prbayes.estimate.sampling import Local, first_order_shifts, local_sampling
 from prbayes.estimate.sandwich import Information
-from prbayes.metrics.function import FunctionMetric
+from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.base import N_BLOCKS
-from prbayes.propagation.fresh import FreshBound
-from prbayes.propagation.reweighted import Design
 
 _STEP = 0.02  # of differences, in standard errors
 _TOLERANCE = 1e-4  # gain, in units of the curvature along a standard error, that is left on the table
@@ -93,7 +91,7 @@ class Neighbourhood:
 
         With designs the minimisation is exact, and else of first order; no response is computed with designs.
         """
-        if not all(isinstance(n.bound, Design) for n in self.evaluator.nodes):
+        if not all(n.bound.stored for n in self.evaluator.nodes):
             shifts = first_order_shifts(self.parts, self.scales, self.frame, sets) / self.sd
             return shifts, np.ones(len(shifts), dtype=bool)
         size = len(sets.weights[0])
@@ -115,7 +113,7 @@ class Neighbourhood:
         their parts tell: they count as exact.
         """
         bounds = [n.bound for n in self.evaluator.nodes]
-        blocks = [b.blocks * (not b.is_line) for b in bounds if isinstance(b, Design)]
+        blocks = [b.blocks * (not b.is_line) for b in bounds if b.stored]
         if len(blocks) < len(bounds) or all((b == 0).all() for b in blocks):
             return np.nan
         x, converged = self._refit(observed_set(self.evaluator), np.zeros(N_BLOCKS, dtype=int), blocks)
@@ -179,9 +177,9 @@ def _mean_hessian(value: Callable[[Floats], Floats], r: int) -> Floats:
 def inapplicable(evaluator: Evaluator) -> str:
     """Say why draws of a model cannot be adjusted; empty if they can."""
     for node in evaluator.nodes:
-        if isinstance(node.metric, FunctionMetric):
-            return f"{node.name} has a FunctionMetric, of which nothing is known"
-        if isinstance(node.bound, FreshBound):
+        if node.metric.minimum is Minimum.UNKNOWN:
+            return f"{node.name} has a {type(node.metric).__name__}, of which nothing is known"
+        if node.bound.random:
             return f"{node.name} has prb.Fresh, whose discrepancy is random"
     if evaluator.model.potentials or len(evaluator.model.observed_RVs) > len(evaluator.nodes):
         return "the model has likelihood terms or potentials besides its simulators"

@@ -10,7 +10,7 @@ from prbayes._checks import Floats
 from prbayes.estimate.data_sets import DataSets, dependent
 from prbayes.estimate.identifiability import seen_by_area, seen_by_curvature
 from prbayes.estimate.sandwich import Information
-from prbayes.metrics.function import FunctionMetric
+from prbayes.metrics.base import Minimum
 
 _IRLS = 30
 _LOADING = 0.02  # share of a hyperparameter in unseen directions above which it is not identified
@@ -40,7 +40,7 @@ def first_order_shifts(parts: list[Information], scales: Floats, basis: Floats, 
     areas = []
     for part, s in zip(parts, scales, strict=True):
         data = sets.values[part.k], sets.weights[part.k]
-        if part.evaluator.nodes[part.k].metric.smooth:
+        if part.evaluator.nodes[part.k].metric.minimum is Minimum.QUADRATIC:
             rhs -= part.gradients(*data) @ directions / s
             curvature += directions.T @ part.hessian @ directions / s
         else:
@@ -99,11 +99,11 @@ def local_sampling(parts: list[Information], scales: Floats, weakest: float = 1.
         If one of the metrics is a user's function, of which nothing is known.
     """
     metrics = [p.evaluator.nodes[p.k].metric for p in parts]
-    if any(isinstance(m, FunctionMetric) for m in metrics):
-        raise TypeError("standard errors: got a FunctionMetric, expected a metric of this package")
+    if any(m.minimum is Minimum.UNKNOWN for m in metrics):
+        raise TypeError("standard errors: got a metric that declares nothing of its minimum, expected one that does")
     scale = parts[0].scale
     unit = np.outer(scale, scale)
-    if all(m.smooth for m in metrics):
+    if all(m.minimum is Minimum.QUADRATIC for m in metrics):
         hessian = unit * sum(p.hessian / s for p, s in zip(parts, scales, strict=True))
         if dependent(parts[0].evaluator.nodes):
             together = sum(p.gradients(*p.data_set) / s for p, s in zip(parts, scales, strict=True))
@@ -115,7 +115,7 @@ def local_sampling(parts: list[Information], scales: Floats, weakest: float = 1.
         return Local(scale, vectors[:, seen], vectors[:, ~seen], inverse.T @ noise @ inverse)
     seen_by = []
     for p, m in zip(parts, metrics, strict=True):
-        if m.smooth:
+        if m.minimum is Minimum.QUADRATIC:
             _, vectors, seen = seen_by_curvature(p.hessian * unit, p.sampling_covariance * unit, weakest)
             seen_by.append(vectors[:, seen])
         else:

@@ -24,13 +24,6 @@ _BLOCK = 1 << 20  # numbers held at a time where data sets meet the features of 
 _POINTS = 1000  # single observations over which the covariance of an additive gradient is taken
 
 
-def prior_scale(evaluator: Evaluator, *, size: int = 256, seed: int = 0) -> Floats:
-    """Return the prior's standard deviation of each element of theta, robust, shape (d,)."""
-    thetas = evaluator.prior_thetas(size, seed)
-    spread = np.subtract(*np.quantile(thetas, [0.84, 0.16], axis=0)) / 2
-    return np.where((spread > 0) & np.isfinite(spread), spread, 1.0)
-
-
 @dataclass(frozen=True, eq=False)
 class Information:
     """Local information about theta in the data of one simulator, were they drawn from the model at ``theta``.
@@ -60,9 +53,7 @@ class Information:
 
     @property
     def _smooth(self) -> bool:
-        node = self.evaluator.nodes[self.k]
-        cells = getattr(node.target, "cells", None)
-        return bool(node.metric.smooth and (cells is None or cells.smooth))
+        return self.evaluator.nodes[self.k].target.differentiable
 
     @property
     def jumps(self) -> bool:
@@ -76,7 +67,7 @@ class Information:
         def look(step: float) -> tuple[float, tuple[Floats, Floats]]:
             return step, self.evaluator.populations(self.theta + self._stencil(step), self.k)
 
-        if not self.evaluator.nodes[self.k].bound.n_per_theta:
+        if self.evaluator.nodes[self.k].bound.stored:
             return look(_STEP)
         if self._smooth:
             narrow = look(_STEP)

@@ -14,13 +14,11 @@ from pytensor.gradient import NullTypeGradError
 
 from prbayes._checks import Floats
 from prbayes._progress import progress
-from prbayes.estimate.methods import Scipy
+from prbayes.estimate.methods import Method
 from prbayes.estimate.objective import Objective, SpentError, StalledError, differences
 from prbayes.metrics.area import AreaMetric
-from prbayes.metrics.base import DensityDiscrepancy
-from prbayes.metrics.function import FunctionMetric
+from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
-from prbayes.propagation.fresh import FreshBound
 
 _OVER = 0.5  # prior standard deviations: the simplex where the discrepancy jumps
 _SETTLED = 1e-4  # relative gain of a simplex below which a stalled line search counts as converged
@@ -37,11 +35,11 @@ class Search:
     """Runs a minimiser on the objective, as often as scales or designs change, within one budget of evaluations."""
 
     def __init__(
-        self, evaluator: Evaluator, scale: Floats, method: Scipy, prior: bool, tolerance: float, most: int
+        self, evaluator: Evaluator, scale: Floats, method: Method, prior: bool, tolerance: float, most: int
     ) -> None:
         self.evaluator, self.scale, self.method = evaluator, scale, method
         self.prior, self.tolerance, self.most = prior, tolerance, most
-        self.fresh = any(isinstance(n.bound, FreshBound) for n in evaluator.nodes)
+        self.fresh = any(n.bound.random for n in evaluator.nodes)
         self.gradient = method.gradient and not self.fresh
         self.thetas: list[Floats] = []
         self.values: list[float] = []
@@ -66,7 +64,7 @@ class Search:
 
     def size(self, theta: Floats, scales: Floats) -> float:
         """Return a typical size of the objective; of a user's metric it is the value at theta."""
-        if not any(isinstance(n.metric, FunctionMetric) for n in self.evaluator.nodes):
+        if not any(n.metric.minimum is Minimum.UNKNOWN for n in self.evaluator.nodes):
             return float(sum(n.target.scale / s for n, s in zip(self.evaluator.nodes, scales, strict=True)))
         first = float(np.abs(self.evaluator.total(theta[None], scales)[0]))
         return first if 0 < first < np.inf else 1.0
@@ -155,11 +153,7 @@ class Search:
 
     def overlap(self, values: list[Floats], weights: list[Floats]) -> Floats:
         """Return the smallest overlap over the simulators with densities, shape (P,); one where there is none."""
-        overlaps = [
-            n.target.overlap(v, w)
-            for n, v, w in zip(self.evaluator.nodes, values, weights, strict=True)
-            if isinstance(n.target, DensityDiscrepancy)
-        ]
+        overlaps = [n.target.overlap(v, w) for n, v, w in zip(self.evaluator.nodes, values, weights, strict=True)]
         return np.min([np.ones(len(values[0])), *overlaps], axis=0)
 
     def _run(self, objective: Objective, start: Floats, **settings: Any) -> Any:
@@ -204,7 +198,7 @@ class Search:
 
     def _jumps(self) -> bool:
         """Whether a smooth discrepancy loses or wins simulated responses close to the best theta."""
-        if not all(n.metric.smooth for n in self.evaluator.nodes):
+        if not all(n.metric.minimum is Minimum.QUADRATIC for n in self.evaluator.nodes):
             return False
         near = self.best + np.vstack([0 * self.scale, *(s * e for e in np.diag(_STEP * self.scale) for s in (1, -1))])
         lost = [~np.isfinite(v) for v in self._populations(near)[0]]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
-from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.metrics.base import Discrepancy, Metric, Minimum
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class AreaMetric(Metric):
     0.5
     """
 
-    smooth: ClassVar[bool] = False
+    minimum: ClassVar[Minimum] = Minimum.ABSOLUTE
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         return AreaDiscrepancy(self, observed, weights)

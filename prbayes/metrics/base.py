@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,6 +21,24 @@ from prbayes._checks import Floats, observed_sample, sample_weights, simulated_s
 from prbayes.metrics.cells import Cells
 
 _FLOOR = 1e-9
+
+
+class Minimum(Enum):
+    """How a discrepancy behaves around its minimum, as far as its metric declares it.
+
+    Attributes
+    ----------
+    QUADRATIC
+        Twice differentiable in the hyperparameters: Hessian and gradient tell the sampling distribution.
+    ABSOLUTE
+        An integral of absolute differences between distribution functions, each linear in the weights.
+    UNKNOWN
+        Nothing is declared; what is needed is measured by refits, or refused.
+    """
+
+    QUADRATIC = "quadratic"
+    ABSOLUTE = "absolute"
+    UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +98,25 @@ class Discrepancy(ABC):
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the discrepancy of the features; ``xp`` is `numpy` or `pytensor.tensor`."""
 
+    @property
+    def symbolic(self) -> bool:
+        """Whether `outer` can be written as a graph; else it is called as an operation without gradient."""
+        return True
+
+    @property
+    def density_cells(self) -> Cells | None:
+        """The cells on which densities are compared, None where the features are none."""
+        return None
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether the discrepancy has second derivatives in the values and weights of the population."""
+        return self.metric.minimum is Minimum.QUADRATIC
+
+    def overlap(self, simulated: Floats, weights: Floats) -> Floats:
+        """Return the overlap of simulated and observed densities, (..., n) -> (...); one where there are none."""
+        return np.ones(np.shape(simulated)[:-1])
+
     def of(self, simulated: Floats, weights: Floats) -> Any:
         """Return the discrepancy of checked values (..., n) and weights that sum to at most one."""
         return self.outer(*self.features(simulated, weights, np), xp=np)
@@ -116,19 +154,28 @@ class Metric(ABC):
 
     Attributes
     ----------
-    smooth : bool
-        Whether the discrepancy is twice differentiable in the hyperparameters.
+    minimum : Minimum
+        How the discrepancy behaves around its minimum; unknown unless the metric declares it.
+    tail_responses : int
+        Simulated responses for each observation, all of equal weight, below which the metric sees too little of the
+        population's tails; zero where that does not matter.
     likelihood : bool
         Whether N times the discrepancy is on the scale of a log-likelihood, so that epsilon is 1/N.
     """
 
-    smooth: ClassVar[bool] = True
+    minimum: ClassVar[Minimum] = Minimum.UNKNOWN
     likelihood: ClassVar[bool] = False
+    tail_responses: ClassVar[int] = 0
 
     @property
     def additive(self) -> bool:
         """Whether the gradient in the hyperparameters is a mean over observations."""
-        return self.smooth
+        return self.minimum is Minimum.QUADRATIC
+
+    @property
+    def takes_weights(self) -> bool:
+        """Whether simulated responses may have unequal weights, as under `Reweighted`."""
+        return True
 
     @abstractmethod
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy: ...
@@ -200,6 +247,16 @@ class DensityDiscrepancy(Discrepancy):
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return the density on the cells."""
         return (weights @ basis[0],)
+
+    @property
+    def density_cells(self) -> Cells:
+        """The cells."""
+        return self.cells
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether the densities, as functions of the simulated values, are smooth too; those of a histogram are not."""
+        return super().differentiable and self.cells.smooth
 
     @property
     def scale(self) -> float:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from prbayes._checks import Floats
-from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric
+from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric, Minimum
 from prbayes.metrics.density import DensityEstimator, GaussianKDE, density_estimator
 
 
@@ -42,6 +42,7 @@ class KullbackLeibler(Metric):
 
     density: DensityEstimator = field(default_factory=GaussianKDE)
     reverse: bool = False
+    minimum: ClassVar[Minimum] = Minimum.QUADRATIC
     likelihood: ClassVar[bool] = True
 
     def __post_init__(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,11 +40,15 @@ class FunctionMetric(Metric):
 
     function: Callable[..., Any]
     weighted: bool = False
-    smooth: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not callable(self.function):
             raise TypeError(f"function: got {type(self.function).__name__}, expected f(simulated, observed)")
+
+    @property
+    def takes_weights(self) -> bool:
+        """Whether the function takes the weights of simulated responses."""
+        return self.weighted
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         if not np.allclose(weights, weights[0]):
@@ -56,6 +60,11 @@ class FunctionDiscrepancy(Discrepancy):
     """A user's metric against fixed observed values."""
 
     metric: FunctionMetric
+
+    @property
+    def symbolic(self) -> bool:
+        """No: the function is called."""
+        return False
 
     @property
     def scale(self) -> float:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from prbayes._checks import Floats
-from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric
+from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric, Minimum
 from prbayes.metrics.density import DensityEstimator, GaussianKDE, density_estimator, likelihood_bandwidth
 
 
@@ -35,7 +35,9 @@ class LogLikelihood(Metric):
     """
 
     density: DensityEstimator = field(default_factory=lambda: GaussianKDE(likelihood_bandwidth))
+    minimum: ClassVar[Minimum] = Minimum.QUADRATIC
     likelihood: ClassVar[bool] = True
+    tail_responses: ClassVar[int] = 300  # from which standard errors are right to a tenth
 
     def __post_init__(self) -> None:
         density_estimator(self.density)

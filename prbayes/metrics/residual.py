@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from prbayes._checks import Floats, positive_number
-from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric
+from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric, Minimum
 from prbayes.metrics.density import DensityEstimator, GaussianKDE, density_estimator
 
 
@@ -49,6 +49,7 @@ class ProbabilityResidual(Metric):
 
     density: DensityEstimator = field(default_factory=GaussianKDE)
     scale_base: float = 100.0
+    minimum: ClassVar[Minimum] = Minimum.QUADRATIC
 
     def __post_init__(self) -> None:
         density_estimator(self.density)

@@ -26,6 +26,8 @@ from prbayes.propagation.reweighted import Design
 from prbayes.response.compilation import PLAIN, ninf_for_invalid
 from prbayes.response.distributions import PriorPoints, PriorSampler
 
+_PRIOR_DRAWS = 256  # for the prior's spread, which only sets units: a tenth more or less changes no answer
+_ONE_SD = (0.84, 0.16)  # levels of a normal one standard deviation above and below its mean
 _CHUNK = 1 << 22  # design points times particles evaluated at a time: bounds memory
 
 
@@ -112,7 +114,7 @@ class Evaluator:
     @property
     def designs(self) -> dict[str, Design]:
         """The designs of the simulators that reweight stored responses, by name."""
-        return {n.name: n.bound for n in self.nodes if isinstance(n.bound, Design)}
+        return {n.name: n.design for n in self.nodes if n.design is not None}
 
     def _params(self) -> list[list[Any]]:
         """Return the simulators' roots as they stand in this model, which may be a clone."""
@@ -284,9 +286,9 @@ class Evaluator:
     def support(self, thetas: Floats) -> dict[str, dict[str, Floats]]:
         """Return how well each design supports the populations at thetas, arrays of shape (P,)."""
         return {
-            node.name: node.bound.support(self.roots(thetas, k))
+            node.name: node.design.support(self.roots(thetas, k))
             for k, node in enumerate(self.nodes)
-            if isinstance(node.bound, Design)
+            if node.design is not None
         }
 
     def thetas_of(self, draws: Sequence[Floats]) -> Floats:
@@ -302,6 +304,15 @@ class Evaluator:
         if (size, seed) not in self._drawn:
             self._drawn[size, seed] = self.thetas_of(self._sampler(size, seed))
         return self._drawn[size, seed].copy()
+
+    @cached_property
+    def prior_sd(self) -> Floats:
+        """The prior's standard deviation of each element of theta, robust, shape (d,): the unit of parameters."""
+        thetas = self.prior_thetas(_PRIOR_DRAWS, seed=0)
+        upper, lower = np.quantile(thetas, _ONE_SD, axis=0)
+        spread = (upper - lower) / 2
+        known = (spread > 0) & np.isfinite(spread)
+        return np.where(known, spread, 1.0)
 
     @cached_property
     def _points(self) -> PriorPoints | None:

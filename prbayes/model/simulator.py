@@ -20,7 +20,7 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._checks import Floats, observed_sample, positive_number
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.propagation.base import Bound, Propagation
-from prbayes.propagation.reweighted import Reweighted
+from prbayes.propagation.reweighted import Design, Reweighted, design_of
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 
@@ -53,6 +53,11 @@ class Node:
     def metric(self) -> Metric:
         """The calibration metric."""
         return self.target.metric
+
+    @property
+    def design(self) -> Design | None:
+        """The stored responses, None where the propagation stores none."""
+        return design_of(self.bound)
 
     @property
     def epsilon_value(self) -> float:

@@ -10,7 +10,6 @@ import numpy as np
 from prbayes._checks import Floats, positive_integer
 from prbayes.estimate.data_sets import observed_set, simulated_sets
 from prbayes.estimate.refit import Neighbourhood, inapplicable
-from prbayes.estimate.sandwich import prior_scale
 from prbayes.model.evaluator import Evaluator
 
 _FEWEST = 50  # draws of a mode below which it is left as it is
@@ -37,7 +36,7 @@ class Affine:
     ----------
     n_sets : int
         Number of data sets drawn and fitted.
-    seed : int
+    random_seed : int
 
     References
     ----------
@@ -47,25 +46,25 @@ class Affine:
     Examples
     --------
     >>> Affine()
-    Affine(n_sets=200, seed=0)
+    Affine(n_sets=200, random_seed=0)
     """
 
     n_sets: int = 200
-    seed: int = 0
+    random_seed: int = 0
 
     def __post_init__(self) -> None:
         positive_integer(self.n_sets, "Affine: n_sets", minimum=20)
-        positive_integer(self.seed, "Affine: seed", minimum=0)
+        positive_integer(self.random_seed, "Affine: random_seed", minimum=0)
 
     def target(self, hood: Neighbourhood) -> tuple[Floats, Floats]:
         """Return the centre (r,) and covariance (r, r) that draws should have, in the coordinates of ``hood``."""
         evaluator, r = hood.evaluator, hood.sd.size
         (center,), _ = hood.refit(observed_set(evaluator))
-        x, ok = hood.refit(simulated_sets(evaluator, hood.thetas(center), self.n_sets, self.seed))
+        x, ok = hood.refit(simulated_sets(evaluator, hood.thetas(center), self.n_sets, self.random_seed))
         shifts = np.clip(x[ok] - center, -_REACH, _REACH)
         information = np.linalg.inv(np.cov(shifts, rowvar=False).reshape(r, r))
         bias = np.median(shifts, axis=0)  # the same in every parametrisation, as where a scale comes near zero
-        prior, _ = hood.coordinates(evaluator.prior_thetas(1024, self.seed))
+        prior, _ = hood.coordinates(evaluator.prior_thetas(1024, self.random_seed))
         precision = np.linalg.inv(np.cov(prior, rowvar=False).reshape(r, r))
         covariance = np.linalg.inv(information + precision)
         return covariance @ (information @ (center - bias) + precision @ prior.mean(axis=0)), covariance
@@ -90,7 +89,7 @@ class Affine:
         reason = inapplicable(evaluator)
         if reason:
             return thetas, f"none: {reason}"
-        flat, scale = thetas.reshape(-1, thetas.shape[-1]), prior_scale(evaluator)
+        flat, scale = thetas.reshape(-1, thetas.shape[-1]), evaluator.prior_sd
         hoods = [Neighbourhood.of(evaluator, theta, evaluator.epsilon, scale, _WEAKEST) for theta in optima]
         hoods = [h for h in hoods if h.sd.size]
         if not hoods:

@@ -7,9 +7,8 @@ import numpy as np
 from prbayes.estimate.identifiability import seen_by_area, seen_by_curvature
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.sampling import first_order_shifts
-from prbayes.estimate.sandwich import Information, prior_scale
-from prbayes.metrics.function import FunctionMetric
-from prbayes.propagation.fresh import FreshBound
+from prbayes.estimate.sandwich import Information
+from prbayes.metrics.base import Minimum
 
 _CLOUD = 500  # thetas that carry each simulated data set's posterior
 _SETS = 200
@@ -67,7 +66,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
             "prb.calibrate_epsilon(prb.minimize(model))"
         )
     evaluator = surveyed(optimum, "calibrate_epsilon").evaluator
-    scale = prior_scale(evaluator)
+    scale = evaluator.prior_sd
     return {
         node.name: _epsilon(Information(evaluator, k, optimum.theta, scale, n_sets=_SETS))
         for k, node in enumerate(evaluator.nodes)
@@ -78,13 +77,14 @@ def _epsilon(information: Information) -> float:
     node = information.evaluator.nodes[information.k]
     if node.metric.likelihood:
         return 1 / node.target.n_effective
-    if isinstance(node.metric, FunctionMetric) or isinstance(node.bound, FreshBound):
-        what = "a FunctionMetric" if isinstance(node.metric, FunctionMetric) else "prb.Fresh"
+    unknown = node.metric.minimum is Minimum.UNKNOWN
+    if unknown or node.bound.random:
+        what = f"a {type(node.metric).__name__}" if unknown else "prb.Fresh"
         raise TypeError(
             f"{node.name}: epsilon of {what} cannot be calibrated, since it has no derivatives; pass epsilon= to "
             "prb.Simulator (the standard deviation of the discrepancy at a good theta is a start)"
         )
-    return _sandwich(information) if node.metric.smooth else _by_coverage(information)
+    return _sandwich(information) if node.metric.minimum is Minimum.QUADRATIC else _by_coverage(information)
 
 
 def _sandwich(information: Information) -> float:

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes._progress import CONSOLE, shown
-from prbayes.estimate.minimize import find_optimum
+from prbayes.estimate.minimization import find_optimum
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse
 from prbayes.estimate.refit import inapplicable
@@ -28,7 +28,6 @@ from prbayes.posterior.checkpoint import Checkpoint, stored_identity
 from prbayes.posterior.epsilon import calibrate_epsilon
 from prbayes.posterior.smc_kernel import BatchedKernel
 from prbayes.posterior.trees import posterior_tree
-from prbayes.propagation.fresh import FreshBound
 
 _log = logging.getLogger("prbayes")
 
@@ -43,7 +42,7 @@ def sample_smc(
     adjust: Affine | bool = True,
     threshold: float = 0.5,
     refine: bool = True,
-    random_seed: int | None = None,
+    random_seed: int | None = 0,
     checkpoint: str | PathLike[str] | None = None,
     progressbar: bool = True,
 ) -> xr.DataTree:
@@ -144,7 +143,7 @@ def sample(
     adjust: Affine | bool = True,
     threshold: float = 0.5,
     refine: bool = True,
-    random_seed: int | None = None,
+    random_seed: int | None = 0,
     progressbar: bool = False,
     checkpoint: str | PathLike[str] | None = None,
 ) -> xr.DataTree:
@@ -332,9 +331,9 @@ class _Run:
 
     def _generators(self) -> dict[str, Any]:
         """Return how often the generators of simulators with `Fresh` have been used."""
-        return {n.name: n.bound.used for n in self.evaluator.nodes if isinstance(n.bound, FreshBound)}
+        return {n.name: n.bound.draws for n in self.evaluator.nodes if n.bound.random}
 
     def _restore_generators(self, states: dict[str, Any]) -> None:
         for node in self.evaluator.nodes:
-            if isinstance(node.bound, FreshBound):
-                node.bound.used = states[node.name]
+            if node.bound.random:
+                node.bound.draws = states[node.name]

@@ -12,7 +12,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import cached_property
 from os import PathLike
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytensor.tensor as pt
@@ -45,10 +45,30 @@ class Bound(ABC):
         Number of responses that one evaluation of the discrepancy computes.
     symbolic : bool
         Whether the responses are part of the graph, so that `responses` does not count them.
+    stored : bool
+        Whether the responses are stored, and theta moves their weights; then a theta costs no response.
+    random : bool
+        Whether every evaluation draws anew, so that the discrepancy is random and has no gradient.
+    is_line : bool
+        Whether the points are a quadrature rule of one dimension, whose error falls like 1 / n.
+    draws : int
+        Number of evaluations so far that a random propagation's next draws depend on; with the seed it determines them.
     """
 
     n_per_theta: int = 0
     symbolic: bool = False
+    stored: ClassVar[bool] = False
+    random: ClassVar[bool] = False
+    draws: int = 0
+
+    @property
+    def is_line(self) -> bool:
+        """Whether the points are a quadrature rule of one dimension."""
+        return False
+
+    def same_points(self, other: Bound) -> bool:
+        """Return whether the i-th points of another bound of the same configuration and inputs are the same."""
+        return True
 
     def __init__(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> None:
         self.name = name

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytensor.tensor as pt
@@ -29,7 +29,7 @@ class Fresh(Propagation):
     ----------
     n : int
         Number of draws for each theta.
-    seed : int
+    random_seed : int
         Seed of the generator that belongs to the simulator.
     executor, store, on_failure
         As for `Reweighted`.
@@ -37,16 +37,16 @@ class Fresh(Propagation):
     Examples
     --------
     >>> Fresh(50)
-    Fresh(n=50, seed=0)
+    Fresh(n=50, random_seed=0)
     """
 
     n: int = 1024
-    seed: int = 0
+    random_seed: int = 0
 
     def __post_init__(self) -> None:
         self.check()
         positive_integer(self.n, "Fresh: n", minimum=1)
-        positive_integer(self.seed, "Fresh: seed", minimum=0)
+        positive_integer(self.random_seed, "Fresh: random_seed", minimum=0)
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Prepare the generator of draws."""
@@ -60,17 +60,18 @@ class FreshBound(Bound):
 
     Attributes
     ----------
-    used : int
+    draws : int
         Number of evaluations so far; with the seed it determines the next draws.
     """
+
+    random: ClassVar[bool] = True
 
     def __init__(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses, config: Fresh) -> None:
         super().__init__(name, inputs, target, responses)
         self.n_per_theta = config.n
-        self._seed = config.seed
-        self.used = 0
+        self._seed = config.random_seed
         self._sampler = PopulationSampler(inputs)
-        probe(self, self._sampler, config.seed)
+        probe(self, self._sampler, config.random_seed)
 
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return an operation that draws and evaluates."""
@@ -78,8 +79,8 @@ class FreshBound(Bound):
 
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
         """Return fresh responses with equal weights."""
-        self.used += 1
-        rng = np.random.default_rng([self._seed, self.used])
+        self.draws += 1
+        rng = np.random.default_rng([self._seed, self.draws])
         values = self.responses(*self._sampler(params, self.n_per_theta, rng))
         return values, np.broadcast_to(1 / self.n_per_theta, values.shape)
 

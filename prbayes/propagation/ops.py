@@ -172,9 +172,8 @@ for _op in (ResponseOp, DensityOp, CotangentOp, OpaqueOp):
 
 def symbolic_discrepancy(target: Discrepancy, sample: Any, weights: Any) -> Any:
     """Return the graph of a discrepancy for a sample that depends on theta, shapes (n,), (n,) -> ()."""
-    cells = getattr(target, "cells", None)
-    if cells is not None:
-        return target.outer(DensityOp(cells)(sample, weights), xp=pt)
-    if getattr(target.metric, "function", None) is not None:
+    if target.density_cells is not None:
+        return target.outer(DensityOp(target.density_cells)(sample, weights), xp=pt)
+    if not target.symbolic:
         return OpaqueOp(target)(sample, weights)
     return target.outer(*target.features(sample, weights, pt), xp=pt)

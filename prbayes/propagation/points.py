@@ -46,10 +46,34 @@ def monte_carlo(n: int, dimensions: int, seed: int) -> Floats:
 
     Examples
     --------
-    >>> Resimulated(1000, points=monte_carlo).n
-    1000
+    >>> monte_carlo(4, 1, 0).shape
+    (4, 1)
     """
     return np.clip(np.random.default_rng(seed).random((n, dimensions)), 1e-12, 1 - 1e-12)
+
+
+def points_from(points: object) -> Callable[[int, int, int], Floats]:
+    """Return the function that makes points, from its name or from itself.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is neither.
+    """
+    named = {"sobol": sobol, "monte_carlo": monte_carlo}
+    if isinstance(points, str):
+        if points not in named:
+            raise ValueError(
+                f'points: got {points!r:.60}, expected "sobol", "monte_carlo" or a function '
+                "(n, dimensions, seed) -> points"
+            )
+        return named[points]
+    if not callable(points):
+        raise TypeError(
+            f'points: got {type(points).__name__}, expected "sobol", "monte_carlo" or a function '
+            "(n, dimensions, seed) -> points"
+        )
+    return points
 
 
 def base_points(

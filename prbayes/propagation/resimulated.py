@@ -16,10 +16,9 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
-from prbayes.metrics.likelihood import LikelihoodDiscrepancy
 from prbayes.propagation.base import Bound, Propagation, probe, refuse_nested
 from prbayes.propagation.ops import ResponseOp, symbolic_discrepancy
-from prbayes.propagation.points import base_points, sobol
+from prbayes.propagation.points import base_points, points_from
 from prbayes.response.compilation import PLAIN, compile_batched, ninf_for_invalid
 from prbayes.response.distributions import PopulationSampler, quantiles, valid
 from prbayes.response.inputs import Inputs
@@ -36,33 +35,29 @@ class Resimulated(Propagation):
     ----------
     n : int
         Number of points, best a power of two; n responses are computed for each theta.
-    seed : int
+    random_seed : int
         Seed of the scrambling.
-    points : callable
-        ``points(n, dimensions, seed)``, the points in the unit cube, shape (n, dimensions): `sobol`, or `monte_carlo`
-        for random numbers that are the same for each theta.
+    points : {"sobol", "monte_carlo"} or callable
+        Scrambled Sobol points, random numbers that are the same for each theta, or a function
+        ``points(n, dimensions, seed)`` that returns points in the open unit cube, shape (n, dimensions).
     executor, store, on_failure
         As for `Reweighted`.
 
     Examples
     --------
     >>> Resimulated(512)
-    Resimulated(n=512, seed=0)
+    Resimulated(n=512, random_seed=0)
     """
 
     n: int = 1024
-    seed: int = 0
-    points: Callable[[int, int, int], Floats] = field(default=sobol, repr=False)
+    random_seed: int = 0
+    points: str | Callable[[int, int, int], Floats] = field(default="sobol", repr=False)
 
     def __post_init__(self) -> None:
         self.check()
         positive_integer(self.n, "Resimulated: n", minimum=2)
-        if not callable(self.points):
-            raise TypeError(
-                f"Resimulated: points: got {type(self.points).__name__}, expected prb.sobol, prb.monte_carlo or a "
-                "function (n, dimensions, seed) -> points"
-            )
-        positive_integer(self.seed, "Resimulated: seed", minimum=0)
+        points_from(self.points)
+        positive_integer(self.random_seed, "Resimulated: random_seed", minimum=0)
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Lay out the base points and find out whether the response accepts PyTensor variables."""
@@ -72,7 +67,6 @@ class Resimulated(Propagation):
         return ResimulatedBound(name, inputs, target, responses, self)
 
 
-_TAILS = 300  # responses for each observation from which a log-likelihood's standard errors are right to a tenth
 _KEPT = 1 << 21  # base points whose transforms may stay in memory
 
 
@@ -84,20 +78,20 @@ class ResimulatedBound(Bound):
     ) -> None:
         super().__init__(name, inputs, target, responses)
         self.n_per_theta = config.n
-        enough = _TAILS * target.n_effective
-        if isinstance(target, LikelihoodDiscrepancy) and config.n < enough:
+        enough = target.metric.tail_responses * target.n_effective
+        if config.n < enough:
             _log.warning(
                 "%s: the log-likelihood of %d resimulated responses sees too little of the tails: its standard errors "
                 "and posterior come out too narrow, expected at least %.0f responses, %d for each observation; use "
                 "prb.Reweighted(n), prb.KullbackLeibler() or a larger n",
-                name, config.n, enough, _TAILS,
+                name, config.n, enough, target.metric.tail_responses,
             )  # fmt: skip
-        _, points = base_points(inputs, config.n, config.seed, config.points)
+        _, points = base_points(inputs, config.n, config.random_seed, points_from(config.points))
         # What depends on constants alone, PyTensor computes once and keeps: fast, unless it is too large to keep.
         self._points: list[Any] = points if config.n <= _KEPT else [shared(u) for u in points]
         for dist, u in zip(inputs.aleatory, self._points, strict=True):
             quantiles(name, dist, u)  # refuses what has no inverse distribution function
-        self.symbolic = self._accepts_tensors(*probe(self, PopulationSampler(inputs), config.seed))
+        self.symbolic = self._accepts_tensors(*probe(self, PopulationSampler(inputs), config.random_seed))
 
     def _accepts_tensors(self, expected: Floats, aleatory: list[Floats], epistemic: list[Floats]) -> bool:
         """Try the response on PyTensor variables, and believe it only if the numbers agree."""

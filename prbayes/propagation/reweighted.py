@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytensor
@@ -19,7 +19,6 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes.metrics.base import Discrepancy
-from prbayes.metrics.function import FunctionMetric
 from prbayes.propagation.base import N_BLOCKS, Bound, Propagation, refuse_all_nan, refuse_nested
 from prbayes.propagation.ops import OpaqueOp
 from prbayes.propagation.points import base_points
@@ -40,7 +39,7 @@ class Reweighted(Propagation):
     n : int
         Number of design points, drawn from the inputs' prior predictive distribution; the response is
         computed n times, once. `refine` adds batches where they are needed.
-    seed : int
+    random_seed : int
         Seed of the design.
     max_lost : float
         Largest share of a population's weight that may fall on points whose response is NaN.
@@ -61,18 +60,18 @@ class Reweighted(Propagation):
     Examples
     --------
     >>> Reweighted(256)
-    Reweighted(n=256, seed=0, max_lost=0.05, max_points=None)
+    Reweighted(n=256, random_seed=0, max_lost=0.05, max_points=None)
     """
 
     n: int = 1024
-    seed: int = 0
+    random_seed: int = 0
     max_lost: float = 0.05
     max_points: int | None = None
 
     def __post_init__(self) -> None:
         self.check()
         positive_integer(self.n, "Reweighted: n", minimum=16)
-        positive_integer(self.seed, "Reweighted: seed", minimum=0)
+        positive_integer(self.random_seed, "Reweighted: random_seed", minimum=0)
         if self.max_lost != 0 and positive_number(self.max_lost, "Reweighted: max_lost") >= 1:
             raise ValueError(f"Reweighted: max_lost: got {self.max_lost}, expected a share below 1")
         if self.max_points is not None and positive_integer(self.max_points, "Reweighted: max_points") < self.n:
@@ -88,9 +87,9 @@ class Reweighted(Propagation):
                 "variable (epistemic), so stored responses cannot be reweighted; use propagation=prb.Resimulated()"
             )
         refuse_nested(name, inputs)
-        if getattr(target.metric, "weighted", True) is False:
+        if not target.metric.takes_weights:
             raise TypeError(
-                f"{name}: a FunctionMetric without weights cannot be used with prb.Reweighted; write "
+                f"{name}: a metric that takes no weights cannot be used with prb.Reweighted; in a FunctionMetric write "
                 "function(simulated, observed, weights) with weighted=True, or use propagation=prb.Resimulated()"
             )
         return Design(name, inputs, target, responses, self)
@@ -114,6 +113,8 @@ class Design(Bound):
     exactly the mixture, over all batches, of the densities at the listed values (balance heuristic).
     """
 
+    stored: ClassVar[bool] = True
+
     def __init__(self, name: str, inputs: Any, target: Discrepancy, responses: Responses, config: Reweighted) -> None:
         super().__init__(name, inputs, target, responses)
         self.config = config
@@ -125,7 +126,7 @@ class Design(Bound):
         self._shared: list[Any] = []
         self._basis: tuple[Any, int, Any] = (None, 0, None)
         self._others: deque[tuple[Responses, Floats]] = deque(maxlen=_OTHERS)
-        thetas = prior_draws(inputs.roots, min(config.n, _MAX_THETAS), config.seed)
+        thetas = prior_draws(inputs.roots, min(config.n, _MAX_THETAS), config.random_seed)
         size = self.add(thetas)
         refuse_all_nan(name, self.values)
         if size < self.required_ess:
@@ -214,7 +215,7 @@ class Design(Bound):
         float
             The median weight effective sample size over these populations.
         """
-        n, seed = n or self.config.n, self.config.seed + 7919 * self.batches
+        n, seed = n or self.config.n, self.config.random_seed + 7919 * self.batches
         thetas = self.valid_only(thetas)
         if self.is_line:
             points, counts = self._equal_mass(thetas, n, seed)
@@ -333,7 +334,7 @@ class Design(Bound):
         raw = pt.exp(pt.switch(supported, logs - disconnected_grad(top), 0.0))
         weights = raw / raw.sum()
         basis = tuple(self._shared[len(self.inputs.aleatory) + 1 :])
-        if isinstance(self.target.metric, FunctionMetric):
+        if not self.target.symbolic:
             d = OpaqueOp(self.target)(*basis, weights)
         else:
             d = self.target.outer(*self.target.from_basis(weights, basis, pt), xp=pt)
@@ -383,6 +384,11 @@ class Design(Bound):
             "mean_weight": np.exp(total - np.log(self.values.size)),
             "lost_mass": np.nan_to_num(lost, nan=1.0),
         }
+
+
+def design_of(bound: Bound) -> Design | None:
+    """Return a bound as a design if its responses are stored, and else None."""
+    return bound if isinstance(bound, Design) else None
 
 
 def _log_sum(logs: Floats, axis: int) -> Floats:

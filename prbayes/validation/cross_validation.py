@@ -9,7 +9,6 @@ from prbayes._checks import positive_integer
 from prbayes.estimate.data_sets import DataSets, specimens
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refit import Neighbourhood, inapplicable
-from prbayes.estimate.sandwich import prior_scale
 from prbayes.model.labels import versions
 
 
@@ -78,7 +77,7 @@ def held_out(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) -> xr.Da
         raise ValueError(f"folds: got {folds}, with fewer than 2 observations of {few} in the others, expected fewer")
     kept = [w / w.sum(axis=1, keepdims=True) for w in kept]
     scales = np.array(list(optimum.scales.values()))
-    hood = Neighbourhood.of(evaluator, optimum.theta, scales, prior_scale(evaluator))
+    hood = Neighbourhood.of(evaluator, optimum.theta, scales, evaluator.prior_sd)
     x, converged = hood.refit(DataSets([t.observed for t in targets], kept))
     thetas = hood.thetas(x)
     found = np.full((2, folds, len(targets)), np.nan)

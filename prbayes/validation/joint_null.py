@@ -14,8 +14,6 @@ from prbayes._predict import data_digest, serving, specimen_names
 from prbayes.estimate.data_sets import groups, sets_at, simulated_points, specimens
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refit import Neighbourhood, inapplicable
-from prbayes.estimate.sandwich import prior_scale
-from prbayes.propagation.reweighted import Design
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.validation.nulls import Case, Condition, Predictive, SimulatedNull
@@ -92,7 +90,7 @@ class JointNull(SimulatedNull):
             _refuse_other(c, populations[k][0][0] if values is None else values, populations[k][1][0])
         points = simulated_points(evaluator, populations, self.replicates, self.seed, more=total)
         scales = np.array(list(self.optimum.scales.values()))
-        hood = Neighbourhood.of(evaluator, theta, scales, prior_scale(evaluator))
+        hood = Neighbourhood.of(evaluator, theta, scales, evaluator.prior_sd)
         x, converged = hood.refit(sets_at(evaluator, populations, points))
         if converged.mean() < 0.5:
             raise ValueError(
@@ -144,8 +142,8 @@ class JointNull(SimulatedNull):
                 f"{condition.name}: responses: got inputs that no simulator with prb.Reweighted has, expected its "
                 ".dist() objects; only then is it known which responses belong to the specimens of the calibration"
             )
-        assert isinstance(node.bound, Design)
-        return nodes.index(node), node.bound.values_of(called)
+        assert node.design is not None
+        return nodes.index(node), node.design.values_of(called)
 
     def _numbers(self, case: Case, served: list[int]) -> tuple[list[NDArray[np.intp]], int]:
         """Return the specimens of each condition, those of the calibration by their numbers, and how many are new."""

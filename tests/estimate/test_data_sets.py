@@ -26,7 +26,6 @@ from prbayes.estimate.data_sets import (
 )
 from prbayes.estimate.objective import differences
 from prbayes.estimate.refit import Neighbourhood, _mean_hessian
-from prbayes.estimate.sandwich import prior_scale
 from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
@@ -64,7 +63,7 @@ def pair(a: Any, b: Any, propagation: Any = R256, *, other_input: bool = False, 
         x = pm.Normal.dist(mu, 0.5)
         z = pm.Normal.dist(mu, 0.5)
         prb.Simulator("a", same, x, metric=KL, observed=OBSERVED, specimens=a, propagation=propagation)
-        other = prb.Reweighted(256, seed=seed) if seed else propagation
+        other = prb.Reweighted(256, random_seed=seed) if seed else propagation
         prb.Simulator(
             "b", double, z if other_input else x, metric=KL, observed=2 * OBSERVED, specimens=b, propagation=other
         )
@@ -297,7 +296,7 @@ def neighbourhood(name: str, *, design: bool = True) -> Neighbourhood:
     model = build(METRICS[name], sd=None, propagation=R256 if design else prb.Resimulated(512))
     optimum = prb.minimize(model, method="Nelder-Mead", starts=0)
     evaluator = optimum.evaluator
-    return Neighbourhood.of(evaluator, optimum.theta, np.array(list(optimum.scales.values())), prior_scale(evaluator))
+    return Neighbourhood.of(evaluator, optimum.theta, np.array(list(optimum.scales.values())), evaluator.prior_sd)
 
 
 def test_coordinates_are_standard_errors_along_a_frame() -> None:
@@ -318,7 +317,7 @@ def test_what_is_not_seen_is_left_over() -> None:
         pm.Normal("idle", 0, 3)
         prb.Simulator("y", same, x, metric=KL, observed=OBSERVED, propagation=R256)
     evaluator = Evaluator(model)
-    hood = Neighbourhood.of(evaluator, np.array([1.0, 0.0]), np.ones(1), prior_scale(evaluator))
+    hood = Neighbourhood.of(evaluator, np.array([1.0, 0.0]), np.ones(1), evaluator.prior_sd)
     x, rest = hood.coordinates(np.array([[1.5, 2.0]]))
     assert x.shape == (1, 1)
     np.testing.assert_allclose(rest, [[0.0, 2.0]], atol=1e-9)
@@ -379,11 +378,11 @@ def test_two_simulators_are_weighed_by_their_scales() -> None:
     # A normal mean with known sd: both minimisers are about the means of the data, weighed by N_k.
     labels = np.arange(N)
     evaluator = pair(labels, labels)
-    hood = Neighbourhood.of(evaluator, TRUTH, np.array([1 / N, 1e9, 1e9]), prior_scale(evaluator))
+    hood = Neighbourhood.of(evaluator, TRUTH, np.array([1 / N, 1e9, 1e9]), evaluator.prior_sd)
     sets = reweighted_sets(evaluator, 20)
     only_a, _ = hood.refit(sets)
     alone = Evaluator(build(KL))
-    by_itself = Neighbourhood.of(alone, TRUTH, np.array([1 / N]), prior_scale(alone))
+    by_itself = Neighbourhood.of(alone, TRUTH, np.array([1 / N]), alone.prior_sd)
     expected, _ = by_itself.refit(DataSets(sets.values[:1], sets.weights[:1]))
     np.testing.assert_allclose(hood.thetas(only_a), by_itself.thetas(expected), atol=0.003)
 

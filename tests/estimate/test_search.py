@@ -14,6 +14,7 @@ from scipy import optimize, stats
 
 import prbayes as prb
 from prbayes._checks import Floats
+from prbayes.estimate.methods import Method
 from prbayes.estimate.objective import Objective, StalledError, differences
 from prbayes.estimate.search import Search
 from prbayes.model.evaluator import Evaluator
@@ -59,30 +60,30 @@ def steepest_descent(
 
 
 @pytest.mark.parametrize(
-    "method",
+    ("method", "options"),
     [
-        prb.Scipy("L-BFGS-B", {"maxcor": 3}),
-        "slsqp",
-        "TNC",
-        "trust-constr",
-        "Newton-CG",
-        "COBYQA",
-        "COBYLA",
-        steepest_descent,
-        prb.Scipy(steepest_descent, {"steps": 1500}),
+        ("L-BFGS-B", {"maxcor": 3}),
+        ("slsqp", None),
+        ("TNC", None),
+        ("trust-constr", None),
+        ("Newton-CG", None),
+        ("COBYQA", None),
+        ("COBYLA", None),
+        (steepest_descent, None),
+        (steepest_descent, {"steps": 1500}),
     ],
-    ids=lambda method: prb.Scipy.of(method).name,
+    ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_any_method_finds_the_optimum(method: Any) -> None:
+def test_any_method_finds_the_optimum(method: Any, options: Any) -> None:
     # The callable descends in small steps and takes hundreds.
-    found = prb.minimize(model(), start={"mu": 0.5, "sigma": 0.8}, method=method)
+    found = prb.minimize(model(), start={"mu": 0.5, "sigma": 0.8}, method=method, options=options)
     assert found.converged
     np.testing.assert_allclose(pair(found), pair(best()), atol=3e-4)
 
 
 def test_options_replace_defaults_and_are_not_changed() -> None:
     options = {"xatol": 0.3, "fatol": 10.0}
-    loose = prb.minimize(model(), start={"mu": 0.5, "sigma": 0.8}, method=prb.Scipy("Nelder-Mead", options))
+    loose = prb.minimize(model(), start={"mu": 0.5, "sigma": 0.8}, method="Nelder-Mead", options=options)
     tight = prb.minimize(model(), start={"mu": 0.5, "sigma": 0.8}, method="Nelder-Mead")
     assert loose.n_evaluations < tight.n_evaluations / 3
     assert options == {"xatol": 0.3, "fatol": 10.0}
@@ -93,8 +94,8 @@ def test_options_replace_defaults_and_are_not_changed() -> None:
     [
         ("bfsg", ValueError, r"got 'bfsg', expected one of BFGS, CG, .*, or a function"),
         ("dogleg", ValueError, "got 'dogleg'"),  # needs a Hessian
-        (3, TypeError, "method: got 3, expected prb.Scipy"),
-        (prb.Scipy, TypeError, "expected prb.Scipy"),
+        (3, TypeError, "method: got 3, expected the name of a scipy method"),
+        (dict, TypeError, "expected the name of a scipy method"),
     ],
 )
 def test_an_unknown_method_is_refused_before_any_work(method: Any, error: type[Exception], words: str) -> None:
@@ -108,7 +109,7 @@ def test_an_unknown_method_is_refused_before_any_work(method: Any, error: type[E
 
 def test_options_must_be_a_mapping() -> None:
     with pytest.raises(TypeError, match="options: got list, expected a mapping"):
-        prb.Scipy("BFGS", [1])  # type: ignore[arg-type]
+        prb.minimize(model(), options=[1])  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -227,7 +228,7 @@ def test_overlap_is_one_for_equal_and_zero_for_disjoint_densities() -> None:
 @pytest.mark.parametrize("propagation", [prb.Reweighted(256), prb.Resimulated(256)], ids=["stored", "anew"])
 def test_where_there_is_overlap_the_start_is_left_alone(propagation: Any) -> None:
     evaluator = Evaluator(normal_model(propagation))
-    search = Search(evaluator, np.ones(2), prb.Scipy(), prior=False, tolerance=1e-6, most=100)
+    search = Search(evaluator, np.ones(2), Method(), prior=False, tolerance=1e-6, most=100)
     theta = np.array([0.3, 0.0])
     assert search.approach(theta, np.ones(1), 0) is theta
     assert search.count == 0
@@ -241,16 +242,17 @@ def test_where_there_is_overlap_the_start_is_left_alone(propagation: Any) -> Non
 
 
 def test_monte_carlo_points_agree_with_sobol_points() -> None:
-    random = prb.minimize(normal_model(prb.Resimulated(20_000, points=prb.monte_carlo)), start=best().point)
+    random = prb.minimize(normal_model(prb.Resimulated(20_000, points="monte_carlo")), start=best().point)
     # The error of independent points is sqrt(N / n) standard errors.
     limit = 4 * np.sqrt(50 / 20_000)
     assert (np.abs(pair(random) - pair(best())) < limit * np.array([best().stderr["mu"], best().stderr["sigma"]])).all()
     assert (pair(random) != pair(best())).all()
 
 
-def test_points_must_be_a_function() -> None:
-    with pytest.raises(TypeError, match=r"points: got str, expected prb.sobol, prb.monte_carlo"):
-        prb.Resimulated(64, points="sobol")  # type: ignore[arg-type]
+@pytest.mark.parametrize(("points", "error"), [("halton", ValueError), (3, TypeError)])
+def test_points_are_a_name_or_a_function(points: Any, error: type[Exception]) -> None:
+    with pytest.raises(error, match=r'points: got .*, expected "sobol", "monte_carlo" or a function'):
+        prb.Resimulated(64, points=points)
 
 
 MILLION = """

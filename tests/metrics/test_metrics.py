@@ -8,6 +8,7 @@ from scipy.stats import norm, wasserstein_distance
 
 from prbayes._checks import Floats
 from prbayes.metrics.area import AreaMetric
+from prbayes.metrics.base import Minimum
 from prbayes.metrics.density import GaussianKDE, Histogram, likelihood_bandwidth
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.function import FunctionMetric
@@ -115,7 +116,7 @@ def test_shift_scale_sign_and_order(name: str, shift: float, a: float) -> None:
     i, j = (np.random.default_rng(3).permutation(v.size) for v in (x, z))
     before, after = METRICS[name].against(z, u), make(abs(a) * H)[name].against(a * z[j] + shift, u[j])
     expected = before(x, w)
-    rtol = 1e-4 if a < 0 and before.metric.smooth and "bins" not in name else 1e-8
+    rtol = 1e-4 if a < 0 and before.metric.minimum is Minimum.QUADRATIC and "bins" not in name else 1e-8
     if name == "area":
         expected *= abs(a)
     elif name in ("pr", "pr-bins"):
@@ -250,8 +251,13 @@ def test_attributes() -> None:
     assert LogLikelihood().against(z).scale == KullbackLeibler().against(z).scale == 1
     default = (ProbabilityResidual().scale_base, LogLikelihood().density)
     assert default == (100, GaussianKDE(likelihood_bandwidth))
-    flags = [(METRICS[name].smooth, METRICS[name].likelihood) for name in ("area", "pr", "kl", "ll")]
-    assert flags == [(False, False), (True, False), (True, True), (True, True)]
+    flags = [(METRICS[name].minimum, METRICS[name].likelihood) for name in ("area", "pr", "kl", "ll")]
+    assert flags == [
+        (Minimum.ABSOLUTE, False),
+        (Minimum.QUADRATIC, False),
+        (Minimum.QUADRATIC, True),
+        (Minimum.QUADRATIC, True),
+    ]
 
 
 OK = [0.0, 1.0, 3.0]
@@ -286,7 +292,7 @@ def test_function_metric() -> None:
     rows = np.random.default_rng(13).dirichlet(np.ones(x.size), (2, 3))
     np.testing.assert_allclose(d(x, rows), np.abs(rows @ x - z.mean()), rtol=1e-12)
     np.testing.assert_allclose(d.outer(*d.from_basis(rows, d.basis(x), np), xp=np), d(x, rows), rtol=1e-12)
-    assert (plain.smooth, plain.likelihood, d.scale) == (False, False, 1.0)
+    assert (plain.minimum, plain.likelihood, d.scale) == (Minimum.UNKNOWN, False, 1.0)
 
 
 def test_wrong_settings() -> None:

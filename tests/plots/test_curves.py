@@ -6,14 +6,15 @@ from functools import cache
 import numpy as np
 import pymc as pm
 import pytest
-from prbayes.pictures import curves
 from scipy import stats
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
+from prbayes.plots import _curves as curves
 from prbayes.plots._ensemble import read_before, read_result, supported
 from prbayes.plots._grid import elements, landscape, rooted
 from prbayes.plots._margins import chosen, margin_densities, margins
+from prbayes.propagation.base import Propagation
 
 QUANTILES = stats.norm.ppf((np.arange(1000) + 0.5) / 1000)
 EQUAL = np.full(1000, 1e-3)
@@ -127,7 +128,7 @@ def test_ticks_of_logarithms_stand_where_their_labels_say() -> None:
 # -- inputs ----------------------------------------------------------------------------------------------
 
 
-def two_inputs(propagation: prb.propagation.Propagation) -> tuple[pm.Model, list[object]]:
+def two_inputs(propagation: Propagation) -> tuple[pm.Model, list[object]]:
     def first(load: np.ndarray, gap: np.ndarray, factor: float) -> np.ndarray:
         return load[..., 0] * factor + gap + 0 * load[..., 1]
 
@@ -197,7 +198,7 @@ def test_margins_without_a_density_of_their_own_are_drawn() -> None:
 
 
 @cache
-def normal_model(propagation: prb.propagation.Propagation) -> pm.Model:
+def normal_model(propagation: Propagation) -> pm.Model:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
         observed = 1 + 0.5 * stats.norm.ppf((np.arange(30) + 0.5) / 30)

@@ -18,6 +18,7 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes.plots._canvas import named
+from prbayes.propagation.base import Propagation
 
 RNG = np.random.default_rng(4)
 MU, SIGMA = RNG.normal(1.0, 0.1, (2, 150)), RNG.normal(0.5, 0.03, (2, 150))
@@ -31,7 +32,7 @@ def _close() -> Iterator[None]:
     plt.close("all")
 
 
-def build(propagation: prb.propagation.Propagation, response: Any = np.positive) -> pm.Model:
+def build(propagation: Propagation, response: Any = np.positive) -> pm.Model:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
         prb.Simulator("y", response, x, metric=prb.AreaMetric(), observed=OBSERVED, propagation=propagation)

@@ -15,7 +15,6 @@ from scipy.stats import gamma, norm
 import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.estimate.refit import Neighbourhood, inapplicable
-from prbayes.estimate.sandwich import prior_scale
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.adjustment import _drawn_in, moved
 
@@ -76,7 +75,7 @@ def blind_hood() -> Neighbourhood:
         prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
     evaluator = Evaluator(model)
     theta = evaluator.unconstrained({"mu": 1.0, "sigma": 0.5, "idle": 5.0})
-    return Neighbourhood.of(evaluator, theta, evaluator.epsilon, prior_scale(evaluator))
+    return Neighbourhood.of(evaluator, theta, evaluator.epsilon, evaluator.prior_sd)
 
 
 def test_median_and_covariance_are_hit() -> None:
@@ -134,7 +133,7 @@ def test_draws_get_the_moments_that_the_target_says() -> None:
     optimum, idata = fit("kl"), adjusted("kl")
     evaluator = optimum.evaluator
     epsilon = idata.calibration["epsilon"].values
-    hood = Neighbourhood.of(evaluator, optimum.theta, epsilon, prior_scale(evaluator))
+    hood = Neighbourhood.of(evaluator, optimum.theta, epsilon, evaluator.prior_sd)
     prb.set_epsilon(optimum.model, {"y": epsilon[0]})
     center, covariance = prb.Affine(n_sets=1000).target(hood)
     x, _ = hood.coordinates(thetas(idata))
@@ -329,11 +328,11 @@ def adjustment(idata: xr.DataTree) -> str:
 def test_a_given_epsilon_is_taken_at_its_word() -> None:
     optimum = prb.minimize(build(METRICS["kl"], sd=0.5))
     short = {"draws": 60, "optimum": optimum}
-    assert adjustment(sample(optimum.model, **short)) == "Affine(n_sets=200, seed=0)"  # 1/N, which nobody gave
+    assert adjustment(sample(optimum.model, **short)) == "Affine(n_sets=200, random_seed=0)"  # 1/N, which nobody gave
     assert adjustment(sample(optimum.model, epsilon=0.01, **short)) == "none"
     assert (
         adjustment(sample(optimum.model, epsilon=0.01, adjust=prb.Affine(50, 3), **short))
-        == "Affine(n_sets=50, seed=3)"
+        == "Affine(n_sets=50, random_seed=3)"
     )
     assert adjustment(sample(optimum.model, adjust=False, **short)) == "none"
     prb.set_epsilon(optimum.model, {"y": 0.05})

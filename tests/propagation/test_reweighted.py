@@ -32,7 +32,7 @@ def line(
 ) -> pm.Model:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, prior_sd), pm.HalfNormal("sigma", 1))
-        propagation = prb.Reweighted(n, seed=seed, **keywords)
+        propagation = prb.Reweighted(n, random_seed=seed, **keywords)
         prb.Simulator("y", response, x, metric=metric, observed=OBSERVED, propagation=propagation)
     return model
 
@@ -241,7 +241,7 @@ def hard(metric: prb.Metric, n: int = 512, seed: int = 0, pairs: Floats = PAIRS)
         for name, response in zip(("sum", "difference"), responses, strict=True):
             observed = response(pairs)
             response.count = 0
-            propagation = prb.Reweighted(n, seed=seed)
+            propagation = prb.Reweighted(n, random_seed=seed)
             prb.Simulator(name, response, x, metric=metric, observed=observed, propagation=propagation)
     return model, responses
 
@@ -320,7 +320,7 @@ def test_the_error_of_a_design_is_measured() -> None:
         rng = np.random.default_rng(3)
         with pm.Model() as model:
             a = pm.Normal.dist(pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1))
-            propagation = prb.Reweighted(512, seed=seed, **keywords)
+            propagation = prb.Reweighted(512, random_seed=seed, **keywords)
             observed = rng.normal(2, 0.5, 40) * np.exp(rng.normal(0, 0.2, 40))
             b = pm.Normal.dist(0, 0.2)
             prb.Simulator("y", lambda a, b: a * np.exp(b), a, b, metric=PR, observed=observed, propagation=propagation)

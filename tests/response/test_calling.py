@@ -248,7 +248,7 @@ def test_nothing_is_computed_twice(tmp_path: Path) -> None:
     second = model(prb.scalar(times), store=tmp_path)
     np.testing.assert_array_equal(stored(second), EXPECTED)
     assert (responses(first).computed, responses(second).computed) == (N, 0)
-    more = model(prb.scalar(times), propagation=prb.Reweighted(N, seed=1, store=tmp_path))
+    more = model(prb.scalar(times), propagation=prb.Reweighted(N, random_seed=1, store=tmp_path))
     assert responses(more).computed == N  # other points
     assert {p.suffix for p in tmp_path.iterdir()} == {".nc"}
     with xr.open_dataset(tmp_path / "y.nc") as data:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -15,19 +15,18 @@ from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes._progress import shown
 from prbayes.estimate.caveats import flat, trouble
 from prbayes.estimate.identifiability import blind_directions
-from prbayes.estimate.methods import Scipy
+from prbayes.estimate.methods import Method
 from prbayes.estimate.optimum import Optimum, assemble, plain
 from prbayes.estimate.refinement import AGREE, MAX_ROUNDS, grow, pilot, refine_at, refuse, spread_around
 from prbayes.estimate.refit import Neighbourhood
 from prbayes.estimate.rivals import Rival, rivals
 from prbayes.estimate.sampling import Local
-from prbayes.estimate.sandwich import Information, prior_scale
+from prbayes.estimate.sandwich import Information
 from prbayes.estimate.search import Search
-from prbayes.metrics.function import FunctionMetric
+from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.simulator import model_on_context
 from prbayes.model.support import shortcomings
-from prbayes.propagation.fresh import FreshBound
 
 _log = logging.getLogger("prbayes")
 
@@ -68,7 +67,7 @@ def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[
     >>> prb.refine(model)
     {'y': 1024}
     """
-    from prbayes.estimate.minimize import minimize
+    from prbayes.estimate.minimization import minimize
 
     model = model_on_context(model, "prb.refine")
     evaluator = Evaluator(model)
@@ -95,7 +94,8 @@ def minimize(
     model: pm.Model | None = None,
     *,
     start: dict[str, Any] | None = None,
-    method: Scipy | str | Callable[..., Any] | None = None,
+    method: str | Callable[..., Any] | None = None,
+    options: Mapping[str, Any] | None = None,
     prior: bool = False,
     tolerance: float = 1e-6,
     max_evaluations: int = 5000,
@@ -118,10 +118,14 @@ def minimize(
         A value for each free variable, in the user's own units. By default the best of 256 Sobol points of the prior
         where they cost no response (`Reweighted`), and else the model's initial point. Where no simulated response is
         near the data at the start, the area metric leads from there to where some are.
-    method : Scipy, str or callable, optional
+    method : str or callable, optional
         BFGS by default, with exact gradients where there are any (`Reweighted`; `Resimulated` if the response accepts
         PyTensor variables, which is tried) and differences on common points elsewhere. Any other method of
-        `scipy.optimize.minimize`, by its name, as `Scipy` with options, or as a function.
+        `scipy.optimize.minimize` that needs no Hessian, by its name, or a function as scipy takes it:
+        ``method(fun, x0, args, jac=..., callback=..., **options) -> OptimizeResult``. It works on standardised
+        parameters, that start at zero; ``jac`` is None under `Fresh`.
+    options : mapping, optional
+        For scipy's ``options=``, in units of the standardised problem; they replace those that are set otherwise.
     prior : bool
         Add minus the log prior (then discrepancies should be divided by calibrated epsilons).
     tolerance : float
@@ -172,6 +176,7 @@ def minimize(
             evaluator,
             start=start,
             method=method,
+            options=options,
             prior=prior,
             tolerance=tolerance,
             max_evaluations=max_evaluations,
@@ -185,7 +190,8 @@ def find_optimum(
     evaluator: Evaluator,
     *,
     start: dict[str, Any] | None = None,
-    method: Scipy | str | Callable[..., Any] | None = None,
+    method: str | Callable[..., Any] | None = None,
+    options: Mapping[str, Any] | None = None,
     prior: bool = False,
     tolerance: float = 1e-6,
     max_evaluations: int = 5000,
@@ -195,23 +201,23 @@ def find_optimum(
 ) -> Optimum:
     """Do what `minimize` does, for an evaluator."""
     clock = time.perf_counter()
-    method = Scipy.of(method)
+    minimiser = Method.of(method, options)
     positive_number(tolerance, "tolerance")
     positive_integer(max_evaluations, "max_evaluations")
-    fresh = [n.name for n in evaluator.nodes if isinstance(n.bound, FreshBound)]
-    if fresh and method.gradient and isinstance(method.method, str):
+    fresh = [n.name for n in evaluator.nodes if n.bound.random]
+    if fresh and minimiser.gradient and isinstance(minimiser.method, str):
         raise TypeError(
-            f"{fresh[0]}: prb.Fresh draws new responses at every evaluation, so the method {method.name} has no "
+            f"{fresh[0]}: prb.Fresh draws new responses at every evaluation, so the method {minimiser.name} has no "
             "gradient to follow; pass epsilon= to prb.sample_smc, which then needs no optimum, use "
             "prb.minimize(method='Nelder-Mead'), or propagation=prb.Reweighted() or prb.Resimulated()"
         )
-    scale = prior_scale(evaluator, seed=random_seed)
+    scale = evaluator.prior_sd
     already = evaluator.n_responses
     stored = sum(d.n_points for d in evaluator.designs.values())
     several = len(evaluator.nodes) > 1
     natural = np.array([n.target.scale for n in evaluator.nodes]) if several or prior else np.ones(1)
     natural = np.where(np.isnan(evaluator.epsilon) | (not (several or prior)), natural, evaluator.epsilon)
-    search = Search(evaluator, scale, method, prior, tolerance, max_evaluations)
+    search = Search(evaluator, scale, minimiser, prior, tolerance, max_evaluations)
     theta, screened = search.start(start, natural, random_seed)
     theta = search.approach(theta, natural, random_seed)
     scales = natural
@@ -289,7 +295,7 @@ def find_optimum(
 
 def _hood(evaluator: Evaluator, theta: Floats, scale: Floats, scales: Floats) -> Neighbourhood | None:
     """Return the sampling distribution of the minimiser around theta, or None where nothing is known of it."""
-    if any(isinstance(n.metric, FunctionMetric) or isinstance(n.bound, FreshBound) for n in evaluator.nodes):
+    if any(n.metric.minimum is Minimum.UNKNOWN or n.bound.random for n in evaluator.nodes):
         return None
     return Neighbourhood.of(evaluator, theta, scales, scale)
 

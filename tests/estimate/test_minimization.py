@@ -15,7 +15,6 @@ from scipy.stats import norm
 import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.estimate.refit import Neighbourhood
-from prbayes.estimate.sandwich import prior_scale
 from prbayes.estimate.search import Search
 from prbayes.metrics.density import GaussianKDE
 from prbayes.model.evaluator import Evaluator
@@ -362,7 +361,7 @@ def test_standard_errors_are_those_of_where_the_simplex_ended() -> None:
     model = lossy("pr", 1, 4096)
     optimum = prb.minimize(model, start=START)
     assert "A simplex from there" in optimum.message
-    hood = Neighbourhood.of(optimum.evaluator, optimum.theta, np.ones(1), prior_scale(optimum.evaluator))
+    hood = Neighbourhood.of(optimum.evaluator, optimum.theta, np.ones(1), optimum.evaluator.prior_sd)
     np.testing.assert_allclose(optimum.covariance, hood.local.in_theta, rtol=1e-6)
 
 

@@ -13,7 +13,6 @@ from prbayes.estimate.data_sets import reweighted_sets, simulated_sets
 from prbayes.estimate.identifiability import blind_directions
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refit import Neighbourhood, inapplicable
-from prbayes.estimate.sandwich import prior_scale
 from prbayes.posterior.trees import bootstrap_tree
 
 
@@ -77,7 +76,7 @@ def bootstrap(
     if reason:
         raise ValueError(f"bootstrap: {reason}; use prb.sample_smc")
     scales = np.array(list(optimum.scales.values()))
-    hood = Neighbourhood.of(evaluator, optimum.theta, scales, prior_scale(evaluator))
+    hood = Neighbourhood.of(evaluator, optimum.theta, scales, evaluator.prior_sd)
     blind = blind_directions(hood.local.blind, evaluator.readable_names)
     if blind:
         raise ValueError(
