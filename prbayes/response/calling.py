@@ -1,7 +1,8 @@
-"""Calling an expensive response at many points: on an executor, in chunks, with a store and a failure policy.
+"""Calling an expensive response at many points: in chunks, stored, with a failure policy.
 
-`respond` is the whole of it. Points are looked up in the store; `chunks` sends out those that are missing, a few chunks
-at a time, and gives back each as it is done; `compute` is what a worker does with one.
+`respond` is the whole of it. Points are looked up in the store; `chunks` sends out those that are
+missing, a few chunks at a time, and gives back each as it is done; `compute` is what a worker does
+with one.
 """
 
 from __future__ import annotations
@@ -27,19 +28,22 @@ _log = logging.getLogger("prbayes")
 
 Rows = NDArray[np.intp]
 
-# Seconds that a chunk should take: long against the 4.5 ms that sending one costs (`python -m benchmarks.scale`), short
-# against what is lost with a worker. By judgement.
+# Seconds that a chunk should take: long against the 4.5 ms that sending one costs (`python -m
+# benchmarks.scale`), short against what is lost with a worker. By judgement.
 _CHUNK_SECONDS = 0.2
-# Seconds from which a response of one specimen at a time is a chunk of its own, so that none waits for others to be
-# stored. By judgement: twice what sending it costs.
+# Seconds from which a response of one specimen at a time is a chunk of its own, so that none waits
+# for others to be stored. By judgement: twice what sending it costs.
 _ALONE_SECONDS = 0.01
-# Points of the first chunk of a response that takes arrays, whose cost is not known yet. By judgement: what a call costs
-# by itself is spread over a few, and a response of minutes is not called for long.
+# Points of the first chunk of a response that takes arrays, whose cost is not known yet. By
+# judgement: what a call costs by itself is spread over a few, and a response of minutes is not
+# called for long.
 _FIRST = 16
-# Share of earlier chunks in the measured cost of a response; it only sizes the next chunks. By judgement.
+# Share of earlier chunks in the measured cost of a response; it only sizes the next chunks. By
+# judgement.
 _MEMORY = 0.7
-# Chunks sent out at a time to an executor that does not tell how many workers it has: as many as workers that are known
-# of in practice; what one costs in memory is measured by `python -m benchmarks.scale`. By judgement.
+# Chunks sent out at a time to an executor that does not tell how many workers it has: as many as
+# workers that are known of in practice; what one costs in memory is measured by `python -m
+# benchmarks.scale`. By judgement.
 _MANY = 1024
 
 
@@ -105,7 +109,7 @@ class Points:
         return len(self.arguments[list(self.varying).index(True)])
 
     def at(self, rows: Rows | int) -> Points:
-        """Return some of the points; with a number, the arguments of that one, without the leading axis."""
+        """Return some of the points; with a number that one, without the leading axis."""
         pairs = zip(self.arguments, self.varying, strict=True)
         return Points([a[rows] if varies else a for a, varies in pairs], self.varying)
 
@@ -189,7 +193,7 @@ class Tally:
 
 
 def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
-    """Return the responses at points, shape (n,); none that is stored is computed, and what is computed is stored.
+    """Return the responses at points, shape (n,), from the store or computed and then stored.
 
     Raises
     ------
@@ -208,9 +212,9 @@ def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
             values[rows] = chunk.values
             raised.update({int(rows[i]): text for i, text in chunk.raised.items()})
             if calling.store is not None:
-                # NaN is a result once nothing is tried again, unless the chunk broke off at an exception.
-                final = last and (tolerant or not chunk.raised)
-                keep = np.full(rows.size, final) | ~np.isnan(chunk.values)
+                # NaN is a result, too, after the last try, but not where a chunk broke off.
+                whole = tolerant or not chunk.raised
+                keep = ~np.isnan(chunk.values) | (last and whole)
                 _keep(calling.store, keys[rows], chunk, keep)
         if raised and not tolerant:
             raise _failed(calling, raised)
@@ -232,7 +236,10 @@ def _keep(store: Store, keys: Floats, chunk: Chunk, keep: NDArray[np.bool_]) -> 
     """Store the responses of a chunk that are to be kept, with what was raised in place of some."""
     kept = np.flatnonzero(keep)
     if kept.size:
-        reasons = {i: chunk.raised[int(j)] for i, j in enumerate(kept) if int(j) in chunk.raised}
+        reasons = {}
+        for i, row in enumerate(kept):
+            if int(row) in chunk.raised:
+                reasons[i] = chunk.raised[int(row)]
         store.add(keys[kept], chunk.values[kept], reasons)
 
 
@@ -240,21 +247,16 @@ def _settled(calling: Calling, values: Floats, raised: dict[int, str], tally: Ta
     """Return responses with what the policy puts in the place of those that are NaN."""
     bad = np.isnan(values)
     policy = calling.on_failure.final
-    if not bad.any():
+    n_bad = int(bad.sum())
+    if not n_bad:
         return values
     first = next(iter(raised.values()), "it is NaN")
     if policy.refuses_nan:
         raise _failed(calling, raised or {0: first})
     if policy.replacement is not None:
-        tally.failures += int(bad.sum())
-        _log.warning(
-            "%s: %d of %d responses failed, replaced by %s; the first: %s",
-            calling.name,
-            bad.sum(),
-            bad.size,
-            policy.replacement,
-            first,
-        )
+        tally.failures += n_bad
+        text = f"{n_bad} of {bad.size} responses failed, replaced by {policy.replacement}"
+        _log.warning("%s: %s; the first: %s", calling.name, text, first)
         values[bad] = policy.replacement
     return values
 
@@ -270,7 +272,7 @@ def _failed(calling: Calling, raised: dict[int, str]) -> ResponseError:
     )
 
 
-# -- sending out ---------------------------------------------------------------------------------------------------------
+# -- sending out -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -284,8 +286,8 @@ class Capacity:
 def capacity(executor: Executor | None) -> Capacity:
     """Return how much an executor takes.
 
-    The interface does not tell: processes, threads and loky keep ``_max_workers``, MPI ``num_workers``, and Dask's
-    client knows. Of others many chunks are sent out, lest workers wait.
+    The interface does not tell: processes, threads and loky keep ``_max_workers``, MPI
+    ``num_workers``, and Dask's client knows. Of others many chunks are sent out, lest workers wait.
     """
     if executor is None:
         return Capacity(1, 1)
@@ -316,7 +318,8 @@ def chunks(
 ) -> Iterator[tuple[Rows, Chunk]]:
     """Compute the responses at some rows of the points, and yield chunks of them as they are done.
 
-    After a failure that is not tolerated nothing more is begun, and what was begun is waited for and yielded.
+    After a failure that is not tolerated nothing more is begun, and what was begun is waited for
+    and yielded.
 
     Raises
     ------
@@ -362,7 +365,7 @@ def _raise_lost(name: str, error: BaseException) -> None:
 
 
 def _work(calling: Calling) -> Callable[[Points, bool], Chunk]:
-    """Return what an executor is to do with points: to other processes the function travels packed."""
+    """Return what is done with points; to other processes the function travels packed."""
     if calling.executor is None or isinstance(calling.executor, ThreadPoolExecutor):
         return partial(compute, calling.function)
     return partial(compute_packed, packed(calling.function))
@@ -371,7 +374,7 @@ def _work(calling: Calling) -> Callable[[Points, bool], Chunk]:
 def _submitted(
     executor: Executor | None, work: Callable[[Points, bool], Chunk], points: Points, tolerant: bool
 ) -> Future[Chunk]:
-    """Return the work as a future: done already if there is no executor, failed if the executor is broken."""
+    """Return the work as a future: done already without an executor, failed if that is broken."""
     future: Future[Chunk] = Future()
     try:
         if executor is not None:
@@ -382,7 +385,7 @@ def _submitted(
     return future
 
 
-# -- at work -------------------------------------------------------------------------------------------------------------
+# -- at work ---------------------------------------------------------------------------------------
 
 
 def compute(function: Callable[..., Any], points: Points, tolerant: bool) -> Chunk:
@@ -433,7 +436,7 @@ def _said(error: Exception) -> str:
 
 
 def checked(result: Any, batch: tuple[int, ...], arguments: Sequence[Any]) -> Floats:
-    """Return a response's result as floats, or raise if it is not real numbers in the batch shape."""
+    """Return a response's result as floats; it has to be real numbers in the batch shape."""
     array = np.asarray(result)
     if array.dtype.kind not in "fiub":
         got = f"{type(result).__name__} of dtype {array.dtype}"

@@ -1,4 +1,4 @@
-"""The SQLite file of a store: its tables, how it is made and opened, and what can be wrong with it."""
+"""The SQLite file of a store: its tables, how it is made and opened, what can be wrong."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from typing import Any
 APPLICATION = int.from_bytes(b"prby")
 # Counts the changes of the tables below: a file of another layout is refused, and not misread.
 LAYOUT = 1
-# Seconds to wait for other writers. By judgement: a chunk is written in some 10 ms, so that a thousand
-# writers wait less, and one that hangs is told of within a minute.
+# Seconds to wait for other writers. By judgement: a chunk is written in some 10 ms, so that a
+# thousand writers wait less, and one that hangs is told of within a minute.
 PATIENCE = 60.0
 
-# `constants`, `version` and `fingerprint` can tell responses of one name apart; nothing fills them yet.
-# Key and value of a run are float64, little-endian: every bit survives, those of NaN too. Runs are numbered
-# without a gap, so that one that is lost is missed.
+# `constants`, `version` and `fingerprint` can tell responses of one name apart; nothing fills them
+# yet. Key and value of a run are float64, little-endian: every bit survives, those of NaN too. Runs
+# are numbered without a gap, so that one that is lost is missed.
 TABLES = (
     "CREATE TABLE response (id INTEGER PRIMARY KEY, name TEXT NOT NULL, columns INTEGER NOT NULL, "
     "constants BLOB, version TEXT, fingerprint BLOB, checksum INTEGER NOT NULL)",
@@ -42,6 +42,17 @@ INSERT_RUN = (
 SELECT_RUNS = (
     "SELECT id, response, key, state, reason, value, checksum FROM run WHERE id > ? ORDER BY id"
 )
+# The first three are what SQLite recommends for files that may be damaged
+# (https://www.sqlite.org/security.html); with the last, what is committed has been flushed to disk.
+_SETTINGS = (
+    "trusted_schema = OFF",
+    "cell_size_check = ON",
+    "mmap_size = 0",
+    "synchronous = FULL",
+)
+# Bytes of the smallest page (https://www.sqlite.org/fileformat.html); SQLite takes a file that was
+# cut to nothing for a new one.
+_SMALLEST = 512
 # States of a run.
 COMPUTED, FAILED = "computed", "failed"
 
@@ -60,12 +71,12 @@ def damaged(what: str) -> Complaint:
     return Complaint(
         f"which is damaged: {what}",
         "what was written",
-        "nothing was changed: put back a copy of the folder, move the file away, or pass another folder; "
-        "the program sqlite3 may recover what is left (.recover)",
+        "nothing was changed: put back a copy, move the file away, or pass another folder; the "
+        "program sqlite3 may recover what is left (.recover)",
     )
 
 
-_EMPTY = damaged("it is empty, which a store never is")
+_CUT = damaged("it was cut to less than a page")
 _FOREIGN = Complaint(
     "which is a database of another program",
     "a store of prbayes",
@@ -143,19 +154,19 @@ def connected(path: Path, mode: str = "rw") -> sqlite3.Connection:
         isolation_level=None,  # transactions begin where the code says so
         check_same_thread=False,  # the garbage collector may close it in another thread
     )
-    # On files that may be damaged: https://www.sqlite.org/security.html.
-    connection.execute("PRAGMA trusted_schema = OFF")
-    connection.execute("PRAGMA cell_size_check = ON")
-    connection.execute("PRAGMA mmap_size = 0")
-    # What is committed has been flushed to disk.
-    connection.execute("PRAGMA synchronous = FULL")
+    try:
+        for setting in _SETTINGS:
+            connection.execute(f"PRAGMA {setting}")
+    except sqlite3.Error:
+        connection.close()
+        raise
     return connection
 
 
 def complaint_about(path: Path, connection: sqlite3.Connection) -> Complaint | None:
     """Return what is wrong with a file as a whole."""
-    if path.stat().st_size == 0:
-        return _EMPTY
+    if path.stat().st_size < _SMALLEST:
+        return _CUT
     (application,) = connection.execute("PRAGMA application_id").fetchone()
     if application != APPLICATION:
         return _FOREIGN

@@ -40,13 +40,15 @@ class OnFailure:
 
 @dataclass(frozen=True)
 class Abort(OnFailure):
-    """Stop when a response raises, and, if asked for, when one is NaN; what was computed stays in the store.
+    """Stop when a response raises, and, if asked for, when one is NaN.
+
+    What was computed stays in the store.
 
     Parameters
     ----------
     on_nan : bool
-        By default NaN is a result: a point that could not be computed keeps its weight, which is reported as
-        lost mass.
+        By default NaN is a result: a point that could not be computed keeps its weight, which is
+        reported as lost mass.
 
     Examples
     --------

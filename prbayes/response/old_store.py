@@ -1,4 +1,4 @@
-"""Stores of the layout before SQLite, a netCDF file and a journal for each simulator: read once, and converted."""
+"""Stores of the layout before SQLite, netCDF and a journal: read once, and converted."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _HEADER = struct.Struct("<III")
 
 
 def old_responses(folder: Path, name: str) -> Floats | None:
-    """Return what an old store knows of a simulator, shape (n, columns + 1): inputs, then the response.
+    """Return what an old store knows of a simulator: rows of inputs and then the response.
 
     Raises
     ------

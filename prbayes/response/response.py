@@ -30,16 +30,18 @@ def refuse_uncallable(name: str, function: object) -> None:
     if not callable(function):
         got = type(function).__name__
         raise TypeError(
-            f"{name}: response: got {got}, expected a function of the inputs, such as lambda x: x**2; "
-            "the order is Simulator(name, response, *inputs, metric=..., observed=...)"
+            f"{name}: response: got {got}, expected a function of the inputs, such as "
+            "lambda x: x**2; the order is Simulator(name, response, *inputs, metric=..., "
+            "observed=...)"
         )
 
 
 class Responses:
     """The user's response: a function of inputs, and how it is called.
 
-    A function that takes whole batches, with nothing else asked for, is called once for each batch (``plain``). Every
-    other goes through `respond`: on an executor, in chunks, with a store and a failure policy.
+    A function that takes whole batches, with nothing else asked for, is called once for each batch
+    (``plain``). Every other goes through `respond`: on an executor, in chunks, with a store and a
+    failure policy.
 
     Parameters
     ----------
@@ -88,7 +90,7 @@ class Responses:
 
     @property
     def computed(self) -> int:
-        """Scalar responses computed here: without those found in a store, with those computed again."""
+        """Responses computed here: without those found in a store, with those tried again."""
         return self.count if self.plain else self._tally.computed
 
     @property
@@ -105,7 +107,7 @@ class Responses:
         return all(_same(self.inputs, x, other.inputs, y) for x, y in pairs)
 
     def __call__(self, aleatory: Sequence[Floats], epistemic: Sequence[Floats]) -> Floats:
-        """Return responses, shape (...), for aleatory values (..., *event) and epistemic ones (..., *event).
+        """Return responses, shape (...), for values of the inputs, shapes (..., *event).
 
         Raises
         ------
@@ -128,7 +130,7 @@ class Responses:
         return found.reshape(batch)
 
     def _filled(self, values: Sequence[Floats]) -> list[Any]:
-        """Return the function's arguments from values of the aleatory and then the epistemic inputs."""
+        """Return the function's arguments from values of aleatory, then epistemic inputs."""
         k = len(self.inputs.aleatory)
         return self.inputs.fill(values[:k], values[k:])
 
@@ -139,9 +141,9 @@ class Responses:
                 result = self.function(*arguments)
         except Exception as error:
             raise ResponseError(
-                f"{self.name}: the response raised {type(error).__name__}: {error}; it was called with "
-                f"inputs of shapes {shapes(arguments)} and is expected to take arrays of any leading "
-                "shape, or to be wrapped in prb.scalar"
+                f"{self.name}: the response raised {type(error).__name__}: {error}; it was called "
+                f"with inputs of shapes {shapes(arguments)} and is expected to take arrays of any "
+                "leading shape, or to be wrapped in prb.scalar"
             ) from error
         self.count += int(np.prod(batch, dtype=int))
         try:

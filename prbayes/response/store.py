@@ -1,9 +1,9 @@
 """Computed responses on disk, keyed by their inputs: none is computed twice, none is lost.
 
-A store is a folder with one SQLite file for all simulators that were given it. Runs are only ever appended, a
-transaction for each chunk of them: whatever moment a process is killed at, what was committed is found again,
-and several processes may write at once. Every run carries a checksum: a damaged file is refused with a sentence,
-and never read as other numbers.
+A store is a folder with one SQLite file for all simulators that were given it. Runs are only ever
+appended, a transaction for each chunk of them: whatever moment a process is killed at, what was
+committed is found again, and several processes may write at once. Every run carries a checksum: a
+damaged file is refused with a sentence, and never read as other numbers.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _NAN = np.array(np.nan, dtype="<f8").tobytes()
 
 
 class StoreError(RuntimeError):
-    """A store that cannot be read or written, or belongs to something else; it is never overwritten."""
+    """A store that cannot be read or written, or is of something else; never overwritten."""
 
 
 @dataclass(frozen=True)
@@ -79,12 +79,15 @@ class _Session:
     known: dict[bytes, bytes] = field(default_factory=dict)
     seen: int = 0
 
+    def __post_init__(self) -> None:
+        self.close = weakref.finalize(self, _close, self.connection, os.getpid())
+
 
 class Store:
     """The stored responses of one simulator, in ``<folder>/responses.sqlite``.
 
-    Several processes and threads of one machine may use a folder at once. Each opens the file by itself when it
-    needs it, also after a fork, and where the store was sent to another process.
+    Several processes and threads of one machine may use a folder at once. Each opens the file by
+    itself when it needs it, also after a fork, and where the store was sent to another process.
 
     Parameters
     ----------
@@ -93,8 +96,8 @@ class Store:
     name : str
         Of the simulator.
     columns : int, optional
-        Number of values that the inputs of one point are made of. By default that of the stored responses; there
-        must be some, then.
+        Number of values that the inputs of one point are made of. By default that of the stored
+        responses; there must be some, then.
 
     Raises
     ------
@@ -138,7 +141,7 @@ class Store:
         return len(self._read().known)
 
     def find(self, inputs: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return stored responses of inputs (n, columns), and which of them were found, shapes (n,)."""
+        """Return stored responses of inputs (n, columns), and which were found, shapes (n,)."""
         known = self._read().known
         found = [known.get(key) for key in _keys(inputs)]
         present = np.array([value is not None for value in found], dtype=bool)
@@ -165,7 +168,8 @@ class Store:
         Returns
         -------
         Dataset
-            ``inputs``, dims (point, column), and ``response``, dim (point), in the order in which they came.
+            ``inputs``, dims (point, column), and ``response``, dim (point), in the order in which
+            they came.
         """
         session = self._read()
         inputs = _numbers(session.known).reshape(-1, session.entry.columns)
@@ -176,6 +180,13 @@ class Store:
             },
             attrs={"simulator": self.name},
         )
+
+    def close(self) -> None:
+        """Close the file in this thread; it is opened again when it is needed."""
+        session: _Session | None = getattr(self._local, "session", None)
+        if session is not None:
+            session.close()
+            del self._local.session
 
     def _read(self) -> _Session:
         """Return the session of this thread, after reading what others have written meanwhile."""
@@ -209,12 +220,10 @@ class Store:
             complaint = complaint_about(self.path, connection)
             if complaint is not None:
                 raise self._refusal(complaint)
-            session = _Session(connection, self._opened(), self._entry(connection))
+            return _Session(connection, self._opened(), self._entry(connection))
         except BaseException:
             connection.close()
             raise
-        weakref.finalize(session, _close, connection, os.getpid())
-        return session
 
     def _entry(self, connection: sqlite3.Connection) -> _Entry:
         """Return the store's response in the file, where it is entered if it is new."""
