@@ -14,7 +14,7 @@ import pytest
 
 import prbayes as prb
 from prbayes.model.simulator import nodes
-from prbayes.response.calling import _capacity
+from prbayes.response.calling import Capacity, capacity
 
 distributed = pytest.importorskip("distributed")
 
@@ -46,7 +46,8 @@ def test_a_worker_is_killed_and_nothing_is_lost(tmp_path: Path) -> None:
         n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
     )
     with cluster, distributed.Client(cluster) as client:
-        assert _capacity(client.get_executor(pure=False)) == (2, 4)  # of the cluster, not of this machine
+        # That of the cluster, not of this machine.
+        assert capacity(client.get_executor(pure=False)) == Capacity(2, 4)
         pids = list(client.run(os.getpid).values())
         killer = threading.Timer(0.6, os.kill, (pids[0], signal.SIGKILL))
         killer.start()
