@@ -119,7 +119,7 @@ class Points:
         columns = []
         for a, varies in zip(self.arguments, self.varying, strict=True):
             each = a if varies else np.broadcast_to(a, (n, *np.shape(a)))
-            columns.append(each.reshape(n, -1))
+            columns.append(each.reshape(n, int(np.prod(each.shape[1:], dtype=int))))
         return np.concatenate(columns, axis=1).astype(np.float64)
 
 

@@ -43,7 +43,15 @@ def model(response: Any, propagation: Any = None, **keywords: Any) -> pm.Model:
     propagation = prb.Reweighted(N, **keywords) if propagation is None else propagation
     with pm.Model() as found:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
-        prb.Simulator("y", response, x, 2.0, metric=prb.AreaMetric(), observed=[1, 2, 3, 5.0], propagation=propagation)
+        prb.Simulator(
+            "y",
+            response,
+            x,
+            2.0,
+            metric=prb.AreaMetric(),
+            observed=[1, 2, 3, 5.0],
+            propagation=propagation,
+        )
     return found
 
 
@@ -79,7 +87,7 @@ EXPECTED = stored(model(times))
 POINTS = EXPECTED / 2
 
 
-# -- the same numbers, wherever they are computed --------------------------------------------------------
+# -- the same numbers, wherever they are computed --------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +117,12 @@ def test_resimulated_and_fresh_use_the_executor_too() -> None:
         for propagation in (prb.Resimulated(N, executor=pool), prb.Fresh(N, executor=pool)):
             seen.clear()
             prb.sample_smc(
-                20, chains=1, model=model(response, propagation), epsilon=1.0, random_seed=1, progressbar=False
+                20,
+                chains=1,
+                model=model(response, propagation),
+                epsilon=1.0,
+                random_seed=1,
+                progressbar=False,
             )
             assert seen
             assert all(name.startswith("far") for name in seen)
@@ -125,7 +138,12 @@ def test_a_multivariate_input_arrives_whole_at_a_scalar_function() -> None:
     with pm.Model() as found:
         x = pm.MvNormal.dist(pm.Normal("mu", 0, 1, shape=2), np.eye(2))
         prb.Simulator(
-            "y", prb.scalar(length), x, metric=prb.AreaMetric(), observed=[1, 2.0], propagation=prb.Reweighted(N)
+            "y",
+            prb.scalar(length),
+            x,
+            metric=prb.AreaMetric(),
+            observed=[1, 2.0],
+            propagation=prb.Reweighted(N),
         )
     assert shapes == {(2,)}
     assert (stored(found) > 0).all()
@@ -234,6 +252,11 @@ def test_what_is_no_response_is_refused(result: Any, message: str) -> None:
     np.testing.assert_array_equal(checked([1, True, np.nan], (3,), []), [1.0, 1.0, np.nan])
 
 
+def test_a_scalar_needs_a_function() -> None:
+    with pytest.raises(TypeError, match=r"scalar: got int, expected a function of one specimen's"):
+        prb.scalar(3)  # type: ignore[arg-type]
+
+
 def test_points_that_fail_are_found_by_halving() -> None:
     seen: list[int] = []
 
@@ -257,13 +280,15 @@ def test_points_that_fail_are_found_by_halving() -> None:
     assert list(chunk.raised) == [0]
 
 
-# -- failures --------------------------------------------------------------------------------------------
+# -- failures --------------------------------------------------------------------------------------
 
 STEEP = POINTS > 2
 BATCHED = pytest.mark.parametrize("kind", ["scalar", "batched", "threads"])
 
 
-def failing(kind: str, function: Any, on_failure: OnFailure | None = None, **keywords: Any) -> pm.Model:
+def failing(
+    kind: str, function: Any, on_failure: OnFailure | None = None, **keywords: Any
+) -> pm.Model:
     keywords |= {} if on_failure is None else {"on_failure": on_failure}
     if kind == "batched":
         return model(lambda x, a: np.array([function(v, a) for v in x]), **keywords)
@@ -310,7 +335,8 @@ def test_retried_once_and_then_it_works() -> None:
 
     found = failing("scalar", moody, prb.Retry(1, then=prb.Abort()))
     np.testing.assert_array_equal(stored(found), EXPECTED)
-    # The simulator tries 16 points of the prior only where it has to; here every design point, the steep ones twice.
+    # The simulator tries 16 points of the prior only where it has to; here every design point,
+    # the steep ones twice.
     assert sorted(set(calls.values())) == [1, 2]
     assert responses(found).computed == N + STEEP.sum()
 
@@ -336,7 +362,7 @@ def test_a_lost_worker_is_named() -> None:
         model(prb.scalar(lambda x, a: os._exit(3)), executor=pool)
 
 
-# -- what is stored ---------------------------------------------------------------------------------------
+# -- what is stored --------------------------------------------------------------------------------
 
 
 def test_nothing_is_computed_twice(tmp_path: Path) -> None:
@@ -393,7 +419,12 @@ def test_an_executor_that_does_not_tell_its_size_gets_work_for_many() -> None:
         most = 0
 
         def __init__(self, pool: ThreadPoolExecutor) -> None:
-            self.pool, self.under_way, self.lock, self.full = pool, 0, threading.Lock(), threading.Event()
+            self.pool, self.under_way, self.lock, self.full = (
+                pool,
+                0,
+                threading.Lock(),
+                threading.Event(),
+            )
 
         def submit(self, function: Any, *arguments: Any) -> Any:
             with self.lock:
@@ -420,8 +451,10 @@ def test_an_executor_that_does_not_tell_its_size_gets_work_for_many() -> None:
 
 
 @pytest.mark.parametrize("error", [ArithmeticError, BrokenExecutor])
-def test_what_is_being_computed_when_one_fails_is_kept(error: type[Exception], tmp_path: Path) -> None:
-    """The first of four tasks that are begun fails at once; the others are waited for, and nothing more is begun."""
+def test_what_is_being_computed_when_one_fails_is_kept(
+    error: type[Exception], tmp_path: Path
+) -> None:
+    """Four tasks are begun, the first fails: the others are waited for, and no more are begun."""
 
     def function(x: float) -> float:
         if x == 0:
@@ -453,7 +486,7 @@ def test_stored_failures_are_replaced_as_the_policy_of_the_day_says(tmp_path: Pa
     assert responses(found).computed == 0
 
 
-# -- killed ----------------------------------------------------------------------------------------------
+# -- killed ----------------------------------------------------------------------------------------
 
 SCRIPT = """
 import sys, time
@@ -473,14 +506,24 @@ with pm.Model() as model:
         propagation = prb.Reweighted(100, store=folder + "/store")
     else:
         propagation = prb.Resimulated(4, store=folder + "/store")
-    prb.Simulator("y", prb.scalar(response), pm.Normal.dist(mu, 1.0), metric=prb.AreaMetric(), observed=[1.0, 2.0, 4.0],
-                  epsilon=2.0, propagation=propagation)
-    idata = prb.sample_smc(10, chains=2, random_seed=1, checkpoint=folder + "/run.nc", progressbar=False)
+    prb.Simulator(
+        "y",
+        prb.scalar(response),
+        pm.Normal.dist(mu, 1.0),
+        metric=prb.AreaMetric(),
+        observed=[1.0, 2.0, 4.0],
+        epsilon=2.0,
+        propagation=propagation,
+    )
+    settings = {"checkpoint": folder + "/run.nc", "progressbar": False}
+    idata = prb.sample_smc(10, chains=2, random_seed=1, **settings)
 print(repr(float(idata.posterior["mu"].sum())))
 """
 
 
-def undisturbed(folder: Path, kind: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
+def undisturbed(
+    folder: Path, kind: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> str:
     """Run the script in this process."""
     folder.mkdir()
     monkeypatch.setattr(sys, "argv", ["script", str(folder), kind])
@@ -493,7 +536,10 @@ def run(folder: Path, kind: str, *, kill_at: int | None = None) -> str:
     """Run the script; kill it, hard, as soon as so many responses were computed."""
     folder.mkdir(exist_ok=True)
     process = subprocess.Popen(
-        [sys.executable, "-c", SCRIPT, str(folder), kind], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", SCRIPT, str(folder), kind],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     calls = folder / "calls"
     while kill_at is not None and process.poll() is None:
@@ -507,7 +553,11 @@ def run(folder: Path, kind: str, *, kill_at: int | None = None) -> str:
 
 @pytest.mark.parametrize(("kind", "kills"), [("reweighted", [40]), ("resimulated", [200])])
 def test_a_killed_run_computes_nothing_again_and_gives_the_same(
-    kind: str, kills: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    kind: str,
+    kills: list[int],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     once = undisturbed(tmp_path / "a", kind, monkeypatch, capsys)
     for at in kills:
@@ -516,6 +566,6 @@ def test_a_killed_run_computes_nothing_again_and_gives_the_same(
     expected = (tmp_path / "a" / "calls").read_text().splitlines()
     calls = (tmp_path / "b" / "calls").read_text().splitlines()
     assert len(expected) == len(set(expected))
-    # A kill may fall between the end of a response and its record: then that one response is computed again.
+    # A kill may fall between the end of a response and its record: then that one is computed again.
     assert len(calls) - len(set(calls)) <= len(kills)
     assert set(calls) == set(expected)

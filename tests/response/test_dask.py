@@ -1,4 +1,4 @@
-"""A real Dask cluster on the loopback interface, one worker of which is killed while it computes."""
+"""A real Dask cluster on the loopback interface; one worker is killed while it computes."""
 
 from __future__ import annotations
 
@@ -57,6 +57,8 @@ def test_a_worker_is_killed_and_nothing_is_lost(tmp_path: Path) -> None:
         killer.join()
         assert pids[0] not in client.run(os.getpid).values()
     responses = next(iter(nodes(model).values())).bound
-    np.testing.assert_array_equal(responses.values, next(iter(nodes(build()).values())).bound.values)
+    np.testing.assert_array_equal(
+        responses.values, next(iter(nodes(build()).values())).bound.values
+    )
     again = next(iter(nodes(build(store=tmp_path)).values())).bound.responses
     assert again.computed == 0

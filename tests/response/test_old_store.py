@@ -75,7 +75,9 @@ def test_damaged_old_files_are_refused(tmp_path: Path) -> None:
     text = bytearray(path.read_bytes())
     text[30] ^= 255
     path.write_bytes(text)
-    with pytest.raises(StoreError, match=r"y: store: .*older version.*damaged in the middle.*nothing"):
+    with pytest.raises(
+        StoreError, match=r"y: store: .*older version.*damaged in the middle.*nothing"
+    ):
         Store(tmp_path, "y", 2)
     path.write_bytes(b"something else")
     with pytest.raises(StoreError, match=r"is no journal of prbayes"):

@@ -1,4 +1,4 @@
-"""The store: nothing lost, nothing computed twice, nothing misread; several writers, kills, damage."""
+"""The store: nothing is lost and nothing misread; several writers, kills, damage, full disks."""
 
 from __future__ import annotations
 
@@ -85,7 +85,10 @@ def test_every_bit_of_inputs_and_responses_survives(tmp_path: Path) -> None:
     values = np.array(special)
     store = Store(tmp_path, "y", 1)
     store.add(values[:, None], values[::-1])
-    for found, known in (store.find(values[:, None]), Store(tmp_path, "y", 1).find(values[:, None])):
+    for found, known in (
+        store.find(values[:, None]),
+        Store(tmp_path, "y", 1).find(values[:, None]),
+    ):
         assert known.all()
         np.testing.assert_array_equal(found.view(np.uint64), values[::-1].view(np.uint64))
 
@@ -316,11 +319,11 @@ def test_flipped_bits_never_give_a_wrong_number_silently(part: slice, folder: Pa
         try:
             # Where nothing is said the bit was in use by nothing: all is found, and right.
             store = Store(folder, "y", 3)
+        except StoreError:
+            refusals += 1
+        else:
             assert all_right(store)
             store.close()
-        except StoreError as error:
-            assert "responses.sqlite" in str(error)
-            refusals += 1
         for left in folder.iterdir():
             if left != path:
                 left.unlink()
@@ -378,7 +381,8 @@ def test_damage_that_happens_during_a_run_is_noticed(folder: Path) -> None:
     connection = sqlite3.connect(file_of(folder))
     with connection:
         connection.execute(
-            "INSERT INTO run (response, key, state, value, checksum) VALUES (1, ?, 'computed', ?, 0)",
+            "INSERT INTO run (response, key, state, value, checksum) "
+            "VALUES (1, ?, 'computed', ?, 0)",
             (KEYS[0].tobytes(), b"12345678"),
         )
     connection.close()
@@ -437,7 +441,7 @@ def test_what_is_no_store_is_refused(folder: Path, tmp_path: Path) -> None:
     refused(folder, "which is a database of another program, expected a store of prbayes; nothing")
     path.unlink()
     path.mkdir()
-    with pytest.raises(StoreError, match="responses.sqlite"):
+    with pytest.raises(StoreError, match=r"responses\.sqlite"):
         Store(folder, "y", 3)
     connection.close()
     (tmp_path / "file").touch()
@@ -449,17 +453,21 @@ def test_another_layout_is_refused(folder: Path) -> None:
     connection = sqlite3.connect(file_of(folder))
     connection.execute("PRAGMA user_version = 2")
     connection.close()
-    refused(folder, "which has layout 2, expected layout 1; use the version of prbayes that wrote it")
+    refused(
+        folder, "which has layout 2, expected layout 1; use the version of prbayes that wrote it"
+    )
 
 
 def test_other_inputs_are_refused(folder: Path) -> None:
     with pytest.raises(
         StoreError,
-        match=r"y: store: .* holds inputs of 3 values for simulator 'y', expected 2 values; nothing",
+        match=r"y: store: .* holds inputs of 3 values for simulator 'y', expected 2 values; no",
     ):
         Store(folder, "y", 2)
     assert all_right(Store(folder, "y", 3))
-    with pytest.raises(StoreError, match=r"no responses of simulator 'x', expected one of \['y', 'z'\]"):
+    with pytest.raises(
+        StoreError, match=r"no responses of simulator 'x', expected one of \['y', 'z'\]"
+    ):
         Store(folder, "x")
 
 
@@ -473,7 +481,9 @@ def test_a_full_disk_is_named_and_the_store_works_again_with_space(folder: Path)
     (most,) = connection.execute(f"PRAGMA max_page_count = {pages + 1}").fetchone()
     assert most == pages + 1
     more = np.random.default_rng(4).normal(size=(1000, 3))
-    with pytest.raises(StoreError, match=r"cannot grow \(database or disk is full\).*free some space"):
+    with pytest.raises(
+        StoreError, match=r"cannot grow \(database or disk is full\).*free some space"
+    ):
         store.add(more, more[:, 0])
     # Nothing of the chunk is there, all else is; also for another process.
     for again in (store, Store(folder, "y", 3)):
