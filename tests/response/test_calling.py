@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import threading
@@ -347,6 +348,17 @@ def test_retried_in_vain() -> None:
     assert responses(found).computed == N + 2 * STEEP.sum()
     with pytest.raises(prb.ResponseError, match="too steep"):
         failing("scalar", fails_above_two, prb.Retry(2, then=prb.Abort()))
+
+
+@BATCHED
+def test_the_store_knows_which_points_failed_and_why(kind: str, tmp_path: Path) -> None:
+    failing(kind, fails_above_two, prb.Retry(1, then=prb.Replace(-1.0)), store=tmp_path)
+    connection = sqlite3.connect(tmp_path / "responses.sqlite")
+    query = "SELECT key, reason FROM run WHERE state = 'failed'"
+    found = dict(connection.execute(query).fetchall())
+    connection.close()
+    keys = [np.array([x, 2.0]).tobytes() for x in POINTS[STEEP]]
+    assert found == dict.fromkeys(keys, "it raised ArithmeticError: too steep")
 
 
 def test_a_wrong_shape_is_a_mistake_and_no_failure() -> None:
