@@ -20,7 +20,8 @@ from prbayes.response.response import Responses
 # Calls of the user's functions have no compiled form; nothing is gained by saying so at every compilation.
 warnings.filterwarnings(
     "ignore",
-    message="Numba will use object mode to run (prbayes_Simulator|FreshOp|ResponseOp|DensityOp|CotangentOp|OpaqueOp|abc_d)",
+    message="Numba will use object mode to run "
+    "(prbayes_Simulator|FreshOp|ResponseOp|DensityOp|CotangentOp|OpaqueOp|abc_d)",
 )
 
 
