@@ -10,6 +10,7 @@ import numpy as np
 from pytensor.graph.basic import Variable
 
 from prbayes._checks import Floats
+from prbayes.response.batches import batch_shape, broadcast_batch
 from prbayes.response.calling import (
     Calling,
     Points,
@@ -114,11 +115,9 @@ class Responses:
         ResponseError
             If the response raises, or if its result is not real numbers in the batch shape.
         """
-        # Every input gets the leading axes of all.
         given = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
-        pairs = list(zip(given, self._event_ndims, strict=True))
-        batch = np.broadcast_shapes(*(v.shape[: v.ndim - e] for v, e in pairs))
-        values = [np.broadcast_to(v, batch + v.shape[v.ndim - e :]) for v, e in pairs]
+        batch = batch_shape(given, self._event_ndims)
+        values = broadcast_batch(given, self._event_ndims, batch)
         if self.plain:
             return self._at_once(self._filled(values), batch)
         # Here a point is a row.

@@ -192,8 +192,12 @@ class Store:
         """Return the session of this thread, after reading what others have written meanwhile."""
         session: _Session | None = getattr(self._local, "session", None)
         with self._explained():
-            # A fork, or another file in its place, makes a new session.
-            if session is None or session.opened != self._opened():
+            # After a fork, and where another file is in its place, the session is an old one. It is
+            # closed first: closing deletes the log of writes, by name.
+            if session is not None and session.opened != self._opened():
+                session.close()
+                session = None
+            if session is None:
                 session = self._open()
             self._read_on(session)
         self._local.session = session

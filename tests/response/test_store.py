@@ -293,6 +293,7 @@ def test_a_store_that_was_removed_begins_anew(folder: Path) -> None:
         path.unlink()
     store.add(KEYS[:2], VALUES[:2])
     assert len(store) == len(Store(folder, "y", 3)) == 2
+    assert (folder / "responses.sqlite-wal").exists()  # not deleted with the file before
 
 
 # -- damage --------------------------------------------------------------------------------------
