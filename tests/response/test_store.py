@@ -254,8 +254,12 @@ def test_threads_share_a_store_object(tmp_path: Path) -> None:
 
 
 def in_child(store: Store) -> None:
+    inherited = store._local.session
     assert len(store) == 1
     store.add(np.array([[2.0]]), np.array([20.0]))
+    # The parent's connection is neither used nor closed.
+    assert store._local.session.connection is not inherited.connection
+    inherited.connection.execute("PRAGMA user_version")
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
