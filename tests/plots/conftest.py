@@ -59,7 +59,7 @@ def optimum(build: Callable[..., pm.Model]) -> prb.Optimum:
 
 @pytest.fixture(scope="session")
 def posterior(known: SimpleNamespace) -> xr.DataTree:
-    """Draws that are known, with statistics of stages: three of the first chain, two of the second."""
+    """Draws that are known, with statistics: three stages of one chain, two of the other."""
     nan = np.nan
     stages = {
         "beta": [[1e-3, 0.1, 1.0], [2e-3, 1.0, nan]],

@@ -15,7 +15,7 @@ GRID = np.linspace(-5, 9, 301)
 
 
 def test_a_weighted_density_is_that_of_the_target() -> None:
-    """Values of N(0, 2) with weights of N(1, 1) over N(0, 2): smoothed, the density of N(1, sqrt(1 + h^2))."""
+    """N(0, 2) weighted by N(1, 1) over N(0, 2): smoothed, the density of N(1, sqrt(1 + h^2))."""
     x = 2 * QUANTILES
     w = stats.norm.pdf(x, 1, 1) / stats.norm.pdf(x, 0, 2)
     w /= w.sum()
@@ -82,7 +82,7 @@ def test_ranges_are_quantiles_of_most_samples() -> None:
     np.testing.assert_allclose(found, [1 - 1.645, 9 + 1.645], atol=0.02)
 
 
-# -- data ------------------------------------------------------------------------------------------------
+# -- data ------------------------------------------------------------------------------------------
 
 
 def test_the_histogram_has_the_area_of_what_is_finite() -> None:

@@ -32,7 +32,7 @@ def shoelace(corners: np.ndarray[Any, Any]) -> float:
     return float(abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2)
 
 
-# -- plot_validity ---------------------------------------------------------------------------------------
+# -- plot_validity ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("shift", "folded"), [(0.0, False), (1.2, False), (0.0, True)])
