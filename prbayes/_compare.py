@@ -17,7 +17,7 @@ from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import nodes
+from prbayes.model.node import nodes
 from prbayes.model.support import shortcomings
 
 _INTERVAL = 0.89

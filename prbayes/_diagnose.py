@@ -13,7 +13,7 @@ import xarray as xr
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import model_on_context
+from prbayes.model.node import model_on_context
 from prbayes.model.support import shortcoming
 
 _RHAT = 1.01

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from prbayes._checks import Floats, positive_integer
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.labels import versions
-from prbayes.model.simulator import Node, model_on_context, nodes
+from prbayes.model.node import Node, model_on_context, nodes
 from prbayes.model.support import DesignError
 from prbayes.propagation.points import base_points
 from prbayes.response.calling import ResponseError

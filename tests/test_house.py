@@ -143,4 +143,4 @@ def negations_of_a_discrepancy(path: Path) -> list[str]:
 
 def test_the_sign_of_a_discrepancy_changes_in_one_place() -> None:
     found = [place for path in FILES for place in negations_of_a_discrepancy(path)]
-    assert found == ["model.simulator.log_kernel"]
+    assert found == ["model.node.log_kernel"]

@@ -12,7 +12,7 @@ import xarray as xr
 from scipy.special import ndtri
 
 import prbayes as prb
-from prbayes.model.simulator import nodes
+from prbayes.model.node import nodes
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 MEANS = np.array([[0.8, 1.0, 1.1], [0.9, 1.0, 1.2]])  # of two chains with three draws

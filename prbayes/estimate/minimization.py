@@ -25,7 +25,7 @@ from prbayes.estimate.sandwich import Information
 from prbayes.estimate.search import Search
 from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import model_on_context
+from prbayes.model.node import model_on_context
 from prbayes.model.support import shortcomings
 
 _log = logging.getLogger("prbayes")

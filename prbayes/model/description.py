@@ -12,7 +12,7 @@ from pymc.printing import str_for_dist
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
 
-from prbayes.model.simulator import Node, nodes
+from prbayes.model.node import Node, nodes
 
 _LONGEST = 60_000  # characters that an attribute of an HDF5 file can hold
 _LABELS = 40

@@ -13,7 +13,9 @@ from prbayes.model.evaluator import Evaluator
 
 def versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
-    return {f"{name}_version": importlib.metadata.version(name) for name in ("prbayes", "pymc", "numpy")}
+    return {
+        f"{name}_version": importlib.metadata.version(name) for name in ("prbayes", "pymc", "numpy")
+    }
 
 
 def labelled(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, int]) -> xr.Dataset:

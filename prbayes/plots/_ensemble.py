@@ -15,7 +15,7 @@ from prbayes._checks import Floats
 from prbayes._predict import populations_of
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import model_on_context
+from prbayes.model.node import model_on_context
 from prbayes.model.support import DesignError
 
 _FREE, _COSTLY = 200, 40  # populations in a band, where they cost no response and where they do

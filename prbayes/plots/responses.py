@@ -12,7 +12,7 @@ import xarray as xr
 
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
-from prbayes.model.simulator import Node
+from prbayes.model.node import Node
 from prbayes.plots._canvas import DASHED, INK, VERMILION, Canvas, named
 from prbayes.plots._curves import (
     central_range,

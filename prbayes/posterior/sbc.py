@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor, Future, as_completed
-from contextlib import ExitStack, contextmanager
-from threading import Lock
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -17,14 +16,13 @@ from prbayes._checks import Floats, positive_integer
 from prbayes._progress import progress, shown
 from prbayes.estimate.data_sets import fresh_data
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import model_on_context, nodes, revive
+from prbayes.model.node import model_on_context
 from prbayes.posterior.adjustment import Affine
 from prbayes.posterior.smc import sample
 from prbayes.posterior.trees import calibration_tree
 
 _log = logging.getLogger("prbayes")
 _CHUNK = 10  # data sets that a worker analyses before it reports
-_ARRIVING = Lock()  # threads share the classes that hold the nodes, of which the last model to arrive has its own
 
 
 def simulation_based_calibration(
@@ -111,11 +109,10 @@ def simulation_based_calibration(
             import cloudpickle
 
             sent = cloudpickle.dumps(model)
-            with _classes_kept(model):
-                futures: list[Future[Any]] = [executor.submit(_remote, sent, *job) for job in jobs]
-                for done in as_completed(futures):
-                    report(len(done.result()), "")
-                rows = [row for future in futures for row in future.result()]
+            futures: list[Future[Any]] = [executor.submit(_remote, sent, *job) for job in jobs]
+            for done in as_completed(futures):
+                report(len(done.result()), "")
+            rows = [row for future in futures for row in future.result()]
     failed = [row for row in rows if isinstance(row, str)]
     good = [row for row in rows if not isinstance(row, str)]
     if failed:
@@ -125,25 +122,10 @@ def simulation_based_calibration(
     return calibration_tree(evaluator, good, failed=len(failed), draws=draws, adjust=adjust, seed=random_seed)
 
 
-@contextmanager
-def _classes_kept(model: pm.Model) -> Iterator[None]:
-    """Undo what a model that arrives in a thread does to the classes of this one's simulators."""
-    kept = [(type(rv.owner.op), dict(vars(type(rv.owner.op)))) for rv in nodes(model)]
-    try:
-        yield
-    finally:
-        for class_, attributes in kept:
-            for name, value in attributes.items():
-                if vars(class_)[name] is not value:
-                    setattr(class_, name, value)
-
-
 def _remote(sent: bytes, *job: Any) -> list[Any]:
     import cloudpickle
 
-    with _ARRIVING:
-        evaluator = Evaluator(revive(cloudpickle.loads(sent)))
-    return _analyse(evaluator, *job)
+    return _analyse(Evaluator(cloudpickle.loads(sent)), *job)
 
 
 def _analyse(

@@ -21,7 +21,7 @@ from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse
 from prbayes.estimate.refit import inapplicable
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import model_on_context
+from prbayes.model.node import model_on_context
 from prbayes.model.support import shortcomings
 from prbayes.posterior.adjustment import Affine
 from prbayes.posterior.checkpoint import Checkpoint, stored_identity

@@ -10,7 +10,7 @@ from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 
 from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluation, Evaluator
-from prbayes.model.simulator import model_on_context
+from prbayes.model.node import model_on_context
 
 _MAX_STEPS = 25
 _UNCORRELATED = 0.05  # with the particles before the last stage; on the way, six times as much will do

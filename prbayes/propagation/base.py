@@ -6,13 +6,14 @@ the discrepancy as a graph of the hyperparameters and knows how many responses w
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import cached_property
 from os import PathLike
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pytensor.tensor as pt
@@ -75,6 +76,12 @@ class Bound(ABC):
         self.inputs = inputs
         self.target = target
         self.responses = responses
+
+    def copied(self) -> Self:
+        """Return the same propagation with a count of responses of its own, for a clone of the model."""
+        other = copy.copy(self)
+        other.responses = self.responses.copied()
+        return other
 
     @property
     def n_points(self) -> int:

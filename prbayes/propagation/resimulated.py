@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pytensor.tensor as pt
@@ -92,6 +92,12 @@ class ResimulatedBound(Bound):
         for dist, u in zip(inputs.aleatory, self._points, strict=True):
             quantiles(name, dist, u)  # refuses what has no inverse distribution function
         self.symbolic = self._accepts_tensors(*probe(self, PopulationSampler(inputs), config.random_seed))
+
+    def copied(self) -> Self:
+        """Return the same propagation with a count of its own, which its compiled function has to know."""
+        other = super().copied()
+        other.__dict__.pop("_values", None)
+        return other
 
     def _accepts_tensors(self, expected: Floats, aleatory: list[Floats], epistemic: list[Floats]) -> bool:
         """Try the response on PyTensor variables, and believe it only if the numbers agree."""

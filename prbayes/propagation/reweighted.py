@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pytensor
@@ -254,6 +254,16 @@ class Design(Bound):
                 weights = logs - log_g[i : i + step]
                 sums = np.logaddexp(sums, [_log_sum(power * weights, axis=1) for power in (1, 2)])
         return log_g, sums
+
+    def copied(self) -> Self:
+        """Return a design with the same points, which grows by itself."""
+        other = super().copied()
+        other._sizes, other._thetas, other._points = list(self._sizes), list(self._thetas), list(self._points)
+        other._others = deque(self._others, maxlen=_OTHERS)
+        other._shared = []
+        other._store([shared.get_value() for shared in self._shared])
+        other.__dict__.pop("_log_weights", None)  # compiled on the shared variables of this one
+        return other
 
     @contextmanager
     def undone(self) -> Iterator[None]:

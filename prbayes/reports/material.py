@@ -15,7 +15,7 @@ from prbayes._compare import compare
 from prbayes._diagnose import Diagnosis, diagnose
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.description import describe, from_attributes
-from prbayes.model.simulator import nodes
+from prbayes.model.node import nodes
 from prbayes.validation.validity import ValidityTest
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from typing import Any
@@ -68,6 +69,12 @@ class Responses:
             kept = None if store is None else Store(store, name, self._columns())
             self._caller = Caller(name, function, executor, on_failure or Abort(), kept)
         self.count = 0
+
+    def copied(self) -> Responses:
+        """Return the same function with counts of its own; executor and store are the same."""
+        other = copy.copy(self)
+        other._caller = copy.copy(self._caller)
+        return other
 
     def _columns(self) -> int:
         """Return of how many numbers the inputs of one point are made."""

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from pytensor.graph.basic import Variable
 
 from prbayes._checks import Floats, real_array
-from prbayes.model.simulator import model_on_context
+from prbayes.model.node import model_on_context
 from prbayes.propagation.points import sobol
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, prior_draws, valid

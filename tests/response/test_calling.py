@@ -21,7 +21,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.model.simulator import nodes
+from prbayes.model.node import nodes
 from prbayes.response.calling import Caller
 from prbayes.response.failures import Abort, OnFailure
 from prbayes.response.store import Store
