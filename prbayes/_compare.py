@@ -10,13 +10,14 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._checks import Floats
-from prbayes.estimate.optimum import Optimum
+from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.identity import Level, identity_of_model, require_same
 from prbayes.model.node import nodes
 from prbayes.model.support import shortcomings
 
@@ -70,6 +71,7 @@ def compare(
     """
     if not results:
         raise ValueError("compare: got no results, expected a dict such as {'optimum': optimum, 'ABC': idata}")
+    _require_one_problem(results, model)
     columns = {label: _column(label, result) for label, result in results.items()}
     names = [n for n in next(iter(columns.values()))[0] if all(n in c[0] for c in columns.values())]
     if model is not None:
@@ -91,6 +93,15 @@ def compare(
     if model is not None and nodes(model):
         data |= {key: ("result", found) for key, found in _scores(model, names, table[..., 0], metrics).items()}
     return xr.Dataset(data, coords={"result": list(columns), "hyperparameter": names}, attrs={"interval": _INTERVAL})
+
+
+def _require_one_problem(results: Mapping[str, Any], model: pm.Model | None) -> None:
+    """Refuse results of other populations than the model's, or the first result's, as far as they tell."""
+    known = [identity_in(result) for result in results.values()]
+    first = next((identity for identity in known if identity is not None), None)
+    expected = identity_of_model(model) if model is not None and nodes(model) else first
+    for label, identity in zip(results, known, strict=True):
+        require_same(identity, expected, f"compare: {label}", Level.POPULATIONS)
 
 
 def _scores(

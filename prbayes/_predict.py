@@ -16,7 +16,8 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats, positive_integer
-from prbayes.estimate.optimum import Optimum
+from prbayes.estimate.optimum import Optimum, identity_in
+from prbayes.model.identity import Level, identity_of_model, require_same
 from prbayes.model.labels import versions
 from prbayes.model.node import Node, model_on_context, nodes
 from prbayes.model.support import DesignError
@@ -120,6 +121,8 @@ def predict(
     label = name or str(getattr(response, "__name__", type(response).__name__))
     if store is not None and name is None and not label.isidentifier():
         raise ValueError(f"name: got a store for a function called {label}, expected a name to keep its responses by")
+    if not (isinstance(result, Optimum) and model is result.model):
+        require_same(identity_in(result), identity_of_model(model), "prb.predict", Level.POPULATIONS)
     points, coords = populations_of(result, model, draws, "prb.predict")
     sorted_inputs = read_inputs(label, inputs, model)
     responses = Responses(label, response, sorted_inputs, executor=executor, store=store)

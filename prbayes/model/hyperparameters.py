@@ -21,6 +21,7 @@ from prbayes.model.elements import element_names
 from prbayes.propagation.points import sobol
 from prbayes.response.compilation import PLAIN, ninf_for_invalid
 from prbayes.response.distributions import PriorPoints, PriorSampler
+from prbayes.response.inputs import event_shape
 
 # The prior's spread only sets the units of parameters: a tenth more or less changes no answer.
 _PRIOR_DRAWS = 256
@@ -215,5 +216,28 @@ class Hyperparameters:
         if self._points is None:
             return self.prior_thetas(size, seed)
         cube = sobol(size, self._points.size, seed)
+        return self._placed(cube)
+
+    def _placed(self, cube: Floats) -> Floats:
+        """Return thetas at points of the unit cube, shape (P, size)."""
+        assert self._points is not None
         thetas = self.thetas_of(self._points(cube))
         return np.where(np.isfinite(thetas), thetas, self.initial)
+
+    def fixed_points(self, size: int) -> Floats:
+        """Return thetas, shape (size, d), that are the same for clones, which may order variables in other ways."""
+        if self._points is None:
+            offsets = sobol(size, self.size, seed=0) - 0.5
+            return self.initial + _by_name(offsets, self.names)
+        names: list[str] = []
+        for rv in self.model.free_RVs:
+            names += element_names(rv.name, event_shape(rv))
+        cube = sobol(size, self._points.size, seed=0)
+        return self._placed(_by_name(cube, names))
+
+
+def _by_name(columns: Floats, names: Sequence[str]) -> Floats:
+    """Return columns such that the first is that of the first name in the alphabet, and so on."""
+    own = np.empty_like(columns)
+    own[:, np.argsort(names)] = columns
+    return own

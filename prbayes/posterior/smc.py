@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import time
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,17 +12,19 @@ import pymc as pm
 import xarray as xr
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from prbayes._checks import Floats, positive_integer, positive_number
+from prbayes._checks import Floats, positive_integer
 from prbayes._progress import CONSOLE, shown
 from prbayes.estimate.minimization import find_optimum
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse
 from prbayes.estimate.refit import inapplicable
+from prbayes.model.epsilon import checked_epsilon
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.identity import identity_of, require_same
 from prbayes.model.node import model_on_context
 from prbayes.model.support import shortcomings
 from prbayes.posterior.adjustment import Affine
-from prbayes.posterior.checkpoint import Checkpoint, stored_identity
+from prbayes.posterior.checkpoint import Checkpoint, stored_settings
 from prbayes.posterior.epsilon import calibrate_epsilon
 from prbayes.posterior.smc_kernel import BatchedKernel
 from prbayes.posterior.trees import posterior_tree
@@ -117,9 +117,12 @@ def sample_smc(
         raise TypeError(f"adjust: got {type(adjust).__name__} {adjust!r:.60}, expected prb.Affine(), True or False")
     if optimum is not None and not isinstance(optimum, Optimum):
         raise TypeError(f"optimum: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first")
+    evaluator = Evaluator(model) if optimum is None or optimum.model is not model else optimum.evaluator
+    if optimum is not None:
+        require_same(optimum.identity, identity_of(evaluator), "sample_smc: optimum")
     with shown(progressbar):
         return sample(
-            Evaluator(model) if optimum is None else optimum.evaluator,
+            evaluator,
             draws=draws,
             chains=chains,
             epsilon=epsilon,
@@ -164,8 +167,17 @@ def sample(
             calibrated = calibrate_epsilon(optimum)
             for node in unset:
                 node.epsilon.set_value(np.asarray(calibrated[node.name]))
-        saved = _checkpoint(checkpoint, evaluator, draws, chains, threshold, random_seed)
-        seeds = np.random.SeedSequence(random_seed if saved is None else int(saved.identity["entropy"]))
+        saved = _checkpoint(
+            checkpoint,
+            evaluator,
+            random_seed,
+            draws=draws,
+            chains=chains,
+            threshold=threshold,
+            adjust=repr(adjust),
+            refine=refine,
+        )
+        seeds = np.random.SeedSequence(random_seed if saved is None else int(saved.settings["entropy"]))
         run = _Run(evaluator, draws, threshold, saved)
         for round_ in range(MAX_ROUNDS + 1):
             children = seeds.spawn(chains)
@@ -176,9 +188,7 @@ def sample(
             plain, discrepancies, stats = run(children, progressbar)
             thetas, note = plain, "none"
             if isinstance(adjust, Affine):
-                optima = (
-                    [] if optimum is None else [optimum.theta, *(r["theta"] for r in optimum.rivals if r["comparable"])]
-                )
+                optima = [] if optimum is None else _optima(optimum, evaluator)
                 thetas, note = adjust(evaluator, plain, optima)
             if not (refine and evaluator.designs):
                 break
@@ -213,33 +223,23 @@ def sample(
             node.epsilon.set_value(np.asarray(value))
 
 
+def _optima(optimum: Optimum, evaluator: Evaluator) -> list[Floats]:
+    """Return the optimum, and those that the data cannot tell from it, in the evaluator's order of elements."""
+    order = [optimum.names.index(name) for name in evaluator.names]
+    rivals = [rival["theta"] for rival in optimum.rivals if rival["comparable"]]
+    return [theta[order] for theta in (optimum.theta, *rivals)]
+
+
 def _checkpoint(
-    path: str | PathLike[str] | None,
-    evaluator: Evaluator,
-    draws: int,
-    chains: int,
-    threshold: float,
-    seed: int | None,
+    path: str | PathLike[str] | None, evaluator: Evaluator, seed: int | None, **settings: Any
 ) -> Checkpoint | None:
     """Open the checkpoint; a run without a seed takes that of the run it goes on with."""
     if path is None:
         return None
-    entropy = np.random.SeedSequence(seed).entropy
-    if seed is None and Path(path).exists():
-        entropy = stored_identity(path).get("entropy", entropy)
-    observed = b"".join(n.target.observed.tobytes() + n.target.weights.tobytes() for n in evaluator.nodes)
-    identity = {
-        "draws": draws,
-        "chains": chains,
-        "threshold": threshold,
-        "entropy": str(entropy),
-        "hyperparameters": evaluator.names,
-        "epsilon": [float(e) for e in evaluator.epsilon],
-        "metrics and propagations": [f"{n.metric!r} {n.propagation!r}".split(" at 0x")[0] for n in evaluator.nodes],
-        "observed": hashlib.sha256(observed).hexdigest(),
-        "responses before": [n.bound.n_points for n in evaluator.nodes],
-    }
-    return Checkpoint(path, identity)
+    entropy = str(np.random.SeedSequence(seed).entropy)
+    if seed is None:
+        entropy = stored_settings(path).get("entropy", entropy)
+    return Checkpoint(path, identity_of(evaluator), {**settings, "entropy": entropy})
 
 
 def _set_for_run(evaluator: Evaluator, epsilon: float | dict[str, float] | None) -> None:
@@ -250,10 +250,7 @@ def _set_for_run(evaluator: Evaluator, epsilon: float | dict[str, float] | None)
         if len(names) > 1:
             raise ValueError(f"epsilon: got one number for {len(names)} simulators, expected a dict by name: {names}")
         epsilon = {names[0]: epsilon}
-    unknown = sorted(set(epsilon) - set(names))
-    if unknown:
-        raise KeyError(f"epsilon: got {unknown}, expected names of simulators: {names}")
-    values = {n: positive_number(v, f"{n}: epsilon") for n, v in epsilon.items()}
+    values = checked_epsilon(epsilon, evaluator.nodes, evaluator.model, "sample_smc: epsilon")
     for node in evaluator.nodes:
         if node.name in values:
             node.epsilon.set_value(np.asarray(values[node.name]))

@@ -8,6 +8,7 @@ import xarray as xr
 from prbayes._checks import Floats
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.identity import as_attributes, identity_of
 from prbayes.model.labels import labelled, observed_dataset, versions
 
 _ENVELOPE = 0.95  # probability that the ECDF of uniform ranks stays inside
@@ -78,6 +79,7 @@ def posterior_tree(
     }
     evidence = _evidence(stats)
     posterior.attrs.update({"inference_library": "prbayes", **attrs, **evidence, **as_attribute(evaluator.model)})
+    posterior.attrs.update(as_attributes(identity_of(evaluator)))
     names, designs = [n.name for n in evaluator.nodes], evaluator.designs
     where = ["chain", "draw", "simulator"]
     shape = (chains, draws, len(names))
@@ -153,6 +155,7 @@ def bootstrap_tree(
             "random_seed": str(seed),
             **versions(),
             **as_attribute(evaluator.model),
+            **as_attributes(identity_of(evaluator)),
         }
     )
     return xr.DataTree.from_dict({"posterior": posterior, "observed_data": observed_dataset(evaluator)})

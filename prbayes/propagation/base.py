@@ -61,6 +61,12 @@ class Bound(ABC):
     stored: ClassVar[bool] = False
     random: ClassVar[bool] = False
     draws: int = 0
+    _probed: Floats = np.empty(0)
+
+    @property
+    def known_responses(self) -> Floats:
+        """Responses that were computed when the simulator was made, of which the first stay the first."""
+        return self._probed
 
     @property
     def is_line(self) -> bool:
@@ -210,6 +216,7 @@ def probe(bound: Bound, sampler: PopulationSampler, seed: int) -> tuple[Any, ...
     aleatory, epistemic = sampler(thetas, 8, np.random.default_rng(seed))
     values = bound.responses(aleatory, epistemic)
     refuse_all_nan(bound.name, values)
+    bound._probed = values.ravel()
     return values, aleatory, epistemic
 
 

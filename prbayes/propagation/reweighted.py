@@ -141,6 +141,11 @@ class Design(Bound):
             )
 
     @property
+    def known_responses(self) -> Floats:
+        """The stored responses."""
+        return self.values
+
+    @property
     def _dimensions(self) -> int:
         """Number of aleatory numbers that make one specimen."""
         return sum(int(np.prod(shape, dtype=int)) for shape in self.inputs.event_shapes)
