@@ -192,7 +192,7 @@ def _simulator(node: Node, discrepancies: Floats) -> SimulatorIdentity:
         metric=without_addresses(node.metric),
         propagation=without_addresses(node.propagation),
         n_points=node.bound.n_points,
-        batches=1 if node.design is None else node.design.batches,
+        batches=1 if node.design is None else node.design.n_batches,
         epsilon=node.epsilon_value,
         responses=_numbers(node.bound.known_responses[:_RESPONSES]),
         discrepancies=_numbers(discrepancies),
