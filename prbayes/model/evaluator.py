@@ -44,7 +44,8 @@ class Evaluation:
     def log_likelihood(self, epsilon: Floats) -> Floats:
         """Return the pseudo log-likelihood, shape (P,), for epsilons of shape (k,)."""
         kernels = np.asarray(log_kernel(self.discrepancies, epsilon))
-        return np.asarray(self.log_other + kernels.sum(axis=-1))
+        total = kernels.sum(axis=-1)
+        return np.asarray(self.log_other + total)
 
 
 class Evaluator:
@@ -141,7 +142,8 @@ class Evaluator:
 
     def log_other(self, thetas: Floats) -> Floats:
         """Return the log-likelihood of ordinary observed variables, and potentials, shape (P,)."""
-        if len(self.model.observed_RVs) == len(self.nodes) and not self.model.potentials:
+        ordinary = len(self.model.observed_RVs) > len(self.nodes)
+        if not ordinary and not self.model.potentials:
             return np.zeros(len(thetas))
         (found,) = self._evaluate_other(np.ascontiguousarray(thetas))
         return np.array(np.broadcast_to(found, len(thetas)))
@@ -165,17 +167,17 @@ class Evaluator:
             log_other[rows] = self.log_other(block)
             for i in range(k):
                 discrepancies[rows, i] = self.discrepancies(block, i)
-        return Evaluation(
-            np.nan_to_num(log_prior, nan=-np.inf, posinf=np.inf, neginf=-np.inf),
-            np.nan_to_num(log_other, nan=-np.inf, posinf=np.inf, neginf=-np.inf),
-            np.nan_to_num(discrepancies, nan=np.inf, posinf=np.inf, neginf=-np.inf),
-        )
+        log_prior[np.isnan(log_prior)] = -np.inf
+        log_other[np.isnan(log_other)] = -np.inf
+        discrepancies[np.isnan(discrepancies)] = np.inf
+        return Evaluation(log_prior, log_other, discrepancies)
 
     def _count(self, thetas: int) -> None:
         """Count the responses that are part of a graph, evaluated at so many thetas."""
         for node in self.nodes:
-            if node.bound.symbolic:
-                node.bound.responses.count += node.bound.n_per_theta * thetas
+            bound = node.bound
+            if bound.symbolic:
+                bound.responses.count += bound.n_per_theta * thetas
 
     @cache  # noqa: B019 (lives as long as the evaluator)
     def objective(self, *, prior: bool, gradient: bool) -> Any:
@@ -220,9 +222,11 @@ class Evaluator:
         other.nodes = []
         for node in self.nodes:
             observed = data[node.name]
-            same_size = np.size(observed) == node.target.observed.size
-            weights = node.target.weights if same_size else None
-            target = (metric or node.metric).against(observed, weights)
+            before = node.target
+            same_size = np.size(observed) == before.observed.size
+            weights = before.weights if same_size else None
+            chosen = metric or node.metric
+            target = chosen.against(observed, weights)
             other.nodes.append(replace(node, target=target))
         other.__dict__["objective"] = other._uncompiled
         return other
@@ -236,7 +240,8 @@ class Evaluator:
         """Return the sum of d_k / scale_k - log of ordinary terms, shape (P,); +inf outside the priors' support."""
         found = self(thetas)
         with np.errstate(invalid="ignore"):
-            value = (found.discrepancies / scales).sum(axis=-1) - found.log_other
+            scaled = found.discrepancies / scales
+            value = scaled.sum(axis=-1) - found.log_other
         known = np.isfinite(found.log_prior) & np.isfinite(value)
         return np.where(known, value, np.inf)
 
@@ -251,8 +256,13 @@ class Evaluator:
     def roots(self, thetas: Floats, k: int) -> list[Floats]:
         """Return the values of the k-th simulator's roots, shapes (P, *shape)."""
         compiled, ends = self._roots
-        values = compiled(np.ascontiguousarray(thetas))[ends[k] : ends[k + 1]]
-        return [np.broadcast_to(v, (len(thetas), *np.shape(v)[1:])) for v in values]
+        values = compiled(np.ascontiguousarray(thetas))
+        size = len(thetas)
+        found = []
+        for value in values[ends[k] : ends[k + 1]]:
+            shape = (size, *np.shape(value)[1:])
+            found.append(np.broadcast_to(value, shape))
+        return found
 
     def populations(self, thetas: Floats, k: int) -> tuple[Floats, Floats]:
         """Return responses and weights, (P, n) each, of the k-th simulator's populations."""
@@ -262,6 +272,9 @@ class Evaluator:
         """Return how well each design supports the populations at thetas, arrays of shape (P,)."""
         found = {}
         for k, node in enumerate(self.nodes):
-            if node.design is not None:
-                found[node.name] = node.design.support(self.roots(thetas, k))
+            design = node.design
+            if design is None:
+                continue
+            roots = self.roots(thetas, k)
+            found[node.name] = design.support(roots)
         return found

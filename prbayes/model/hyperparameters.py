@@ -62,8 +62,10 @@ class Hyperparameters:
         self._point = model.initial_point(random_seed=0)
         values = [self._point[v.name] for v in model.value_vars]
         names = [str(v.name) for v in model.value_vars]
-        self.shapes = dict(zip(names, map(np.shape, values), strict=True))
-        self.initial = np.concatenate([np.ravel(value) for value in values])
+        shapes = [np.shape(value) for value in values]
+        raveled = [np.ravel(value) for value in values]
+        self.shapes = dict(zip(names, shapes, strict=True))
+        self.initial = np.concatenate(raveled)
         self.size = self.initial.size
         self._drawn: dict[tuple[int, int], Floats] = {}
 
@@ -151,11 +153,13 @@ class Hyperparameters:
             if value.shape not in ((), shape):
                 raise ValueError(f"start: {name}: got shape {value.shape}, expected {shape}")
             draws.append(np.broadcast_to(value, shape)[None])
-        theta: Floats = self.thetas_of(draws)[0]
-        if not np.isfinite(theta).all() or not self.in_support(theta[None])[0]:
+        thetas = self.thetas_of(draws)
+        finite = np.isfinite(thetas).all()
+        if not (finite and self.in_support(thetas).all()):
             raise ValueError(
                 f"start: got {dict(point)}, expected values inside the support of the priors"
             )
+        theta: Floats = thetas[0]
         return theta
 
     @cached_property
@@ -166,7 +170,9 @@ class Hyperparameters:
         for value_variable in self.model.value_vars:
             rv = self.model.values_to_rvs[value_variable]
             transform = self.model.rvs_to_transforms[rv]
-            value = rv if transform is None else transform.forward(rv, *rv.owner.inputs)
+            value = rv
+            if transform is not None:
+                value = transform.forward(rv, *rv.owner.inputs)
             columns.append(pt.atleast_1d(value).ravel())
         swap = dict(zip(free, symbols, strict=True))
         theta = graph_replace(pt.concatenate(columns), swap, strict=False)
@@ -188,9 +194,11 @@ class Hyperparameters:
 
     def prior_thetas(self, size: int, seed: int) -> Floats:
         """Draw thetas from the prior, shape (size, d)."""
-        if (size, seed) not in self._drawn:
-            self._drawn[size, seed] = self.thetas_of(self._sampler(size, seed))
-        return self._drawn[size, seed].copy()
+        asked = (size, seed)
+        if asked not in self._drawn:
+            draws = self._sampler(size, seed)
+            self._drawn[asked] = self.thetas_of(draws)
+        return self._drawn[asked].copy()
 
     @cached_property
     def prior_sd(self) -> Floats:
@@ -203,8 +211,9 @@ class Hyperparameters:
 
     @cached_property
     def _points(self) -> PriorPoints | None:
+        free = self.model.free_RVs
         try:
-            return PriorPoints(self.model.free_RVs)
+            return PriorPoints(free)
         except TypeError:  # a prior without inverse distribution function
             return None
 

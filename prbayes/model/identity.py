@@ -174,15 +174,15 @@ def _identity(model: pm.Model, simulators: Sequence[SimulatorIdentity], **others
     terms += [str(potential.name) for potential in model.potentials]
     # Clones may order variables in other ways.
     ordered = sorted(simulators, key=lambda simulator: simulator.name)
-    return Identity(
-        priors=priors, terms=tuple(sorted(terms)), simulators=tuple(ordered), **others
-    )
+    return Identity(priors=priors, terms=tuple(sorted(terms)), simulators=tuple(ordered), **others)
 
 
 def _simulator(node: Node, discrepancies: Floats) -> SimulatorIdentity:
     observed, weights = node.target.observed, node.target.weights
     order = np.lexsort((weights, observed))
-    labels = [] if node.specimens is None else node.specimens[order].tolist()
+    labels = []
+    if node.specimens is not None:
+        labels = node.specimens[order].tolist()
     return SimulatorIdentity(
         name=node.name,
         data=_digest(observed[order].tobytes()),
@@ -307,24 +307,29 @@ def differences(got: Identity, expected: Identity, level: Level) -> list[str]:
     if names[0] != names[1]:
         return [_told("simulators", *names)]
     found: list[str] = []
+    pairs = list(zip(got.simulators, expected.simulators, strict=True))
     priors = _prior_differences(got, expected)
-    for a, b in zip(got.simulators, expected.simulators, strict=True):
+    for a, b in pairs:
         # Design points are drawn through the priors: with others, other responses are known.
         comparable = not priors and a.propagation == b.propagation
         found += _population_differences(a, b, comparable=comparable)
     if level >= Level.OPTIMUM:
         found += priors
-        for a, b in zip(got.simulators, expected.simulators, strict=True):
+        for a, b in pairs:
             found += _discrepancy_differences(a, b)
     if level >= Level.POSTERIOR:
-        for a, b in zip(got.simulators, expected.simulators, strict=True):
+        for a, b in pairs:
             if not _close([a.epsilon], [b.epsilon]):
                 found.append(_told(f"epsilon of {a.name}", a.epsilon, b.epsilon))
     if level >= Level.RUN:
-        for a, b in zip(got.simulators, expected.simulators, strict=True):
-            if (a.n_points, a.batches) != (b.n_points, b.batches):
+        for a, b in pairs:
+            if not _same_design(a, b):
                 found.append(_told(f"number of responses of {a.name}", a.n_points, b.n_points))
     return found
+
+
+def _same_design(a: SimulatorIdentity, b: SimulatorIdentity) -> bool:
+    return a.n_points == b.n_points and a.batches == b.batches
 
 
 def _population_differences(
@@ -353,9 +358,7 @@ def _prior_differences(got: Identity, expected: Identity) -> list[str]:
         if got.priors[name] != expected.priors.get(name)
     ]
     if got.terms != expected.terms:
-        found.append(
-            _told("other likelihood terms", got.terms or "none", expected.terms or "none")
-        )
+        found.append(_told("other likelihood terms", got.terms or "none", expected.terms or "none"))
     if found or not got.thetas or not expected.thetas:
         return found
     if not _close(got.thetas, expected.thetas) or not _close(got.log_prior, expected.log_prior):
@@ -371,9 +374,10 @@ def _discrepancy_differences(a: SimulatorIdentity, b: SimulatorIdentity) -> list
         one, other = getattr(a, what), getattr(b, what)
         if one != other:
             found.append(_told(f"{what} of {a.name}", one, other))
-    same_design = (a.n_points, a.batches) == (b.n_points, b.batches)
-    known = a.discrepancies and b.discrepancies
-    if not found and same_design and known and not _close(a.discrepancies, b.discrepancies):
+    known = bool(a.discrepancies and b.discrepancies)
+    if found or not known or not _same_design(a, b):
+        return found
+    if not _close(a.discrepancies, b.discrepancies):
         found.append(f"the discrepancy of {a.name} has other values at the same hyperparameters")
     return found
 
@@ -391,6 +395,6 @@ def _close(got: Any, expected: Any) -> bool:
     a, b = np.asarray(got, dtype=np.float64), np.asarray(expected, dtype=np.float64)
     if a.shape != b.shape:
         return False
-    known = np.abs(a[np.isfinite(a)])
-    size = known.max(initial=0.0)
+    finite = a[np.isfinite(a)]
+    size = np.abs(finite).max(initial=0.0)
     return bool(np.allclose(a, b, rtol=0.0, atol=_ROUNDING * size, equal_nan=True))

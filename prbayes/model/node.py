@@ -142,24 +142,35 @@ class SimulatorRV(RandomVariable):
     def rng_fn(self, rng: np.random.Generator, *arguments: Any) -> Floats:
         """Draw responses of different specimens, of the shape that comes last among the arguments."""
         *params, size = arguments
-        ndims = [root.type.ndim for root in self.node.bound.inputs.roots]
-        batches = [p.shape[: p.ndim - ndim] for p, ndim in zip(params, ndims, strict=True)]
+        bound = self.node.bound
+        batches = []
+        for root, param in zip(bound.inputs.roots, params, strict=True):
+            leading = param.ndim - root.type.ndim
+            batches.append(param.shape[:leading])
         batch = np.broadcast_shapes(*batches)
         values = np.empty(batch if size is None else size)
         # One population for each element of a batch of parameters: commonly there is one.
         for index in np.ndindex(batch):
-            at = [p[_own_index(index, own)] for p, own in zip(params, batches, strict=True)]
-            places = tuple(slice(None) if n == 1 else i for i, n in zip(index, batch, strict=True))
-            size_there = values[places].size
-            drawn = self.node.bound.draw(rng, size_there, at)
-            values[places] = drawn.reshape(values[places].shape)
+            pairs = zip(params, batches, strict=True)
+            at = [param[_own_index(index, own)] for param, own in pairs]
+            places = _places(index, batch)
+            there = values[places]
+            drawn = bound.draw(rng, there.size, at)
+            values[places] = drawn.reshape(there.shape)
         return values
 
 
 def _own_index(index: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, ...]:
     """Return where an array of this leading shape is read for an index of the shape it broadcasts to."""
     last = index[len(index) - len(shape) :]
-    return tuple(0 if n == 1 else i for i, n in zip(last, shape, strict=True))
+    pairs = zip(last, shape, strict=True)
+    return tuple(0 if n == 1 else i for i, n in pairs)
+
+
+def _places(index: tuple[int, ...], batch: tuple[int, ...]) -> tuple[int | slice, ...]:
+    """Return where the values for an index of a batch stand: all along its axes of length one."""
+    pairs = zip(index, batch, strict=True)
+    return tuple(slice(None) if n == 1 else i for i, n in pairs)
 
 
 @_logprob.register(SimulatorRV)  # type: ignore[untyped-decorator]
