@@ -15,7 +15,9 @@ from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.function import FunctionMetric
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual
-from prbayes.model.simulator import Simulator, abc_distance, set_epsilon
+from prbayes.model.epsilon import set_epsilon
+from prbayes.model.simulator import Simulator
+from prbayes.model.stock import abc_distance
 from prbayes.model.support import DesignError
 from prbayes.plots.comparison import plot_comparison
 from prbayes.plots.landscape import plot_landscape

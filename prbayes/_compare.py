@@ -12,15 +12,16 @@ import xarray as xr
 from scipy.stats import norm
 
 from prbayes._checks import Floats
-from prbayes.estimate.optimum import Optimum
+from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual
-from prbayes.model.description import element_name
+from prbayes.model.elements import element_name
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import nodes
+from prbayes.model.identity import Level, identity_of_model, require_same
+from prbayes.model.node import nodes
 from prbayes.model.support import shortcomings
 
 INTERVAL = 0.89  # probability: what ArviZ takes by default, az.rcParams["stats.ci_prob"]
@@ -79,6 +80,7 @@ def compare(
         raise ValueError(
             "compare: got no results, expected a dict such as {'optimum': optimum, 'ABC': idata}"
         )
+    _require_one_problem(results, model)
     columns = {label: _column(label, result) for label, result in results.items()}
     names = _shared(list(columns.values()), model)
     if not names:
@@ -186,6 +188,15 @@ def _shared(columns: list[_Column], model: pm.Model | None) -> list[str]:
         return names
     free = {rv.name for rv in model.free_RVs}
     return [name for name in names if name.partition("[")[0] in free]
+
+
+def _require_one_problem(results: Mapping[str, Any], model: pm.Model | None) -> None:
+    """Refuse results of other populations than the model's, or the first result's, as far as they tell."""
+    known = [identity_in(result) for result in results.values()]
+    first = next((identity for identity in known if identity is not None), None)
+    expected = identity_of_model(model) if model is not None and nodes(model) else first
+    for label, identity in zip(results, known, strict=True):
+        require_same(identity, expected, f"compare: {label}", Level.POPULATIONS)
 
 
 def _scores(

@@ -13,9 +13,9 @@ import xarray as xr
 
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
-from prbayes.model.description import element_name
+from prbayes.model.elements import element_name
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import model_on_context
+from prbayes.model.node import model_on_context
 from prbayes.model.support import shortcoming
 
 _RHAT = 1.01  # recommended by Vehtari et al. (2021)

@@ -18,9 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats, positive_integer
 from prbayes._weighted import reached
-from prbayes.estimate.optimum import Optimum
+from prbayes.estimate.optimum import Optimum, identity_in
+from prbayes.model.identity import Level, identity_of_model, require_same
 from prbayes.model.labels import versions
-from prbayes.model.simulator import Node, model_on_context, nodes
+from prbayes.model.node import Node, model_on_context, nodes
 from prbayes.model.support import DesignError
 from prbayes.propagation.points import base_points
 from prbayes.propagation.reweighted import Design
@@ -139,6 +140,9 @@ def predict(
         model = result.model
     model = model_on_context(model, "prb.predict")
     label = _label(response, name, store)
+    if not (isinstance(result, Optimum) and model is result.model):
+        identity = identity_of_model(model)
+        require_same(identity_in(result), identity, "prb.predict", Level.POPULATIONS)
     points, coords = populations_of(result, model, draws, "prb.predict")
     sorted_inputs = read_inputs(label, inputs, model)
     responses = Responses(label, response, sorted_inputs, executor=executor, store=store)

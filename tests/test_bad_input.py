@@ -15,7 +15,7 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import nodes
+from prbayes.model.node import nodes
 from prbayes.response.compilation import PLAIN
 
 OBSERVED = 0.75 * (2.0 + 0.8 * norm.ppf((np.arange(30) + 0.5) / 30))

@@ -12,7 +12,7 @@ import xarray as xr
 from scipy.special import ndtri
 
 import prbayes as prb
-from prbayes.model.simulator import nodes
+from prbayes.model.node import nodes
 from prbayes.model.support import DesignError
 from prbayes.response.calling import ResponseError
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import Node
+from prbayes.model.node import Node
 from prbayes.response.distributions import PopulationSampler
 
 _MOST = 1 << 15  # points of a resimulated population from which data sets are drawn

@@ -17,7 +17,15 @@ from prbayes.estimate.caveats import flat, trouble
 from prbayes.estimate.identifiability import blind_directions
 from prbayes.estimate.methods import Method
 from prbayes.estimate.optimum import Optimum, assemble, plain
-from prbayes.estimate.refinement import AGREE, MAX_ROUNDS, grow, pilot, refine_at, refuse, spread_around
+from prbayes.estimate.refinement import (
+    AGREE,
+    MAX_ROUNDS,
+    grow,
+    pilot,
+    refine_at,
+    refuse,
+    spread_around,
+)
 from prbayes.estimate.refit import Neighbourhood
 from prbayes.estimate.rivals import Rival, rivals
 from prbayes.estimate.sampling import Local
@@ -25,7 +33,7 @@ from prbayes.estimate.sandwich import Information
 from prbayes.estimate.search import Search
 from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import model_on_context
+from prbayes.model.node import model_on_context
 from prbayes.model.support import shortcomings
 
 _log = logging.getLogger("prbayes")

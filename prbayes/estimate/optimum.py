@@ -16,6 +16,7 @@ from prbayes.estimate.sampling import Local
 from prbayes.estimate.search import Search
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.identity import Identity, as_attributes, from_attributes, identity_of
 from prbayes.model.labels import labelled, observed_dataset, versions
 
 
@@ -74,6 +75,8 @@ class Optimum:
     at_jump : tuple of str
         Simulators whose discrepancy jumps at the optimum, since points lose their response there: nothing is known of
         standard errors.
+    identity : Identity or None
+        Of the problem that was solved, by which it is known again.
     """
 
     point: dict[str, Any]
@@ -98,6 +101,7 @@ class Optimum:
     warnings: tuple[str, ...] = ()
     at_edge: tuple[str, ...] = ()
     at_jump: tuple[str, ...] = ()
+    identity: Identity | None = None
 
     def __repr__(self) -> str:
         """Show the answer, what it cost, and what is to be said of it."""
@@ -180,6 +184,7 @@ def assemble(
             "evaluations": np.array(search.counts, dtype=np.int64),
         },
         seconds=time.perf_counter() - clock,
+        identity=identity_of(evaluator, prior_minimised=search.prior),
     )
 
 
@@ -198,6 +203,16 @@ def surveyed(optimum: Optimum, caller: str) -> Optimum:
             "prb.sample_smc(epsilon=..., adjust=False) makes no use of it"
         )
     return optimum
+
+
+def identity_in(result: Any) -> Identity | None:
+    """Return the identity that an optimum or a DataTree carries, or None."""
+    if isinstance(result, Optimum):
+        return result.identity
+    if not isinstance(result, xr.DataTree):
+        return None
+    group = "posterior" if "posterior" in result.children else "optimum"
+    return from_attributes(result[group].attrs) if group in result.children else None
 
 
 def plain(value: Any) -> Any:
@@ -220,6 +235,7 @@ def optimum_tree(optimum: Optimum) -> xr.DataTree:
         "warnings": "\n".join(optimum.warnings),
         **versions(),
         **as_attribute(optimum.model),
+        **({} if optimum.identity is None else as_attributes(optimum.identity)),
     }
     elements = {"element": optimum.names, "other_element": optimum.names}
     return xr.DataTree.from_dict(

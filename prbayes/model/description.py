@@ -13,7 +13,7 @@ from pymc.printing import str_for_dist
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
 
-from prbayes.model.simulator import Node, nodes
+from prbayes.model.node import Node, nodes
 
 # Characters: an attribute of an HDF5 file holds less than 64 KiB, with what surrounds it.
 # JSON writes letters beyond ASCII as six characters of a byte each, so that these are bytes.
@@ -73,11 +73,6 @@ def from_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
     except (KeyError, TypeError, ValueError):
         return None
     return {"variables": variables, "simulators": simulators}
-
-
-def element_name(name: str, index: tuple[int, ...]) -> str:
-    """Return the name of an element of a variable, such as 'mu[1]'; of a scalar, its own."""
-    return f"{name}[{','.join(map(str, index))}]" if index else name
 
 
 def _texts(found: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, str]:

@@ -15,7 +15,7 @@ from prbayes._checks import Floats
 from prbayes._predict import populations_of
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import model_on_context
+from prbayes.model.node import model_on_context
 from prbayes.model.support import DesignError
 
 # Populations in a band, whose sides are quantiles of so many curves: with 200 the standard error of

@@ -1,4 +1,4 @@
-"""Names of elements, such as 'mu[1]', and what a reader calls them."""
+"""What a reader calls the elements of variables."""
 
 from __future__ import annotations
 
@@ -7,31 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from prbayes._checks import Floats
-
-
-def element_name(name: str, index: tuple[int, ...]) -> str:
-    """Return the name of an element, such as 'mu[1]'; of a scalar, the variable's own."""
-    if not index:
-        return name
-    places = ",".join(map(str, index))
-    return f"{name}[{places}]"
+from prbayes.model.elements import split_elements
 
 
 def variable_of(element: str) -> str:
     """Return the name of the variable that an element belongs to."""
     return element.partition("[")[0]
-
-
-def split_elements(values: Mapping[str, Any]) -> dict[str, Floats]:
-    """Return one-dimensional arrays by element name, of arrays of shape (n, *shape) by variable."""
-    found: dict[str, Floats] = {}
-    for name, value in values.items():
-        array = np.asarray(value)
-        for index in np.ndindex(array.shape[1:]):
-            element = element_name(name, index)
-            found[element] = array[(slice(None), *index)]
-    return found
 
 
 def point_elements(point: Mapping[str, Any]) -> dict[str, float]:

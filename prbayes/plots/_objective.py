@@ -8,8 +8,8 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
+from prbayes.model.elements import split_elements
 from prbayes.model.evaluator import Evaluator
-from prbayes.plots._names import split_elements
 
 # What a reader calls a metric of the package; any other one goes by the name of its class.
 _METRIC_LABELS = {

@@ -12,10 +12,11 @@ import xarray as xr
 
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
+from prbayes.model.elements import split_elements
 from prbayes.model.evaluator import Evaluator
 from prbayes.plots._canvas import BLUE, DASHED, DIAMOND, DOTTED, GREY, VERMILION, Canvas, Panel
 from prbayes.plots._curves import bounded_density, central_levels, normal_density
-from prbayes.plots._names import named, point_elements, split_elements
+from prbayes.plots._names import named, point_elements
 from prbayes.plots._objective import free_elements
 from prbayes.plots._populations import check_level
 from prbayes.plots._ticks import round_ticks

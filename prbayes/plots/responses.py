@@ -14,7 +14,7 @@ import xarray as xr
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import Node
+from prbayes.model.node import Node
 from prbayes.plots._canvas import DASHED, INK, VERMILION, Canvas, Panel
 from prbayes.plots._curves import (
     GRID_POINTS,

@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from prbayes._checks import Floats
+from prbayes.model.identity import Identity, Level, as_text, differences, from_text
 from prbayes.response.store import StoreError
 
 
@@ -21,8 +22,10 @@ class Checkpoint:
     Parameters
     ----------
     path : path-like
-    identity : dict
-        What a run depends on; a file of another run is refused.
+    problem : Identity
+        What is sampled.
+    settings : dict
+        What the draws depend on besides; a file of another problem, or with other settings, is refused.
 
     Raises
     ------
@@ -30,23 +33,36 @@ class Checkpoint:
         If there is a file that cannot be read, or that belongs to another run; it is left as it is.
     """
 
-    def __init__(self, path: str | os.PathLike[str], identity: dict[str, Any]) -> None:
+    def __init__(
+        self, path: str | os.PathLike[str], problem: Identity, settings: dict[str, Any]
+    ) -> None:
         self.path = Path(path)
-        self.identity = json.loads(json.dumps(identity))
+        self.problem = problem
+        self.settings = _plain(settings)
         self.arrays: dict[str, Floats] = {}
         self.note: dict[str, Any] = {}
         if self.path.exists():
             self._read()
         elif not self.path.parent.is_dir():
-            raise StoreError(f"checkpoint: got {self.path}, whose folder does not exist, expected one that does")
+            raise StoreError(
+                f"checkpoint: got {self.path}, whose folder does not exist, expected one that does"
+            )
 
     def save(self, arrays: dict[str, Floats], note: dict[str, Any]) -> None:
         """Replace what is on disk; it is safe there when this returns."""
-        data = xr.Dataset(
-            {name: ([f"{name}_{i}" for i in range(np.ndim(a))], np.asarray(a)) for name, a in arrays.items()},
-            attrs={"prbayes_checkpoint": 1, "identity": json.dumps(self.identity), "note": json.dumps(note)},
-        )
+        variables = {}
+        for name, array in arrays.items():
+            dims = [f"{name}_{i}" for i in range(np.ndim(array))]
+            variables[name] = (dims, np.asarray(array))
+        attributes = {
+            "prbayes_checkpoint": 2,
+            "problem": as_text(self.problem),
+            "settings": json.dumps(self.settings),
+            "note": json.dumps(note),
+        }
+        data = xr.Dataset(variables, attrs=attributes)
         data.attrs["digest"] = _digest(data)
+        # Written beside and then renamed, so that the file is whole whenever the process ends.
         part = self.path.with_name(self.path.name + ".part")
         data.to_netcdf(part, engine="h5netcdf")
         with part.open("rb") as file:
@@ -56,35 +72,54 @@ class Checkpoint:
 
     def _read(self) -> None:
         try:
-            with xr.open_dataset(self.path, engine="h5netcdf") as data:
-                data.load()
-            identity, note = json.loads(data.attrs["identity"]), json.loads(data.attrs["note"])
+            data = _loaded(self.path)
+            problem = from_text(data.attrs["problem"])
+            settings, note = (json.loads(data.attrs[key]) for key in ("settings", "note"))
             sound = data.attrs["digest"] == _digest(data)
         except Exception as error:
-            raise StoreError(self._refusal(f"cannot be read ({type(error).__name__}: {error})")) from error
+            reason = f"cannot be read ({type(error).__name__}: {error})"
+            raise StoreError(self._refusal(reason)) from error
         if not sound:
             raise StoreError(self._refusal("is damaged: its contents do not match their digest"))
-        other = sorted(k for k in {*identity, *self.identity} if identity.get(k) != self.identity.get(k))
+        other = differences(problem, self.problem, Level.RUN)
+        for key in sorted({*settings, *self.settings}):
+            got, expected = settings.get(key), self.settings.get(key)
+            if got != expected:
+                other.append(f"{key}: got {got}, expected {expected}")
         if other:
-            raise StoreError(self._refusal(f"belongs to another run, which differs in {', '.join(other)}"))
+            raise StoreError(self._refusal(f"belongs to another run: {'; '.join(other)}"))
         self.arrays = {str(name): a.values for name, a in data.data_vars.items()}
         self.note = note
 
     def _refusal(self, what: str) -> str:
-        return f"checkpoint: {self.path} {what}; nothing was changed: move it away, or pass another path"
+        return (
+            f"checkpoint: {self.path} {what}; nothing was changed: move it away, or pass another path"
+        )
 
 
-def stored_identity(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return what the run of a checkpoint depends on; empty if it cannot be read."""
+def stored_settings(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the settings of a checkpoint's run; empty if there is none that can be read."""
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as data:
-            return dict(json.loads(data.attrs["identity"]))
+        return dict(json.loads(_loaded(path).attrs["settings"]))
     except Exception:  # Checkpoint says what is wrong with it
         return {}
 
 
+def _loaded(path: str | os.PathLike[str]) -> xr.Dataset:
+    with xr.open_dataset(path, engine="h5netcdf") as data:
+        return data.load()
+
+
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    """Return what JSON makes of values, so that they compare equal to those that were read."""
+    return dict(json.loads(json.dumps(values)))
+
+
 def _digest(data: xr.Dataset) -> str:
-    total = hashlib.sha256((data.attrs["identity"] + data.attrs["note"]).encode())
+    """Return the digest of all that a checkpoint holds."""
+    texts = [data.attrs[key] for key in ("problem", "settings", "note")]
+    total = hashlib.sha256("".join(texts).encode())
     for name in sorted(map(str, data.data_vars)):
-        total.update(name.encode() + np.ascontiguousarray(data[name].values, dtype="<f8").tobytes())
+        values = np.ascontiguousarray(data[name].values, dtype="<f8")
+        total.update(name.encode() + values.tobytes())
     return total.hexdigest()

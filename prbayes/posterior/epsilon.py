@@ -9,6 +9,8 @@ from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.sampling import first_order_shifts
 from prbayes.estimate.sandwich import Information
 from prbayes.metrics.base import Minimum
+from prbayes.model.epsilon import Epsilon
+from prbayes.model.identity import identity_of, require_same
 
 _CLOUD = 500  # thetas that carry each simulated data set's posterior
 _SETS = 200
@@ -67,10 +69,12 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
         )
     evaluator = surveyed(optimum, "calibrate_epsilon").evaluator
     scale = evaluator.prior_sd
-    return {
-        node.name: _epsilon(Information(evaluator, k, optimum.theta, scale, n_sets=_SETS))
-        for k, node in enumerate(evaluator.nodes)
-    }
+    require_same(optimum.identity, identity_of(evaluator), "calibrate_epsilon")
+    found = {}
+    for k, node in enumerate(evaluator.nodes):
+        information = Information(evaluator, k, optimum.theta, scale, n_sets=_SETS)
+        found[node.name] = _epsilon(information)
+    return Epsilon(found, optimum.identity)
 
 
 def _epsilon(information: Information) -> float:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor, Future, as_completed
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import chain
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from prbayes._checks import Floats, positive_integer
 from prbayes._progress import progress, shown
 from prbayes.estimate.data_sets import fresh_data
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import model_on_context, nodes, revive
+from prbayes.model.node import model_on_context
 from prbayes.posterior.adjustment import Affine
 from prbayes.posterior.smc import sample
 from prbayes.posterior.trees import calibration_tree
@@ -27,9 +26,6 @@ from prbayes.posterior.trees import calibration_tree
 _log = logging.getLogger("prbayes")
 # Data sets that a worker analyses before it reports: seconds of work, against milliseconds of sending the model.
 _CHUNK = 10
-_ARRIVING = (
-    Lock()
-)  # threads share the classes that hold the nodes, of which the last model to arrive has its own
 
 
 def simulation_based_calibration(
@@ -154,32 +150,16 @@ def _on_executor(
     import cloudpickle
 
     sent = cloudpickle.dumps(model)
-    with _classes_kept(model):
-        futures: list[Future[list[_Row]]] = [executor.submit(_remote, sent, job) for job in jobs]
-        for done in as_completed(futures):
-            report(len(done.result()))
-        return [future.result() for future in futures]
-
-
-@contextmanager
-def _classes_kept(model: pm.Model) -> Iterator[None]:
-    """Undo what a model that arrives in a thread does to the classes of this one's simulators."""
-    kept = [(type(rv.owner.op), dict(vars(type(rv.owner.op)))) for rv in nodes(model)]
-    try:
-        yield
-    finally:
-        for class_, attributes in kept:
-            for name, value in attributes.items():
-                if vars(class_)[name] is not value:
-                    setattr(class_, name, value)
+    futures: list[Future[list[_Row]]] = [executor.submit(_remote, sent, job) for job in jobs]
+    for done in as_completed(futures):
+        report(len(done.result()))
+    return [future.result() for future in futures]
 
 
 def _remote(sent: bytes, job: _Job) -> list[_Row]:
     import cloudpickle
 
-    with _ARRIVING:
-        evaluator = Evaluator(revive(cloudpickle.loads(sent)))
-    return _analyse(evaluator, job)
+    return _analyse(Evaluator(cloudpickle.loads(sent)), job)
 
 
 def _analyse(

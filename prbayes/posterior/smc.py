@@ -2,31 +2,32 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats, positive_integer, positive_number
+from prbayes._checks import Floats, positive_integer
 from prbayes._progress import shown
 from prbayes.estimate.minimization import find_optimum
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse
 from prbayes.estimate.refit import inapplicable
+from prbayes.model.epsilon import checked_epsilon
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import Node, model_on_context
+from prbayes.model.identity import identity_of, require_same
+from prbayes.model.node import Node, model_on_context
 from prbayes.model.support import shortcomings
 from prbayes.posterior.adjustment import Affine
 from prbayes.posterior.chains import Chains, Particles
-from prbayes.posterior.checkpoint import Checkpoint, stored_identity
+from prbayes.posterior.checkpoint import Checkpoint, stored_settings
 from prbayes.posterior.epsilon import calibrate_epsilon
 from prbayes.posterior.trees import posterior_tree
 
@@ -123,9 +124,10 @@ def sample_smc(
     if optimum is not None and not isinstance(optimum, Optimum):
         got = type(optimum).__name__
         raise TypeError(f"optimum: got {got}, expected an Optimum; call prb.minimize() first")
+    evaluator = _evaluator(model, optimum)
     with shown(progressbar):
         return sample(
-            Evaluator(model) if optimum is None else optimum.evaluator,
+            evaluator,
             draws=draws,
             chains=chains,
             epsilon=epsilon,
@@ -172,14 +174,23 @@ def sample(
                 node.epsilon.set_value(np.asarray(calibrated[node.name]))
 
         # The draws, on designs that support them
-        saved = _checkpoint(checkpoint, evaluator, draws, chains, threshold, random_seed)
-        entropy = random_seed if saved is None else int(saved.identity["entropy"])
+        saved = _checkpoint(
+            checkpoint,
+            evaluator,
+            random_seed,
+            draws=draws,
+            chains=chains,
+            threshold=threshold,
+            adjust=repr(adjustment),
+            refine=refine,
+        )
+        entropy = random_seed if saved is None else int(saved.settings["entropy"])
         rounds = _Rounds(
             run=Chains(evaluator, draws, threshold, saved),
             chains=chains,
             seeds=np.random.SeedSequence(entropy),
             adjustment=adjustment,
-            optima=() if optimum is None else _optima(optimum),
+            optima=() if optimum is None else _optima(optimum, evaluator),
             refine=refine and bool(evaluator.designs),
         )
         found = rounds.until_supported(progressbar)
@@ -294,10 +305,7 @@ def _set_epsilons(evaluator: Evaluator, epsilon: float | dict[str, float] | None
                 f"epsilon: got one number for {len(names)} simulators, expected a dict by name: {names}"
             )
         epsilon = {names[0]: epsilon}
-    unknown = sorted(set(epsilon) - set(names))
-    if unknown:
-        raise KeyError(f"epsilon: got {unknown}, expected names of simulators: {names}")
-    values = {name: positive_number(value, f"{name}: epsilon") for name, value in epsilon.items()}
+    values = checked_epsilon(epsilon, evaluator.nodes, evaluator.model, "sample_smc: epsilon")
     for node in evaluator.nodes:
         if node.name in values:
             node.epsilon.set_value(np.asarray(values[node.name]))
@@ -315,10 +323,23 @@ def _needs_optimum(evaluator: Evaluator, unset: list[Node], adjustment: Affine |
     return bool(unset) or (adjustment is not None and not inapplicable(evaluator))
 
 
-def _optima(optimum: Optimum) -> tuple[Floats, ...]:
-    """Return the optimum, and others that the data could as well come from."""
+def _evaluator(model: pm.Model, optimum: Optimum | None) -> Evaluator:
+    """Return the evaluator of a model; an optimum's own if it is this model's, and no optimum of another problem."""
+    if optimum is None:
+        return Evaluator(model)
+    evaluator = optimum.evaluator if optimum.model is model else Evaluator(model)
+    require_same(optimum.identity, identity_of(evaluator), "sample_smc: optimum")
+    return evaluator
+
+
+def _optima(optimum: Optimum, evaluator: Evaluator) -> tuple[Floats, ...]:
+    """Return the optimum, and others that the data could as well come from.
+
+    Their elements are in the evaluator's order, which in a clone of the optimum's model may be another one.
+    """
+    order = [optimum.names.index(name) for name in evaluator.names]
     rivals = [rival["theta"] for rival in optimum.rivals if rival["comparable"]]
-    return (optimum.theta, *rivals)
+    return tuple(theta[order] for theta in (optimum.theta, *rivals))
 
 
 def _discrepancy_errors(evaluator: Evaluator, particles: Particles) -> Floats:
@@ -334,33 +355,12 @@ def _discrepancy_errors(evaluator: Evaluator, particles: Particles) -> Floats:
 
 
 def _checkpoint(
-    path: str | PathLike[str] | None,
-    evaluator: Evaluator,
-    draws: int,
-    chains: int,
-    threshold: float,
-    seed: int | None,
+    path: str | PathLike[str] | None, evaluator: Evaluator, seed: int | None, **settings: Any
 ) -> Checkpoint | None:
     """Open the checkpoint; a run without a seed takes that of the run it goes on with."""
     if path is None:
         return None
-    entropy = np.random.SeedSequence(seed).entropy
-    if seed is None and Path(path).exists():
-        entropy = stored_identity(path).get("entropy", entropy)
-    observed = b"".join(
-        n.target.observed.tobytes() + n.target.weights.tobytes() for n in evaluator.nodes
-    )
-    identity = {
-        "draws": draws,
-        "chains": chains,
-        "threshold": threshold,
-        "entropy": str(entropy),
-        "hyperparameters": evaluator.names,
-        "epsilon": [float(e) for e in evaluator.epsilon],
-        "metrics and propagations": [
-            f"{n.metric!r} {n.propagation!r}".split(" at 0x")[0] for n in evaluator.nodes
-        ],
-        "observed": hashlib.sha256(observed).hexdigest(),
-        "responses before": [n.bound.n_points for n in evaluator.nodes],
-    }
-    return Checkpoint(path, identity)
+    entropy = str(np.random.SeedSequence(seed).entropy)
+    if seed is None:
+        entropy = stored_settings(path).get("entropy", entropy)
+    return Checkpoint(path, identity_of(evaluator), {**settings, "entropy": entropy})

@@ -11,7 +11,7 @@ from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 
 from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluation, Evaluator
-from prbayes.model.simulator import model_on_context
+from prbayes.model.node import model_on_context
 
 # Proposals at most in a stage: a bound on the cost where particles do not forget.
 _MAX_STEPS = 25

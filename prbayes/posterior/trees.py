@@ -9,7 +9,9 @@ import xarray as xr
 
 from prbayes._checks import Floats
 from prbayes.model.description import as_attribute, without_addresses
+from prbayes.model.elements import split_elements
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.identity import as_attributes, identity_of
 from prbayes.model.labels import labelled, observed_dataset, versions
 
 # Probability that the ECDF of uniform ranks stays inside: that of ArviZ's own pictures of ranks.
@@ -71,6 +73,7 @@ def posterior_tree(
             **attrs,
             **_evidence(stats),
             **as_attribute(evaluator.model),
+            **as_attributes(identity_of(evaluator)),
         }
     )
     errors = np.full(len(evaluator.nodes), np.nan) if errors is None else errors
@@ -191,6 +194,7 @@ def bootstrap_tree(
             "random_seed": str(seed),
             **versions(),
             **as_attribute(evaluator.model),
+            **as_attributes(identity_of(evaluator)),
         }
     )
     return xr.DataTree.from_dict(
@@ -233,19 +237,14 @@ def _envelopes(ranks: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
     from arviz_stats.ecdf_utils import ecdf_pit
 
     rows, names = {}, []
-    for key, variable in ranks.data_vars.items():
-        values = variable.values[0]
-        for i in np.ndindex(values.shape[1:]):
-            name = f"{key}[{','.join(map(str, i))}]" if i else str(key)
-            x, ecdf, lower, upper = ecdf_pit(  # type: ignore[no-untyped-call]
-                values[(slice(None), *i)],
-                _ENVELOPE,
-                n_simulations=1000,
-                rng=np.random.default_rng(0),
-            )
-            rows[name] = ecdf
-            if ((ecdf < lower) | (ecdf > upper)).any():
-                names.append(name)
+    values = {name: variable.values[0] for name, variable in ranks.data_vars.items()}
+    for name, column in split_elements(values).items():
+        x, ecdf, lower, upper = ecdf_pit(  # type: ignore[no-untyped-call]
+            column, _ENVELOPE, n_simulations=1000, rng=np.random.default_rng(0)
+        )
+        rows[name] = ecdf
+        if ((ecdf < lower) | (ecdf > upper)).any():
+            names.append(name)
     found = xr.Dataset(
         {
             "ecdf": (["variable", "x"], np.array(list(rows.values()))),

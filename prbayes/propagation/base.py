@@ -6,13 +6,14 @@ the discrepancy as a graph of the hyperparameters and knows how many responses w
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import cached_property
 from os import PathLike
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pytensor.tensor as pt
@@ -62,6 +63,12 @@ class Bound(ABC):
     stored: ClassVar[bool] = False
     random: ClassVar[bool] = False
     draws: int = 0
+    _probed: Floats = np.empty(0)
+
+    @property
+    def known_responses(self) -> Floats:
+        """Responses that were computed when the simulator was made, of which the first stay the first."""
+        return self._probed
 
     @property
     def is_line(self) -> bool:
@@ -79,6 +86,12 @@ class Bound(ABC):
         self.inputs = inputs
         self.target = target
         self.responses = responses
+
+    def copied(self) -> Self:
+        """Return the same propagation with a count of responses of its own, for a clone of the model."""
+        other = copy.copy(self)
+        other.responses = self.responses.copied()
+        return other
 
     @property
     def n_points(self) -> int:
@@ -221,6 +234,7 @@ def probe(bound: Bound, sampler: PopulationSampler, seed: int) -> tuple[Any, ...
     aleatory, epistemic = sampler(two, 8, np.random.default_rng(seed))
     values = bound.responses(aleatory, epistemic)
     refuse_all_nan(bound.name, values)
+    bound._probed = values.ravel()
     return values, aleatory, epistemic
 
 

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pytensor.tensor as pt
@@ -91,6 +91,12 @@ class ResimulatedBound(Bound):
             quantiles(name, dist, u)  # refuses what has no inverse distribution function
         tried = probe(self, PopulationSampler(inputs), config.random_seed)
         self.symbolic = self._accepts_tensors(*tried)
+
+    def copied(self) -> Self:
+        """Return the same propagation with a count of its own, which its compiled function has to know."""
+        other = super().copied()
+        other.__dict__.pop("_values", None)
+        return other
 
     def _warn_of_few_responses(self) -> None:
         per_observation = self.target.metric.tail_responses

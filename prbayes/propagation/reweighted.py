@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pytensor
@@ -220,6 +220,11 @@ class Design(Bound):
         return self.config.max_points or 32 * self.config.n
 
     @property
+    def known_responses(self) -> Floats:
+        """The stored responses."""
+        return self.values
+
+    @property
     def _dimensions(self) -> int:
         """Number of aleatory numbers that make one specimen."""
         sizes = [int(np.prod(shape)) for shape in self.inputs.event_shapes]
@@ -388,6 +393,15 @@ class Design(Bound):
                 found = [_log_sum(power * log_weights, axis=1) for power in (1, 2)]
                 sums = np.logaddexp(sums, found)
         return log_g, sums
+
+    def copied(self) -> Self:
+        """Return a design with the same points, which grows by itself."""
+        other = super().copied()
+        other._others = deque(self._others, maxlen=_OTHER_RESPONSES)
+        other._shared = []
+        other._share([shared.get_value() for shared in self._shared])
+        other.__dict__.pop("_log_weights", None)  # compiled on the shared variables of this one
+        return other
 
     @contextmanager
     def undone(self) -> Iterator[None]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pymc as pm
 
-from prbayes.model.simulator import nodes
+from prbayes.model.node import nodes
 from prbayes.plots.comparison import plot_comparison
 from prbayes.plots.landscape import plot_landscape
 from prbayes.plots.optimizer import plot_optimizer

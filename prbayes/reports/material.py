@@ -14,8 +14,9 @@ from prbayes._checks import Floats
 from prbayes._compare import compare
 from prbayes._diagnose import Diagnosis, diagnose
 from prbayes.estimate.optimum import Optimum
-from prbayes.model.description import describe, element_name, from_attributes
-from prbayes.model.simulator import nodes
+from prbayes.model.description import describe, from_attributes
+from prbayes.model.elements import element_name
+from prbayes.model.node import nodes
 from prbayes.validation.validity import ValidityTest
 
 

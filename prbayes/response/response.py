@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from typing import Any
@@ -88,6 +89,12 @@ class Responses:
         self._calling = Calling(name, function, executor, kept, policy)
         self._tally = Tally()
         self._event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
+
+    def copied(self) -> Responses:
+        """Return the same function with counts of its own; executor and store are the same."""
+        other = copy.copy(self)
+        other._tally = copy.copy(self._tally)
+        return other
 
     @property
     def computed(self) -> int:

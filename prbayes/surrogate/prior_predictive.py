@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes.model.simulator import model_on_context
+from prbayes.model.node import model_on_context
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, prior_draws, valid
 from prbayes.response.inputs import Inputs, read_inputs

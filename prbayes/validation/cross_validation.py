@@ -15,7 +15,7 @@ from prbayes.estimate.refit import Neighbourhood, inapplicable
 from prbayes.metrics.base import Discrepancy
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import versions
-from prbayes.model.simulator import Node
+from prbayes.model.node import Node
 
 # Sets the random numbers of folds apart from others with the same seed; any integer does.
 _STREAM = 3

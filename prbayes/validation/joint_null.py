@@ -14,7 +14,7 @@ from prbayes._predict import data_digest, serving, specimen_names
 from prbayes.estimate.data_sets import groups, sets_at, simulated_points, specimens
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refit import Neighbourhood, inapplicable
-from prbayes.model.simulator import Node
+from prbayes.model.node import Node
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.validation.conditions import Case, Condition

@@ -18,7 +18,7 @@ from prbayes.estimate.refit import Neighbourhood
 from prbayes.estimate.search import Search
 from prbayes.metrics.density import GaussianKDE
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import nodes
+from prbayes.model.node import nodes
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N, MEAN, SD = OBSERVED.size, float(OBSERVED.mean()), float(OBSERVED.std())

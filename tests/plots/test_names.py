@@ -3,13 +3,8 @@
 import numpy as np
 import pytest
 
-from prbayes.plots._names import (
-    element_name,
-    named,
-    point_elements,
-    split_elements,
-    variable_of,
-)
+from prbayes.model.elements import element_name, split_elements
+from prbayes.plots._names import named, point_elements, variable_of
 
 
 @pytest.mark.parametrize(("index", "expected"), [((), "mu"), ((1,), "mu[1]"), ((0, 2), "mu[0,2]")])

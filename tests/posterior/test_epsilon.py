@@ -14,7 +14,7 @@ from prbayes._checks import Floats
 from prbayes.estimate.sandwich import Information
 from prbayes.metrics.density import Histogram
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import nodes
+from prbayes.model.node import nodes
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N = OBSERVED.size

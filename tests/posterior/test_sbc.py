@@ -17,7 +17,7 @@ import xarray as xr
 import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import nodes
+from prbayes.model.node import nodes
 from prbayes.posterior import sbc
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)

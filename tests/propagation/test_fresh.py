@@ -9,7 +9,7 @@ import pytensor.tensor as pt
 import pytest
 
 import prbayes as prb
-from prbayes.model.simulator import nodes
+from prbayes.model.node import nodes
 from prbayes.propagation.base import Bound
 
 

@@ -15,7 +15,7 @@ from scipy.stats import norm
 import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import nodes
+from prbayes.model.node import nodes
 from prbayes.model.support import shortcomings
 from prbayes.propagation.reweighted import Design
 

@@ -21,7 +21,7 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
-from prbayes.model.simulator import nodes
+from prbayes.model.node import nodes
 from prbayes.response.calling import (
     Calling,
     Capacity,

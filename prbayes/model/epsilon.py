@@ -1,0 +1,79 @@
+"""`Epsilon` by simulator, as `calibrate_epsilon` returns it, and `set_epsilon`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pymc as pm
+
+from prbayes._checks import positive_number
+from prbayes.model.identity import Identity, identity_of_model, require_same
+from prbayes.model.node import Node, required_nodes
+
+
+class Epsilon(dict[str, float]):
+    """Epsilon by the names of simulators, which knows the problem that it was calibrated for.
+
+    Attributes
+    ----------
+    identity : Identity or None
+    """
+
+    def __init__(self, values: Mapping[str, float], identity: Identity | None) -> None:
+        super().__init__(values)
+        self.identity = identity
+
+
+def checked_epsilon(
+    epsilon: Mapping[str, float], simulators: list[Node], model: pm.Model, caller: str
+) -> dict[str, float]:
+    """Return positive numbers by the names of simulators, or raise.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If a name is unknown, a value is not a positive number, or they were calibrated for another problem.
+    """
+    names = [node.name for node in simulators]
+    unknown = sorted(set(epsilon) - set(names))
+    if unknown:
+        raise KeyError(f"epsilon: got {unknown}, expected names of simulators: {sorted(names)}")
+    if isinstance(epsilon, Epsilon):
+        require_same(epsilon.identity, identity_of_model(model), caller)
+    return {name: positive_number(value, f"{name}: epsilon") for name, value in epsilon.items()}
+
+
+def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
+    """Set the epsilon of simulators by name.
+
+    Parameters
+    ----------
+    model : pymc.Model
+    epsilon : dict
+        Positive numbers by the names of simulators; others keep theirs.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If a name is unknown, a value is not a positive number, or `calibrate_epsilon` found them for another
+        problem; then nothing is changed.
+
+    Notes
+    -----
+    A clone of a model (`pymc.do`, `pymc.observe`, a copy) has epsilons of its own from the first time that this
+    package is given it; what was compiled before follows the original.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu"), 1.0)
+    ...     y = prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=[0.5, 1.0, 4.0])
+    >>> prb.set_epsilon(model, {"y": 0.1})
+    """
+    simulators = list(required_nodes(model).values())
+    values = checked_epsilon(epsilon, simulators, model, "set_epsilon")
+    for node in simulators:
+        if node.name in values:
+            node.epsilon.set_value(np.asarray(values[node.name]))

@@ -1,0 +1,252 @@
+"""`Hyperparameters`: the vector theta of a PyMC model, its names, transforms and prior draws.
+
+Theta is the vector of the model's value variables, unconstrained through PyMC's transforms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytensor
+import pytensor.tensor as pt
+from pymc.pytensorf import join_nonshared_inputs
+from pytensor.graph.replace import graph_replace, vectorize_graph
+
+from prbayes._checks import Floats, real_array
+from prbayes.model.elements import element_names
+from prbayes.propagation.points import sobol
+from prbayes.response.compilation import PLAIN, ninf_for_invalid
+from prbayes.response.distributions import PriorPoints, PriorSampler
+from prbayes.response.inputs import event_shape
+
+# The prior's spread only sets the units of parameters: a tenth more or less changes no answer.
+_PRIOR_DRAWS = 256
+# Levels of a normal distribution one standard deviation above and below its mean.
+_ONE_SD = (0.84, 0.16)
+
+
+class Hyperparameters:
+    """The free variables of a model as vectors theta of numbers, and their prior.
+
+    Parameters
+    ----------
+    model : pymc.Model
+
+    Attributes
+    ----------
+    shapes : dict
+        Shapes of the value variables, in the order of theta.
+    initial : ndarray, shape (d,)
+        PyMC's initial point.
+    size : int
+        Number of elements of theta, d.
+
+    Raises
+    ------
+    TypeError
+        If one is discrete.
+    """
+
+    def __init__(self, model: pm.Model) -> None:
+        self.model = model
+        discrete = [v.name for v in model.value_vars if not v.dtype.startswith("float")]
+        if discrete:
+            raise TypeError(
+                f"model: got discrete hyperparameters {discrete}, expected continuous ones; "
+                "use pm.sample, or fix them"
+            )
+        self._point = model.initial_point(random_seed=0)
+        values = [self._point[v.name] for v in model.value_vars]
+        names = [str(v.name) for v in model.value_vars]
+        shapes = [np.shape(value) for value in values]
+        raveled = [np.ravel(value) for value in values]
+        self.shapes = dict(zip(names, shapes, strict=True))
+        self.initial = np.concatenate(raveled)
+        self.size = self.initial.size
+        self._drawn: dict[tuple[int, int], Floats] = {}
+
+    # Names.
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the elements of theta, such as 'sigma_log__' or 'mu[1]'."""
+        return self._elements(list(self.shapes))
+
+    @property
+    def readable_names(self) -> list[str]:
+        """The same with the variables' own names, such as 'sigma'; they are transformed nevertheless."""
+        rvs = [self.model.values_to_rvs[v] for v in self.model.value_vars]
+        return self._elements([str(rv.name) for rv in rvs])
+
+    def _elements(self, names: list[str]) -> list[str]:
+        found: list[str] = []
+        for name, shape in zip(names, self.shapes.values(), strict=True):
+            found += element_names(name, shape)
+        return found
+
+    # Functions of theta.
+
+    def joined(self, graphs: Sequence[Any]) -> tuple[list[Any], Any]:
+        """Return graphs of the value variables as graphs of one vector theta, and that vector."""
+        outputs, theta = join_nonshared_inputs(self._point, list(graphs), self.model.value_vars)
+        return list(outputs), theta
+
+    def compile(self, graphs: Sequence[Any]) -> Any:
+        """Compile graphs of the value variables into a function of thetas, shape (P, d).
+
+        Where a parameter of a distribution is invalid, the result is -inf for that theta alone.
+        """
+        outputs, theta = self.joined(graphs)
+        batch = pt.dmatrix("thetas")
+        batched = vectorize_graph(ninf_for_invalid(outputs), {theta: batch})
+        return pytensor.function([batch], batched, mode=PLAIN, on_unused_input="ignore")
+
+    @cached_property
+    def _log_prior(self) -> Any:
+        return self.compile([self.model.varlogp])
+
+    def log_prior(self, thetas: Floats) -> Floats:
+        """Return the log prior density with the Jacobian of the transforms, shape (P,)."""
+        (found,) = self._log_prior(np.ascontiguousarray(thetas))
+        return np.array(np.broadcast_to(found, len(thetas)))
+
+    def in_support(self, thetas: Floats) -> Any:
+        """Return which thetas have a finite log prior, shape (P,)."""
+        return np.isfinite(self.log_prior(thetas))
+
+    @cached_property
+    def _constrain(self) -> Any:
+        return self.compile(self.model.replace_rvs_by_values(self.model.unobserved_RVs))
+
+    def constrained(self, thetas: Floats) -> dict[str, Floats]:
+        """Return variables and deterministics, shapes (P, *shape), in the user's own units."""
+        size = len(thetas)
+        values = self._constrain(np.ascontiguousarray(thetas))
+        found = {}
+        for variable, value in zip(self.model.unobserved_RVs, values, strict=True):
+            # What does not depend on theta comes without the leading axis, or with one of length one.
+            shape = (size, *np.shape(value)[1:])
+            found[variable.name] = np.array(np.broadcast_to(value, shape))
+        return found
+
+    def unconstrained(self, point: Mapping[str, Any]) -> Floats:
+        """Return theta, shape (d,), of a point given in the user's own units.
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError
+            If the names are not the model's free variables, or a value is outside its support.
+        """
+        free = {rv.name: rv for rv in self.model.free_RVs}
+        if set(point) != set(free):
+            raise KeyError(
+                f"start: got {sorted(point)}, expected a value for each of {sorted(free)}"
+            )
+        draws = []
+        for name, rv in free.items():
+            value = real_array(point[name], f"start: {name}")
+            shape = tuple(map(int, rv.shape.eval()))
+            if value.shape not in ((), shape):
+                raise ValueError(f"start: {name}: got shape {value.shape}, expected {shape}")
+            draws.append(np.broadcast_to(value, shape)[None])
+        thetas = self.thetas_of(draws)
+        finite = np.isfinite(thetas).all()
+        if not (finite and self.in_support(thetas).all()):
+            raise ValueError(
+                f"start: got {dict(point)}, expected values inside the support of the priors"
+            )
+        theta: Floats = thetas[0]
+        return theta
+
+    @cached_property
+    def _transform(self) -> Any:
+        free = self.model.free_RVs
+        symbols = [rv.type() for rv in free]
+        columns = []
+        for value_variable in self.model.value_vars:
+            rv = self.model.values_to_rvs[value_variable]
+            transform = self.model.rvs_to_transforms[rv]
+            value = rv
+            if transform is not None:
+                value = transform.forward(rv, *rv.owner.inputs)
+            columns.append(pt.atleast_1d(value).ravel())
+        swap = dict(zip(free, symbols, strict=True))
+        theta = graph_replace(pt.concatenate(columns), swap, strict=False)
+        batched = [pt.tensor(dtype=s.dtype, shape=(None, *s.type.shape)) for s in symbols]
+        thetas = vectorize_graph(theta, dict(zip(symbols, batched, strict=True)))
+        return pytensor.function(
+            batched, thetas, mode=PLAIN, on_unused_input="ignore", allow_input_downcast=True
+        )
+
+    def thetas_of(self, draws: Sequence[Floats]) -> Floats:
+        """Return thetas, shape (P, d), of values of the free variables, (P, *shape), in their order."""
+        return np.asarray(self._transform(*draws))
+
+    # The prior.
+
+    @cached_property
+    def _sampler(self) -> PriorSampler:
+        return PriorSampler(self.model.free_RVs)
+
+    def prior_thetas(self, size: int, seed: int) -> Floats:
+        """Draw thetas from the prior, shape (size, d)."""
+        asked = (size, seed)
+        if asked not in self._drawn:
+            draws = self._sampler(size, seed)
+            self._drawn[asked] = self.thetas_of(draws)
+        return self._drawn[asked].copy()
+
+    @cached_property
+    def prior_sd(self) -> Floats:
+        """The prior's standard deviation of each element, robust, shape (d,): the unit of parameters."""
+        thetas = self.prior_thetas(_PRIOR_DRAWS, seed=0)
+        upper, lower = np.quantile(thetas, _ONE_SD, axis=0)
+        spread = (upper - lower) / 2
+        known = (spread > 0) & np.isfinite(spread)
+        return np.where(known, spread, 1.0)
+
+    @cached_property
+    def _points(self) -> PriorPoints | None:
+        free = self.model.free_RVs
+        try:
+            return PriorPoints(free)
+        except TypeError:  # a prior without inverse distribution function
+            return None
+
+    def prior_points(self, size: int, seed: int) -> Floats:
+        """Return thetas spread evenly over the prior, shape (size, d).
+
+        Sobol points through the inverse distribution functions, or draws where there are none.
+        """
+        if self._points is None:
+            return self.prior_thetas(size, seed)
+        cube = sobol(size, self._points.size, seed)
+        return self._placed(cube)
+
+    def _placed(self, cube: Floats) -> Floats:
+        """Return thetas at points of the unit cube, shape (P, size)."""
+        assert self._points is not None
+        thetas = self.thetas_of(self._points(cube))
+        return np.where(np.isfinite(thetas), thetas, self.initial)
+
+    def fixed_points(self, size: int) -> Floats:
+        """Return thetas, shape (size, d), that are the same for clones, which may order variables in other ways."""
+        if self._points is None:
+            offsets = sobol(size, self.size, seed=0) - 0.5
+            return self.initial + _by_name(offsets, self.names)
+        names: list[str] = []
+        for rv in self.model.free_RVs:
+            names += element_names(rv.name, event_shape(rv))
+        cube = sobol(size, self._points.size, seed=0)
+        return self._placed(_by_name(cube, names))
+
+
+def _by_name(columns: Floats, names: Sequence[str]) -> Floats:
+    """Return columns such that the first is that of the first name in the alphabet, and so on."""
+    own = np.empty_like(columns)
+    own[:, np.argsort(names)] = columns
+    return own

@@ -1,0 +1,400 @@
+"""`Identity`: what a result belongs to. One record of a problem, and one function that compares two of them.
+
+A result carries the identity of the problem that it was made from: an optimum, a posterior, a checkpoint on disk.
+Where it meets a model again, `require_same` refuses what is not the same problem. How much has to be the same
+depends on the question, see `Level`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+import pymc as pm
+from pymc.printing import str_for_dist
+
+from prbayes._checks import Floats
+from prbayes.model.description import describe, without_addresses
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.node import Node, nodes
+
+# Points of the prior at which densities and discrepancies are kept: a change that leaves the values at all of
+# them as they are is none that matters. A power of two, as Sobol points are balanced then.
+_POINTS = 4
+# Responses kept of each simulator. Stored ones are appended to, so that the first stay the first.
+_RESPONSES = 8
+# Relative difference of numbers that another machine, or another version of NumPy, may make.
+_ROUNDING = 1e-6
+# Characters that an attribute of an HDF5 file can hold, less what goes with it.
+_LONGEST = 60_000
+
+
+class Level(IntEnum):
+    """How much of two problems has to be the same; each level asks for what those before it ask for.
+
+    POPULATIONS
+        Hyperparameters, data, inputs and responses, so that a population of one is a population of the other.
+    OPTIMUM
+        And priors, other likelihood terms, metrics and propagations: what is minimised. A design that has
+        grown since is the same problem.
+    POSTERIOR
+        And epsilon.
+    RUN
+        And the design: all that a sampler's draws depend on, but for its own settings.
+    """
+
+    POPULATIONS = 1
+    OPTIMUM = 2
+    POSTERIOR = 3
+    RUN = 4
+
+
+# What to do about a difference.
+_REMEDIES = {
+    Level.POPULATIONS: "pass the model that the result was made from, or make the result anew",
+    Level.OPTIMUM: "call prb.minimize on this model, and use that optimum",
+    Level.POSTERIOR: "sample this model anew",
+    Level.RUN: "start a new run",
+}
+
+
+@dataclass(frozen=True)
+class SimulatorIdentity:
+    """What identifies one simulator.
+
+    Attributes
+    ----------
+    name : str
+    data, weights, specimens : str
+        Digests of the observed values, their weights and the specimens' labels, in the order of the values.
+    inputs : str
+        The response's arguments, as PyMC prints them.
+    metric, propagation : str
+        Their representations.
+    n_points, batches : int
+        The design's size, and how often points were added.
+    epsilon : float
+        NaN while it is not set.
+    responses : tuple of float
+        The first responses that are known anyway.
+    discrepancies : tuple of float
+        At the fixed thetas; empty where that would cost responses.
+    """
+
+    name: str
+    data: str
+    weights: str
+    specimens: str
+    inputs: str
+    metric: str
+    propagation: str
+    n_points: int
+    batches: int
+    epsilon: float
+    responses: tuple[float, ...]
+    discrepancies: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What identifies a problem.
+
+    Attributes
+    ----------
+    shapes : dict
+        Shapes of the value variables by name, such as 'sigma_log__'.
+    priors : dict
+        Distributions of the free variables by name, as PyMC prints them.
+    terms : tuple of str
+        Other observed variables with their distributions, and names of potentials.
+    simulators : tuple of SimulatorIdentity
+    prior_minimised : bool or None
+        Whether minus the log prior was part of the objective; None for what was not minimised.
+    thetas : tuple of tuple of float
+        Fixed points of the prior, elements in the order of the alphabet; empty if no numbers were asked for.
+    log_prior, log_other : tuple of float
+        Logarithms of the prior density, and of other likelihood terms, at these points.
+    """
+
+    shapes: dict[str, tuple[int, ...]]
+    priors: dict[str, str]
+    terms: tuple[str, ...]
+    simulators: tuple[SimulatorIdentity, ...]
+    prior_minimised: bool | None = None
+    thetas: tuple[tuple[float, ...], ...] = ()
+    log_prior: tuple[float, ...] = ()
+    log_other: tuple[float, ...] = ()
+
+
+def identity_of(evaluator: Evaluator, *, prior_minimised: bool | None = None) -> Identity:
+    """Return the identity of an evaluator's problem, with numbers; no response is computed for them."""
+    thetas = evaluator.hyperparameters.fixed_points(_POINTS)
+    by_name = np.argsort(evaluator.names)
+    simulators = []
+    for k, node in enumerate(evaluator.nodes):
+        free = node.bound.stored
+        discrepancies = evaluator.discrepancies(thetas, k) if free else np.empty(0)
+        simulators.append(_simulator(node, discrepancies))
+    return _identity(
+        evaluator.model,
+        simulators,
+        shapes=evaluator.shapes,
+        prior_minimised=prior_minimised,
+        thetas=tuple(map(_numbers, thetas[:, by_name])),
+        log_prior=_numbers(evaluator.hyperparameters.log_prior(thetas)),
+        log_other=_numbers(evaluator.log_other(thetas)),
+    )
+
+
+def identity_of_model(model: pm.Model) -> Identity:
+    """Return the identity of a model without what has to be compiled: densities and discrepancies."""
+    simulators = [_simulator(node, np.empty(0)) for node in nodes(model).values()]
+    shapes = {}
+    for rv in model.free_RVs:
+        value = model.rvs_to_values[rv]
+        shapes[str(value.name)] = value.type.shape
+    if any(None in shape for shape in shapes.values()):
+        point = model.initial_point(random_seed=0)
+        shapes = {name: np.shape(point[name]) for name in shapes}
+    return _identity(model, simulators, shapes=shapes)
+
+
+def _identity(model: pm.Model, simulators: Sequence[SimulatorIdentity], **others: Any) -> Identity:
+    priors, terms = {}, []
+    for variable in describe(model)["variables"]:
+        if variable["role"] == "hyperparameter":
+            priors[variable["name"]] = variable["distribution"]
+        if variable["role"] == "observed":
+            terms.append(f"{variable['name']} ~ {variable['distribution']}")
+    terms += [str(potential.name) for potential in model.potentials]
+    # Clones may order variables in other ways.
+    ordered = sorted(simulators, key=lambda simulator: simulator.name)
+    return Identity(priors=priors, terms=tuple(sorted(terms)), simulators=tuple(ordered), **others)
+
+
+def _simulator(node: Node, discrepancies: Floats) -> SimulatorIdentity:
+    observed, weights = node.target.observed, node.target.weights
+    order = np.lexsort((weights, observed))
+    labels = []
+    if node.specimens is not None:
+        labels = node.specimens[order].tolist()
+    return SimulatorIdentity(
+        name=node.name,
+        data=_digest(observed[order].tobytes()),
+        weights=_digest(weights[order].tobytes()),
+        specimens=_digest(repr(labels).encode()),
+        inputs=_inputs(node),
+        metric=without_addresses(node.metric),
+        propagation=without_addresses(node.propagation),
+        n_points=node.bound.n_points,
+        batches=1 if node.design is None else node.design.n_batches,
+        epsilon=node.epsilon_value,
+        responses=_numbers(node.bound.known_responses[:_RESPONSES]),
+        discrepancies=_numbers(discrepancies),
+    )
+
+
+def _inputs(node: Node) -> str:
+    """Return the arguments of a response, the same for all clones of a model."""
+    inputs = node.bound.inputs
+    roots = set(inputs.roots)
+    texts = []
+    for argument in inputs.arguments:
+        if isinstance(argument, int):
+            texts.append(str_for_dist(inputs.aleatory[argument], named_vars=roots))
+        elif argument in inputs.epistemic:
+            texts.append(str(argument.name or "an expression"))
+        else:
+            values = np.asarray(argument, dtype=np.float64)
+            texts.append(f"{values}" if values.ndim == 0 else _digest(values.tobytes()))
+    return ", ".join(texts)
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def _numbers(values: Floats) -> tuple[float, ...]:
+    return tuple(map(float, values))
+
+
+# Text, for files.
+
+
+def as_text(identity: Identity) -> str:
+    """Return an identity as JSON."""
+    return json.dumps(asdict(identity))
+
+
+def from_text(text: str) -> Identity:
+    """Return an identity from JSON.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If it is none.
+    """
+    found = json.loads(text)
+    simulators = []
+    for fields in found.pop("simulators"):
+        for key in ("responses", "discrepancies"):
+            fields[key] = tuple(fields[key])
+        simulators.append(SimulatorIdentity(**fields))
+    shapes = {name: tuple(shape) for name, shape in found.pop("shapes").items()}
+    thetas = tuple(tuple(theta) for theta in found.pop("thetas"))
+    for key in ("terms", "log_prior", "log_other"):
+        found[key] = tuple(found[key])
+    return Identity(shapes=shapes, simulators=tuple(simulators), thetas=thetas, **found)
+
+
+def as_attributes(identity: Identity) -> dict[str, str]:
+    """Return an identity as an attribute of a file; none where it is too long for one."""
+    text = as_text(identity)
+    return {"identity": text} if len(text) <= _LONGEST else {}
+
+
+def from_attributes(attributes: Mapping[Any, Any]) -> Identity | None:
+    """Return the identity that a file has, or None: that of a result of other tools is not known."""
+    try:
+        return from_text(attributes["identity"])
+    except (AttributeError, KeyError, TypeError, ValueError):
+        return None
+
+
+# Comparison.
+
+
+def require_same(
+    got: Identity | None, expected: Identity | None, caller: str, level: Level = Level.OPTIMUM
+) -> None:
+    """Raise unless a result is one of the problem at hand, as far as is known.
+
+    Parameters
+    ----------
+    got : Identity or None
+        Of the result; nothing is asked of one that is not known.
+    expected : Identity or None
+        Of the problem.
+    caller : str
+        For the message.
+    level : Level
+        How much has to be the same.
+
+    Raises
+    ------
+    ValueError
+        With all that differs.
+    """
+    if got is None or expected is None:
+        return
+    found = differences(got, expected, level)
+    if found:
+        raise ValueError(
+            f"{caller}: got a result of another problem: {'; '.join(found)}; {_REMEDIES[level]}"
+        )
+
+
+def differences(got: Identity, expected: Identity, level: Level) -> list[str]:
+    """Return in what two problems differ, as far as a level asks for it, in words; numbers up to rounding."""
+    if got.shapes != expected.shapes:
+        return [_told("hyperparameters", _shown(got.shapes), _shown(expected.shapes))]
+    names = [[s.name for s in one.simulators] for one in (got, expected)]
+    if names[0] != names[1]:
+        return [_told("simulators", *names)]
+    found: list[str] = []
+    pairs = list(zip(got.simulators, expected.simulators, strict=True))
+    priors = _prior_differences(got, expected)
+    for a, b in pairs:
+        # Design points are drawn through the priors: with others, other responses are known.
+        comparable = not priors and a.propagation == b.propagation
+        found += _population_differences(a, b, comparable=comparable)
+    if level >= Level.OPTIMUM:
+        found += priors
+        for a, b in pairs:
+            found += _discrepancy_differences(a, b)
+    if level >= Level.POSTERIOR:
+        for a, b in pairs:
+            if not _close([a.epsilon], [b.epsilon]):
+                found.append(_told(f"epsilon of {a.name}", a.epsilon, b.epsilon))
+    if level >= Level.RUN:
+        for a, b in pairs:
+            if not _same_design(a, b):
+                found.append(_told(f"number of responses of {a.name}", a.n_points, b.n_points))
+    return found
+
+
+def _same_design(a: SimulatorIdentity, b: SimulatorIdentity) -> bool:
+    return a.n_points == b.n_points and a.batches == b.batches
+
+
+def _population_differences(
+    a: SimulatorIdentity, b: SimulatorIdentity, *, comparable: bool
+) -> list[str]:
+    found = [
+        f"other {what} of {a.name}"
+        for what, one, other in (
+            ("observed values", a.data, b.data),
+            ("weights of observed values", a.weights, b.weights),
+            ("labels of specimens", a.specimens, b.specimens),
+        )
+        if one != other
+    ]
+    if a.inputs != b.inputs:
+        found.append(_told(f"inputs of {a.name}", a.inputs, b.inputs))
+    elif comparable and not _close(a.responses, b.responses):
+        found.append(f"the response of {a.name} has other values at the same points")
+    return found
+
+
+def _prior_differences(got: Identity, expected: Identity) -> list[str]:
+    found = [
+        _told(f"prior of {name}", got.priors[name], expected.priors[name])
+        for name in got.priors
+        if got.priors[name] != expected.priors.get(name)
+    ]
+    if got.terms != expected.terms:
+        found.append(_told("other likelihood terms", got.terms or "none", expected.terms or "none"))
+    if found or not got.thetas or not expected.thetas:
+        return found
+    if not _close(got.thetas, expected.thetas) or not _close(got.log_prior, expected.log_prior):
+        found.append("the priors have other densities")
+    elif not _close(got.log_other, expected.log_other):
+        found.append("other likelihood terms, or potentials, have other values")
+    return found
+
+
+def _discrepancy_differences(a: SimulatorIdentity, b: SimulatorIdentity) -> list[str]:
+    found = []
+    for what in ("metric", "propagation"):
+        one, other = getattr(a, what), getattr(b, what)
+        if one != other:
+            found.append(_told(f"{what} of {a.name}", one, other))
+    known = bool(a.discrepancies and b.discrepancies)
+    if found or not known or not _same_design(a, b):
+        return found
+    if not _close(a.discrepancies, b.discrepancies):
+        found.append(f"the discrepancy of {a.name} has other values at the same hyperparameters")
+    return found
+
+
+def _told(what: str, got: object, expected: object) -> str:
+    return f"{what}: got {got}, expected {expected}"
+
+
+def _shown(shapes: Mapping[str, tuple[int, ...]]) -> str:
+    return ", ".join(f"{name} {shape}" if shape else name for name, shape in shapes.items())
+
+
+def _close(got: Any, expected: Any) -> bool:
+    """Return whether numbers are the same up to rounding, relative to the largest of them."""
+    a, b = np.asarray(got, dtype=np.float64), np.asarray(expected, dtype=np.float64)
+    if a.shape != b.shape:
+        return False
+    finite = a[np.isfinite(a)]
+    size = np.abs(finite).max(initial=0.0)
+    return bool(np.allclose(a, b, rtol=0.0, atol=_ROUNDING * size, equal_nan=True))

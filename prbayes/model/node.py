@@ -1,0 +1,256 @@
+"""What a simulator is inside a PyMC model: a `Node`, carried by the operation of an observed variable.
+
+The operation is an instance of one class, `SimulatorRV`, whose log-density is registered once: a model that is
+pickled, cloned, conditioned or sent to another process needs nothing else than this module.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytensor
+import pytensor.tensor as pt
+from numpy.typing import NDArray
+from pymc.logprob.abstract import _logprob
+from pymc.logprob.utils import CheckParameterValue
+from pytensor.graph.basic import Apply
+from pytensor.tensor.random.op import RandomVariable
+from pytensor.tensor.variable import TensorVariable
+
+from prbayes._checks import Floats
+from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.propagation.base import Bound, Propagation
+from prbayes.propagation.reweighted import Design, design_of
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """One simulator of a model.
+
+    Attributes
+    ----------
+    name : str
+    target : Discrepancy
+        The metric, prepared against the observed responses.
+    bound : Bound
+        The propagation at work.
+    propagation : Propagation
+        Its configuration.
+    epsilon : shared variable
+        Scalar; NaN while it is not set.
+    specimens : ndarray, shape (N,), or None
+        Labels of the specimens that the observed responses were measured on.
+    """
+
+    name: str
+    target: Discrepancy
+    bound: Bound
+    propagation: Propagation
+    epsilon: Any
+    specimens: NDArray[Any] | None
+
+    @property
+    def metric(self) -> Metric:
+        """The calibration metric."""
+        return self.target.metric
+
+    @property
+    def design(self) -> Design | None:
+        """The stored responses, None where the propagation stores none."""
+        return design_of(self.bound)
+
+    @property
+    def epsilon_value(self) -> float:
+        """The value of epsilon, NaN while it is not set."""
+        return float(self.epsilon.get_value())
+
+    @property
+    def epsilon_is_default(self) -> bool:
+        """Whether epsilon is the 1/N of a metric on the scale of a likelihood, which nobody gave."""
+        return self.metric.likelihood and self.epsilon_value == 1 / self.target.n_effective
+
+    def copied(self) -> Node:
+        """Return the same simulator with a design, a count of responses and an epsilon of its own."""
+        epsilon = shared_epsilon(self.name, self.epsilon_value)
+        return replace(self, bound=self.bound.copied(), epsilon=epsilon)
+
+
+def shared_epsilon(name: str, value: float) -> Any:
+    """Return the shared scalar that holds a simulator's epsilon."""
+    return pytensor.shared(np.asarray(value, dtype=np.float64), name=f"{name}_epsilon")
+
+
+def log_kernel(discrepancy: Any, epsilon: Any) -> Any:
+    """Return the log-density of an observed node; the only place where the sign of a discrepancy changes."""
+    return -discrepancy / epsilon
+
+
+class SimulatorRV(RandomVariable):
+    """The operation of an observed variable: draws data sets, and carries its `Node`.
+
+    Two of them are equal if they carry the same node, so that no rewrite of a graph takes one simulator for another.
+
+    Attributes
+    ----------
+    node : Node
+    """
+
+    __props__ = ("name", "signature", "dtype", "inplace", "node")
+    _print_name = ("prbayes_Simulator", "\\operatorname{prbayes\\_Simulator}")
+
+    def __init__(
+        self,
+        name: str = "prbayes_Simulator",
+        signature: str | None = None,
+        dtype: str = "floatX",
+        inplace: bool = False,
+        *,
+        node: Node,
+    ) -> None:
+        super().__init__(name=name, signature=signature, dtype=dtype, inplace=inplace)
+        self.node = node
+        self._owner: weakref.ref[Any] | None = None
+
+    def __str__(self) -> str:
+        """Show the name and the signature, without what the node holds."""
+        return f'{self.name}_rv{{"{self.signature}"}}'
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the owner: a copy that is unpickled belongs to a model of its own."""
+        return {**self.__dict__, "_owner": None}
+
+    def own_node(self, apply: Apply[Any, Any]) -> Node:
+        """Return the node that belongs to an application of this operation in a model.
+
+        Clones of a model share the operation with the original. Each is then given one of its own, whose design,
+        count and epsilon are copies: what is refined or set there leaves the original alone.
+        """
+        if self._owner is None:
+            self._owner = weakref.ref(apply)
+        if self._owner() is apply:
+            return self.node
+        properties = {**self._props_dict(), "node": self.node.copied()}
+        own = SimulatorRV(**properties)
+        apply.op = own
+        return own.own_node(apply)
+
+    def rng_fn(self, rng: np.random.Generator, *arguments: Any) -> Floats:
+        """Draw responses of different specimens, of the shape that comes last among the arguments."""
+        *params, size = arguments
+        bound = self.node.bound
+        batches = []
+        for root, param in zip(bound.inputs.roots, params, strict=True):
+            leading = param.ndim - root.type.ndim
+            batches.append(param.shape[:leading])
+        batch = np.broadcast_shapes(*batches)
+        values = np.empty(batch if size is None else size)
+        # One population for each element of a batch of parameters: commonly there is one.
+        for index in np.ndindex(batch):
+            pairs = zip(params, batches, strict=True)
+            at = [param[_own_index(index, own)] for param, own in pairs]
+            places = _places(index, batch)
+            there = values[places]
+            drawn = bound.draw(rng, there.size, at)
+            values[places] = drawn.reshape(there.shape)
+        return values
+
+
+def _own_index(index: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return where an array of this leading shape is read for an index of the shape it broadcasts to."""
+    last = index[len(index) - len(shape) :]
+    pairs = zip(last, shape, strict=True)
+    return tuple(0 if n == 1 else i for i, n in pairs)
+
+
+def _places(index: tuple[int, ...], batch: tuple[int, ...]) -> tuple[int | slice, ...]:
+    """Return where the values for an index of a batch stand: all along its axes of length one."""
+    pairs = zip(index, batch, strict=True)
+    return tuple(slice(None) if n == 1 else i for i, n in pairs)
+
+
+@_logprob.register(SimulatorRV)  # type: ignore[untyped-decorator]
+def _log_density(
+    op: SimulatorRV, values: Any, rng: Any, size: Any, *params: Any, **kwargs: Any
+) -> TensorVariable:
+    """Return the log-density of the observed data: a graph of the roots and of epsilon."""
+    node = op.node
+    check = CheckParameterValue(
+        f"{node.name}: epsilon is not set; call prb.set_epsilon(model, "
+        "prb.calibrate_epsilon(prb.minimize(model))), pass epsilon= to prb.Simulator, or use prb.sample_smc, "
+        "which calibrates it"
+    )
+    epsilon = check(node.epsilon, pt.gt(node.epsilon, 0.0))
+    inputs = node.bound.inputs
+    return log_kernel(node.bound.discrepancy(inputs.core(params)), epsilon)
+
+
+class SimulatorDistribution(pm.Distribution):
+    """The distribution of an observed variable, as PyMC makes variables from."""
+
+    rv_type = SimulatorRV
+
+    @classmethod
+    def rv_op(cls, *params: Any, node: Node, size: Any = None, rng: Any = None) -> TensorVariable:
+        """Return a random variable that carries a node."""
+        op = SimulatorRV(signature=_signature([p.type.ndim for p in params]), node=node)
+        generator = pt.random.shared_rng(seed=None) if rng is None else rng
+        _, rv = op(*params, size=size, rng=generator, return_next_rng=True)
+        return rv
+
+    @classmethod
+    def dist(cls, *params: Any, **kwargs: Any) -> TensorVariable:
+        """Return a random variable outside a model."""
+        return super().dist(params, **kwargs)
+
+    @staticmethod
+    def support_point(rv: TensorVariable, size: Any, *params: Any) -> TensorVariable:
+        """Return where a sampler would start, were the variable not observed."""
+        return pt.zeros_like(rv)
+
+
+def _signature(ndims: Sequence[int]) -> str:
+    """Return the signature of a random variable of scalar support, such as '(),(i10,i11)->()'."""
+    groups = []
+    for k, ndim in enumerate(ndims):
+        axes = ",".join(f"i{k}{axis}" for axis in range(ndim))
+        groups.append(f"({axes})")
+    return ",".join(groups) + "->()"
+
+
+def nodes(model: pm.Model) -> dict[Any, Node]:
+    """Return the simulators of a model, keyed by their observed variables, in the model's order.
+
+    In a clone they are copies, made when they are first asked for, which its compiled functions follow from then on.
+    """
+    found = {}
+    for rv in model.observed_RVs:
+        if isinstance(rv.owner.op, SimulatorRV):
+            found[rv] = rv.owner.op.own_node(rv.owner)
+    return found
+
+
+def required_nodes(model: pm.Model) -> dict[Any, Node]:
+    """Return the simulators of a model, or raise if it has none."""
+    found = nodes(model)
+    if not found:
+        raise ValueError(
+            "model: got one without a prb.Simulator, expected at least one; add "
+            "prb.Simulator(name, response, *inputs, metric=..., observed=...) inside the `with pm.Model()`"
+        )
+    return found
+
+
+def model_on_context(model: pm.Model | None, caller: str) -> pm.Model:
+    """Return the model given, or the one on the context, or raise."""
+    found = pm.Model.get_context(error_if_none=False) if model is None else model
+    if not isinstance(found, pm.Model):
+        got = "no model on the context" if found is None else type(found).__name__
+        raise TypeError(
+            f"{caller}: got {got}, expected a pm.Model; call it inside `with pm.Model():` or pass model="
+        )
+    return found

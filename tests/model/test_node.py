@@ -1,0 +1,276 @@
+"""Simulators in clones, copies and unpickled models: the same problem, and nothing shared that one may change."""
+
+from __future__ import annotations
+
+import copy
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+import numpy as np
+import pymc as pm
+import pytensor
+import pytest
+from pymc.model.fgraph import clone_model
+from pymc.model.transform.optimization import freeze_dims_and_data
+from pytensor.graph.replace import vectorize_graph
+
+import prbayes as prb
+from prbayes._checks import Floats
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.node import Node, SimulatorRV, nodes
+from prbayes.propagation.base import Propagation
+from prbayes.response.compilation import PLAIN
+
+OBSERVED = np.random.default_rng(1).normal(1.5, 0.6, 20)
+AT = {"mu": 1.2, "sigma_log__": np.log(0.7)}
+THETA = np.array([list(AT.values())])
+QUIET = {"progressbar": False}
+PROPAGATIONS: dict[str, Propagation] = {
+    "Reweighted": prb.Reweighted(64),
+    "Resimulated": prb.Resimulated(64),
+    "Fresh": prb.Fresh(20_000),
+}
+
+
+def build(propagation: Propagation, epsilon: float | None = 0.1) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
+        prb.Simulator(
+            "y",
+            np.positive,
+            x,
+            metric=prb.AreaMetric(),
+            observed=OBSERVED,
+            epsilon=epsilon,
+            propagation=propagation,
+        )
+    return model
+
+
+def node_of(model: pm.Model) -> Node:
+    (node,) = nodes(model).values()
+    return node
+
+
+def log_density(model: pm.Model) -> Callable[[dict[str, Any]], float]:
+    compiled = model.compile_logp(vars=[model["y"]], mode=PLAIN)
+    return lambda at: float(compiled(at))
+
+
+def by_cloudpickle(model: pm.Model) -> pm.Model:
+    return cloudpickle.loads(cloudpickle.dumps(model))
+
+
+COPIES: dict[str, Callable[[pm.Model], pm.Model]] = {
+    "clone": clone_model,
+    "copy": copy.copy,
+    "deepcopy": copy.deepcopy,
+    "freeze": freeze_dims_and_data,
+    "cloudpickle": by_cloudpickle,
+    "clone of a clone": lambda model: clone_model(clone_model(model)),
+    "clone of an unpickled model": lambda model: clone_model(by_cloudpickle(model)),
+    "unpickled clone": lambda model: by_cloudpickle(clone_model(model)),
+}
+each_copy = pytest.mark.parametrize("way", COPIES)
+
+
+@pytest.mark.parametrize("name", PROPAGATIONS)
+def test_conditioned_models_have_the_same_discrepancy(name: str) -> None:
+    model = build(PROPAGATIONS[name])
+    mu, sigma = AT["mu"], float(np.exp(AT["sigma_log__"]))
+    conditioned = {
+        "do": (pm.do(model, {"mu": mu}), {"sigma_log__": AT["sigma_log__"]}),
+        "observe": (pm.observe(model, {"sigma": sigma}), {"mu": mu}),
+        "clone": (clone_model(model), AT),
+    }
+    expected = Evaluator(model)(THETA).discrepancies[0, 0]
+    tolerance = {"rtol": 0.1} if name == "Fresh" else {"rtol": 1e-9}
+    for clone, at in conditioned.values():
+        evaluator = Evaluator(clone)
+        assert sorted(evaluator.names) == sorted(at)
+        theta = np.array([[at[n] for n in evaluator.names]])
+        found = evaluator(theta).discrepancies[0, 0]
+        np.testing.assert_allclose(found, expected, **tolerance)
+        np.testing.assert_allclose(log_density(clone)(at), -expected / 0.1, **tolerance)
+
+
+@each_copy
+def test_a_copy_gives_the_same_optimum(way: str) -> None:
+    model = build(prb.Reweighted(64))
+    other = COPIES[way](model)
+    first, second = (prb.minimize(m, starts=0, **QUIET) for m in (model, other))
+    # PyMC's clones may order the variables, and so the starting points, in another way: up to the tolerance
+    for name in ("mu", "sigma"):
+        assert abs(first.point[name] - second.point[name]) < 0.01 * first.stderr[name]
+        assert first.stderr[name] == pytest.approx(second.stderr[name], rel=0.01)
+    assert first.n_responses == second.n_responses
+
+
+@each_copy
+def test_a_copy_shares_nothing_that_changes(way: str) -> None:
+    model = build(prb.Reweighted(64))
+    other = COPIES[way](model)
+    node_of(other)
+    mine, its = log_density(model), log_density(other)
+    before = mine(AT)
+    assert its(AT) == pytest.approx(before, rel=1e-12)
+    # Epsilon
+    prb.set_epsilon(other, {"y": 0.2})
+    assert its(AT) == pytest.approx(before / 2, rel=1e-12)
+    assert mine(AT) == before
+    prb.set_epsilon(model, {"y": 0.05})
+    assert its(AT) == pytest.approx(before / 2, rel=1e-12)
+    assert mine(AT) == pytest.approx(2 * before, rel=1e-12)
+    # The design, and its count of responses
+    design = node_of(other).design
+    assert design is not None
+    design.add([np.full(4, 1.2), np.full(4, 0.7)])
+    assert its(AT) != pytest.approx(before / 2, rel=1e-12)
+    assert mine(AT) == pytest.approx(2 * before, rel=1e-12)
+    assert (node_of(model).bound.n_points, node_of(other).bound.n_points) == (64, 128)
+    assert node_of(model).bound.responses.count == 64
+
+
+def test_minimize_on_a_conditioned_model_leaves_the_compiled_density_of_the_original_alone() -> (
+    None
+):
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 0, 30), pm.HalfNormal("sigma", 1)
+        x = pm.Normal.dist(mu, sigma)
+        prb.Simulator(
+            "y",
+            np.positive,
+            x,
+            metric=prb.AreaMetric(),
+            observed=OBSERVED,
+            epsilon=0.1,
+            propagation=prb.Reweighted(64),
+        )
+    compiled = log_density(model)
+    before = compiled(AT)
+    conditioned = pm.do(model, {"sigma": 0.7})
+    prb.minimize(conditioned, starts=0, **QUIET)
+    assert node_of(conditioned).bound.n_points > 64, "the design was refined"
+    assert compiled(AT) == before
+    assert node_of(model).bound.n_points == 64
+
+
+def test_the_owner_of_a_node_keeps_it() -> None:
+    model = build(prb.Reweighted(64))
+    node = node_of(model)
+    clone = clone_model(model)
+    assert node_of(model) is node
+    own = node_of(clone)
+    assert own is not node
+    assert node_of(clone) is own
+    assert model["y"].owner.op.node is node
+
+
+def test_counts_of_resimulated_responses_are_apart() -> None:
+    model = build(prb.Resimulated(64))
+    first = Evaluator(model)
+    first.populations(THETA, 0)
+    count = node_of(model).bound.responses.count
+    clone = clone_model(model)
+    Evaluator(clone).populations(THETA, 0)
+    Evaluator(clone)(THETA)
+    assert node_of(model).bound.responses.count == count
+    assert node_of(clone).bound.responses.count == count + 2 * 64
+
+
+# A process of its own.
+
+SCRIPT = """
+import logging, pickle, sys
+import numpy as np
+with open(sys.argv[1], "rb") as file:
+    model = pickle.load(file)
+import prbayes as prb, pymc as pm
+logging.getLogger("pymc").setLevel(logging.ERROR)
+print(repr(float(model.compile_logp(vars=[model["y"]])({"mu": 1.2, "sigma_log__": np.log(0.7)}))))
+optimum = prb.minimize(model, starts=0, progressbar=False)
+print(repr(optimum.point["mu"]))
+drawn = pm.sample_prior_predictive(3, model=model, random_seed=1).prior_predictive["y"]
+print(repr(float(drawn.sum())))
+prb.set_epsilon(model, {"y": 0.2})
+print(repr(float(model.compile_logp(vars=[model["y"]])({"mu": 1.2, "sigma_log__": np.log(0.7)}))))
+"""
+
+
+def test_a_model_unpickled_in_a_fresh_process_works_without_any_help(tmp_path: Path) -> None:
+    model = build(prb.Reweighted(64))
+    file = tmp_path / "model.pkl"
+    file.write_bytes(cloudpickle.dumps(model))
+    run = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", SCRIPT, str(file)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    density, mu, drawn, halved = map(float, run.stdout.split())
+    assert density == pytest.approx(log_density(model)(AT), rel=1e-9)
+    assert mu == pytest.approx(prb.minimize(model, starts=0, **QUIET).point["mu"], rel=1e-9)
+    mine = pm.sample_prior_predictive(3, model=model, random_seed=1).prior_predictive["y"]
+    assert drawn == pytest.approx(float(mine.sum()), rel=1e-9)
+    assert halved == pytest.approx(density / 2, rel=1e-9)
+
+
+def test_a_copy_in_the_same_process_takes_nothing_over() -> None:
+    model = build(prb.Reweighted(64))
+    before = log_density(model)(AT)
+    by_cloudpickle(model)
+    prb.set_epsilon(model, {"y": 0.2})
+    assert log_density(model)(AT) == pytest.approx(before / 2, rel=1e-12)
+
+
+# The operation.
+
+
+def test_operations_are_equal_if_they_carry_the_same_node() -> None:
+    first, second = build(prb.Reweighted(64)), build(prb.Reweighted(64))
+    one, other = first["y"].owner.op, second["y"].owner.op
+    assert one == clone_model(first)["y"].owner.op
+    assert one != other, "two simulators, however alike, are not to be merged in a graph"
+    assert str(one) == 'prbayes_Simulator_rv{"(),()->()"}'
+    assert isinstance(one, SimulatorRV)
+
+
+def test_two_simulators_with_the_same_inputs_draw_different_data() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
+        for name, factor in (("y", 1.0), ("z", -1.0)):
+            prb.Simulator(
+                name,
+                lambda x, c: c * x,
+                x,
+                factor,
+                metric=prb.AreaMetric(),
+                observed=factor * OBSERVED,
+                epsilon=0.1,
+                propagation=prb.Reweighted(64),
+            )
+    y, z = pm.draw([model["y"], model["z"]], random_seed=1)
+    assert y.mean() * z.mean() < 0
+    densities = [model.compile_logp(vars=[model[name]], mode=PLAIN)({"mu": 1.0}) for name in "yz"]
+    assert densities[0] == pytest.approx(densities[1], rel=1e-9)
+
+
+def test_a_batch_of_parameters_is_a_batch_of_populations() -> None:
+    model = build(prb.Reweighted(256))
+    y, mu = model["y"], model["mu"]
+    means = np.array([-0.5, 1.0, 2.5])
+    many = vectorize_graph(y, {mu: pytensor.tensor.as_tensor(means), model["sigma"]: 0.5 + 0 * mu})
+    drawn: Floats = pm.draw(many, random_seed=1)
+    assert drawn.shape == (3, OBSERVED.size)
+    # Twenty values of standard deviation .5 each: a standard error of .11
+    np.testing.assert_allclose(drawn.mean(axis=1), means, atol=0.5)
+
+
+def test_a_picture_of_the_model_names_the_simulator() -> None:
+    graph = pm.model_graph.ModelGraph(build(prb.Reweighted(64)))
+    assert graph.model["y"].owner.op._print_name[0] == "prbayes_Simulator"

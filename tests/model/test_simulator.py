@@ -1,0 +1,359 @@
+"""Propagations times samplers: every way of drawing or optimising gives the same answer from the same node."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+from scipy import stats
+
+import prbayes as prb
+from prbayes._checks import Floats
+from prbayes.metrics.base import Metric
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.node import Node, nodes
+from prbayes.propagation.base import Propagation
+from prbayes.response.compilation import PLAIN
+
+N, MU, SIGMA, EPSILON, POINTS = 30, 2.0, 0.8, 0.02, 128
+OBSERVED = np.random.default_rng(3).permutation(
+    0.75 * stats.norm(MU, SIGMA).ppf((np.arange(N) + 0.5) / N)
+)
+QUIET = {"progressbar": False}
+
+
+def line(x: Any) -> Any:
+    return 0.75 * x
+
+
+@dataclass
+class BlackBox:
+    """A response that PyTensor cannot look into; counts its scalar responses by itself."""
+
+    count: int = 0
+
+    def __call__(self, x: Any) -> Any:
+        values = np.asarray(x, dtype=np.float64)
+        self.count += values.size
+        return 0.75 * values
+
+
+def build(
+    propagation: Propagation,
+    response: Any = line,
+    *,
+    prior: tuple[float, float] = (2, 1),
+    metric: Metric | None = None,
+    **changes: Any,
+) -> tuple[pm.Model, Node]:
+    keywords = {
+        "metric": metric or prb.AreaMetric(),
+        "observed": OBSERVED,
+        "epsilon": EPSILON,
+    } | changes
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", *prior), pm.HalfNormal("sigma", 1)
+        prb.Simulator("y", response, pm.Normal.dist(mu, sigma), propagation=propagation, **keywords)
+    return model, next(iter(nodes(model).values()))
+
+
+RESPONSES = {
+    "Reweighted": BlackBox(),
+    "strong prior": line,
+    "Resimulated": line,
+    "black box": BlackBox(),
+    "Fresh": BlackBox(),
+}
+PROPAGATIONS: dict[str, Propagation] = {
+    "Reweighted": prb.Reweighted(POINTS),
+    "strong prior": prb.Reweighted(POINTS),
+    "Resimulated": prb.Resimulated(POINTS),
+    "black box": prb.Resimulated(POINTS),
+    "Fresh": prb.Fresh(POINTS),
+}
+
+
+@cache
+def model_of(name: str) -> tuple[pm.Model, Node]:
+    return build(
+        PROPAGATIONS[name], RESPONSES[name], prior=(1.8, 0.08) if name == "strong prior" else (2, 1)
+    )
+
+
+@cache
+def reference(name: str) -> dict[str, tuple[float, float]]:
+    """Posterior mean and sd on a grid, for the same node; Fresh has that of Resimulated, blurred by its noise."""
+    evaluator = Evaluator(model_of("Resimulated" if name == "Fresh" else name)[0])
+    grid = np.stack(np.meshgrid(np.linspace(1.5, 2.5, 41), np.linspace(-1, 0.4, 41)), -1).reshape(
+        -1, 2
+    )
+    found = evaluator(grid)
+    logs = found.log_prior + found.log_likelihood(evaluator.epsilon)
+    w = np.exp(logs - logs.max())
+    w /= w.sum()
+    out = {}
+    for key, values in {"mu": grid[:, 0], "sigma": np.exp(grid[:, 1])}.items():
+        mean = float(w @ values)
+        out[key] = (mean, float(np.sqrt(w @ (values - mean) ** 2)))
+    return out
+
+
+def nuts(model: pm.Model) -> Any:
+    return pm.sample(
+        200,
+        tune=200,
+        chains=2,
+        cores=1,
+        model=model,
+        random_seed=1,
+        compute_convergence_checks=False,
+        **QUIET,
+    )
+
+
+def find_map(model: pm.Model) -> Any:
+    return pm.find_MAP(
+        model=model,
+        return_inferencedata=True,
+        jitter=False,
+        compile_kwargs={"mode": PLAIN},
+        **QUIET,
+    )
+
+
+def stock_smc(model: pm.Model, kernel: Any = pm.smc.IMH, cores: int = 1) -> Any:
+    return pm.sample_smc(
+        200,
+        kernel=kernel,
+        chains=2,
+        cores=cores,
+        model=model,
+        random_seed=2,
+        compute_convergence_checks=False,
+        **QUIET,
+    )
+
+
+def own_smc(model: pm.Model) -> Any:
+    return prb.sample_smc(300, chains=2, model=model, random_seed=3, **QUIET)
+
+
+SAMPLERS: dict[str, Callable[[pm.Model], Any]] = {
+    "NUTS": nuts,
+    "stock SMC": stock_smc,
+    "stock SMC, two cores": lambda model: stock_smc(model, cores=2),
+    "batched kernel": lambda model: stock_smc(model, prb.BatchedKernel),
+    "batched kernel, two cores": lambda model: stock_smc(model, prb.BatchedKernel, cores=2),
+    "prbayes SMC": own_smc,
+}
+
+
+@cache
+def draws_of(name: str, sampler: str) -> Any:
+    return SAMPLERS[sampler](model_of(name)[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "sampler"),
+    [
+        ("Reweighted", "NUTS"),
+        ("Reweighted", "stock SMC, two cores"),
+        ("Reweighted", "batched kernel, two cores"),
+        ("Reweighted", "prbayes SMC"),
+        ("strong prior", "batched kernel"),
+        ("strong prior", "prbayes SMC"),
+        ("Resimulated", "NUTS"),
+        ("Resimulated", "stock SMC"),
+        ("Resimulated", "batched kernel"),
+        ("Resimulated", "prbayes SMC"),
+        ("black box", "stock SMC"),
+        ("black box", "batched kernel"),
+        ("black box", "prbayes SMC"),
+        ("Fresh", "stock SMC"),
+        ("Fresh", "batched kernel"),
+        ("Fresh", "prbayes SMC"),
+    ],
+)
+def test_samplers_find_the_posterior(name: str, sampler: str) -> None:
+    idata = draws_of(name, sampler)
+    assert ("diverging" in idata.sample_stats) == (sampler == "NUTS")
+    if sampler == "NUTS":
+        assert int(idata.sample_stats["diverging"].sum()) <= 2
+    for key, (mean, sd) in reference(name).items():
+        draws = idata.posterior[key].values
+        assert draws.shape[0] == 2
+        blur = 1.8 if name == "Fresh" else 1.0
+        assert abs(draws.mean() - mean) < 0.4 * sd * blur, key
+        assert 0.7 < draws.std() / sd < 1.35 * blur, key
+
+
+@pytest.mark.parametrize("name", ["Reweighted", "strong prior", "Resimulated", "black box"])
+def test_find_map_agrees_with_minimize(name: str) -> None:
+    model = model_of(name)[0]
+    optimum = prb.minimize(model, prior=True).point
+    warns = (
+        pytest.warns(UserWarning, match="Gradient not available")
+        if name == "black box"
+        else nullcontext()
+    )
+    with warns:
+        found = find_map(model).posterior
+    for key, (_, sd) in reference(name).items():
+        np.testing.assert_allclose(found[key].item(), optimum[key], atol=0.1 * sd)
+
+
+def test_a_black_box_gets_slice_steps_from_stock_sampling() -> None:
+    model = model_of("black box")[0]
+    idata = pm.sample(
+        60,
+        tune=20,
+        chains=1,
+        cores=1,
+        model=model,
+        random_seed=1,
+        compute_convergence_checks=False,
+        **QUIET,
+    )
+    assert "diverging" not in idata.sample_stats
+    for key, (mean, sd) in reference("black box").items():
+        assert abs(float(idata.posterior[key].mean()) - mean) < 0.6 * sd, key
+
+
+@pytest.mark.parametrize("sampler", [nuts, find_map, prb.minimize])
+def test_fresh_is_refused_where_gradients_are_needed(sampler: Callable[[pm.Model], Any]) -> None:
+    with pytest.raises(TypeError, match=r"y: prb.Fresh draws new .*use .*prb.Re"):
+        sampler(model_of("Fresh")[0])
+
+
+def test_fresh_with_an_epsilon_for_the_run() -> None:
+    model, node = build(prb.Fresh(POINTS), epsilon=None)
+    idata = prb.sample_smc(100, chains=1, model=model, epsilon=EPSILON, random_seed=1, **QUIET)
+    assert abs(float(idata.posterior["mu"].mean()) - MU) < 0.1
+    assert float(idata.calibration["epsilon"][0]) == EPSILON
+    assert np.isnan(node.epsilon_value)
+    with pytest.raises(TypeError, match=r"y: prb.Fresh .*Nelder-Mead"):
+        prb.sample_smc(100, model=model, **QUIET)
+
+
+# Predictive sampling.
+
+
+@cache
+def predictive(name: str, kind: str, seed: int = 1) -> Floats:
+    """Data sets, shape (draws, N)."""
+    model = model_of(name)[0]
+    if kind == "prior":
+        group = pm.sample_prior_predictive(40, model=model, random_seed=seed).prior_predictive
+    else:
+        few = draws_of(name, "prbayes SMC").isel(draw=slice(0, 40))
+        group = pm.sample_posterior_predictive(
+            few, model=model, random_seed=seed, **QUIET
+        ).posterior_predictive
+    assert group["y"].dims[:2] == ("chain", "draw")
+    return np.asarray(group["y"].values.reshape(-1, N))
+
+
+@pytest.mark.parametrize("kind", ["prior", "posterior"])
+@pytest.mark.parametrize("name", ["Reweighted", "Resimulated", "Fresh"])
+def test_predictive_draws_are_different_specimens(name: str, kind: str) -> None:
+    stored = model_of(name)[1].bound.n_points
+    sets = predictive(name, kind)
+    assert sets.shape == ((40, N) if kind == "prior" else (80, N))
+    within, between = sets.std(axis=1, ddof=1), sets.mean(axis=1).std()
+    assert (within > 0).all()
+    if kind == "prior":
+        np.testing.assert_allclose(within.mean(), 0.75 * np.sqrt(2 / np.pi), rtol=0.2)
+        np.testing.assert_allclose(between, 0.75, rtol=0.25)
+    else:
+        np.testing.assert_allclose(within.mean(), 0.75 * SIGMA, rtol=0.08)
+        np.testing.assert_allclose(sets.mean(), 0.75 * MU, atol=0.06)
+        assert 0.75 * SIGMA / np.sqrt(N) * 0.7 < between < 0.75 * SIGMA / np.sqrt(N) * 2
+    # Neither a repeated data set, nor an order: specimen i is no better than specimen j.
+    assert len(np.unique(sets[:, 0])) > 1
+    assert len(np.unique(sets.mean(axis=1))) == len(sets)
+    inside = sets - sets.mean(axis=1, keepdims=True)
+    assert abs(stats.spearmanr(np.tile(np.arange(N), len(sets)), inside.ravel()).statistic) < 0.1
+    if name == "Reweighted":
+        assert RESPONSES["Reweighted"].count == stored == POINTS
+        assert np.isin(sets, model_of(name)[1].bound.values).all()
+
+
+@pytest.mark.parametrize("name", ["Reweighted", "Resimulated"])
+def test_the_same_seed_gives_the_same_prediction(name: str) -> None:
+    first = predictive(name, "prior")
+    predictive.cache_clear()
+    np.testing.assert_array_equal(predictive(name, "prior"), first)
+    assert not np.array_equal(predictive(name, "prior", seed=2), first)
+
+
+def test_reweighted_calls_the_response_n_times_in_all() -> None:
+    for sampler in ("NUTS", "stock SMC, two cores", "batched kernel, two cores", "prbayes SMC"):
+        draws_of("Reweighted", sampler)
+    model, node = model_of("Reweighted")
+    optimum = prb.minimize(model)
+    assert (
+        RESPONSES["Reweighted"].count == node.bound.responses.count == node.bound.n_points == POINTS
+    )
+    assert (
+        optimum.n_responses
+        == draws_of("Reweighted", "prbayes SMC").posterior.attrs["n_responses"]
+        == POINTS
+    )
+
+
+@pytest.mark.parametrize("response", [line, BlackBox()])
+def test_resimulated_counts_its_responses(response: Any) -> None:
+    model, node = build(prb.Resimulated(64), response)
+    assert node.bound.symbolic == (response is line)
+    evaluator, before = Evaluator(model), node.bound.responses.count
+    evaluator(np.zeros((5, 2)))
+    evaluator.populations(np.zeros((2, 2)), 0)
+    assert node.bound.responses.count - before == 7 * 64
+    if response is not line:
+        assert node.bound.responses.count == response.count
+
+
+# Samplers that compile the log-density with other backends: nutpie, and NumPyro through PyMC's JAX backend.
+
+OF_OTHERS = [
+    prb.AreaMetric(),
+    prb.ProbabilityResidual(),
+    prb.KullbackLeibler(),
+    prb.LogLikelihood(),
+]
+
+
+@pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning"
+)
+@pytest.mark.parametrize("metric", OF_OTHERS, ids=lambda m: type(m).__name__)
+@pytest.mark.parametrize("sampler", ["nutpie", "numpyro"])
+def test_the_posterior_is_that_of_sample_smc(sampler: str, metric: prb.Metric) -> None:
+    pytest.importorskip(sampler)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        observed = np.random.default_rng(0).normal(2, 1, 50)
+        prb.Simulator(
+            "y",
+            lambda x: 2 * x,
+            x,
+            metric=metric,
+            observed=observed,
+            epsilon=0.05,
+            propagation=prb.Reweighted(256),
+        )
+        nuts = pm.sample(
+            700, tune=500, chains=2, nuts_sampler=sampler, random_seed=1, progressbar=False
+        )
+    smc = prb.sample_smc(1000, chains=2, model=model, random_seed=1, progressbar=False)
+    for name in ("mu", "sigma"):
+        sd = float(smc.posterior[name].std())
+        # Means of several hundred effective draws each: a standard error of .05 sd; sds to 4%.
+        assert abs(float(nuts.posterior[name].mean() - smc.posterior[name].mean())) < 0.25 * sd
+        np.testing.assert_allclose(nuts.posterior[name].std(), sd, rtol=0.2)

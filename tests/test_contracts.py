@@ -1,0 +1,301 @@
+"""What the package relies on in the inner parts of PyMC, PyTensor and ArviZ, tested directly.
+
+`tests/test_house.py` holds the list of these names against the package's imports. A test that fails here after an
+upgrade says what has changed, where a failure elsewhere would only say that something has.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytensor
+import pytensor.tensor as pt
+import pytest
+from arviz_stats.ecdf_utils import ecdf_pit
+from pymc.distributions.distribution import SymbolicRandomVariable
+from pymc.distributions.multivariate import MvNormal
+from pymc.distributions.shape_utils import change_dist_size
+from pymc.logprob.abstract import _logprob
+from pymc.logprob.utils import CheckParameterValue
+from pymc.model.fgraph import clone_model
+from pymc.printing import str_for_dist
+from pymc.pytensorf import join_nonshared_inputs
+from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
+from pytensor import shared
+from pytensor.compile import function
+from pytensor.compile.mode import Mode
+from pytensor.gradient import NullTypeGradError, disconnected_grad, grad_undefined
+from pytensor.graph.basic import Apply, Variable
+from pytensor.graph.op import Op
+from pytensor.graph.replace import _vectorize_node, graph_replace, vectorize_graph
+from pytensor.graph.traversal import ancestors, walk
+from pytensor.graph.utils import MissingInputError
+from pytensor.tensor.random.op import RandomVariable
+from pytensor.tensor.random.type import RandomGeneratorType
+from pytensor.tensor.variable import TensorVariable
+
+PLAIN = Mode(linker="py", optimizer="fast_run")
+
+
+def two_normals() -> pm.Model:
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0.0, 1.0)
+        pm.HalfNormal("sigma", 2.0)
+        pm.Normal("y", mu, 3.0, observed=[1.0, 2.0])
+    return model
+
+
+# Graphs.
+
+
+def test_variables_of_models_are_tensors_made_by_applications_of_operations() -> None:
+    mu = two_normals()["mu"]
+    assert isinstance(mu, TensorVariable)
+    assert isinstance(mu, Variable)
+    assert isinstance(mu.owner, Apply)
+    assert isinstance(mu.owner.op, Op)
+    assert isinstance(mu.owner.op, RandomVariable)
+
+
+def test_a_clone_has_applications_of_its_own_and_the_same_operations() -> None:
+    model = two_normals()
+    clone = clone_model(model)
+    assert clone["mu"].owner is not model["mu"].owner
+    assert clone["mu"].owner.op is model["mu"].owner.op
+
+
+def test_the_operation_of_an_application_can_be_replaced() -> None:
+    model = two_normals()
+    op = model["mu"].owner.op
+    model["mu"].owner.op = type(op)(**op._props_dict())
+    assert model["mu"].owner.op == op
+
+
+def test_walk_and_ancestors_go_upwards_once() -> None:
+    x = pt.scalar("x")
+    top = pt.exp(x)
+    bottom = top + top
+    assert list(ancestors([bottom])).count(top) == 1
+    seen = list(walk([bottom], lambda v: None if v is top or v.owner is None else v.owner.inputs))
+    assert top in seen
+    assert x not in seen, "nothing is above where None is returned"
+
+
+def test_replacement_without_strictness_ignores_what_is_not_there() -> None:
+    x, y, z = pt.dscalar("x"), pt.dscalar("y"), pt.dscalar("z")
+    (found,) = graph_replace([x + 1.0], {x: z, y: 2 * z}, strict=False)
+    assert found.eval({z: 2.0}) == 3.0
+
+
+def test_graphs_are_vectorized_over_leading_axes() -> None:
+    x = pt.vector("x")
+    batch = pt.matrix("batch")
+    rows = np.arange(6.0).reshape(2, 3)
+    np.testing.assert_array_equal(vectorize_graph(x.sum(), {x: batch}).eval({batch: rows}), [3, 12])
+
+
+class Batched(Op):
+    __props__ = ()
+
+    def make_node(self, x: Any) -> Any:
+        return Apply(self, [x], [x.type()])
+
+    def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
+        outputs[0][0] = 2 * inputs[0]
+
+    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
+        return [grad_undefined(self, 0, inputs[0])]
+
+
+_vectorize_node.register(Batched, lambda op, node, *batched: op.make_node(*batched))
+
+
+def test_operations_say_themselves_how_they_are_vectorized() -> None:
+    x, batch = pt.vector("x"), pt.matrix("batch")
+    found = vectorize_graph(Batched()(x), {x: batch})
+    assert isinstance(found.owner.op, Batched), "one call for the batch, no loop"
+
+
+def test_what_has_no_gradient_says_so_by_its_own_error() -> None:
+    x = pt.vector("x")
+    with pytest.raises(NullTypeGradError):
+        pt.grad(Batched()(x).sum(), x)
+
+
+def test_a_disconnected_value_has_no_part_in_a_gradient() -> None:
+    x = pt.dscalar("x")
+    slope = pt.grad(x * disconnected_grad(x), x)
+    assert slope.eval({x: 3.0}) == 3.0
+
+
+def test_a_graph_without_an_input_is_refused_by_its_own_error() -> None:
+    with pytest.raises(MissingInputError):
+        function([], pt.exp(pt.scalar("x")), mode=PLAIN)
+
+
+def test_shared_variables_may_change_length() -> None:
+    x = shared(np.zeros(2), shape=(None,))
+    total = function([], x.sum(), mode=PLAIN)
+    x.set_value(np.ones(5))
+    assert total() == 5.0
+
+
+def test_modes_leave_rewrites_out() -> None:
+    x = pt.dvector("x")
+    compiled = function([x], pt.exp(x + 1.0), mode=PLAIN.excluding("fusion"))
+    assert len(compiled.maker.fgraph.toposort()) >= 2
+
+
+# Densities.
+
+
+def test_densities_are_dispatched_on_the_class_of_the_operation() -> None:
+    class Flat(RandomVariable):
+        name, signature, dtype = "flat", "()->()", "float64"
+
+    @_logprob.register(Flat)
+    def density(op: Any, values: Any, rng: Any, size: Any, *params: Any, **kwargs: Any) -> Any:
+        (value,) = values
+        return value + params[0]
+
+    generator = pt.random.shared_rng(seed=None)
+    _, variable = Flat()(2.0, rng=generator, return_next_rng=True)
+    assert pm.logp(variable, 5.0).eval() == 7.0
+
+
+def test_parameter_checks_hold_the_value_and_then_the_conditions() -> None:
+    x = pt.dscalar("x")
+    checked = CheckParameterValue("x is positive")(x, pt.gt(x, 0.0))
+    value, condition = checked.owner.inputs
+    assert value is x
+    assert condition.dtype == "bool"
+    with pytest.raises(Exception, match="x is positive"):
+        checked.eval({x: -1.0})
+
+
+def test_densities_of_priors_check_their_parameters_in_this_way() -> None:
+    sigma = pt.dscalar("sigma")
+    graph = pm.logp(pm.Normal.dist(0.0, sigma), 1.0)
+    checks = [
+        v for v in ancestors([graph]) if v.owner and isinstance(v.owner.op, CheckParameterValue)
+    ]
+    assert len(checks) == 1
+
+
+def test_value_variables_are_joined_in_the_order_given() -> None:
+    model = two_normals()
+    point = model.initial_point(random_seed=0)
+    mu, sigma = model.value_vars
+    (found,), theta = join_nonshared_inputs(point, [mu - sigma], [mu, sigma])
+    assert found.eval({theta: [5.0, 2.0]}) == 3.0
+
+
+def test_values_and_transforms_are_found_by_variables() -> None:
+    model = two_normals()
+    names = [value.name for value in model.value_vars]
+    assert names == ["mu", "sigma_log__"]
+    sigma = model.values_to_rvs[model.value_vars[1]]
+    assert sigma is model["sigma"]
+    transform = model.rvs_to_transforms[sigma]
+    assert transform.forward(sigma, *sigma.owner.inputs).owner is not None
+    assert model.rvs_to_transforms[model["mu"]] is None
+
+
+# Distributions.
+
+
+def test_random_variables_know_their_parameters_and_make_themselves_anew() -> None:
+    mu = two_normals()["mu"]
+    op = mu.owner.op
+    loc, scale = op.dist_params(mu.owner)
+    assert (loc.eval(), scale.eval()) == (0.0, 1.0)
+    assert set(RandomVariable.__props__) == {"name", "signature", "dtype", "inplace"}
+    assert type(op)(**op._props_dict()) == op
+
+
+def test_random_variables_draw_from_parameters_and_then_the_size() -> None:
+    class Recorded(RandomVariable):
+        name, signature, dtype = "recorded", "(),()->()", "float64"
+
+        def rng_fn(self, rng: Any, *arguments: Any) -> Any:
+            a, b, size = arguments
+            assert isinstance(rng, np.random.Generator)
+            assert a.shape == b.shape == (1,), "parameters get leading axes of length one"
+            return np.full(size, a + b)
+
+    generator = pt.random.shared_rng(seed=None)
+    _, variable = Recorded()(1.0, 2.0, size=(4,), rng=generator, return_next_rng=True)
+    np.testing.assert_array_equal(variable.eval(mode=PLAIN), np.full(4, 3.0))
+
+
+def test_symbolic_random_variables_are_no_random_variables() -> None:
+    op = pm.Censored.dist(pm.Normal.dist(), lower=0.0, upper=None).owner.op
+    assert isinstance(op, SymbolicRandomVariable)
+    assert not isinstance(op, RandomVariable)
+
+
+def test_a_multivariate_normal_is_known_by_its_operation() -> None:
+    x = pm.MvNormal.dist(np.zeros(2), np.eye(2))
+    assert isinstance(x.owner.op, type(MvNormal.rv_op))
+    mean, covariance = x.owner.op.dist_params(x.owner)
+    assert (mean.type.ndim, covariance.type.ndim) == (1, 2)
+
+
+def test_distributions_are_resized_by_leading_axes() -> None:
+    many = change_dist_size(pm.Normal.dist(0.0, 1.0, shape=2), (5,), expand=True)
+    assert pm.draw(many, random_seed=0, mode=PLAIN).shape == (5, 2)
+
+
+def test_generators_are_shared_variables_of_a_compiled_function() -> None:
+    compiled = pm.compile([], pm.Normal.dist(), mode=PLAIN)
+    generators = [v for v in compiled.get_shared() if isinstance(v.type, RandomGeneratorType)]
+    assert len(generators) == 1
+    draws = []
+    for _ in range(2):
+        generators[0].set_value(np.random.default_rng(3), borrow=True)
+        draws.append(float(compiled()))
+    assert draws[0] == draws[1]
+
+
+def test_distributions_are_printed_with_the_names_of_what_is_above() -> None:
+    model = two_normals()
+    text = str_for_dist(model["y"], named_vars={model["mu"]})
+    assert re.fullmatch(r"y ~ Normal\(mu, 3\)", text)
+
+
+# Samplers and statistics.
+
+
+def test_kernels_have_the_steps_that_ours_replaces() -> None:
+    steps = [
+        "_initialize_kernel",
+        "resample",
+        "mutate",
+        "sample_stats",
+        "sample_settings",
+        "set_rng",
+    ]
+    for name in [*steps, "update_beta_and_weights", "step", "initialize", "_reset_state"]:
+        assert callable(getattr(SMC_KERNEL, name)), name
+    assert list(inspect.signature(SMC_KERNEL.initialize).parameters) == ["self", "start", "rng"]
+
+
+def test_systematic_resampling_keeps_expected_counts() -> None:
+    weights = np.array([0.5, 0.25, 0.25, 0.0])
+    index = systematic_resampling(weights, np.random.default_rng(0))
+    np.testing.assert_array_equal(np.bincount(index, minlength=4), [2, 1, 1, 0])
+
+
+def test_the_envelope_of_ranks_is_around_the_diagonal() -> None:
+    uniform = (np.arange(50) + 0.5) / 50
+    x, ecdf, lower, upper = ecdf_pit(uniform, 0.95, n_simulations=200, rng=np.random.default_rng(0))
+    assert ((lower <= ecdf) & (ecdf <= upper)).all()
+    assert len(x) == len(lower) == len(upper)
+
+
+def test_numbers_are_of_double_precision() -> None:
+    assert pytensor.config.floatX == "float64"
