@@ -13,7 +13,7 @@ import pymc as pm
 
 from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes._progress import shown
-from prbayes.estimate.caveats import flat, trouble
+from prbayes.estimate.caveats import elements_at_edge, trouble
 from prbayes.estimate.identifiability import blind_directions
 from prbayes.estimate.methods import Method
 from prbayes.estimate.optimum import Optimum, assemble, plain
@@ -85,8 +85,6 @@ _LOOKS = 3  # at other optima, with a design that is refined in between
 _STARTS = 32  # points of the prior from which other optima are searched for where a theta costs no response
 _TOLERATED = 1.5 * AGREE  # an estimate from eight blocks is itself uncertain
 _MOVED = 0.01  # prior standard deviations from which what is known of an optimum is looked up again
-_FAR = 4.0  # prior standard deviations from the prior's middle, from where on the edge of a support is thought of
-_SAME = 1e-6  # of the objective's typical size: a change that is none
 _FLOOR = 0.3  # of the noise floor: about the difference of the discrepancy between the data's fit and the truth's
 
 
@@ -273,7 +271,10 @@ def find_optimum(
         error = np.nan
     if hood is not None and np.isnan(error):
         error = hood.design_error()
-    edge = () if local is None else _at_edge(evaluator, theta, scales, local, search.size(theta, scales), random_seed)
+    edge: tuple[str, ...] = ()
+    if local is not None:
+        size = search.size(theta, scales)
+        edge = elements_at_edge(evaluator, theta, scales, size=size, tolerance=tolerance, seed=random_seed)
     jump = () if hood is None else tuple(evaluator.nodes[k].name for k in hood.unsettled())
     if edge or jump:
         local, others = None, []
@@ -313,22 +314,6 @@ def _rivals(
             break
         refine_at(evaluator, thin[0].theta[None])
     return [r for r in found if not shortcomings(evaluator, r.theta[None])]
-
-
-def _at_edge(
-    evaluator: Evaluator, theta: Floats, scales: Floats, local: Local, size: float, seed: int
-) -> tuple[str, ...]:
-    """Return the elements that went far out and could go on without any change: their best value is at an edge.
-
-    Data drawn from such a population tell much, so that the standard errors are small there, and mean nothing.
-    """
-    away = theta - np.median(evaluator.prior_thetas(256, seed), axis=0)
-    far = np.flatnonzero((np.abs(away) > _FAR * local.scale) & np.isfinite(np.diag(local.in_theta)))
-    if not far.size or flat(evaluator, theta, local.scale):
-        return ()
-    further = np.diag(np.sign(away) * local.scale)[far]
-    here, *there = evaluator.total(np.vstack([theta, theta + further]), scales)
-    return tuple(evaluator.readable_names[i] for i, f in zip(far, there, strict=True) if abs(f - here) < _SAME * size)
 
 
 def _described(evaluator: Evaluator, rival: Rival) -> dict[str, Any]:

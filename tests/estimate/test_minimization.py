@@ -290,14 +290,48 @@ def two_modes(x: Any, coin: Any) -> Any:
     return x + np.where(coin < 0.5, -16.0, 16.0)
 
 
-def test_a_population_that_collapsed_within_the_bandwidth_is_no_convergence() -> None:
+def collapsing(spread: Callable[[], Any]) -> pm.Model:
     """The log-likelihood's bandwidth follows the spread between the modes, and prefers a point in either."""
     rng = np.random.default_rng(3)
     observed = two_modes(rng.normal(1.5, 0.1, 20), rng.random(20))
     with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 1.5, 0.5), pm.HalfNormal("sigma", 0.3))
+        x = pm.Normal.dist(pm.Normal("mu", 1.5, 0.5), spread())
         coin, propagation = pm.Uniform.dist(0, 1), prb.Resimulated(512)
         prb.Simulator("y", two_modes, x, coin, metric=METRICS["ll"], observed=observed, propagation=propagation)
+    return model
+
+
+@pytest.mark.parametrize(
+    ("spread", "keywords"),
+    [
+        (lambda: pm.LogNormal("sigma", np.log(0.1), 4.0), {}),  # less than three spreads of it away
+        (lambda: pm.InverseGamma("sigma", 2, 0.3), {}),
+        (lambda: pm.HalfNormal("sigma", 0.3), {"tolerance": 1e-3}),
+        (lambda: pm.HalfNormal("sigma", 0.3), {"method": "Powell"}),
+    ],
+    ids=["wide", "inverse gamma", "coarse", "Powell"],
+)
+def test_a_collapsed_population_is_known_by_the_objective(spread: Callable[[], Any], keywords: dict[str, Any]) -> None:
+    """Not by standard errors: curvature and its noise are rounding errors there, and their ratio is anything."""
+    optimum = prb.minimize(collapsing(spread), **keywords)
+    assert optimum.point["sigma"] < 3e-3
+    assert optimum.at_edge == ("sigma",)
+    assert not optimum.converged
+
+
+def test_a_hyperparameter_without_effect_is_at_no_edge_however_far_out() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
+        pm.Normal("idle", 3, 2)
+        prb.Simulator("y", same, x, metric=METRICS["pr"], observed=OBSERVED, propagation=R256)
+    optimum = prb.minimize(model, start={"mu": 1.0, "idle": 60.0}, starts=0)
+    assert optimum.point["idle"] == pytest.approx(60.0)
+    assert optimum.at_edge == ()
+    assert optimum.converged
+
+
+def test_a_population_that_collapsed_within_the_bandwidth_is_no_convergence() -> None:
+    model = collapsing(lambda: pm.HalfNormal("sigma", 0.3))
     optimum = prb.minimize(model)
     assert optimum.point["sigma"] < 1e-3
     assert not optimum.converged
