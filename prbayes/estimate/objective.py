@@ -1,4 +1,4 @@
-"""The standardised objective of one minimisation, and differences where there is no gradient."""
+"""The standardised objective of one minimisation, and why it may end early."""
 
 from __future__ import annotations
 
@@ -66,20 +66,3 @@ class Objective:
     def lowest(self) -> float:
         """The smallest value so far."""
         return min((v for v in self.values if np.isfinite(v)), default=np.inf)
-
-
-def differences(values: Callable[[Floats], Floats], step: Floats) -> Callable[[Floats], Any]:
-    """Return a function of theta that gives value, gradient by central differences, and number of evaluations.
-
-    Where one of two neighbours is infinite, as at the edge of a support, the difference is one-sided.
-    """
-
-    def function(theta: Floats) -> Any:
-        found = values(np.vstack([theta, theta + np.diag(step), theta - np.diag(step)]))
-        middle, up, down = found[0], found[1 : 1 + step.size], found[1 + step.size :]
-        with np.errstate(invalid="ignore"):
-            forward, backward = (up - middle) / step, (middle - down) / step
-            central = np.where(np.isfinite(down), (up - down) / (2 * step), forward)
-        return middle, np.where(np.isfinite(up), central, backward), len(found)
-
-    return function

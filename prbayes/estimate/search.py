@@ -14,8 +14,9 @@ from pytensor.gradient import NullTypeGradError
 
 from prbayes._checks import Floats
 from prbayes._progress import progress
+from prbayes.estimate.differences import differences
 from prbayes.estimate.methods import Method
-from prbayes.estimate.objective import Objective, SpentError, StalledError, differences
+from prbayes.estimate.objective import Objective, SpentError, StalledError
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator

@@ -14,8 +14,9 @@ from scipy import optimize, stats
 
 import prbayes as prb
 from prbayes._checks import Floats
+from prbayes.estimate.differences import differences
 from prbayes.estimate.methods import Method
-from prbayes.estimate.objective import Objective, StalledError, differences
+from prbayes.estimate.objective import Objective, StalledError
 from prbayes.estimate.search import Search
 from prbayes.model.evaluator import Evaluator
 
@@ -167,15 +168,6 @@ def test_exact_and_differenced_gradients_agree() -> None:
     assert cost == 5
     np.testing.assert_allclose(value, exact[0], rtol=1e-12)
     np.testing.assert_allclose(gradient, exact[1], rtol=1e-5)
-
-
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_differences_at_an_edge_are_one_sided(side: float) -> None:
-    def values(thetas: Floats) -> Floats:
-        return np.where(side * thetas[:, 0] > 1.0, np.inf, thetas[:, 0] ** 2 + thetas[:, 1])
-
-    _, gradient, _ = differences(values, np.array([1e-4, 1e-4]))(np.array([side, 3.0]))
-    np.testing.assert_allclose(gradient, [2.0 * side, 1.0], rtol=1e-3)
 
 
 def test_a_line_search_without_progress_is_stopped() -> None:
