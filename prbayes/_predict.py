@@ -19,7 +19,7 @@ from prbayes._checks import Floats, positive_integer
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.labels import versions
 from prbayes.model.simulator import Node, model_on_context, nodes
-from prbayes.model.support import DesignError
+from prbayes.model.support import TOLERABLE, DesignError, shortcoming
 from prbayes.propagation.points import base_points
 from prbayes.response.calling import ResponseError
 from prbayes.response.compilation import compile_batched
@@ -205,7 +205,8 @@ def _resampled(node: Node, roots: list[Floats], n: int, rng: np.random.Generator
     assert design is not None
     support = design.support(roots)
     ess, mass = np.median(support["weight_ess"]), np.median(support["mean_weight"])
-    if not (ess >= design.required_ess / 2 and 0.7 < mass < 1.4):
+    # Points without response become NaN, which are counted and said by themselves.
+    if shortcoming(support, design.required_ess, 1.0, design.n_points, TOLERABLE):
         raise DesignError(
             f"{node.name}: got a weight effective sample size of {ess:.0f} and a mean raw weight of {mass:.2f} "
             f"(medians over the populations), expected {design.required_ess:.0f} and 1; call prb.refine(model) and "

@@ -244,7 +244,7 @@ def find_optimum(
         elif rounds == MAX_ROUNDS:
             refuse(short, evaluator)
         elif cloud is None:
-            cloud = near = pilot(evaluator, scales, scale, seed=random_seed)
+            cloud = near = pilot(evaluator, scales, seed=random_seed)
         elif not refine_at(evaluator, near):
             refine_at(evaluator, theta[None])
         rounds += 1
