@@ -124,7 +124,7 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         best = thetas[order]
         # Let the designs reach them.
         thin = _thin(evaluator, best)
-        _add(evaluator, best, {n for n in thin if evaluator.designs[n].batches <= MAX_ROUNDS})
+        _add(evaluator, best, {n for n in thin if evaluator.designs[n].n_batches <= MAX_ROUNDS})
         # Stop where sampling explains the differences that are left.
         spread = value[order[-1]] - value[order[0]]
         if spread < _noise(evaluator, best[0], scales) and not thin:
