@@ -127,7 +127,8 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         _add(evaluator, best, {n for n in thin if evaluator.designs[n].n_batches <= MAX_ROUNDS})
         # Stop where sampling explains the differences that are left.
         spread = value[order[-1]] - value[order[0]]
-        if spread < _noise(evaluator, best[0], scales) and not thin:
+        noise = sum(noise_floors(evaluator, best[0], _PILOT_SETS) / scales)
+        if not thin and spread < noise:
             break
         # Step on, from each of them at random.
         covariance = np.atleast_2d(np.cov(best, rowvar=False))
@@ -147,13 +148,13 @@ def _thin(evaluator: Evaluator, thetas: Floats) -> set[str]:
     return names
 
 
-def _noise(evaluator: Evaluator, theta: Floats, scales: Floats) -> float:
-    """Return the objective of data sets drawn from the model at theta."""
+def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int = 200) -> Floats:
+    """Return the mean discrepancy of data sets drawn from the model at theta, (k,) by simulator."""
     floors = []
-    for k, s in enumerate(scales):
-        information = Information(evaluator, k, theta, evaluator.prior_sd, n_sets=_PILOT_SETS)
-        floors.append(information.noise_floor / s)
-    return float(sum(floors))
+    for k in range(len(evaluator.nodes)):
+        information = Information(evaluator, k, theta, evaluator.prior_sd, n_sets=n_sets)
+        floors.append(information.noise_floor)
+    return np.array(floors)
 
 
 def refuse(short: Mapping[str, Shortcoming], evaluator: Evaluator) -> None:

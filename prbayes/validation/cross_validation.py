@@ -7,8 +7,7 @@ import xarray as xr
 
 from prbayes._checks import positive_integer
 from prbayes.estimate.data_sets import DataSets, specimens
-from prbayes.estimate.optimum import Optimum, surveyed
-from prbayes.estimate.refit import Neighbourhood, inapplicable
+from prbayes.estimate.optimum import Optimum, require_refits
 from prbayes.model.labels import versions
 
 
@@ -58,12 +57,8 @@ def held_out(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) -> xr.Da
     >>> found.discrepancy.dims, bool((found.discrepancy > found.calibrated).mean() > 0.5)
     (('fold', 'simulator'), True)
     """
-    if not isinstance(optimum, Optimum):
-        raise TypeError(f"held_out: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first")
-    evaluator = surveyed(optimum, "held_out").evaluator
-    reason = inapplicable(evaluator)
-    if reason:
-        raise ValueError(f"held_out: {reason}, so that the model cannot be calibrated anew")
+    advice = ", so that the model cannot be calibrated anew"
+    evaluator = require_refits(optimum, "held_out", advice).evaluator
     folds = positive_integer(folds, "folds", minimum=2)
     numbers, total = specimens(evaluator.nodes)
     if total < 2 * folds:
@@ -76,8 +71,7 @@ def held_out(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) -> xr.Da
     if few:
         raise ValueError(f"folds: got {folds}, with fewer than 2 observations of {few} in the others, expected fewer")
     kept = [w / w.sum(axis=1, keepdims=True) for w in kept]
-    scales = np.array(list(optimum.scales.values()))
-    hood = Neighbourhood.of(evaluator, optimum.theta, scales, evaluator.prior_sd)
+    hood = optimum.sampling()
     x, converged = hood.refit(DataSets([t.observed for t in targets], kept))
     thetas = hood.thetas(x)
     found = np.full((2, folds, len(targets)), np.nan)

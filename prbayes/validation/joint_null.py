@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats, positive_integer
 from prbayes._predict import data_digest, serving, specimen_names
 from prbayes.estimate.data_sets import groups, sets_at, simulated_points, specimens
-from prbayes.estimate.optimum import Optimum, surveyed
-from prbayes.estimate.refit import Neighbourhood, inapplicable
+from prbayes.estimate.optimum import Optimum, require_refits
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.validation.nulls import Case, Condition, Predictive, SimulatedNull
@@ -70,13 +69,8 @@ class JointNull(SimulatedNull):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.optimum, Optimum):
-            raise TypeError(
-                f"JointNull: got {type(self.optimum).__name__}, expected an Optimum; call prb.minimize() first"
-            )
-        reason = inapplicable(surveyed(self.optimum, "JointNull").evaluator)
-        if reason:
-            raise ValueError(f"JointNull: {reason}, so that the model cannot be calibrated anew; use PosteriorNull()")
+        advice = ", so that the model cannot be calibrated anew; use PosteriorNull()"
+        require_refits(self.optimum, "JointNull", advice)
         positive_integer(self.replicates, "JointNull: replicates", minimum=19)
         positive_integer(self.seed, "JointNull: seed", minimum=0)
 
@@ -89,8 +83,7 @@ class JointNull(SimulatedNull):
         for c, (k, values) in zip(case.conditions, found, strict=True):
             _refuse_other(c, populations[k][0][0] if values is None else values, populations[k][1][0])
         points = simulated_points(evaluator, populations, self.replicates, self.seed, more=total)
-        scales = np.array(list(self.optimum.scales.values()))
-        hood = Neighbourhood.of(evaluator, theta, scales, evaluator.prior_sd)
+        hood = self.optimum.sampling()
         x, converged = hood.refit(sets_at(evaluator, populations, points))
         if converged.mean() < 0.5:
             raise ValueError(
