@@ -29,7 +29,7 @@ from prbayes.estimate.refinement import (
 from prbayes.estimate.refit import Neighbourhood
 from prbayes.estimate.rivals import Rival, rivals
 from prbayes.estimate.sampling import Local
-from prbayes.estimate.search import Path, Run, Search, approach, minimise, settle
+from prbayes.estimate.search import Run, Search, Trace, approach, minimise, settle
 from prbayes.estimate.search import start as begin
 from prbayes.estimate.solution import assemble, rival_record
 from prbayes.metrics.base import Minimum
@@ -230,14 +230,14 @@ def find_optimum(
     led = approach(search, theta, scales, random_seed)
 
     # Step: minimise, look at the design, until it is enough
-    state = _minimised(plan, led.theta, scales, led.path)
+    state = _minimised(plan, led.theta, scales, led.trace)
     rounds = 0
     while True:
         state = _judged(plan, state, rounds)
         if state.restart is None:
             break
         rounds += 1
-        state = _minimised(plan, state.restart, state.scales, state.run.path, state.cloud)
+        state = _minimised(plan, state.restart, state.scales, state.run.trace, state.cloud)
 
     # Terminate: other optima, stalled line searches, the error of the design where it ended
     state, others = _against_rivals(plan, state)
@@ -315,7 +315,7 @@ class _State:
     scales : ndarray, shape (k,)
         By which the simulators' discrepancies are divided.
     run : Run
-        The last one, with the path of all.
+        The last one, with the trace of all.
     sampling : Neighbourhood or None
         The sampling distribution of the minimiser around theta; None where nothing is known of it.
     design_error : float
@@ -372,15 +372,15 @@ def _initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
 
 
 def _minimised(
-    plan: _Plan, theta: Floats, scales: Floats, path: Path, cloud: Floats | None = None
+    plan: _Plan, theta: Floats, scales: Floats, trace: Trace, cloud: Floats | None = None
 ) -> _State:
     """Minimise from theta; with several simulators again, with the noise at that pilot optimum."""
-    run = minimise(plan.search, theta, scales, path)
+    run = minimise(plan.search, theta, scales, trace)
     unset = np.isnan(plan.evaluator.epsilon)
     if plan.several and unset.any():
         noise = noise_floors(plan.evaluator, run.best)
         scales = np.where(unset, noise, plan.evaluator.epsilon)
-        run = minimise(plan.search, run.best, scales, run.path)
+        run = minimise(plan.search, run.best, scales, run.trace)
     sampling = _sampling(plan.evaluator, run.best, scales)
     return _State(run.best, scales, run, sampling, cloud=cloud)
 
@@ -426,7 +426,7 @@ def _against_rivals(plan: _Plan, state: _State) -> tuple[_State, list[Rival]]:
     others = _rivals(plan, state)
     if not others or not others[0].better:
         return state, others
-    run = minimise(plan.search, others[0].theta, state.scales, state.run.path)
+    run = minimise(plan.search, others[0].theta, state.scales, state.run.trace)
     sampling = _sampling(plan.evaluator, run.best, state.scales)
     state = replace(state, theta=run.best, run=run, sampling=sampling)
     return state, ([] if sampling is None else _rivals(plan, state))

@@ -58,7 +58,7 @@ Function = Callable[[Floats], tuple[float, Floats | None, int]]
 
 
 @dataclass(frozen=True)
-class Path:
+class Trace:
     """The points that minimisers have asked for.
 
     Attributes
@@ -77,10 +77,10 @@ class Path:
     counts: tuple[int, ...] = ()
     count: int = 0
 
-    def then(self, objective: Objective) -> Path:
-        """Return the path with the points of one more minimisation."""
+    def then(self, objective: Objective) -> Trace:
+        """Return the trace with the points of one more minimisation."""
         counts = tuple(self.count + c for c in objective.counts)
-        return Path(
+        return Trace(
             thetas=self.thetas + tuple(objective.thetas),
             values=self.values + tuple(objective.values),
             counts=self.counts + counts,
@@ -172,7 +172,7 @@ class Run:
     success : bool
     message : str
         What the method said.
-    path : Path
+    trace : Trace
         With the points of those before it.
     center : ndarray, shape (d,)
         Where it began.
@@ -186,7 +186,7 @@ class Run:
     best: Floats
     success: bool
     message: str
-    path: Path
+    trace: Trace
     center: Floats
     scales: Floats
     lowest: float
@@ -207,10 +207,10 @@ def start(
     return search.best_of(candidates, scales), len(candidates)
 
 
-def minimise(search: Search, theta: Floats, scales: Floats, path: Path) -> Run:
+def minimise(search: Search, theta: Floats, scales: Floats, trace: Trace) -> Run:
     """Minimise from theta, within what is left of the budget."""
     size = search.size(theta, scales)
-    objective = search.objective(theta, scales, size, gradient=search.gradient, spent=path.count)
+    objective = search.objective(theta, scales, size, gradient=search.gradient, spent=trace.count)
     if search.method.name.lower() in _LINE_SEARCHES:
         objective.patience = _PATIENCE
     success, message = _scipy(
@@ -225,7 +225,7 @@ def minimise(search: Search, theta: Floats, scales: Floats, path: Path) -> Run:
         best=objective.best,
         success=success,
         message=message,
-        path=path.then(objective),
+        trace=trace.then(objective),
         center=theta,
         scales=scales,
         lowest=objective.lowest,
@@ -239,9 +239,9 @@ def settle(search: Search, run: Run) -> Run:
     Where the discrepancy jumps, since points lose their response there, the simplex is wide enough
     to step over it.
     """
-    if run.success or not search.gradient or run.path.count >= search.most:
+    if run.success or not search.gradient or run.trace.count >= search.most:
         return run
-    spent = run.path.count
+    spent = run.trace.count
     again = search.objective(run.center, run.scales, run.size, gradient=False, spent=spent)
     begin = (run.best - run.center) / search.units
     edge = _OVER if jumps(search, run.best) else _NEAR
@@ -258,7 +258,7 @@ def settle(search: Search, run: Run) -> Run:
         best=again.best if again.lowest <= run.lowest else run.best,
         success=success or gain < _SETTLED,
         message=f"{run.message} A simplex from there gained {max(gain, 0):.1e}: {message}",
-        path=run.path.then(again),
+        trace=run.trace.then(again),
     )
 
 
@@ -298,13 +298,13 @@ class Approach:
     Attributes
     ----------
     theta : ndarray, shape (d,)
-    path : Path
+    trace : Trace
     remark : str
         That it did; empty if there was no need.
     """
 
     theta: Floats
-    path: Path
+    trace: Trace
     remark: str = ""
 
 
@@ -317,7 +317,7 @@ def approach(search: Search, theta: Floats, scales: Floats, seed: int) -> Approa
     """
     evaluator = search.evaluator
     if not _astray(evaluator, theta):
-        return Approach(theta, Path())
+        return Approach(theta, Trace())
     guide = _Guide(evaluator, scales)
     if not evaluator.responses_per_theta:
         points = evaluator.prior_points(_SCREENED, seed)
@@ -347,7 +347,7 @@ def approach(search: Search, theta: Floats, scales: Floats, seed: int) -> Approa
         " At the start hardly any simulated response was near the data: the area metric led from "
         f"there, in {objective.count} evaluations."
     )
-    return Approach(reached, Path().then(objective), remark)
+    return Approach(reached, Trace().then(objective), remark)
 
 
 def _astray(evaluator: Evaluator, theta: Floats) -> bool:

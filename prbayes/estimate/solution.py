@@ -62,7 +62,7 @@ def assemble(
         discrepancy=float((values / scales).sum()),
         discrepancies=discrepancies,
         scales=dict(zip(names, map(float, scales), strict=True)),
-        n_evaluations=run.path.count,
+        n_evaluations=run.trace.count,
         n_screened=screened,
         n_responses=evaluator.n_responses - responses_before,
         converged=run.success and not nowhere,
@@ -74,9 +74,9 @@ def assemble(
         evaluator=evaluator,
         support=_support(evaluator, theta),
         trace={
-            "theta": np.array(run.path.thetas).reshape(-1, theta.size),
-            "discrepancy": np.array(run.path.values),
-            "evaluations": np.array(run.path.counts, dtype=np.int64),
+            "theta": np.array(run.trace.thetas).reshape(-1, theta.size),
+            "discrepancy": np.array(run.trace.values),
+            "evaluations": np.array(run.trace.counts, dtype=np.int64),
         },
     )
 

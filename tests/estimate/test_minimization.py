@@ -14,8 +14,9 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._checks import Floats
+from prbayes.estimate import minimization
 from prbayes.estimate.refit import Neighbourhood
-from prbayes.estimate.search import Search
+from prbayes.estimate.search import Approach, Trace
 from prbayes.metrics.density import GaussianKDE
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.simulator import nodes
@@ -397,6 +398,7 @@ def test_standard_errors_are_those_of_where_the_simplex_ended() -> None:
     assert "A simplex from there" in optimum.message
     hood = Neighbourhood.of(optimum.evaluator, optimum.theta, np.ones(1), optimum.evaluator.prior_sd)
     np.testing.assert_allclose(optimum.covariance, hood.local.in_theta, rtol=1e-6)
+    np.testing.assert_array_equal(optimum.sampling().local.in_theta, hood.local.in_theta)
 
 
 @pytest.mark.parametrize("name", ["kl", "pr"])
@@ -490,7 +492,7 @@ def far_model(name: str, propagation: Any) -> pm.Model:
 
 @pytest.mark.parametrize("propagation", [R256, prb.Resimulated(1024)], ids=["reweighted", "resimulated"])
 def test_without_the_area_metric_a_far_start_does_not_arrive(propagation: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Search, "approach", lambda self, theta, *_: theta)
+    monkeypatch.setattr(minimization, "approach", lambda search, theta, *_: Approach(theta, Trace()))
     optimum = prb.minimize(far_model("pr", propagation), start={"mu": 30.0, "sigma": 0.1}, refine=False, starts=0)
     assert abs(optimum.point["mu"] - MEAN) > 1.0
 
