@@ -13,7 +13,7 @@ import xarray as xr
 from matplotlib.image import imread
 
 import prbayes as prb
-from prbayes.validation.nulls import area
+from prbayes.validation.statistic import area
 
 RNG = np.random.default_rng(1)
 PREDICTED = RNG.normal(RNG.normal(0, 0.25, (200, 1)), 1.0, (200, 500))
