@@ -17,6 +17,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats, positive_integer
+from prbayes._weighted import reached
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.labels import versions
 from prbayes.model.simulator import Node, model_on_context, nodes
@@ -310,15 +311,8 @@ def _resampled(
     """
     _refuse_unsupported(name, design, roots)
     _, weights = design.populations(roots)
-    cumulative = np.cumsum(np.nan_to_num(weights), axis=1)
-    total = cumulative[:, -1:]
-    # Populations without any weight are among those that the design supports only in part.
-    cumulative /= np.maximum(total, np.finfo(np.float64).tiny)
     places = (np.arange(n) + rng.random((len(weights), 1))) / n
-    rows = zip(cumulative, places, strict=True)
-    found = np.array([np.searchsorted(steps, place) for steps, place in rows])
-    # Rounding may leave the last step below 1.
-    found = np.minimum(found, design.n_points - 1)
+    found = reached(np.nan_to_num(weights), places, normalized=True)
     return rng.permuted(found, axis=1)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
+from prbayes._weighted import distribution_function, reached
 from prbayes.estimate.data_sets import DataSets, dependent, simulated_sets, thinned
 from prbayes.model.evaluator import Evaluator
 
@@ -146,7 +147,7 @@ class Information:
         values, weights = self._center
         order = np.argsort(values)
         levels = (np.arange(_POINTS) + 0.5) / _POINTS
-        points = values[order][np.minimum(np.searchsorted(np.cumsum(weights[order]), levels), values.size - 1)]
+        points = values[order][reached(weights[order], levels)]
         slopes = self.gradients(points, np.eye(_POINTS))
         return np.atleast_2d(np.cov(slopes, rowvar=False)) / target.n_effective
 
@@ -180,17 +181,9 @@ class Information:
         knots = np.unique(np.concatenate([values[0][np.isfinite(values[0])], observed]))
         knots = knots[np.unique(np.linspace(0, knots.size - 1, _KNOTS).astype(int))]
         if np.array_equal(values[0], values[-1], equal_nan=True):
-            cdf = _cdf(values[0], w, knots)
-        else:
-            cdf = np.array([_cdf(v, u, knots) for v, u in zip(values, w, strict=True)])
+            values = values[0]
+        cdf = distribution_function(values, w, knots, kind="quicksort")
+        measured = distribution_function(observed, weights, knots, kind="quicksort")
         d = self.theta.size
         slopes = (cdf[1 : 1 + 2 * d : 2] - cdf[2 : 2 + 2 * d : 2]) / (2 * self._step[:, None])
-        return (cdf[0] - _cdf(observed, weights, knots))[:, :-1], slopes[:, :-1], np.diff(knots)
-
-
-def _cdf(values: Floats, weights: Floats, at: Floats) -> Floats:
-    """Return distribution functions of values (n,) with weights (..., n), shape (..., m)."""
-    order = np.argsort(values)
-    total = np.cumsum(weights[..., order], axis=-1)
-    total = np.concatenate([np.zeros_like(total[..., :1]), total], axis=-1)
-    return np.asarray(total[..., np.searchsorted(values[order], at, side="right")])
+        return (cdf[0] - measured)[:, :-1], slopes[:, :-1], np.diff(knots)

@@ -20,7 +20,8 @@ class FunctionMetric(Metric):
     Parameters
     ----------
     function : callable
-        ``function(simulated, observed) -> discrepancy``, shapes (..., n), (N,) -> (...); smaller is better.
+        ``function(simulated, observed) -> discrepancy``, shapes (..., n), (N,) -> (...); smaller is
+        better.
     weighted : bool
         Whether the function takes the weights of the simulated values, shape (..., n), as a third
         argument. `Reweighted` needs that; the other propagations do not.
@@ -33,7 +34,9 @@ class FunctionMetric(Metric):
     Examples
     --------
     >>> import numpy as np
-    >>> metric = FunctionMetric(lambda simulated, observed: abs(np.mean(simulated, -1) - observed.mean()))
+    >>> def difference(simulated, observed):
+    ...     return abs(np.mean(simulated, axis=-1) - observed.mean())
+    >>> metric = FunctionMetric(difference)
     >>> metric([0.0, 2.0], [4.0])
     3.0
     """
@@ -43,7 +46,8 @@ class FunctionMetric(Metric):
 
     def __post_init__(self) -> None:
         if not callable(self.function):
-            raise TypeError(f"function: got {type(self.function).__name__}, expected f(simulated, observed)")
+            got = type(self.function).__name__
+            raise TypeError(f"function: got {got}, expected f(simulated, observed)")
 
     @property
     def takes_weights(self) -> bool:
@@ -52,7 +56,10 @@ class FunctionMetric(Metric):
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         if not np.allclose(weights, weights[0]):
-            raise ValueError("observed weights: got unequal ones, expected none; a FunctionMetric has no use for them")
+            raise ValueError(
+                "observed weights: got unequal ones, expected none; "
+                "a FunctionMetric has no use for them"
+            )
         return FunctionDiscrepancy(self, observed, weights)
 
 
@@ -73,22 +80,27 @@ class FunctionDiscrepancy(Discrepancy):
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
         """Return the value of the function."""
-        if self.metric.weighted:
-            value = self.metric.function(simulated, self.observed, np.broadcast_to(weights, simulated.shape))
-        elif not np.allclose(weights, np.asarray(weights)[..., :1]):
+        value = np.asarray(self._called(simulated, weights), dtype=np.float64)
+        expected = simulated.shape[:-1]
+        if value.shape != expected:
             raise ValueError(
-                "weights: got unequal ones for a FunctionMetric whose function takes none; write "
-                "function(simulated, observed, weights) and pass weighted=True, or use prb.Resimulated"
-            )
-        else:
-            value = self.metric.function(simulated, self.observed)
-        value = np.asarray(value, dtype=np.float64)
-        if value.shape != simulated.shape[:-1]:
-            raise ValueError(
-                f"FunctionMetric: got a result of shape {value.shape} for simulated values of shape "
-                f"{simulated.shape}, expected {simulated.shape[:-1]}; reduce over the last axis"
+                f"FunctionMetric: got a result of shape {value.shape} for simulated values of "
+                f"shape {simulated.shape}, expected {expected}; reduce over the last axis"
             )
         return (value,)
+
+    def _called(self, simulated: Floats, weights: Floats) -> Any:
+        """Call the function, with weights if it takes them; equal ones it need not know."""
+        function = self.metric.function
+        if self.metric.weighted:
+            return function(simulated, self.observed, np.broadcast_to(weights, simulated.shape))
+        if not np.allclose(weights, np.asarray(weights)[..., :1]):
+            raise ValueError(
+                "weights: got unequal ones for a FunctionMetric whose function takes none; "
+                "write function(simulated, observed, weights) and pass weighted=True, "
+                "or use prb.Resimulated"
+            )
+        return function(simulated, self.observed)
 
     def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
         """Return the simulated values themselves."""
@@ -96,7 +108,8 @@ class FunctionDiscrepancy(Discrepancy):
 
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return the value of the function."""
-        return self.features(np.broadcast_to(basis[0], weights.shape), weights, xp)
+        (values,) = basis
+        return self.features(np.broadcast_to(values, weights.shape), weights, xp)
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the value of the function."""

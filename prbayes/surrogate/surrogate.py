@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.propagation.points import sobol
-from prbayes.response.calling import Caller, ResponseError
+from prbayes.response.calling import Calling, Points, ResponseError, Tally, respond
 from prbayes.response.failures import Abort, OnFailure, Replace
 from prbayes.response.store import Store
 from prbayes.surrogate.error import CrossValidation, cross_validated, points_needed
@@ -170,9 +170,10 @@ class Surrogate:
         # Compute the responses.
         points = domain.at(sobol(n, domain.dimensions, random_seed))
         kept = None if store is None else Store(store, name, points.shape[1])
-        caller = Caller(name, response, executor, on_failure or Abort(), kept)
+        calling = Calling(name, response, executor, kept, on_failure or Abort())
         varying = [not one.constant for one in domain.inputs]
-        responses = caller(domain.arguments(points), varying, points)
+        tally = Tally()
+        responses = respond(calling, Points(domain.arguments(points), varying), tally)
         good = np.isfinite(responses)
         if good.sum() < needed:
             raise ResponseError(
@@ -186,14 +187,14 @@ class Surrogate:
         error = CrossValidation(residuals, float(responses[good].std()))
 
         # Fit the surface; only then is the spread over the prior predictive distribution known.
-        unfitted = cls(domain, points, responses, model, outside, caller.count, error)
+        unfitted = cls(domain, points, responses, model, outside, tally.computed, error)
         found = unfitted._completed()
         if predictive is not None:
             values = found._at(predictive)
             spread = values[np.isfinite(values)].std()
             found = replace(found, error=CrossValidation(residuals, float(spread)))
         _log.info(
-            "%s: %d responses computed; cross-validated error %s", name, caller.count, found.error
+            "%s: %d responses computed; cross-validated error %s", name, tally.computed, found.error
         )
         return found
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from prbayes._checks import Floats
+from prbayes._weighted import cumulated
 
 
 class Predictive:
@@ -28,8 +29,7 @@ class Predictive:
             return
         order = np.argsort(known)
         self._values = known[order]
-        total = np.cumsum(weights[is_known][order])
-        below = np.concatenate([[0.0], total])
+        below = cumulated(weights[is_known], order)
         self._below = below / below[-1]
 
     def steps(self, y: Floats) -> tuple[Floats, Floats]:

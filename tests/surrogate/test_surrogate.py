@@ -76,7 +76,7 @@ def test_executors_give_the_same_and_a_store_computes_nothing_twice(tmp_path: Pa
     again = prb.Surrogate.fit(bent, BOX, 48, store=folder, model=prb.surrogate.Polynomial(3))
     assert again.n_runs == 0
     assert again.error.rms > 0
-    assert (folder / "surrogate.nc").exists()
+    assert (folder / "responses.sqlite").exists()
 
 
 def test_a_response_that_raises_stops_or_is_left_out(tmp_path: Path) -> None:
