@@ -26,7 +26,7 @@ import prbayes as prb
 from benchmarks import record
 from benchmarks.systems import METRICS, SYSTEMS
 from prbayes.estimate.methods import Method
-from prbayes.estimate.search import Search
+from prbayes.estimate.search import Search, Trace, approach, minimise, settle
 
 SIZE = 1000
 REACH = {"linear": (-12.0, 12.0), "nonlinear A": (-12.0, 8.0)}  # of mu, in standard deviations from the truth
@@ -66,9 +66,12 @@ def basins(evaluator: Any, name: str, metric: str, *, guided: bool) -> tuple[Any
     labels, counts = [], []
     for theta in thetas(name, STARTS):
         search = Search(evaluator, np.array([sigma, 1.0]), Method("BFGS"), prior=False, tolerance=1e-5, most=500)
-        start = search.approach(theta, np.ones(1), 0) if guided else theta
-        search.settle(search(start, np.ones(1)))
-        at, spread = search.best[0], np.exp(search.best[1])
+        start, trace = theta, Trace()
+        if guided:
+            led = approach(search, theta, np.ones(1), 0)
+            start, trace = led.theta, led.trace
+        run = settle(search, minimise(search, start, np.ones(1), trace))
+        at, spread = run.best[0], np.exp(run.best[1])
         close = 0.5 < spread / sigma < 2
         mirror = MIRROR[name]
         if close and abs(at - mu) < sigma:
@@ -78,7 +81,7 @@ def basins(evaluator: Any, name: str, metric: str, *, guided: bool) -> tuple[Any
         else:
             labels.append("elsewhere")
         if labels[-1] != "elsewhere":
-            counts.append(len(search.values))
+            counts.append(len(run.trace.values))
     return np.array(labels), float(np.median(counts)) if counts else np.nan
 
 

@@ -24,7 +24,7 @@ import prbayes as prb
 from benchmarks import record
 from benchmarks.systems import METRICS
 from prbayes.estimate.methods import Method
-from prbayes.estimate.search import Search
+from prbayes.estimate.search import Search, approach, minimise, settle
 from prbayes.model.evaluator import Evaluator
 
 SIZES = (20, 50, 1000, 100_000)
@@ -71,8 +71,9 @@ def fit(base: Evaluator, data: Any, metric: str) -> tuple[float, float, bool]:
         return np.nan, np.nan, False
     search = Search(ev, np.array([1.0, 1.0]), Method(), prior=False, tolerance=1e-6, most=3000)
     start = ev.unconstrained({"mu": float(np.median(data)) + 0.3, "sigma": 1.5})
-    result = search.settle(search(search.approach(start, np.ones(1), 0), np.ones(1)))
-    return float(search.best[0]), float(np.exp(search.best[1])), bool(result.success)
+    led = approach(search, start, np.ones(1), 0)
+    run = settle(search, minimise(search, led.theta, np.ones(1), led.trace))
+    return float(run.best[0]), float(np.exp(run.best[1])), run.success
 
 
 def families(base: Evaluator, seeds: int) -> dict[str, Any]:

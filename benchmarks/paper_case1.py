@@ -27,7 +27,7 @@ import prbayes as prb
 from benchmarks import record
 from benchmarks.systems import METRICS, SYSTEMS
 from prbayes.estimate.methods import Method
-from prbayes.estimate.search import Search
+from prbayes.estimate.search import Search, Trace, minimise, settle
 
 SIZES = (20, 50, 1000, 100_000)
 POINTS = {"sobol": prb.Resimulated(4096), "monte carlo": prb.Resimulated(1_000_000, points="monte_carlo")}
@@ -57,11 +57,12 @@ def fits(evaluator: Any, scale: Any, initial: Any, observed: Any, metric: str) -
     out = {}
     for name, method in METHODS.items():
         search = Search(ev, scale, method, prior=False, tolerance=1e-6, most=2000)
-        result = search(ev.unconstrained({"mu": initial[0], "sigma": initial[1]}), np.ones(1))
-        walked = len(search.values)
-        result = search.settle(result)
-        point = ev.constrained(search.best[None])
-        out[name] = [float(point["mu"][0]), float(point["sigma"][0]), len(search.values), float(bool(result.success))]
+        theta = ev.unconstrained({"mu": initial[0], "sigma": initial[1]})
+        run = minimise(search, theta, np.ones(1), Trace())
+        walked = len(run.trace.values)
+        run = settle(search, run)
+        point = ev.constrained(run.best[None])
+        out[name] = [float(point["mu"][0]), float(point["sigma"][0]), len(run.trace.values), float(run.success)]
         out[name].append(walked)
     return out
 

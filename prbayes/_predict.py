@@ -22,7 +22,7 @@ from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.model.identity import Level, identity_of_model, require_same
 from prbayes.model.labels import versions
 from prbayes.model.node import Node, model_on_context, nodes
-from prbayes.model.support import DesignError
+from prbayes.model.support import TOLERABLE, DesignError, shortcoming
 from prbayes.propagation.points import base_points
 from prbayes.propagation.reweighted import Design
 from prbayes.response.calling import ResponseError
@@ -32,13 +32,6 @@ from prbayes.response.inputs import Inputs, read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 
 _log = logging.getLogger("prbayes")
-
-# Shares of the effective sample size that a calibration requires of a design, and of a population's
-# mass, which the median population of a prediction must have. By judgement: laxer than what a
-# calibration asks, as draws at the edge of a posterior are less well supported than its centre, and
-# resampling needs no derivative.
-_LEAST_ESS = 0.5
-_MASS = 0.7, 1.4
 
 # Of the unit interval, by which points keep off its ends: any value from 1e-16 to 1e-9 moves only
 # specimens that are rarer than one in 1e9.
@@ -332,8 +325,8 @@ def _refuse_unsupported(name: str, design: Design, roots: list[Floats]) -> None:
     support = design.support(roots)
     ess = np.median(support["weight_ess"])
     mass = np.median(support["mean_weight"])
-    low, high = _MASS
-    if ess >= _LEAST_ESS * design.required_ess and low < mass < high:
+    # Points without response become NaN, which are counted and said by themselves.
+    if not shortcoming(support, design.required_ess, 1.0, design.n_points, TOLERABLE):
         return
     raise DesignError(
         f"{name}: got a weight effective sample size of {ess:.0f} and a mean raw weight of "

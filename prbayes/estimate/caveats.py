@@ -1,15 +1,40 @@
-"""What is to be said of an optimum: at an edge, at a jump, far from the data."""
+"""What is to be said of an optimum: at an edge or a jump, far from the data, not identified."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from prbayes._checks import Floats
+from prbayes.estimate.differences import cross
+from prbayes.estimate.identifiability import blind_directions
+from prbayes.estimate.refinement import AGREE
+from prbayes.estimate.rivals import Rival
+from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
 
+# Step, in spreads of the prior, within which nothing changes where there is no information; small
+# enough to stay on a plateau, and large against rounding. By judgement.
+_NEAR = 0.01
+# A relative change that is rounding: 1e4 times that of a sum in double precision. By judgement.
+_ROUNDING = 1e-12
+# Design error of which is warned, in standard errors: half as much again as is asked for, since an
+# estimate from eight blocks is itself uncertain by a quarter.
+_TOLERATED = 1.5 * AGREE
+# Where an element left its prior, by spreads of the prior from its middle; nearer to it nothing is
+# evaluated. Collapsed populations end 2.9 to 24 of them out, with priors of sigma from narrow to
+# fifty times as wide as its truth (test: a collapsed population is known by the objective).
+_FAR = 2.0
+# A change that is none, of the objective's typical size. Of collapsed populations a spread further
+# changes 2e-7 at most, and the way back to the prior's middle 7e-4 at least: any value in
+# [1e-6, 1e-4] gives the same verdicts on them, on four processors and with noise of 1e-12.
+_UNCHANGED = 1e-5
+# Distance between distribution functions from which two populations differ. A half of the mass whose
+# spread shrinks by a factor of 1.3 makes 0.035; where a population stands still it is a point's 1/n.
+_DIFFERENT = 0.02
 
-def trouble(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> list[str]:
-    """Say that elements are at the edge of their support, and that simulators jump."""
+
+def breakdown(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> list[str]:
+    """Say why no sampling distribution is known: elements at an edge, simulators that jump."""
     lines = []
     if at_edge:
         lines.append(
@@ -25,9 +50,111 @@ def trouble(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> list[str]:
     return lines
 
 
-def flat(evaluator: Evaluator, theta: Floats, scale: Floats) -> bool:
-    """Whether no discrepancy changes around theta, as where populations and observed values do not overlap."""
-    around = np.vstack([theta, *(theta + s * e for e in np.diag(0.01 * scale) for s in (1, -1))])
-    found = evaluator(around).discrepancies
+def no_information(evaluator: Evaluator, theta: Floats) -> bool:
+    """Return whether no discrepancy changes around theta, as where populations miss the data."""
+    found = evaluator(cross(theta, _NEAR * evaluator.prior_sd)).discrepancies
     with np.errstate(invalid="ignore"):
-        return bool(((found == found[0]) | (np.abs(found - found[0]) <= 1e-12 * np.abs(found[0]))).all())
+        change = np.abs(found - found[0])
+        same = (found == found[0]) | (change <= _ROUNDING * np.abs(found[0]))
+    return bool(same.all())
+
+
+def elements_at_edge(
+    evaluator: Evaluator, theta: Floats, scales: Floats, *, size: float, tolerance: float, seed: int
+) -> tuple[str, ...]:
+    """Return the elements that ran to an edge: the population goes on changing there, and its discrepancy does not.
+
+    Standard errors cannot tell: curvature and noise are both rounding errors at an edge, and their ratio is anything.
+    The way back to the middle of the prior does change the discrepancy, unlike that of a hyperparameter without effect.
+    At the bound of a prior the population itself stands still: that is a minimum under a constraint.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    theta : ndarray, shape (d,)
+    scales : ndarray, shape (k,)
+    size : float
+        Typical size of the objective.
+    tolerance : float
+        Of the minimiser: it stops where the objective changes by less than that in one spread of the prior.
+    seed : int
+    """
+    middle = np.median(evaluator.prior_thetas(256, seed), axis=0)
+    away = theta - middle
+    far = np.flatnonzero(np.abs(away) > _FAR * evaluator.prior_sd)
+    if not far.size or no_information(evaluator, theta):
+        return ()
+    further = theta + np.diag(np.sign(away) * evaluator.prior_sd)[far]
+    back = theta - np.diag(away)[far]
+    # What changes further out, and on the way back
+    here, *there = evaluator.total(np.vstack([theta, further, back]), scales)
+    with np.errstate(invalid="ignore"):
+        changes = np.abs(np.array(there) - here).reshape(2, -1)
+    unchanged = max(_UNCHANGED, tolerance) * size
+    stands_still, comes_back = changes[0] < unchanged, changes[1] > unchanged
+    suspects = np.flatnonzero(stands_still & comes_back)
+    names = evaluator.readable_names
+    return tuple(
+        names[far[i]] for i in suspects if _apart(evaluator, theta, further[i]) > _DIFFERENT
+    )
+
+
+def _apart(evaluator: Evaluator, a: Floats, b: Floats) -> float:
+    """Return the largest distance between distribution functions of the populations at two thetas."""
+    largest = 0.0
+    for k in range(len(evaluator.nodes)):
+        values, weights = evaluator.populations(np.array([a, b]), k)
+        at = np.unique(values[np.isfinite(values)])
+        below = [_shares_below(v, w, at) for v, w in zip(values, weights, strict=True)]
+        largest = max(largest, float(np.abs(below[0] - below[1]).max(initial=0.0)))
+    return largest
+
+
+def _shares_below(values: Floats, weights: Floats, at: Floats) -> Floats:
+    """Return the shares of weight of the values up to each number; those without response are above all."""
+    order = np.argsort(values)
+    total = np.concatenate([[0.0], np.cumsum(weights[order])])
+    return np.asarray(total[np.searchsorted(values[order], at, side="right")] / total[-1])
+
+
+def caveats(
+    evaluator: Evaluator, local: Local | None, others: list[Rival], design_error: float
+) -> tuple[str, ...]:
+    """Say whether the design is too small, what other optima there are, what is not identified."""
+    lines = []
+    if design_error > _TOLERATED:
+        lines.append(_of_design(evaluator, design_error))
+    lines += [_of_rival(evaluator, rival) for rival in others if rival.comparable]
+    if local is not None:
+        directions = blind_directions(local.blind, evaluator.readable_names)
+        lines += map(_of_direction, directions)
+    return tuple(lines)
+
+
+def _of_design(evaluator: Evaluator, error: float) -> str:
+    points = max(d.n_points for d in evaluator.designs.values())
+    return (
+        f"the optimum of another design would differ by about {error:.2f} standard errors, "
+        f"expected at most {AGREE}; pass a larger n or max_points to prb.Reweighted (now {points} "
+        "points)"
+    )
+
+
+def _of_rival(evaluator: Evaluator, rival: Rival) -> str:
+    point = evaluator.constrained(rival.theta[None])
+    values = []
+    for rv in evaluator.model.free_RVs:
+        value = np.array2string(point[rv.name][0], precision=4)
+        values.append(f"{rv.name} = {value}")
+    return (
+        f"the data could as well come from {', '.join(values)}: another optimum, or mirror "
+        "solution, whose discrepancy differs by no more than sampling noise; state a prior that "
+        "excludes one, or report both"
+    )
+
+
+def _of_direction(direction: str) -> str:
+    return (
+        f"the data tell less than the prior about {direction} (in units of the priors' standard "
+        "deviations): it is not identified by them, and its posterior rests on the prior"
+    )

@@ -8,8 +8,14 @@ from typing import Any
 
 import numpy as np
 
+# Names of scipy's minimisers that need no Hessian.
 _GRADIENT_FREE = ("Nelder-Mead", "Powell", "COBYLA", "COBYQA")
 _WITH_GRADIENT = ("BFGS", "CG", "L-BFGS-B", "Newton-CG", "SLSQP", "TNC", "trust-constr")
+# Where the budget of evaluations alone is to limit a method.
+_UNLIMITED = 10**9
+# First step of methods without gradient, in spreads of the prior. By judgement: larger than the
+# standard errors of most problems, and within the prior.
+_FIRST = 0.2
 
 
 @dataclass(frozen=True)
@@ -57,27 +63,35 @@ class Method:
                 "scipy.optimize.minimize takes as its method"
             )
         if not isinstance(self.options, Mapping):
-            raise TypeError(f"options: got {type(self.options).__name__}, expected a mapping of names to values")
+            raise TypeError(
+                f"options: got {type(self.options).__name__}, expected a mapping of names to values"
+            )
 
     @classmethod
-    def of(cls, method: str | Callable[..., Any] | None, options: Mapping[str, Any] | None) -> Method:
+    def of(
+        cls, method: str | Callable[..., Any] | None, options: Mapping[str, Any] | None
+    ) -> Method:
         """Return what a user meant by ``method=`` and ``options=``."""
         return cls("BFGS" if method is None else method, {} if options is None else options)
 
     @property
     def name(self) -> str:
         """What messages call it."""
-        return self.method if isinstance(self.method, str) else getattr(self.method, "__name__", repr(self.method))
+        if isinstance(self.method, str):
+            return self.method
+        return str(getattr(self.method, "__name__", repr(self.method)))
 
     @property
     def gradient(self) -> bool:
         """Whether the method is given gradients."""
-        return not isinstance(self.method, str) or self.method.lower() not in {n.lower() for n in _GRADIENT_FREE}
+        if not isinstance(self.method, str):
+            return True
+        return self.method.lower() not in {n.lower() for n in _GRADIENT_FREE}
 
     def settings(self, tolerance: float, size: int) -> dict[str, Any]:
         """Return scipy's options for a standardised problem; the budget of evaluations alone limits iterations."""
-        most = 10**9
-        simplex = np.vstack([np.zeros(size), 0.2 * np.eye(size)])
+        most = _UNLIMITED
+        simplex = np.vstack([np.zeros(size), _FIRST * np.eye(size)])
         known: dict[str, dict[str, Any]] = {
             "bfgs": {"gtol": tolerance, "maxiter": most},
             "cg": {"gtol": tolerance, "maxiter": most},
@@ -94,7 +108,13 @@ class Method:
                 "maxiter": most,
             },
             "powell": {"xtol": tolerance, "ftol": tolerance**2, "maxfev": most, "maxiter": most},
-            "cobyla": {"tol": tolerance, "rhobeg": 0.2, "maxiter": most},
-            "cobyqa": {"final_tr_radius": tolerance, "initial_tr_radius": 0.2, "maxfev": most, "maxiter": most},
+            "cobyla": {"tol": tolerance, "rhobeg": _FIRST, "maxiter": most},
+            "cobyqa": {
+                "final_tr_radius": tolerance,
+                "initial_tr_radius": _FIRST,
+                "maxfev": most,
+                "maxiter": most,
+            },
         }
-        return {**known.get(self.name.lower() if isinstance(self.method, str) else "", {}), **self.options}
+        name = self.method.lower() if isinstance(self.method, str) else ""
+        return {**known.get(name, {}), **self.options}

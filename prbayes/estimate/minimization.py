@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,14 +13,14 @@ import pymc as pm
 
 from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes._progress import shown
-from prbayes.estimate.caveats import flat, trouble
-from prbayes.estimate.identifiability import blind_directions
+from prbayes.estimate.caveats import breakdown, caveats, elements_at_edge
 from prbayes.estimate.methods import Method
-from prbayes.estimate.optimum import Optimum, assemble, plain
+from prbayes.estimate.optimum import Optimum
 from prbayes.estimate.refinement import (
     AGREE,
     MAX_ROUNDS,
     grow,
+    noise_floors,
     pilot,
     refine_at,
     refuse,
@@ -29,8 +29,9 @@ from prbayes.estimate.refinement import (
 from prbayes.estimate.refit import Neighbourhood
 from prbayes.estimate.rivals import Rival, rivals
 from prbayes.estimate.sampling import Local
-from prbayes.estimate.sandwich import Information
-from prbayes.estimate.search import Search
+from prbayes.estimate.search import Run, Search, Trace, approach, minimise, settle
+from prbayes.estimate.search import start as begin
+from prbayes.estimate.solution import assemble, rival_record
 from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import model_on_context
@@ -75,8 +76,6 @@ def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[
     >>> prb.refine(model)
     {'y': 1024}
     """
-    from prbayes.estimate.minimization import minimize
-
     model = model_on_context(model, "prb.refine")
     evaluator = Evaluator(model)
     if thetas is None:
@@ -89,13 +88,18 @@ def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[
     return {name: design.n_points for name, design in evaluator.designs.items()}
 
 
-_LOOKS = 3  # at other optima, with a design that is refined in between
-_STARTS = 32  # points of the prior from which other optima are searched for where a theta costs no response
-_TOLERATED = 1.5 * AGREE  # an estimate from eight blocks is itself uncertain
-_MOVED = 0.01  # prior standard deviations from which what is known of an optimum is looked up again
-_FAR = 4.0  # prior standard deviations from the prior's middle, from where on the edge of a support is thought of
-_SAME = 1e-6  # of the objective's typical size: a change that is none
-_FLOOR = 0.3  # of the noise floor: about the difference of the discrepancy between the data's fit and the truth's
+# Looks at other optima, with a design that is refined in between; most need one. By judgement.
+_LOOKS = 3
+# Points of the prior from which other optima are searched for where a theta costs no response; the
+# better half of four times as many. By judgement: more take time, fewer may leave out a basin.
+_STARTS = 32
+# Spreads of the prior from which what is known of an optimum is looked up again: a simplex that
+# settles a line search moves it by less, and standard errors change by less.
+_MOVED = 0.01
+# Of the noise floor: about the difference of the discrepancy between the data's fit and the truth's.
+_FLOOR = 0.3
+# Data sets that tell the noise floor, which only says when optima are compared.
+_FLOOR_SETS = 50
 
 
 def minimize(
@@ -212,161 +216,292 @@ def find_optimum(
     minimiser = Method.of(method, options)
     positive_number(tolerance, "tolerance")
     positive_integer(max_evaluations, "max_evaluations")
-    fresh = [n.name for n in evaluator.nodes if n.bound.random]
-    if fresh and minimiser.gradient and isinstance(minimiser.method, str):
-        raise TypeError(
-            f"{fresh[0]}: prb.Fresh draws new responses at every evaluation, so the method {minimiser.name} has no "
-            "gradient to follow; pass epsilon= to prb.sample_smc, which then needs no optimum, use "
-            "prb.minimize(method='Nelder-Mead'), or propagation=prb.Reweighted() or prb.Resimulated()"
-        )
-    scale = evaluator.prior_sd
-    already = evaluator.n_responses
+    _refuse_random(evaluator, minimiser)
+    search = Search(evaluator, evaluator.prior_sd, minimiser, prior, tolerance, max_evaluations)
     stored = sum(d.n_points for d in evaluator.designs.values())
-    several = len(evaluator.nodes) > 1
-    natural = np.array([n.target.scale for n in evaluator.nodes]) if several or prior else np.ones(1)
-    natural = np.where(np.isnan(evaluator.epsilon) | (not (several or prior)), natural, evaluator.epsilon)
-    search = Search(evaluator, scale, minimiser, prior, tolerance, max_evaluations)
-    theta, screened = search.start(start, natural, random_seed)
-    theta = search.approach(theta, natural, random_seed)
-    scales = natural
-    cloud: Floats | None = None
-    error, rounds = np.nan, 0
+    responses_before = evaluator.n_responses - stored
+    if starts is None:
+        starts = 0 if evaluator.responses_per_theta else _STARTS
+    plan = _Plan(search, _several(evaluator), refine, starts, random_seed)
+
+    # Initialise: a start, and the way to where simulated responses meet the data
+    scales = _initial_scales(evaluator, prior=prior)
+    theta, screened = begin(search, start, scales, random_seed)
+    led = approach(search, theta, scales, random_seed)
+
+    # Step: minimise, look at the design, until it is enough
+    state = _minimised(plan, led.theta, scales, led.trace)
+    rounds = 0
     while True:
-        result = search(theta, scales)
-        theta = search.best
-        if several and np.isnan(evaluator.epsilon).any():
-            noise = [Information(evaluator, k, theta, scale).noise_floor for k in range(len(evaluator.nodes))]
-            scales = np.where(np.isnan(evaluator.epsilon), noise, evaluator.epsilon)
-            result = search(theta, scales)
-            theta = search.best
-        hood = _hood(evaluator, theta, scale, scales)
-        local = None if hood is None else hood.local
-        covariance = np.full((theta.size, theta.size), np.nan) if local is None else local.in_theta
-        if not (refine and evaluator.designs):
+        state = _judged(plan, state, rounds)
+        if state.restart is None:
             break
-        near = spread_around(theta, covariance, scale, seed=random_seed) if cloud is None else cloud
-        near = near[evaluator.in_support(near)]
-        short = shortcomings(evaluator, near) or shortcomings(evaluator, theta[None])
-        if not short:
-            error = np.nan if hood is None else hood.design_error()
-            if not error > AGREE or not grow(evaluator, near, error):
-                break
-        elif rounds == MAX_ROUNDS:
-            refuse(short, evaluator)
-        elif cloud is None:
-            cloud = near = pilot(evaluator, scales, scale, seed=random_seed)
-        elif not refine_at(evaluator, near):
-            refine_at(evaluator, theta[None])
         rounds += 1
-        # What looked best on a thin design may be an artefact of it.
-        theta = search.best_of(np.vstack([theta, near]), scales)
-    starts = (0 if evaluator.responses_per_theta else _STARTS) if starts is None else starts
-    others: list[Rival] = []
-    if starts and local is not None:
-        others = _rivals(evaluator, theta, scales, local, starts, random_seed, refine=refine)
-        if others and others[0].better:
-            result = search(others[0].theta, scales)
-            theta = search.best
-            hood = _hood(evaluator, theta, scale, scales)
-            local = None if hood is None else hood.local
-            others = (
-                [] if local is None else _rivals(evaluator, theta, scales, local, starts, random_seed, refine=refine)
-            )
-    result = search.settle(result)
-    theta = search.best
-    if hood is not None and not np.array_equal(theta, hood.theta):
-        if (np.abs(theta - hood.theta) > _MOVED * scale).any():
-            hood = _hood(evaluator, theta, scale, scales)
-            local = None if hood is None else hood.local
-        error = np.nan
-    if hood is not None and np.isnan(error):
-        error = hood.design_error()
-    edge = () if local is None else _at_edge(evaluator, theta, scales, local, search.size(theta, scales), random_seed)
-    jump = () if hood is None else tuple(evaluator.nodes[k].name for k in hood.unsettled())
+        state = _minimised(plan, state.restart, state.scales, state.run.trace, state.cloud)
+
+    # Terminate: other optima, stalled line searches, the error of the design where it ended
+    state, others = _against_rivals(plan, state)
+    state = _settled(plan, state)
+
+    # Postprocess: where nothing is known of the sampling distribution, none is reported
+    edge, jump = _breakdown(plan, state)
     if edge or jump:
-        local, others = None, []
-    warnings = (*trouble(edge, jump), *_warnings(evaluator, local, others, error))
+        state, others = replace(state, sampling=None), []
+    found = assemble(
+        search,
+        state.run,
+        covariance=_covariance(state),
+        remark=led.remark,
+        screened=screened,
+        responses_before=responses_before,
+    )
+    warnings = (
+        *breakdown(edge, jump),
+        *caveats(evaluator, state.local, others, state.design_error),
+    )
     for line in warnings:
         _log.warning("%s", line)
-    found = assemble(evaluator, theta, scales, local, search, result, screened, already - stored, clock)
+    ran_out = f" {', '.join(edge)} ran to the edge of the support." if edge else ""
     return replace(
         found,
         converged=found.converged and not edge,
-        message=found.message + (f" {', '.join(edge)} ran to the edge of the support." if edge else ""),
-        design_error=error,
-        rivals=tuple(_described(evaluator, o) for o in others),
+        message=found.message + ran_out,
+        seconds=time.perf_counter() - clock,
+        design_error=state.design_error,
+        rivals=tuple(rival_record(evaluator, o) for o in others),
         warnings=warnings,
         at_edge=edge,
         at_jump=jump,
     )
 
 
-def _hood(evaluator: Evaluator, theta: Floats, scale: Floats, scales: Floats) -> Neighbourhood | None:
-    """Return the sampling distribution of the minimiser around theta, or None where nothing is known of it."""
-    if any(n.metric.minimum is Minimum.UNKNOWN or n.bound.random for n in evaluator.nodes):
-        return None
-    return Neighbourhood.of(evaluator, theta, scales, scale)
+# -- what a minimisation is, and where it stands ---------------------------------------------------
 
 
-def _rivals(
-    evaluator: Evaluator, theta: Floats, scales: Floats, local: Local, starts: int, seed: int, *, refine: bool
-) -> list[Rival]:
-    """Look for other optima; where a design is too thin for one that matters, refine it there and look again."""
-    floors = [Information(evaluator, k, theta, local.scale, n_sets=50).noise_floor for k in range(len(evaluator.nodes))]
-    noise = _FLOOR * float((np.array(floors) / scales).sum())
+@dataclass(frozen=True)
+class _Plan:
+    """What is to be done: the search, and what goes on around it.
+
+    Attributes
+    ----------
+    search : Search
+    several : bool
+        Whether there are several simulators, so that their scales matter.
+    refine : bool
+    starts : int
+    seed : int
+    """
+
+    search: Search
+    several: bool
+    refine: bool
+    starts: int
+    seed: int
+
+    @property
+    def evaluator(self) -> Evaluator:
+        """The model's evaluator."""
+        return self.search.evaluator
+
+
+@dataclass(frozen=True)
+class _State:
+    """Where the minimisation stands.
+
+    Attributes
+    ----------
+    theta : ndarray, shape (d,)
+        The best so far.
+    scales : ndarray, shape (k,)
+        By which the simulators' discrepancies are divided.
+    run : Run
+        The last one, with the trace of all.
+    sampling : Neighbourhood or None
+        The sampling distribution of the minimiser around theta; None where nothing is known of it.
+    design_error : float
+        Of the design, in standard errors; NaN where it is not known.
+    cloud : ndarray, shape (m, d), or None
+        Thetas to which a pilot led, around which the design grows.
+    restart : ndarray, shape (d,), or None
+        Where to minimise again, on a design that has grown.
+    """
+
+    theta: Floats
+    scales: Floats
+    run: Run
+    sampling: Neighbourhood | None
+    design_error: float = np.nan
+    cloud: Floats | None = None
+    restart: Floats | None = None
+
+    @property
+    def local(self) -> Local | None:
+        """To first order."""
+        return None if self.sampling is None else self.sampling.local
+
+
+# -- before ----------------------------------------------------------------------------------------
+
+
+def _refuse_random(evaluator: Evaluator, method: Method) -> None:
+    """Raise if a method of scipy that follows gradients is to follow those of random draws."""
+    random = [n.name for n in evaluator.nodes if n.bound.random]
+    if random and method.gradient and isinstance(method.method, str):
+        raise TypeError(
+            f"{random[0]}: prb.Fresh draws new responses at every evaluation, so the method "
+            f"{method.name} has no gradient to follow; pass epsilon= to prb.sample_smc, which then "
+            "needs no optimum, use prb.minimize(method='Nelder-Mead'), or "
+            "propagation=prb.Reweighted() or prb.Resimulated()"
+        )
+
+
+def _several(evaluator: Evaluator) -> bool:
+    return len(evaluator.nodes) > 1
+
+
+def _initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
+    """Return epsilons where they are given and matter, else typical sizes of discrepancies."""
+    if not (_several(evaluator) or prior):
+        return np.ones(1)
+    natural = np.array([n.target.scale for n in evaluator.nodes])
+    epsilon = evaluator.epsilon
+    return np.where(np.isnan(epsilon), natural, epsilon)
+
+
+# -- steps -----------------------------------------------------------------------------------------
+
+
+def _minimised(
+    plan: _Plan, theta: Floats, scales: Floats, trace: Trace, cloud: Floats | None = None
+) -> _State:
+    """Minimise from theta; with several simulators again, with the noise at that pilot optimum."""
+    run = minimise(plan.search, theta, scales, trace)
+    unset = np.isnan(plan.evaluator.epsilon)
+    if plan.several and unset.any():
+        noise = noise_floors(plan.evaluator, run.best)
+        scales = np.where(unset, noise, plan.evaluator.epsilon)
+        run = minimise(plan.search, run.best, scales, run.trace)
+    sampling = _sampling(plan.evaluator, run.best, scales)
+    return _State(run.best, scales, run, sampling, cloud=cloud)
+
+
+def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
+    """Judge the designs; where they are not enough, add points and say where to begin again.
+
+    Raises
+    ------
+    DesignError
+        If they still fall short after the last round.
+    """
+    evaluator = plan.evaluator
+    if not (plan.refine and evaluator.designs):
+        return state
+    near = state.cloud
+    if near is None:
+        near = spread_around(state.theta, _covariance(state), evaluator.prior_sd, seed=plan.seed)
+    near = near[evaluator.in_support(near)]
+    short = shortcomings(evaluator, near) or shortcomings(evaluator, state.theta[None])
+    if not short:
+        # Enough for the populations; for the optimum?
+        error = np.nan if state.sampling is None else state.sampling.design_error()
+        state = replace(state, design_error=error)
+        if not error > AGREE or not grow(evaluator, near, error):
+            return state
+    elif rounds == MAX_ROUNDS:
+        refuse(short, evaluator)
+    elif state.cloud is None:
+        near = pilot(evaluator, state.scales, seed=plan.seed)
+        state = replace(state, cloud=near)
+    elif not refine_at(evaluator, near):
+        refine_at(evaluator, state.theta[None])
+    # What looked best on a thin design may be an artefact of it.
+    candidates = np.vstack([state.theta, near])
+    return replace(state, restart=plan.search.best_of(candidates, state.scales))
+
+
+def _against_rivals(plan: _Plan, state: _State) -> tuple[_State, list[Rival]]:
+    """Look for other optima, and leave for a better one."""
+    if not plan.starts or state.local is None:
+        return state, []
+    others = _rivals(plan, state)
+    if not others or not others[0].better:
+        return state, others
+    run = minimise(plan.search, others[0].theta, state.scales, state.run.trace)
+    sampling = _sampling(plan.evaluator, run.best, state.scales)
+    state = replace(state, theta=run.best, run=run, sampling=sampling)
+    return state, ([] if sampling is None else _rivals(plan, state))
+
+
+def _rivals(plan: _Plan, state: _State) -> list[Rival]:
+    """Return other optima; where a design is too thin for one that matters, refine and look again."""
+    evaluator = plan.evaluator
+    assert state.local is not None
+    floors = noise_floors(evaluator, state.theta, n_sets=_FLOOR_SETS)
+    noise = _FLOOR * float((floors / state.scales).sum())
     for _ in range(_LOOKS):
-        found = rivals(evaluator, theta, scales, local, noise, starts=starts, seed=seed)
-        thin = [r for r in found if (r.better or r.comparable) and shortcomings(evaluator, r.theta[None])]
-        if not thin or not refine:
+        found = rivals(
+            evaluator,
+            state.theta,
+            state.scales,
+            state.local,
+            noise,
+            starts=plan.starts,
+            seed=plan.seed,
+        )
+        matter = [r for r in found if r.better or r.comparable]
+        thin = [r for r in matter if shortcomings(evaluator, r.theta[None])]
+        if not thin or not plan.refine:
             break
         refine_at(evaluator, thin[0].theta[None])
     return [r for r in found if not shortcomings(evaluator, r.theta[None])]
 
 
-def _at_edge(
-    evaluator: Evaluator, theta: Floats, scales: Floats, local: Local, size: float, seed: int
-) -> tuple[str, ...]:
-    """Return the elements that went far out and could go on without any change: their best value is at an edge.
-
-    Data drawn from such a population tell much, so that the standard errors are small there, and mean nothing.
-    """
-    away = theta - np.median(evaluator.prior_thetas(256, seed), axis=0)
-    far = np.flatnonzero((np.abs(away) > _FAR * local.scale) & np.isfinite(np.diag(local.in_theta)))
-    if not far.size or flat(evaluator, theta, local.scale):
-        return ()
-    further = np.diag(np.sign(away) * local.scale)[far]
-    here, *there = evaluator.total(np.vstack([theta, theta + further]), scales)
-    return tuple(evaluator.readable_names[i] for i, f in zip(far, there, strict=True) if abs(f - here) < _SAME * size)
-
-
-def _described(evaluator: Evaluator, rival: Rival) -> dict[str, Any]:
-    point = {name: plain(v[0]) for name, v in evaluator.constrained(rival.theta[None]).items()}
-    return {"point": point, "discrepancy": rival.value, "theta": rival.theta, "comparable": rival.comparable}
+def _settled(plan: _Plan, state: _State) -> _State:
+    """Settle a line search that gave up; what is known of the optimum is then that of its place."""
+    before = state.theta
+    run = settle(plan.search, state.run)
+    state = replace(state, theta=run.best, run=run)
+    if state.sampling is None:
+        return state
+    away = np.abs(state.theta - before)
+    if (away > _MOVED * plan.evaluator.prior_sd).any():
+        sampling = _sampling(plan.evaluator, state.theta, state.scales)
+        state = replace(state, sampling=sampling)
+    known = not np.isnan(state.design_error) and not away.any()
+    if known or state.sampling is None:
+        return state
+    return replace(state, design_error=state.sampling.design_error())
 
 
-def _warnings(evaluator: Evaluator, local: Local | None, others: list[Rival], error: float) -> tuple[str, ...]:
-    """Say what is not identified, and whether the design is too small."""
-    lines = []
-    if error > _TOLERATED:
-        points = max(d.n_points for d in evaluator.designs.values())
-        lines.append(
-            f"the optimum of another design would differ by about {error:.2f} standard errors, expected at most "
-            f"{AGREE}; pass a larger n or max_points to prb.Reweighted (now {points} points)"
-        )
-    for rival in others:
-        if rival.comparable:
-            point = evaluator.constrained(rival.theta[None])
-            at = ", ".join(
-                f"{rv.name} = {np.array2string(point[rv.name][0], precision=4)}" for rv in evaluator.model.free_RVs
-            )
-            lines.append(
-                f"the data could as well come from {at}: another optimum, or mirror solution, whose discrepancy "
-                "differs by no more than sampling noise; state a prior that excludes one, or report both"
-            )
-    if local is not None:
-        lines += [
-            f"the data tell less than the prior about {direction} (in units of the priors' standard deviations): it is "
-            "not identified by them, and its posterior rests on the prior"
-            for direction in blind_directions(local.blind, evaluator.readable_names)
-        ]
-    return tuple(lines)
+# -- after -----------------------------------------------------------------------------------------
+
+
+def _breakdown(plan: _Plan, state: _State) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the elements at an edge, and the simulators at a jump."""
+    if state.sampling is None:
+        return (), ()
+    evaluator = plan.evaluator
+    edge = elements_at_edge(
+        evaluator,
+        state.theta,
+        state.scales,
+        size=plan.search.size(state.theta, state.scales),
+        tolerance=plan.search.tolerance,
+        seed=plan.seed,
+    )
+    jump = tuple(evaluator.nodes[k].name for k in state.sampling.unsettled())
+    return edge, jump
+
+
+def _sampling(evaluator: Evaluator, theta: Floats, scales: Floats) -> Neighbourhood | None:
+    """Return the sampling distribution of the minimiser, or None where nothing is known of it."""
+    if any(n.metric.minimum is Minimum.UNKNOWN or n.bound.random for n in evaluator.nodes):
+        return None
+    return Neighbourhood.of(evaluator, theta, scales, evaluator.prior_sd)
+
+
+def _covariance(state: _State) -> Floats:
+    """Return the sampling covariance, (d, d); NaN where nothing is known."""
+    if state.local is None:
+        return np.full((state.theta.size, state.theta.size), np.nan)
+    return state.local.in_theta

@@ -1,4 +1,4 @@
-"""The standardised objective of one minimisation, and differences where there is no gradient."""
+"""The standardised objective of one minimisation, and why it may end early."""
 
 from __future__ import annotations
 
@@ -9,7 +9,13 @@ import numpy as np
 
 from prbayes._checks import Floats
 
-_PROGRESS = 1e-10  # of the objective, in its typical size: a smaller gain is none
+# A gain that is none, of the objective's typical size: rounding of a sum over thousands of points.
+_PROGRESS = 1e-10
+# Values where there is none: simplices compare them, and line searches differ them.
+_HUGE = 1e300
+_STEEP = 1e10
+# Evaluations without progress that are never reached.
+_UNLIMITED = 10**9
 
 
 class SpentError(Exception):
@@ -21,12 +27,43 @@ class StalledError(Exception):
 
 
 class Objective:
-    """The standardised objective of one minimisation; records every point, at most ``most`` evaluations."""
+    """The standardised objective of one minimisation, which records every point.
 
-    def __init__(self, function: Any, center: Floats, scale: Floats, size: float, *, gradient: bool, most: int) -> None:
-        self.function, self.center, self.scale, self.size = function, center, scale, size
-        self.gradient, self.most, self.count = gradient, most, 0
-        self.patience, self._lowest, self._since = 10**9, np.inf, 0
+    Parameters
+    ----------
+    function : callable
+        Theta -> value, gradient or None, number of evaluations.
+    center : ndarray, shape (d,)
+        Theta where the standardised parameters are zero.
+    units : ndarray, shape (d,)
+    size : float
+        Typical size of the values.
+    gradient : bool
+        Whether the gradient is returned as well.
+    most : int
+        Largest number of evaluations, after which `SpentError` is raised.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Floats], Any],
+        center: Floats,
+        units: Floats,
+        size: float,
+        *,
+        gradient: bool,
+        most: int,
+    ) -> None:
+        self.function = function
+        self.center = center
+        self.units = units
+        self.size = size
+        self.gradient = gradient
+        self.most = most
+        self.count = 0
+        self.patience = _UNLIMITED
+        self._lowest = np.inf
+        self._since = 0
         self.thetas: list[Floats] = []
         self.values: list[float] = []
         self.counts: list[int] = []
@@ -36,50 +73,42 @@ class Objective:
         """Return the value, and the gradient where there is one, at standardised parameters."""
         if self.count >= self.most:
             raise SpentError
-        theta = self.center + np.asarray(t) * self.scale
+        theta = self.center + np.asarray(t) * self.units
         value, gradient, cost = self.function(theta)
+        self._record(theta, float(value), cost)
+        value = float(value) / self.size
+        self._look_for_progress(value, cost)
+        if not self.gradient:
+            return value if np.isfinite(value) else _HUGE
+        slope = np.asarray(gradient) * self.units / self.size
+        if not np.isfinite(value) or not np.isfinite(slope).all():
+            # Back towards the start, without breaking a line search.
+            return _STEEP + float(t @ t), 2 * t
+        return value, slope
+
+    def _record(self, theta: Floats, value: float, cost: int) -> None:
         self.count += cost
         self.thetas.append(theta)
-        self.values.append(float(value))
+        self.values.append(value)
         self.counts.append(self.count)
-        value = float(value) / self.size
-        self._since = 0 if value < self._lowest - _PROGRESS else self._since + 1
+
+    def _look_for_progress(self, value: float, cost: int) -> None:
+        gained = value < self._lowest - _PROGRESS
+        self._since = 0 if gained else self._since + 1
         self._lowest = min(self._lowest, value)
         self.report(cost, f"discrepancy {self._lowest * self.size:.4g}")
         if self._since > self.patience:
             raise StalledError
-        if not self.gradient:
-            return value if np.isfinite(value) else 1e300
-        g = np.asarray(gradient) * self.scale / self.size
-        if not np.isfinite(value) or not np.isfinite(g).all():
-            return 1e10 + float(t @ t), 2 * t  # back towards the start, without breaking a line search
-        return value, g
 
     @property
     def best(self) -> Floats:
         """The point with the smallest value so far, or the center."""
         if not self.values:
             return self.center
-        return self.thetas[int(np.argmin(np.nan_to_num(self.values, nan=np.inf, posinf=np.inf)))]
+        values = np.nan_to_num(self.values, nan=np.inf, posinf=np.inf)
+        return self.thetas[int(np.argmin(values))]
 
     @property
     def lowest(self) -> float:
         """The smallest value so far."""
         return min((v for v in self.values if np.isfinite(v)), default=np.inf)
-
-
-def differences(values: Callable[[Floats], Floats], step: Floats) -> Callable[[Floats], Any]:
-    """Return a function of theta that gives value, gradient by central differences, and number of evaluations.
-
-    Where one of two neighbours is infinite, as at the edge of a support, the difference is one-sided.
-    """
-
-    def function(theta: Floats) -> Any:
-        found = values(np.vstack([theta, theta + np.diag(step), theta - np.diag(step)]))
-        middle, up, down = found[0], found[1 : 1 + step.size], found[1 + step.size :]
-        with np.errstate(invalid="ignore"):
-            forward, backward = (up - middle) / step, (middle - down) / step
-            central = np.where(np.isfinite(down), (up - down) / (2 * step), forward)
-        return middle, np.where(np.isfinite(up), central, backward), len(found)
-
-    return function

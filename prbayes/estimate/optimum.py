@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,12 +10,11 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._checks import Floats
-from prbayes.estimate.caveats import flat, trouble
-from prbayes.estimate.sampling import Local
-from prbayes.estimate.search import Search
+from prbayes.estimate.caveats import breakdown
+from prbayes.estimate.refit import Neighbourhood, inapplicable
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.identity import Identity, as_attributes, from_attributes, identity_of
+from prbayes.model.identity import Identity, as_attributes, from_attributes
 from prbayes.model.labels import labelled, observed_dataset, versions
 
 
@@ -105,10 +103,15 @@ class Optimum:
 
     def __repr__(self) -> str:
         """Show the answer, what it cost, and what is to be said of it."""
-        found = [f"{name} = {_short(value)} ± {_short(self.stderr[name])}" for name, value in self.point.items()]
+        found = [
+            f"{name} = {_short(value)} ± {_short(self.stderr[name])}"
+            for name, value in self.point.items()
+        ]
         state = "converged" if self.converged else "NOT converged"
         cost = f"{self.n_evaluations} evaluations, {self.n_responses} responses, {state}"
-        return "\n  ".join([f"Optimum: discrepancy {self.discrepancy:.4g} after {cost}", *found, *self.warnings])
+        return "\n  ".join(
+            [f"Optimum: discrepancy {self.discrepancy:.4g} after {cost}", *found, *self.warnings]
+        )
 
     @property
     def model(self) -> pm.Model:
@@ -120,75 +123,41 @@ class Optimum:
         """Responses computed for the model so far: without those found in a store, with those computed again."""
         return sum(node.bound.responses.computed for node in self.evaluator.nodes)
 
+    def sampling(self, *, weakest: float = 1.0) -> Neighbourhood:
+        """Return the sampling distribution of the minimiser around the optimum.
+
+        Parameters
+        ----------
+        weakest : float
+            Largest standard error of a direction that counts as identified, in spreads of the prior.
+
+        Raises
+        ------
+        ValueError
+            If nothing is known around the optimum: it is at the edge of a support, or at a jump.
+        TypeError
+            If a metric declares nothing of its minimum, or a discrepancy is random.
+        """
+        require_sampling(self, "sampling")
+        reason = inapplicable(self.evaluator)
+        if reason:
+            raise TypeError(f"sampling: {reason}")
+        scales = np.array(list(self.scales.values()))
+        prior_sd = self.evaluator.prior_sd
+        return Neighbourhood.of(self.evaluator, self.theta, scales, prior_sd, weakest)
+
     def to_datatree(self) -> xr.DataTree:
         """Return the optimum as a DataTree with groups ``optimum``, ``stderr``, ``trace`` and ``calibration``."""
         return optimum_tree(self)
 
 
 def _short(value: Any) -> str:
-    return np.array2string(np.asarray(value), precision=4, threshold=8, formatter={"float_kind": "{:.4g}".format})
-
-
-def assemble(
-    evaluator: Evaluator,
-    theta: Floats,
-    scales: Floats,
-    local: Local | None,
-    search: Search,
-    result: Any,
-    screened: int,
-    computed: int,
-    clock: float,
-) -> Optimum:
-    """Return the record of a search that has ended at theta."""
-    covariance = np.full((theta.size, theta.size), np.nan) if local is None else local.in_theta
-    step = 1e-4 * search.scale
-    rows = np.vstack([theta, *(theta + s * e for e in np.diag(step) for s in (1, -1))])
-    values = evaluator.constrained(rows)
-    stderr = {}
-    for name, v in values.items():
-        slopes = np.moveaxis((v[1::2] - v[2::2]), 0, -1) / (2 * step)
-        blind = np.isinf(covariance)
-        variance = np.einsum("...i,ij,...j->...", slopes, np.where(blind, 0.0, covariance), slopes)
-        touched = np.einsum("...i,ij,...j->...", np.abs(slopes), blind.astype(float), np.abs(slopes))
-        at_edge = blind.any() & (slopes == 0).all(axis=-1)
-        variance = np.where(at_edge, np.nan, np.where(touched > 0, np.inf, np.maximum(variance, 0)))
-        stderr[name] = plain(np.sqrt(variance))
-    variance = np.diag(covariance) / search.scale**2  # where nothing changes, that of rounding errors
-    nowhere = bool((np.isinf(variance) | (variance < 1e-16)).all()) and flat(evaluator, theta, search.scale)
-    lost = " No hyperparameter changes the discrepancy here, far from the data: try another start." if nowhere else ""
-    found = evaluator(theta[None])
-    discrepancies = dict(zip([n.name for n in evaluator.nodes], map(float, found.discrepancies[0]), strict=True))
-    return Optimum(
-        point={name: plain(v[0]) for name, v in values.items()},
-        discrepancy=float((found.discrepancies[0] / scales).sum()),
-        discrepancies=discrepancies,
-        scales=dict(zip(discrepancies, map(float, scales), strict=True)),
-        n_evaluations=search.count,
-        n_screened=screened,
-        n_responses=evaluator.n_responses - computed,
-        converged=bool(result.success) and not nowhere,
-        message=f"{result.message}{search.remark}{lost}",
-        stderr=stderr,
-        covariance=covariance,
-        theta=theta,
-        names=evaluator.names,
-        evaluator=evaluator,
-        support={
-            name: {key: float(value[0]) for key, value in support.items()}
-            for name, support in evaluator.support(theta[None]).items()
-        },
-        trace={
-            "theta": np.array(search.thetas).reshape(-1, theta.size),
-            "discrepancy": np.array(search.values),
-            "evaluations": np.array(search.counts, dtype=np.int64),
-        },
-        seconds=time.perf_counter() - clock,
-        identity=identity_of(evaluator, prior_minimised=search.prior),
+    return np.array2string(
+        np.asarray(value), precision=4, threshold=8, formatter={"float_kind": "{:.4g}".format}
     )
 
 
-def surveyed(optimum: Optimum, caller: str) -> Optimum:
+def require_sampling(optimum: Optimum, caller: str) -> Optimum:
     """Return the optimum, or raise where nothing is known of the discrepancy around it.
 
     Raises
@@ -196,7 +165,7 @@ def surveyed(optimum: Optimum, caller: str) -> Optimum:
     ValueError
         If it is at the edge of a support, or at a jump.
     """
-    lines = trouble(optimum.at_edge, optimum.at_jump)
+    lines = breakdown(optimum.at_edge, optimum.at_jump)
     if lines:
         raise ValueError(
             f"{caller}: got an optimum around which nothing is known: {'; '.join(lines)}. "
@@ -215,6 +184,25 @@ def identity_in(result: Any) -> Identity | None:
     return from_attributes(result[group].attrs) if group in result.children else None
 
 
+def require_refits(optimum: object, caller: str, advice: str) -> Optimum:
+    """Return an optimum whose model can be calibrated to other data sets, or raise.
+
+    Raises
+    ------
+    TypeError
+        If it is no Optimum.
+    ValueError
+        If nothing is known around it, or the model cannot be calibrated anew; then with ``advice``.
+    """
+    if not isinstance(optimum, Optimum):
+        got = type(optimum).__name__
+        raise TypeError(f"{caller}: got {got}, expected an Optimum; call prb.minimize() first")
+    reason = inapplicable(require_sampling(optimum, caller).evaluator)
+    if reason:
+        raise ValueError(f"{caller}: {reason}{advice}")
+    return optimum
+
+
 def plain(value: Any) -> Any:
     """Return a float, or an array where there are several numbers."""
     return float(value) if np.ndim(value) == 0 else np.asarray(value)
@@ -223,7 +211,6 @@ def plain(value: Any) -> Any:
 def optimum_tree(optimum: Optimum) -> xr.DataTree:
     """Return the DataTree of an optimum."""
     evaluator = optimum.evaluator
-    names = list(optimum.discrepancies)
     attrs = {
         "discrepancy": optimum.discrepancy,
         "converged": int(optimum.converged),
@@ -237,33 +224,38 @@ def optimum_tree(optimum: Optimum) -> xr.DataTree:
         **as_attribute(optimum.model),
         **({} if optimum.identity is None else as_attributes(optimum.identity)),
     }
+    groups = {
+        "optimum": labelled(evaluator, optimum.point, {}).assign_attrs(attrs),
+        "stderr": labelled(evaluator, optimum.stderr, {}),
+        "trace": _trace_dataset(optimum),
+        "calibration": _calibration_dataset(optimum),
+        "observed_data": observed_dataset(evaluator),
+    }
+    return xr.DataTree.from_dict(groups)
+
+
+def _trace_dataset(optimum: Optimum) -> xr.Dataset:
+    trace = optimum.trace
+    variables = {
+        "theta": (["evaluation", "element"], trace["theta"]),
+        "discrepancy": ("evaluation", trace["discrepancy"]),
+        "evaluations": ("evaluation", trace["evaluations"]),
+    }
+    return xr.Dataset(variables, coords={"element": optimum.names})
+
+
+def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
+    names = list(optimum.discrepancies)
+    metrics = [without_addresses(n.metric) for n in optimum.evaluator.nodes]
+    variables: dict[str, Any] = {
+        "discrepancy": ("simulator", list(optimum.discrepancies.values())),
+        "scale": ("simulator", list(optimum.scales.values())),
+    }
+    for key in ("weight_ess", "mean_weight", "lost_mass"):
+        values = [optimum.support.get(n, {}).get(key, np.nan) for n in names]
+        variables[key] = ("simulator", values)
+    variables["theta"] = ("element", optimum.theta)
+    variables["covariance"] = (["element", "other_element"], optimum.covariance)
+    variables["metric"] = ("simulator", metrics)
     elements = {"element": optimum.names, "other_element": optimum.names}
-    return xr.DataTree.from_dict(
-        {
-            "optimum": labelled(evaluator, optimum.point, {}).assign_attrs(attrs),
-            "stderr": labelled(evaluator, optimum.stderr, {}),
-            "trace": xr.Dataset(
-                {
-                    "theta": (["evaluation", "element"], optimum.trace["theta"]),
-                    "discrepancy": ("evaluation", optimum.trace["discrepancy"]),
-                    "evaluations": ("evaluation", optimum.trace["evaluations"]),
-                },
-                coords={"element": optimum.names},
-            ),
-            "calibration": xr.Dataset(
-                {
-                    "discrepancy": ("simulator", list(optimum.discrepancies.values())),
-                    "scale": ("simulator", list(optimum.scales.values())),
-                    **{
-                        key: ("simulator", [optimum.support.get(n, {}).get(key, np.nan) for n in names])
-                        for key in ("weight_ess", "mean_weight", "lost_mass")
-                    },
-                    "theta": ("element", optimum.theta),
-                    "covariance": (["element", "other_element"], optimum.covariance),
-                    "metric": ("simulator", [without_addresses(n.metric) for n in evaluator.nodes]),
-                },
-                coords={"simulator": names, **elements},
-            ),
-            "observed_data": observed_dataset(evaluator),
-        }
-    )
+    return xr.Dataset(variables, coords={"simulator": names, **elements})

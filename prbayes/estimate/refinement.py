@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -10,30 +11,51 @@ from prbayes._checks import Floats
 from prbayes.estimate.data_sets import siblings
 from prbayes.estimate.sandwich import Information
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.support import DesignError, shortcomings
+from prbayes.model.support import DesignError, Shortcoming, shortcomings
 
 _log = logging.getLogger("prbayes")
+# Batches added before a design is refused: by judgement.
 MAX_ROUNDS = 8
+# Standard errors within which the optima of two independent designs are to be: a tenth adds half a
+# per cent to the width of an interval.
+AGREE = 0.1
+# Thetas that stand for the populations around an optimum; by judgement: more cost time, not responses.
 _THETAS = 256
-AGREE = 0.1  # standard errors within which the optima of two independent designs are to be
-_RATE = 0.65  # the power of its size with which the error of a design of several inputs falls, about
+# The power of its size with which the error of a design of several inputs falls, about; it only
+# says how many points are added at a time (benchmarks/dimensions.py).
+_RATE = 0.65
+# Most by which a design grows at a time: the estimate of its error is itself uncertain.
+_GROWTH = 2.0
+# Step of a pilot, in standard deviations of the thetas kept: small against their spread, so that
+# the next ones are within reach of the design; by judgement.
+_PILOT_STEP = 0.4
+# Data sets that tell the noise to which a pilot is led; it only stops the pilot.
+_PILOT_SETS = 50
+# Share of each variance added to a covariance, so that its root exists.
+_RIDGE = 1e-12
 
 
-def refine_at(evaluator: Evaluator, thetas: Floats) -> dict[str, str]:
-    """Add one batch to each design that falls short at thetas, shape (P, d); return what was short."""
+def refine_at(evaluator: Evaluator, thetas: Floats) -> dict[str, Shortcoming]:
+    """Add one batch to each design that falls short at thetas, (P, d); return what was short.
+
+    Raises
+    ------
+    DesignError
+        If too many points have no response, of which more points would have no more.
+    """
     short = shortcomings(evaluator, thetas)
     for name, what in short.items():
-        if what.startswith("lost mass"):
+        if what.lost is not None:
             raise DesignError(
-                f"{name}: {what}; repair the response there, return +inf for specimens that fail, narrow the priors, "
-                "or raise max_lost"
+                f"{name}: {what}; repair the response there, return +inf for specimens that fail, "
+                "narrow the priors, or raise max_lost"
             )
     _add(evaluator, thetas, set(short))
     return short
 
 
 def grow(evaluator: Evaluator, thetas: Floats, error: float) -> bool:
-    """Add points to all designs until their error is expected to be small enough; return whether any were added.
+    """Add points to all designs until their error is expected to be small enough.
 
     Parameters
     ----------
@@ -42,38 +64,49 @@ def grow(evaluator: Evaluator, thetas: Floats, error: float) -> bool:
         Where the populations live that matter.
     error : float
         Difference between the optima of independent designs, in standard errors.
+
+    Returns
+    -------
+    bool
+        Whether any were added.
     """
-    factor = min(2.0, (error / AGREE) ** (1 / _RATE))
-    _log.info("independent designs would differ by %.2f standard errors, expected at most %.2f", error, AGREE)
+    factor = min(_GROWTH, (error / AGREE) ** (1 / _RATE))
+    _log.info(
+        "independent designs would differ by %.2f standard errors, expected at most %.2f",
+        error,
+        AGREE,
+    )
     return _add(evaluator, thetas, set(evaluator.designs), factor)
 
 
 def _add(evaluator: Evaluator, thetas: Floats, names: set[str], factor: float = 1.0) -> bool:
     """Add one batch to the designs named, and to those of simulators that share their specimens.
 
-    The batch has the design's first size, or brings the whole to ``factor`` times what it was. Returns whether
-    ``max_points`` left room for any.
+    The batch has the design's first size, or brings the whole to ``factor`` times what it was.
+    Returns whether ``max_points`` left room for any.
     """
     names = siblings(evaluator.nodes, names)
     added = False
     for k, node in enumerate(evaluator.nodes):
         design = node.design
-        if node.name in names and design is not None:
-            first, now = design.config.n, design.n_points
-            batches = max(1, round((factor - 1) * now / first))
-            size = min(batches * first, design.max_points - now)
-            if size > 0:
-                design.add(evaluator.roots(thetas, k), size)
-                added = True
-                _log.info("%s: refined to %d responses", node.name, design.n_points)
+        if design is None or node.name not in names:
+            continue
+        first, now = design.config.n, design.n_points
+        batches = max(1, round((factor - 1) * now / first))
+        room = design.max_points - now
+        size = min(batches * first, room)
+        if size > 0:
+            design.add(evaluator.roots(thetas, k), size)
+            added = True
+            _log.info("%s: refined to %d responses", node.name, design.n_points)
     return added
 
 
-def pilot(evaluator: Evaluator, scales: Floats, scale: Floats, *, seed: int = 0) -> Floats:
-    """Lead a design that is far too thin from the prior to where the discrepancy is small, in short steps.
+def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
+    """Lead a design that is far too thin from the prior to where the discrepancy is small.
 
-    Each step keeps the best quarter of the thetas and, where the design is thin there, adds points from
-    their populations before it looks closer: the kept thetas are never far from the design's reach.
+    Each step keeps the best quarter of the thetas and, where the design is thin there, adds points
+    from their populations before it looks closer: the kept thetas are never far from its reach.
 
     Returns
     -------
@@ -83,45 +116,71 @@ def pilot(evaluator: Evaluator, scales: Floats, scale: Floats, *, seed: int = 0)
     rng = np.random.default_rng(seed)
     thetas = evaluator.prior_thetas(4 * _THETAS, seed)
     for _ in range(2 * MAX_ROUNDS):
+        # Keep the best.
         found = evaluator(thetas)
         value = (found.discrepancies / scales).sum(axis=-1) - found.log_other
         value = np.where(np.isfinite(found.log_prior), value, np.inf)
         order = np.argsort(value)[:_THETAS]
         best = thetas[order]
-        thin = {
-            name
-            for name, support in evaluator.support(best).items()
-            if np.median(support["weight_ess"]) < evaluator.designs[name].required_ess
-        }
-        _add(evaluator, best, {name for name in thin if evaluator.designs[name].n_batches <= MAX_ROUNDS})
-        noise = sum(Information(evaluator, k, best[0], scale, n_sets=50).noise_floor / s for k, s in enumerate(scales))
-        if not thin and value[order[-1]] - value[order[0]] < noise:
+        # Let the designs reach them.
+        thin = _thin(evaluator, best)
+        _add(evaluator, best, {n for n in thin if evaluator.designs[n].n_batches <= MAX_ROUNDS})
+        # Stop where sampling explains the differences that are left.
+        spread = value[order[-1]] - value[order[0]]
+        noise = sum(noise_floors(evaluator, best[0], _PILOT_SETS) / scales)
+        if not thin and spread < noise:
             break
+        # Step on, from each of them at random.
         covariance = np.atleast_2d(np.cov(best, rowvar=False))
-        root = np.linalg.cholesky(covariance + 1e-12 * np.diag(np.diag(covariance)))
+        root = np.linalg.cholesky(covariance + _RIDGE * np.diag(np.diag(covariance)))
         parents = best[rng.integers(len(best), size=4 * _THETAS)]
-        thetas = parents + 0.4 * rng.standard_normal(parents.shape) @ root.T
+        steps = _PILOT_STEP * rng.standard_normal(parents.shape) @ root.T
+        thetas = parents + steps
     return best
 
 
-def refuse(short: dict[str, str], evaluator: Evaluator) -> None:
+def _thin(evaluator: Evaluator, thetas: Floats) -> set[str]:
+    """Return the designs that reach fewer than half of the populations at thetas."""
+    names = set()
+    for name, support in evaluator.support(thetas).items():
+        if np.median(support["weight_ess"]) < evaluator.designs[name].required_ess:
+            names.add(name)
+    return names
+
+
+def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int = 200) -> Floats:
+    """Return the mean discrepancy of data sets drawn from the model at theta, (k,) by simulator."""
+    floors = []
+    for k in range(len(evaluator.nodes)):
+        information = Information(evaluator, k, theta, evaluator.prior_sd, n_sets=n_sets)
+        floors.append(information.noise_floor)
+    return np.array(floors)
+
+
+def refuse(short: Mapping[str, Shortcoming], evaluator: Evaluator) -> None:
     """Raise for designs that still fall short."""
-    if short:
-        first = next(iter(short))
-        points = evaluator.designs[first].n_points
-        raise DesignError(
-            "; ".join(f"{name}: the design does not support the answer: {what}" for name, what in short.items())
-            + f"; narrow the priors, pass a larger prb.Reweighted(n) (now {points} points in all, of at "
-            f"most {evaluator.designs[first].max_points}), or use "
-            "prb.Resimulated(n), which has no design"
-        )
+    if not short:
+        return
+    what = "; ".join(
+        f"{name}: the design does not support the answer: {s}" for name, s in short.items()
+    )
+    design = evaluator.designs[next(iter(short))]
+    raise DesignError(
+        f"{what}; narrow the priors, pass a larger prb.Reweighted(n) (now {design.n_points} points "
+        f"in all, of at most {design.max_points}), or use prb.Resimulated(n), which has no design"
+    )
 
 
-def spread_around(center: Floats, covariance: Floats, scale: Floats, *, seed: int = 0) -> Floats:
-    """Return thetas around an optimum, from a normal with its covariance, at most the prior's scale."""
-    known = np.where(np.isfinite(covariance), covariance / np.outer(scale, scale), 0.0)
-    known[np.diag_indices_from(known)] = np.where(np.isfinite(np.diag(covariance)), np.diag(known), 1.0)
+def spread_around(center: Floats, covariance: Floats, prior_sd: Floats, *, seed: int = 0) -> Floats:
+    """Return thetas around an optimum, from a normal with its covariance, no wider than the prior.
+
+    Along elements of which nothing is known they are as wide as the prior.
+    """
+    unit = np.outer(prior_sd, prior_sd)
+    known = np.where(np.isfinite(covariance), covariance / unit, 0.0)
+    variances = np.diag(covariance)
+    known[np.diag_indices_from(known)] = np.where(np.isfinite(variances), np.diag(known), 1.0)
     values, vectors = np.linalg.eigh(known)
     sd = np.sqrt(np.clip(values, 0, 1))
     z = np.random.default_rng(seed).standard_normal((_THETAS, center.size))
-    return np.asarray(center + (z * sd) @ vectors.T * scale)
+    return np.asarray(center + (z * sd) @ vectors.T * prior_sd)

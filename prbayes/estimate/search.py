@@ -1,12 +1,13 @@
 """Runs minimisers on the standardised objective, and decides whether they have converged.
 
-Standardised: parameters in units of the prior's spread, the objective in units of its typical size. A tolerance then
-means the same for every model, metric and method.
+Standardised: parameters in units of the prior's spread, the objective in units of its typical size.
+A tolerance then means the same for every model, metric and method.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,192 +15,393 @@ from pytensor.gradient import NullTypeGradError
 
 from prbayes._checks import Floats
 from prbayes._progress import progress
+from prbayes.estimate.differences import cross, differences
 from prbayes.estimate.methods import Method
-from prbayes.estimate.objective import Objective, SpentError, StalledError, differences
+from prbayes.estimate.objective import Objective, SpentError, StalledError
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
 
-_OVER = 0.5  # prior standard deviations: the simplex where the discrepancy jumps
-_SETTLED = 1e-4  # relative gain of a simplex below which a stalled line search counts as converged
-_SCREENED = 256  # prior draws tried as starts where a theta costs no response
-_PATIENCE = 15  # evaluations in a line search without progress
-_STEP = 1e-4  # of differences, in units of the prior's spread
-_OVERLAP = 0.02  # of two densities, below which the area metric leads
-_THIN = 2.0  # weight effective sample size below which a design does not reach a population at all
-_ENOUGH = 0.5  # overlap from which on the metric itself is followed
-_COARSE = 1e-2  # tolerance of the area metric as a guide
+# Edge of the simplex where the discrepancy jumps, in spreads of the prior: wide enough to step over
+# the jump of a point that loses its response. By judgement.
+_OVER = 0.5
+# Edge of the simplex that looks whether a stalled line search is at its minimum.
+_NEAR = 0.01
+# Its tolerances: coarse, since it only has to gain less than _SETTLED.
+_SIMPLEX = {"xatol": 1e-4, "fatol": 1e-7}
+# Its evaluations for each parameter.
+_SIMPLEX_EVALUATIONS = 60
+# Relative gain of a simplex below which a stalled line search counts as converged: far below the
+# noise of any data, which is 1 / N. By judgement.
+_SETTLED = 1e-4
+# Points of the prior that are tried as starts where a theta costs no response: they take one batch.
+_SCREENED = 256
+# Evaluations in a line search without progress; those of scipy that arrive take fewer. By judgement.
+_PATIENCE = 15
+# Step of differences in spreads of the prior: errors of rounding, 1e-16 / step, and of curvature,
+# step^2, are then both below the tolerance.
+_STEP = 1e-4
+# Overlap of two densities below which the area metric leads, and from which on the metric itself
+# is followed; from far starts both lead to the same optima (benchmarks/landscapes.py).
+_OVERLAP = 0.02
+_ENOUGH = 0.5
+# Weight effective sample size below which a design does not reach a population at all.
+_THIN = 2.0
+# Tolerance of the area metric as a guide, which is left before it converges.
+_COARSE = 1e-2
+# Methods whose line searches are stopped where they gain nothing.
+_LINE_SEARCHES = {"bfgs", "cg", "l-bfgs-b"}
+# Smallest divisor of a relative gain.
+_TINY = 1e-300
+
+Function = Callable[[Floats], tuple[float, Floats | None, int]]
 
 
+@dataclass(frozen=True)
+class Trace:
+    """The points that minimisers have asked for.
+
+    Attributes
+    ----------
+    thetas : tuple of ndarray, shapes (d,)
+    values : tuple of float
+        The objective there.
+    counts : tuple of int
+        Evaluations until then.
+    count : int
+        Evaluations in all.
+    """
+
+    thetas: tuple[Floats, ...] = ()
+    values: tuple[float, ...] = ()
+    counts: tuple[int, ...] = ()
+    count: int = 0
+
+    def then(self, objective: Objective) -> Trace:
+        """Return the trace with the points of one more minimisation."""
+        counts = tuple(self.count + c for c in objective.counts)
+        return Trace(
+            thetas=self.thetas + tuple(objective.thetas),
+            values=self.values + tuple(objective.values),
+            counts=self.counts + counts,
+            count=self.count + objective.count,
+        )
+
+
+@dataclass(frozen=True)
 class Search:
-    """Runs a minimiser on the objective, as often as scales or designs change, within one budget of evaluations."""
+    """What is minimised, and how.
 
-    def __init__(
-        self, evaluator: Evaluator, scale: Floats, method: Method, prior: bool, tolerance: float, most: int
-    ) -> None:
-        self.evaluator, self.scale, self.method = evaluator, scale, method
-        self.prior, self.tolerance, self.most = prior, tolerance, most
-        self.fresh = any(n.bound.random for n in evaluator.nodes)
-        self.gradient = method.gradient and not self.fresh
-        self.thetas: list[Floats] = []
-        self.values: list[float] = []
-        self.counts: list[int] = []
-        self.count = 0
-        self.best = np.empty(0)
-        self.remark = ""
+    Parameters
+    ----------
+    evaluator : Evaluator
+    units : ndarray, shape (d,)
+        Typical size of each parameter: the prior's spread.
+    method : Method
+    prior : bool
+        Whether minus the log prior is added.
+    tolerance : float
+        Of the standardised problem.
+    most : int
+        Largest number of evaluations in all.
+    """
 
-    def start(self, start: dict[str, Any] | None, scales: Floats, seed: int) -> tuple[Floats, int]:
-        """Return where to begin and how many draws were screened for it."""
-        if start is not None:
-            return self.evaluator.unconstrained(start), 0
-        if self.evaluator.responses_per_theta:
-            return self.evaluator.initial, 0
-        draws = np.concatenate([self.evaluator.initial[None], self.evaluator.prior_points(_SCREENED, seed)])
-        return self.best_of(draws, scales), len(draws)
+    evaluator: Evaluator
+    units: Floats
+    method: Method
+    prior: bool
+    tolerance: float
+    most: int
+
+    @property
+    def gradient(self) -> bool:
+        """Whether the method is given gradients."""
+        random = any(n.bound.random for n in self.evaluator.nodes)
+        return self.method.gradient and not random
+
+    def size(self, theta: Floats, scales: Floats) -> float:
+        """Return a typical size of the objective; of a user's metric it is the value at theta."""
+        nodes = self.evaluator.nodes
+        if not any(n.metric.minimum is Minimum.UNKNOWN for n in nodes):
+            return float(sum(n.target.scale / s for n, s in zip(nodes, scales, strict=True)))
+        first = float(np.abs(self.evaluator.total(theta[None], scales)[0]))
+        return first if 0 < first < np.inf else 1.0
 
     def best_of(self, thetas: Floats, scales: Floats) -> Floats:
         """Return the theta with the smallest objective, evaluated in one batch."""
         value = self.evaluator.total(thetas, scales)
         return np.asarray(thetas[np.argmin(value)])
 
-    def size(self, theta: Floats, scales: Floats) -> float:
-        """Return a typical size of the objective; of a user's metric it is the value at theta."""
-        if not any(n.metric.minimum is Minimum.UNKNOWN for n in self.evaluator.nodes):
-            return float(sum(n.target.scale / s for n, s in zip(self.evaluator.nodes, scales, strict=True)))
-        first = float(np.abs(self.evaluator.total(theta[None], scales)[0]))
-        return first if 0 < first < np.inf else 1.0
+    def objective(
+        self, center: Floats, scales: Floats, size: float, *, gradient: bool, spent: int
+    ) -> Objective:
+        """Return the standardised objective around a center."""
+        function = self._with_gradient(scales) if gradient else self._without_gradient(scales)
+        most = self.most - spent
+        return Objective(function, center, self.units, size, gradient=gradient, most=most)
 
-    def _function(self, scales: Floats, *, gradient: bool) -> Callable[[Floats], Any]:
-        """Return theta -> value, gradient, number of evaluations: exact where it can be had, or by differences."""
-        if gradient:
-            try:
-                exact = self.evaluator.objective(prior=self.prior, gradient=True)
-                return lambda theta: (*exact(theta, scales), 1)
-            except (NotImplementedError, NullTypeGradError):  # of the response, or of an inverse distribution function
-                step = _STEP * self.scale
-        if not self.prior:
-            total = self.evaluator.total  # needs no compilation
-            if gradient:
-                return differences(lambda thetas: total(thetas, scales), step)
-            return lambda theta: (total(theta[None], scales)[0], None, 1)
-        plain = self.evaluator.objective(prior=self.prior, gradient=False)
-        if gradient:
-            return differences(lambda thetas: np.array([float(plain(t, scales)[0]) for t in thetas]), step)
-        return lambda theta: (plain(theta, scales)[0], None, 1)
-
-    def __call__(self, theta: Floats, scales: Floats) -> Any:
-        """Minimise from theta; sets ``best``."""
-        self.best = theta
-        function, size = self._function(scales, gradient=self.gradient), self.size(theta, scales)
-        objective = Objective(function, theta, self.scale, size, gradient=self.gradient, most=self.most - self.count)
-        if self.method.name.lower() in {"bfgs", "cg", "l-bfgs-b"}:
-            objective.patience = _PATIENCE
-        options = self.method.settings(self.tolerance, theta.size)
-        result = self._run(
-            objective, np.zeros_like(theta), jac=self.gradient or None, method=self.method.method, options=options
-        )
-        self._record(objective)
-        self.best = objective.best
-        self._last = objective, scales
-        return result
-
-    def approach(self, theta: Floats, scales: Floats, seed: int) -> Floats:
-        """Go to where simulated responses overlap with the data, by the area metric, whose gradient does not vanish.
-
-        Without overlap a density metric hardly changes, or changes so that populations get wider without end. Where a
-        theta costs no response, the prior's draws are looked at first. Returns theta itself where there is overlap.
-        """
-        thin = any(s["weight_ess"][0] < _THIN for s in self.evaluator.support(theta[None]).values())
-        if self.fresh or (not thin and self.overlap(*self._populations(theta[None]))[0] > _OVERLAP):
-            return theta
-        areas = [AreaMetric().against(n.target.observed, n.target.weights) for n in self.evaluator.nodes]
-        seen: dict[bytes, tuple[float, float]] = {}
-
-        def area(thetas: Floats) -> Floats:
-            populations = self._populations(thetas)
-            values = [a.of(v, w) / a.scale for a, v, w in zip(areas, *populations, strict=True)]
-            total = np.where(self.evaluator.in_support(thetas), np.sum(values, axis=0), np.inf)
-            parts = zip(self.evaluator.nodes, scales, *populations, strict=True)
-            own = sum(n.target.of(v, w) / s for n, s, v, w in parts)
-            for row, both in zip(thetas, zip(self.overlap(*populations), own, strict=True), strict=True):
-                seen[row.tobytes()] = both
-            return np.asarray(np.nan_to_num(total, nan=np.inf, posinf=np.inf))
-
-        if not self.evaluator.responses_per_theta:
-            candidates = np.vstack([theta, self.evaluator.prior_points(_SCREENED, seed)])
-            theta = candidates[np.argmin(area(candidates))]
-        guide, left = differences(area, _STEP * self.scale), self.most - self.count
-        objective = Objective(guide, theta, self.scale, len(areas), gradient=True, most=left)
-
-        def near(t: Floats) -> None:
-            if seen[(theta + t * self.scale).tobytes()][0] > _ENOUGH:
-                raise StopIteration
-
-        self._run(objective, np.zeros_like(theta), jac=True, method="BFGS", options={"gtol": _COARSE}, callback=near)
-        reached = objective.best
-        found = [seen[t.tobytes()] for t in objective.thetas]
-        objective.values = [own for _, own in found]
-        self._record(objective)
-        self.remark = (
-            f" At the start hardly any simulated response was near the data: the area metric led from there, in "
-            f"{objective.count} evaluations."
-        )
-        return reached
-
-    def _populations(self, thetas: Floats) -> tuple[list[Floats], list[Floats]]:
-        """Return responses and weights, (P, n) each, by simulator."""
-        found = [self.evaluator.populations(thetas, k) for k in range(len(self.evaluator.nodes))]
-        return [v for v, _ in found], [w for _, w in found]
-
-    def overlap(self, values: list[Floats], weights: list[Floats]) -> Floats:
-        """Return the smallest overlap over the simulators with densities, shape (P,); one where there is none."""
-        overlaps = [n.target.overlap(v, w) for n, v, w in zip(self.evaluator.nodes, values, weights, strict=True)]
-        return np.min([np.ones(len(values[0])), *overlaps], axis=0)
-
-    def _run(self, objective: Objective, start: Floats, **settings: Any) -> Any:
-        from scipy import optimize  # takes longer to import than the whole package
-
+    def _with_gradient(self, scales: Floats) -> Function:
+        """Return theta -> value, gradient, evaluations: exact where it can be, or by differences."""
         try:
-            with progress("evaluations") as objective.report:
-                return optimize.minimize(objective, start, **settings)
-        except SpentError:
-            message = f"max_evaluations = {self.most} was reached before convergence."
-        except StalledError:
-            message = f"The line search gained nothing in {objective.patience} evaluations."
-        return optimize.OptimizeResult(success=False, message=message, fun=objective.lowest / objective.size)
+            exact = self.evaluator.objective(prior=self.prior, gradient=True)
+        except (NotImplementedError, NullTypeGradError):
+            # Of the response, or of an inverse distribution function, there is none.
+            return differences(self._values(scales), _STEP * self.units)
+        return lambda theta: (*exact(theta, scales), 1)
 
-    def _record(self, objective: Objective) -> None:
-        self.thetas += objective.thetas
-        self.values += objective.values
-        self.counts += [self.count + c for c in objective.counts]
-        self.count += objective.count
+    def _without_gradient(self, scales: Floats) -> Function:
+        values = self._values(scales)
+        return lambda theta: (values(theta[None])[0], None, 1)
 
-    def settle(self, result: Any) -> Any:
-        """Decide on a line search that gave up: at a kink or at rounding that is the minimum, if a simplex agrees.
+    def _values(self, scales: Floats) -> Callable[[Floats], Floats]:
+        """Return thetas (P, d) -> values (P,)."""
+        if not self.prior:
+            # Needs no compilation.
+            return lambda thetas: self.evaluator.total(thetas, scales)
+        single = self.evaluator.objective(prior=self.prior, gradient=False)
+        return lambda thetas: np.array([float(single(t, scales)[0]) for t in thetas])
 
-        Where the discrepancy jumps, since points lose their response there, the simplex is wide enough to step over it.
-        """
-        (last, scales), left = self._last, self.most - self.count
-        if result.success or not self.gradient or left <= 0:
-            return result
-        plain = self._function(scales, gradient=False)
-        again = Objective(plain, last.center, self.scale, last.size, gradient=False, most=left)
-        start, before = (self.best - last.center) / self.scale, last.lowest
-        simplex = np.vstack([start, start + (_OVER if self._jumps() else 0.01) * np.eye(start.size)])
-        options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-7, "maxfev": 60 * start.size}
-        polished = self._run(again, start, method="Nelder-Mead", options=options)
-        self._record(again)
-        if again.lowest <= before:
-            self.best = again.best
-        gain = (before - again.lowest) / max(abs(before), 1e-300)
-        polished.success = bool(polished.success or gain < _SETTLED)
-        polished.message = f"{result.message} A simplex from there gained {max(gain, 0):.1e}: {polished.message}"
-        return polished
 
-    def _jumps(self) -> bool:
-        """Whether a smooth discrepancy loses or wins simulated responses close to the best theta."""
-        if not all(n.metric.minimum is Minimum.QUADRATIC for n in self.evaluator.nodes):
-            return False
-        near = self.best + np.vstack([0 * self.scale, *(s * e for e in np.diag(_STEP * self.scale) for s in (1, -1))])
-        lost = [~np.isfinite(v) for v in self._populations(near)[0]]
-        return any((rows != rows[0]).any() for rows in lost)
+@dataclass(frozen=True)
+class Run:
+    """Where a minimisation ended.
+
+    Attributes
+    ----------
+    best : ndarray, shape (d,)
+    success : bool
+    message : str
+        What the method said.
+    trace : Trace
+        With the points of those before it.
+    center : ndarray, shape (d,)
+        Where it began.
+    scales : ndarray, shape (k,)
+    lowest : float
+        The objective at ``best``.
+    size : float
+        Its typical size.
+    """
+
+    best: Floats
+    success: bool
+    message: str
+    trace: Trace
+    center: Floats
+    scales: Floats
+    lowest: float
+    size: float
+
+
+def start(
+    search: Search, given: dict[str, Any] | None, scales: Floats, seed: int
+) -> tuple[Floats, int]:
+    """Return where to begin, and how many points were screened for it."""
+    evaluator = search.evaluator
+    if given is not None:
+        return evaluator.unconstrained(given), 0
+    if evaluator.responses_per_theta:
+        return evaluator.initial, 0
+    points = evaluator.prior_points(_SCREENED, seed)
+    candidates = np.concatenate([evaluator.initial[None], points])
+    return search.best_of(candidates, scales), len(candidates)
+
+
+def minimise(search: Search, theta: Floats, scales: Floats, trace: Trace) -> Run:
+    """Minimise from theta, within what is left of the budget."""
+    size = search.size(theta, scales)
+    objective = search.objective(theta, scales, size, gradient=search.gradient, spent=trace.count)
+    if search.method.name.lower() in _LINE_SEARCHES:
+        objective.patience = _PATIENCE
+    success, message = _scipy(
+        search,
+        objective,
+        np.zeros_like(theta),
+        jac=search.gradient or None,
+        method=search.method.method,
+        options=search.method.settings(search.tolerance, theta.size),
+    )
+    return Run(
+        best=objective.best,
+        success=success,
+        message=message,
+        trace=trace.then(objective),
+        center=theta,
+        scales=scales,
+        lowest=objective.lowest,
+        size=objective.size,
+    )
+
+
+def settle(search: Search, run: Run) -> Run:
+    """Decide on a line search that gave up: at a kink or rounding, it has if a simplex agrees.
+
+    Where the discrepancy jumps, since points lose their response there, the simplex is wide enough
+    to step over it.
+    """
+    if run.success or not search.gradient or run.trace.count >= search.most:
+        return run
+    spent = run.trace.count
+    again = search.objective(run.center, run.scales, run.size, gradient=False, spent=spent)
+    begin = (run.best - run.center) / search.units
+    edge = _OVER if jumps(search, run.best) else _NEAR
+    simplex = np.vstack([begin, begin + edge * np.eye(begin.size)])
+    options = {
+        "initial_simplex": simplex,
+        "maxfev": _SIMPLEX_EVALUATIONS * begin.size,
+        **_SIMPLEX,
+    }
+    success, message = _scipy(search, again, begin, method="Nelder-Mead", options=options)
+    gain = (run.lowest - again.lowest) / max(abs(run.lowest), _TINY)
+    return replace(
+        run,
+        best=again.best if again.lowest <= run.lowest else run.best,
+        success=success or gain < _SETTLED,
+        message=f"{run.message} A simplex from there gained {max(gain, 0):.1e}: {message}",
+        trace=run.trace.then(again),
+    )
+
+
+def jumps(search: Search, theta: Floats) -> bool:
+    """Return whether a smooth discrepancy loses or wins simulated responses close to theta."""
+    if not all(n.metric.minimum is Minimum.QUADRATIC for n in search.evaluator.nodes):
+        return False
+    near = cross(theta, _STEP * search.units)
+    values, _ = _populations(search.evaluator, near)
+    lost = [~np.isfinite(v) for v in values]
+    return any((rows != rows[0]).any() for rows in lost)
+
+
+def _scipy(
+    search: Search, objective: Objective, begin: Floats, **settings: Any
+) -> tuple[bool, str]:
+    """Run a minimiser of scipy; return whether it succeeded, and what it said."""
+    from scipy import optimize  # takes longer to import than the whole package
+
+    try:
+        with progress("evaluations") as objective.report:
+            result = optimize.minimize(objective, begin, **settings)
+    except SpentError:
+        return False, f"max_evaluations = {search.most} was reached before convergence."
+    except StalledError:
+        return False, f"The line search gained nothing in {objective.patience} evaluations."
+    return bool(result.success), str(result.message)
+
+
+# -- where nothing overlaps ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Approach:
+    """Where the area metric led.
+
+    Attributes
+    ----------
+    theta : ndarray, shape (d,)
+    trace : Trace
+    remark : str
+        That it did; empty if there was no need.
+    """
+
+    theta: Floats
+    trace: Trace
+    remark: str = ""
+
+
+def approach(search: Search, theta: Floats, scales: Floats, seed: int) -> Approach:
+    """Go to where simulated responses overlap with the data, by the area metric.
+
+    Without overlap a density metric hardly changes, or changes so that populations get wider without
+    end; the gradient of the area metric does not vanish. Where a theta costs no response, points of
+    the prior are looked at first. Returns theta itself where there is overlap.
+    """
+    evaluator = search.evaluator
+    if not _astray(evaluator, theta):
+        return Approach(theta, Trace())
+    guide = _Guide(evaluator, scales)
+    if not evaluator.responses_per_theta:
+        points = evaluator.prior_points(_SCREENED, seed)
+        candidates = np.vstack([theta, points])
+        theta = candidates[np.argmin(guide(candidates))]
+    function = differences(guide, _STEP * search.units)
+    size = len(evaluator.nodes)
+    objective = Objective(function, theta, search.units, size, gradient=True, most=search.most)
+
+    def stop_where_near(t: Floats) -> None:
+        if guide.overlap_at(theta + t * search.units) > _ENOUGH:
+            raise StopIteration
+
+    _scipy(
+        search,
+        objective,
+        np.zeros_like(theta),
+        jac=True,
+        method="BFGS",
+        options={"gtol": _COARSE},
+        callback=stop_where_near,
+    )
+    reached = objective.best
+    # The trace is of the model's own objective.
+    objective.values = [guide.objective_at(t) for t in objective.thetas]
+    remark = (
+        " At the start hardly any simulated response was near the data: the area metric led from "
+        f"there, in {objective.count} evaluations."
+    )
+    return Approach(reached, Trace().then(objective), remark)
+
+
+def _astray(evaluator: Evaluator, theta: Floats) -> bool:
+    """Return whether hardly a response of the population at theta is near the data."""
+    thin = any(s["weight_ess"][0] < _THIN for s in evaluator.support(theta[None]).values())
+    if any(n.bound.random for n in evaluator.nodes):
+        return False
+    if thin:
+        return True
+    return not overlap(evaluator, *_populations(evaluator, theta[None]))[0] > _OVERLAP
+
+
+class _Guide:
+    """The area between populations and data, with what else is known of the thetas it was asked for."""
+
+    def __init__(self, evaluator: Evaluator, scales: Floats) -> None:
+        nodes = evaluator.nodes
+        self.evaluator, self.scales = evaluator, scales
+        self.areas = [AreaMetric().against(n.target.observed, n.target.weights) for n in nodes]
+        self._known: dict[bytes, tuple[float, float]] = {}
+
+    def __call__(self, thetas: Floats) -> Floats:
+        """Return the sum of the areas, in units of their typical sizes; thetas (P, d) -> (P,)."""
+        values, weights = _populations(self.evaluator, thetas)
+        by_node = list(zip(self.evaluator.nodes, self.scales, values, weights, strict=True))
+        areas = [a.of(v, w) / a.scale for a, v, w in zip(self.areas, values, weights, strict=True)]
+        inside = self.evaluator.in_support(thetas)
+        total = np.where(inside, np.sum(areas, axis=0), np.inf)
+        # What is known of them besides: the overlap, and the model's own objective.
+        overlaps = overlap(self.evaluator, values, weights)
+        objective = sum(n.target.of(v, w) / s for n, s, v, w in by_node)
+        for theta, one, other in zip(thetas, overlaps, objective, strict=True):
+            self._known[theta.tobytes()] = one, other
+        return np.asarray(np.nan_to_num(total, nan=np.inf, posinf=np.inf))
+
+    def overlap_at(self, theta: Floats) -> float:
+        """Return the overlap at a theta that was asked for."""
+        return self._known[theta.tobytes()][0]
+
+    def objective_at(self, theta: Floats) -> float:
+        """Return the model's own objective at a theta that was asked for."""
+        return self._known[theta.tobytes()][1]
+
+
+def overlap(evaluator: Evaluator, values: list[Floats], weights: list[Floats]) -> Floats:
+    """Return the smallest overlap over simulators with densities, (P,); one where there is none."""
+    overlaps = [
+        n.target.overlap(v, w) for n, v, w in zip(evaluator.nodes, values, weights, strict=True)
+    ]
+    return np.min([np.ones(len(values[0])), *overlaps], axis=0)
+
+
+def _populations(evaluator: Evaluator, thetas: Floats) -> tuple[list[Floats], list[Floats]]:
+    """Return responses and weights, (P, n) each, by simulator."""
+    found = [evaluator.populations(thetas, k) for k in range(len(evaluator.nodes))]
+    values, weights = zip(*found, strict=True)
+    return list(values), list(weights)

@@ -2,43 +2,154 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluator
+
+# Quantiles of the populations that count: single ones far out may fall short.
+_LOW, _HIGH = 0.05, 0.95
 
 
 class DesignError(RuntimeError):
     """A design that cannot support the answer, even after refinement."""
 
 
-def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, str]:
-    """Say, by simulator, in what its design does not support the populations at thetas, shape (P, d)."""
-    designs = evaluator.designs
-    found = {
-        name: shortcoming(support, designs[name].required_ess, designs[name].config.max_lost, designs[name].n_points)
-        for name, support in evaluator.support(thetas).items()
-    }
-    return {name: what for name, what in found.items() if what}
+@dataclass(frozen=True)
+class Level:
+    """How well a design has to support populations.
+
+    Attributes
+    ----------
+    ess : float
+        Weight effective sample size at the median, as a share of what the design asks for.
+    lowest_ess : float
+        The same at the 5% quantile.
+    mass : tuple of float
+        Bounds of the mean raw weight, which is one if the design covers the population.
+    tails : bool
+        Whether 5% and 95% quantiles of the mean raw weight are bounded, or the median.
+    """
+
+    ess: float
+    lowest_ess: float
+    mass: tuple[float, float]
+    tails: bool
 
 
-def shortcoming(support: dict[str, Floats], need: float, max_lost: float, n_points: int) -> str:
-    """Say in what a design with such support, arrays of shape (P,), falls short; nothing where it does not."""
+# Where an answer is made: the optimiser and the samplers, whose designs grow until it holds. A mean
+# weight of 0.8 to 1.25 is a fifth of the population's mass either way; by judgement.
+ENOUGH = Level(ess=1.0, lowest_ess=0.1, mass=(0.8, 1.25), tails=True)
+# Where an answer is used: designs do not grow for a prediction. By judgement: laxer, as draws at the
+# edge of a posterior are less well supported than its centre, and resampling needs no derivative.
+TOLERABLE = Level(ess=0.5, lowest_ess=0.0, mass=(0.7, 1.4), tails=False)
+
+
+@dataclass(frozen=True)
+class Shortcoming:
+    """In what a design does not support populations; it can be said as text.
+
+    Attributes
+    ----------
+    lost : float or None
+        Share of a population's weight on points without response, at the 95% quantile, if too much.
+    ess : tuple of float or None
+        Weight effective sample size, 5% quantile and median, if too small.
+    mass : tuple of float or None
+        Mean raw weight, lowest and highest that count, if one of them is out of bounds.
+    max_lost : float
+        The share that may be lost.
+    required_ess : float
+        What the design asks for.
+    n_points : int
+    level : Level
+    """
+
+    lost: float | None
+    ess: tuple[float, float] | None
+    mass: tuple[float, float] | None
+    max_lost: float
+    required_ess: float
+    n_points: int
+    level: Level
+
+    def __bool__(self) -> bool:
+        """Whether the design falls short at all."""
+        return any(found is not None for found in (self.lost, self.ess, self.mass))
+
+    def __str__(self) -> str:
+        """Return what is wrong, and what was expected, as the end of a sentence."""
+        if self.lost is not None:
+            return (
+                f"lost mass: {self.lost:.1%} of a population's weight is on points whose response "
+                f"is NaN, expected at most max_lost = {self.max_lost:.1%}"
+            )
+        complaints = []
+        if self.ess is not None:
+            low, middle = self.ess
+            least = self.level.lowest_ess * self.required_ess
+            need = self.level.ess * self.required_ess
+            complaints.append(
+                f"weight effective sample size {low:.0f} (5% quantile) and {middle:.0f} (median) "
+                f"of {self.n_points} points, expected {least:.0f} and {need:.0f}"
+            )
+        if self.mass is not None:
+            low, high = self.mass
+            least, most = self.level.mass
+            complaints.append(
+                f"mean raw weight from {low:.2f} to {high:.2f}, expected within {least} to {most}"
+            )
+        return ", and ".join(complaints)
+
+
+def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, Shortcoming]:
+    """Return, by simulator, in what its design does not support populations at thetas, (P, d)."""
+    found = {}
+    for name, support in evaluator.support(thetas).items():
+        design = evaluator.designs[name]
+        short = shortcoming(support, design.required_ess, design.config.max_lost, design.n_points)
+        if short:
+            found[name] = short
+    return found
+
+
+def shortcoming(
+    support: dict[str, Floats],
+    required_ess: float,
+    max_lost: float,
+    n_points: int,
+    level: Level = ENOUGH,
+) -> Shortcoming:
+    """Return in what a design falls short; it is false where it does not.
+
+    Parameters
+    ----------
+    support : dict
+        ``weight_ess``, ``mean_weight`` and ``lost_mass`` of each population, arrays of shape (P,).
+    required_ess : float
+        Weight effective sample size that the design asks for.
+    max_lost : float
+        Largest share of a population's weight on points without response.
+    n_points : int
+    level : Level
+        `ENOUGH` or `TOLERABLE`.
+    """
     ess, mass, lost = (support[key] for key in ("weight_ess", "mean_weight", "lost_mass"))
-    low, middle = np.quantile(ess, [0.05, 0.5])
-    mass_low, mass_high = np.quantile(mass, [0.05, 0.95])
-    most_lost = float(np.quantile(lost, 0.95))
-    if most_lost > max_lost:
-        return (
-            f"lost mass: {most_lost:.1%} of a population's weight is on points whose response is NaN, expected at "
-            f"most max_lost = {max_lost:.1%}"
-        )
-    complaints = []
-    if middle < need or low < need / 10:
-        complaints.append(
-            f"weight effective sample size {low:.0f} (5% quantile) and {middle:.0f} (median) of {n_points} "
-            f"points, expected {need / 10:.0f} and {need:.0f}"
-        )
-    if mass_low < 0.8 or mass_high > 1.25:
-        complaints.append(f"mean raw weight from {mass_low:.2f} to {mass_high:.2f}, expected within 0.8 to 1.25")
-    return ", and ".join(complaints)
+    low, middle = np.quantile(ess, [_LOW, 0.5])
+    mass_low, mass_high = np.quantile(mass, [_LOW, _HIGH] if level.tails else [0.5, 0.5])
+    most_lost = float(np.quantile(lost, _HIGH))
+    least, most = level.mass
+    # A comparison with NaN is false, and falls short.
+    many = middle >= level.ess * required_ess and low >= level.lowest_ess * required_ess
+    covered = mass_low >= least and mass_high <= most
+    return Shortcoming(
+        lost=most_lost if most_lost > max_lost else None,
+        ess=(float(low), float(middle)) if not many else None,
+        mass=(float(mass_low), float(mass_high)) if not covered else None,
+        max_lost=max_lost,
+        required_ess=required_ess,
+        n_points=n_points,
+        level=level,
+    )

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import time
 
-import numpy as np
 import xarray as xr
 
 from prbayes._checks import positive_integer
 from prbayes._progress import shown
 from prbayes.estimate.data_sets import reweighted_sets, simulated_sets
 from prbayes.estimate.identifiability import blind_directions
-from prbayes.estimate.optimum import Optimum, surveyed
-from prbayes.estimate.refit import Neighbourhood, inapplicable
+from prbayes.estimate.optimum import Optimum, require_refits
 from prbayes.posterior.trees import bootstrap_tree
 
 
@@ -73,17 +71,9 @@ def bootstrap(
     (1, 50)
     """
     clock = time.perf_counter()
-    if not isinstance(optimum, Optimum):
-        raise TypeError(
-            f"bootstrap: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first"
-        )
+    evaluator = require_refits(optimum, "bootstrap", "; use prb.sample_smc").evaluator
     positive_integer(draws, "draws", minimum=2)
-    evaluator = surveyed(optimum, "bootstrap").evaluator
-    reason = inapplicable(evaluator)
-    if reason:
-        raise ValueError(f"bootstrap: {reason}; use prb.sample_smc")
-    scales = np.array(list(optimum.scales.values()))
-    hood = Neighbourhood.of(evaluator, optimum.theta, scales, evaluator.prior_sd)
+    hood = optimum.sampling()
     blind = blind_directions(hood.local.blind, evaluator.readable_names)
     if blind:
         raise ValueError(

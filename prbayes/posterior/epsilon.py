@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from prbayes.estimate.identifiability import seen_by_area, seen_by_curvature
-from prbayes.estimate.optimum import Optimum, surveyed
+from prbayes.estimate.optimum import Optimum, require_sampling
 from prbayes.estimate.sampling import first_order_shifts
 from prbayes.estimate.sandwich import Information
 from prbayes.metrics.base import Minimum
@@ -67,7 +67,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
             f"calibrate_epsilon: got {type(optimum).__name__}, expected an Optimum; call "
             "prb.calibrate_epsilon(prb.minimize(model))"
         )
-    evaluator = surveyed(optimum, "calibrate_epsilon").evaluator
+    evaluator = require_sampling(optimum, "calibrate_epsilon").evaluator
     scale = evaluator.prior_sd
     require_same(optimum.identity, identity_of(evaluator), "calibrate_epsilon")
     found = {}

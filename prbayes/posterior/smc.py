@@ -17,7 +17,7 @@ import xarray as xr
 from prbayes._checks import Floats, positive_integer
 from prbayes._progress import shown
 from prbayes.estimate.minimization import find_optimum
-from prbayes.estimate.optimum import Optimum, surveyed
+from prbayes.estimate.optimum import Optimum, require_sampling
 from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse
 from prbayes.estimate.refit import inapplicable
 from prbayes.model.epsilon import checked_epsilon
@@ -167,7 +167,7 @@ def sample(
         if optimum is None and _needs_optimum(evaluator, unset, adjustment):
             optimum = find_optimum(evaluator, refine=refine)
         if optimum is not None and adjustment is not None:
-            surveyed(optimum, "sample_smc")
+            require_sampling(optimum, "sample_smc")
         if optimum is not None and unset:
             calibrated = calibrate_epsilon(optimum)
             for node in unset:

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.estimate.data_sets import DataSets, specimens
-from prbayes.estimate.optimum import Optimum, surveyed
-from prbayes.estimate.refit import Neighbourhood, inapplicable
+from prbayes.estimate.optimum import Optimum, require_refits
 from prbayes.metrics.base import Discrepancy
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import versions
@@ -68,24 +67,16 @@ def cross_validate(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) ->
     >>> found.discrepancy.dims, bool((found.discrepancy > found.calibrated).mean() > 0.5)
     (('fold', 'simulator'), True)
     """
-    if not isinstance(optimum, Optimum):
-        raise TypeError(
-            f"cross_validate: got {type(optimum).__name__}, expected an Optimum; call "
-            "prb.minimize() first"
-        )
-    evaluator = surveyed(optimum, "cross_validate").evaluator
-    reason = inapplicable(evaluator)
-    if reason:
-        raise ValueError(f"cross_validate: {reason}, so that the model cannot be calibrated anew")
+    advice = ", so that the model cannot be calibrated anew"
+    evaluator = require_refits(optimum, "cross_validate", advice).evaluator
     folds = positive_integer(folds, "folds", minimum=2)
     parts = _Folds.dealt(evaluator.nodes, folds, random_seed)
 
     # Calibrate on the others of each fold.
     observed = [node.target.observed for node in evaluator.nodes]
-    units = np.array(list(optimum.scales.values()))
-    neighbourhood = Neighbourhood.of(evaluator, optimum.theta, units, evaluator.prior_sd)
-    x, converged = neighbourhood.refit(DataSets(observed, parts.kept))
-    thetas = neighbourhood.thetas(x)
+    sampling = optimum.sampling()
+    x, converged = sampling.refit(DataSets(observed, parts.kept))
+    thetas = sampling.thetas(x)
 
     # Compare what was found with both parts.
     left_out = _discrepancies(evaluator, thetas, parts.left_out)

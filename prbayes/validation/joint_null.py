@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats, positive_integer
 from prbayes._predict import data_digest, serving, specimen_names
 from prbayes.estimate.data_sets import groups, sets_at, simulated_points, specimens
-from prbayes.estimate.optimum import Optimum, surveyed
-from prbayes.estimate.refit import Neighbourhood, inapplicable
+from prbayes.estimate.optimum import Optimum, require_refits
 from prbayes.model.node import Node
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
@@ -90,17 +89,10 @@ class JointNull(SimulatedNull):
     random_seed: int = 0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.optimum, Optimum):
-            raise TypeError(
-                f"JointNull: got {type(self.optimum).__name__}, expected an Optimum; call "
-                "prb.minimize() first"
-            )
-        reason = inapplicable(surveyed(self.optimum, "JointNull").evaluator)
-        if reason:
-            raise ValueError(
-                f"JointNull: {reason}, so that the model cannot be calibrated anew; use "
-                "prb.validation.PosteriorNull()"
-            )
+        advice = (
+            ", so that the model cannot be calibrated anew; use prb.validation.PosteriorNull()"
+        )
+        require_refits(self.optimum, "JointNull", advice)
         positive_integer(self.replicates, "JointNull: replicates", minimum=LEAST_REPLICATES)
         positive_integer(self.random_seed, "JointNull: random_seed", minimum=0)
 
@@ -151,15 +143,14 @@ class JointNull(SimulatedNull):
     ) -> tuple[Floats, NDArray[np.bool_]]:
         """Return the minimisers of the replicates that converged, (r, d), and which did."""
         evaluator = self.optimum.evaluator
-        units = np.array(list(self.optimum.scales.values()))
-        neighbourhood = Neighbourhood.of(evaluator, self.optimum.theta, units, evaluator.prior_sd)
-        x, converged = neighbourhood.refit(sets_at(evaluator, populations, points))
+        sampling = self.optimum.sampling()
+        x, converged = sampling.refit(sets_at(evaluator, populations, points))
         if converged.mean() < _CONVERGED:
             raise ValueError(
                 f"JointNull: got {converged.mean():.0%} of the minimisations converged, expected "
                 "most; look at prb.diagnose(optimum)"
             )
-        return neighbourhood.thetas(x[converged]), converged
+        return sampling.thetas(x[converged]), converged
 
     def _served(self, case: Case, condition: Condition) -> _Served:
         """Return the simulator whose points are the specimens, and the responses at them."""

@@ -24,7 +24,7 @@ from prbayes.estimate.data_sets import (
     simulated_sets,
     specimens,
 )
-from prbayes.estimate.objective import differences
+from prbayes.estimate.differences import differences
 from prbayes.estimate.refit import Neighbourhood, _mean_hessian
 from prbayes.model.evaluator import Evaluator
 

@@ -14,8 +14,9 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._checks import Floats
+from prbayes.estimate import minimization
 from prbayes.estimate.refit import Neighbourhood
-from prbayes.estimate.search import Search
+from prbayes.estimate.search import Approach, Trace
 from prbayes.metrics.density import GaussianKDE
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import nodes
@@ -290,14 +291,48 @@ def two_modes(x: Any, coin: Any) -> Any:
     return x + np.where(coin < 0.5, -16.0, 16.0)
 
 
-def test_a_population_that_collapsed_within_the_bandwidth_is_no_convergence() -> None:
+def collapsing(spread: Callable[[], Any]) -> pm.Model:
     """The log-likelihood's bandwidth follows the spread between the modes, and prefers a point in either."""
     rng = np.random.default_rng(3)
     observed = two_modes(rng.normal(1.5, 0.1, 20), rng.random(20))
     with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 1.5, 0.5), pm.HalfNormal("sigma", 0.3))
+        x = pm.Normal.dist(pm.Normal("mu", 1.5, 0.5), spread())
         coin, propagation = pm.Uniform.dist(0, 1), prb.Resimulated(512)
         prb.Simulator("y", two_modes, x, coin, metric=METRICS["ll"], observed=observed, propagation=propagation)
+    return model
+
+
+@pytest.mark.parametrize(
+    ("spread", "keywords"),
+    [
+        (lambda: pm.LogNormal("sigma", np.log(0.1), 4.0), {}),  # less than three spreads of it away
+        (lambda: pm.InverseGamma("sigma", 2, 0.3), {}),
+        (lambda: pm.HalfNormal("sigma", 0.3), {"tolerance": 1e-3}),
+        (lambda: pm.HalfNormal("sigma", 0.3), {"method": "Powell"}),
+    ],
+    ids=["wide", "inverse gamma", "coarse", "Powell"],
+)
+def test_a_collapsed_population_is_known_by_the_objective(spread: Callable[[], Any], keywords: dict[str, Any]) -> None:
+    """Not by standard errors: curvature and its noise are rounding errors there, and their ratio is anything."""
+    optimum = prb.minimize(collapsing(spread), **keywords)
+    assert optimum.point["sigma"] < 3e-3
+    assert optimum.at_edge == ("sigma",)
+    assert not optimum.converged
+
+
+def test_a_hyperparameter_without_effect_is_at_no_edge_however_far_out() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
+        pm.Normal("idle", 3, 2)
+        prb.Simulator("y", same, x, metric=METRICS["pr"], observed=OBSERVED, propagation=R256)
+    optimum = prb.minimize(model, start={"mu": 1.0, "idle": 60.0}, starts=0)
+    assert optimum.point["idle"] == pytest.approx(60.0)
+    assert optimum.at_edge == ()
+    assert optimum.converged
+
+
+def test_a_population_that_collapsed_within_the_bandwidth_is_no_convergence() -> None:
+    model = collapsing(lambda: pm.HalfNormal("sigma", 0.3))
     optimum = prb.minimize(model)
     assert optimum.point["sigma"] < 1e-3
     assert not optimum.converged
@@ -363,6 +398,7 @@ def test_standard_errors_are_those_of_where_the_simplex_ended() -> None:
     assert "A simplex from there" in optimum.message
     hood = Neighbourhood.of(optimum.evaluator, optimum.theta, np.ones(1), optimum.evaluator.prior_sd)
     np.testing.assert_allclose(optimum.covariance, hood.local.in_theta, rtol=1e-6)
+    np.testing.assert_array_equal(optimum.sampling().local.in_theta, hood.local.in_theta)
 
 
 @pytest.mark.parametrize("name", ["kl", "pr"])
@@ -456,7 +492,7 @@ def far_model(name: str, propagation: Any) -> pm.Model:
 
 @pytest.mark.parametrize("propagation", [R256, prb.Resimulated(1024)], ids=["reweighted", "resimulated"])
 def test_without_the_area_metric_a_far_start_does_not_arrive(propagation: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Search, "approach", lambda self, theta, *_: theta)
+    monkeypatch.setattr(minimization, "approach", lambda search, theta, *_: Approach(theta, Trace()))
     optimum = prb.minimize(far_model("pr", propagation), start={"mu": 30.0, "sigma": 0.1}, refine=False, starts=0)
     assert abs(optimum.point["mu"] - MEAN) > 1.0
 

@@ -1,4 +1,4 @@
-"""Methods as objects, budgets and tolerances, starting points, and a million responses."""
+"""Budgets and tolerances, starting points, and a million responses."""
 
 import subprocess
 import sys
@@ -10,23 +10,27 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
-from scipy import optimize, stats
+from scipy import stats
 
 import prbayes as prb
 from prbayes._checks import Floats
+from prbayes.estimate.differences import differences
 from prbayes.estimate.methods import Method
-from prbayes.estimate.objective import Objective, StalledError, differences
-from prbayes.estimate.search import Search
+from prbayes.estimate.search import Search, approach, overlap
 from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 
 
-def normal_model(propagation: Any, response: Callable[..., Any] = lambda x: x, unit: float = 1.0) -> pm.Model:
+def normal_model(
+    propagation: Any, response: Callable[..., Any] = lambda x: x, unit: float = 1.0
+) -> pm.Model:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2 * unit), pm.HalfNormal("sigma", unit))
         metric = prb.ProbabilityResidual()
-        prb.Simulator("y", response, x, metric=metric, observed=unit * OBSERVED, propagation=propagation)
+        prb.Simulator(
+            "y", response, x, metric=metric, observed=unit * OBSERVED, propagation=propagation
+        )
     return model
 
 
@@ -44,83 +48,16 @@ def pair(optimum: prb.Optimum) -> Floats:
     return np.array([optimum.point["mu"], optimum.point["sigma"]])
 
 
-# -- methods ---------------------------------------------------------------------------------------------
-
-
-def steepest_descent(
-    fun: Any, x0: Floats, args: Any, jac: Any = None, steps: int = 2000, **_: Any
-) -> optimize.OptimizeResult:
-    x = np.array(x0)
-    for _i in range(steps):
-        g = jac(x)
-        if np.abs(g).max() < 1e-7:
-            break
-        x = x - 0.05 * g
-    return optimize.OptimizeResult(x=x, fun=fun(x), success=True, message="down")
+# -- budgets, tolerances, trace --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("method", "options"),
-    [
-        ("L-BFGS-B", {"maxcor": 3}),
-        ("slsqp", None),
-        ("TNC", None),
-        ("trust-constr", None),
-        ("Newton-CG", None),
-        ("COBYQA", None),
-        ("COBYLA", None),
-        (steepest_descent, None),
-        (steepest_descent, {"steps": 1500}),
-    ],
-    ids=lambda value: value if isinstance(value, str) else "",
-)
-def test_any_method_finds_the_optimum(method: Any, options: Any) -> None:
-    # The callable descends in small steps and takes hundreds.
-    found = prb.minimize(model(), start={"mu": 0.5, "sigma": 0.8}, method=method, options=options)
-    assert found.converged
-    np.testing.assert_allclose(pair(found), pair(best()), atol=3e-4)
-
-
-def test_options_replace_defaults_and_are_not_changed() -> None:
-    options = {"xatol": 0.3, "fatol": 10.0}
-    loose = prb.minimize(model(), start={"mu": 0.5, "sigma": 0.8}, method="Nelder-Mead", options=options)
-    tight = prb.minimize(model(), start={"mu": 0.5, "sigma": 0.8}, method="Nelder-Mead")
-    assert loose.n_evaluations < tight.n_evaluations / 3
-    assert options == {"xatol": 0.3, "fatol": 10.0}
-
-
-@pytest.mark.parametrize(
-    ("method", "error", "words"),
-    [
-        ("bfsg", ValueError, r"got 'bfsg', expected one of BFGS, CG, .*, or a function"),
-        ("dogleg", ValueError, "got 'dogleg'"),  # needs a Hessian
-        (3, TypeError, "method: got 3, expected the name of a scipy method"),
-        (dict, TypeError, "expected the name of a scipy method"),
-    ],
-)
-def test_an_unknown_method_is_refused_before_any_work(method: Any, error: type[Exception], words: str) -> None:
-    calls = []
-    other = normal_model(prb.Resimulated(64), lambda x: calls.append(1) or np.array(x))
-    calls.clear()
-    with pytest.raises(error, match=words):
-        prb.minimize(other, method=method)
-    assert not calls
-
-
-def test_options_must_be_a_mapping() -> None:
-    with pytest.raises(TypeError, match="options: got list, expected a mapping"):
-        prb.minimize(model(), options=[1])  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("keywords", "words"), [({"tolerance": 0.0}, "tolerance"), ({"max_evaluations": 0}, "max_evaluations")]
+    ("keywords", "words"),
+    [({"tolerance": 0.0}, "tolerance"), ({"max_evaluations": 0}, "max_evaluations")],
 )
 def test_tolerance_and_budget_are_checked(keywords: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         prb.minimize(model(), **keywords)
-
-
-# -- budgets, tolerances, trace --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", ["BFGS", "L-BFGS-B", "Nelder-Mead", "Powell"])
@@ -140,7 +77,9 @@ def test_the_budget_means_the_same_for_all_methods(method: str, box: bool) -> No
 
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
 def test_units_do_not_matter(unit: float) -> None:
-    found = prb.minimize(normal_model(prb.Resimulated(256), unit=unit), start={"mu": 0.5 * unit, "sigma": 0.8 * unit})
+    found = prb.minimize(
+        normal_model(prb.Resimulated(256), unit=unit), start={"mu": 0.5 * unit, "sigma": 0.8 * unit}
+    )
     assert found.converged
     assert found.n_evaluations == best().n_evaluations <= 15
     np.testing.assert_allclose(pair(found) / unit, pair(best()), rtol=1e-6)
@@ -163,28 +102,12 @@ def test_exact_and_differenced_gradients_agree() -> None:
     evaluator, scales = Evaluator(model()), np.array([0.7])
     theta = np.array([0.4, -0.3])
     exact = evaluator.objective(prior=False, gradient=True)(theta, scales)
-    value, gradient, cost = differences(lambda t: evaluator.total(t, scales), np.array([2e-4, 1e-4]))(theta)
+    value, gradient, cost = differences(
+        lambda t: evaluator.total(t, scales), np.array([2e-4, 1e-4])
+    )(theta)
     assert cost == 5
     np.testing.assert_allclose(value, exact[0], rtol=1e-12)
     np.testing.assert_allclose(gradient, exact[1], rtol=1e-5)
-
-
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_differences_at_an_edge_are_one_sided(side: float) -> None:
-    def values(thetas: Floats) -> Floats:
-        return np.where(side * thetas[:, 0] > 1.0, np.inf, thetas[:, 0] ** 2 + thetas[:, 1])
-
-    _, gradient, _ = differences(values, np.array([1e-4, 1e-4]))(np.array([side, 3.0]))
-    np.testing.assert_allclose(gradient, [2.0 * side, 1.0], rtol=1e-3)
-
-
-def test_a_line_search_without_progress_is_stopped() -> None:
-    objective = Objective(lambda t: (1.0, np.zeros(1), 1), np.zeros(1), np.ones(1), 1.0, gradient=True, most=100)
-    objective.patience = 4
-    for _ in range(5):
-        objective(np.zeros(1))
-    with pytest.raises(StalledError):
-        objective(np.zeros(1))
 
 
 # -- starting points -------------------------------------------------------------------------------------
@@ -195,7 +118,14 @@ def test_points_of_the_prior_are_spread_evenly_and_follow_hierarchies() -> None:
         center = pm.Normal("center", 3.0, 2.0)
         means = pm.Normal("means", center, 0.1, shape=2)
         x = pm.Normal.dist(means[0] + means[1], pm.Gamma("sigma", 2, 1))
-        prb.Simulator("y", lambda x: x, x, metric=prb.AreaMetric(), observed=OBSERVED, propagation=prb.Resimulated(8))
+        prb.Simulator(
+            "y",
+            lambda x: x,
+            x,
+            metric=prb.AreaMetric(),
+            observed=OBSERVED,
+            propagation=prb.Resimulated(8),
+        )
     evaluator = Evaluator(hierarchical)
     thetas = evaluator.prior_points(256, 0)
     assert thetas.shape == (256, 4)
@@ -212,7 +142,9 @@ def test_points_of_the_prior_are_spread_evenly_and_follow_hierarchies() -> None:
 def test_priors_without_inverse_distribution_function_are_drawn() -> None:
     with pm.Model() as other:
         mu = pm.VonMises("mu", 0.0, 1.0)
-        prb.Simulator("y", lambda x: x, pm.Normal.dist(mu, 1.0), metric=prb.AreaMetric(), observed=OBSERVED)
+        prb.Simulator(
+            "y", lambda x: x, pm.Normal.dist(mu, 1.0), metric=prb.AreaMetric(), observed=OBSERVED
+        )
     evaluator = Evaluator(other)
     np.testing.assert_array_equal(evaluator.prior_points(16, 3), evaluator.prior_thetas(16, 3))
 
@@ -225,33 +157,43 @@ def test_overlap_is_one_for_equal_and_zero_for_disjoint_densities() -> None:
     assert 0.05 < between < 0.95
 
 
-@pytest.mark.parametrize("propagation", [prb.Reweighted(256), prb.Resimulated(256)], ids=["stored", "anew"])
+@pytest.mark.parametrize(
+    "propagation", [prb.Reweighted(256), prb.Resimulated(256)], ids=["stored", "anew"]
+)
 def test_where_there_is_overlap_the_start_is_left_alone(propagation: Any) -> None:
     evaluator = Evaluator(normal_model(propagation))
     search = Search(evaluator, np.ones(2), Method(), prior=False, tolerance=1e-6, most=100)
     theta = np.array([0.3, 0.0])
-    assert search.approach(theta, np.ones(1), 0) is theta
-    assert search.count == 0
-    far = np.array([9.0, -1.0])
-    reached = search.approach(far, np.ones(1), 0)
-    assert search.overlap(*search._populations(reached[None]))[0] > 0.5
-    assert search.count > 0
+    near = approach(search, theta, np.ones(1), 0)
+    assert near.theta is theta
+    assert near.trace.count == 0
+    far = approach(search, np.array([9.0, -1.0]), np.ones(1), 0)
+    values, weights = evaluator.populations(far.theta[None], 0)
+    assert overlap(evaluator, [values], [weights])[0] > 0.5
+    assert far.trace.count > 0
 
 
 # -- a million responses ---------------------------------------------------------------------------------
 
 
 def test_monte_carlo_points_agree_with_sobol_points() -> None:
-    random = prb.minimize(normal_model(prb.Resimulated(20_000, points="monte_carlo")), start=best().point)
+    random = prb.minimize(
+        normal_model(prb.Resimulated(20_000, points="monte_carlo")), start=best().point
+    )
     # The error of independent points is sqrt(N / n) standard errors.
     limit = 4 * np.sqrt(50 / 20_000)
-    assert (np.abs(pair(random) - pair(best())) < limit * np.array([best().stderr["mu"], best().stderr["sigma"]])).all()
+    assert (
+        np.abs(pair(random) - pair(best()))
+        < limit * np.array([best().stderr["mu"], best().stderr["sigma"]])
+    ).all()
     assert (pair(random) != pair(best())).all()
 
 
 @pytest.mark.parametrize(("points", "error"), [("halton", ValueError), (3, TypeError)])
 def test_points_are_a_name_or_a_function(points: Any, error: type[Exception]) -> None:
-    with pytest.raises(error, match=r'points: got .*, expected "sobol", "monte_carlo" or a function'):
+    with pytest.raises(
+        error, match=r'points: got .*, expected "sobol", "monte_carlo" or a function'
+    ):
         prb.Resimulated(64, points=points)
 
 
@@ -274,9 +216,15 @@ print(int(status.split("VmHWM:")[1].split()[0]) / 2**20)
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="peak memory is read from /proc")
-@pytest.mark.parametrize("metric", ["ProbabilityResidual", pytest.param("AreaMetric", marks=pytest.mark.slow)])
-def test_a_million_responses_with_gradients_and_standard_errors_take_less_than_a_gibibyte(metric: str) -> None:
-    run = subprocess.run([sys.executable, "-c", MILLION, metric], capture_output=True, text=True, check=False)
+@pytest.mark.parametrize(
+    "metric", ["ProbabilityResidual", pytest.param("AreaMetric", marks=pytest.mark.slow)]
+)
+def test_a_million_responses_with_gradients_and_standard_errors_take_less_than_a_gibibyte(
+    metric: str,
+) -> None:
+    run = subprocess.run(
+        [sys.executable, "-c", MILLION, metric], capture_output=True, text=True, check=False
+    )
     assert run.returncode == 0, run.stderr
     assert float(run.stdout) < 1.0
 
@@ -286,7 +234,11 @@ def test_an_inverse_distribution_function_without_gradient_is_differenced() -> N
     observed = np.random.default_rng(5).gamma(16, 1 / 16, 60)
     with pm.Model() as model:
         x = pm.Gamma.dist(mu=pm.HalfNormal("mu", 2), sigma=pm.HalfNormal("sigma", 1))
-        keywords = {"metric": prb.KullbackLeibler(), "observed": observed, "propagation": prb.Resimulated(512)}
+        keywords = {
+            "metric": prb.KullbackLeibler(),
+            "observed": observed,
+            "propagation": prb.Resimulated(512),
+        }
         prb.Simulator("y", lambda x: 2 * x - x, x, **keywords)
     optimum = prb.minimize(model)
     assert optimum.converged

@@ -1,0 +1,133 @@
+"""From where a search ended to an `Optimum`: values in the user's units, standard errors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from prbayes._checks import Floats
+from prbayes.estimate.caveats import no_information
+from prbayes.estimate.differences import cross, slopes
+from prbayes.estimate.optimum import Optimum, plain
+from prbayes.estimate.rivals import Rival
+from prbayes.estimate.search import Run, Search
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.identity import identity_of
+
+# Step of differences from theta to the user's units, in spreads of the prior: transforms are smooth.
+_STEP = 1e-4
+# Variance, in squared spreads of the prior, below which it can be that of rounding errors; whether
+# it is, the discrepancy tells.
+_ROUNDING = 1e-16
+
+
+def assemble(
+    search: Search,
+    run: Run,
+    *,
+    covariance: Floats,
+    remark: str,
+    screened: int,
+    responses_before: int,
+) -> Optimum:
+    """Return the record of a search that has ended.
+
+    Parameters
+    ----------
+    search : Search
+    run : Run
+        The last one.
+    covariance : ndarray, shape (d, d)
+        Sampling covariance in unconstrained space; infinite along what is not identified, or NaN.
+    remark : str
+        What is added to the message.
+    screened : int
+        Points of the prior tried as starts.
+    responses_before : int
+        Scalar responses that were computed for something else.
+    """
+    evaluator, theta, scales = search.evaluator, run.best, run.scales
+    point, stderr = point_and_stderr(evaluator, theta, covariance)
+    nowhere = _nowhere(evaluator, theta, covariance)
+    lost = ""
+    if nowhere:
+        lost = (
+            " No hyperparameter changes the discrepancy here, far from the data: try another start."
+        )
+    values = evaluator(theta[None]).discrepancies[0]
+    names = [n.name for n in evaluator.nodes]
+    discrepancies = dict(zip(names, map(float, values), strict=True))
+    return Optimum(
+        point=point,
+        discrepancy=float((values / scales).sum()),
+        discrepancies=discrepancies,
+        scales=dict(zip(names, map(float, scales), strict=True)),
+        n_evaluations=run.trace.count,
+        n_screened=screened,
+        n_responses=evaluator.n_responses - responses_before,
+        converged=run.success and not nowhere,
+        message=f"{run.message}{remark}{lost}",
+        stderr=stderr,
+        covariance=covariance,
+        theta=theta,
+        names=evaluator.names,
+        evaluator=evaluator,
+        support=_support(evaluator, theta),
+        trace={
+            "theta": np.array(run.trace.thetas).reshape(-1, theta.size),
+            "discrepancy": np.array(run.trace.values),
+            "evaluations": np.array(run.trace.counts, dtype=np.int64),
+        },
+        identity=identity_of(evaluator, prior_minimised=search.prior),
+    )
+
+
+def point_and_stderr(
+    evaluator: Evaluator, theta: Floats, covariance: Floats
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return variables and deterministics in the user's units, and their standard errors."""
+    step = _STEP * evaluator.prior_sd
+    values = evaluator.constrained(cross(theta, step))
+    point = {name: plain(v[0]) for name, v in values.items()}
+    stderr = {name: plain(_stderr(slopes(v, step), covariance)) for name, v in values.items()}
+    return point, stderr
+
+
+def _stderr(gradients: Floats, covariance: Floats) -> Floats:
+    """Carry a covariance, some of it infinite or NaN, along gradients (..., d)."""
+    unknown = np.isinf(covariance)
+    finite = np.where(unknown, 0.0, covariance)
+    variance = np.einsum("...i,ij,...j->...", gradients, finite, gradients)
+    size = np.abs(gradients)
+    touched = np.einsum("...i,ij,...j->...", size, unknown.astype(float), size)
+    # At a bound of its support nothing moves it, and nothing is known of what would.
+    at_bound = unknown.any() & (gradients == 0).all(axis=-1)
+    variance = np.where(touched > 0, np.inf, np.maximum(variance, 0))
+    return np.asarray(np.sqrt(np.where(at_bound, np.nan, variance)))
+
+
+def _nowhere(evaluator: Evaluator, theta: Floats, covariance: Floats) -> bool:
+    """Return whether the search ended where no hyperparameter changes the discrepancy."""
+    variance = np.diag(covariance) / evaluator.prior_sd**2
+    suspect = np.isinf(variance) | (variance < _ROUNDING)
+    return bool(suspect.all()) and no_information(evaluator, theta)
+
+
+def _support(evaluator: Evaluator, theta: Floats) -> dict[str, dict[str, float]]:
+    """Return how well the designs support the population at theta, by simulator."""
+    out = {}
+    for name, support in evaluator.support(theta[None]).items():
+        out[name] = {key: float(value[0]) for key, value in support.items()}
+    return out
+
+
+def rival_record(evaluator: Evaluator, rival: Rival) -> dict[str, Any]:
+    """Return another optimum as `Optimum` keeps it."""
+    values = evaluator.constrained(rival.theta[None])
+    return {
+        "point": {name: plain(v[0]) for name, v in values.items()},
+        "discrepancy": rival.value,
+        "theta": rival.theta,
+        "comparable": rival.comparable,
+    }

@@ -1,0 +1,68 @@
+"""The standardised objective: units, sign of the gradient, record, budget, progress."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from prbayes._checks import Floats
+from prbayes.estimate.objective import Objective, SpentError, StalledError
+
+
+def parabola(theta: Floats) -> Any:
+    return float((theta**2).sum()), 2 * theta, 3
+
+
+def objective(function: Any = parabola, **keywords: Any) -> Objective:
+    center, units = np.array([1.0, 2.0]), np.array([0.5, 4.0])
+    return Objective(function, center, units, 10.0, **({"gradient": True, "most": 100} | keywords))
+
+
+def test_value_and_gradient_are_in_units_of_size_and_parameters() -> None:
+    value, gradient = objective()(np.array([2.0, -0.25]))  # theta = (2, 1)
+    assert value == pytest.approx(0.5)
+    np.testing.assert_allclose(gradient, [2 * 2 * 0.5 / 10, 2 * 1 * 4.0 / 10])
+
+
+def test_points_are_recorded_with_their_cost_and_the_best_is_the_lowest() -> None:
+    found = objective()
+    np.testing.assert_array_equal(found.best, [1.0, 2.0])  # the center, as long as nothing is known
+    for t in ([0.0, 0.0], [-2.0, -0.5], [1.0, 1.0]):
+        found(np.array(t))
+    assert found.counts == [3, 6, 9]
+    np.testing.assert_array_equal(found.best, [0.0, 0.0])
+    assert found.lowest == 0.0
+
+
+def test_the_budget_is_not_exceeded() -> None:
+    found = objective(most=4)
+    found(np.zeros(2))
+    found(np.zeros(2))
+    with pytest.raises(SpentError):
+        found(np.zeros(2))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_where_there_is_no_value_a_line_search_is_led_back(bad: float) -> None:
+    def broken(theta: Floats) -> Any:
+        return bad, np.full(2, np.nan), 1
+
+    t = np.array([1.0, -2.0])
+    value, gradient = objective(broken)(t)
+    assert value > 1e9
+    np.testing.assert_array_equal(np.sign(gradient), np.sign(t))
+    assert np.isfinite(objective(broken, gradient=False)(t))
+    found = objective(broken)
+    found(t)
+    assert found.lowest == np.inf
+
+
+def test_a_line_search_without_progress_is_stopped() -> None:
+    found = Objective(
+        lambda t: (1.0, np.zeros(1), 1), np.zeros(1), np.ones(1), 1.0, gradient=True, most=100
+    )
+    found.patience = 4
+    for _ in range(5):
+        found(np.zeros(1))
+    with pytest.raises(StalledError):
+        found(np.zeros(1))

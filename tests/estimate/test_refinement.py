@@ -1,0 +1,25 @@
+"""Where designs are refined: thetas around an optimum."""
+
+import numpy as np
+import pytest
+
+from prbayes.estimate.refinement import spread_around
+
+PRIOR_SD = np.array([2.0, 0.5])
+
+
+def test_thetas_have_the_covariance_of_the_optimum() -> None:
+    covariance = np.array([[0.04, 0.006], [0.006, 0.0025]])
+    thetas = spread_around(np.array([1.0, -1.0]), covariance, PRIOR_SD)
+    assert thetas.shape == (256, 2)
+    # 256 normal draws: variances to 9%, means to a sixteenth of a standard deviation; 4.5 of them.
+    np.testing.assert_allclose(np.diag(np.cov(thetas.T)), np.diag(covariance), rtol=0.4)
+    assert np.cov(thetas.T)[0, 1] == pytest.approx(0.006, rel=0.5)
+    assert (np.abs(thetas.mean(axis=0) - [1.0, -1.0]) < 0.28 * np.sqrt(np.diag(covariance))).all()
+
+
+@pytest.mark.parametrize("unknown", [np.nan, np.inf, 1e6])
+def test_thetas_are_no_wider_than_the_prior(unknown: float) -> None:
+    covariance = np.diag([unknown, 0.0025])
+    sd = spread_around(np.zeros(2), covariance, PRIOR_SD).std(axis=0)
+    np.testing.assert_allclose(sd, [2.0, 0.05], rtol=0.2)
