@@ -14,16 +14,16 @@ import pymc as pm
 from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes._progress import shown
 from prbayes.estimate.caveats import flat, trouble
-from prbayes.estimate.identifiability import blind_directions
+from prbayes.estimate.identifiability import unidentified_directions
 from prbayes.estimate.methods import Method
+from prbayes.estimate.obstacles import sampling_obstacle
 from prbayes.estimate.optimum import Optimum, assemble, plain
 from prbayes.estimate.refinement import AGREE, MAX_ROUNDS, grow, pilot, refine_at, refuse, spread_around
-from prbayes.estimate.refit import Neighbourhood
+from prbayes.estimate.refit import SamplingDistribution
 from prbayes.estimate.rivals import Rival, rivals
 from prbayes.estimate.sampling import Local
 from prbayes.estimate.sandwich import Information
 from prbayes.estimate.search import Search
-from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.simulator import model_on_context
 from prbayes.model.support import shortcomings
@@ -227,7 +227,7 @@ def find_optimum(
         result = search(theta, scales)
         theta = search.best
         if several and np.isnan(evaluator.epsilon).any():
-            noise = [Information(evaluator, k, theta, scale).noise_floor for k in range(len(evaluator.nodes))]
+            noise = [Information(evaluator, k, theta).noise_floor for k in range(len(evaluator.nodes))]
             scales = np.where(np.isnan(evaluator.epsilon), noise, evaluator.epsilon)
             result = search(theta, scales)
             theta = search.best
@@ -293,18 +293,18 @@ def find_optimum(
     )
 
 
-def _hood(evaluator: Evaluator, theta: Floats, scale: Floats, scales: Floats) -> Neighbourhood | None:
+def _hood(evaluator: Evaluator, theta: Floats, scale: Floats, scales: Floats) -> SamplingDistribution | None:
     """Return the sampling distribution of the minimiser around theta, or None where nothing is known of it."""
-    if any(n.metric.minimum is Minimum.UNKNOWN or n.bound.random for n in evaluator.nodes):
+    if sampling_obstacle(evaluator) is not None:
         return None
-    return Neighbourhood.of(evaluator, theta, scales, scale)
+    return SamplingDistribution.of(evaluator, theta, scales)
 
 
 def _rivals(
     evaluator: Evaluator, theta: Floats, scales: Floats, local: Local, starts: int, seed: int, *, refine: bool
 ) -> list[Rival]:
     """Look for other optima; where a design is too thin for one that matters, refine it there and look again."""
-    floors = [Information(evaluator, k, theta, local.scale, n_sets=50).noise_floor for k in range(len(evaluator.nodes))]
+    floors = [Information(evaluator, k, theta, n_sets=50).noise_floor for k in range(len(evaluator.nodes))]
     noise = _FLOOR * float((np.array(floors) / scales).sum())
     for _ in range(_LOOKS):
         found = rivals(evaluator, theta, scales, local, noise, starts=starts, seed=seed)
@@ -323,10 +323,10 @@ def _at_edge(
     Data drawn from such a population tell much, so that the standard errors are small there, and mean nothing.
     """
     away = theta - np.median(evaluator.prior_thetas(256, seed), axis=0)
-    far = np.flatnonzero((np.abs(away) > _FAR * local.scale) & np.isfinite(np.diag(local.in_theta)))
-    if not far.size or flat(evaluator, theta, local.scale):
+    far = np.flatnonzero((np.abs(away) > _FAR * local.prior_sd) & np.isfinite(np.diag(local.in_theta)))
+    if not far.size or flat(evaluator, theta, local.prior_sd):
         return ()
-    further = np.diag(np.sign(away) * local.scale)[far]
+    further = np.diag(np.sign(away) * local.prior_sd)[far]
     here, *there = evaluator.total(np.vstack([theta, theta + further]), scales)
     return tuple(evaluator.readable_names[i] for i, f in zip(far, there, strict=True) if abs(f - here) < _SAME * size)
 
@@ -359,6 +359,6 @@ def _warnings(evaluator: Evaluator, local: Local | None, others: list[Rival], er
         lines += [
             f"the data tell less than the prior about {direction} (in units of the priors' standard deviations): it is "
             "not identified by them, and its posterior rests on the prior"
-            for direction in blind_directions(local.blind, evaluator.readable_names)
+            for direction in unidentified_directions(local.unidentified, evaluator.readable_names)
         ]
     return tuple(lines)

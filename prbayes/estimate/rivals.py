@@ -71,7 +71,7 @@ def rivals(
     def objective(thetas: Floats) -> Floats:
         return evaluator.total(thetas.reshape(-1, thetas.shape[-1]), scales).reshape(thetas.shape[:-1])
 
-    scale = local.scale
+    scale = local.prior_sd
     draws = evaluator.prior_points(8 * starts, seed)
     first = objective(draws)
     chosen = draws[np.argsort(first, kind="stable")[::4][:starts]]  # the better half, without crowding
@@ -86,7 +86,7 @@ def rivals(
         tolerance=0.01 * noise,
     )
     kept = [(best, float(objective(best[None])[0]))]
-    in_line = ends - ends @ local.blind @ local.blind.T
+    in_line = ends - ends @ local.unidentified @ local.unidentified.T
     also = objective(best + in_line * scale)
     ends, values = np.where((also < values + 0.01 * noise)[:, None], in_line, ends), np.minimum(also, values)
     for i in np.argsort(values):

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 from prbayes.metrics.base import Discrepancy, Metric
 
+# Of counts that are computed from weights; weights that are no counts differ from such by far more.
+_ROUNDING = 1e-6
+
 
 @dataclass(frozen=True)
 class FunctionMetric(Metric):
@@ -53,13 +56,24 @@ class FunctionMetric(Metric):
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         if not np.allclose(weights, weights[0]):
             raise ValueError("observed weights: got unequal ones, expected none; a FunctionMetric has no use for them")
-        return FunctionDiscrepancy(self, observed, weights)
+        return FunctionDiscrepancy(self, observed, weights, observed.size)
 
 
+@dataclass(frozen=True, eq=False)
 class FunctionDiscrepancy(Discrepancy):
-    """A user's metric against fixed observed values."""
+    """A user's metric against fixed observed values.
+
+    The function takes observed values without weights: a data set that is given by weights of
+    values is handed to it as a sample, in which each value is repeated by its count.
+
+    Attributes
+    ----------
+    size : int
+        Number of values in such a sample.
+    """
 
     metric: FunctionMetric
+    size: int
 
     @property
     def symbolic(self) -> bool:
@@ -73,22 +87,40 @@ class FunctionDiscrepancy(Discrepancy):
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
         """Return the value of the function."""
+        if self.weights.ndim > 1:
+            return (self._of_each(simulated, weights),)
+        observed = repeated(self.observed, self.weights, self.size)
+        return (self._called(simulated, observed, weights),)
+
+    def _of_each(self, simulated: Floats, weights: Floats) -> Floats:
+        """Return the values for several data sets, (B, ...), from populations (B, ..., n) or (1, ..., n)."""
+        n_sets = len(self.weights)
+        simulated = np.broadcast_to(simulated, (n_sets, *simulated.shape[1:]))
+        weights = np.broadcast_to(weights, (n_sets, *weights.shape[1:]))
+        found = np.empty(simulated.shape[:-1])
+        for i, counts in enumerate(self.weights.reshape(n_sets, -1)):
+            observed = repeated(self.observed, counts, self.size)
+            found[i] = self._called(simulated[i], observed, weights[i])
+        return found
+
+    def _called(self, simulated: Floats, observed: Floats, weights: Floats) -> Floats:
+        """Call the function for one data set, with weights if it takes them, and check what it returns."""
         if self.metric.weighted:
-            value = self.metric.function(simulated, self.observed, np.broadcast_to(weights, simulated.shape))
+            value = self.metric.function(simulated, observed, np.broadcast_to(weights, simulated.shape))
         elif not np.allclose(weights, np.asarray(weights)[..., :1]):
             raise ValueError(
                 "weights: got unequal ones for a FunctionMetric whose function takes none; write "
                 "function(simulated, observed, weights) and pass weighted=True, or use prb.Resimulated"
             )
         else:
-            value = self.metric.function(simulated, self.observed)
+            value = self.metric.function(simulated, observed)
         value = np.asarray(value, dtype=np.float64)
         if value.shape != simulated.shape[:-1]:
             raise ValueError(
                 f"FunctionMetric: got a result of shape {value.shape} for simulated values of shape "
                 f"{simulated.shape}, expected {simulated.shape[:-1]}; reduce over the last axis"
             )
-        return (value,)
+        return value
 
     def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
         """Return the simulated values themselves."""
@@ -101,3 +133,28 @@ class FunctionDiscrepancy(Discrepancy):
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the value of the function."""
         return features[0]
+
+
+def repeated(values: Floats, weights: Floats, size: int) -> Floats:
+    """Return a sample in which each value occurs as often as its weight says.
+
+    Parameters
+    ----------
+    values, weights : ndarray, shape (n,)
+    size : int
+        Number of values in the sample, if the weights are multiples of its inverse. If they are
+        not, the value of smallest weight occurs once, as where some were left out.
+
+    Raises
+    ------
+    ValueError
+        If the weights are no counts, as those of the loss-likelihood bootstrap.
+    """
+    for counts in (weights * size, weights / weights[weights > 0].min()):
+        whole = np.round(counts)
+        if np.abs(counts - whole).max() < _ROUNDING:
+            return np.repeat(values, whole.astype(int))
+    raise ValueError(
+        "observed weights: got weights that are no counts, expected repeated values; a FunctionMetric takes no "
+        "weights of observed values; use prb.bootstrap(optimum, parametric=True)"
+    )

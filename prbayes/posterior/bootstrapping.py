@@ -10,9 +10,10 @@ import xarray as xr
 from prbayes._checks import positive_integer
 from prbayes._progress import shown
 from prbayes.estimate.data_sets import reweighted_sets, simulated_sets
-from prbayes.estimate.identifiability import blind_directions
+from prbayes.estimate.identifiability import unidentified_directions
+from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, surveyed
-from prbayes.estimate.refit import Neighbourhood, inapplicable
+from prbayes.estimate.refit import SamplingDistribution
 from prbayes.posterior.trees import bootstrap_tree
 
 
@@ -72,12 +73,12 @@ def bootstrap(
         raise TypeError(f"bootstrap: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first")
     positive_integer(draws, "draws", minimum=2)
     evaluator = surveyed(optimum, "bootstrap").evaluator
-    reason = inapplicable(evaluator)
+    reason = refit_obstacle(evaluator)
     if reason:
         raise ValueError(f"bootstrap: {reason}; use prb.sample_smc")
     scales = np.array(list(optimum.scales.values()))
-    hood = Neighbourhood.of(evaluator, optimum.theta, scales, evaluator.prior_sd)
-    blind = blind_directions(hood.local.blind, evaluator.readable_names)
+    sampling = SamplingDistribution.of(evaluator, optimum.theta, scales)
+    blind = unidentified_directions(sampling.local.unidentified, evaluator.readable_names)
     if blind:
         raise ValueError(
             f"bootstrap: the data tell less than the prior about {', '.join(blind)}, along which the minimiser is "
@@ -88,10 +89,10 @@ def bootstrap(
     else:
         data = reweighted_sets(evaluator, draws, random_seed)
     with shown(progressbar):
-        x, converged = hood.refit(data)
+        x, converged = sampling.refit(data)
     return bootstrap_tree(
         evaluator,
-        hood.thetas(x)[None],
+        sampling.thetas(x)[None],
         sampler="parametric bootstrap" if parametric else "loss-likelihood bootstrap",
         converged=float(converged.mean()),
         seed=random_seed,

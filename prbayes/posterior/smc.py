@@ -17,9 +17,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes._progress import CONSOLE, shown
 from prbayes.estimate.minimization import find_optimum
+from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse
-from prbayes.estimate.refit import inapplicable
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.simulator import model_on_context
 from prbayes.model.support import shortcomings
@@ -156,7 +156,7 @@ def sample(
         unset = [n for n in evaluator.nodes if np.isnan(n.epsilon_value)]
         if adjust is True and all(n in unset or n.epsilon_is_default for n in evaluator.nodes):
             adjust = Affine()
-        if optimum is None and (unset or (isinstance(adjust, Affine) and not inapplicable(evaluator))):
+        if optimum is None and (unset or (isinstance(adjust, Affine) and refit_obstacle(evaluator) is None)):
             optimum = find_optimum(evaluator, refine=refine)
         if optimum is not None and isinstance(adjust, Affine):
             surveyed(optimum, "sample_smc")

@@ -7,8 +7,9 @@ import xarray as xr
 
 from prbayes._checks import positive_integer
 from prbayes.estimate.data_sets import DataSets, specimens
+from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, surveyed
-from prbayes.estimate.refit import Neighbourhood, inapplicable
+from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.labels import versions
 
 
@@ -61,7 +62,7 @@ def held_out(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) -> xr.Da
     if not isinstance(optimum, Optimum):
         raise TypeError(f"held_out: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first")
     evaluator = surveyed(optimum, "held_out").evaluator
-    reason = inapplicable(evaluator)
+    reason = refit_obstacle(evaluator)
     if reason:
         raise ValueError(f"held_out: {reason}, so that the model cannot be calibrated anew")
     folds = positive_integer(folds, "folds", minimum=2)
@@ -77,9 +78,9 @@ def held_out(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) -> xr.Da
         raise ValueError(f"folds: got {folds}, with fewer than 2 observations of {few} in the others, expected fewer")
     kept = [w / w.sum(axis=1, keepdims=True) for w in kept]
     scales = np.array(list(optimum.scales.values()))
-    hood = Neighbourhood.of(evaluator, optimum.theta, scales, evaluator.prior_sd)
-    x, converged = hood.refit(DataSets([t.observed for t in targets], kept))
-    thetas = hood.thetas(x)
+    sampling = SamplingDistribution.of(evaluator, optimum.theta, scales)
+    x, converged = sampling.refit(DataSets([t.observed for t in targets], kept))
+    thetas = sampling.thetas(x)
     found = np.full((2, folds, len(targets)), np.nan)
     for k, target in enumerate(targets):
         values, weights = evaluator.populations(thetas, k)

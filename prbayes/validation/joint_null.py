@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats, positive_integer
 from prbayes._predict import data_digest, serving, specimen_names
 from prbayes.estimate.data_sets import groups, sets_at, simulated_points, specimens
+from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, surveyed
-from prbayes.estimate.refit import Neighbourhood, inapplicable
+from prbayes.estimate.refit import SamplingDistribution
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.validation.nulls import Case, Condition, Predictive, SimulatedNull
@@ -74,7 +75,7 @@ class JointNull(SimulatedNull):
             raise TypeError(
                 f"JointNull: got {type(self.optimum).__name__}, expected an Optimum; call prb.minimize() first"
             )
-        reason = inapplicable(surveyed(self.optimum, "JointNull").evaluator)
+        reason = refit_obstacle(surveyed(self.optimum, "JointNull").evaluator)
         if reason:
             raise ValueError(f"JointNull: {reason}, so that the model cannot be calibrated anew; use PosteriorNull()")
         positive_integer(self.replicates, "JointNull: replicates", minimum=19)
@@ -90,14 +91,14 @@ class JointNull(SimulatedNull):
             _refuse_other(c, populations[k][0][0] if values is None else values, populations[k][1][0])
         points = simulated_points(evaluator, populations, self.replicates, self.seed, more=total)
         scales = np.array(list(self.optimum.scales.values()))
-        hood = Neighbourhood.of(evaluator, theta, scales, evaluator.prior_sd)
-        x, converged = hood.refit(sets_at(evaluator, populations, points))
+        sampling = SamplingDistribution.of(evaluator, theta, scales)
+        x, converged = sampling.refit(sets_at(evaluator, populations, points))
         if converged.mean() < 0.5:
             raise ValueError(
                 f"JointNull: got {converged.mean():.0%} of the minimisations converged, expected most; look at "
                 "prb.diagnose(optimum)"
             )
-        thetas = hood.thetas(x[converged])
+        thetas = sampling.thetas(x[converged])
         u: list[Floats] = []
         for (k, values), number in zip(found, numbers, strict=True):
             measured = (populations[k][0][0] if values is None else values)[points[k][converged][:, number]]

@@ -25,7 +25,7 @@ from prbayes.estimate.data_sets import (
     specimens,
 )
 from prbayes.estimate.objective import differences
-from prbayes.estimate.refit import Neighbourhood, _mean_hessian
+from prbayes.estimate.refit import SamplingDistribution, _mean_hessian
 from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
@@ -292,23 +292,23 @@ def test_shared_specimens_have_one_weight() -> None:
 
 
 @cache
-def neighbourhood(name: str, *, design: bool = True) -> Neighbourhood:
+def neighbourhood(name: str, *, design: bool = True) -> SamplingDistribution:
     model = build(METRICS[name], sd=None, propagation=R256 if design else prb.Resimulated(512))
     optimum = prb.minimize(model, method="Nelder-Mead", starts=0)
     evaluator = optimum.evaluator
-    return Neighbourhood.of(evaluator, optimum.theta, np.array(list(optimum.scales.values())), evaluator.prior_sd)
+    return SamplingDistribution.of(evaluator, optimum.theta, np.array(list(optimum.scales.values())))
 
 
 def test_coordinates_are_standard_errors_along_a_frame() -> None:
-    hood = neighbourhood("kl")
-    thetas = hood.theta + np.random.default_rng(6).normal(size=(7, 2))
-    x, rest = hood.coordinates(thetas)
-    np.testing.assert_allclose(hood.thetas(x, rest), thetas)
-    np.testing.assert_allclose(rest, 0, atol=1e-12)  # two hyperparameters, both seen
-    np.testing.assert_allclose(hood.frame.T @ hood.frame, np.eye(2), atol=1e-12)
+    sampling = neighbourhood("kl")
+    thetas = sampling.theta + np.random.default_rng(6).normal(size=(7, 2))
+    x, remainder = sampling.coordinates(thetas)
+    np.testing.assert_allclose(sampling.thetas(x, remainder), thetas)
+    np.testing.assert_allclose(remainder, 0, atol=1e-12)  # two hyperparameters, both seen
+    np.testing.assert_allclose(sampling.axes.T @ sampling.axes, np.eye(2), atol=1e-12)
     # One unit along each direction, together, make up the sampling covariance of theta.
-    steps = hood.thetas(np.eye(2)) - hood.theta
-    np.testing.assert_allclose(steps.T @ steps, hood.local.in_theta)
+    steps = sampling.thetas(np.eye(2)) - sampling.theta
+    np.testing.assert_allclose(steps.T @ steps, sampling.local.in_theta)
 
 
 def test_what_is_not_seen_is_left_over() -> None:
@@ -317,26 +317,26 @@ def test_what_is_not_seen_is_left_over() -> None:
         pm.Normal("idle", 0, 3)
         prb.Simulator("y", same, x, metric=KL, observed=OBSERVED, propagation=R256)
     evaluator = Evaluator(model)
-    hood = Neighbourhood.of(evaluator, np.array([1.0, 0.0]), np.ones(1), evaluator.prior_sd)
-    x, rest = hood.coordinates(np.array([[1.5, 2.0]]))
+    sampling = SamplingDistribution.of(evaluator, np.array([1.0, 0.0]), np.ones(1))
+    x, remainder = sampling.coordinates(np.array([[1.5, 2.0]]))
     assert x.shape == (1, 1)
-    np.testing.assert_allclose(rest, [[0.0, 2.0]], atol=1e-9)
-    np.testing.assert_allclose(hood.thetas(x, rest), [[1.5, 2.0]])
+    np.testing.assert_allclose(remainder, [[0.0, 2.0]], atol=1e-9)
+    np.testing.assert_allclose(sampling.thetas(x, remainder), [[1.5, 2.0]])
 
 
 @pytest.mark.parametrize("name", ["kl", slow("ll"), slow("pr"), "area"])
 def test_refits_are_minimisers(name: str) -> None:
     # Against a simplex on each data set by itself.
-    hood = neighbourhood(name)
-    sets = reweighted_sets(hood.evaluator, 6)
-    x, converged = hood.refit(sets)
+    sampling = neighbourhood(name)
+    sets = reweighted_sets(sampling.evaluator, 6)
+    x, converged = sampling.refit(sets)
     assert converged.all()
-    target = hood.evaluator.nodes[0].target
+    target = sampling.evaluator.nodes[0].target
     for found, weights in zip(x, sets.weights[0], strict=True):
         own = target.with_observed(sets.values[0], weights)
 
         def value(point: Floats, own: Any = own) -> float:
-            return float(own.of(*hood.evaluator.populations(hood.thetas(point)[None], 0))[0])
+            return float(own.of(*sampling.evaluator.populations(sampling.thetas(point)[None], 0))[0])
 
         best = optimize.minimize(value, np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-12})
         # Gains of 1e-4 of a standard error's are left on the table: 0.02 standard errors, the area's kinks more.
@@ -353,9 +353,9 @@ def test_the_observed_responses_are_fitted_by_the_optimum() -> None:
 @pytest.mark.parametrize("name", [slow("kl"), "pr", "area"])
 def test_first_order_without_a_design(name: str) -> None:
     # The optima differ little between 512 fixed points and a design; data sets of the observed specimens are the same.
-    hood, first = neighbourhood(name), neighbourhood(name, design=False)
-    sets = reweighted_sets(hood.evaluator, 100)
-    a = hood.thetas(hood.refit(sets)[0]) - hood.theta
+    sampling, first = neighbourhood(name), neighbourhood(name, design=False)
+    sets = reweighted_sets(sampling.evaluator, 100)
+    a = sampling.thetas(sampling.refit(sets)[0]) - sampling.theta
     b = first.thetas(first.refit(sets)[0]) - first.theta
     for i in range(2):
         assert np.corrcoef(a[:, i], b[:, i])[0, 1] > 0.9
@@ -364,11 +364,11 @@ def test_first_order_without_a_design(name: str) -> None:
 
 
 def test_blocks_of_data_sets_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
-    hood = neighbourhood("kl")
-    sets = simulated_sets(hood.evaluator, hood.theta, 23)
-    whole, _ = hood.refit(sets)
+    sampling = neighbourhood("kl")
+    sets = simulated_sets(sampling.evaluator, sampling.theta, 23)
+    whole, _ = sampling.refit(sets)
     monkeypatch.setattr(refit, "_BLOCK", 10 * 5 * (256 + sets.values[0].size))
-    parts, converged = hood.refit(sets)
+    parts, converged = sampling.refit(sets)
     assert converged.size == 23
     # Each block guesses its curvature from its own data sets, so that paths differ, but not where they lead.
     np.testing.assert_allclose(parts, whole, atol=0.04)
@@ -378,13 +378,13 @@ def test_two_simulators_are_weighed_by_their_scales() -> None:
     # A normal mean with known sd: both minimisers are about the means of the data, weighed by N_k.
     labels = np.arange(N)
     evaluator = pair(labels, labels)
-    hood = Neighbourhood.of(evaluator, TRUTH, np.array([1 / N, 1e9, 1e9]), evaluator.prior_sd)
+    sampling = SamplingDistribution.of(evaluator, TRUTH, np.array([1 / N, 1e9, 1e9]))
     sets = reweighted_sets(evaluator, 20)
-    only_a, _ = hood.refit(sets)
+    only_a, _ = sampling.refit(sets)
     alone = Evaluator(build(KL))
-    by_itself = Neighbourhood.of(alone, TRUTH, np.array([1 / N]), alone.prior_sd)
+    by_itself = SamplingDistribution.of(alone, TRUTH, np.array([1 / N]))
     expected, _ = by_itself.refit(DataSets(sets.values[:1], sets.weights[:1]))
-    np.testing.assert_allclose(hood.thetas(only_a), by_itself.thetas(expected), atol=0.003)
+    np.testing.assert_allclose(sampling.thetas(only_a), by_itself.thetas(expected), atol=0.003)
 
 
 def test_mean_hessian_of_a_parabola() -> None:

@@ -14,7 +14,7 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.estimate.refit import Neighbourhood
+from prbayes.estimate.refit import SamplingDistribution
 from prbayes.estimate.search import Search
 from prbayes.metrics.density import GaussianKDE
 from prbayes.model.evaluator import Evaluator
@@ -361,8 +361,8 @@ def test_standard_errors_are_those_of_where_the_simplex_ended() -> None:
     model = lossy("pr", 1, 4096)
     optimum = prb.minimize(model, start=START)
     assert "A simplex from there" in optimum.message
-    hood = Neighbourhood.of(optimum.evaluator, optimum.theta, np.ones(1), optimum.evaluator.prior_sd)
-    np.testing.assert_allclose(optimum.covariance, hood.local.in_theta, rtol=1e-6)
+    sampling = SamplingDistribution.of(optimum.evaluator, optimum.theta, np.ones(1))
+    np.testing.assert_allclose(optimum.covariance, sampling.local.in_theta, rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["kl", "pr"])

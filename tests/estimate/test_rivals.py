@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.estimate.identifiability import blind_directions, seen_by_curvature
+from prbayes.estimate.identifiability import seen_by_curvature, unidentified_directions
 from prbayes.estimate.rivals import rivals
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
@@ -206,7 +206,7 @@ def local(blind: Any) -> Local:
 )
 def test_directions_have_names(blind: Any, lines: list[str]) -> None:
     assert [
-        sorted_signs(d) for d in blind_directions(np.linalg.qr(np.array(blind, dtype=float).T)[0], ["a", "b", "c"])
+        sorted_signs(d) for d in unidentified_directions(np.linalg.qr(np.array(blind, dtype=float).T)[0], ["a", "b", "c"])
     ] == lines
 
 
@@ -216,7 +216,7 @@ def sorted_signs(line: str) -> str:
 
 
 def test_nothing_is_blind() -> None:
-    assert blind_directions(np.zeros((2, 0)), ["a", "b"]) == []
+    assert unidentified_directions(np.zeros((2, 0)), ["a", "b"]) == []
 
 
 @pytest.mark.parametrize("name", [slow("ll"), slow("kl"), "pr"])
@@ -258,7 +258,7 @@ def test_a_hyperparameter_without_effect_is_named_and_makes_no_rivals() -> None:
     assert line.endswith("it is not identified by them, and its posterior rests on the prior")
 
 
-def test_rivals_stand_where_the_optimum_does_along_blind_directions() -> None:
+def test_rivals_stand_where_the_optimum_does_along_unidentified_directions() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1.5), 0.5)
         pm.Normal("idle", 3, 2)

@@ -14,9 +14,10 @@ from scipy.stats import gamma, norm
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.estimate.refit import Neighbourhood, inapplicable
+from prbayes.estimate.obstacles import refit_obstacle
+from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
-from prbayes.posterior.adjustment import _drawn_in, moved
+from prbayes.posterior.adjustment import _drawn_in, transported
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N = OBSERVED.size
@@ -67,7 +68,7 @@ def thetas(idata: xr.DataTree) -> Floats:
 
 
 @cache
-def blind_hood() -> Neighbourhood:
+def idle_sampling() -> SamplingDistribution:
     """Two hyperparameters that the data see and one that they do not, with unlike units."""
     with pm.Model() as model:
         pm.Normal("idle", 5, 30)
@@ -75,40 +76,40 @@ def blind_hood() -> Neighbourhood:
         prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
     evaluator = Evaluator(model)
     theta = evaluator.unconstrained({"mu": 1.0, "sigma": 0.5, "idle": 5.0})
-    return Neighbourhood.of(evaluator, theta, evaluator.epsilon, evaluator.prior_sd)
+    return SamplingDistribution.of(evaluator, theta, evaluator.epsilon)
 
 
 def test_median_and_covariance_are_hit() -> None:
-    hood = blind_hood()
+    sampling = idle_sampling()
     rng = np.random.default_rng(2)
     root = rng.normal(size=(3, 3))
-    draws = hood.theta + rng.uniform(-1, 1, (500, 3)) @ root.T * np.array([30.0, 0.1, 0.2])
-    x, rest = hood.coordinates(draws)
+    draws = sampling.theta + rng.uniform(-1, 1, (500, 3)) @ root.T * np.array([30.0, 0.1, 0.2])
+    x, remainder = sampling.coordinates(draws)
     assert x.shape == (500, 2)
     center, covariance = np.array([0.3, -0.7]), np.array([[2.0, 0.9], [0.9, 0.7]])
-    out = moved(hood, x, rest, center, covariance)
-    new_x, new_rest = hood.coordinates(out)
+    out = transported(sampling, x, remainder, center, covariance)
+    new_x, new_remainder = sampling.coordinates(out)
     # Medians of sums are about sums of medians.
     np.testing.assert_allclose(np.median(new_x, axis=0), center, atol=0.1)
     np.testing.assert_allclose(np.cov(new_x, rowvar=False), covariance, rtol=1e-9)
 
-    # What the data do not see has the same distribution given the rest: slopes and residuals of the regression.
-    def regression(x: Floats, rest: Floats) -> tuple[Floats, Floats]:
+    # What the data do not see has the same distribution given the remainder: slopes and residuals of the regression.
+    def regression(x: Floats, remainder: Floats) -> tuple[Floats, Floats]:
         design = np.column_stack([np.ones(len(x)), x])
-        slopes = np.linalg.lstsq(design, rest, rcond=None)[0]
-        return slopes, rest - design @ slopes
+        slopes = np.linalg.lstsq(design, remainder, rcond=None)[0]
+        return slopes, remainder - design @ slopes
 
-    before, after = regression(x, rest), regression(new_x, new_rest)
+    before, after = regression(x, remainder), regression(new_x, new_remainder)
     assert np.abs(before[0][1:]).max() > 1  # there is something to follow
     for b, a in zip(before, after, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-8)
 
 
 def test_a_few_draws_far_out_do_not_decide_how_the_others_are_moved() -> None:
-    hood = blind_hood()
+    sampling = idle_sampling()
     x = np.random.default_rng(4).standard_normal((2000, 2))
     x[:10, 0] -= 60
-    new, _ = hood.coordinates(moved(hood, x, np.zeros((2000, 3)), np.array([1.0, 2.0]), np.diag([4.0, 0.25])))
+    new, _ = sampling.coordinates(transported(sampling, x, np.zeros((2000, 3)), np.array([1.0, 2.0]), np.diag([4.0, 0.25])))
     np.testing.assert_allclose(new[10:].std(axis=0), [2.0, 0.5], rtol=0.12)
     np.testing.assert_allclose(new[10:].mean(axis=0), [1.0, 2.0], atol=0.1)
     assert new[:10, 0].max() < new[10:, 0].min()
@@ -116,16 +117,16 @@ def test_a_few_draws_far_out_do_not_decide_how_the_others_are_moved() -> None:
 
 def test_the_least_motion_among_all_maps() -> None:
     # The map between normals is symmetric in these coordinates: draws that are there already stay.
-    hood = blind_hood()
-    draws = hood.thetas(np.random.default_rng(3).standard_normal((200, 2)) @ np.array([[1.0, 0.4], [0.0, 0.8]]))
-    x, rest = hood.coordinates(draws)
+    sampling = idle_sampling()
+    draws = sampling.thetas(np.random.default_rng(3).standard_normal((200, 2)) @ np.array([[1.0, 0.4], [0.0, 0.8]]))
+    x, remainder = sampling.coordinates(draws)
     counted = np.cov(_drawn_in(x, 3.0), rowvar=False)
-    np.testing.assert_allclose(moved(hood, x, rest, np.median(x, axis=0), counted), draws, atol=1e-9)
+    np.testing.assert_allclose(transported(sampling, x, remainder, np.median(x, axis=0), counted), draws, atol=1e-9)
     # And uncorrelated ones only stretch: no rotation, no reflection.
     x = np.clip(x - np.median(x, axis=0), -1.5, 1.5)  # none is far
     x = np.linalg.solve(np.linalg.cholesky(np.cov(x, rowvar=False)), x.T).T
     x -= np.median(x, axis=0)
-    new, _ = hood.coordinates(moved(hood, x, rest, np.zeros(2), np.diag([4.0, 0.25])))
+    new, _ = sampling.coordinates(transported(sampling, x, remainder, np.zeros(2), np.diag([4.0, 0.25])))
     np.testing.assert_allclose(new, x * [2.0, 0.5], atol=1e-9)
 
 
@@ -133,10 +134,10 @@ def test_draws_get_the_moments_that_the_target_says() -> None:
     optimum, idata = fit("kl"), adjusted("kl")
     evaluator = optimum.evaluator
     epsilon = idata.calibration["epsilon"].values
-    hood = Neighbourhood.of(evaluator, optimum.theta, epsilon, evaluator.prior_sd)
+    sampling = SamplingDistribution.of(evaluator, optimum.theta, epsilon)
     prb.set_epsilon(optimum.model, {"y": epsilon[0]})
-    center, covariance = prb.Affine(n_sets=1000).target(hood)
-    x, _ = hood.coordinates(thetas(idata))
+    center, covariance = prb.Affine(n_sets=1000).target(sampling)
+    x, _ = sampling.coordinates(thetas(idata))
     np.testing.assert_allclose(np.median(x, axis=0), center, atol=0.05)
     np.testing.assert_allclose(np.cov(_drawn_in(x, 3.0), rowvar=False), covariance, rtol=0.05, atol=0.02)
 
@@ -214,17 +215,17 @@ def test_a_standard_deviation_near_zero(name: str, sigma: float) -> None:
 
 
 def test_refits_that_ran_away_do_not_decide_the_width(monkeypatch: pytest.MonkeyPatch) -> None:
-    hood = blind_hood()
-    before = prb.Affine().target(hood)[1]
-    refit = Neighbourhood.refit
+    sampling = idle_sampling()
+    before = prb.Affine().target(sampling)[1]
+    refit = SamplingDistribution.refit
 
-    def some_lost(self: Neighbourhood, sets: Any) -> Any:
+    def some_lost(self: SamplingDistribution, sets: Any) -> Any:
         x, ok = refit(self, sets)
         x[: len(x) // 100] -= 300.0
         return x, ok
 
-    monkeypatch.setattr(Neighbourhood, "refit", some_lost)
-    after = prb.Affine().target(hood)[1]
+    monkeypatch.setattr(SamplingDistribution, "refit", some_lost)
+    after = prb.Affine().target(sampling)[1]
     np.testing.assert_allclose(np.sqrt(np.diag(after)), np.sqrt(np.diag(before)), rtol=0.3)
 
 
@@ -409,7 +410,7 @@ NONE = {
 def test_what_cannot_be_adjusted_says_so(case: str, caplog: pytest.LogCaptureFixture) -> None:
     make, words = NONE[case]
     model = make()
-    assert words in inapplicable(Evaluator(model))
+    assert words in str(refit_obstacle(Evaluator(model)))
     # A FunctionMetric's epsilon has to be given: only an explicit Affine would adjust it.
     with caplog.at_level(logging.WARNING, logger="prbayes"):
         idata = sample(model, 60, chains=1, adjust=prb.Affine() if case == "function" else True)

@@ -63,7 +63,7 @@ def known_sd(n: int | None = 256) -> tuple[prb.Optimum, Information]:
     propagation = prb.Resimulated(1024) if n is None else prb.Reweighted(n)
     optimum = prb.minimize(build(PR, sd=0.5, propagation=propagation))
     evaluator = Evaluator(optimum.model)
-    return optimum, Information(evaluator, 0, optimum.theta, evaluator.prior_sd)
+    return optimum, Information(evaluator, 0, optimum.theta)
 
 
 # -- likelihoods -----------------------------------------------------------------------------------------
@@ -153,7 +153,7 @@ def test_the_posterior_width_that_it_gives() -> None:
 def test_area_epsilon_is_about_0_28_of_the_noise_floor() -> None:
     optimum = area_fit()
     evaluator = Evaluator(optimum.model)
-    floor = Information(evaluator, 0, optimum.theta, evaluator.prior_sd).noise_floor
+    floor = Information(evaluator, 0, optimum.theta).noise_floor
     # The floor is a mean over 200 data sets whose distances vary by 40%; the bisected coverage has a standard error
     # of 1.6%, hence epsilon one of about 4%: 5% together. Bounds from the studies: 0.28 at N = 50, linear response.
     assert 0.22 < prb.calibrate_epsilon(optimum)["y"] / floor < 0.34
@@ -162,7 +162,7 @@ def test_area_epsilon_is_about_0_28_of_the_noise_floor() -> None:
 def test_noise_floor_of_the_area_metric_is_the_expected_distance_at_the_truth() -> None:
     optimum = area_fit()
     evaluator = Evaluator(optimum.model)
-    floor = Information(evaluator, 0, optimum.theta, evaluator.prior_sd).noise_floor
+    floor = Information(evaluator, 0, optimum.theta).noise_floor
     rng, u = np.random.default_rng(3), (np.arange(2000) + 0.5) / 2000
     quantiles = norm.ppf(u, optimum.point["mu"], optimum.point["sigma"])
     data = np.sort(rng.normal(optimum.point["mu"], optimum.point["sigma"], (1000, N)), axis=1)
