@@ -54,12 +54,14 @@ class BatchObjective:
         blocks: Sequence[NDArray[np.intp]] = (),
     ) -> BatchObjective:
         """Prepare the observed sides of all data sets; of all simulators by default."""
+        # Copied row by row: sums over rows then do not depend on how the weights lie in memory.
+        every = np.arange(len(sets.weights[0]))
         chosen = tuple(range(len(evaluator.nodes)) if simulators is None else simulators)
         targets, bases = [], []
         for k in chosen:
             node = evaluator.nodes[k]
             design = evaluator.designs[node.name]
-            target = node.target.with_observed(sets.values[k], sets.weights[k][:, None])
+            target = node.target.with_observed(sets.values[k], sets.weights[k][every, None])
             targets.append(target)
             bases.append(target.basis(design.values))
         return cls(evaluator, scales, chosen, targets, bases, blocks)
