@@ -11,7 +11,6 @@ averaged.
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ import numpy as np
 import pymc as pm
 
 import prbayes as prb
+from benchmarks import record
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.smc import sample
 
@@ -83,7 +83,7 @@ def main() -> None:
             }
             print(f"{metric:20s} {name:10s} {shift[0]:9.2f} {error[0]:5.2f} {shift[1]:12.2f} {error[1]:5.2f} "
                   f"{ratio[0]:12.2f} {ratio[1]:15.2f}", flush=True)  # fmt: skip
-    arguments.out.write_text(json.dumps(table, indent=1) + "\n")
+    record.save(arguments.out, table)
 
 
 if __name__ == "__main__":

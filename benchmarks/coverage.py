@@ -25,6 +25,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2, norm, qmc
 
+from benchmarks import record
+
 METRICS = ("ProbabilityResidual", "KullbackLeibler", "AreaMetric", "LogLikelihood")
 SIZES = (20, 50, 200)
 STORE = Path(__file__).parent / "results" / "coverage"
@@ -379,7 +381,7 @@ def main() -> None:
                 path.with_suffix(".part").replace(path)
     found = table(arguments.store)
     if arguments.out:
-        arguments.out.write_text(json.dumps(found, indent=1) + "\n")
+        record.save(arguments.out, found)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ Run: uv run python -m benchmarks.dimensions [--seeds 2] [--out benchmarks/result
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import time
 from pathlib import Path
@@ -20,6 +19,7 @@ import numpy as np
 import pymc as pm
 
 import prbayes as prb
+from benchmarks import record
 
 METRICS = {"PR": prb.ProbabilityResidual(), "KLD": prb.KullbackLeibler(), "area": prb.AreaMetric()}
 
@@ -76,7 +76,7 @@ def main() -> None:
             table[f"{d}/{metric}"] = rows
             cells = [f"{r['responses']} ({r['off']:.2f})" if "off" in r else "refused" for r in rows]
             print(f"{d:6d} {metric:>6s}  " + "   ".join(cells), flush=True)
-            arguments.out.write_text(json.dumps(table, indent=1) + "\n")
+            record.save(arguments.out, table)
 
 
 if __name__ == "__main__":

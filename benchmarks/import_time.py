@@ -1,14 +1,15 @@
 """Import time of prbayes on top of pymc, in fresh processes; prints a table and writes JSON.
 
-Run: uv run python benchmarks/import_time.py [--runs 7] [--out import_time.json]
+Run: uv run python -m benchmarks.import_time [--runs 7] [--out import_time.json]
 """
 
 import argparse
-import json
 import statistics
 import subprocess
 import sys
 from pathlib import Path
+
+from benchmarks import record
 
 CODE = """
 import time
@@ -16,6 +17,8 @@ a = time.perf_counter()
 import pymc
 b = time.perf_counter()
 import prbayes
+
+from benchmarks import record
 c = time.perf_counter()
 print(b - a, c - b)
 """
@@ -41,7 +44,7 @@ def main():
     }
     for name, value in table.items():
         print(f"{name:28s} {value:.3f}" if isinstance(value, float) else f"{name:28s} {value}")
-    arguments.out.write_text(json.dumps(table, indent=2) + "\n")
+    record.save(arguments.out, table)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ as they are and with the area metric as a guide where densities do not overlap.
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import prbayes as prb
+from benchmarks import record
 from benchmarks.systems import METRICS, SYSTEMS
 from prbayes.estimate.methods import Method
 from prbayes.estimate.search import Search
@@ -133,7 +133,7 @@ def main() -> None:
         figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
         arguments.images.mkdir(parents=True, exist_ok=True)
         figure.savefig(arguments.images / f"landscape_{name.replace(' ', '_')}.png", dpi=110)
-    arguments.out.write_text(json.dumps(out, indent=1) + "\n")
+    record.save(arguments.out, out)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ of N = 50, rounded to multiples of 0.1 to 2 standard deviations, or with half of
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ import pymc as pm
 from scipy import stats
 
 import prbayes as prb
+from benchmarks import record
 from benchmarks.systems import METRICS
 from prbayes.estimate.methods import Method
 from prbayes.estimate.search import Search
@@ -144,7 +144,7 @@ def main() -> None:
     logging.getLogger("prbayes").setLevel(logging.ERROR)
     base = evaluator()
     out = {"families": families(base, arguments.seeds), "ties": ties(base, arguments.seeds)}
-    arguments.out.write_text(json.dumps(out, indent=1) + "\n")
+    record.save(arguments.out, out)
 
 
 if __name__ == "__main__":

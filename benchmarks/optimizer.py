@@ -16,7 +16,6 @@ All ratios are of times in one run, on one core.
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import time
 from collections.abc import Callable
@@ -27,6 +26,7 @@ import numpy as np
 import pymc as pm
 
 import prbayes as prb
+from benchmarks import record
 from benchmarks.systems import METRICS, SYSTEMS, System
 from prbayes.model.evaluator import Evaluator
 
@@ -213,7 +213,7 @@ def main() -> None:
         "against_plain": against_plain(arguments.repeats),
         "sobol": sobol_accuracy(arguments.repeats),
     }
-    arguments.out.write_text(json.dumps(out, indent=1) + "\n")
+    record.save(arguments.out, out)
 
 
 if __name__ == "__main__":

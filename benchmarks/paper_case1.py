@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 import prbayes as prb
+from benchmarks import record
 from benchmarks.systems import METRICS, SYSTEMS
 from prbayes.estimate.methods import Method
 from prbayes.estimate.search import Search
@@ -67,7 +68,7 @@ def fits(evaluator: Any, scale: Any, initial: Any, observed: Any, metric: str) -
 
 def work(arguments: argparse.Namespace) -> dict[str, Any]:
     """Fit what is not fitted yet."""
-    done: dict[str, Any] = json.loads(arguments.out.read_text())["fits"] if arguments.out.exists() else {}
+    done: dict[str, Any] = record.load(arguments.out, {"fits": {}})["fits"]
     clock = saved = time.perf_counter()
     for points, propagation in POINTS.items():
         if points not in arguments.points:
@@ -97,7 +98,8 @@ def save(path: Path, done: dict[str, Any]) -> float:
         for key, value in done.items()
     )
     part = path.with_suffix(".part")
-    part.write_text('{"fits": {\n' + rows + "\n}}\n")
+    run = json.dumps(record.about(), indent=1)
+    part.write_text(f'{{"run": {run},\n"found": {{"fits": {{\n{rows}\n}}}}}}\n')
     part.replace(path)
     return time.perf_counter()
 
@@ -162,7 +164,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("paper_case1.json"))
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
-    tables(json.loads(arguments.out.read_text())["fits"] if arguments.tables else work(arguments))
+    tables(record.load(arguments.out, None)["fits"] if arguments.tables else work(arguments))
 
 
 if __name__ == "__main__":

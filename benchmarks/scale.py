@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import record
 from benchmarks.processes import child
 
 N = 50
@@ -138,7 +139,7 @@ def main() -> None:
         print(json.dumps(tasks(int(size)) if kind == "tasks" else one(kind, metric, int(size))))
         return
     only = arguments.only
-    kept = json.loads(arguments.out.read_text()) if only and arguments.out.exists() else []
+    kept = record.load(arguments.out, []) if only else []
     table: list[dict[str, Any]] = [row for row in kept if row["kind"] != only]
     print(f"{'':48} set-up s      s  growth  sampling s    MiB   responses")
     for kind in [k for k in KINDS if only in (None, k)]:
@@ -169,7 +170,7 @@ def main() -> None:
             f"{found['MiB more']:.0f} MiB more on the client",
             flush=True,
         )
-    arguments.out.write_text(json.dumps(table, indent=1) + "\n")
+    record.save(arguments.out, table)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ it is off by more than a per cent of the standard deviation. Last, `prb.minimize
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import warnings
 from pathlib import Path
@@ -22,6 +21,7 @@ import numpy as np
 import pymc as pm
 
 import prbayes as prb
+from benchmarks import record
 
 MAXIMA = (5000.0, 0.005)
 BASES = (1, 10, 100, 1000)
@@ -98,7 +98,7 @@ def main() -> None:
             f"{maximum:6g} "
             + " ".join(f"C = {c}: {n}, {m:.6f}, {s:.6f};" for c, (n, m, s) in zip(BASES, found, strict=True))
         )
-    arguments.out.write_text(json.dumps(out, indent=1) + "\n")
+    record.save(arguments.out, out)
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import record
 from benchmarks.processes import child
 
 N = 50
@@ -302,8 +303,7 @@ def main() -> None:
         system, *problem = arguments.child
         print(json.dumps(one(system, *problem) if problem else slow(system)))
         return
-    kept = arguments.only and arguments.out.exists()
-    table: dict[str, Any] = json.loads(arguments.out.read_text()) if kept else {}
+    table: dict[str, Any] = record.load(arguments.out, {}) if arguments.only else {}
     print(f"{'':24} accurate  mean off  sd ratio  responses     wall      cpu  after set-up: wall  cpu   draws/s cpu")
     for problem in PROBLEMS:
         reference = exact(problem)
@@ -329,7 +329,7 @@ def main() -> None:
     if arguments.only in (None, "10ms"):
         table["10 ms"] = {system: child("benchmarks.smc", system) for system in ("reweighted", "resimulated")}
         print("response of 10 ms, two workers:", table["10 ms"])
-    arguments.out.write_text(json.dumps(table, indent=1) + "\n")
+    record.save(arguments.out, table)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ end, the fit of the first natural frequency to its stated distribution for two f
 Run: uv run python -m benchmarks.surrogate
 """
 
-import json
 import logging
 import sys
 import time
@@ -18,6 +17,7 @@ import numpy as np
 import pymc as pm
 
 import prbayes as prb
+from benchmarks import record
 
 ROOT = Path(__file__).parent
 sys.path.insert(0, str(ROOT.parent / "examples" / "rotor"))
@@ -95,7 +95,7 @@ def main():
             mean_error, sd_error = fits[f"{name}, {label}"]
             print(f"stiffness {name:7s} {label:15s} error of the mean {mean_error:+.3f}%, of the sd {sd_error:+.2f}%")
     path = ROOT / "results" / "surrogate.json"
-    path.write_text(json.dumps({"rows": rows, "stated frequency, errors in %": fits}, indent=1) + "\n")
+    record.save(path, {"rows": rows, "stated frequency, errors in %": fits})
     print(f"{path.name}; {time.perf_counter() - clock:.0f} s")
 
 

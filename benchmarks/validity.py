@@ -16,7 +16,6 @@ the nominal size.
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import time
 from pathlib import Path
@@ -27,6 +26,7 @@ import pymc as pm
 from scipy.special import ndtr, ndtri, stdtr
 
 import prbayes as prb
+from benchmarks import record
 from prbayes.estimate.minimization import find_optimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.smc import sample
@@ -163,13 +163,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("validity.json"), help="other parts that it has are kept")
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
-    result: dict[str, Any] = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
+    result: dict[str, Any] = record.load(arguments.out, {})
     for part in arguments.parts:
         clock = time.perf_counter()
         {"size": run_sizes, "pipeline": run_pipeline, "power": run_power}[part](result, arguments)
         result[f"{part}_seconds"] = round(time.perf_counter() - clock)
         print(f"{result[f'{part}_seconds']} s\n", flush=True)
-        arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+        record.save(arguments.out, result)
 
 
 HEADER = f"{'n0':>4s} {'n':>4s} {'null':24s} " + " ".join(f"{level:>6.0%}" for level in LEVELS)

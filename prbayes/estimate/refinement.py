@@ -93,7 +93,7 @@ def pilot(evaluator: Evaluator, scales: Floats, scale: Floats, *, seed: int = 0)
             for name, support in evaluator.support(best).items()
             if np.median(support["weight_ess"]) < evaluator.designs[name].required_ess
         }
-        _add(evaluator, best, {name for name in thin if evaluator.designs[name].batches <= MAX_ROUNDS})
+        _add(evaluator, best, {name for name in thin if evaluator.designs[name].n_batches <= MAX_ROUNDS})
         noise = sum(Information(evaluator, k, best[0], n_sets=50).noise_floor / s for k, s in enumerate(scales))
         if not thin and value[order[-1]] - value[order[0]] < noise:
             break

@@ -18,7 +18,12 @@ from prbayes.posterior.trees import bootstrap_tree
 
 
 def bootstrap(
-    optimum: Optimum, draws: int = 1000, *, parametric: bool = False, random_seed: int = 0, progressbar: bool = True
+    optimum: Optimum,
+    draws: int = 1000,
+    *,
+    parametric: bool = False,
+    random_seed: int = 0,
+    progressbar: bool = True,
 ) -> xr.DataTree:
     """Minimise the discrepancy once for each of many data sets that resemble the observed one.
 
@@ -70,7 +75,9 @@ def bootstrap(
     """
     clock = time.perf_counter()
     if not isinstance(optimum, Optimum):
-        raise TypeError(f"bootstrap: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first")
+        raise TypeError(
+            f"bootstrap: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first"
+        )
     positive_integer(draws, "draws", minimum=2)
     evaluator = surveyed(optimum, "bootstrap").evaluator
     reason = refit_obstacle(evaluator)

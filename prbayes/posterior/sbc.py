@@ -6,6 +6,8 @@ import logging
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, as_completed
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from itertools import chain
 from threading import Lock
 from typing import Any
 
@@ -23,8 +25,11 @@ from prbayes.posterior.smc import sample
 from prbayes.posterior.trees import calibration_tree
 
 _log = logging.getLogger("prbayes")
-_CHUNK = 10  # data sets that a worker analyses before it reports
-_ARRIVING = Lock()  # threads share the classes that hold the nodes, of which the last model to arrive has its own
+# Data sets that a worker analyses before it reports: seconds of work, against milliseconds of sending the model.
+_CHUNK = 10
+_ARRIVING = (
+    Lock()
+)  # threads share the classes that hold the nodes, of which the last model to arrive has its own
 
 
 def simulation_based_calibration(
@@ -103,26 +108,57 @@ def simulation_based_calibration(
             "simulation_based_calibration: got a model with likelihood terms or potentials besides its simulators, "
             "whose data cannot be drawn; expected prb.Simulator nodes only"
         )
-    jobs = [(range(i, min(i + _CHUNK, n)), draws, adjust, random_seed) for i in range(0, n, _CHUNK)]
+    starts = range(0, n, _CHUNK)
+    jobs = [
+        _Job(range(start, min(start + _CHUNK, n)), draws, adjust, random_seed) for start in starts
+    ]
     with shown(progressbar), progress("data sets", n) as report:
         if executor is None:
-            rows = [row for job in jobs for row in _analyse(evaluator, *job, lambda: report(1, ""))]
+            parts = [_analyse(evaluator, job, lambda: report(1, "")) for job in jobs]
         else:
-            import cloudpickle
-
-            sent = cloudpickle.dumps(model)
-            with _classes_kept(model):
-                futures: list[Future[Any]] = [executor.submit(_remote, sent, *job) for job in jobs]
-                for done in as_completed(futures):
-                    report(len(done.result()), "")
-                rows = [row for future in futures for row in future.result()]
+            parts = _on_executor(executor, model, jobs, lambda size: report(size, ""))
+    rows = list(chain.from_iterable(parts))
+    good = [row for row in rows if isinstance(row, dict)]
     failed = [row for row in rows if isinstance(row, str)]
-    good = [row for row in rows if not isinstance(row, str)]
     if failed:
-        _log.warning("%d of %d data sets could not be analysed; the first: %s", len(failed), n, failed[0])
+        _log.warning(
+            "%d of %d data sets could not be analysed; the first: %s", len(failed), n, failed[0]
+        )
     if len(failed) > n / 2:
-        raise RuntimeError(f"simulation_based_calibration: {len(failed)} of {n} data sets failed; first: {failed[0]}")
-    return calibration_tree(evaluator, good, failed=len(failed), draws=draws, adjust=adjust, seed=random_seed)
+        raise RuntimeError(
+            f"simulation_based_calibration: {len(failed)} of {n} data sets failed; first: {failed[0]}"
+        )
+    return calibration_tree(
+        evaluator, good, failed=len(failed), draws=draws, adjust=adjust, seed=random_seed
+    )
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Some of the data sets, by their numbers, and how they are analysed."""
+
+    which: range
+    draws: int
+    adjust: Affine | bool
+    random_seed: int
+
+
+# Ranks, truths and standard deviations by variable; or what went wrong.
+_Row = dict[str, Floats] | str
+
+
+def _on_executor(
+    executor: Executor, model: pm.Model, jobs: list[_Job], report: Callable[[int], Any]
+) -> list[list[_Row]]:
+    """Return the rows of each job; reports as they are done, in whatever order."""
+    import cloudpickle
+
+    sent = cloudpickle.dumps(model)
+    with _classes_kept(model):
+        futures: list[Future[list[_Row]]] = [executor.submit(_remote, sent, job) for job in jobs]
+        for done in as_completed(futures):
+            report(len(done.result()))
+        return [future.result() for future in futures]
 
 
 @contextmanager
@@ -138,50 +174,48 @@ def _classes_kept(model: pm.Model) -> Iterator[None]:
                     setattr(class_, name, value)
 
 
-def _remote(sent: bytes, *job: Any) -> list[Any]:
+def _remote(sent: bytes, job: _Job) -> list[_Row]:
     import cloudpickle
 
     with _ARRIVING:
         evaluator = Evaluator(revive(cloudpickle.loads(sent)))
-    return _analyse(evaluator, *job)
+    return _analyse(evaluator, job)
 
 
 def _analyse(
-    evaluator: Evaluator,
-    which: range,
-    draws: int,
-    adjust: Affine | bool,
-    seed: int,
-    report: Callable[[], Any] = lambda: None,
-) -> list[Any]:
-    """Analyse some data sets; each gives ranks, truths and standard deviations by variable, or what went wrong."""
-    rows: list[Any] = []
-    for i in which:
-        rng = np.random.default_rng([seed, i])
+    evaluator: Evaluator, job: _Job, report: Callable[[], Any] = lambda: None
+) -> list[_Row]:
+    """Analyse some data sets, each on the designs as they were before."""
+    rows: list[_Row] = []
+    for i in job.which:
+        rng = np.random.default_rng([job.random_seed, i])
         with ExitStack() as stack:
             stack.enter_context(shown(False))
             for design in evaluator.designs.values():
                 stack.enter_context(design.undone())
             try:
-                rows.append(_one(evaluator, draws, adjust, rng))
+                rows.append(_one(evaluator, job, rng))
             except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
                 rows.append(f"{type(error).__name__}: {error}")
         report()
     return rows
 
 
-def _one(evaluator: Evaluator, draws: int, adjust: Affine | bool, rng: np.random.Generator) -> dict[str, Floats]:
+def _one(evaluator: Evaluator, job: _Job, rng: np.random.Generator) -> dict[str, Floats]:
+    """Draw hyperparameters, and data from their population, and rank them among the posterior's draws."""
     theta = evaluator.prior_thetas(1, int(rng.integers(2**31)))[0]
+    data = fresh_data(evaluator, theta, rng)
     tree = sample(
-        evaluator.observing(fresh_data(evaluator, theta, rng)),
-        draws=draws,
-        adjust=adjust,
+        evaluator.observing(data),
+        draws=job.draws,
+        adjust=job.adjust,
         random_seed=int(rng.integers(2**31)),
     )
-    out = {}
-    for name, value in evaluator.constrained(theta[None]).items():
+    row = {}
+    for name, (truth,) in evaluator.constrained(theta[None]).items():
         found = np.asarray(tree["posterior"][name])[0]
-        below = (found < value[0]).sum(axis=0)
-        rank = (below + rng.random(np.shape(below))) / (draws + 1)
-        out[name] = np.stack([rank, value[0], found.std(axis=0)])
-    return out
+        below = (found < truth).sum(axis=0)
+        # Somewhere between the two neighbours, so that ranks are uniform and not discrete.
+        rank = (below + rng.random(np.shape(below))) / (job.draws + 1)
+        row[name] = np.stack([rank, truth, found.std(axis=0)])
+    return row

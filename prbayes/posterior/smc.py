@@ -5,31 +5,35 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from prbayes._checks import Floats, positive_integer, positive_number
-from prbayes._progress import CONSOLE, shown
+from prbayes._progress import shown
 from prbayes.estimate.minimization import find_optimum
 from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.simulator import model_on_context
+from prbayes.model.simulator import Node, model_on_context
 from prbayes.model.support import shortcomings
 from prbayes.posterior.adjustment import Affine
+from prbayes.posterior.chains import Chains, Particles
 from prbayes.posterior.checkpoint import Checkpoint, stored_identity
 from prbayes.posterior.epsilon import calibrate_epsilon
-from prbayes.posterior.smc_kernel import BatchedKernel
 from prbayes.posterior.trees import posterior_tree
 
 _log = logging.getLogger("prbayes")
+
+# Draws at whose populations the design is looked at: their 5% quantiles are then those of a dozen.
+_LOOKED_AT = 256
 
 
 def sample_smc(
@@ -114,9 +118,11 @@ def sample_smc(
     positive_integer(chains, "chains")
     model = model_on_context(model, "prb.sample_smc")
     if not isinstance(adjust, Affine | bool):
-        raise TypeError(f"adjust: got {type(adjust).__name__} {adjust!r:.60}, expected prb.Affine(), True or False")
+        got = f"{type(adjust).__name__} {adjust!r:.60}"
+        raise TypeError(f"adjust: got {got}, expected prb.Affine(), True or False")
     if optimum is not None and not isinstance(optimum, Optimum):
-        raise TypeError(f"optimum: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first")
+        got = type(optimum).__name__
+        raise TypeError(f"optimum: got {got}, expected an Optimum; call prb.minimize() first")
     with shown(progressbar):
         return sample(
             Evaluator(model) if optimum is None else optimum.evaluator,
@@ -149,68 +155,182 @@ def sample(
 ) -> xr.DataTree:
     """Do what `sample_smc` does, for an evaluator."""
     clock = time.perf_counter()
-    computed = evaluator.n_responses - sum(d.n_points for d in evaluator.designs.values())
-    before = evaluator.epsilon
-    try:
-        _set_for_run(evaluator, epsilon)
-        unset = [n for n in evaluator.nodes if np.isnan(n.epsilon_value)]
-        if adjust is True and all(n in unset or n.epsilon_is_default for n in evaluator.nodes):
-            adjust = Affine()
-        if optimum is None and (unset or (isinstance(adjust, Affine) and refit_obstacle(evaluator) is None)):
+    in_designs = sum(design.n_points for design in evaluator.designs.values())
+    before = evaluator.n_responses - in_designs
+    with _epsilons_restored(evaluator):
+        # Epsilon, the adjustment, and the optimum that they need
+        _set_epsilons(evaluator, epsilon)
+        unset = [node for node in evaluator.nodes if np.isnan(node.epsilon_value)]
+        adjustment = _adjustment(adjust, evaluator, unset)
+        if optimum is None and _needs_optimum(evaluator, unset, adjustment):
             optimum = find_optimum(evaluator, refine=refine)
-        if optimum is not None and isinstance(adjust, Affine):
+        if optimum is not None and adjustment is not None:
             surveyed(optimum, "sample_smc")
-        if unset and optimum is not None:
+        if optimum is not None and unset:
             calibrated = calibrate_epsilon(optimum)
             for node in unset:
                 node.epsilon.set_value(np.asarray(calibrated[node.name]))
+
+        # The draws, on designs that support them
         saved = _checkpoint(checkpoint, evaluator, draws, chains, threshold, random_seed)
-        seeds = np.random.SeedSequence(random_seed if saved is None else int(saved.identity["entropy"]))
-        run = _Run(evaluator, draws, threshold, saved)
-        for round_ in range(MAX_ROUNDS + 1):
-            children = seeds.spawn(chains)
-            if saved is not None and round_ < saved.note.get("round", 0):
-                run.refined.append(saved.arrays[f"refined{round_}_thetas"])
-                refine_at(evaluator, run.refined[-1])
-                continue
-            plain, discrepancies, stats = run(children, progressbar)
-            thetas, note = plain, "none"
-            if isinstance(adjust, Affine):
-                optima = (
-                    [] if optimum is None else [optimum.theta, *(r["theta"] for r in optimum.rivals if r["comparable"])]
-                )
-                thetas, note = adjust(evaluator, plain, optima)
-            if not (refine and evaluator.designs):
-                break
-            both = np.concatenate([plain, thetas]).reshape(-1, evaluator.size)
-            some = np.random.default_rng(seeds).permutation(both)[:256]
-            if round_ == MAX_ROUNDS:
-                refuse(shortcomings(evaluator, some), evaluator)
-            elif not refine_at(evaluator, some):
-                break
-            run.refined.append(some)
-            _log.info("sampling again on the refined design")
-        if note.startswith("none: "):
-            _log.warning("the draws are not adjusted: %s; their width is epsilon's", note.removeprefix("none: "))
-        best = plain[np.unravel_index((discrepancies / evaluator.epsilon).sum(axis=-1).argmin(), plain.shape[:2])]
-        roots = [evaluator.roots(best[None], k) for k in range(len(evaluator.nodes))]
-        errors = [node.bound.discrepancy_error(r) for node, r in zip(evaluator.nodes, roots, strict=True)]
+        entropy = random_seed if saved is None else int(saved.identity["entropy"])
+        rounds = _Rounds(
+            run=Chains(evaluator, draws, threshold, saved),
+            chains=chains,
+            seeds=np.random.SeedSequence(entropy),
+            adjustment=adjustment,
+            optima=() if optimum is None else _optima(optimum),
+            refine=refine and bool(evaluator.designs),
+        )
+        found = rounds.until_supported(progressbar)
+        if found.unadjusted_because:
+            _log.warning(
+                "the draws are not adjusted: %s; their width is epsilon's", found.unadjusted_because
+            )
+
+        # The record
         return posterior_tree(
             evaluator,
-            thetas,
-            discrepancies,
-            stats,
-            unadjusted=None if thetas is plain else plain,
-            adjustment=note,
+            found.thetas,
+            found.particles.discrepancies,
+            found.particles.stats,
+            unadjusted=None if found.thetas is found.particles.thetas else found.particles.thetas,
+            adjustment=found.note,
             warnings=() if optimum is None else optimum.warnings,
-            errors=np.array(errors),
+            errors=_discrepancy_errors(evaluator, found.particles),
             seed=random_seed,
-            n_responses=evaluator.n_responses - computed,
+            n_responses=evaluator.n_responses - before,
             seconds=time.perf_counter() - clock,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Draws:
+    """The draws of one round: particles of the pseudo-posterior, and what an adjustment made of them."""
+
+    particles: Particles
+    thetas: Floats
+    note: str
+
+    @property
+    def unadjusted_because(self) -> str:
+        """Why an adjustment that was asked for left the draws as they are; empty if it did not."""
+        return self.note.removeprefix("none: ") if self.note.startswith("none: ") else ""
+
+
+@dataclass(frozen=True, eq=False)
+class _Rounds:
+    """Sampling, adjustment and refinement of the designs, again until the designs support the draws."""
+
+    run: Chains
+    chains: int
+    seeds: np.random.SeedSequence
+    adjustment: Affine | None
+    optima: tuple[Floats, ...]
+    refine: bool
+
+    def until_supported(self, progressbar: bool) -> _Draws:
+        """Return the draws of the first round that its designs support.
+
+        Raises
+        ------
+        DesignError
+            If there is none.
+        """
+        evaluator = self.run.evaluator
+        for round_ in range(MAX_ROUNDS + 1):
+            children = self.seeds.spawn(self.chains)
+            saved = self.run.saved_refinement(round_)
+            if saved is not None:
+                self.run.refined.append(saved)
+                refine_at(evaluator, saved)
+                continue
+            found = self._draws(children, progressbar)
+            if not self.refine:
+                return found
+            some = self._some_of(found)
+            if round_ == MAX_ROUNDS:
+                refuse(shortcomings(evaluator, some), evaluator)
+                return found
+            if not refine_at(evaluator, some):
+                return found
+            self.run.refined.append(some)
+            _log.info("sampling again on the refined design")
+        raise AssertionError("the last round returns or raises")
+
+    def _draws(self, children: list[np.random.SeedSequence], progressbar: bool) -> _Draws:
+        particles = self.run(children, progressbar)
+        if self.adjustment is None:
+            return _Draws(particles, particles.thetas, "none")
+        thetas, note = self.adjustment(self.run.evaluator, particles.thetas, self.optima)
+        return _Draws(particles, thetas, note)
+
+    def _some_of(self, found: _Draws) -> Floats:
+        """Return some draws, before and after the adjustment: the design has to support both."""
+        both = np.concatenate([found.particles.thetas, found.thetas])
+        rows = both.reshape(-1, self.run.evaluator.size)
+        return np.random.default_rng(self.seeds).permutation(rows)[:_LOOKED_AT]
+
+
+@contextmanager
+def _epsilons_restored(evaluator: Evaluator) -> Iterator[None]:
+    """Give the simulators their epsilons back afterwards."""
+    before = evaluator.epsilon
+    try:
+        yield
     finally:
         for node, value in zip(evaluator.nodes, before, strict=True):
             node.epsilon.set_value(np.asarray(value))
+
+
+def _set_epsilons(evaluator: Evaluator, epsilon: float | dict[str, float] | None) -> None:
+    """Set the epsilons that were given for this run."""
+    if epsilon is None:
+        return
+    names = [node.name for node in evaluator.nodes]
+    if not isinstance(epsilon, dict):
+        if len(names) > 1:
+            raise ValueError(
+                f"epsilon: got one number for {len(names)} simulators, expected a dict by name: {names}"
+            )
+        epsilon = {names[0]: epsilon}
+    unknown = sorted(set(epsilon) - set(names))
+    if unknown:
+        raise KeyError(f"epsilon: got {unknown}, expected names of simulators: {names}")
+    values = {name: positive_number(value, f"{name}: epsilon") for name, value in epsilon.items()}
+    for node in evaluator.nodes:
+        if node.name in values:
+            node.epsilon.set_value(np.asarray(values[node.name]))
+
+
+def _adjustment(adjust: Affine | bool, evaluator: Evaluator, unset: list[Node]) -> Affine | None:
+    """Return the adjustment that was asked for; an epsilon that was given is taken at its word."""
+    if isinstance(adjust, Affine):
+        return adjust
+    nobody_gave_one = all(node in unset or node.epsilon_is_default for node in evaluator.nodes)
+    return Affine() if adjust and nobody_gave_one else None
+
+
+def _needs_optimum(evaluator: Evaluator, unset: list[Node], adjustment: Affine | None) -> bool:
+    return bool(unset) or (adjustment is not None and refit_obstacle(evaluator) is None)
+
+
+def _optima(optimum: Optimum) -> tuple[Floats, ...]:
+    """Return the optimum, and others that the data could as well come from."""
+    rivals = [rival["theta"] for rival in optimum.rivals if rival["comparable"]]
+    return (optimum.theta, *rivals)
+
+
+def _discrepancy_errors(evaluator: Evaluator, particles: Particles) -> Floats:
+    """Return the Monte Carlo errors of the discrepancies at the best particle, shape (k,)."""
+    total = (particles.discrepancies / evaluator.epsilon).sum(axis=-1)
+    where = np.unravel_index(total.argmin(), total.shape)
+    best = particles.thetas[where][None]
+    errors = []
+    for k, node in enumerate(evaluator.nodes):
+        roots = evaluator.roots(best, k)
+        errors.append(node.bound.discrepancy_error(roots))
+    return np.array(errors)
 
 
 def _checkpoint(
@@ -227,7 +347,9 @@ def _checkpoint(
     entropy = np.random.SeedSequence(seed).entropy
     if seed is None and Path(path).exists():
         entropy = stored_identity(path).get("entropy", entropy)
-    observed = b"".join(n.target.observed.tobytes() + n.target.weights.tobytes() for n in evaluator.nodes)
+    observed = b"".join(
+        n.target.observed.tobytes() + n.target.weights.tobytes() for n in evaluator.nodes
+    )
     identity = {
         "draws": draws,
         "chains": chains,
@@ -235,105 +357,10 @@ def _checkpoint(
         "entropy": str(entropy),
         "hyperparameters": evaluator.names,
         "epsilon": [float(e) for e in evaluator.epsilon],
-        "metrics and propagations": [f"{n.metric!r} {n.propagation!r}".split(" at 0x")[0] for n in evaluator.nodes],
+        "metrics and propagations": [
+            f"{n.metric!r} {n.propagation!r}".split(" at 0x")[0] for n in evaluator.nodes
+        ],
         "observed": hashlib.sha256(observed).hexdigest(),
         "responses before": [n.bound.n_points for n in evaluator.nodes],
     }
     return Checkpoint(path, identity)
-
-
-def _set_for_run(evaluator: Evaluator, epsilon: float | dict[str, float] | None) -> None:
-    names = [n.name for n in evaluator.nodes]
-    if epsilon is None:
-        return
-    if not isinstance(epsilon, dict):
-        if len(names) > 1:
-            raise ValueError(f"epsilon: got one number for {len(names)} simulators, expected a dict by name: {names}")
-        epsilon = {names[0]: epsilon}
-    unknown = sorted(set(epsilon) - set(names))
-    if unknown:
-        raise KeyError(f"epsilon: got {unknown}, expected names of simulators: {names}")
-    values = {n: positive_number(v, f"{n}: epsilon") for n, v in epsilon.items()}
-    for node in evaluator.nodes:
-        if node.name in values:
-            node.epsilon.set_value(np.asarray(values[node.name]))
-
-
-class _Run:
-    """All chains of one round on one design; saves its state after every stage, and takes over one that was saved."""
-
-    def __init__(self, evaluator: Evaluator, draws: int, threshold: float, checkpoint: Checkpoint | None) -> None:
-        self.evaluator, self.draws, self.threshold, self.checkpoint = evaluator, draws, threshold, checkpoint
-        self.refined: list[Floats] = []  # thetas at which designs were refined in earlier rounds
-
-    def __call__(
-        self, seeds: list[np.random.SeedSequence], progressbar: bool
-    ) -> tuple[Floats, Floats, list[dict[str, list[float]]]]:
-        """Return thetas, (chains, draws, d), discrepancies, (chains, draws, k), and statistics by stage."""
-        columns = (
-            TextColumn("SMC chain {task.fields[chain]}"),
-            BarColumn(),
-            TextColumn("beta {task.completed:.4f}"),
-            TextColumn("acceptance {task.fields[rate]:.2f}"),
-            TimeElapsedColumn(),
-        )
-        done: list[tuple[Floats, Floats]] = []
-        stats: list[dict[str, list[float]]] = []
-        saved = self._saved()
-        with shown(progressbar) as visible, Progress(*columns, console=CONSOLE, disable=not visible) as progress:
-            for chain, seed in enumerate(seeds):
-                task = progress.add_task("", total=1.0, chain=chain, rate=0.0)
-                kernel = BatchedKernel(
-                    self.draws, model=self.evaluator.model, threshold=self.threshold, evaluator=self.evaluator
-                )
-                if chain < saved.get("chain", 0):
-                    arrays = self._arrays(f"chain{chain}_")
-                    done.append((arrays["thetas"], arrays["discrepancies"]))
-                    stats.append(saved["stats"][chain])
-                    continue
-                stages: dict[str, list[float]] = {name: [] for name in kernel.stats_dtypes_shapes}
-                if chain == saved.get("chain"):
-                    kernel.restore(self._arrays("now_"), saved["state"])
-                    stages = saved["stats"][chain]
-                    self._restore_generators(saved["generators"])
-                else:
-                    kernel.initialize(None, np.random.default_rng(seed))
-                while kernel.beta < 1:
-                    kernel.update_beta_and_weights()
-                    for name, value in kernel.step().items():
-                        stages[name].append(value)
-                    self._save(done, [*stats, stages], kernel)
-                    progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
-                done.append((kernel.tempered_posterior, kernel.discrepancies))
-                stats.append(stages)
-        return np.array([d[0] for d in done]), np.array([d[1] for d in done]), stats
-
-    def _saved(self) -> dict[str, Any]:
-        note = self.checkpoint.note if self.checkpoint is not None else {}
-        return note if note.get("round") == len(self.refined) else {}
-
-    def _arrays(self, prefix: str) -> dict[str, Floats]:
-        assert self.checkpoint is not None
-        return {k.removeprefix(prefix): v for k, v in self.checkpoint.arrays.items() if k.startswith(prefix)}
-
-    def _save(
-        self, done: list[tuple[Floats, Floats]], stats: list[dict[str, list[float]]], kernel: BatchedKernel
-    ) -> None:
-        if self.checkpoint is None:
-            return
-        arrays, state = kernel.state()
-        everything = {f"now_{k}": v for k, v in arrays.items()}
-        for i, (thetas, discrepancies) in enumerate(done):
-            everything |= {f"chain{i}_thetas": thetas, f"chain{i}_discrepancies": discrepancies}
-        everything |= {f"refined{i}_thetas": thetas for i, thetas in enumerate(self.refined)}
-        note = {"round": len(self.refined), "chain": len(done), "stats": stats, "state": state}
-        self.checkpoint.save(everything, note | {"generators": self._generators()})
-
-    def _generators(self) -> dict[str, Any]:
-        """Return how often the generators of simulators with `Fresh` have been used."""
-        return {n.name: n.bound.draws for n in self.evaluator.nodes if n.bound.random}
-
-    def _restore_generators(self, states: dict[str, Any]) -> None:
-        for node in self.evaluator.nodes:
-            if node.bound.random:
-                node.bound.draws = states[node.name]

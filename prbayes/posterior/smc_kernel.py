@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,8 +13,21 @@ from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluation, Evaluator
 from prbayes.model.simulator import model_on_context
 
+# Proposals at most in a stage: a bound on the cost where particles do not forget.
 _MAX_STEPS = 25
-_UNCORRELATED = 0.05  # with the particles before the last stage; on the way, six times as much will do
+# Mean absolute correlation with the particles before a stage at which they count as new draws; among 500 particles
+# that share nothing it is .036. On the way to the posterior six times as much will do: later stages forget the rest.
+_UNCORRELATED = 0.05
+_ON_THE_WAY = 6
+# Gain in correlation below which more proposals are in vain.
+_NO_PROGRESS = 0.01
+# Random walks: the scale that is best for normal targets, and the acceptance rate that it is steered to
+# (Roberts, Gelman and Gilks 1997, doi:10.1214/aoap/1034625254: .234 in many dimensions, .44 in one).
+_WALK = 2.38
+_WALK_RATE = 0.3
+# Relative and absolute jitter that makes the covariance of identical particles a proper one.
+_JITTER = 1e-12
+_TINY = 1e-300
 
 
 class BatchedKernel(SMC_KERNEL):
@@ -64,14 +78,15 @@ class BatchedKernel(SMC_KERNEL):
         self.threshold = threshold
         model = model_on_context(model, "BatchedKernel")
         self.evaluator = evaluator or Evaluator(model)
-        unset = [n.name for n, e in zip(self.evaluator.nodes, self.evaluator.epsilon, strict=True) if np.isnan(e)]
+        unset = [n.name for n in self.evaluator.nodes if np.isnan(n.epsilon_value)]
         if unset:
             raise ValueError(
                 f"{unset[0]}: epsilon is not set; call prb.set_epsilon(model, "
                 "prb.calibrate_epsilon(prb.minimize(model))) or use prb.sample_smc, which calibrates it"
             )
         self.variables = model.value_vars
-        self.var_info = {n: (s, int(np.prod(s, dtype=int))) for n, s in self.evaluator.shapes.items()}
+        shapes = self.evaluator.shapes.items()
+        self.var_info = {name: (shape, int(np.prod(shape, dtype=int))) for name, shape in shapes}
         self.rng = np.random.default_rng(random_seed)
         self._reset_state()
 
@@ -84,8 +99,10 @@ class BatchedKernel(SMC_KERNEL):
         return found.log_prior, found.log_likelihood(self.evaluator.epsilon), found.discrepancies
 
     def _initialize_kernel(self) -> None:
-        self.tempered_posterior = self.evaluator.prior_thetas(self.draws, int(self.rng.integers(2**31)))
-        self.prior_logp, self.likelihood_logp, self.discrepancies = self._evaluate(self.tempered_posterior)
+        seed = int(self.rng.integers(2**31))
+        self.tempered_posterior = self.evaluator.prior_thetas(self.draws, seed)
+        found = self._evaluate(self.tempered_posterior)
+        self.prior_logp, self.likelihood_logp, self.discrepancies = found
         if not np.isfinite(self.likelihood_logp).any():
             raise ValueError(
                 f"model: got no finite discrepancy among {self.draws} draws from the prior, expected some; the "
@@ -97,41 +114,60 @@ class BatchedKernel(SMC_KERNEL):
         index = systematic_resampling(self.weights, self.rng)
         self.resampling_indexes = index
         self.tempered_posterior = self.tempered_posterior[index]
-        self.prior_logp, self.likelihood_logp = self.prior_logp[index], self.likelihood_logp[index]
+        self.prior_logp = self.prior_logp[index]
+        self.likelihood_logp = self.likelihood_logp[index]
         self.discrepancies = self.discrepancies[index]
 
     def mutate(self) -> None:
         """Move all particles by Metropolis-Hastings steps that leave the tempered posterior as it is."""
         before = self.tempered_posterior.copy()
-        mean, d = before.mean(axis=0), before.shape[1]
-        covariance = np.atleast_2d(np.cov(before, rowvar=False))
-        root = np.linalg.cholesky(covariance + 1e-12 * np.diag(np.diag(covariance) + 1e-300))
-        scale, accepted, correlation = 2.38 / np.sqrt(d), [], 1.0
-        enough = _UNCORRELATED * (1 if self.beta == 1 else 6)
+        fitted = _Normal.of(before)
+        enough = _UNCORRELATED if self.beta == 1 else _UNCORRELATED * _ON_THE_WAY
+        scale = _WALK / np.sqrt(before.shape[1])
+        correlation = 1.0
+        accepted = []
         for step in range(1, _MAX_STEPS + 1):
+            # In turn: new places at once, and steps from where each particle is
             noise = self.rng.standard_normal(before.shape)
             if step % 2:
-                moved = mean + noise @ root.T
-                now = np.linalg.solve(root, (self.tempered_posterior - mean).T)
-                log_ratio = 0.5 * ((noise**2).sum(axis=1) - (now**2).sum(axis=0))
-            else:
-                moved, log_ratio = self.tempered_posterior + scale * noise @ root.T, np.zeros(len(before))
-            rate = self._accept(moved, log_ratio)
+                accepted.append(self._jump(fitted, noise))
+                continue
+            rate = self._walk(fitted, scale * noise)
             accepted.append(rate)
-            if not step % 2:
-                scale *= np.exp(rate - 0.3)
-                last, correlation = correlation, _correlation(before, self.tempered_posterior)
-                if correlation < enough or correlation > last - 0.01:
-                    break
-        self.accept_rate, self.n_steps = float(np.mean(accepted)), step
+            scale *= np.exp(rate - _WALK_RATE)
 
-    def _accept(self, moved: Floats, log_ratio: Floats) -> float:
-        prior, likelihood, discrepancies = self._evaluate(moved)
+            # Terminate when the particles have forgotten, or stop forgetting
+            last = correlation
+            correlation = _correlation(before, self.tempered_posterior)
+            if correlation < enough or correlation > last - _NO_PROGRESS:
+                break
+        self.accept_rate = float(np.mean(accepted))
+        self.n_steps = step
+
+    def _jump(self, fitted: _Normal, noise: Floats) -> float:
+        """Propose independent draws of the fitted normal; return the rate of acceptance."""
+        proposed = fitted.mean + noise @ fitted.root.T
+        here = np.linalg.solve(fitted.root, (self.tempered_posterior - fitted.mean).T)
+        # Log density of the normal, up to a constant, at the present place less that at the proposed one.
+        log_ratio = 0.5 * ((noise**2).sum(axis=1) - (here**2).sum(axis=0))
+        return self._accept(proposed, log_ratio)
+
+    def _walk(self, fitted: _Normal, noise: Floats) -> float:
+        """Propose a step from each particle; return the rate of acceptance."""
+        proposed = self.tempered_posterior + noise @ fitted.root.T
+        return self._accept(proposed, np.zeros(len(proposed)))
+
+    def _accept(self, proposed: Floats, log_ratio: Floats) -> float:
+        """Accept or reject by Metropolis and Hastings; ``log_ratio`` is that of the proposal's densities."""
+        prior, likelihood, discrepancies = self._evaluate(proposed)
         with np.errstate(invalid="ignore"):
-            gain = prior - self.prior_logp + self.beta * (likelihood - self.likelihood_logp) + log_ratio
-        ok = np.log(self.rng.random(len(moved))) < np.nan_to_num(gain, nan=-np.inf)
-        self.tempered_posterior[ok] = moved[ok]
-        self.prior_logp[ok], self.likelihood_logp[ok] = prior[ok], likelihood[ok]
+            tempered = self.beta * (likelihood - self.likelihood_logp)
+            gain = prior - self.prior_logp + tempered + log_ratio
+        log_uniform = np.log(self.rng.random(len(proposed)))
+        ok = log_uniform < np.nan_to_num(gain, nan=-np.inf)
+        self.tempered_posterior[ok] = proposed[ok]
+        self.prior_logp[ok] = prior[ok]
+        self.likelihood_logp[ok] = likelihood[ok]
         self.discrepancies[ok] = discrepancies[ok]
         return float(ok.mean())
 
@@ -162,9 +198,13 @@ class BatchedKernel(SMC_KERNEL):
 
     def restore(self, arrays: dict[str, Floats], note: dict[str, Any]) -> None:
         """Take over a state."""
-        self.tempered_posterior, self.discrepancies = arrays["thetas"].copy(), arrays["discrepancies"].copy()
-        self.prior_logp, self.likelihood_logp = arrays["prior"].copy(), arrays["likelihood"].copy()
-        self.beta, self.log_marginal_likelihood, self.iteration = note["beta"], note["evidence"], note["iteration"]
+        self.tempered_posterior = arrays["thetas"].copy()
+        self.prior_logp = arrays["prior"].copy()
+        self.likelihood_logp = arrays["likelihood"].copy()
+        self.discrepancies = arrays["discrepancies"].copy()
+        self.beta = note["beta"]
+        self.log_marginal_likelihood = note["evidence"]
+        self.iteration = note["iteration"]
         self.rng = np.random.default_rng()
         self.rng.bit_generator.state = note["generator"]
 
@@ -173,8 +213,25 @@ class BatchedKernel(SMC_KERNEL):
         return {"_n_draws": self.draws, "threshold": self.threshold, "_n_tune": self.n_steps}
 
 
+@dataclass(frozen=True, eq=False)
+class _Normal:
+    """A normal distribution fitted to particles: mean, shape (d,), and Cholesky factor, shape (d, d)."""
+
+    mean: Floats
+    root: Floats
+
+    @classmethod
+    def of(cls, particles: Floats) -> _Normal:
+        covariance = np.atleast_2d(np.cov(particles, rowvar=False))
+        jitter = _JITTER * np.diag(np.diag(covariance) + _TINY)
+        return cls(particles.mean(axis=0), np.linalg.cholesky(covariance + jitter))
+
+
 def _correlation(before: Floats, after: Floats) -> float:
     """Return the mean absolute correlation of the particles' coordinates with those before."""
-    a, b = before - before.mean(axis=0), after - after.mean(axis=0)
+    a = before - before.mean(axis=0)
+    b = after - after.mean(axis=0)
     size = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
-    return float(np.mean(np.abs((a * b).sum(axis=0)) / np.where(size > 0, size, 1.0)))
+    size = np.where(size > 0, size, 1.0)
+    each = np.abs((a * b).sum(axis=0)) / size
+    return float(np.mean(each))

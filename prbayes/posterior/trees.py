@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 
@@ -10,7 +12,8 @@ from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import labelled, observed_dataset, versions
 
-_ENVELOPE = 0.95  # probability that the ECDF of uniform ranks stays inside
+# Probability that the ECDF of uniform ranks stays inside: that of ArviZ's own pictures of ranks.
+_ENVELOPE = 0.95
 
 
 def posterior_tree(
@@ -50,23 +53,8 @@ def posterior_tree(
     seconds : float
     """
     chains, draws, d = thetas.shape
-    leading = {"chain": chains, "draw": draws}
-    flat = thetas.reshape(-1, d)
-    posterior = _draws(evaluator, thetas)
     if unadjusted is not None:
-        free = not evaluator.responses_per_theta
-        discrepancies = evaluator(flat).discrepancies.reshape(discrepancies.shape) if free else discrepancies * np.nan
-    n_stages = max(len(s["beta"]) for s in stats)
-    sample_stats = xr.Dataset(
-        {
-            name: (
-                ["chain", "stage"],
-                np.array([list(map(float, s[name])) + [np.nan] * (n_stages - len(s[name])) for s in stats]),
-            )
-            for name in stats[0]
-        },
-        coords={"chain": np.arange(chains), "stage": np.arange(n_stages)},
-    )
+        discrepancies = _discrepancies_again(evaluator, thetas.reshape(-1, d), discrepancies)
     attrs = {
         "sampler": "SMC-ABC",
         "n_responses": n_responses,
@@ -76,40 +64,35 @@ def posterior_tree(
         "warnings": "\n".join(warnings),
         **versions(),
     }
-    evidence = _evidence(stats)
-    posterior.attrs.update({"inference_library": "prbayes", **attrs, **evidence, **as_attribute(evaluator.model)})
-    names, designs = [n.name for n in evaluator.nodes], evaluator.designs
-    where = ["chain", "draw", "simulator"]
-    shape = (chains, draws, len(names))
-    support = evaluator.support(flat)
-    nothing = {"weight_ess": np.nan, "mean_weight": np.nan, "lost_mass": np.nan}
+    posterior = _draws(evaluator, thetas)
+    posterior.attrs.update(
+        {
+            "inference_library": "prbayes",
+            **attrs,
+            **_evidence(stats),
+            **as_attribute(evaluator.model),
+        }
+    )
+    errors = np.full(len(evaluator.nodes), np.nan) if errors is None else errors
     calibration = xr.Dataset(
         {
-            "discrepancy": (where, discrepancies),
-            **{
-                key: (
-                    where,
-                    np.stack([np.broadcast_to(support.get(n, nothing)[key], len(flat)) for n in names], -1).reshape(
-                        shape
-                    ),
-                )
-                for key in nothing
-            },
+            "discrepancy": (_EACH_DRAW, discrepancies),
+            **_support(evaluator, thetas),
             "theta": (["chain", "draw", "element"], thetas),
-            "epsilon": ("simulator", evaluator.epsilon),
-            "discrepancy_error": ("simulator", np.full(len(names), np.nan) if errors is None else errors),
-            "required_ess": ("simulator", [designs[n].required_ess if n in designs else np.nan for n in names]),
-            "max_lost": ("simulator", [designs[n].config.max_lost if n in designs else np.nan for n in names]),
-            "metric": ("simulator", [without_addresses(n.metric) for n in evaluator.nodes]),
-            "propagation": ("simulator", [without_addresses(n.propagation) for n in evaluator.nodes]),
-            "n_points": ("simulator", [n.bound.n_points for n in evaluator.nodes]),
+            "discrepancy_error": ("simulator", errors),
+            **_by_simulator(evaluator),
         },
-        coords={"simulator": names, "element": evaluator.names, **{k: np.arange(v) for k, v in leading.items()}},
+        coords={
+            "simulator": [node.name for node in evaluator.nodes],
+            "element": evaluator.names,
+            "chain": np.arange(chains),
+            "draw": np.arange(draws),
+        },
         attrs=attrs,
     )
     groups = {
         "posterior": posterior,
-        "sample_stats": sample_stats,
+        "sample_stats": _sample_stats(stats),
         "calibration": calibration,
         "observed_data": observed_dataset(evaluator),
     }
@@ -118,9 +101,64 @@ def posterior_tree(
     return xr.DataTree.from_dict(groups)
 
 
+_EACH_DRAW = ["chain", "draw", "simulator"]
+
+
+def _discrepancies_again(evaluator: Evaluator, thetas: Floats, before: Floats) -> Floats:
+    """Return the discrepancies of draws that were moved, where that costs no response, and else NaN."""
+    if evaluator.responses_per_theta:
+        return np.full(before.shape, np.nan)
+    return evaluator(thetas).discrepancies.reshape(before.shape)
+
+
+def _sample_stats(stats: list[dict[str, list[float]]]) -> xr.Dataset:
+    """Return statistics by chain and stage, NaN after the last one of a chain."""
+    n_stages = max(len(chain["beta"]) for chain in stats)
+    variables = {}
+    for name in stats[0]:
+        table = np.full((len(stats), n_stages), np.nan)
+        for row, chain in zip(table, stats, strict=True):
+            row[: len(chain[name])] = chain[name]
+        variables[name] = (["chain", "stage"], table)
+    coords = {"chain": np.arange(len(stats)), "stage": np.arange(n_stages)}
+    return xr.Dataset(variables, coords=coords)
+
+
+def _support(evaluator: Evaluator, thetas: Floats) -> dict[str, Any]:
+    """Return how well designs support each draw, by simulator; NaN where there is no design."""
+    chains, draws, d = thetas.shape
+    found = evaluator.support(thetas.reshape(-1, d))
+    variables = {}
+    for key in ("weight_ess", "mean_weight", "lost_mass"):
+        columns = np.full((chains * draws, len(evaluator.nodes)), np.nan)
+        for k, node in enumerate(evaluator.nodes):
+            if node.name in found:
+                columns[:, k] = found[node.name][key]
+        variables[key] = (_EACH_DRAW, columns.reshape(chains, draws, -1))
+    return variables
+
+
+def _by_simulator(evaluator: Evaluator) -> dict[str, Any]:
+    """Return the settings of each simulator."""
+    nodes = evaluator.nodes
+    designs = [node.design for node in nodes]
+    required = [np.nan if design is None else design.required_ess for design in designs]
+    max_lost = [np.nan if design is None else design.config.max_lost for design in designs]
+    return {
+        "epsilon": ("simulator", evaluator.epsilon),
+        "required_ess": ("simulator", required),
+        "max_lost": ("simulator", max_lost),
+        "metric": ("simulator", [without_addresses(node.metric) for node in nodes]),
+        "propagation": ("simulator", [without_addresses(node.propagation) for node in nodes]),
+        "n_points": ("simulator", [node.bound.n_points for node in nodes]),
+    }
+
+
 def _evidence(stats: list[dict[str, list[float]]]) -> dict[str, float]:
     """Return the logarithm of the mean marginal likelihood of the chains, and their standard deviation in logs."""
-    logs = np.array([s["log_marginal_likelihood"][-1] for s in stats if "log_marginal_likelihood" in s])
+    logs = np.array(
+        [s["log_marginal_likelihood"][-1] for s in stats if "log_marginal_likelihood" in s]
+    )
     if not logs.size:
         return {}
     spread = float(logs.std(ddof=1)) if logs.size > 1 else np.nan
@@ -155,11 +193,19 @@ def bootstrap_tree(
             **as_attribute(evaluator.model),
         }
     )
-    return xr.DataTree.from_dict({"posterior": posterior, "observed_data": observed_dataset(evaluator)})
+    return xr.DataTree.from_dict(
+        {"posterior": posterior, "observed_data": observed_dataset(evaluator)}
+    )
 
 
 def calibration_tree(
-    evaluator: Evaluator, rows: list[dict[str, Floats]], *, failed: int, draws: int, adjust: object, seed: int
+    evaluator: Evaluator,
+    rows: list[dict[str, Floats]],
+    *,
+    failed: int,
+    draws: int,
+    adjust: object,
+    seed: int,
 ) -> xr.DataTree:
     """Return the DataTree of a simulation-based calibration, from rank, truth and sd by variable and data set."""
     stacked = {name: np.stack([row[name] for row in rows])[None] for name in rows[0]}
@@ -192,7 +238,10 @@ def _envelopes(ranks: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
         for i in np.ndindex(values.shape[1:]):
             name = f"{key}[{','.join(map(str, i))}]" if i else str(key)
             x, ecdf, lower, upper = ecdf_pit(  # type: ignore[no-untyped-call]
-                values[(slice(None), *i)], _ENVELOPE, n_simulations=1000, rng=np.random.default_rng(0)
+                values[(slice(None), *i)],
+                _ENVELOPE,
+                n_simulations=1000,
+                rng=np.random.default_rng(0),
             )
             rows[name] = ecdf
             if ((ecdf < lower) | (ecdf > upper)).any():

@@ -29,7 +29,9 @@ from prbayes.response.failures import Abort, OnFailure
 from prbayes.response.inputs import Inputs
 from prbayes.response.response import Responses
 
-N_BLOCKS = 8  # parts of a population's points whose differences tell its error
+# Parts of a population's points whose differences tell its error: few enough that each is a design of its own, and
+# their spread is then known to about a quarter, 1 / sqrt(2 (8 - 1)).
+N_BLOCKS = 8
 
 
 class Bound(ABC):
@@ -70,7 +72,9 @@ class Bound(ABC):
         """Return whether the i-th points of another bound of the same configuration and inputs are the same."""
         return True
 
-    def __init__(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> None:
+    def __init__(
+        self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses
+    ) -> None:
         self.name = name
         self.inputs = inputs
         self.target = target
@@ -85,8 +89,10 @@ class Bound(ABC):
         """Return the discrepancy as a scalar graph of the roots' values."""
         # Built on plain symbols: PyMC may clone parameters that are random, and a copy would be drawn, not given.
         symbols = self.inputs.placeholders()
-        swap = {s: pt.as_tensor(p) for s, p in zip(symbols, params, strict=True)}
-        return graph_replace([self._discrepancy(symbols)], swap, strict=False)[0]
+        values = map(pt.as_tensor, params)
+        swap = dict(zip(symbols, values, strict=True))
+        (graph,) = graph_replace([self._discrepancy(symbols)], swap, strict=False)
+        return graph
 
     @abstractmethod
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
@@ -98,7 +104,8 @@ class Bound(ABC):
 
     def discrepancies(self, params: Sequence[Any], target: Discrepancy) -> Floats:
         """Return the discrepancies of the populations at given roots, shape (k,); +inf where they are invalid."""
-        result = np.full(len(params[0]) if params else 1, np.inf)
+        size = len(params[0]) if params else 1
+        result = np.full(size, np.inf)
         ok = self.valid(params)
         if ok.any():
             values, weights = self.populations([p[ok] for p in params])
@@ -118,20 +125,26 @@ class Bound(ABC):
         if self.n_points < 2 * N_BLOCKS:
             return np.nan
         values, weights = self.populations(params)
-        found = []
+        without_block = []
         for block in range(N_BLOCKS):
             left = self.blocks != block
-            found.append(self.target.of(values[:, left], weights[:, left] / weights[:, left].sum())[0])
-        return float(np.sqrt((N_BLOCKS - 1) * np.var(found)))
+            kept = weights[:, left]
+            found = self.target.of(values[:, left], kept / kept.sum())
+            without_block.append(found[0])
+        # The jackknife of grouped points.
+        return float(np.sqrt((N_BLOCKS - 1) * np.var(without_block)))
 
     @cached_property
     def _valid(self) -> Any:
         symbols = self.inputs.placeholders()
-        return compile_batched(symbols, [valid(self.inputs, self.inputs.rebuilt(symbols)[0])])
+        dists, _ = self.inputs.rebuilt(symbols)
+        return compile_batched(symbols, [valid(self.inputs, dists)])
 
     def valid(self, params: Sequence[Any]) -> Any:
         """Return which of a batch of roots give valid distributions (sigma > 0 and such), shape (k,)."""
-        return np.broadcast_to(self._valid(*params)[0], np.shape(params[0])[:1]).astype(bool)
+        (found,) = self._valid(*params)
+        batch = np.shape(params[0])[:1]
+        return np.broadcast_to(found, batch).astype(bool)
 
     def valid_only(self, params: Sequence[Floats]) -> list[Floats]:
         """Leave out the roots that give no valid distributions, or raise if none does."""
@@ -150,11 +163,12 @@ class Bound(ABC):
         if not self.valid(at).all():
             return np.full(size, np.nan)
         values, weights = self.populations(at)
-        good = ~np.isnan(values[0])
-        w = np.where(good, weights[0], 0.0)
-        if not w.sum() > 0:
+        known = ~np.isnan(values[0])
+        mass = np.where(known, weights[0], 0.0)
+        total = mass.sum()
+        if not total > 0:
             return np.full(size, np.nan)
-        return rng.choice(values[0], size=size, p=w / w.sum())
+        return rng.choice(values[0], size=size, p=mass / total)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,10 +181,13 @@ class Propagation(ABC):
 
     def check(self) -> None:
         """Refuse what is no executor, folder or policy."""
-        if self.executor is not None and not (hasattr(self.executor, "submit") and hasattr(self.executor, "map")):
-            raise TypeError(f"executor: got {type(self.executor).__name__}, expected a concurrent.futures.Executor")
-        if self.store is not None and not isinstance(self.store, str | PathLike):
-            raise TypeError(f"store: got {type(self.store).__name__}, expected the path of a folder")
+        executor, store = self.executor, self.store
+        executes = hasattr(executor, "submit") and hasattr(executor, "map")
+        if executor is not None and not executes:
+            got = type(executor).__name__
+            raise TypeError(f"executor: got {got}, expected a concurrent.futures.Executor")
+        if store is not None and not isinstance(store, str | PathLike):
+            raise TypeError(f"store: got {type(store).__name__}, expected the path of a folder")
         if not isinstance(self.on_failure, OnFailure):
             raise TypeError(
                 f"on_failure: got {type(self.on_failure).__name__} {self.on_failure!r:.60}, expected prb.Abort(), "
@@ -199,8 +216,9 @@ def probe(bound: Bound, sampler: PopulationSampler, seed: int) -> tuple[Any, ...
     ResponseError
         If the response raises, has the wrong shape, or is NaN everywhere.
     """
-    thetas = [t[:2] for t in bound.valid_only(prior_draws(bound.inputs.roots, 64, seed))]
-    aleatory, epistemic = sampler(thetas, 8, np.random.default_rng(seed))
+    draws = prior_draws(bound.inputs.roots, 64, seed)  # of which a few at least are valid
+    two = [draw[:2] for draw in bound.valid_only(draws)]
+    aleatory, epistemic = sampler(two, 8, np.random.default_rng(seed))
     values = bound.responses(aleatory, epistemic)
     refuse_all_nan(bound.name, values)
     return values, aleatory, epistemic

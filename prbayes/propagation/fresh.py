@@ -9,13 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 import pytensor.tensor as pt
 from pytensor.graph.basic import Apply
-from pytensor.graph.op import Op
-from pytensor.graph.replace import _vectorize_node
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
 from prbayes.propagation.base import Bound, Propagation, probe
+from prbayes.propagation.ops import OwnOp, float_output
+from prbayes.response.batches import batch_shape, broadcast_batch
 from prbayes.response.distributions import PopulationSampler
 from prbayes.response.inputs import Inputs
 from prbayes.response.response import Responses
@@ -50,8 +50,6 @@ class Fresh(Propagation):
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Prepare the generator of draws."""
-        from prbayes.propagation.fresh import FreshBound
-
         return FreshBound(name, inputs, target, responses, self)
 
 
@@ -66,7 +64,9 @@ class FreshBound(Bound):
 
     random: ClassVar[bool] = True
 
-    def __init__(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses, config: Fresh) -> None:
+    def __init__(
+        self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses, config: Fresh
+    ) -> None:
         super().__init__(name, inputs, target, responses)
         self.n_per_theta = config.n
         self._seed = config.random_seed
@@ -81,32 +81,40 @@ class FreshBound(Bound):
         """Return fresh responses with equal weights."""
         self.draws += 1
         rng = np.random.default_rng([self._seed, self.draws])
-        values = self.responses(*self._sampler(params, self.n_per_theta, rng))
+        aleatory, epistemic = self._sampler(params, self.n_per_theta, rng)
+        values = self.responses(aleatory, epistemic)
         return values, np.broadcast_to(1 / self.n_per_theta, values.shape)
 
 
-class FreshOp(Op):
+class FreshOp(OwnOp):
     """Draws a population and returns its discrepancy, () ... -> ()."""
 
     def __init__(self, bound: FreshBound) -> None:
         self.bound = bound
 
+    @property
+    def held(self) -> tuple[object, ...]:
+        """The generator of draws."""
+        return (self.bound,)
+
+    @property
+    def _event_ndims(self) -> list[int]:
+        return [r.type.ndim for r in self.bound.inputs.roots]
+
     def make_node(self, *params: Any) -> Apply[Any, Any]:
         """Apply to the roots' values."""
         tensors = [pt.as_tensor(p) for p in params]
-        ndims = [r.type.ndim for r in self.bound.inputs.roots]
-        batch = max(t.type.ndim - d for t, d in zip(tensors, ndims, strict=True))
-        return Apply(self, tensors, [pt.tensor(dtype="float64", shape=(None,) * batch)])
+        pairs = zip(tensors, self._event_ndims, strict=True)
+        ndim = max(t.type.ndim - event for t, event in pairs)
+        return Apply(self, tensors, [float_output(ndim)])
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Draw, call the response, compare."""
-        ndims = [r.type.ndim for r in self.bound.inputs.roots]
-        batch = np.broadcast_shapes(*(p.shape[: p.ndim - d] for p, d in zip(inputs, ndims, strict=True)))
-        params = [
-            np.broadcast_to(p, batch + p.shape[p.ndim - d :]).reshape(-1, *p.shape[p.ndim - d :])
-            for p, d in zip(inputs, ndims, strict=True)
-        ]
-        outputs[0][0] = self.bound.discrepancies(params, self.bound.target).reshape(batch)
+        batch = batch_shape(inputs, self._event_ndims)
+        full = broadcast_batch(inputs, self._event_ndims, batch)
+        params = [p.reshape(-1, *p.shape[len(batch) :]) for p in full]
+        found = self.bound.discrepancies(params, self.bound.target)
+        outputs[0][0] = found.reshape(batch)
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
         """Refuse by name; not as NotImplementedError, which PyMC takes as leave to use a slice sampler."""
@@ -115,6 +123,3 @@ class FreshOp(Op):
             "has no gradient: pm.sample, pm.find_MAP and gradient methods of prb.minimize would be wrong; use "
             "propagation=prb.Reweighted() or prb.Resimulated(), or prb.sample_smc"
         )
-
-
-_vectorize_node.register(FreshOp, lambda op, node, *batched: op.make_node(*batched))

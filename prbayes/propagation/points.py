@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.response.inputs import Inputs
+
+# Coordinates keep this distance from 0 and 1, where quantiles may be infinite; a point of 10^11 is ever closer.
+_SMALLEST = 1e-12
 
 
 def sobol(n: int, dimensions: int, seed: int) -> Floats:
@@ -29,8 +33,12 @@ def sobol(n: int, dimensions: int, seed: int) -> Floats:
     from scipy.stats import qmc  # takes longer to import than the whole package
 
     engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
-    points = engine.random_base2(int(np.ceil(np.log2(n))))[:n] if n > 1 else engine.random(1)
-    return np.asarray(np.clip(points, 1e-12, 1 - 1e-12, out=points))
+    if n == 1:
+        points = engine.random(1)
+    else:
+        power = int(np.ceil(np.log2(n)))
+        points = engine.random_base2(power)[:n]
+    return np.asarray(np.clip(points, _SMALLEST, 1 - _SMALLEST, out=points))
 
 
 def monte_carlo(n: int, dimensions: int, seed: int) -> Floats:
@@ -49,7 +57,8 @@ def monte_carlo(n: int, dimensions: int, seed: int) -> Floats:
     >>> monte_carlo(4, 1, 0).shape
     (4, 1)
     """
-    return np.clip(np.random.default_rng(seed).random((n, dimensions)), 1e-12, 1 - 1e-12)
+    points = np.random.default_rng(seed).random((n, dimensions))
+    return np.clip(points, _SMALLEST, 1 - _SMALLEST)
 
 
 def points_from(points: object) -> Callable[[int, int, int], Floats]:
@@ -84,5 +93,8 @@ def base_points(
     sizes = [int(np.prod(s, dtype=int)) for s in shapes]
     u = points(n, 1 + sum(sizes), seed)
     edges = np.cumsum([1, *sizes])
-    parts = [u[:, a:b].reshape(n, *s).copy() for a, b, s in zip(edges[:-1], edges[1:], shapes, strict=True)]
+    parts = []
+    for (start, end), shape in zip(pairwise(edges), shapes, strict=True):
+        part = u[:, start:end].reshape(n, *shape)
+        parts.append(part.copy())
     return u[:, 0].copy(), parts

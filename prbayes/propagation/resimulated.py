@@ -26,6 +26,9 @@ from prbayes.response.response import Responses
 
 _log = logging.getLogger("prbayes")
 
+# Base points whose transforms may stay in memory: 16 MiB for each input.
+_KEPT = 1 << 21
+
 
 @dataclass(frozen=True)
 class Resimulated(Propagation):
@@ -61,55 +64,75 @@ class Resimulated(Propagation):
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Lay out the base points and find out whether the response accepts PyTensor variables."""
-        from prbayes.propagation.resimulated import ResimulatedBound
-
         refuse_nested(name, inputs)
         return ResimulatedBound(name, inputs, target, responses, self)
-
-
-_KEPT = 1 << 21  # base points whose transforms may stay in memory
 
 
 class ResimulatedBound(Bound):
     """Common random numbers: the same base points for every theta."""
 
     def __init__(
-        self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses, config: Resimulated
+        self,
+        name: str,
+        inputs: Inputs,
+        target: Discrepancy,
+        responses: Responses,
+        config: Resimulated,
     ) -> None:
         super().__init__(name, inputs, target, responses)
         self.n_per_theta = config.n
-        enough = target.metric.tail_responses * target.n_effective
-        if config.n < enough:
-            _log.warning(
-                "%s: the log-likelihood of %d resimulated responses sees too little of the tails: its standard errors "
-                "and posterior come out too narrow, expected at least %.0f responses, %d for each observation; use "
-                "prb.Reweighted(n), prb.KullbackLeibler() or a larger n",
-                name, config.n, enough, target.metric.tail_responses,
-            )  # fmt: skip
-        _, points = base_points(inputs, config.n, config.random_seed, points_from(config.points))
+        self._warn_of_few_responses()
+        make_points = points_from(config.points)
+        _, points = base_points(inputs, config.n, config.random_seed, make_points)
         # What depends on constants alone, PyTensor computes once and keeps: fast, unless it is too large to keep.
-        self._points: list[Any] = points if config.n <= _KEPT else [shared(u) for u in points]
+        keep = config.n <= _KEPT
+        self._points: list[Any] = points if keep else [shared(u) for u in points]
         for dist, u in zip(inputs.aleatory, self._points, strict=True):
             quantiles(name, dist, u)  # refuses what has no inverse distribution function
-        self.symbolic = self._accepts_tensors(*probe(self, PopulationSampler(inputs), config.random_seed))
+        tried = probe(self, PopulationSampler(inputs), config.random_seed)
+        self.symbolic = self._accepts_tensors(*tried)
 
-    def _accepts_tensors(self, expected: Floats, aleatory: list[Floats], epistemic: list[Floats]) -> bool:
+    def _warn_of_few_responses(self) -> None:
+        per_observation = self.target.metric.tail_responses
+        enough = per_observation * self.target.n_effective
+        if self.n_per_theta < enough:
+            _log.warning(
+                "%s: the log-likelihood of %d resimulated responses sees too little of the tails: its "
+                "standard errors and posterior come out too narrow, expected at least %.0f responses, "
+                "%d for each observation; use prb.Reweighted(n), prb.KullbackLeibler() or a larger n",
+                self.name,
+                self.n_per_theta,
+                enough,
+                per_observation,
+            )
+
+    def _accepts_tensors(
+        self, expected: Floats, aleatory: list[Floats], epistemic: list[Floats]
+    ) -> bool:
         """Try the response on PyTensor variables, and believe it only if the numbers agree."""
         if not self.responses.plain:
             return False
-        symbols = [pt.tensor(dtype="float64", shape=(None,) * v.ndim) for v in (*aleatory, *epistemic)]
+        given = [*aleatory, *epistemic]
+        symbols = [pt.tensor(dtype="float64", shape=(None,) * v.ndim) for v in given]
+        k = len(aleatory)
+        arguments = self.inputs.fill(symbols[:k], symbols[k:])
         try:
-            graph = self.responses.function(*self.inputs.fill(symbols[: len(aleatory)], symbols[len(aleatory) :]))
+            graph = self.responses.function(*arguments)
             if not isinstance(graph, TensorVariable):
                 return False
-            values = function(symbols, graph, mode=PLAIN, on_unused_input="ignore")(*aleatory, *epistemic)
+            compiled = function(symbols, graph, mode=PLAIN, on_unused_input="ignore")
+            values = compiled(*given)
         except Exception:  # whatever it is: the response is then called with arrays
             return False
-        return values.shape == expected.shape and np.allclose(values, expected, rtol=1e-9, equal_nan=True)
+        # The two ways differ by rounding at most.
+        same_shape = values.shape == expected.shape
+        return same_shape and np.allclose(values, expected, rtol=1e-9, equal_nan=True)
 
     def _response(self, params: Sequence[Any]) -> tuple[TensorVariable, TensorVariable]:
+        """Return the responses at the base points as a graph, and whether the parameters are valid."""
         dists, epistemic = self.inputs.rebuilt(params)
-        aleatory = ninf_for_invalid([quantiles(self.name, d, u) for d, u in zip(dists, self._points, strict=True)])
+        pairs = zip(dists, self._points, strict=True)
+        aleatory = ninf_for_invalid([quantiles(self.name, d, u) for d, u in pairs])
         common = [e[None] for e in epistemic]
         if self.symbolic:
             values = self.responses.function(*self.inputs.fill(aleatory, common))
@@ -119,13 +142,16 @@ class ResimulatedBound(Bound):
 
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy of the responses at the base points, +inf where parameters are invalid."""
-        (values, ok), n = self._response(params), self.n_per_theta
-        return pt.switch(ok, symbolic_discrepancy(self.target, values, np.full(n, 1 / n)), np.inf)
+        values, parameters_valid = self._response(params)
+        weights = np.full(self.n_per_theta, 1 / self.n_per_theta)
+        found = symbolic_discrepancy(self.target, values, weights)
+        return pt.switch(parameters_valid, found, np.inf)
 
     @cached_property
     def _values(self) -> Any:
         symbols = self.inputs.placeholders()
-        return compile_batched(symbols, [self._response(symbols)[0]])
+        values, _ = self._response(symbols)
+        return compile_batched(symbols, [values])
 
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
         """Return the responses at the base points, with equal weights."""

@@ -29,6 +29,21 @@ from prbayes.response.response import Responses
 
 _log = logging.getLogger("prbayes")
 
+# Components of a batch's mixture density: as many as there are points would be as good, and cost their square.
+_COMPONENTS = 512
+# Draft points, whose response is not computed, for each point of a one-dimensional design; from 2^18 on they are a grid
+# that is fine enough for any design, so that more only cost time.
+_DRAFT = 16
+_LARGEST_DRAFT = 1 << 18
+# Components times points whose log-densities are held at a time: 32 MiB of floats.
+_CHUNK = 1 << 22
+# Responses under other conditions that are kept: more conditions than a study has, fewer than fill the memory.
+_OTHER_RESPONSES = 32
+# Batches differ in their seeds by a prime, so that seeds 0, 1, 2, ... of a user share no batch.
+_SEED_STEP = 7919
+# Inputs beyond which the weights become so uneven that another propagation is recommended (docs/choose.md).
+_MANY_INPUTS = 4
+
 
 @dataclass(frozen=True)
 class Reweighted(Propagation):
@@ -74,36 +89,65 @@ class Reweighted(Propagation):
         positive_integer(self.random_seed, "Reweighted: random_seed", minimum=0)
         if self.max_lost != 0 and positive_number(self.max_lost, "Reweighted: max_lost") >= 1:
             raise ValueError(f"Reweighted: max_lost: got {self.max_lost}, expected a share below 1")
-        if self.max_points is not None and positive_integer(self.max_points, "Reweighted: max_points") < self.n:
-            raise ValueError(f"Reweighted: max_points: got {self.max_points}, expected n = {self.n} or more")
+        if (
+            self.max_points is not None
+            and positive_integer(self.max_points, "Reweighted: max_points") < self.n
+        ):
+            raise ValueError(
+                f"Reweighted: max_points: got {self.max_points}, expected n = {self.n} or more"
+            )
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Compute the responses at the first design points."""
-        from prbayes.propagation.reweighted import Design
-
         if inputs.epistemic:
+            names = ", ".join(str(e.name or e) for e in inputs.epistemic)
             raise TypeError(
-                f"{name}: {', '.join(str(e.name or e) for e in inputs.epistemic)} goes into the response as a model "
-                "variable (epistemic), so stored responses cannot be reweighted; use propagation=prb.Resimulated()"
+                f"{name}: {names} goes into the response as a model variable (epistemic), so stored "
+                "responses cannot be reweighted; use propagation=prb.Resimulated()"
             )
         refuse_nested(name, inputs)
         if not target.metric.takes_weights:
             raise TypeError(
-                f"{name}: a metric that takes no weights cannot be used with prb.Reweighted; in a FunctionMetric write "
-                "function(simulated, observed, weights) with weighted=True, or use propagation=prb.Resimulated()"
+                f"{name}: a metric that takes no weights cannot be used with prb.Reweighted; in a "
+                "FunctionMetric write function(simulated, observed, weights) with weighted=True, or use "
+                "propagation=prb.Resimulated()"
             )
         return Design(name, inputs, target, responses, self)
 
 
-_MAX_THETAS = 512  # components of a batch's mixture density
-_DRAFT = 16  # draft points, whose response is not computed, for each point of a one-dimensional design
-_MOST_DRAFT = 1 << 18  # from which on they are a fine grid
+@dataclass(frozen=True)
+class Batches:
+    """The points of a design, batch after batch, and the mixture that they were drawn from.
 
-_CHUNK = 1 << 22  # thetas times points at a time: bounds memory
-_OTHERS = 32  # responses under other conditions that are kept
-_MANY = 4  # inputs beyond which reweighting is seldom worth its while
-_REFINED = "prb.minimize and prb.sample_smc refine it themselves, before pm.sample call prb.refine(model)"
-_TOO_MANY = "{} inputs are many for stored responses: rather use propagation=prb.Resimulated(n), which has no design"
+    Attributes
+    ----------
+    points : tuple of ndarray, shapes (n, *event)
+        One for each aleatory input.
+    values : ndarray, shape (n,)
+        Their responses; NaN where there is none.
+    components : tuple of ndarray, shapes (k, *shape)
+        The roots' values of the mixture's components, one array for each root.
+    counts : ndarray, shape (k,)
+        How many points came from each component.
+    sizes : tuple of int
+        Number of points of each batch.
+    """
+
+    points: tuple[Floats, ...]
+    values: Floats
+    components: tuple[Floats, ...]
+    counts: Floats
+    sizes: tuple[int, ...]
+
+    def followed_by(self, other: Batches) -> Batches:
+        """Return these batches with others after them."""
+        return Batches(
+            points=tuple(map(_end_to_end, self.points, other.points)),
+            values=_end_to_end(self.values, other.values),
+            components=tuple(map(_end_to_end, self.components, other.components)),
+            counts=_end_to_end(self.counts, other.counts),
+            sizes=(*self.sizes, *other.sizes),
+        )
 
 
 class Design(Bound):
@@ -115,35 +159,71 @@ class Design(Bound):
 
     stored: ClassVar[bool] = True
 
-    def __init__(self, name: str, inputs: Any, target: Discrepancy, responses: Responses, config: Reweighted) -> None:
+    def __init__(
+        self, name: str, inputs: Any, target: Discrepancy, responses: Responses, config: Reweighted
+    ) -> None:
         super().__init__(name, inputs, target, responses)
         self.config = config
-        self._sizes: list[int] = []
-        self._thetas: list[Floats] = []
-        self._counts = np.empty(0)
-        self._points: list[Floats] = []
-        self.values = np.empty(0)
+        self._stored: Batches | None = None
         self._shared: list[Any] = []
         self._basis: tuple[Any, int, Any] = (None, 0, None)
-        self._others: deque[tuple[Responses, Floats]] = deque(maxlen=_OTHERS)
-        thetas = prior_draws(inputs.roots, min(config.n, _MAX_THETAS), config.random_seed)
-        size = self.add(thetas)
+        self._others: deque[tuple[Responses, Floats]] = deque(maxlen=_OTHER_RESPONSES)
+        components = prior_draws(inputs.roots, min(config.n, _COMPONENTS), config.random_seed)
+        size = self.add(components)
         refuse_all_nan(name, self.values)
         if size < self.required_ess:
-            _log.warning(
-                "%s: the design of %d responses supports a typical population of the prior with a weight effective "
-                "sample size of %.0f, expected %.0f; %s",
-                name,
-                config.n,
-                size,
-                self.required_ess,
-                _REFINED if self._dimensions <= _MANY else _TOO_MANY.format(self._dimensions),
-            )
+            self._warn_of_thin_support(size)
+
+    def _warn_of_thin_support(self, size: float) -> None:
+        advice = (
+            "prb.minimize and prb.sample_smc refine it themselves, before pm.sample call prb.refine(model)"
+            if self._dimensions <= _MANY_INPUTS
+            else f"{self._dimensions} inputs are many for stored responses: rather use "
+            "propagation=prb.Resimulated(n), which has no design"
+        )
+        _log.warning(
+            "%s: the design of %d responses supports a typical population of the prior with a weight "
+            "effective sample size of %.0f, expected %.0f; %s",
+            self.name,
+            self.config.n,
+            size,
+            self.required_ess,
+            advice,
+        )
+
+    # -- What the design is --
+
+    @property
+    def batches(self) -> Batches:
+        """The points so far; there is always at least one batch."""
+        assert self._stored is not None
+        return self._stored
+
+    @property
+    def values(self) -> Floats:
+        """The stored responses, shape (n,)."""
+        return self.batches.values
+
+    @property
+    def n_batches(self) -> int:
+        """How often points were added."""
+        return 0 if self._stored is None else len(self._stored.sizes)
+
+    @property
+    def n_points(self) -> int:
+        """Number of stored responses."""
+        return self.values.size
+
+    @property
+    def max_points(self) -> int:
+        """The largest number of points that refinement may reach."""
+        return self.config.max_points or 32 * self.config.n
 
     @property
     def _dimensions(self) -> int:
         """Number of aleatory numbers that make one specimen."""
-        return sum(int(np.prod(shape, dtype=int)) for shape in self.inputs.event_shapes)
+        sizes = [int(np.prod(shape)) for shape in self.inputs.event_shapes]
+        return sum(sizes)
 
     @property
     def required_ess(self) -> float:
@@ -153,22 +233,16 @@ class Design(Bound):
         the size follows from asking that error to be a fraction of 1/sqrt(N).
         """
         root = np.sqrt(self.target.n_effective)
-        return float(max(50.0, 6 * root) if self._dimensions == 1 else max(100.0, (15 * root) ** (4 / 3)))
+        if self._dimensions == 1:
+            return float(max(50.0, 6 * root))
+        return float(max(100.0, (15 * root) ** (4 / 3)))
 
     @property
-    def batches(self) -> int:
-        """How often points were added."""
-        return len(self._sizes)
-
-    @property
-    def max_points(self) -> int:
-        """The largest number of points that refinement may reach."""
-        return self.config.max_points or 32 * self.config.n
-
-    @property
-    def n_points(self) -> int:
-        """Number of stored responses."""
-        return self.values.size
+    def is_line(self) -> bool:
+        """Whether there is one continuous aleatory input of one dimension."""
+        x = self.inputs.aleatory[0]
+        continuous = x.dtype.startswith("float")
+        return len(self.inputs.aleatory) == 1 and x.type.ndim == 0 and continuous
 
     @property
     def blocks(self) -> NDArray[np.intp]:
@@ -178,35 +252,50 @@ class Design(Bound):
         """
         if self.is_line:
             return np.arange(self.n_points) % N_BLOCKS
-        return np.concatenate([np.arange(n) * N_BLOCKS // n for n in self._sizes])
+        found = []
+        for size in self.batches.sizes:
+            place = np.arange(size) * N_BLOCKS
+            found.append(place // size)
+        return np.concatenate(found)
+
+    # -- Its specimens, and their responses --
 
     def points_of(self, inputs: Inputs) -> list[Floats]:
         """Return the points of some of the design's aleatory inputs, shapes (n, *event)."""
-        points = dict(zip(map(id, self.inputs.aleatory), self._points, strict=True))
-        return [points[id(x)] for x in inputs.aleatory]
+        known = dict(zip(map(id, self.inputs.aleatory), self.batches.points, strict=True))
+        return [known[id(x)] for x in inputs.aleatory]
 
     def values_of(self, responses: Responses) -> Floats:
         """Return another response of the design's specimens, shape (n,); none that is known is computed again."""
         if responses.same_as(self.responses):
             return self.values
-        known = next((v for r, v in self._others if responses.same_as(r)), np.empty(0))
+        known = np.empty(0)
+        for other, values in self._others:
+            if responses.same_as(other):
+                known = values
+                break
         if known.size < self.n_points:
-            known = np.concatenate([known, responses([p[known.size :] for p in self.points_of(responses.inputs)], [])])
+            missing = [p[known.size :] for p in self.points_of(responses.inputs)]
+            known = np.concatenate([known, responses(missing, [])])
             self._others.append((responses, known))
         return known
 
     def same_points(self, other: Bound) -> bool:
         """Return whether another design has the same points, so that their responses belong together."""
-        return isinstance(other, Design) and all(
-            np.array_equal(a, b) for a, b in zip(self._points, other._points, strict=True)
-        )
+        if not isinstance(other, Design):
+            return False
+        pairs = zip(self.batches.points, other.batches.points, strict=True)
+        return all(np.array_equal(a, b) for a, b in pairs)
 
-    def add(self, thetas: Sequence[Floats], n: int | None = None) -> float:
-        """Compute more responses, at points drawn from the populations of ``thetas``, shapes (k, *shape).
+    # -- Adding points --
+
+    def add(self, components: Sequence[Floats], n: int | None = None) -> float:
+        """Compute more responses, at points drawn from the populations of ``components``.
 
         Parameters
         ----------
-        thetas : sequence of ndarray
+        components : sequence of ndarray, shapes (k, *shape)
+            Values of the roots.
         n : int, optional
             How many; ``config.n`` by default.
 
@@ -215,27 +304,69 @@ class Design(Bound):
         float
             The median weight effective sample size over these populations.
         """
-        n, seed = n or self.config.n, self.config.random_seed + 7919 * self.batches
-        thetas = self.valid_only(thetas)
-        if self.is_line:
-            points, counts = self._equal_mass(thetas, n, seed)
-        else:
-            points, counts = self._place(thetas, n, seed)
+        n = n or self.config.n
+        seed = self.config.random_seed + _SEED_STEP * self.n_batches
+        components = self.valid_only(components)
+        place = self._equal_mass if self.is_line else self._place
+        points, counts = place(components, n, seed)
         values = self.responses(points, [])
-        if self.batches:
-            points = [np.concatenate(pair) for pair in zip(self._points, points, strict=True)]
-            values = np.concatenate([self.values, values])
-            thetas = [np.concatenate(pair) for pair in zip(self._thetas, thetas, strict=True)]
-        k = len(counts)
-        self._points, self.values, self._thetas = points, values, list(thetas)
-        self._counts = np.concatenate([self._counts, counts])
-        self._sizes.append(n)
-        log_g, sums = self._log_mixture(self._thetas, self._counts, points)
-        self._store([*points, log_g, *self.target.basis(values)])
-        return float(np.median(np.exp(2 * sums[0] - sums[1])[-k:]))
+        batch = Batches(tuple(points), values, tuple(components), counts, (n,))
+        self._stored = batch if self._stored is None else self._stored.followed_by(batch)
+
+        # The mixture is that of all batches, so its density changes at the old points too.
+        log_g, sums = self._log_mixture(
+            self.batches.components, self.batches.counts, self.batches.points
+        )
+        self._share([*self.batches.points, log_g, *self.target.basis(self.values)])
+        log_ess = 2 * sums[0] - sums[1]
+        of_these = np.exp(log_ess)[-len(counts) :]
+        return float(np.median(of_these))
+
+    def _place(
+        self, components: Sequence[Floats], n: int, seed: int
+    ) -> tuple[list[Floats], Floats]:
+        """Return n points, one from each population of a stratified list, and how often each component was used.
+
+        Scrambled Sobol points go through the inverse distribution functions where they exist.
+        """
+        k = len(components[0])
+        spare, uniforms = base_points(self.inputs, n, seed)
+        which = np.minimum((spare * k).astype(int), k - 1)
+        at = [c[which] for c in components]
+        try:
+            points = list(self._quantiles(*at, *uniforms))
+        except TypeError:  # a distribution without inverse distribution function
+            rng = np.random.default_rng(seed)
+            draws, _ = PopulationSampler(self.inputs)(at, 1, rng)
+            points = [x[:, 0] for x in draws]
+        counts = np.bincount(which, minlength=k).astype(float)
+        return points, counts
+
+    def _equal_mass(
+        self, components: Sequence[Floats], n: int, seed: int
+    ) -> tuple[list[Floats], Floats]:
+        """Return n points of one input that cut the mixture over all components into parts of equal mass."""
+        n_draft = min(_DRAFT * n, _LARGEST_DRAFT)
+        (draft,), counts = self._place(components, n_draft, seed)
+        grid = np.unique(draft[np.isfinite(draft)])
+        log_g, _ = self._log_mixture(components, counts, [grid], summed=False)
+        density = np.exp(log_g)
+        # The distribution function by trapezoids, inverted at levels that are half open at a random place.
+        both_ends = density[1:] + density[:-1]
+        trapezoids = 0.5 * both_ends * np.diff(grid)
+        mass = np.concatenate([[0.0], np.cumsum(trapezoids)])
+        shift = np.random.default_rng(seed).uniform()
+        levels = (np.arange(n) + shift) / n
+        points = np.interp(levels * mass[-1], mass, grid)
+        return [points], counts * (n / counts.sum())
 
     def _log_mixture(
-        self, thetas: Sequence[Floats], counts: Floats, points: Sequence[Floats], *, summed: bool = True
+        self,
+        components: Sequence[Floats],
+        counts: Floats,
+        points: Sequence[Floats],
+        *,
+        summed: bool = True,
     ) -> tuple[Floats, Floats]:
         """Return the log density of a mixture at points, (n,), and log sums of its components' weights, (2, k).
 
@@ -243,87 +374,72 @@ class Design(Bound):
         squares.
         """
         used = counts > 0
-        share = np.log(counts[used, None] / counts.sum())
-        log_g = np.empty(len(points[0]))
+        log_share = np.log(counts[used, None] / counts.sum())
+        n = len(points[0])
+        log_g = np.empty(n)
         sums = np.full((2, counts.size), -np.inf)
         step = max(1, _CHUNK // counts.size)
-        for i in range(0, log_g.size, step):
-            (logs,) = self._log_density(*thetas, *(p[i : i + step] for p in points))
-            log_g[i : i + step] = _log_sum(logs[used] + share, axis=0)
+        for start in range(0, n, step):
+            chunk = slice(start, start + step)
+            (logs,) = self._log_density(*components, *(p[chunk] for p in points))
+            log_g[chunk] = _log_sum(logs[used] + log_share, axis=0)
             if summed:
-                weights = logs - log_g[i : i + step]
-                sums = np.logaddexp(sums, [_log_sum(power * weights, axis=1) for power in (1, 2)])
+                log_weights = logs - log_g[chunk]
+                found = [_log_sum(power * log_weights, axis=1) for power in (1, 2)]
+                sums = np.logaddexp(sums, found)
         return log_g, sums
 
     @contextmanager
     def undone(self) -> Iterator[None]:
         """Forget, afterwards, the batches that are added inside."""
-        kept = (self._points, self.values, self._thetas, self._counts, list(self._sizes))
+        stored = self._stored
         shared = [s.get_value() for s in self._shared]
         try:
             yield
         finally:
-            self._points, self.values, self._thetas, self._counts, self._sizes = kept
+            self._stored = stored
             self._basis = (None, 0, None)
-            self._store(shared)
+            self._share(shared)
 
-    def _store(self, arrays: Sequence[Any]) -> None:
+    def _share(self, arrays: Sequence[Any]) -> None:
+        """Hand arrays to the compiled graphs, which read shared variables of any length."""
         if not self._shared:
             self._shared = [pytensor.shared(a, shape=(None,) * a.ndim) for a in arrays]
         for shared, array in zip(self._shared, arrays, strict=True):
             shared.set_value(array)
 
+    # -- Weights --
+
     @cached_property
     def _log_density(self) -> Any:
         symbols = self.inputs.placeholders()
-        points = [pt.tensor(dtype=x.dtype, shape=(None,) * (x.type.ndim + 1)) for x in self.inputs.aleatory]
-        graph = log_density(self.inputs, self.inputs.rebuilt(symbols)[0], points)
-        return compile_batched(symbols, [graph], points)
+        points = [
+            pt.tensor(dtype=x.dtype, shape=(None,) * (x.type.ndim + 1))
+            for x in self.inputs.aleatory
+        ]
+        dists, _ = self.inputs.rebuilt(symbols)
+        return compile_batched(symbols, [log_density(self.inputs, dists, points)], points)
 
     @cached_property
     def _quantiles(self) -> Any:
         symbols = self.inputs.placeholders()
         uniforms = [pt.tensor(dtype="float64", shape=x.type.shape) for x in self.inputs.aleatory]
-        dists = self.inputs.rebuilt(symbols)[0]
-        placed = [quantiles(self.name, d, u[None])[0] for d, u in zip(dists, uniforms, strict=True)]
+        dists, _ = self.inputs.rebuilt(symbols)
+        pairs = zip(dists, uniforms, strict=True)
+        placed = [quantiles(self.name, d, u[None])[0] for d, u in pairs]
         return compile_batched([*symbols, *uniforms], placed)
-
-    @property
-    def is_line(self) -> bool:
-        """Whether there is one continuous aleatory input of one dimension."""
-        x = self.inputs.aleatory[0]
-        return len(self.inputs.aleatory) == 1 and x.type.ndim == 0 and x.dtype.startswith("float")
-
-    def _place(self, thetas: Sequence[Floats], n: int, seed: int) -> tuple[list[Floats], Floats]:
-        """Return n points, one from each population of a stratified list, and how often each theta was used.
-
-        Scrambled Sobol points go through the inverse distribution functions where they exist.
-        """
-        k = len(thetas[0])
-        spare, uniforms = base_points(self.inputs, n, seed)
-        which = np.minimum((spare * k).astype(int), k - 1)
-        at = [t[which] for t in thetas]
-        try:
-            points = list(self._quantiles(*at, *uniforms))
-        except TypeError:  # a distribution without inverse distribution function
-            draws, _ = PopulationSampler(self.inputs)(at, 1, np.random.default_rng(seed))
-            points = [x[:, 0] for x in draws]
-        return points, np.bincount(which, minlength=k).astype(float)
-
-    def _equal_mass(self, thetas: Sequence[Floats], n: int, seed: int) -> tuple[list[Floats], Floats]:
-        """Return n points of one input that cut the mixture over all thetas into parts of equal mass."""
-        (draft,), counts = self._place(thetas, min(_DRAFT * n, _MOST_DRAFT), seed)
-        grid = np.unique(draft[np.isfinite(draft)])
-        density = np.exp(self._log_mixture(thetas, counts, [grid], summed=False)[0])
-        mass = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(grid))])
-        levels = (np.arange(n) + np.random.default_rng(seed).uniform()) / n
-        return [np.interp(levels * mass[-1], mass, grid)], counts * (n / counts.sum())
 
     def log_weights(self, params: Sequence[Any]) -> TensorVariable:
         """Return log p(x given theta) - log g(x) at the design points, shape (n,)."""
         k = len(self.inputs.aleatory)
-        logp = log_density(self.inputs, self.inputs.rebuilt(params)[0], self._shared[:k])
-        return logp - self._shared[k]
+        points, log_g = self._shared[:k], self._shared[k]
+        dists, _ = self.inputs.rebuilt(params)
+        return log_density(self.inputs, dists, points) - log_g
+
+    @cached_property
+    def _log_weights(self) -> Any:
+        symbols = self.inputs.placeholders()
+        return compile_batched(symbols, [self.log_weights(symbols)])
 
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy of the reweighted responses, +inf where no point has weight."""
@@ -334,16 +450,12 @@ class Design(Bound):
         raw = pt.exp(pt.switch(supported, logs - disconnected_grad(top), 0.0))
         weights = raw / raw.sum()
         basis = tuple(self._shared[len(self.inputs.aleatory) + 1 :])
-        if not self.target.symbolic:
-            d = OpaqueOp(self.target)(*basis, weights)
+        if self.target.symbolic:
+            features = self.target.from_basis(weights, basis, pt)
+            value = self.target.outer(*features, xp=pt)
         else:
-            d = self.target.outer(*self.target.from_basis(weights, basis, pt), xp=pt)
-        return pt.switch(supported, d, np.inf)
-
-    @cached_property
-    def _log_weights(self) -> Any:
-        symbols = self.inputs.placeholders()
-        return compile_batched(symbols, [self.log_weights(symbols)])
+            value = OpaqueOp(self.target)(*basis, weights)
+        return pt.switch(supported, value, np.inf)
 
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
         """Return the stored responses and their weights at given roots."""
@@ -359,10 +471,12 @@ class Design(Bound):
         """Return the discrepancies of the populations at given roots, shape (k,); +inf where none has support."""
         if self._basis[:2] != (target, self.n_points):
             self._basis = (target, self.n_points, target.basis(self.values))
+        basis = self._basis[2]
         _, weights = self.populations(params)
         supported = np.isfinite(weights).all(axis=-1)
         weights = np.where(supported[:, None], weights, 1 / self.n_points)
-        return np.where(supported, target.outer(*target.from_basis(weights, self._basis[2], np), xp=np), np.inf)
+        found = target.outer(*target.from_basis(weights, basis, np), xp=np)
+        return np.where(supported, found, np.inf)
 
     def support(self, params: Sequence[Any]) -> dict[str, Floats]:
         """Say how well the design supports the populations at given roots, shapes (k,).
@@ -376,9 +490,11 @@ class Design(Bound):
         """
         (logs,) = self._log_weights(*params)
         total = _log_sum(logs, axis=-1)
+        squares = _log_sum(2 * logs, axis=-1)
+        without_response = _log_sum(logs[..., np.isnan(self.values)], axis=-1)
         with np.errstate(invalid="ignore"):
-            ess = np.exp(2 * total - _log_sum(2 * logs, axis=-1))
-            lost = np.exp(_log_sum(logs[..., np.isnan(self.values)], axis=-1) - total)
+            ess = np.exp(2 * total - squares)
+            lost = np.exp(without_response - total)
         return {
             "weight_ess": np.nan_to_num(ess),
             "mean_weight": np.exp(total - np.log(self.values.size)),
@@ -391,9 +507,14 @@ def design_of(bound: Bound) -> Design | None:
     return bound if isinstance(bound, Design) else None
 
 
+def _end_to_end(first: Floats, second: Floats) -> Floats:
+    return np.concatenate([first, second])
+
+
 def _log_sum(logs: Floats, axis: int) -> Floats:
     """Return log(sum(exp(logs))), -inf where there is nothing: NumPy's logaddexp.reduce takes several times as long."""
     top = logs.max(axis=axis, keepdims=True, initial=-np.inf)
     top = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log(np.exp(logs - top).sum(axis=axis)) + top.squeeze(axis))
+        total = np.log(np.exp(logs - top).sum(axis=axis))
+    return np.asarray(total + top.squeeze(axis))

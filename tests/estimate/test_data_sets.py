@@ -446,9 +446,9 @@ def test_batches_added_inside_are_undone() -> None:
         with design.undone():
             design.add(evaluator.roots(at, 0))
             assert design.n_points == 512
-            assert design.batches == 2
+            assert design.n_batches == 2
             inside.append(evaluator(thetas).discrepancies)
-        assert (design.n_points, design.batches) == (256, 1)
+        assert (design.n_points, design.n_batches) == (256, 1)
     np.testing.assert_array_equal(evaluator(thetas).discrepancies, before)
     for key, value in evaluator.support(thetas)["y"].items():
         np.testing.assert_array_equal(value, support[key])

@@ -28,7 +28,12 @@ def same(x: Any) -> Any:
 
 
 def line(
-    n: int = 256, seed: int = 0, metric: prb.Metric = AREA, response: Any = same, prior_sd: float = 2.0, **keywords: Any
+    n: int = 256,
+    seed: int = 0,
+    metric: prb.Metric = AREA,
+    response: Any = same,
+    prior_sd: float = 2.0,
+    **keywords: Any,
 ) -> pm.Model:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, prior_sd), pm.HalfNormal("sigma", 1))
@@ -45,8 +50,8 @@ def design(model: pm.Model, name: str = "y") -> Design:
 
 def log_mixture(d: Design, x: Floats) -> Floats:
     """log g at x from the list of thetas of a normal input, by SciPy."""
-    mu, sigma = (t[:, None] for t in d._thetas)
-    shares = np.log(d._counts / d._counts.sum())[:, None]
+    mu, sigma = (t[:, None] for t in d.batches.components)
+    shares = np.log(d.batches.counts / d.batches.counts.sum())[:, None]
     return np.asarray(logsumexp(norm.logpdf(x, mu, sigma) + shares, axis=0))
 
 
@@ -67,9 +72,9 @@ def twice() -> pm.Model:
 
 def test_points_of_one_input_have_equal_mass() -> None:
     d = design(once())
-    (points,) = d._points
-    mu, sigma = (t[:, None] for t in d._thetas)
-    mass = d._counts @ norm.cdf(np.sort(points), mu, sigma) / d._counts.sum()
+    (points,) = d.batches.points
+    mu, sigma = (t[:, None] for t in d.batches.components)
+    mass = d.batches.counts @ norm.cdf(np.sort(points), mu, sigma) / d.batches.counts.sum()
     gaps = np.diff(mass) * len(points)
     np.testing.assert_allclose(np.median(gaps), 1.0, rtol=0.01)
     # Gaps of 4096 draft points in the outermost parts are bridged by straight lines.
@@ -80,16 +85,20 @@ def test_points_of_one_input_have_equal_mass() -> None:
 @pytest.mark.parametrize("model", [once, twice])
 def test_weights_are_the_populations_density_over_the_mixture(model: Any) -> None:
     d = design(model())
-    (points,) = d._points
-    assert len(points) == d.n_points == d._counts.sum()
+    (points,) = d.batches.points
+    assert len(points) == d.n_points == d.batches.counts.sum()
     mu, sigma = np.array([0.0, 1.0, -2.0]), np.array([1.0, 0.3, 0.7])
     logs = norm.logpdf(points, mu[:, None], sigma[:, None]) - log_mixture(d, points)
     values, weights = d.populations([mu, sigma])
     np.testing.assert_array_equal(values[0], points)
-    np.testing.assert_allclose(weights, np.exp(logs - logsumexp(logs, axis=1, keepdims=True)), rtol=1e-9)
+    np.testing.assert_allclose(
+        weights, np.exp(logs - logsumexp(logs, axis=1, keepdims=True)), rtol=1e-9
+    )
     support = d.support([mu, sigma])
     w = np.exp(logs)
-    np.testing.assert_allclose(support["weight_ess"], w.sum(axis=1) ** 2 / (w**2).sum(axis=1), rtol=1e-9)
+    np.testing.assert_allclose(
+        support["weight_ess"], w.sum(axis=1) ** 2 / (w**2).sum(axis=1), rtol=1e-9
+    )
     np.testing.assert_allclose(support["mean_weight"], w.mean(axis=1), rtol=1e-9)
     np.testing.assert_array_equal(support["lost_mass"], 0.0)
 
@@ -113,7 +122,10 @@ def test_a_second_batch_supports_what_it_was_added_for() -> None:
     assert design(twice()).n_points == 512
     assert after > before + 200  # nearly all of the 256 points
     elsewhere = [np.array([-2.0]), np.array([0.5])]
-    lost = design(twice()).support(elsewhere)["weight_ess"][0] / design(once()).support(elsewhere)["weight_ess"][0]
+    lost = (
+        design(twice()).support(elsewhere)["weight_ess"][0]
+        / design(once()).support(elsewhere)["weight_ess"][0]
+    )
     assert lost > 0.95  # the balance heuristic forgets nothing
 
 
@@ -132,14 +144,16 @@ def test_mass_out_of_reach_shows_in_the_mean_weight() -> None:
 
 def test_a_design_is_deterministic() -> None:
     one, two, other = design(line()), design(line()), design(line(seed=1))
-    np.testing.assert_array_equal(one._points[0], two._points[0])
-    np.testing.assert_array_equal(one._thetas[0], two._thetas[0])
-    assert not np.isin(other._points[0], one._points[0]).any()
+    np.testing.assert_array_equal(one.batches.points[0], two.batches.points[0])
+    np.testing.assert_array_equal(one.batches.components[0], two.batches.components[0])
+    assert not np.isin(other.batches.points[0], one.batches.points[0]).any()
     batches = [np.array([1.0, 2.0]), np.array([0.5, 0.5])]
     for d in (one, two):
         d.add(batches)
-    np.testing.assert_array_equal(one._points[0], two._points[0])
-    assert np.unique(one._points[0]).size == 512  # a batch repeats no point of an earlier one
+    np.testing.assert_array_equal(one.batches.points[0], two.batches.points[0])
+    assert (
+        np.unique(one.batches.points[0]).size == 512
+    )  # a batch repeats no point of an earlier one
 
 
 def test_two_seeds_agree_in_the_discrepancy() -> None:
@@ -152,7 +166,9 @@ def test_two_seeds_agree_in_the_discrepancy() -> None:
 
 
 def test_an_input_without_inverse_distribution_function() -> None:
-    data = np.random.default_rng(2).normal(1.0, 0.3, 40) + np.random.default_rng(3).exponential(0.5, 40)
+    data = np.random.default_rng(2).normal(1.0, 0.3, 40) + np.random.default_rng(3).exponential(
+        0.5, 40
+    )
     with pm.Model() as model:
         x = pm.ExGaussian.dist(pm.Normal("mu", 0, 2), 0.3, nu=0.5)
         with pytest.raises(NotImplementedError):
@@ -192,7 +208,9 @@ def test_lost_mass_is_the_probability_of_failure() -> None:
     model = line(512, response=lambda x: np.where(x < 0, np.nan, x), max_lost=0.2)
     d = design(model)
     mu, sigma = np.array([0.0, 1.0, 3.0]), np.array([1.0, 1.0, 0.5])
-    np.testing.assert_allclose(d.support([mu, sigma])["lost_mass"], norm.cdf(-mu / sigma), atol=0.01)
+    np.testing.assert_allclose(
+        d.support([mu, sigma])["lost_mass"], norm.cdf(-mu / sigma), atol=0.01
+    )
     evaluator = Evaluator(model)
     assert not shortcomings(evaluator, np.array([[1.0, 0.0]]))  # 16%
     short = shortcomings(evaluator, np.array([[0.5, 0.0]]))["y"]
@@ -225,7 +243,9 @@ class Sum:
 PAIRS = np.random.default_rng(0).multivariate_normal([1.0, 2.0], [[0.36, 0.18], [0.18, 0.36]], 20)
 
 
-def hard(metric: prb.Metric, n: int = 512, seed: int = 0, pairs: Floats = PAIRS) -> tuple[pm.Model, list[Sum]]:
+def hard(
+    metric: prb.Metric, n: int = 512, seed: int = 0, pairs: Floats = PAIRS
+) -> tuple[pm.Model, list[Sum]]:
     """Two correlated inputs under wide priors, two conditions: their sum and their difference.
 
     The four hyperparameters are a means and an sd for either condition, so that the optimum is that of
@@ -242,7 +262,9 @@ def hard(metric: prb.Metric, n: int = 512, seed: int = 0, pairs: Floats = PAIRS)
             observed = response(pairs)
             response.count = 0
             propagation = prb.Reweighted(n, random_seed=seed)
-            prb.Simulator(name, response, x, metric=metric, observed=observed, propagation=propagation)
+            prb.Simulator(
+                name, response, x, metric=metric, observed=observed, propagation=propagation
+            )
     return model, responses
 
 
@@ -285,7 +307,9 @@ def test_refinement_of_two_correlated_inputs(caplog: pytest.LogCaptureFixture) -
 @pytest.mark.slow
 @pytest.mark.parametrize("metric", [KL, PR, AREA])
 def test_two_designs_agree_in_the_optimum_of_the_hard_case(metric: prb.Metric) -> None:
-    pairs = np.random.default_rng(0).multivariate_normal([1.0, 2.0], [[0.36, 0.18], [0.18, 0.36]], 30)
+    pairs = np.random.default_rng(0).multivariate_normal(
+        [1.0, 2.0], [[0.36, 0.18], [0.18, 0.36]], 30
+    )
     optima = []
     for seed in (0, 1):
         model, responses = hard(metric, 1024, seed, pairs)
@@ -303,14 +327,21 @@ def test_two_designs_agree_in_the_optimum_of_the_hard_case(metric: prb.Metric) -
     one, two = optima
     assert max(one.design_error, two.design_error) <= 0.1
     # The largest of four differences of which each is to have a standard deviation of 0.1 at most.
-    shift = np.array([(one.point[n] - two.point[n]) / one.stderr[n] for n in ("location", "spread")])
+    shift = np.array(
+        [(one.point[n] - two.point[n]) / one.stderr[n] for n in ("location", "spread")]
+    )
     assert np.sqrt((shift**2).mean()) < 0.1
     assert (np.abs(shift) < 0.2).all()
     if metric is KL:  # moments are matched exactly
         data = np.stack([pairs.sum(axis=1), pairs[:, 0] - pairs[:, 1]])
         for optimum in optima:
-            assert (np.abs(optimum.point["location"] - data.mean(axis=1)) < 0.25 * optimum.stderr["location"]).all()
-            assert (np.abs(optimum.point["spread"] - data.std(axis=1)) < 0.25 * optimum.stderr["spread"]).all()
+            assert (
+                np.abs(optimum.point["location"] - data.mean(axis=1))
+                < 0.25 * optimum.stderr["location"]
+            ).all()
+            assert (
+                np.abs(optimum.point["spread"] - data.std(axis=1)) < 0.25 * optimum.stderr["spread"]
+            ).all()
 
 
 def test_the_error_of_a_design_is_measured() -> None:
@@ -323,7 +354,15 @@ def test_the_error_of_a_design_is_measured() -> None:
             propagation = prb.Reweighted(512, random_seed=seed, **keywords)
             observed = rng.normal(2, 0.5, 40) * np.exp(rng.normal(0, 0.2, 40))
             b = pm.Normal.dist(0, 0.2)
-            prb.Simulator("y", lambda a, b: a * np.exp(b), a, b, metric=PR, observed=observed, propagation=propagation)
+            prb.Simulator(
+                "y",
+                lambda a, b: a * np.exp(b),
+                a,
+                b,
+                metric=PR,
+                observed=observed,
+                propagation=propagation,
+            )
         return model
 
     small = [prb.minimize(product(seed, max_points=1024), starts=0) for seed in range(6)]
@@ -347,9 +386,11 @@ def test_a_wide_population_is_refused_where_a_narrow_design_may_not_grow() -> No
         x = pm.Normal.dist(0, pm.LogNormal("sigma", -1.1, 0.1))  # about a third
         propagation = prb.Reweighted(256, max_points=256)
         prb.Simulator("y", same, x, metric=AREA, observed=data, propagation=propagation)
-    assert np.abs(design(model)._points[0]).max() < 3
+    assert np.abs(design(model).batches.points[0]).max() < 3
     for find in (prb.minimize, prb.refine):
-        with pytest.raises(prb.DesignError, match=r"y: the design does not support.* of at most 256\), or use"):
+        with pytest.raises(
+            prb.DesignError, match=r"y: the design does not support.* of at most 256\), or use"
+        ):
             find(model)
 
 
@@ -360,9 +401,10 @@ def test_many_inputs_are_told_what_to_use(caplog: pytest.LogCaptureFixture) -> N
             x = pm.MvNormal.dist(pm.Normal("mu", 0, 3, shape=k), 0.1 * np.eye(k))
             observed = [0.0, 1.0, 2.0]
             prb.Simulator("y", lambda x: x.sum(axis=-1), x, metric=AREA, observed=observed)
-        assert ("5 inputs are many for stored responses: rather use propagation=prb.Resimulated" in caplog.text) == (
-            k == 5
-        )
+        assert (
+            "5 inputs are many for stored responses: rather use propagation=prb.Resimulated"
+            in caplog.text
+        ) == (k == 5)
 
 
 def test_minimize_refines_where_the_answer_is_far_out_in_the_prior() -> None:
@@ -384,7 +426,9 @@ def test_minimize_refines_where_the_answer_is_far_out_in_the_prior() -> None:
 
 @pytest.mark.parametrize("metric", [KL, PR])
 @pytest.mark.parametrize("prior_sd", [0.1, 1.0])
-def test_data_that_no_population_of_the_prior_reaches_are_never_silent(metric: prb.Metric, prior_sd: float) -> None:
+def test_data_that_no_population_of_the_prior_reaches_are_never_silent(
+    metric: prb.Metric, prior_sd: float
+) -> None:
     data = np.random.default_rng(1).normal(10.0, 0.5, 30)
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, prior_sd), 0.5)
@@ -411,7 +455,9 @@ def test_sample_smc_refines() -> None:
     data = np.random.default_rng(1).normal(6.0, 0.5, 30)
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 3), 0.2)
-        prb.Simulator("y", same, x, metric=AREA, observed=data, epsilon=0.05, propagation=prb.Reweighted(64))
+        prb.Simulator(
+            "y", same, x, metric=AREA, observed=data, epsilon=0.05, propagation=prb.Reweighted(64)
+        )
     keywords: dict[str, Any] = {"model": model, "chains": 2, "random_seed": 1, "progressbar": False}
     bare = prb.sample_smc(100, refine=False, **keywords)
     assert bare.posterior.attrs["n_responses"] == 64
@@ -434,7 +480,9 @@ def test_a_design_that_can_never_do_is_refused() -> None:
     # Populations of many widths at once, each with a few points of its own: eight batches of 16 are too few.
     model = line(16)
     thetas = np.stack([np.linspace(-40, 40, 256), np.full(256, np.log(0.01))], axis=1)
-    with pytest.raises(prb.DesignError, match=r"y: the design does not support the answer.*now 144 points in all"):
+    with pytest.raises(
+        prb.DesignError, match=r"y: the design does not support the answer.*now 144 points in all"
+    ):
         prb.refine(model, thetas)
 
 
@@ -442,7 +490,10 @@ def test_a_design_that_can_never_do_is_refused() -> None:
 
 
 def posterior(**values: Floats) -> xr.DataTree:
-    data = {k: (["chain", "draw", *(f"{k}_{i}" for i in range(np.ndim(v) - 2))], v) for k, v in values.items()}
+    data = {
+        k: (["chain", "draw", *(f"{k}_{i}" for i in range(np.ndim(v) - 2))], v)
+        for k, v in values.items()
+    }
     return xr.DataTree.from_dict({"posterior": xr.Dataset(data)})
 
 
@@ -454,7 +505,9 @@ def test_diagnose_is_silent_when_nothing_is_wrong() -> None:
     assert str(found) == "No problem was found."
     assert found.support["weight_ess"].dims == ("simulator", "sample")
     assert found.support["weight_ess"].sizes == {"simulator": 1, "sample": 100}
-    expected = design(once()).support([result["posterior"][n].values.ravel() for n in ("mu", "sigma")])
+    expected = design(once()).support(
+        [result["posterior"][n].values.ravel() for n in ("mu", "sigma")]
+    )
     for key in ("weight_ess", "mean_weight", "lost_mass"):
         np.testing.assert_allclose(found.support[key].sel(simulator="y"), expected[key], rtol=1e-9)
     with once():
@@ -464,12 +517,18 @@ def test_diagnose_is_silent_when_nothing_is_wrong() -> None:
 def test_diagnose_says_what_to_do() -> None:
     model, _ = hard(PR, 256)
     shape = (2, 20)
-    result = posterior(mean=np.broadcast_to([8.0, -8.0], (*shape, 2)), sd=np.full(shape, 0.1), rho=np.full(shape, 0.9))
+    result = posterior(
+        mean=np.broadcast_to([8.0, -8.0], (*shape, 2)),
+        sd=np.full(shape, 0.1),
+        rho=np.full(shape, 0.9),
+    )
     found = prb.diagnose(result, model=model)
     assert not found.ok
     assert len(found.messages) == 2
     for name, message in zip(("sum", "difference"), found.messages, strict=True):
-        assert message.startswith(f"{name}: the design does not support the answer: weight effective sample size")
+        assert message.startswith(
+            f"{name}: the design does not support the answer: weight effective sample size"
+        )
         assert "Call prb.refine(model) and sample again, or use prb.Resimulated." in message
     assert float(found.support["weight_ess"].max()) < 5
 
@@ -488,13 +547,17 @@ def test_diagnose_needs_the_models_variables() -> None:
         prb.diagnose(posterior(mu=np.zeros((1, 5))))
 
 
-def test_a_log_likelihood_of_few_resimulated_responses_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_log_likelihood_of_few_resimulated_responses_is_warned_of(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     observed = np.random.default_rng(1).normal(10, 1, 50)
 
     def error(metric: prb.Metric, propagation: prb.Reweighted | prb.Resimulated) -> float:
         with pm.Model() as model:
             x = pm.Normal.dist(pm.Normal("mu", 10, 3), pm.HalfNormal("sigma", 3))
-            prb.Simulator("y", lambda x: x, x, metric=metric, observed=observed, propagation=propagation)
+            prb.Simulator(
+                "y", lambda x: x, x, metric=metric, observed=observed, propagation=propagation
+            )
         return float(prb.minimize(model).stderr["sigma"])
 
     likelihood = prb.LogLikelihood()

@@ -1,0 +1,48 @@
+"""Results on disk, with what is needed to read them later: command, commit, versions, date and machine."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+PACKAGES = ("prbayes", "pymc", "pytensor", "arviz", "numba", "numpy", "scipy", "xarray")
+
+
+def _git(*arguments: str) -> str:
+    found = subprocess.run(["git", *arguments], capture_output=True, text=True, check=False)
+    return found.stdout.strip()
+
+
+def about() -> dict[str, Any]:
+    """Return how, on what and when this process runs."""
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    module = f"-m {spec.name}" if spec is not None else sys.argv[0]
+    changed = " with changes" if _git("status", "--porcelain", "--untracked-files=no") else ""
+    versions = {"python": platform.python_version()}
+    for name in PACKAGES:
+        versions[name] = importlib.metadata.version(name)
+    return {
+        "command": " ".join(["python", module, *sys.argv[1:]]),
+        "commit": _git("rev-parse", "--short", "HEAD") + changed,
+        "versions": versions,
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+    }
+
+
+def save(path: Path, found: Any) -> None:
+    """Write what was found, and how."""
+    whole = {"run": about(), "found": found}
+    path.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
+
+
+def load(path: Path, missing: Any) -> Any:
+    """Return what was found, or ``missing`` where there is no such file."""
+    return json.loads(path.read_text(encoding="utf-8"))["found"] if path.exists() else missing

@@ -1,0 +1,151 @@
+"""The chains of one round of sampling, saved after every stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from prbayes._checks import Floats
+from prbayes._progress import CONSOLE, shown
+from prbayes.model.evaluator import Evaluator
+from prbayes.posterior.checkpoint import Checkpoint
+from prbayes.posterior.smc_kernel import BatchedKernel
+
+Stages = dict[str, list[float]]
+
+
+@dataclass(frozen=True, eq=False)
+class Particles:
+    """Draws of the pseudo-posterior.
+
+    Attributes
+    ----------
+    thetas : ndarray, shape (chains, draws, d)
+    discrepancies : ndarray, shape (chains, draws, k)
+    stats : list of dict
+        By chain: statistics by name, one value per stage.
+    """
+
+    thetas: Floats
+    discrepancies: Floats
+    stats: list[Stages]
+
+
+class Chains:
+    """All chains on one design; saves its state after every stage, and takes over one that was saved.
+
+    Attributes
+    ----------
+    refined : list of ndarray, shapes (n, d)
+        Thetas at which designs were refined in earlier rounds.
+    """
+
+    def __init__(
+        self, evaluator: Evaluator, draws: int, threshold: float, checkpoint: Checkpoint | None
+    ) -> None:
+        self.evaluator = evaluator
+        self.draws = draws
+        self.threshold = threshold
+        self.checkpoint = checkpoint
+        self.refined: list[Floats] = []
+
+    def __call__(self, seeds: list[np.random.SeedSequence], progressbar: bool) -> Particles:
+        """Run one chain for each seed."""
+        columns = (
+            TextColumn("SMC chain {task.fields[chain]}"),
+            BarColumn(),
+            TextColumn("beta {task.completed:.4f}"),
+            TextColumn("acceptance {task.fields[rate]:.2f}"),
+            TimeElapsedColumn(),
+        )
+        done: list[tuple[Floats, Floats]] = []
+        stats: list[Stages] = []
+        with (
+            shown(progressbar) as visible,
+            Progress(*columns, console=CONSOLE, disable=not visible) as progress,
+        ):
+            for chain, seed in enumerate(seeds):
+                task = progress.add_task("", total=1.0, chain=chain, rate=0.0)
+                finished = self._finished(chain)
+                if finished is not None:
+                    done.append(finished)
+                    stats.append(self._saved["stats"][chain])
+                    continue
+                kernel, stages = self._begun(chain, seed)
+                while kernel.beta < 1:
+                    kernel.update_beta_and_weights()
+                    for name, value in kernel.step().items():
+                        stages[name].append(value)
+                    self._save(done, [*stats, stages], kernel)
+                    progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
+                done.append((kernel.tempered_posterior, kernel.discrepancies))
+                stats.append(stages)
+        thetas, discrepancies = zip(*done, strict=True)
+        return Particles(np.array(thetas), np.array(discrepancies), stats)
+
+    # -- What was saved --
+
+    @property
+    def _saved(self) -> dict[str, Any]:
+        """What a run that was killed noted in this round, or nothing."""
+        note = {} if self.checkpoint is None else self.checkpoint.note
+        return note if note.get("round") == len(self.refined) else {}
+
+    def saved_refinement(self, round_: int) -> Floats | None:
+        """Return the thetas at which a round that is over refined the designs, None where it is not over."""
+        if self.checkpoint is None or round_ >= self.checkpoint.note.get("round", 0):
+            return None
+        return self.checkpoint.arrays[f"refined{round_}_thetas"]
+
+    def _arrays(self, prefix: str) -> dict[str, Floats]:
+        assert self.checkpoint is not None
+        arrays = self.checkpoint.arrays.items()
+        return {key.removeprefix(prefix): a for key, a in arrays if key.startswith(prefix)}
+
+    def _finished(self, chain: int) -> tuple[Floats, Floats] | None:
+        """Return thetas and discrepancies of a chain that was at its end."""
+        if chain >= self._saved.get("chain", 0):
+            return None
+        arrays = self._arrays(f"chain{chain}_")
+        return arrays["thetas"], arrays["discrepancies"]
+
+    def _begun(self, chain: int, seed: np.random.SeedSequence) -> tuple[BatchedKernel, Stages]:
+        """Return a kernel at the stage that its chain had reached, and the statistics until then."""
+        evaluator = self.evaluator
+        kernel = BatchedKernel(
+            self.draws, model=evaluator.model, threshold=self.threshold, evaluator=evaluator
+        )
+        if chain != self._saved.get("chain"):
+            kernel.initialize(None, np.random.default_rng(seed))
+            return kernel, {name: [] for name in kernel.stats_dtypes_shapes}
+        saved = self._saved
+        kernel.restore(self._arrays("now_"), saved["state"])
+        for node in evaluator.nodes:
+            if node.bound.random:
+                node.bound.draws = saved["generators"][node.name]
+        return kernel, saved["stats"][chain]
+
+    def _save(
+        self, done: list[tuple[Floats, Floats]], stats: list[Stages], kernel: BatchedKernel
+    ) -> None:
+        if self.checkpoint is None:
+            return
+        now, state = kernel.state()
+        arrays = {f"now_{key}": value for key, value in now.items()}
+        for i, (thetas, discrepancies) in enumerate(done):
+            arrays[f"chain{i}_thetas"] = thetas
+            arrays[f"chain{i}_discrepancies"] = discrepancies
+        for i, thetas in enumerate(self.refined):
+            arrays[f"refined{i}_thetas"] = thetas
+        bounds = [node.bound for node in self.evaluator.nodes]
+        note = {
+            "round": len(self.refined),
+            "chain": len(done),
+            "stats": stats,
+            "state": state,
+            "generators": {bound.name: bound.draws for bound in bounds if bound.random},
+        }
+        self.checkpoint.save(arrays, note)

@@ -1,0 +1,136 @@
+"""Operations of graphs, against NumPy and against differences."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytensor
+import pytensor.tensor as pt
+import pytest
+from pytensor.graph.replace import vectorize_graph
+
+import prbayes as prb
+from prbayes.metrics.base import Discrepancy
+from prbayes.propagation.ops import (
+    CotangentOp,
+    DensityOp,
+    OpaqueOp,
+    ResponseOp,
+    symbolic_discrepancy,
+)
+from prbayes.response.inputs import read_inputs
+from prbayes.response.response import Responses
+
+OBSERVED = np.array([0.1, 0.4, 0.5, 0.9, 1.3])
+SAMPLE = np.linspace(-0.5, 1.8, 12)
+WEIGHTS = np.arange(1.0, 13) / 78
+
+
+def target(metric: Any) -> Discrepancy:
+    return metric.against(OBSERVED)
+
+
+def mean_gap(simulated: Any, observed: Any, weights: Any) -> Any:
+    return np.abs((simulated * weights).sum(axis=-1) - observed.mean())
+
+
+METRICS = {
+    "PR": prb.ProbabilityResidual(),
+    "KLD": prb.KullbackLeibler(),
+    "area": prb.AreaMetric(),
+    "bins": prb.ProbabilityResidual(prb.Histogram()),
+    "function": prb.FunctionMetric(mean_gap, weighted=True),
+}
+
+
+@pytest.mark.parametrize("name", METRICS)
+def test_the_graph_of_a_metric_agrees_with_its_direct_call(name: str) -> None:
+    sample, weights = pt.dvector(), pt.dvector()
+    graph = symbolic_discrepancy(target(METRICS[name]), sample, weights)
+    compiled = pytensor.function([sample, weights], graph)
+    direct = target(METRICS[name])(SAMPLE, WEIGHTS)
+    assert compiled(SAMPLE, WEIGHTS) == pytest.approx(direct, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["PR", "KLD", "area"])
+def test_gradients_in_values_and_weights_are_those_of_differences(name: str) -> None:
+    sample, weights = pt.dvector(), pt.dvector()
+    graph = symbolic_discrepancy(target(METRICS[name]), sample, weights)
+    gradient = pytensor.function([sample, weights], pt.grad(graph, [sample, weights]))
+    in_sample, in_weights = gradient(SAMPLE, WEIGHTS)
+    direct, step = target(METRICS[name]).of, 1e-6
+    for i in range(SAMPLE.size):
+        nudge = step * np.eye(SAMPLE.size)[i]
+        by_sample = direct(SAMPLE + nudge, WEIGHTS) - direct(SAMPLE - nudge, WEIGHTS)
+        by_weight = direct(SAMPLE, WEIGHTS + nudge) - direct(SAMPLE, WEIGHTS - nudge)
+        assert in_sample[i] == pytest.approx(by_sample / (2 * step), abs=1e-6)
+        assert in_weights[i] == pytest.approx(by_weight / (2 * step), abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["bins", "function"])
+def test_what_has_no_gradient_says_so(name: str) -> None:
+    sample = pt.dvector()
+    graph = symbolic_discrepancy(target(METRICS[name]), sample, WEIGHTS)
+    with pytest.raises(NotImplementedError, match="has no gradient"):
+        pt.grad(graph, sample)
+
+
+def test_second_derivatives_are_refused() -> None:
+    sample = pt.dvector()
+    first = pt.grad(
+        symbolic_discrepancy(target(prb.ProbabilityResidual()), sample, WEIGHTS), sample
+    )
+    with pytest.raises(NotImplementedError, match="second derivatives"):
+        pt.grad(first.sum(), sample)
+
+
+def test_operations_are_equal_if_they_hold_the_very_same_objects() -> None:
+    one, other = (target(prb.ProbabilityResidual()).density_cells for _ in range(2))
+    assert one is not None
+    assert other is not None
+    assert DensityOp(one) == DensityOp(one)
+    assert hash(DensityOp(one)) == hash(DensityOp(one))
+    assert DensityOp(one) != DensityOp(other)
+    assert CotangentOp(one, 0) != CotangentOp(one, 1)
+    assert CotangentOp(one, 0) != DensityOp(one)
+    opaque = target(METRICS["function"])
+    assert OpaqueOp(opaque) == OpaqueOp(opaque)
+
+
+def response_op(calls: list[tuple[int, ...]]) -> ResponseOp:
+    def response(x: Any, m: Any) -> Any:
+        calls.append(x.shape)
+        return x + m
+
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, 1)
+        x = pm.Normal.dist(mu, 1.0)
+        m = pm.Normal("m", 0, 1)
+        inputs = read_inputs("y", [x, m], model)
+    return ResponseOp(Responses("y", response, inputs))
+
+
+def test_a_batch_is_one_call_of_the_response() -> None:
+    calls: list[tuple[int, ...]] = []
+    op = response_op(calls)
+    x, m = pt.dvector(), pt.dvector()
+    xs, ms = pt.dmatrix(), pt.dmatrix()
+    graph = vectorize_graph(op(x, m), {x: xs, m: ms})
+    found = pytensor.function([xs, ms], graph)(np.ones((3, 4)), np.arange(3.0)[:, None])
+    np.testing.assert_array_equal(found, 1 + np.arange(3.0)[:, None] + np.zeros((3, 4)))
+    assert calls == [(3, 4)]
+
+
+def test_the_response_is_not_called_for_populations_without_a_finite_specimen() -> None:
+    calls: list[tuple[int, ...]] = []
+    op = response_op(calls)
+    xs, ms = pt.dmatrix(), pt.dmatrix()
+    compiled = pytensor.function([xs, ms], op(xs, ms))
+    x = np.array([[1.0, 2.0], [-np.inf, np.nan], [3.0, np.inf]])
+    found = compiled(x, np.zeros((3, 1)))
+    np.testing.assert_array_equal(found, [[1.0, 2.0], [np.nan, np.nan], [3.0, np.inf]])
+    assert calls == [(2, 2)]
+    assert np.isnan(compiled(np.full((1, 2), -np.inf), np.zeros((1, 1)))).all()
+    assert len(calls) == 1
