@@ -207,7 +207,10 @@ def analyse(
     ev.nodes[0].epsilon.set_value(epsilon[0])
     sampling = SamplingDistribution.of(ev, optimum.theta, epsilon)
     r = sampling.stderr.size
-    spread = 2.0 * (sampling.axes * sampling.stderr**2) @ sampling.axes.T + sampling.local.unidentified @ sampling.local.unidentified.T
+    spread = (
+        2.0 * (sampling.axes * sampling.stderr**2) @ sampling.axes.T
+        + sampling.local.unidentified @ sampling.local.unidentified.T
+    )
     thetas, log_q = proposal(optimum.theta, spread * np.outer(sampling.local.prior_sd, sampling.local.prior_sd))
     found = ev(thetas)
     draws, ess = weighted(found.log_prior + found.log_likelihood(epsilon) - log_q, thetas)

@@ -452,7 +452,7 @@ def test_refusals_of_the_joint_null() -> None:
         x = pm.Normal.dist(pm.Normal("mu", 10, 3), 1.0)
         prb.Simulator("y", same, x, metric=prb.FunctionMetric(lambda s, o: np.abs(s.mean(-1) - o.mean())),
                       observed=DATA, propagation=prb.Resimulated(64))  # fmt: skip
-    with pytest.raises(ValueError, match="a FunctionMetric, of which nothing is known"):
+    with pytest.raises(ValueError, match="a FunctionMetric, of which nothing is known without refits"):
         prb.JointNull(prb.minimize(model, method="Nelder-Mead"))
 
 
