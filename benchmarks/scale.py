@@ -106,24 +106,24 @@ def tasks(size: int) -> dict[str, float]:
     import cloudpickle
     import distributed
 
-    from prbayes.response.calling import Caller, _compute, _packed, scalar
-    from prbayes.response.failures import Abort
+    from prbayes.response import calling
 
-    points = np.random.default_rng(1).normal(size=(size, 5))
-    function = scalar(lambda *x: sum(x))
+    numbers = np.random.default_rng(1).normal(size=(size, 5))
+    function = calling.scalar(lambda *x: sum(x))
     cluster = distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
     )
     with cluster, distributed.Client(cluster) as client:
         executor = _Untold(client.get_executor(pure=False))
-        caller = Caller("y", function, executor, Abort(), None)  # type: ignore[arg-type]
-        columns, varying = list(points.T), [True] * 5
-        caller(columns, varying, points[:10])  # the workers are up
-        caller._chunk = lambda left: 1  # type: ignore[method-assign]
+        how = calling.Calling("y", function, executor)  # type: ignore[arg-type]
+        points = calling.Points(list(numbers.T), [True] * 5)
+        calling.respond(how, points.at(np.arange(10)), calling.Tally())  # the workers are up
+        calling.chunk_size = lambda *_: 1  # type: ignore[assignment]
         before, clock = peak(), time.perf_counter()
-        caller(columns, varying, points)
+        calling.respond(how, points, calling.Tally())
         spent = time.perf_counter() - clock
-    task = cloudpickle.dumps((_compute, _packed(function), [c[:1] for c in columns], varying, False))
+    one, packed = points.at(np.arange(1)), calling.packed(function)
+    task = cloudpickle.dumps((calling.compute_packed, packed, one, False))
     return {"seconds a task": spent / size, "bytes a task": len(task), "MiB more": peak() - before, "tasks": size}
 
 

@@ -43,7 +43,7 @@ def calibrate(response, propagation, *, only_contact=False):
 
 def surrogate_and_optimum(n, model, seed):
     """Return runs, the surrogate's relative error, and the optimum through it."""
-    surrogate = prb.Surrogate.fit(crest_factor, RANGES, n, model=model, seed=seed)
+    surrogate = prb.Surrogate.fit(crest_factor, RANGES, n, model=model, random_seed=seed)
     return surrogate.n_runs, surrogate.error.relative, calibrate(surrogate, prb.Resimulated(1024, random_seed=seed))
 
 

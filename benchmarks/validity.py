@@ -30,7 +30,7 @@ from benchmarks import record
 from prbayes.estimate.minimization import find_optimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.smc import sample
-from prbayes.validation.nulls import area
+from prbayes.validation.statistic import area
 
 LEVELS = (0.01, 0.05, 0.10)
 FITTED = (15, 30, 100)
@@ -60,7 +60,7 @@ def sizes(n0: int, replicates: int) -> dict[str, dict[str, Any]]:
         predicted = posterior_populations(data, rng)
         for n in FRESH:
             fresh = rng.normal(size=n)
-            test = prb.area_test(fresh, predicted, null=prb.PosteriorNull(1999, seed=i))
+            test = prb.area_test(fresh, predicted, null=prb.PosteriorNull(1999, random_seed=i))
             p = found[str(n)]
             p["default"].append(test.p_value)
             p["best fit"].append(exact.p_value(float(area(ndtr((fresh - data.mean()) / data.std(ddof=1)))), n))
@@ -101,9 +101,9 @@ def pipeline(n0: int, n: int, replicates: int) -> dict[str, Any]:
         posterior = sample(other, draws=400, optimum=optimum, random_seed=i)
         predicted = prb.predict(posterior, same, x, model=evaluator.model, random_seed=i)
         best = prb.predict(optimum, same, x, random_seed=i)
-        found["default"].append(prb.area_test(fresh, predicted, null=prb.PosteriorNull(1999, seed=i)).p_value)
+        found["default"].append(prb.area_test(fresh, predicted, null=prb.PosteriorNull(1999, random_seed=i)).p_value)
         found["optimum, ExactModel"].append(prb.area_test(fresh, best).p_value)
-        own = prb.area_test(data, best, null=prb.JointNull(optimum, replicates=199, seed=i))
+        own = prb.area_test(data, best, null=prb.JointNull(optimum, replicates=199, random_seed=i))
         found["own data, JointNull"].append(own.p_value)
         found["own data, ExactModel"].append(prb.ExactModel().p_value(own.statistic, n0))
     return found

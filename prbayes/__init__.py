@@ -39,13 +39,15 @@ from prbayes.reports.section import Section
 from prbayes.response.calling import ResponseError, scalar
 from prbayes.response.failures import Abort, Replace, Retry
 from prbayes.response.store import StoreError
-from prbayes.surrogate.error import SurrogateError
+from prbayes.surrogate.error import CrossValidation as SurrogateError
 from prbayes.surrogate.surfaces import Polynomial, RadialBasis
 from prbayes.surrogate.surrogate import Surrogate
-from prbayes.validation.cross_validation import held_out
+from prbayes.validation.cross_validation import cross_validate
+from prbayes.validation.exact_model import ExactModel
 from prbayes.validation.joint_null import JointNull
-from prbayes.validation.nulls import ExactModel, PosteriorNull
-from prbayes.validation.validity import ValidityTest, area_test, u_values
+from prbayes.validation.nulls import PosteriorNull
+from prbayes.validation.probability_transform import u_values
+from prbayes.validation.validity import ValidityTest, area_test
 
 __version__ = version("prbayes")
 
@@ -87,9 +89,9 @@ __all__ = [
     "bootstrap",
     "calibrate_epsilon",
     "compare",
+    "cross_validate",
     "datasets",
     "diagnose",
-    "held_out",
     "minimize",
     "plot_comparison",
     "plot_landscape",

@@ -21,14 +21,15 @@ _REPORT = """examples:
   prbayes report results.nc optimum.nc validity.nc --title "Crack growth" --out crack.html
   prbayes report results.nc --markdown docs/crack
 
-Files are netCDF: posteriors (sample_smc(...).to_netcdf), optima (minimize(...).to_datatree().to_netcdf) and validity
-tests (area_test(...).to_dataset().to_netcdf), in any number and order. Nothing in them is executed.
+Files are netCDF: posteriors (sample_smc(...).to_netcdf), optima
+(minimize(...).to_datatree().to_netcdf) and validity tests
+(area_test(...).to_dataset().to_netcdf), in any number and order. Nothing in them is executed.
 """
 _DEMO = """example:
   prbayes demo --out demo
 
-Calibrates Paris' law of crack growth on eleven measured specimens, tests the result on ten others, and writes
-results.nc, optimum.nc, validity.nc and report.html. It takes about half a minute.
+Calibrates Paris' law of crack growth on eleven measured specimens, tests the result on ten others,
+and writes results.nc, optimum.nc, validity.nc and report.html. It takes about half a minute.
 """
 
 
@@ -38,8 +39,7 @@ class UserError(Exception):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code: 0, or 2 for a mistake in it."""
-    parser = _parser()
-    given = parser.parse_args(arguments)
+    given = _parser().parse_args(arguments)
     _log_to_stderr(quiet=given.quiet)
     try:
         written = given.run(given)
@@ -51,40 +51,60 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    layout = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
         prog="prbayes",
-        description="Statistical model calibration: reports from saved results, and a demonstration.",
-        epilog="Paths of the files that were written go to stdout, one a line; everything else to stderr.",
+        description="Statistical model calibration: reports from saved results, "
+        "and a demonstration.",
+        epilog="Paths of the files that were written go to stdout, one a line; "
+        "everything else to stderr.",
     )
     parser.add_argument("--version", action="version", version=f"prbayes {version('prbayes')}")
     commands = parser.add_subparsers(required=True, metavar="command", title="commands")
-    report = commands.add_parser(
-        "report", help="a report from saved results", formatter_class=layout, epilog=_REPORT,
-        description="Write a report from saved results, without the model that they came from.",
-    )  # fmt: skip
-    report.add_argument("files", nargs="+", type=Path, metavar="FILE.nc", help="posteriors, optima, validity tests")
-    report.add_argument("--title", help="by default the name of the first file")
-    report.add_argument("--author", default="", help="below the title")
-    report.add_argument("--date", default="", help="below the title; none is made up")
-    report.add_argument("--out", type=Path, metavar="REPORT.html", help="report.html by default")
-    report.add_argument("--markdown", type=Path, metavar="FOLDER", help="write report.md and pictures into a folder")
-    report.add_argument("--no-pictures", action="store_true", help="text and tables only")
-    report.set_defaults(run=_report)
-    demo = commands.add_parser(
-        "demo", help="crack growth from end to end", formatter_class=layout, epilog=_DEMO,
-        description="Run the crack growth case from end to end.",
-    )  # fmt: skip
-    demo.add_argument(
-        "--out", type=Path, default=Path("prbayes-demo"), metavar="FOLDER", help="prbayes-demo by default"
-    )
-    demo.add_argument("--draws", type=_at_least(10), default=1000, help="of each chain, 1000 by default")
-    demo.add_argument("--chains", type=_at_least(1), default=4, help="4 by default")
-    demo.add_argument("--seed", type=_at_least(0), default=1, help="1 by default")
-    demo.set_defaults(run=_demo)
-    for command in (report, demo):
+    for add in (_add_report, _add_demo):
+        command = add(commands)
         command.add_argument("-q", "--quiet", action="store_true", help="warnings only")
     return parser
+
+
+def _add_report(commands: Any) -> Any:
+    report = commands.add_parser(
+        "report",
+        help="a report from saved results",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=_REPORT,
+        description="Write a report from saved results, without the model that they came from.",
+    )
+    add = report.add_argument
+    add("files", nargs="+", type=Path, metavar="FILE.nc", help="posteriors, optima, validity tests")
+    add("--title", help="by default the name of the first file")
+    add("--author", default="", help="below the title")
+    add("--date", default="", help="below the title; none is made up")
+    add("--out", type=Path, metavar="REPORT.html", help="report.html by default")
+    add(
+        "--markdown", type=Path, metavar="FOLDER", help="write report.md and pictures into a folder"
+    )
+    add("--no-pictures", action="store_true", help="text and tables only")
+    report.set_defaults(run=_report)
+    return report
+
+
+def _add_demo(commands: Any) -> Any:
+    demo = commands.add_parser(
+        "demo",
+        help="crack growth from end to end",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=_DEMO,
+        description="Run the crack growth case from end to end.",
+    )
+    add = demo.add_argument
+    folder = Path("prbayes-demo")
+    add("--out", type=Path, default=folder, metavar="FOLDER", help="prbayes-demo by default")
+    # With fewer draws ArviZ tells no effective sample size.
+    add("--draws", type=_at_least(10), default=1000, help="of each chain, 1000 by default")
+    add("--chains", type=_at_least(1), default=4, help="4 by default")
+    add("--seed", type=_at_least(0), default=1, help="1 by default")
+    demo.set_defaults(run=_demo)
+    return demo
 
 
 def _at_least(minimum: int) -> Any:
@@ -108,37 +128,41 @@ def _log_to_stderr(*, quiet: bool) -> None:
 
 
 def _report(given: argparse.Namespace) -> list[Path]:
-    posteriors: dict[str, xr.DataTree] = {}
-    optima: dict[str, xr.DataTree] = {}
-    tests: dict[str, ValidityTest] = {}
-    trees = {path: _opened(path) for path in dict.fromkeys(given.files)}
-    labels = _labels(list(trees))
-    for path, tree in trees.items():
-        if "posterior" in tree:
-            posteriors[labels[path]] = tree
-        elif "optimum" in tree:
-            optima[labels[path]] = tree
-        else:
-            tests[labels[path]] = _test_of(path, tree.to_dataset())
     try:
         report = Report(
             given.title or given.files[0].stem,
-            optimum=_plain(optima, "optimum"),
-            posterior=_plain(posteriors, "posterior"),
-            validity=_plain(tests, "validity"),
+            **_results(given.files),
             author=given.author,
             date=given.date,
             pictures=not given.no_pictures,
         )
     except (TypeError, ValueError, KeyError) as error:
         raise UserError(f"{', '.join(map(str, given.files))}: {_line(error)}") from error
+    written = []
     try:
-        written = [] if given.markdown is None else [report.to_markdown(given.markdown)]
+        if given.markdown is not None:
+            written.append(report.to_markdown(given.markdown))
         if given.out is not None or given.markdown is None:
             written.append(report.to_html(given.out or Path("report.html")))
     except OSError as error:
         raise UserError(f"cannot write: {_line(error)}") from error
     return written
+
+
+def _results(files: Sequence[Path]) -> dict[str, Any]:
+    """Return what files hold, as keywords of a report."""
+    paths = list(dict.fromkeys(files))
+    labels = _labels(paths)
+    kinds: dict[str, dict[str, Any]] = {"posterior": {}, "optimum": {}, "validity": {}}
+    for path in paths:
+        tree = _opened(path)
+        if "posterior" in tree:
+            kinds["posterior"][labels[path]] = tree
+        elif "optimum" in tree:
+            kinds["optimum"][labels[path]] = tree
+        else:
+            kinds["validity"][labels[path]] = _test_of(path, tree.to_dataset())
+    return {kind: _plain(results, kind) for kind, results in kinds.items()}
 
 
 def _demo(given: argparse.Namespace) -> list[Path]:
@@ -168,11 +192,13 @@ def _opened(path: Path) -> xr.DataTree:
         with xr.open_datatree(path, engine="h5netcdf") as tree:
             found: xr.DataTree = tree.load()
     except Exception as error:  # whatever a reader makes of bytes that are no netCDF
-        raise UserError(f"{path}: got no netCDF file that can be read ({_line(error):.100})") from error
+        raise UserError(
+            f"{path}: got no netCDF file that can be read ({_line(error):.100})"
+        ) from error
     if not {"posterior", "optimum"} & set(found.children) and "u" not in found.data_vars:
         raise UserError(
-            f"{path}: got groups {sorted(found.children)}, expected results of prbayes: a group posterior or optimum, "
-            "or a validity test"
+            f"{path}: got groups {sorted(found.children)}, expected results of prbayes: "
+            "a group posterior or optimum, or a validity test"
         )
     return found
 
@@ -180,7 +206,10 @@ def _opened(path: Path) -> xr.DataTree:
 def _test_of(path: Path, dataset: xr.Dataset) -> ValidityTest:
     try:
         return ValidityTest(
-            **{key: float(dataset[key]) for key in ("statistic", "critical_value", "p_value", "level")},
+            **{
+                key: float(dataset[key])
+                for key in ("statistic", "critical_value", "p_value", "level")
+            },
             null=str(dataset.attrs["null"]),
             folded=bool(dataset["folded"]),
             u_values=dataset["u"].values,
@@ -189,7 +218,9 @@ def _test_of(path: Path, dataset: xr.Dataset) -> ValidityTest:
             specimens=dataset["specimen"].values.astype(str),
         )
     except KeyError as error:
-        raise UserError(f"{path}: got no {error}, expected a validity test saved by to_dataset()") from error
+        raise UserError(
+            f"{path}: got no {error}, expected a validity test saved by to_dataset()"
+        ) from error
 
 
 def _line(error: Exception) -> str:

@@ -1,4 +1,7 @@
-"""Coercion and checks of samples, weights and shapes; every message says got, expected, what to do."""
+"""Coercion and checks of samples, weights and shapes.
+
+Every message says what was got, what was expected, and what to do.
+"""
 
 from __future__ import annotations
 
@@ -22,20 +25,31 @@ def real_array(values: ArrayLike, name: str) -> Floats:
     try:
         array = np.asarray(values)
     except ValueError as error:
-        raise TypeError(f"{name}: got a ragged sequence, expected a regular array of numbers") from error
+        raise TypeError(
+            f"{name}: got a ragged sequence, expected a regular array of numbers"
+        ) from error
     if array.dtype.kind == "c":
-        raise TypeError(f"{name}: got complex numbers, expected real ones; pass the real part or the modulus")
+        raise TypeError(
+            f"{name}: got complex numbers, expected real ones; pass the real part or the modulus"
+        )
     if array.dtype.kind not in "fiub":
-        try:
-            if array.dtype.kind != "O":
-                raise TypeError
-            array = array.astype(np.float64)
-        except (TypeError, ValueError):
-            raise TypeError(f"{name}: got {_describe(values, array)}, expected real numbers") from None
+        array = _numbers_in_objects(values, array, name)
     return np.asarray(array, dtype=np.float64)
 
 
+def _numbers_in_objects(values: object, array: NDArray[Any], name: str) -> Floats:
+    """Return the numbers that an array of Python objects holds, or raise for any other array."""
+    if array.dtype.kind == "O":
+        try:
+            return array.astype(np.float64)
+        except (TypeError, ValueError):
+            pass
+    got = _describe(values, array)
+    raise TypeError(f"{name}: got {got}, expected real numbers")
+
+
 def _describe(values: object, array: NDArray[Any]) -> str:
+    """Return what was passed, in words for a message."""
     if array.ndim == 0:
         return f"{type(values).__name__} {values!r:.60}"
     return f"an array of dtype {array.dtype}"
@@ -82,7 +96,7 @@ def observed_sample(values: ArrayLike, name: str = "observed", *, minimum: int =
 
 
 def simulated_sample(values: ArrayLike, name: str = "simulated") -> Floats:
-    """Check simulated responses, shape (..., n); NaN and -inf are refused, +inf (a failed specimen) is not."""
+    """Check simulated responses, shape (..., n): no NaN or -inf; +inf is a failed specimen."""
     array = real_array(values, name)
     if array.ndim == 0 or array.shape[-1] == 0:
         raise ValueError(f"{name}: got shape {array.shape}, expected (..., n) with n >= 1")
@@ -113,7 +127,9 @@ def sample_weights(weights: ArrayLike | None, n: int, name: str = "weights") -> 
         return np.full(n, 1.0 / n)
     array = real_array(weights, name)
     if array.ndim == 0 or array.shape[-1] != n:
-        raise ValueError(f"{name}: got shape {array.shape}, expected (..., {n}), one weight per value")
+        raise ValueError(
+            f"{name}: got shape {array.shape}, expected (..., {n}), one weight per value"
+        )
     if not np.isfinite(array).all() or (array < 0).any():
         raise ValueError(f"{name}: got negative or non-finite weights, expected weights >= 0")
     total = array.sum(axis=-1, keepdims=True)
@@ -125,7 +141,9 @@ def sample_weights(weights: ArrayLike | None, n: int, name: str = "weights") -> 
 def positive_number(value: object, name: str) -> float:
     """Return ``value`` as a float, or raise if it is not a positive finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        raise TypeError(f"{name}: got {type(value).__name__} {value!r:.60}, expected a positive number")
+        raise TypeError(
+            f"{name}: got {type(value).__name__} {value!r:.60}, expected a positive number"
+        )
     if not np.isfinite(value) or value <= 0:
         raise ValueError(f"{name}: got {value!r}, expected a positive finite number")
     return float(value)
@@ -134,7 +152,9 @@ def positive_number(value: object, name: str) -> float:
 def positive_integer(value: object, name: str, *, minimum: int = 1) -> int:
     """Return ``value`` as an int, or raise if it is not an integer of at least ``minimum``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise TypeError(f"{name}: got {type(value).__name__} {value!r:.60}, expected an integer >= {minimum}")
+        raise TypeError(
+            f"{name}: got {type(value).__name__} {value!r:.60}, expected an integer >= {minimum}"
+        )
     if value < minimum:
         raise ValueError(f"{name}: got {value}, expected an integer >= {minimum}")
     return int(value)

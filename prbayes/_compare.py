@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import pymc as pm
 import xarray as xr
+from scipy.stats import norm
 
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
@@ -16,11 +18,12 @@ from prbayes.metrics.base import Metric
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual
+from prbayes.model.description import element_name
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.simulator import nodes
 from prbayes.model.support import shortcomings
 
-_INTERVAL = 0.89
+INTERVAL = 0.89  # probability: what ArviZ takes by default, az.rcParams["stats.ci_prob"]
 _METRICS = (ProbabilityResidual(), KullbackLeibler(), AreaMetric(), LogLikelihood())
 
 
@@ -35,23 +38,27 @@ def compare(
     Parameters
     ----------
     results : mapping
-        `Optimum` objects, their DataTrees, and DataTrees with a ``posterior`` group, by the label they get.
+        `Optimum` objects, their DataTrees, and DataTrees with a ``posterior`` group, by the label
+        they get.
     model : pymc.Model, optional
-        Restricts the table to the model's free variables; by default all that the results share. Its data, and
-        its populations, score the results.
+        Restricts the table to the model's free variables; by default all that the results share.
+        Its data, and its populations, score the results.
     metrics : sequence of Metric, optional
-        Under which each estimate is scored, whatever it was made with. By default all four where that costs no
-        response (`Reweighted`); under the other propagations each result costs n responses per simulator.
+        Under which each estimate is scored, whatever it was made with. By default all four where
+        that costs no response (`Reweighted`); under the other propagations each result costs n
+        responses per simulator.
 
     Returns
     -------
     xarray.Dataset
-        With dimensions ``result`` and ``hyperparameter``: ``estimate`` (the optimum, or the posterior mean),
-        ``sd`` (the standard error, or the posterior standard deviation), ``lower`` and ``upper`` (an 89%
-        interval: normal, or equal-tailed), ``shift`` (of the estimate from that of the first result, in this
-        result's sd); and by result: ``n_responses`` and ``seconds``, NaN where a result does not tell, and the
-        discrepancy of the estimate's population under each metric, by the metric's class, with the simulator's name
-        before it if there are several; NaN where stored responses do not support it.
+        With dimensions ``result`` and ``hyperparameter``: ``estimate`` (the optimum, or the
+        posterior mean), ``sd`` (the standard error, or the posterior standard deviation),
+        ``lower`` and ``upper`` (an 89% interval: normal, or equal-tailed), ``shift`` (of the
+        estimate from that of the first result, in this
+        result's sd); and by result: ``n_responses`` and ``seconds``, NaN where a result does not
+        tell, and the discrepancy of the estimate's population under each metric, by the metric's
+        class, with the simulator's name before it if there are several; NaN where stored responses
+        do not support it.
 
     Raises
     ------
@@ -63,99 +70,157 @@ def compare(
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0, 2, 4])
     >>> table = prb.compare({"optimum": prb.minimize(model)}, model=model)
     >>> table.hyperparameter.values.tolist()
     ['mu']
     """
     if not results:
-        raise ValueError("compare: got no results, expected a dict such as {'optimum': optimum, 'ABC': idata}")
+        raise ValueError(
+            "compare: got no results, expected a dict such as {'optimum': optimum, 'ABC': idata}"
+        )
     columns = {label: _column(label, result) for label, result in results.items()}
-    names = [n for n in next(iter(columns.values()))[0] if all(n in c[0] for c in columns.values())]
-    if model is not None:
-        free = [rv.name for rv in model.free_RVs]
-        names = [n for n in names if n.split("[")[0] in free]
+    names = _shared(list(columns.values()), model)
     if not names:
-        raise ValueError(f"compare: got results {list(results)} that share no hyperparameter, expected the same model")
-    table = np.array([[columns[label][0][n] for n in names] for label in columns])
-    first = table[0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shift = (table[..., 0] - first[:, 0]) / table[..., 1]
+        raise ValueError(
+            f"compare: got results {list(results)} that share no hyperparameter, "
+            "expected the same model"
+        )
+    # Estimate, sd, lower and upper: shape (results, elements, 4)
+    table = np.array([[column.elements[name] for name in names] for column in columns.values()])
+    estimates, sds = table[..., 0], table[..., 1]
+    with np.errstate(divide="ignore", invalid="ignore"):  # a result without spread
+        shift = (estimates - estimates[0]) / sds
     shift[0] = 0.0
-    keys = ("estimate", "sd", "lower", "upper")
-    where = ["result", "hyperparameter"]
-    data: dict[str, Any] = {key: (where, table[..., i]) for i, key in enumerate(keys)}
-    data["shift"] = (where, shift)
-    data["n_responses"] = ("result", [c[1] for c in columns.values()])
-    data["seconds"] = ("result", [c[2] for c in columns.values()])
+
+    dims = ["result", "hyperparameter"]
+    data: dict[str, Any] = {}
+    for i, key in enumerate(_Estimate._fields):
+        data[key] = (dims, table[..., i])
+    data["shift"] = (dims, shift)
+    data["n_responses"] = ("result", [column.n_responses for column in columns.values()])
+    data["seconds"] = ("result", [column.seconds for column in columns.values()])
     if model is not None and nodes(model):
-        data |= {key: ("result", found) for key, found in _scores(model, names, table[..., 0], metrics).items()}
-    return xr.Dataset(data, coords={"result": list(columns), "hyperparameter": names}, attrs={"interval": _INTERVAL})
+        for key, scores in _scores(model, names, estimates, metrics).items():
+            data[key] = ("result", scores)
+    coords = {"result": list(columns), "hyperparameter": names}
+    return xr.Dataset(data, coords=coords, attrs={"interval": INTERVAL})
+
+
+class _Estimate(NamedTuple):
+    """Of one element, by one result."""
+
+    estimate: float
+    sd: float
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class _Column:
+    """What a result tells: estimates by element, and its cost."""
+
+    elements: dict[str, _Estimate]
+    n_responses: float
+    seconds: float
+
+
+def _column(label: str, result: Any) -> _Column:
+    """Read a result of any kind."""
+    if isinstance(result, Optimum):
+        elements = _normal(result.point, result.stderr)
+        return _Column(elements, float(result.n_responses), result.seconds)
+    if isinstance(result, xr.DataTree) and "posterior" in result.children:
+        posterior = result["posterior"]
+        return _Column(_of_draws(posterior.to_dataset()), *_cost(posterior.attrs))
+    if isinstance(result, xr.DataTree) and "optimum" in result.children:
+        optimum = result["optimum"]
+        elements = _normal(optimum.data_vars, result["stderr"].data_vars)
+        return _Column(elements, *_cost(optimum.attrs))
+    raise TypeError(
+        f"{label}: got {type(result).__name__}, "
+        "expected an Optimum or a DataTree with a posterior group"
+    )
+
+
+def _of_draws(posterior: xr.Dataset) -> dict[str, _Estimate]:
+    """Return mean, standard deviation and equal-tailed interval by element."""
+    tails = [(1 - INTERVAL) / 2, (1 + INTERVAL) / 2]
+    found = {}
+    for name, variable in posterior.data_vars.items():
+        stacked = variable.stack(sample=("chain", "draw"))
+        draws = stacked.transpose("sample", ...).values
+        for index in np.ndindex(draws.shape[1:]):
+            x = draws[(slice(None), *index)]
+            lower, upper = np.quantile(x, tails)
+            element = element_name(str(name), index)
+            found[element] = _Estimate(float(x.mean()), float(x.std(ddof=1)), lower, upper)
+    return found
+
+
+def _normal(point: Mapping[Any, Any], stderr: Mapping[Any, Any]) -> dict[str, _Estimate]:
+    """Return estimate, standard error and normal interval by element of an optimum."""
+    z = norm.ppf((1 + INTERVAL) / 2)
+    found = {}
+    for name, value in point.items():
+        values = np.asarray(value)
+        errors = np.asarray(stderr[name])
+        for index in np.ndindex(values.shape):
+            estimate, sd = float(values[index]), float(errors[index])
+            element = element_name(str(name), index)
+            found[element] = _Estimate(estimate, sd, estimate - z * sd, estimate + z * sd)
+    return found
+
+
+def _cost(attrs: Mapping[Any, Any]) -> tuple[float, float]:
+    n_responses = attrs.get("n_responses", np.nan)
+    seconds = attrs.get("seconds", np.nan)
+    return float(n_responses), float(seconds)
+
+
+def _shared(columns: list[_Column], model: pm.Model | None) -> list[str]:
+    """Return the elements that all results have, of the model's free variables if it is given."""
+    first = columns[0].elements
+    names = [name for name in first if all(name in column.elements for column in columns)]
+    if model is None:
+        return names
+    free = {rv.name for rv in model.free_RVs}
+    return [name for name in names if name.partition("[")[0] in free]
 
 
 def _scores(
     model: pm.Model, names: list[str], estimates: Floats, metrics: Sequence[Metric] | None
 ) -> dict[str, Floats]:
-    """Return the discrepancies of estimates, (results, elements), by simulator and metric."""
+    """Return discrepancies of estimates, shape (results, elements), by simulator and metric."""
     evaluator = Evaluator(model)
     if metrics is None and evaluator.responses_per_theta:
+        return {}  # a comparison that was not asked for scores computes no response
+    metrics = _METRICS if metrics is None else metrics
+    thetas = _thetas(evaluator, names, estimates)
+    if thetas is None:
         return {}
-    place = {name: i for i, name in enumerate(names)}
-    shapes = {str(rv.name): tuple(map(int, rv.shape.eval())) for rv in model.free_RVs}
-    elements = {rv: [_element(rv, i) for i in np.ndindex(shape)] for rv, shape in shapes.items()}
-    if not all(e in place for row in elements.values() for e in row):
-        return {}
+    thin = [shortcomings(evaluator, theta[None]) for theta in thetas]
     found = {}
-    thetas = evaluator.thetas_of(
-        [estimates[:, [place[e] for e in elements[rv]]].reshape(-1, *shape) for rv, shape in shapes.items()]
-    )
-    thin = {i: shortcomings(evaluator, theta[None]) for i, theta in enumerate(thetas)}
     for k, node in enumerate(evaluator.nodes):
-        known = np.array([node.name not in thin[i] for i in range(len(thetas))])
-        for metric in _METRICS if metrics is None else metrics:
+        supported = np.array([node.name not in lacking for lacking in thin])
+        roots = evaluator.roots(thetas, k)
+        before = f"{node.name} " if len(evaluator.nodes) > 1 else ""
+        for metric in metrics:
             target = metric.against(node.target.observed, node.target.weights)
-            scores = node.bound.discrepancies(evaluator.roots(thetas, k), target)
-            name = type(metric).__name__
-            found[name if len(evaluator.nodes) == 1 else f"{node.name} {name}"] = np.where(known, scores, np.nan)
+            scores = node.bound.discrepancies(roots, target)
+            key = f"{before}{type(metric).__name__}"
+            found[key] = np.where(supported, scores, np.nan)
     return found
 
 
-def _column(label: str, result: Any) -> tuple[dict[str, tuple[float, ...]], float, float]:
-    """Return (estimate, sd, lower, upper) by element, responses, seconds."""
-    if isinstance(result, Optimum):
-        return _normal(result.point, result.stderr), float(result.n_responses), result.seconds
-    if not isinstance(result, xr.DataTree) or not {"posterior", "optimum"} & set(result.children):
-        raise TypeError(
-            f"{label}: got {type(result).__name__}, expected an Optimum or a DataTree with a posterior group"
-        )
-    if "posterior" not in result:
-        return _normal(result["optimum"].data_vars, result["stderr"].data_vars), *_cost(result["optimum"].attrs)
-    posterior = result["posterior"]
-    rows: dict[str, tuple[float, ...]] = {}
-    for key, variable in posterior.data_vars.items():
-        name = str(key)
-        draws = variable.stack(sample=("chain", "draw")).transpose("sample", ...).values
-        for i in np.ndindex(draws.shape[1:]):
-            x = draws[(slice(None), *i)]
-            lower, upper = np.quantile(x, [(1 - _INTERVAL) / 2, (1 + _INTERVAL) / 2])
-            rows[_element(name, i)] = (float(x.mean()), float(x.std(ddof=1)), float(lower), float(upper))
-    return rows, *_cost(posterior.attrs)
-
-
-def _normal(point: Mapping[Any, Any], stderr: Mapping[Any, Any]) -> dict[str, tuple[float, ...]]:
-    """Return (estimate, sd, lower, upper) by element of an optimum."""
-    z = 1.5982  # the normal's quantile at (1 + 0.89) / 2
-    rows: dict[str, tuple[float, ...]] = {}
-    for name, value in point.items():
-        for i in np.ndindex(np.shape(value)):
-            estimate, sd = float(np.asarray(value)[i]), float(np.asarray(stderr[name])[i])
-            rows[_element(str(name), i)] = (estimate, sd, estimate - z * sd, estimate + z * sd)
-    return rows
-
-
-def _cost(attrs: Mapping[Any, Any]) -> tuple[float, float]:
-    return float(attrs.get("n_responses", np.nan)), float(attrs.get("seconds", np.nan))
-
-
-def _element(name: str, index: tuple[int, ...]) -> str:
-    return f"{name}[{','.join(map(str, index))}]" if index else name
+def _thetas(evaluator: Evaluator, names: list[str], estimates: Floats) -> Floats | None:
+    """Return the estimates as thetas, shape (results, d); None where one lacks an element."""
+    values = []
+    for rv in evaluator.model.free_RVs:
+        shape = tuple(map(int, rv.shape.eval()))
+        elements = [element_name(str(rv.name), index) for index in np.ndindex(shape)]
+        if not set(elements) <= set(names):
+            return None
+        places = [names.index(element) for element in elements]
+        values.append(estimates[:, places].reshape(-1, *shape))
+    return evaluator.thetas_of(values)

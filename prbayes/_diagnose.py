@@ -1,7 +1,8 @@
-"""After any sampler: did it converge, and did the designs support the answer? Silent when nothing is wrong."""
+"""After any sampler or optimiser: whether it converged, and the designs supported the answer."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
@@ -12,13 +13,23 @@ import xarray as xr
 
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
+from prbayes.model.description import element_name
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.simulator import model_on_context
 from prbayes.model.support import shortcoming
 
-_RHAT = 1.01
-_NOISE = 11.0  # R-hat of independent draws is below 1 + _NOISE / (chains x draws) in 999 of 1000 cases, and a bit more
-_ESS = 400
+_RHAT = 1.01  # recommended by Vehtari et al. (2021)
+# R-hat of independent draws exceeds 1 + _NOISE / (chains x draws) about once in a thousand cases:
+# the quantile was 9 to 12 with 2 to 8 chains of 25 to 500 draws, 1500 to 4000 sets of each
+# (4 chains of 50 draws in tests/test_diagnose.py).
+_NOISE = 11.0
+_ESS = 400  # recommended by Vehtari et al. (2021), for R-hat and ESS themselves to be reliable
+# By judgement: of few draws no more than a quarter need be independent.
+_INDEPENDENT = 0.25
+_FEWEST_DRAWS = 4  # of a chain: ArviZ gives NaN for fewer
+# Accepted steps per particle: with fewer, many copies of a particle are still the same draw.
+_FEWEST_MOVES = 1
+
 _SUPPORT = ("weight_ess", "mean_weight", "lost_mass")
 
 
@@ -49,15 +60,18 @@ class Diagnosis:
 def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) -> Diagnosis:
     """Say in sentences what is wrong with a result, and what to do, whichever sampler gave it.
 
-    Looked at are: what is not identified; R-hat and effective sample size, by ArviZ; how far the particles of
-    `sample_smc` moved in its last stage; and whether the stored responses of `Reweighted` supported the answer.
+    Looked at are: what is not identified; whether an optimiser converged; R-hat and effective
+    sample size of draws, by ArviZ; how far the particles of `sample_smc` moved in its last stage;
+    and whether the stored responses of `Reweighted` supported the answer.
 
     Parameters
     ----------
     result : xarray.DataTree or Optimum
-        With a ``posterior`` group that has the model's free variables, from `sample_smc` or any PyMC sampler.
+        With a ``posterior`` group that has the model's free variables, from `sample_smc` or any
+        PyMC sampler; or the tree of an optimum.
     model : pymc.Model, optional
-        The one on the context by default. Results of `sample_smc`, also from a file, tell without it.
+        The one on the context by default. Results of `sample_smc` and `minimize`, also from a file,
+        tell without it.
 
     Returns
     -------
@@ -71,89 +85,130 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
 
     References
     ----------
-    .. [1] Vehtari, A., A. Gelman, D. Simpson, B. Carpenter and P.-C. Buerkner (2021), Rank-normalization, folding, and
-       localization: an improved R-hat, Bayesian Analysis 16(2), 667-718, doi:10.1214/20-BA1221.
+    .. [1] Vehtari, A., A. Gelman, D. Simpson, B. Carpenter and P.-C. Buerkner (2021),
+       Rank-normalization, folding, and localization: an improved R-hat, Bayesian Analysis 16(2),
+       667-718, doi:10.1214/20-BA1221.
 
     Examples
     --------
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0, 2, 4])
     >>> print(prb.diagnose(prb.minimize(model)))
     No problem was found.
     """
     if isinstance(result, Optimum):
-        messages = list(map(_sentence, result.warnings))
-        if not result.converged and not result.at_edge:
-            messages.append(f"The optimiser did not converge ({result.message}); try another start or method.")
-        found = _computed(result.evaluator, result.theta[None])
+        return _of_optimum(result)
+    if "optimum" in result and "posterior" not in result:
+        return _of_stored_optimum(result["optimum"].attrs)
+    return _of_draws(result, model)
+
+
+# -- optima ----------------------------------------------------------------------------------
+
+
+def _of_optimum(optimum: Optimum) -> Diagnosis:
+    messages = _sentences(optimum.warnings)
+    if not optimum.converged and not optimum.at_edge:  # an edge is one of the warnings
+        messages.append(_not_converged(optimum.message))
+    designs = _computed(optimum.evaluator, optimum.theta[None])
+    return Diagnosis((*messages, *_unsupported(designs)), designs.support)
+
+
+def _of_stored_optimum(attrs: Mapping[Any, Any]) -> Diagnosis:
+    messages = _warnings(attrs)
+    if not attrs.get("converged", True):
+        messages.append(_not_converged(str(attrs.get("message", ""))))
+    return Diagnosis(tuple(messages), xr.Dataset())
+
+
+def _not_converged(message: str) -> str:
+    return f"The optimiser did not converge ({message}); try another start or method."
+
+
+# -- draws -----------------------------------------------------------------------------------
+
+
+def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
+    posterior = result["posterior"]
+    variables = posterior.to_dataset()
+    if model is None and "calibration" in result:
+        designs = _stored(result["calibration"].to_dataset())
     else:
-        posterior = result["posterior"]
-        messages = list(map(_sentence, str(posterior.attrs.get("warnings", "")).splitlines()))
-        if model is None and "calibration" in result:
-            found = _stored(result)
-        else:
-            model = model_on_context(model, "prb.diagnose")
-            found = _computed(Evaluator(model), _thetas(posterior, model))
-        variables = posterior.to_dataset()
-        if model is not None:
-            variables = variables[[str(rv.name) for rv in model.free_RVs]]
-        messages += [*_convergence(variables), *_motion(result)]
-    support, needs = found
-    for name, (need, max_lost, n_points) in needs.items():
-        own = {key: support[key].sel(simulator=name).values for key in _SUPPORT}
-        what = shortcoming(own, need, max_lost, n_points)
-        if what:
-            messages.append(
-                f"{name}: the design does not support the answer: {what}. Call prb.refine(model) and sample again, or "
-                "use prb.Resimulated."
-            )
-    return Diagnosis(tuple(messages), support)
+        model = model_on_context(model, "prb.diagnose")
+        designs = _computed(Evaluator(model), _thetas(posterior, model))
+        variables = variables[[str(rv.name) for rv in model.free_RVs]]
+    messages = [
+        *_warnings(posterior.attrs),
+        *_convergence(variables),
+        *_motion(result),
+        *_unsupported(designs),
+    ]
+    return Diagnosis(tuple(messages), designs.support)
 
 
-def _sentence(line: str) -> str:
-    return f"{line[0].upper()}{line[1:]}."
+def _warnings(attrs: Mapping[Any, Any]) -> list[str]:
+    """Return what was said when the result was made."""
+    return _sentences(str(attrs.get("warnings", "")).splitlines())
+
+
+def _sentences(lines: Any) -> list[str]:
+    return [f"{line[0].upper()}{line[1:]}." for line in lines if line]
 
 
 def _convergence(posterior: xr.Dataset) -> list[str]:
     """Say where chains disagree, and where there are too few independent draws."""
-    stats: Any = import_module("arviz_stats")  # heavy, and partly annotated
-    chains, draws = posterior.sizes["chain"], posterior.sizes["draw"]
-    messages = []
-    if draws < 4:
+    if posterior.sizes["draw"] < _FEWEST_DRAWS:
         return []
+    return [*_disagreement(posterior), *_dependence(posterior)]
+
+
+def _disagreement(posterior: xr.Dataset) -> list[str]:
+    chains, draws = posterior.sizes["chain"], posterior.sizes["draw"]
+    if chains == 1:
+        return []
+    limit = max(_RHAT, 1 + _NOISE / (chains * draws))
+    rhats = _by_element("rhat", posterior)
+    high = {name: rhat for name, rhat in rhats.items() if rhat > limit}
+    if not high:
+        return []
+    return [
+        f"R-hat is {_listed(high, '.2f')}, expected at most {limit:.2f}: the chains disagree, "
+        "look at az.plot_rank(idata). "
+        "Pass more draws, or with prb.sample_smc a threshold of 0.8; "
+        "if the chains sit in separate modes, state a prior that excludes one."
+    ]
+
+
+def _dependence(posterior: xr.Dataset) -> list[str]:
+    total = posterior.sizes["chain"] * posterior.sizes["draw"]
+    needed = min(_ESS, _INDEPENDENT * total)
+    sizes = _by_element("ess", posterior)
+    low = {name: size for name, size in sizes.items() if size < needed}
+    if not low:
+        return []
+    return [
+        f"The effective sample size is {_listed(low, '.0f')} of {total} draws: "
+        "too few for means and intervals. Pass more draws."
+    ]
+
+
+def _by_element(statistic: str, posterior: xr.Dataset) -> dict[str, float]:
+    """Return a statistic of ArviZ by element, such as 'mu[1]'."""
+    stats: Any = import_module("arviz_stats")  # heavy, and partly annotated
     with np.errstate(all="ignore"):  # a variable that never moves
-        rhats, sizes = _elements(stats.rhat(posterior)), _elements(stats.ess(posterior))
-    if chains > 1:
-        limit = max(_RHAT, 1 + _NOISE / (chains * draws))
-        high = {name: r for name, r in rhats.items() if r > limit}
-        if high:
-            messages.append(
-                f"R-hat is {_listed(high, '.2f')}, expected at most {limit:.2f}: the chains disagree, look at "
-                "az.plot_rank(idata). Pass more draws, or with prb.sample_smc a threshold of 0.8; if the chains sit in "
-                "separate modes, state a prior that excludes one."
-            )
-    low = {name: e for name, e in sizes.items() if e < min(_ESS, chains * draws / 4)}
-    if low:
-        messages.append(
-            f"The effective sample size is {_listed(low, '.0f')} of {chains * draws} draws: too few for means and "
-            "intervals. Pass more draws."
-        )
-    return messages
+        found = getattr(stats, statistic)(posterior)
+    by_element = {}
+    for name, values in found.items():
+        for index in np.ndindex(values.shape):
+            by_element[element_name(str(name), index)] = float(values.values[index])
+    return by_element
 
 
-def _elements(values: Any) -> dict[str, float]:
-    """Return numbers by element, such as 'mu[1]'."""
-    return {
-        f"{name}[{','.join(map(str, i))}]" if i else str(name): float(value.values[i])
-        for name, value in values.items()
-        for i in np.ndindex(value.shape)
-    }
-
-
-def _listed(values: dict[str, float], form: str) -> str:
-    return ", ".join(f"{value:{form}} for {name}" for name, value in values.items())
+def _listed(values: Mapping[str, float], form: str) -> str:
+    each = [f"{value:{form}} for {name}" for name, value in values.items()]
+    return ", ".join(each)
 
 
 def _motion(result: xr.DataTree) -> list[str]:
@@ -162,52 +217,114 @@ def _motion(result: xr.DataTree) -> list[str]:
         return []
     stats = result["sample_stats"]
     moves: Any = (stats["accept_rate"] * stats["n_steps"]).values
+    # Chains have different numbers of stages: NaN from the end of a chain on.
     last = [chain[~np.isnan(chain)][-1] for chain in moves]
-    stuck = [i for i, m in enumerate(last) if m < 1]
+    stuck = [str(i) for i, moved in enumerate(last) if moved < _FEWEST_MOVES]
     if not stuck:
         return []
+    chains = "chains" if len(stuck) > 1 else "chain"
     calibration = result["calibration"]
     noise = float((calibration["discrepancy_error"] / calibration["epsilon"]).max())
     why = f" (its Monte Carlo error is {noise:.1f} epsilon)" if noise > 1 else ""
     return [
-        f"Particles hardly moved in the last stage of {'chains' if len(stuck) > 1 else 'chain'} "
-        f"{', '.join(map(str, stuck))} ({min(last):.2f} accepted steps per particle, expected at least 1), so that "
-        f"many draws are the same. The discrepancy is too noisy{why}, or epsilon too small: use prb.Reweighted or "
-        "prb.Resimulated instead of prb.Fresh, or pass a larger n or epsilon."
+        f"Particles hardly moved in the last stage of {chains} {', '.join(stuck)} "
+        f"({min(last):.2f} accepted steps per particle, expected at least {_FEWEST_MOVES}), "
+        "so that many draws are the same. "
+        f"The discrepancy is too noisy{why}, or epsilon too small: "
+        "use prb.Reweighted or prb.Resimulated instead of prb.Fresh, "
+        "or pass a larger n or epsilon."
     ]
 
 
 def _thetas(posterior: Any, model: pm.Model) -> Floats:
+    """Return the draws as thetas, shape (chains x draws, d)."""
     names = [rv.name for rv in model.free_RVs]
-    missing = [n for n in names if n not in posterior]
+    missing = [name for name in names if name not in posterior]
     if missing:
         raise KeyError(f"posterior: got no {missing}, expected the model's free variables {names}")
-    arrays = [posterior[n].transpose("chain", "draw", ...).values for n in names]
-    return Evaluator(model).thetas_of([a.reshape(-1, *a.shape[2:]) for a in arrays])
+    draws = []
+    for name in names:
+        values = posterior[name].transpose("chain", "draw", ...).values
+        draws.append(values.reshape(-1, *values.shape[2:]))
+    return Evaluator(model).thetas_of(draws)
 
 
-_Found = tuple[xr.Dataset, dict[str, tuple[float, float, int]]]
+# -- designs ---------------------------------------------------------------------------------
 
 
-def _computed(evaluator: Evaluator, thetas: Floats) -> _Found:
-    """Return the support of the designs now, and what they need, by simulator."""
-    support = evaluator.support(thetas)
-    needs = {name: (d.required_ess, d.config.max_lost, d.n_points) for name, d in evaluator.designs.items()}
-    return _labelled({key: np.array([support[n][key] for n in support]) for key in _SUPPORT}, list(support)), needs
+@dataclass(frozen=True, eq=False)
+class _Needs:
+    """What a design is asked for."""
+
+    weight_ess: float
+    max_lost: float
+    n_points: int
 
 
-def _labelled(support: dict[str, Floats], names: list[str]) -> xr.Dataset:
-    stacked = {key: (["simulator", "sample"], values) for key, values in support.items()} if names else {}
-    return xr.Dataset(stacked, coords={"simulator": names})
+@dataclass(frozen=True, eq=False)
+class _Designs:
+    """How designs support the populations of a result, and what they are asked for.
+
+    Attributes
+    ----------
+    support : xarray.Dataset
+        With the dimensions simulator and sample.
+    needs : dict
+        By simulator.
+    """
+
+    support: xr.Dataset
+    needs: dict[str, _Needs]
 
 
-def _stored(result: xr.DataTree) -> _Found:
-    """Return the same as it was when the sampler ran."""
-    calibration = result["calibration"].to_dataset()
-    calibration = calibration.isel(simulator=np.flatnonzero(~np.isnan(calibration["required_ess"].values)))
-    columns = [calibration[key].values for key in ("simulator", "required_ess", "max_lost", "n_points")]
-    needs = {str(name): (float(need), float(lost), int(n)) for name, need, lost, n in zip(*columns, strict=True)}
-    size = calibration.sizes
-    shape = size["simulator"], size["chain"] * size["draw"]
-    flat = {key: calibration[key].transpose("simulator", "chain", "draw").values.reshape(shape) for key in _SUPPORT}
-    return _labelled(flat, list(needs)), needs
+def _computed(evaluator: Evaluator, thetas: Floats) -> _Designs:
+    """Return the support of the designs as they are now."""
+    needs = {}
+    for name, design in evaluator.designs.items():
+        needs[name] = _Needs(design.required_ess, design.config.max_lost, design.n_points)
+    by_simulator = evaluator.support(thetas)
+    names = list(by_simulator)
+    stacked = {}
+    for key in _SUPPORT:
+        stacked[key] = np.array([by_simulator[name][key] for name in names])
+    return _Designs(_labelled(stacked, names), needs)
+
+
+def _stored(calibration: xr.Dataset) -> _Designs:
+    """Return the support of the designs as it was when the sampler ran."""
+    has_design = ~np.isnan(calibration["required_ess"].values)
+    calibration = calibration.isel(simulator=np.flatnonzero(has_design))
+    names = list(map(str, calibration["simulator"].values.tolist()))
+    needs = {}
+    for name in names:
+        own = calibration.sel(simulator=name)
+        ess, max_lost = float(own["required_ess"]), float(own["max_lost"])
+        needs[name] = _Needs(ess, max_lost, int(own["n_points"]))
+    stacked = {}
+    for key in _SUPPORT:
+        values = calibration[key].transpose("simulator", "chain", "draw").values
+        stacked[key] = values.reshape(
+            len(names), calibration.sizes["chain"] * calibration.sizes["draw"]
+        )
+    return _Designs(_labelled(stacked, names), needs)
+
+
+def _labelled(support: Mapping[str, Floats], names: list[str]) -> xr.Dataset:
+    variables = {}
+    if names:
+        variables = {key: (["simulator", "sample"], values) for key, values in support.items()}
+    return xr.Dataset(variables, coords={"simulator": names})
+
+
+def _unsupported(designs: _Designs) -> list[str]:
+    """Say which designs fall short."""
+    messages = []
+    for name, needs in designs.needs.items():
+        own = {key: designs.support[key].sel(simulator=name).values for key in _SUPPORT}
+        lacking = shortcoming(own, needs.weight_ess, needs.max_lost, needs.n_points)
+        if lacking:
+            messages.append(
+                f"{name}: the design does not support the answer: {lacking}. "
+                "Call prb.refine(model) and sample again, or use prb.Resimulated."
+            )
+    return messages

@@ -6,6 +6,7 @@ import hashlib
 import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
@@ -16,11 +17,13 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats, positive_integer
+from prbayes._weighted import reached
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.labels import versions
 from prbayes.model.simulator import Node, model_on_context, nodes
 from prbayes.model.support import DesignError
 from prbayes.propagation.points import base_points
+from prbayes.propagation.reweighted import Design
 from prbayes.response.calling import ResponseError
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, quantiles
@@ -28,6 +31,17 @@ from prbayes.response.inputs import Inputs, read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 
 _log = logging.getLogger("prbayes")
+
+# Shares of the effective sample size that a calibration requires of a design, and of a population's
+# mass, which the median population of a prediction must have. By judgement: laxer than what a
+# calibration asks, as draws at the edge of a posterior are less well supported than its centre, and
+# resampling needs no derivative.
+_LEAST_ESS = 0.5
+_MASS = 0.7, 1.4
+
+# Of the unit interval, by which points keep off its ends: any value from 1e-16 to 1e-9 moves only
+# specimens that are rarer than one in 1e9.
+_EDGE = 1e-12
 
 
 def predict(
@@ -43,25 +57,28 @@ def predict(
     store: str | PathLike[str] | None = None,
     random_seed: int | None = 0,
 ) -> xr.DataArray:
-    """Draw responses of the calibrated population, also of another response or under another condition.
+    """Draw responses of the calibrated population.
 
-    Each draw of the posterior is a population of its own, of which ``n_samples`` specimens are drawn; an
-    optimum is one population. Where the model has a simulator with `Reweighted` and the same ``.dist()``
-    objects, the specimens are its design points, resampled by their weights: its own response then costs
-    nothing, and any other one is computed once per design point, not once per draw, specimen or call. Elsewhere
-    specimens are new: Sobol points through the inverse distribution functions, with another shift for each
-    draw, or random draws where there is no inverse.
+    Also of another response, or under another condition.
+
+    Each draw of the posterior is a population of its own, of which ``n_samples`` specimens are
+    drawn; an optimum is one population. Where the model has a simulator with `Reweighted` and the
+    same ``.dist()`` objects, the specimens are its design points, resampled by their weights: its
+    own response then costs nothing, and any other one is computed once per design point, not once
+    per draw, specimen or call. Elsewhere specimens are new: Sobol points through the inverse
+    distribution functions, with another shift for each draw, or random draws where there is no
+    inverse.
 
     Parameters
     ----------
     result : Optimum or xarray.DataTree
-        From `minimize`; or with a ``posterior`` group that has the model's free variables, from `sample_smc`,
-        `bootstrap` or any PyMC sampler.
+        From `minimize`; or with a ``posterior`` group that has the model's free variables, from
+        `sample_smc`, `bootstrap` or any PyMC sampler.
     response : callable
         As for `Simulator`; +inf is a specimen that failed, NaN a point that could not be computed.
     *inputs
-        ``.dist()`` objects of the model's simulators, or new ones over the model's variables; model variables;
-        constants.
+        ``.dist()`` objects of the model's simulators, or new ones over the model's variables; model
+        variables; constants.
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
     n_samples : int
@@ -69,7 +86,8 @@ def predict(
     draws : int
         Largest number of populations, over all chains; the posterior's draws are thinned evenly.
     stored : bool
-        Whether design points may serve. With False the response is computed for draws x n_samples specimens.
+        Whether design points may serve. With False the response is computed for draws x n_samples
+        specimens.
     name : str, optional
         Of the result; by default that of the function.
     executor : concurrent.futures.Executor, optional
@@ -81,10 +99,11 @@ def predict(
     Returns
     -------
     xarray.DataArray
-        Dims (chain, draw, sample). Attributes: ``source`` (how specimens were made), ``responses`` (how many were
-        computed), ``nan`` (how many values are NaN), ``specimens_id`` (equal for predictions with the same
-        specimens), ``calibration_data`` and ``calibration_specimens`` (digests of the data, and specimen labels, of
-        the calibration, by which `area_test` knows them).
+        Dims (chain, draw, sample). Attributes: ``source`` (how specimens were made), ``responses``
+        (how many were computed), ``nan`` (how many values are NaN), ``specimens_id`` (equal for
+        predictions with the same specimens), ``calibration_data`` and ``calibration_specimens``
+        (digests of the data, and specimen labels, of the calibration, by which `area_test` knows
+        them).
 
     Raises
     ------
@@ -97,16 +116,18 @@ def predict(
 
     Notes
     -----
-    With the same ``result``, inputs, ``n_samples``, ``draws`` and ``random_seed``, sample i of a draw is the same
-    specimen, whatever the response: predictions of several conditions can be set against repeated
-    measurements. Where two simulators of the model have designs of their own, pass ``stored=False``.
+    With the same ``result``, inputs, ``n_samples``, ``draws`` and ``random_seed``, sample i of a
+    draw is the same specimen, whatever the response: predictions of several conditions can be set
+    against repeated measurements. Where two simulators of the model have designs of their own, pass
+    ``stored=False``.
 
     Examples
     --------
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     data = [0.0, 2.0, 4.0]
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=data)
     >>> squares = prb.predict(prb.minimize(model), np.square, x, random_seed=1)
     >>> squares.name, squares.shape, squares.attrs["responses"]
     ('square', (1, 1, 500), 1024)
@@ -117,40 +138,27 @@ def predict(
     if model is None and isinstance(result, Optimum):
         model = result.model
     model = model_on_context(model, "prb.predict")
-    label = name or str(getattr(response, "__name__", type(response).__name__))
-    if store is not None and name is None and not label.isidentifier():
-        raise ValueError(f"name: got a store for a function called {label}, expected a name to keep its responses by")
+    label = _label(response, name, store)
     points, coords = populations_of(result, model, draws, "prb.predict")
     sorted_inputs = read_inputs(label, inputs, model)
     responses = Responses(label, response, sorted_inputs, executor=executor, store=store)
     rng = np.random.default_rng(random_seed)
     node = serving(list(nodes(model).values()), responses) if stored else None
-    if node is not None:
-        design = node.design
-        assert design is not None
-        chosen = _resampled(node, [points[str(r.name)] for r in design.inputs.roots], n_samples, rng)
-        values = design.values_of(responses)[chosen]
-        specimens = [x[chosen] for x in design.points_of(sorted_inputs)]
-        source = f"{'design points' if responses.count else 'stored responses'} of {node.name}"
+    if node is None:
+        drawn = _new_responses(label, responses, points, n_samples, rng)
     else:
-        roots = [points[str(r.name)] for r in sorted_inputs.roots]
-        specimens, epistemic = _new_specimens(label, sorted_inputs, roots, n_samples, rng)
-        values, source = responses(specimens, epistemic), "new specimens"
-    bad = int(np.isnan(values).sum())
-    if bad == values.size:
-        raise ResponseError(f"{label}: got NaN at all {bad} specimens, expected numbers; +inf is a specimen that fails")
-    if bad:
-        _log.warning("%s: %d of %d predicted responses are NaN", label, bad, values.size)
+        drawn = _resampled_responses(node, responses, points, n_samples, rng)
+    missing = _count_missing(label, drawn.values)
     return xr.DataArray(
-        values.reshape(len(coords["chain"]), len(coords["draw"]), n_samples),
+        drawn.values.reshape(len(coords["chain"]), len(coords["draw"]), n_samples),
         dims=("chain", "draw", "sample"),
         coords={**coords, "sample": np.arange(n_samples)},
         name=label,
         attrs={
-            "source": source,
+            "source": drawn.source,
             "responses": responses.count,
-            "nan": bad,
-            "specimens_id": _digest(*specimens),
+            "nan": missing,
+            "specimens_id": _digest(*drawn.specimens),
             "random_seed": str(random_seed),
             **_calibration(result, model),
             **versions(),
@@ -158,92 +166,245 @@ def predict(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """Responses of specimens.
+
+    Attributes
+    ----------
+    values : ndarray, shape (k, n)
+        By population.
+    specimens : list of ndarray, shapes (k, n, *event)
+        Aleatory inputs.
+    source : str
+        How specimens were made.
+    """
+
+    values: Floats
+    specimens: list[Floats]
+    source: str
+
+
+def _label(response: Callable[..., Any], name: str | None, store: object) -> str:
+    """Return the name of the result: as given, or that of the response."""
+    label = name or str(getattr(response, "__name__", type(response).__name__))
+    if store is not None and name is None and not label.isidentifier():
+        raise ValueError(
+            f"name: got a store for a function called {label}, expected a name to keep its "
+            "responses by"
+        )
+    return label
+
+
+def _count_missing(label: str, values: Floats) -> int:
+    """Return how many responses are NaN, said in the log; raise if all are."""
+    missing = int(np.isnan(values).sum())
+    if missing == values.size:
+        raise ResponseError(
+            f"{label}: got NaN at all {missing} specimens, expected numbers; +inf is a specimen "
+            "that fails"
+        )
+    if missing:
+        _log.warning("%s: %d of %d predicted responses are NaN", label, missing, values.size)
+    return missing
+
+
 def populations_of(
     result: Any, model: pm.Model, draws: int, caller: str
 ) -> tuple[dict[str, Floats], dict[str, NDArray[Any]]]:
-    """Return values of the free variables, (k, *shape) by name, and coordinates of chain and draw."""
+    """Return the populations that a result stands for.
+
+    Parameters
+    ----------
+    result : Optimum or xarray.DataTree
+    model : pymc.Model
+    draws : int
+        Largest number of populations; draws are thinned evenly.
+    caller : str
+        For messages.
+
+    Returns
+    -------
+    points : dict of ndarray, shapes (k, *shape)
+        Values of the free variables, by name.
+    coords : dict of ndarray
+        Chain and draw.
+
+    Raises
+    ------
+    TypeError, KeyError
+        If the result is neither, or lacks a free variable.
+    """
     names = [str(rv.name) for rv in model.free_RVs]
     if isinstance(result, Optimum):
-        known: Any = result.point
-        coords = {"chain": np.arange(1), "draw": np.arange(1)}
-    elif isinstance(result, xr.DataTree) and "posterior" in result:
-        known = result["posterior"].to_dataset()
-        each = max(1, draws // known.sizes["chain"])
-        size = known.sizes["draw"]
-        known = known.isel(draw=np.unique(np.linspace(0, size - 1, min(size, each)).round().astype(int)))
-        coords = {dim: np.asarray(known[dim]) for dim in ("chain", "draw")}
-    else:
+        _refuse_incomplete(result.point, names, caller)
+        points = {n: np.asarray(result.point[n], dtype=np.float64)[None] for n in names}
+        return points, {"chain": np.arange(1), "draw": np.arange(1)}
+    if not isinstance(result, xr.DataTree) or "posterior" not in result:
         raise TypeError(
-            f"{caller}: got {type(result).__name__}, expected an Optimum from prb.minimize, or a DataTree with a "
-            "posterior group, such as prb.sample_smc returns"
+            f"{caller}: got {type(result).__name__}, expected an Optimum from prb.minimize, or a "
+            "DataTree with a posterior group, such as prb.sample_smc returns"
         )
-    missing = [n for n in names if n not in known]
+    thinned = _thinned(result["posterior"].to_dataset(), draws)
+    _refuse_incomplete(thinned, names, caller)
+    points = {}
+    for name in names:
+        values = thinned[name].transpose("chain", "draw", ...).values
+        points[name] = values.reshape(-1, *values.shape[2:])
+    return points, {dim: np.asarray(thinned[dim]) for dim in ("chain", "draw")}
+
+
+def _thinned(posterior: xr.Dataset, draws: int) -> xr.Dataset:
+    """Return at most so many draws of a posterior, over all chains, evenly spaced."""
+    size = posterior.sizes["draw"]
+    each = max(1, draws // posterior.sizes["chain"])
+    places = np.linspace(0, size - 1, min(size, each)).round()
+    return posterior.isel(draw=np.unique(places.astype(int)))
+
+
+def _refuse_incomplete(known: Any, names: list[str], caller: str) -> None:
+    """Raise if a result lacks a free variable of the model."""
+    missing = [name for name in names if name not in known]
     if missing:
-        raise KeyError(f"{caller}: got a result without {missing}, expected the model's free variables {names}")
-    if isinstance(result, Optimum):
-        return {n: np.asarray(known[n], dtype=np.float64)[None] for n in names}, coords
-    arrays = {n: known[n].transpose("chain", "draw", ...).values for n in names}
-    return {n: a.reshape(-1, *a.shape[2:]) for n, a in arrays.items()}, coords
+        raise KeyError(
+            f"{caller}: got a result without {missing}, expected the model's free variables {names}"
+        )
 
 
 def serving(among: Sequence[Node], responses: Responses) -> Node | None:
-    """Return the simulator whose design points are specimens of these inputs: best the one with this response."""
-    wanted = responses.inputs
-    able = [
-        n
-        for n in among
-        if n.bound.stored
-        and not wanted.epistemic
-        and all(any(x is y for y in n.bound.inputs.aleatory) for x in wanted.aleatory)
-    ]
-    return next((n for n in able if responses.same_as(n.bound.responses)), able[0] if able else None)
+    """Return the simulator whose design points are specimens of these inputs, if any.
+
+    Best is one with this very response.
+    """
+    able = [node for node in among if _serves(node, responses.inputs)]
+    for node in able:
+        if responses.same_as(node.bound.responses):
+            return node
+    return able[0] if able else None
 
 
-def _resampled(node: Node, roots: list[Floats], n: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Return design points of n specimens for each population, (k, n): systematic resampling, in random order."""
+def _serves(node: Node, wanted: Inputs) -> bool:
+    """Return whether a simulator has a design over all of these inputs."""
+    if not node.bound.stored or wanted.epistemic:
+        return False
+    known = node.bound.inputs.aleatory
+    return all(any(x is y for y in known) for x in wanted.aleatory)
+
+
+def _resampled_responses(
+    node: Node,
+    responses: Responses,
+    points: dict[str, Floats],
+    n: int,
+    rng: np.random.Generator,
+) -> _Drawn:
+    """Return responses of n design points for each population."""
     design = node.design
     assert design is not None
-    support = design.support(roots)
-    ess, mass = np.median(support["weight_ess"]), np.median(support["mean_weight"])
-    if not (ess >= design.required_ess / 2 and 0.7 < mass < 1.4):
-        raise DesignError(
-            f"{node.name}: got a weight effective sample size of {ess:.0f} and a mean raw weight of {mass:.2f} "
-            f"(medians over the populations), expected {design.required_ess:.0f} and 1; call prb.refine(model) and "
-            "sample again, or pass stored=False, which computes responses of new specimens"
-        )
+    roots = [points[str(rv.name)] for rv in design.inputs.roots]
+    chosen = _resampled(node.name, design, roots, n, rng)
+    values = design.values_of(responses)[chosen]
+    specimens = [x[chosen] for x in design.points_of(responses.inputs)]
+    what = "design points" if responses.count else "stored responses"
+    return _Drawn(values, specimens, f"{what} of {node.name}")
+
+
+def _resampled(
+    name: str, design: Design, roots: list[Floats], n: int, rng: np.random.Generator
+) -> NDArray[np.intp]:
+    """Return design points of n specimens for each population, shape (k, n), in random order.
+
+    Systematic resampling: as many of each point as its weight says, but for one.
+    """
+    _refuse_unsupported(name, design, roots)
     _, weights = design.populations(roots)
-    cumulative = np.cumsum(np.nan_to_num(weights), axis=1)
-    cumulative /= np.maximum(cumulative[:, -1:], 1e-300)
     places = (np.arange(n) + rng.random((len(weights), 1))) / n
-    found = np.array([np.searchsorted(c, u) for c, u in zip(cumulative, places, strict=True)])
-    return rng.permuted(np.minimum(found, design.n_points - 1), axis=1)
+    found = reached(np.nan_to_num(weights), places, normalized=True)
+    return rng.permuted(found, axis=1)
+
+
+def _refuse_unsupported(name: str, design: Design, roots: list[Floats]) -> None:
+    """Raise if the design does not support most of the populations."""
+    support = design.support(roots)
+    ess = np.median(support["weight_ess"])
+    mass = np.median(support["mean_weight"])
+    low, high = _MASS
+    if ess >= _LEAST_ESS * design.required_ess and low < mass < high:
+        return
+    raise DesignError(
+        f"{name}: got a weight effective sample size of {ess:.0f} and a mean raw weight of "
+        f"{mass:.2f} (medians over the populations), expected {design.required_ess:.0f} and 1; "
+        "call prb.refine(model) and sample again, or pass stored=False, which computes responses "
+        "of new specimens"
+    )
+
+
+def _new_responses(
+    label: str,
+    responses: Responses,
+    points: dict[str, Floats],
+    n: int,
+    rng: np.random.Generator,
+) -> _Drawn:
+    """Return responses of n new specimens from each population."""
+    inputs = responses.inputs
+    roots = [points[str(rv.name)] for rv in inputs.roots]
+    specimens, epistemic = _new_specimens(label, inputs, roots, n, rng)
+    values = responses(specimens, epistemic)
+    return _Drawn(values, specimens, "new specimens")
 
 
 def _new_specimens(
     label: str, inputs: Inputs, roots: list[Floats], n: int, rng: np.random.Generator
 ) -> tuple[list[Floats], list[Floats]]:
-    """Return aleatory values, shapes (k, n, *event), and epistemic ones that broadcast against them."""
+    """Return aleatory values, shapes (k, n, *event), and epistemic ones that broadcast."""
     symbols = inputs.placeholders()
+    uniforms = [pt.tensor(dtype="float64", shape=(None, *s)) for s in inputs.event_shapes]
     try:
-        if inputs.nested:
-            raise TypeError("no inverse of a conditional distribution")
-        dists, epistemic = inputs.rebuilt(symbols)
-        uniforms = [pt.tensor(dtype="float64", shape=(None, *s)) for s in inputs.event_shapes]
-        placed = [quantiles(label, d, u) for d, u in zip(dists, uniforms, strict=True)]
+        placed, epistemic = _through_inverses(label, inputs, symbols, uniforms)
     except TypeError:
         return PopulationSampler(inputs)(roots, n, rng)
+
+    # Sobol points in random order, with another shift for each draw.
     _, base = base_points(inputs, n, int(rng.integers(2**31)))
     order = rng.permutation(n)
-    shifted = [(b[order] + rng.random((len(roots[0]), 1, *b.shape[1:]))) % 1 for b in base]
+    k = len(roots[0])
+    shifted = []
+    for points in base:
+        shift = rng.random((k, 1, *points.shape[1:]))
+        # Inverse distribution functions are infinite at 0 and 1.
+        shifted.append(np.clip((points[order] + shift) % 1, _EDGE, 1 - _EDGE))
     function = compile_batched([*symbols, *uniforms], [*placed, *epistemic])
-    values = function(*roots, *(np.clip(u, 1e-12, 1 - 1e-12) for u in shifted))
-    return values[: len(placed)], [v[:, None] for v in values[len(placed) :]]
+    values = function(*roots, *shifted)
+    aleatory = values[: len(placed)]
+    return aleatory, [v[:, None] for v in values[len(placed) :]]
+
+
+def _through_inverses(
+    label: str, inputs: Inputs, symbols: list[Any], uniforms: list[Any]
+) -> tuple[list[Any], list[Any]]:
+    """Return aleatory inputs as inverse distribution functions of uniforms, and epistemic ones.
+
+    Raises
+    ------
+    TypeError
+        If a distribution has no inverse, or depends on another one.
+    """
+    if inputs.nested:
+        raise TypeError("no inverse of a conditional distribution")
+    dists, epistemic = inputs.rebuilt(symbols)
+    placed = [quantiles(label, d, u) for d, u in zip(dists, uniforms, strict=True)]
+    return placed, epistemic
 
 
 def specimen_names(labels: ArrayLike) -> list[str]:
     """Return labels as text, the same for 3 and 3.0."""
-    plain = np.asarray(labels).tolist()
-    return [str(int(x)) if isinstance(x, float) and x.is_integer() else str(x) for x in plain]
+    names = []
+    for label in np.asarray(labels).tolist():
+        if isinstance(label, float) and label.is_integer():
+            label = int(label)
+        names.append(str(label))
+    return names
 
 
 def data_digest(observed: Floats) -> str:
@@ -252,6 +413,7 @@ def data_digest(observed: Floats) -> str:
 
 
 def _digest(*arrays: Floats) -> str:
+    """Return 16 hexadecimal digits of the bytes of arrays."""
     found = hashlib.sha256()
     for array in arrays:
         found.update(np.ascontiguousarray(array, dtype=np.float64).tobytes())
@@ -260,14 +422,24 @@ def _digest(*arrays: Floats) -> str:
 
 def _calibration(result: Optimum | xr.DataTree, model: pm.Model) -> dict[str, list[str]]:
     """Return attributes that tell on what data the result was calibrated."""
-    simulators = result.evaluator.nodes if isinstance(result, Optimum) else list(nodes(model).values())
+    is_optimum = isinstance(result, Optimum)
+    simulators = result.evaluator.nodes if is_optimum else list(nodes(model).values())
+    # As a set that keeps its order.
     labels: dict[str, None] = {}
     digests = []
     for node in simulators:
-        data = node.target.observed
-        if isinstance(result, xr.DataTree) and "observed_data" in result and node.name in result["observed_data"]:
-            data = np.asarray(result["observed_data"][node.name])
-        digests.append(data_digest(data))
-        labels |= dict.fromkeys([] if node.specimens is None else specimen_names(node.specimens))
+        digests.append(data_digest(_calibration_data(result, node)))
+        if node.specimens is not None:
+            labels |= dict.fromkeys(specimen_names(node.specimens))
     found = {"calibration_data": digests, "calibration_specimens": list(labels)}
+    # netCDF has no empty lists.
     return {key: value for key, value in found.items() if value}
+
+
+def _calibration_data(result: Optimum | xr.DataTree, node: Node) -> Floats:
+    """Return what a simulator was calibrated on: the result's own data where it has them."""
+    if isinstance(result, xr.DataTree) and "observed_data" in result:
+        kept = result["observed_data"]
+        if node.name in kept:
+            return np.asarray(kept[node.name])
+    return node.target.observed

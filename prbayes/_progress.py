@@ -11,15 +11,26 @@ from importlib.util import find_spec
 
 from rich.console import Console
 from rich.errors import LiveError
-from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 _log = logging.getLogger("prbayes")
-_SHOWN_FROM = 2.0  # expected seconds from which there is a bar
+
+# Expected seconds from which there is a bar. By judgement: as long as one waits without wondering.
+_SHOWN_FROM = 2.0
 
 
 def _console() -> Console:
-    """Return a console on stderr, that of a notebook only where rich finds its widgets: it warns without them."""
-    return Console(stderr=True, force_jupyter=None if find_spec("ipywidgets") else False)
+    """Return a console on stderr; one of a notebook only with widgets, without which rich warns."""
+    as_rich_finds = None
+    has_widgets = find_spec("ipywidgets") is not None
+    return Console(stderr=True, force_jupyter=as_rich_finds if has_widgets else False)
 
 
 CONSOLE = _console()  # one for all, so that a bar inside another is drawn below it
@@ -29,7 +40,7 @@ _hidden: ContextVar[bool] = ContextVar("hidden", default=False)
 
 @contextmanager
 def shown(visible: bool) -> Iterator[bool]:
-    """Show no bars inside unless ``visible``, nor where an outer call shows none; gives which of the two it is."""
+    """Show bars inside only if ``visible`` here and in all outer calls; gives whether they show."""
     token = _hidden.set(_hidden.get() or not visible)
     try:
         yield not _hidden.get()
@@ -39,31 +50,62 @@ def shown(visible: bool) -> Iterator[bool]:
 
 @contextmanager
 def progress(what: str, total: int | None = None) -> Iterator[Callable[[int, str], None]]:
-    """Give a function (done, note) to be called as work gets done; the bar appears when two seconds are expected.
+    """Give a function (done, note) to be called as work gets done; only long work shows a bar.
 
-    Without a total nothing is known of what is left, and the bar appears when two seconds have passed.
+    The bar appears when two seconds are expected. Without a total nothing is known of what is left,
+    and it appears when two seconds have passed.
+
+    Parameters
+    ----------
+    what : str
+        Stands before the bar.
+    total : int, optional
+        How much work there is, in the units of ``done``.
     """
-    columns: list[ProgressColumn] = [TextColumn(what), BarColumn()]
-    columns += [TextColumn("{task.completed}" if total is None else "{task.completed}/{task.total}")]
-    columns += [TextColumn("{task.fields[note]}"), TimeElapsedColumn() if total is None else TimeRemainingColumn()]
-    bar = Progress(*columns, console=CONSOLE)
+    bar = Progress(*_columns(what, total), console=CONSOLE)
     task = bar.add_task("", total=total, note="")
-    clock, completed, started = time.perf_counter(), 0, _hidden.get()
+    clock = time.perf_counter()
+    completed = 0
+    settled = _hidden.get()  # whether there is a bar, or never will be
 
     def advance(done: int, note: str) -> None:
-        nonlocal completed, started
+        nonlocal completed, settled
         completed += done
         bar.update(task, advance=done, note=note)
         elapsed = time.perf_counter() - clock
-        if not started and (elapsed if total is None else elapsed * (total / max(completed, 1) - 1)) > _SHOWN_FROM:
-            started = True
-            try:
-                bar.start()
-            except LiveError:  # there is one already, and this version of rich draws one at a time
-                _log.debug("%s: no second progress bar", what)
+        if not settled and _expected(elapsed, completed, total) > _SHOWN_FROM:
+            settled = True
+            _start(bar, what)
 
     try:
         yield advance
     finally:
         if bar.live.is_started:  # else a line would be printed where there is no terminal
             bar.stop()
+
+
+def _columns(what: str, total: int | None) -> list[ProgressColumn]:
+    """Return what stands beside each other in a bar's line."""
+    name = TextColumn(what)
+    note = TextColumn("{task.fields[note]}")
+    if total is None:
+        done = TextColumn("{task.completed}")
+        return [name, BarColumn(), done, note, TimeElapsedColumn()]
+    done = TextColumn("{task.completed}/{task.total}")
+    return [name, BarColumn(), done, note, TimeRemainingColumn()]
+
+
+def _expected(elapsed: float, completed: int, total: int | None) -> float:
+    """Return the seconds that are left at the pace so far; those passed without a total."""
+    if total is None:
+        return elapsed
+    left = total / max(completed, 1) - 1
+    return elapsed * left
+
+
+def _start(bar: Progress, what: str) -> None:
+    """Show a bar, unless there is one already and this version of rich draws one at a time."""
+    try:
+        bar.start()
+    except LiveError:
+        _log.debug("%s: no second progress bar", what)

@@ -48,11 +48,17 @@ def test_booleans_count_as_zero_and_one() -> None:
 
 NOT_REAL = {
     "complex": ([1 + 2j, 0], "got complex numbers, expected real ones"),
-    "complex in objects": (np.array([1j, "a"], dtype=object), "array of dtype object, expected real numbers"),
+    "complex in objects": (
+        np.array([1j, "a"], dtype=object),
+        "array of dtype object, expected real numbers",
+    ),
     "strings": (["1.0", "two"], "got an array of dtype <U3, expected real numbers"),
     "one string": ("strength", "got str 'strength', expected real numbers"),
     "bytes": (b"12", "got bytes b'12', expected real numbers"),
-    "dates": (np.array(["2024-01-01"], dtype="datetime64[D]"), r"dtype datetime64\[D\], expected real"),
+    "dates": (
+        np.array(["2024-01-01"], dtype="datetime64[D]"),
+        r"dtype datetime64\[D\], expected real",
+    ),
     "durations": (np.array([1], dtype="timedelta64[s]"), r"dtype timedelta64\[s\], expected real"),
     "dictionary": ({"a": 1.0}, "got dict .*expected real numbers"),
     "ragged": ([[1.0, 2.0], [3.0]], "got a ragged sequence, expected a regular array"),
@@ -61,7 +67,8 @@ NOT_REAL = {
 
 @pytest.mark.parametrize("case", sorted(NOT_REAL))
 @pytest.mark.parametrize(
-    "check", [real_array, observed_sample, simulated_sample, lambda v, name: sample_weights(v, 2, name)]
+    "check",
+    [real_array, observed_sample, simulated_sample, lambda v, name: sample_weights(v, 2, name)],
 )
 def test_what_is_not_real_is_a_type_error_with_name(check: Callable[..., Any], case: str) -> None:
     values, match = NOT_REAL[case]
@@ -70,7 +77,9 @@ def test_what_is_not_real_is_a_type_error_with_name(check: Callable[..., Any], c
 
 
 def test_missing_values_in_a_list_are_not_taken_for_numbers() -> None:
-    with pytest.raises(ValueError, match=r"observed: got 1 NaN or infinite among 3 values.*leave missing"):
+    with pytest.raises(
+        ValueError, match=r"observed: got 1 NaN or infinite among 3 values.*leave missing"
+    ):
         observed_sample([1.0, None, 2.0])
     with pytest.raises(ValueError, match="simulated: got NaN or -inf"):
         simulated_sample([1.0, None])
@@ -87,7 +96,10 @@ def test_missing_values_in_a_list_are_not_taken_for_numbers() -> None:
         ([], "got no values, expected at least 1"),
         (np.ones((0, 2)), r"shape \(0, 2\)"),
         ([1.0, NAN, 2.0], "got 1 NaN or infinite among 3 values"),
-        ([INF, -INF, 2.0, NAN], "got 3 NaN or infinite among 4 values.*leave missing specimens out"),
+        (
+            [INF, -INF, 2.0, NAN],
+            "got 3 NaN or infinite among 4 values.*leave missing specimens out",
+        ),
     ],
 )
 def test_observed_values_are_one_dimensional_and_finite(values: Any, match: str) -> None:
@@ -126,7 +138,9 @@ def test_simulated_values_need_a_last_axis_without_nan(values: Any, match: str) 
 
 @pytest.mark.parametrize("shape", [(5,), (2, 5), (2, 3, 5)])
 @pytest.mark.parametrize("factor", [1e-200, 1.0, 3, 1e200])
-def test_weights_sum_to_one_along_the_last_axis_in_proportion(shape: tuple[int, ...], factor: float) -> None:
+def test_weights_sum_to_one_along_the_last_axis_in_proportion(
+    shape: tuple[int, ...], factor: float
+) -> None:
     raw = np.random.default_rng(2).integers(0, 9, shape) + np.eye(5)[0]
     weights = sample_weights(factor * raw, 5)
     np.testing.assert_allclose(weights.sum(axis=-1), 1.0, rtol=1e-14)
@@ -167,13 +181,17 @@ def test_positive_number_gives_a_float(value: Any) -> None:
 
 @pytest.mark.parametrize("value", [0, 0.0, -1, -1e-300, NAN, INF, np.float64(-2)])
 def test_positive_number_refuses(value: Any) -> None:
-    with pytest.raises(ValueError, match=f"^h: got {re.escape(repr(value))}, expected a positive finite"):
+    with pytest.raises(
+        ValueError, match=f"^h: got {re.escape(repr(value))}, expected a positive finite"
+    ):
         positive_number(value, "h")
 
 
 @pytest.mark.parametrize("value", ["1", None, True, 1j, [1.0], np.ones(1), np.True_])
 def test_positive_number_refuses_other_types(value: Any) -> None:
-    with pytest.raises(TypeError, match=f"^h: got {type(value).__name__} .*expected a positive number"):
+    with pytest.raises(
+        TypeError, match=f"^h: got {type(value).__name__} .*expected a positive number"
+    ):
         positive_number(value, "h")
 
 
@@ -181,11 +199,15 @@ def test_positive_integer_has_a_minimum() -> None:
     assert positive_integer(1, "bins") == 1
     assert type(positive_integer(np.int32(7), "bins", minimum=7)) is int
     for value, minimum in ((0, 1), (-3, 1), (6, 7)):
-        with pytest.raises(ValueError, match=f"^bins: got {value}, expected an integer >= {minimum}"):
+        with pytest.raises(
+            ValueError, match=f"^bins: got {value}, expected an integer >= {minimum}"
+        ):
             positive_integer(value, "bins", minimum=minimum)
 
 
 @pytest.mark.parametrize("value", [2.0, "2", None, True, np.float64(2)])
 def test_positive_integer_refuses_other_types(value: Any) -> None:
-    with pytest.raises(TypeError, match=f"^bins: got {type(value).__name__} .*expected an integer >= 1"):
+    with pytest.raises(
+        TypeError, match=f"^bins: got {type(value).__name__} .*expected an integer >= 1"
+    ):
         positive_integer(value, "bins")

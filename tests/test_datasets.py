@@ -31,7 +31,9 @@ def test_shape_dims_and_coordinates(crack):
 def test_every_csv_row_stands_at_its_specimen_and_cycle(crack, rows):
     assert int(crack.crack_length_inch.notnull().sum()) == len(rows)
     for row in rows:
-        cell = crack.crack_length_inch.sel(specimen=int(row["specimen"]), million_cycles=float(row["million_cycles"]))
+        cell = crack.crack_length_inch.sel(
+            specimen=int(row["specimen"]), million_cycles=float(row["million_cycles"])
+        )
         assert float(cell) == float(row["crack_length_inch"])
 
 

@@ -1,5 +1,6 @@
 """Diagnostics of a sampler's result: sentences, silence, and what ArviZ draws of our trees."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,10 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from arviz_stats import rhat
 
 import prbayes as prb
+from prbayes._diagnose import _NOISE
 from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
@@ -40,7 +43,9 @@ def sampled() -> tuple[pm.Model, xr.DataTree]:
 @cache
 def stuck() -> xr.DataTree:
     """Classic ABC with an epsilon that hardly any simulated sample meets."""
-    return prb.sample_smc(300, chains=2, model=build(prb.Fresh(40)), epsilon=0.002, random_seed=1, progressbar=False)
+    return prb.sample_smc(
+        300, chains=2, model=build(prb.Fresh(40)), epsilon=0.002, random_seed=1, progressbar=False
+    )
 
 
 def normal_tree(means: Any, draws: int = 500) -> xr.DataTree:
@@ -50,10 +55,12 @@ def normal_tree(means: Any, draws: int = 500) -> xr.DataTree:
         "mu": 1 + 0.05 * (rng.normal(size=(len(means), draws)) + np.array(means)[:, None]),
         "sigma": rng.uniform(0.45, 0.55, (len(means), draws)),
     }
-    return xr.DataTree.from_dict({"posterior": xr.Dataset({k: (("chain", "draw"), v) for k, v in values.items()})})
+    return xr.DataTree.from_dict(
+        {"posterior": xr.Dataset({k: (("chain", "draw"), v) for k, v in values.items()})}
+    )
 
 
-# -- sentences -------------------------------------------------------------------------------------------
+# -- sentences -------------------------------------------------------------------------------
 
 
 def test_silent_when_nothing_is_wrong(tmp_path: Path) -> None:
@@ -80,7 +87,9 @@ def test_without_a_model_the_sampler_s_own_numbers_serve() -> None:
     thin = idata.copy(deep=True)
     thin["calibration"]["weight_ess"][:] = 3.0
     (message,) = prb.diagnose(thin).messages
-    assert message.startswith("y: the design does not support the answer: weight effective sample size 3 (5% quantile)")
+    assert message.startswith(
+        "y: the design does not support the answer: weight effective sample size 3 (5% quantile)"
+    )
 
 
 def test_chains_that_disagree() -> None:
@@ -102,7 +111,9 @@ def test_few_independent_draws() -> None:
     for i in range(1, 500):
         walk[:, i] = 0.97 * walk[:, i - 1] + np.sqrt(1 - 0.97**2) * walk[:, i]
     tree["posterior"]["mu"].values[:] = 1 + 0.05 * walk
-    assert "for mu of 1000 draws: too few for means and intervals" in str(prb.diagnose(tree, model=model))
+    assert "for mu of 1000 draws: too few for means and intervals" in str(
+        prb.diagnose(tree, model=model)
+    )
 
 
 def test_particles_that_stick() -> None:
@@ -126,7 +137,62 @@ def test_one_chain_and_hardly_any_draws_raise_nothing() -> None:
     assert prb.diagnose(prb.bootstrap(prb.minimize(model), draws=100), model=model).ok
 
 
-# -- numbers that reach the user --------------------------------------------------------------------------
+def test_independent_draws_are_almost_never_called_dependent() -> None:
+    """What `_NOISE` rests on: R-hat of independent draws exceeds the limit once in a thousand."""
+    rng = np.random.default_rng(0)
+    x = xr.Dataset({"x": (["chain", "draw", "set"], rng.normal(size=(4, 50, 2000)))})
+    excess = 200 * (rhat(x)["x"].values - 1)
+    # Two of the 2000 sets are expected; four standard errors more are eight.
+    assert (excess > _NOISE).sum() <= 8
+    assert (excess > _NOISE / 2).sum() >= 30, "a limit of half of it would cry wolf"
+
+
+def test_a_stored_optimum_tells_what_the_optimum_does() -> None:
+    model, _ = sampled()
+    optimum = prb.minimize(model)
+    assert prb.diagnose(optimum).ok
+    assert prb.diagnose(optimum.to_datatree()).ok
+    lost = replace(optimum, converged=False, message="stopped", warnings=("it is flat", "so so"))
+    memory, stored = prb.diagnose(lost), prb.diagnose(lost.to_datatree())
+    assert memory.messages == stored.messages
+    assert memory.messages[:2] == ("It is flat.", "So so.")
+    assert "did not converge (stopped); try another start or method." in memory.messages[2]
+    assert memory.support.sizes == {"simulator": 1, "sample": 1}
+
+
+def test_an_edge_is_said_once() -> None:
+    model, _ = sampled()
+    edge = replace(
+        prb.minimize(model), converged=False, at_edge=("mu",), warnings=("mu ran to the edge",)
+    )
+    assert prb.diagnose(edge).messages == ("Mu ran to the edge.",)
+
+
+def test_the_support_is_judged_by_simulator() -> None:
+    idata = sampled()[1].copy(deep=True)
+    calibration = idata["calibration"].to_dataset()
+    other = calibration.assign_coords(simulator=["other"])
+    both = xr.concat([calibration, other], "simulator", data_vars="minimal")
+    both["weight_ess"].loc[{"simulator": "other"}] = 3.0
+    idata["calibration"] = both
+    (message,) = prb.diagnose(idata).messages
+    assert message.startswith("other: the design does not support the answer")
+    none = both.assign(required_ess=("simulator", [np.nan, np.nan]))
+    idata["calibration"] = none
+    found = prb.diagnose(idata)
+    assert found.ok
+    assert found.support.sizes["simulator"] == 0
+
+
+def test_a_posterior_without_a_free_variable_is_refused() -> None:
+    model, _ = sampled()
+    tree = normal_tree([0, 0])
+    del tree["posterior"]["sigma"]
+    with pytest.raises(KeyError, match=r"got no \['sigma'\]"):
+        prb.diagnose(tree, model=model)
+
+
+# -- numbers that reach the user -------------------------------------------------------------
 
 
 def test_acceptance_and_beta_of_each_stage() -> None:
@@ -139,7 +205,7 @@ def test_acceptance_and_beta_of_each_stage() -> None:
 
 
 def test_the_evidence_is_a_plain_number_with_its_spread() -> None:
-    """For a likelihood known in closed form: one normal mean, exp(-d / epsilon) integrated on a grid."""
+    """It is that of exp(-d / epsilon), averaged over draws from the prior."""
     model, idata = sampled()
     attrs = idata["posterior"].attrs
     by_chain = idata["sample_stats"]["log_marginal_likelihood"].max("stage").values
@@ -149,7 +215,10 @@ def test_the_evidence_is_a_plain_number_with_its_spread() -> None:
     thetas = evaluator.prior_thetas(20_000, seed=9)
     logs = -evaluator(thetas).discrepancies[:, 0] / float(idata["calibration"]["epsilon"][0])
     likelihood = np.exp(logs)
-    exact, error = np.log(likelihood.mean()), likelihood.std() / likelihood.mean() / np.sqrt(likelihood.size)
+    exact, error = (
+        np.log(likelihood.mean()),
+        likelihood.std() / likelihood.mean() / np.sqrt(likelihood.size),
+    )
     spread = attrs["log_marginal_likelihood_sd"] / np.sqrt(4)
     assert attrs["log_marginal_likelihood"] == pytest.approx(exact, abs=4 * (error + spread) + 0.02)
     assert 0 < attrs["log_marginal_likelihood_sd"] < 0.3
@@ -163,7 +232,8 @@ def test_monte_carlo_error_of_the_discrepancy_of_fresh_responses() -> None:
     values = [float(evaluator(theta).discrepancies[0, 0]) for _ in range(100)]
     roots = evaluator.roots(theta, 0)
     errors = [evaluator.nodes[0].bound.discrepancy_error(roots) for _ in range(50)]
-    # Standard errors: 7% of the spread, about 5% of the mean of the errors; the jackknife's own bias is of order 1/8.
+    # Standard errors: 7% of the spread, about 5% of the mean of the errors; the jackknife's own
+    # bias is of order 1/8.
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(values, ddof=1), rel=0.45)
 
 
@@ -181,7 +251,9 @@ def test_monte_carlo_error_of_common_points_is_a_bound(propagation: Any) -> None
 
 
 def test_monte_carlo_error_of_a_function_that_takes_no_weights_and_of_few_points() -> None:
-    metric = prb.FunctionMetric(lambda simulated, observed: np.abs(simulated.mean(axis=-1) - observed.mean()))
+    metric = prb.FunctionMetric(
+        lambda simulated, observed: np.abs(simulated.mean(axis=-1) - observed.mean())
+    )
     for n in (60, 8):
         evaluator = Evaluator(build(prb.Fresh(n), metric))
         theta = evaluator.unconstrained({"mu": 3.0, "sigma": 0.5})[None]
@@ -192,12 +264,16 @@ def test_monte_carlo_error_of_a_function_that_takes_no_weights_and_of_few_points
 
 def test_the_monte_carlo_error_is_kept_with_the_draws() -> None:
     _, idata = sampled()
-    assert 0 < float(idata["calibration"]["discrepancy_error"][0]) < 0.2 * float(idata["calibration"]["epsilon"][0])
+    assert (
+        0
+        < float(idata["calibration"]["discrepancy_error"][0])
+        < 0.2 * float(idata["calibration"]["epsilon"][0])
+    )
     noisy = stuck()["calibration"]
     assert float(noisy["discrepancy_error"][0]) > 3 * float(noisy["epsilon"][0])
 
 
-# -- ArviZ -----------------------------------------------------------------------------------------------
+# -- ArviZ -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("plot", ["plot_rank", "plot_trace", "plot_ess", "plot_forest"])
@@ -217,10 +293,17 @@ def test_arviz_summary_has_r_hat_and_ess() -> None:
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_loo_speaks_of_one_observation() -> None:
-    """What the docs warn of: a discrepancy is one value per draw, and `az.loo` does not refuse it."""
+    """A discrepancy is one value per draw, as the docs warn, and `az.loo` does not refuse it."""
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
-        prb.Simulator("y", same, x, metric=prb.KullbackLeibler(), observed=OBSERVED, propagation=prb.Reweighted(256))
+        prb.Simulator(
+            "y",
+            same,
+            x,
+            metric=prb.KullbackLeibler(),
+            observed=OBSERVED,
+            propagation=prb.Reweighted(256),
+        )
     idata = prb.sample_smc(100, chains=2, model=model, random_seed=1, progressbar=False)
     pm.compute_log_likelihood(idata, model=model, progressbar=False)
     assert idata["log_likelihood"]["y"].shape == (2, 100)

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pymc as pm
@@ -30,16 +31,22 @@ def _logging() -> Iterator[None]:
 def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "prbayes", *arguments]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
-    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd, env=environment)
+    return subprocess.run(
+        command, capture_output=True, text=True, check=False, cwd=cwd, env=environment
+    )
 
 
 @cache
 def results() -> dict[str, xr.DataTree | xr.Dataset]:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-        prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0, 4.0, 5.0])
+        prb.Simulator(
+            "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0, 4.0, 5.0]
+        )
     optimum = prb.minimize(model)
-    posterior = prb.sample_smc(100, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False)
+    posterior = prb.sample_smc(
+        100, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False
+    )
     later = prb.predict(posterior, lambda x: 2 * x, x, model=model, random_seed=1)
     test = prb.area_test(np.array([1.0, 2.0, 3.0]), later, null=prb.PosteriorNull(199))
     return {"p.nc": posterior, "o.nc": optimum.to_datatree(), "v.nc": test.to_dataset()}
@@ -54,11 +61,22 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_report_of_saved_results(folder: Path) -> None:
-    done = run("report", "p.nc", "o.nc", "v.nc", "--title", "A < B", "--date", "2 May", "--out", "r.html", cwd=folder)
+    files = ("p.nc", "o.nc", "v.nc")
+    options = ("--title", "A < B", "--date", "2 May", "--out", "r.html", "--no-pictures")
+    done = run("report", *files, *options, cwd=folder)
     assert (done.returncode, done.stdout, done.stderr) == (0, "r.html\n", "")
     text = (folder / "r.html").read_text(encoding="utf-8")
     assert "<h1>A &lt; B</h1>" in text
-    for title in ("Model", "Data", "Optimum", "Posterior", "Comparison", "Diagnostics", "Validity", "Cost and origin"):
+    for title in (
+        "Model",
+        "Data",
+        "Optimum",
+        "Posterior",
+        "Comparison",
+        "Diagnostics",
+        "Validity",
+        "Cost and origin",
+    ):
         assert f">{title}</h2>" in text
     draws = results()["p.nc"]["posterior"]["mu"].values
     assert f"mu = {draws.mean():.2f} ± {draws.std(ddof=1):.2f}" in text
@@ -78,7 +96,9 @@ def test_several_posteriors_are_compared_by_the_names_of_their_files(folder: Pat
     (folder / "b").mkdir()
     for name in ("q.nc", "b/p.nc"):
         (folder / name).write_bytes((folder / "p.nc").read_bytes())
-    assert main(["report", "p.nc", "q.nc", "b/p.nc", "p.nc", "--no-pictures", "--markdown", "md"]) == 0
+    assert (
+        main(["report", "p.nc", "q.nc", "b/p.nc", "p.nc", "--no-pictures", "--markdown", "md"]) == 0
+    )
     text = (folder / "md" / "report.md").read_text(encoding="utf-8")
     other = Path("b", "p.nc")
     for label in ("p.nc", "q", str(other)):
@@ -94,15 +114,23 @@ def test_a_saved_validity_test_comes_back_whole(folder: Path) -> None:
     assert found.attrs["null"] == results()["v.nc"].attrs["null"]
 
 
-def test_mistakes_get_one_line_and_exit_code_2(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_get_one_line_and_exit_code_2(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (folder / "text.nc").write_text("no netCDF")
     (folder / "empty.nc").write_bytes(b"")
     (folder / "cut.nc").write_bytes((folder / "p.nc").read_bytes()[:5000])
     xr.Dataset({"a": 1.0}).to_netcdf(folder / "other.nc", engine="h5netcdf")
     xr.Dataset({"u": 1.0}).to_netcdf(folder / "u.nc", engine="h5netcdf")
-    xr.DataTree.from_dict({"posterior": xr.Dataset({"mu": 1.0})}).to_netcdf(folder / "nodims.nc", engine="h5netcdf")
-    stranger = xr.Dataset({"nu": (("chain", "draw"), np.random.default_rng(1).normal(size=(2, 50)))})
-    xr.DataTree.from_dict({"posterior": stranger}).to_netcdf(folder / "stranger.nc", engine="h5netcdf")
+    xr.DataTree.from_dict({"posterior": xr.Dataset({"mu": 1.0})}).to_netcdf(
+        folder / "nodims.nc", engine="h5netcdf"
+    )
+    stranger = xr.Dataset(
+        {"nu": (("chain", "draw"), np.random.default_rng(1).normal(size=(2, 50)))}
+    )
+    xr.DataTree.from_dict({"posterior": stranger}).to_netcdf(
+        folder / "stranger.nc", engine="h5netcdf"
+    )
     cases = [
         (["missing.nc"], "missing.nc: there is no such file"),
         (["."], "there is no such file"),
@@ -149,21 +177,48 @@ def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
             main(arguments)
         assert stop.value.code == 0
         assert expected in capsys.readouterr().out
-    for arguments in ([], ["report"], ["demo", "--draws", "3"], ["demo", "--draws", "many"], ["nothing"]):
+    for arguments in (
+        [],
+        ["report"],
+        ["demo", "--draws", "3"],
+        ["demo", "--draws", "many"],
+        ["nothing"],
+    ):
         with pytest.raises(SystemExit) as stop:
             main(arguments)
         assert stop.value.code == 2
         assert "usage:" in capsys.readouterr().err
 
 
-def test_demo(tmp_path: Path) -> None:
-    done = run("demo", "--out", "here", "--draws", "50", "--chains", "2", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    names = ["results.nc", "optimum.nc", "validity.nc", "report.html"]
-    assert done.stdout.splitlines() == [str(Path("here", n)) for n in names]
-    assert "prbayes: writing the report" in done.stderr
-    text = (tmp_path / "here" / "report.html").read_text(encoding="utf-8")
-    for title in ("Model", "Data", "Optimum", "Posterior", "Comparison", "Diagnostics", "Validity"):
-        assert f">{title}</h2>" in text
-    again = run("report", *(f"here/{n}" for n in names[:3]), "--quiet", cwd=tmp_path)
-    assert (again.returncode, again.stdout) == (0, "report.html\n")
+def test_demo(folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+    """What it does is in test_demo.py; here, what it is asked for."""
+    asked = []
+
+    def run_demo(out: Path, **keywords: int) -> list[Path]:
+        asked.append((out, keywords))
+        return [out / "results.nc", out / "report.html"]
+
+    monkeypatch.setattr("prbayes.__main__.run_demo", run_demo)
+    assert main(["demo", "--out", "here", "--draws", "50", "--chains", "2", "--seed", "3"]) == 0
+    assert main(["demo", "--quiet"]) == 0
+    first, second = asked
+    assert first == (Path("here"), {"draws": 50, "chains": 2, "seed": 3})
+    assert second == (Path("prbayes-demo"), {"draws": 1000, "chains": 4, "seed": 1})
+    assert (folder / "here").is_dir()
+    written = capsys.readouterr().out.splitlines()
+    assert written[:2] == [str(Path("here", n)) for n in ("results.nc", "report.html")]
+
+
+@pytest.mark.parametrize(("options", "level"), [([], logging.INFO), (["-q"], logging.WARNING)])
+def test_what_is_logged_goes_to_stderr(
+    options: list[str], level: int, monkeypatch: Any, tmp_path: Path, capsys: Any
+) -> None:
+    def run_demo(out: Path, **_: int) -> list[Path]:
+        logging.getLogger("prbayes").info("sampling")
+        return []
+
+    monkeypatch.setattr("prbayes.__main__.run_demo", run_demo)
+    assert main(["demo", "--out", str(tmp_path), *options]) == 0
+    assert logging.getLogger("prbayes").level == level
+    out, err = capsys.readouterr()
+    assert (out, err) == ("", "" if options else "prbayes: sampling\n")

@@ -1,4 +1,4 @@
-"""Responses of the calibrated population: what is drawn, which responses are computed, whose specimens they are."""
+"""Responses of the calibrated population: what is drawn and computed, and whose specimens."""
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -13,6 +13,8 @@ from scipy.special import ndtri
 
 import prbayes as prb
 from prbayes.model.simulator import nodes
+from prbayes.model.support import DesignError
+from prbayes.response.calling import ResponseError
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 MEANS = np.array([[0.8, 1.0, 1.1], [0.9, 1.0, 1.2]])  # of two chains with three draws
@@ -37,7 +39,10 @@ class Counted:
 
 def tree(**values: Any) -> xr.DataTree:
     """A posterior as any sampler gives it."""
-    arrays = {n: (["chain", "draw", *(f"{n}_{i}" for i in range(np.ndim(v) - 2))], v) for n, v in values.items()}
+    arrays = {
+        n: (["chain", "draw", *(f"{n}_{i}" for i in range(np.ndim(v) - 2))], v)
+        for n, v in values.items()
+    }
     return xr.DataTree.from_dict({"posterior": xr.Dataset(arrays)})
 
 
@@ -64,19 +69,24 @@ def optimum() -> prb.Optimum:
     return prb.minimize(plain()[0])
 
 
-# -- one population per draw -----------------------------------------------------------------------------
+# One population per draw
 
 
 @pytest.mark.parametrize("stored", [True, False])
 def test_each_draw_is_a_population_of_its_own(stored: bool) -> None:
     model, x = plain()
-    found = prb.predict(POSTERIOR, same, x, model=model, n_samples=400, stored=stored, random_seed=1)
+    found = prb.predict(
+        POSTERIOR, same, x, model=model, n_samples=400, stored=stored, random_seed=1
+    )
     assert found.dims == ("chain", "draw", "sample")
     assert found.shape == (2, 3, 400)
     assert found.name == "same"
     exact = MEANS[..., None] + 0.5 * ndtri(LEVELS)
-    # Points that cut the population into nearly equal parts: far better than 400 random ones (0.05).
-    np.testing.assert_allclose(np.moveaxis(np.quantile(found, LEVELS, axis=-1), 0, -1), exact, atol=0.02)
+    # Points that cut the population into nearly equal parts: far better than 400 random ones
+    # (0.05).
+    np.testing.assert_allclose(
+        np.moveaxis(np.quantile(found, LEVELS, axis=-1), 0, -1), exact, atol=0.02
+    )
     np.testing.assert_allclose(found.std("sample"), 0.5, atol=0.02)
 
 
@@ -90,8 +100,13 @@ def test_an_optimum_is_one_population() -> None:
 def test_samples_are_in_random_order() -> None:
     model, x = plain()
     for stored in (True, False):
-        found = prb.predict(POSTERIOR, same, x, model=model, n_samples=400, stored=stored, random_seed=1).values
-        first, second = found[..., :-1] - found.mean(-1, keepdims=True), found[..., 1:] - found.mean(-1, keepdims=True)
+        found = prb.predict(
+            POSTERIOR, same, x, model=model, n_samples=400, stored=stored, random_seed=1
+        ).values
+        first, second = (
+            found[..., :-1] - found.mean(-1, keepdims=True),
+            found[..., 1:] - found.mean(-1, keepdims=True),
+        )
         correlation = (first * second).mean(axis=-1) / 0.25
         # The standard error of each is 1 / sqrt(400) = .05.
         assert np.abs(correlation).max() < 0.2
@@ -100,7 +115,9 @@ def test_samples_are_in_random_order() -> None:
 def test_draws_are_thinned_evenly_and_keep_their_coordinates() -> None:
     model, x = plain()
     many = tree(mu=np.tile(np.linspace(0.5, 1.5, 101), (2, 1)), sigma=np.full((2, 101), 0.5))
-    many = xr.DataTree.from_dict({"posterior": many["posterior"].to_dataset().assign_coords(draw=np.arange(101) * 10)})
+    many = xr.DataTree.from_dict(
+        {"posterior": many["posterior"].to_dataset().assign_coords(draw=np.arange(101) * 10)}
+    )
     found = prb.predict(many, same, x, model=model, draws=10, n_samples=200, random_seed=1)
     assert found.draw.values.tolist() == [0, 250, 500, 750, 1000]
     np.testing.assert_allclose(found.mean("sample")[0], [0.5, 0.75, 1.0, 1.25, 1.5], atol=0.05)
@@ -122,7 +139,7 @@ def test_a_posterior_of_stock_pymc_serves() -> None:
         prb.area_test(OBSERVED, found)
 
 
-# -- what is computed ------------------------------------------------------------------------------------
+# What is computed
 
 
 def test_the_simulators_own_response_is_not_computed_again() -> None:
@@ -167,7 +184,9 @@ def test_another_constant_is_another_response() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
         prb.Simulator("y", shifted, x, 2.0, metric=prb.AreaMetric(), observed=OBSERVED)
-    own, other = (prb.predict(POSTERIOR, shifted, x, c, model=model, random_seed=1) for c in (2.0, 3.0))
+    own, other = (
+        prb.predict(POSTERIOR, shifted, x, c, model=model, random_seed=1) for c in (2.0, 3.0)
+    )
     assert (own.attrs["responses"], other.attrs["responses"]) == (0, 1024)
     np.testing.assert_allclose(other, own + 1)
 
@@ -176,7 +195,9 @@ def test_without_stored_points_every_specimen_is_computed() -> None:
     model, x = plain()
     response = Counted()
     with ThreadPoolExecutor(2) as pool:
-        found = prb.predict(POSTERIOR, response, x, model=model, n_samples=100, stored=False, executor=pool)
+        found = prb.predict(
+            POSTERIOR, response, x, model=model, n_samples=100, stored=False, executor=pool
+        )
     assert response.count == found.attrs["responses"] == 600
     assert found.attrs["source"] == "new specimens"
 
@@ -185,19 +206,23 @@ def test_a_store_keeps_the_responses(tmp_path: Path) -> None:
     response = Counted()
     for _ in range(2):
         model, x = build()
-        prb.predict(POSTERIOR, response, x, model=model, store=tmp_path, name="later", random_seed=1)
+        prb.predict(
+            POSTERIOR, response, x, model=model, store=tmp_path, name="later", random_seed=1
+        )
     assert response.count == 512
     with pytest.raises(ValueError, match="a function called <lambda>, expected a name"):
         prb.predict(POSTERIOR, lambda x: x, x, model=model, store=tmp_path)
 
 
-# -- inputs ----------------------------------------------------------------------------------------------
+# Inputs
 
 
 def test_new_distributions_over_the_models_variables() -> None:
     model, _ = plain()
     mu, sigma = model["mu"], model["sigma"]
-    found = prb.predict(POSTERIOR, same, pm.Normal.dist(2 * mu, sigma / 5), model=model, random_seed=1)
+    found = prb.predict(
+        POSTERIOR, same, pm.Normal.dist(2 * mu, sigma / 5), model=model, random_seed=1
+    )
     assert found.attrs["source"] == "new specimens"
     np.testing.assert_allclose(found.mean("sample"), 2 * MEANS, atol=0.01)
     np.testing.assert_allclose(found.std("sample"), 0.1, atol=0.005)
@@ -212,7 +237,9 @@ def test_distributions_without_inverse_or_that_depend_on_each_other_are_drawn() 
         found = prb.predict(POSTERIOR, same, x, model=model, n_samples=4000, random_seed=1)
         # 4000 random draws: 5 standard errors.
         assert (np.abs(found.mean("sample") - mean) < 5 * sd / np.sqrt(4000)).all()
-        np.testing.assert_allclose(found.std("sample"), np.broadcast_to(sd, (2, 3)), rtol=5 / np.sqrt(8000))
+        np.testing.assert_allclose(
+            found.std("sample"), np.broadcast_to(sd, (2, 3)), rtol=5 / np.sqrt(8000)
+        )
 
 
 def test_epistemic_variables_and_vectors() -> None:
@@ -234,7 +261,7 @@ def test_epistemic_variables_and_vectors() -> None:
     np.testing.assert_allclose(sums.std("sample"), np.sqrt(3), rtol=0.1)
 
 
-# -- specimens -------------------------------------------------------------------------------------------
+# Specimens
 
 
 @pytest.mark.parametrize("stored", [True, False])
@@ -244,7 +271,8 @@ def test_the_same_seed_gives_the_same_specimens_under_every_condition(stored: bo
     def conditions(seed: int, **keywords: Any) -> list[xr.DataArray]:
         responses = (same, np.exp, lambda x: x**3)
         return [
-            prb.predict(POSTERIOR, f, x, model=model, stored=stored, random_seed=seed, **keywords) for f in responses
+            prb.predict(POSTERIOR, f, x, model=model, stored=stored, random_seed=seed, **keywords)
+            for f in responses
         ]
 
     one, exponential, cube = conditions(1)
@@ -259,7 +287,14 @@ def test_specimens_are_the_same_beside_an_epistemic_variable() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
         factor = pm.HalfNormal("factor")
-        prb.Simulator("y", same, x, metric=prb.AreaMetric(), observed=OBSERVED, propagation=prb.Resimulated(64))
+        prb.Simulator(
+            "y",
+            same,
+            x,
+            metric=prb.AreaMetric(),
+            observed=OBSERVED,
+            propagation=prb.Resimulated(64),
+        )
     posterior = tree(mu=MEANS, factor=np.full((2, 3), 2.0))
     one = prb.predict(posterior, same, x, model=model, random_seed=1)
     two = prb.predict(posterior, lambda x, f: f * x, x, factor, model=model, random_seed=1)
@@ -287,8 +322,13 @@ def test_designs_of_their_own_are_told_apart() -> None:
                 observed=OBSERVED,
                 propagation=prb.Reweighted(256, random_seed=k),
             )
-    first, second = (prb.predict(POSTERIOR, f, x, model=model, random_seed=1) for f in (same, np.exp))
-    assert (first.attrs["source"], second.attrs["source"]) == ("stored responses of y0", "stored responses of y1")
+    first, second = (
+        prb.predict(POSTERIOR, f, x, model=model, random_seed=1) for f in (same, np.exp)
+    )
+    assert (first.attrs["source"], second.attrs["source"]) == (
+        "stored responses of y0",
+        "stored responses of y1",
+    )
     assert first.attrs["specimens_id"] != second.attrs["specimens_id"]
 
 
@@ -299,10 +339,12 @@ def test_the_calibrations_specimens_and_data_are_noted_and_saved(tmp_path: Path)
     found.to_netcdf(tmp_path / "predicted.nc")
     xr.testing.assert_equal(xr.load_dataarray(tmp_path / "predicted.nc"), found)
     with pytest.raises(ValueError, match="2 specimens of the calibration, such as '3'"):
-        prb.area_test([0.1, 0.2, 0.3], xr.load_dataarray(tmp_path / "predicted.nc"), specimens=[3, 7, 90])
+        prb.area_test(
+            [0.1, 0.2, 0.3], xr.load_dataarray(tmp_path / "predicted.nc"), specimens=[3, 7, 90]
+        )
 
 
-# -- failures and refusals -------------------------------------------------------------------------------
+# Failures and refusals
 
 
 def test_failed_specimens_stay_and_nan_is_counted(caplog: pytest.LogCaptureFixture) -> None:
@@ -315,16 +357,20 @@ def test_failed_specimens_stay_and_nan_is_counted(caplog: pytest.LogCaptureFixtu
     assert np.isinf(found).any()
     assert found.attrs["nan"] == int(np.isnan(found).sum()) > 0
     assert f"{found.attrs['nan']} of {found.size} predicted responses are NaN" in caplog.text
-    with pytest.raises(prb.ResponseError, match="got NaN at all 3000 specimens"):
+    with pytest.raises(ResponseError, match="got NaN at all 3000 specimens"):
         prb.predict(POSTERIOR, lambda x: x * np.nan, x, model=model)
 
 
 def test_a_design_that_does_not_reach_the_populations_is_refused() -> None:
     model, x = plain()
     far = tree(mu=np.full((1, 3), 9.0), sigma=np.full((1, 3), 0.01))
-    with pytest.raises(prb.DesignError, match=r"y: got a weight effective sample size of .*stored=False"):
+    with pytest.raises(
+        DesignError, match=r"y: got a weight effective sample size of .*stored=False"
+    ):
         prb.predict(far, same, x, model=model)
-    assert prb.predict(far, same, x, model=model, stored=False).mean() == pytest.approx(9.0, abs=0.01)
+    assert prb.predict(far, same, x, model=model, stored=False).mean() == pytest.approx(
+        9.0, abs=0.01
+    )
 
 
 def test_refusals() -> None:
@@ -339,7 +385,7 @@ def test_refusals() -> None:
         prb.predict(POSTERIOR, x, same, model=model)
     with pytest.raises(ValueError, match="none of them aleatory"):
         prb.predict(POSTERIOR, same, 1.0, model=model)
-    with pytest.raises(prb.ResponseError, match="the response raised ZeroDivisionError"):
+    with pytest.raises(ResponseError, match="the response raised ZeroDivisionError"):
         prb.predict(POSTERIOR, lambda x: 1 // 0, x, model=model)
     for keywords, match in (({"n_samples": 1}, "n_samples: got 1"), ({"draws": 0}, "draws: got 0")):
         with pytest.raises(ValueError, match=match):

@@ -1,4 +1,4 @@
-"""Progress bars: they appear for long work only, on stderr, and stay away where they are not wanted."""
+"""Progress bars appear for long work only, on stderr, and stay away where they are not wanted."""
 
 import io
 import sys
@@ -48,7 +48,9 @@ def test_without_a_total_it_appears_when_the_time_has_passed(screen: io.StringIO
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_short_work_shows_nothing(screen: io.StringIO, monkeypatch: pytest.MonkeyPatch, terminal: bool) -> None:
+def test_short_work_shows_nothing(
+    screen: io.StringIO, monkeypatch: pytest.MonkeyPatch, terminal: bool
+) -> None:
     monkeypatch.setattr(prbayes._progress, "CONSOLE", Console(file=screen, force_terminal=terminal))
     monkeypatch.setattr(prbayes._progress, "_SHOWN_FROM", 2.0)
     for total in (100, None):
@@ -93,7 +95,9 @@ def build(propagation: Any) -> pm.Model:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
         observed = np.linspace(-1, 3, 20)
-        prb.Simulator("y", slow, x, metric=prb.AreaMetric(), observed=observed, propagation=propagation)
+        prb.Simulator(
+            "y", slow, x, metric=prb.AreaMetric(), observed=observed, propagation=propagation
+        )
     return model
 
 
@@ -105,8 +109,12 @@ def test_the_optimiser_shows_its_evaluations(screen: io.StringIO, visible: bool)
 
 
 @pytest.mark.parametrize("visible", [True, False])
-def test_everything_inside_the_sampler_follows_its_keyword(screen: io.StringIO, visible: bool) -> None:
-    prb.sample_smc(60, chains=1, model=build(prb.Resimulated(16)), random_seed=1, progressbar=visible)
+def test_everything_inside_the_sampler_follows_its_keyword(
+    screen: io.StringIO, visible: bool
+) -> None:
+    prb.sample_smc(
+        60, chains=1, model=build(prb.Resimulated(16)), random_seed=1, progressbar=visible
+    )
     assert ("SMC chain 0" in screen.getvalue()) == visible
     assert ("evaluations" in screen.getvalue()) == visible
     if not visible:
@@ -114,7 +122,9 @@ def test_everything_inside_the_sampler_follows_its_keyword(screen: io.StringIO, 
 
 
 @pytest.mark.parametrize("visible", [True, False])
-def test_refits_are_counted(screen: io.StringIO, visible: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refits_are_counted(
+    screen: io.StringIO, visible: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("prbayes.estimate.refit._BLOCK", 20_000)
     model = build(prb.Reweighted(64))
     prb.bootstrap(prb.minimize(model, progressbar=False), draws=1000, progressbar=visible)

@@ -13,25 +13,26 @@ __all__ = ["crack_growth"]
 def crack_growth() -> xr.Dataset:
     """Return the fatigue crack lengths of 21 metal specimens.
 
-    Each specimen started from a notch of 0.90 inch; the crack length was read every 10 000 load cycles, to
-    0.01 inch. A test ended with the first reading of 1.60 inch or more (failure) or at 120 000 cycles.
+    Each specimen started from a notch of 0.90 inch; the crack length was read every 10 000 load
+    cycles, to 0.01 inch. A test ended with the first reading of 1.60 inch or more (failure) or at
+    120 000 cycles.
 
     Returns
     -------
     xarray.Dataset
-        ``crack_length_inch`` with dims ``(specimen, million_cycles)``, shape (21, 13), in inch; NaN after
-        the reading at which a specimen failed and was removed. ``specimen`` counts from 1,
+        ``crack_length_inch`` with dims ``(specimen, million_cycles)``, shape (21, 13), in inch; NaN
+        after the reading at which a specimen failed and was removed. ``specimen`` counts from 1,
         ``million_cycles`` runs from 0 to 0.12. Every call returns a new object.
 
     Notes
     -----
-    The readings of one specimen are dependent: 21 specimens are 21 independent observations, not 262.
-    Divide by ``attrs["notch_inch"]`` for the relative crack length.
+    The readings of one specimen are dependent: 21 specimens are 21 independent observations, not
+    262. Divide by ``attrs["notch_inch"]`` for the relative crack length.
 
     References
     ----------
-    .. [1] C. J. Lu and W. Q. Meeker (1993), Using degradation measures to estimate a time-to-failure
-       distribution, Technometrics 35(2), 161-174, Table 1.
+    .. [1] C. J. Lu and W. Q. Meeker (1993), Using degradation measures to estimate a
+       time-to-failure distribution, Technometrics 35(2), 161-174, Table 1.
     .. [2] J. L. Bogdanoff and F. Kozin (1985), Probabilistic Models of Cumulative Damage, Wiley,
        figure 4.5.2, from which [1]_ read the values.
 
@@ -63,13 +64,15 @@ def crack_growth() -> xr.Dataset:
         },
         attrs={
             "description": (
-                "Fatigue crack growth in metal: crack length of 21 specimens, read every 10 000 cycles to "
-                "0.01 inch, until 1.60 inch (failure) or 120 000 cycles; NaN after failure"
+                "Fatigue crack growth in metal: crack length of 21 specimens, read every 10 000 "
+                "cycles to 0.01 inch, until 1.60 inch (failure) or 120 000 cycles; NaN after "
+                "failure"
             ),
             "source": (
-                "C. J. Lu and W. Q. Meeker (1993), Using degradation measures to estimate a time-to-failure "
-                "distribution, Technometrics 35(2), 161-174, Table 1; values read from figure 4.5.2 of "
-                "J. L. Bogdanoff and F. Kozin (1985), Probabilistic Models of Cumulative Damage, Wiley"
+                "C. J. Lu and W. Q. Meeker (1993), Using degradation measures to estimate a "
+                "time-to-failure distribution, Technometrics 35(2), 161-174, Table 1; values read "
+                "from figure 4.5.2 of J. L. Bogdanoff and F. Kozin (1985), Probabilistic Models of "
+                "Cumulative Damage, Wiley"
             ),
             "notch_inch": 0.90,
         },

@@ -18,7 +18,15 @@ from prbayes.estimate.identifiability import unidentified_directions
 from prbayes.estimate.methods import Method
 from prbayes.estimate.obstacles import sampling_obstacle
 from prbayes.estimate.optimum import Optimum, assemble, plain
-from prbayes.estimate.refinement import AGREE, MAX_ROUNDS, grow, pilot, refine_at, refuse, spread_around
+from prbayes.estimate.refinement import (
+    AGREE,
+    MAX_ROUNDS,
+    grow,
+    pilot,
+    refine_at,
+    refuse,
+    spread_around,
+)
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.estimate.rivals import Rival, rivals
 from prbayes.estimate.sampling import Local

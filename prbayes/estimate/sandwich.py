@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
+from prbayes._weighted import distribution_function, reached
 from prbayes.estimate.data_sets import DataSets, dependent, simulated_sets, thinned
 from prbayes.metrics.base import Discrepancy
 from prbayes.model.evaluator import Evaluator
@@ -219,8 +220,7 @@ class Information:
         values, weights = self._center
         order = np.argsort(values)
         levels = (np.arange(n) + 0.5) / n
-        place = np.searchsorted(np.cumsum(weights[order]), levels)
-        return np.asarray(values[order][np.minimum(place, values.size - 1)])
+        return np.asarray(values[order][reached(weights[order], levels)])
 
     @cached_property
     def hessian(self) -> Floats:
@@ -258,20 +258,11 @@ class Information:
         some = np.linspace(0, knots.size - 1, _KNOTS).astype(int)
         knots = knots[np.unique(some)]
         if np.array_equal(values[0], values[-1], equal_nan=True):
-            cdf = _cdf(values[0], w, knots)
-        else:
-            cdf = np.array([_cdf(v, u, knots) for v, u in zip(values, w, strict=True)])
-        gaps = cdf[0] - _cdf(observed, weights, knots)
+            values = values[0]
+        cdf = distribution_function(values, w, knots, kind="quicksort")
+        measured = distribution_function(observed, weights, knots, kind="quicksort")
+        gaps = cdf[0] - measured
         d = self.theta.size
         up, down = cdf[1 : 1 + 2 * d : 2], cdf[2 : 2 + 2 * d : 2]
         slopes = (up - down) / (2 * self._step[:, None])
         return LinearArea(gaps[:, :-1], slopes[:, :-1], np.diff(knots))
-
-
-def _cdf(values: Floats, weights: Floats, at: Floats) -> Floats:
-    """Return distribution functions of values (n,) with weights (..., n), shape (..., m)."""
-    order = np.argsort(values)
-    total = np.cumsum(weights[..., order], axis=-1)
-    total = np.concatenate([np.zeros_like(total[..., :1]), total], axis=-1)
-    below = np.searchsorted(values[order], at, side="right")
-    return np.asarray(total[..., below])

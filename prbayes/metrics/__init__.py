@@ -1,1 +1,4 @@
-"""Calibration metrics: how much simulated responses disagree with measured ones. Smaller is better."""
+"""Calibration metrics: how much simulated responses disagree with measured ones.
+
+Smaller is better.
+"""

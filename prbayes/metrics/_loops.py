@@ -1,6 +1,7 @@
-"""Loops over the values of a sample, compiled by Numba (PyTensor's default backend) when they are first called.
+"""Loops over the values of a sample, compiled by Numba when they are first called.
 
-They read a sample once and keep nothing but the result, which NumPy's passes over whole arrays do not.
+They read a sample once and keep nothing but the result, which NumPy's passes over whole arrays do
+not. Numba is PyTensor's default backend, so it is there.
 """
 
 from __future__ import annotations
@@ -12,12 +13,13 @@ import numpy as np
 
 from prbayes._checks import Floats
 
-# The four cubic B-splines that reach a point at fraction t between two nodes: coefficients of 1, t, t^2, t^3.
+# The four uniform cubic B-splines that reach a point at fraction t between two nodes: coefficients
+# of 1, t, t^2, t^3 (any textbook on splines).
 SPLINE = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6
 
 
 def _compiled[**P](loop: Callable[P, None]) -> Callable[P, None]:
-    """Compile at the first call, since Numba takes long to import; what was compiled is kept beside the code."""
+    """Compile at the first call, since Numba takes long to import; keep the result on disk."""
 
     @cache
     def compiled() -> Callable[P, None]:
@@ -36,17 +38,25 @@ def _compiled[**P](loop: Callable[P, None]) -> Callable[P, None]:
 
 @_compiled
 def count(
-    sample: Floats, weights: Floats, equal: bool, low: float, inverse: float, counts: Floats, outside: Floats
+    sample: Floats,
+    weights: Floats,
+    equal: bool,
+    low: float,
+    inverse: float,
+    counts: Floats,
+    outside: Floats,
 ) -> None:
-    """Add weights at the nodes of a grid, spread by cubic B-splines, and those of values below and above.
+    """Add weights at the nodes of a grid, spread by cubic B-splines, and those outside it.
 
-    Node k is at ``(low + k) / inverse``. The sample has shape (rows, n), the counts (rows, g), ``outside`` (rows, 2);
-    the weights are flat, and only the first counts if they are equal. NaN counts nowhere.
+    Node k is at ``(low + k) / inverse``. The sample has shape (rows, n), the counts (rows, g),
+    ``outside`` (rows, 2); the weights are flat, and only the first counts if they are equal. NaN
+    counts nowhere.
     """
     rows, n = sample.shape
     g = counts.shape[1]
     moments = np.zeros((g, 4))  # sums of 1, t, t^2, t^3 beyond each node
     for r in range(rows):
+        # Sum the powers of the fractions of all values beyond a node.
         for i in range(n):
             t = sample[r, i] * inverse - low
             w = weights[0] if equal else weights[r * n + i]
@@ -60,9 +70,10 @@ def count(
                 outside[r, 0] += w
             elif t >= g - 2:
                 outside[r, 1] += w
+        # Four splines reach these values: the nodes around them get their shares.
         for node in range(1, g - 2):
             m = moments[node]
-            if m[0] != 0 or m[1] != 0 or m[2] != 0 or m[3] != 0:
+            if m.any():
                 for k in range(4):
                     for power in range(4):
                         counts[r, node - 1 + k] += SPLINE[k, power] * m[power]
@@ -71,37 +82,43 @@ def count(
 
 @_compiled
 def smooth(values: Floats, kernel: Floats, out: Floats) -> None:
-    """Add the convolution of each row with a kernel, zero beyond the ends, to ``out``, shape (rows, g)."""
+    """Add the convolution of rows, zero beyond their ends, with a kernel to ``out``, (rows, g)."""
     rows, g = values.shape
     half = len(kernel) // 2
     for r in range(rows):
         for node in range(g):
             value = values[r, node]
             if value != 0:
-                first, last = max(0, node - half), min(g, node + half + 1)
-                target, weights = out[r, first:last], kernel[first - node + half :]
+                first = max(0, node - half)
+                last = min(g, node + half + 1)
+                target = out[r, first:last]
+                weights = kernel[first - node + half :]
                 for k in range(last - first):
                     target[k] += value * weights[k]
 
 
 @_compiled
-def read(sample: Floats, coefficients: Floats, outside: Floats, low: float, inverse: float, out: Floats) -> None:
+def read(
+    sample: Floats, coefficients: Floats, outside: Floats, low: float, inverse: float, out: Floats
+) -> None:
     """Evaluate piecewise cubics at a sample, shape (1 or rows, n), into ``out``, shape (rows, n).
 
-    The coefficients of 1, t, t^2, t^3 beyond each node have shape (rows, g, 4); values below and above the grid get
-    those of ``outside``, shape (rows, 2), and NaN gets zero.
+    The coefficients of 1, t, t^2, t^3 beyond each node have shape (rows, g, 4); values below and
+    above the grid get those of ``outside``, shape (rows, 2), and NaN gets zero.
     """
     rows, n = out.shape
     g = coefficients.shape[1]
     for r in range(rows):
-        c = coefficients[r]
         values = sample[r % len(sample)]
         for i in range(n):
             t = values[i] * inverse - low
             if 1 <= t < g - 2:
                 node = int(t)
                 t -= node
-                out[r, i] = c[node, 0] + t * (c[node, 1] + t * (c[node, 2] + t * c[node, 3]))
+                c = coefficients[r, node]
+                value = c[2] + t * c[3]
+                value = c[1] + t * value
+                out[r, i] = c[0] + t * value
             elif t < 1:
                 out[r, i] = outside[r, 0]
             elif t >= g - 2:

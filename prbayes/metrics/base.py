@@ -1,25 +1,33 @@
-"""What a calibration metric is: a linear map of the weights of the simulated responses, then an outer function.
+"""What a calibration metric is: features of a weighted population, then one function of them.
 
-`Metric` is configuration; ``metric.against(observed)`` prepares a ``Discrepancy``, which holds the observed side.
-The linear map gives a density on cells, or a difference of distribution functions; the *outer* function takes
-the array namespace, so that the direct call, the optimiser's gradient and the compiled graph of a PyMC model
-run through the same lines.
+`Metric` is configuration. ``metric.against(observed)`` prepares a `Discrepancy`, which holds the
+measured side and is called with simulated responses. It works in two steps:
+
+- *features*: a density on cells, or a difference of distribution functions. For responses that stay
+  the same they are a linear map of the weights (`Discrepancy.basis`, `Discrepancy.from_basis`);
+- the *outer* function of the features, which takes the array namespace, so that the direct call,
+  the optimiser's gradient and the compiled graph of a PyMC model run through the same lines.
 """
 
 from __future__ import annotations
 
-import copy
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats, observed_sample, sample_weights, simulated_sample
-from prbayes.metrics.cells import Cells
+from prbayes.metrics.cells import Cells, product
 
+# Share of the uniform density that is mixed into densities before a logarithm is taken. Any value
+# up to 1e-6 gives the same minimum on normal data, to a thousandth of a standard error (test). It
+# decides for the forward divergence where an observation is far outside the fitted population:
+# among 50 values of Student's t with three degrees of freedom, 1e-7 lets the fit leave out an
+# outlier that 1e-9 and less keep in (test). A kernel has 1e-9 of its mass beyond six bandwidths,
+# where grids end.
 _FLOOR = 1e-9
 
 
@@ -29,9 +37,11 @@ class Minimum(Enum):
     Attributes
     ----------
     QUADRATIC
-        Twice differentiable in the hyperparameters: Hessian and gradient tell the sampling distribution.
+        Twice differentiable in the hyperparameters: Hessian and gradient tell the sampling
+        distribution.
     ABSOLUTE
-        An integral of absolute differences between distribution functions, each linear in the weights.
+        An integral of absolute differences between distribution functions, each linear in the
+        weights.
     UNKNOWN
         Nothing is declared; what is needed is measured by refits, or refused.
     """
@@ -45,32 +55,46 @@ class Minimum(Enum):
 class Discrepancy(ABC):
     """A metric with its observed side prepared; call it with simulated responses.
 
+    Whoever adds a metric derives from this class, or from `DensityDiscrepancy` if the metric
+    compares densities, and defines the abstract methods. All of them are batched: the last axis
+    runs over the values, axes before it over populations. Records are immutable; another observed
+    side makes another record.
+
     Attributes
     ----------
     metric : Metric
+        The configuration that prepared it.
     observed : ndarray, shape (N,)
-    weights : ndarray, shape (N,)
-        Weights of the observed values; they sum to one.
+        Measured responses.
+    weights : ndarray, shape (N,) or (..., N)
+        Weights of the observed values; they sum to one. Several rows stand for as many data sets.
     """
 
     metric: Metric
     observed: Floats
     weights: Floats
+    # The fields that have a row for each data set.
     _by_data_set: ClassVar[tuple[str, ...]] = ("weights",)
 
-    def with_observed(self, observed: Floats, weights: Floats | None = None) -> Discrepancy:
+    def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
         """Return the same metric, on the same cells, against other values; for resampling.
 
-        Weights of shape (..., N) stand for as many data sets; then `outer` broadcasts against features.
-        """
-        return replace(self, observed=observed, weights=sample_weights(weights, observed.size))
+        A metric that derives fields from the observed side derives them anew here.
 
-    def rows(self, index: Any) -> Discrepancy:
-        """Return some of the data sets of which there are several."""
-        chosen = copy.copy(self)
-        for name in self._by_data_set:
-            object.__setattr__(chosen, name, getattr(self, name)[index])
-        return chosen
+        Parameters
+        ----------
+        observed : ndarray, shape (n,)
+        weights : ndarray, shape (n,) or (..., n), optional
+            Equal by default. With several rows, each a data set, `outer` broadcasts the data sets
+            against the features.
+        """
+        w = sample_weights(weights, observed.size)
+        return replace(self, observed=observed, weights=w)
+
+    def rows(self, index: Any) -> Self:
+        """Return some of the data sets of which there are several; nothing is computed anew."""
+        chosen = {name: getattr(self, name)[index] for name in self._by_data_set}
+        return replace(self, **chosen)
 
     @property
     def n_effective(self) -> float:
@@ -80,27 +104,51 @@ class Discrepancy(ABC):
     @property
     @abstractmethod
     def scale(self) -> float:
-        """A typical size of the discrepancy, in its own units; makes optimiser tolerances unit-free."""
+        """A typical size of the discrepancy, positive, in its own units.
+
+        Optimisers divide by it, so that their tolerances mean the same for every metric.
+        """
 
     @abstractmethod
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
-        """Return what `outer` takes, from simulated values (..., n) and weights that sum to at most one."""
+        """Return what `outer` takes, for any simulated responses.
+
+        Parameters
+        ----------
+        simulated : array, shape (..., n)
+            In units of the observed values. +inf is a specimen that failed and counts above all
+            others; NaN is a point without a response and counts nowhere.
+        weights : array, shape (n,) or (..., n)
+            Non-negative; they sum to at most one.
+        xp : module
+            `numpy`, or `pytensor.tensor` for symbolic responses.
+        """
 
     @abstractmethod
     def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
-        """Return the arrays that turn weights of the fixed values ``simulated``, shape (n,), into features."""
+        """Return arrays that turn weights of stored values, shape (n,), into features.
+
+        They are made once for the values; `from_basis` then serves any weights.
+        """
 
     @abstractmethod
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
-        """Return what `outer` takes, from weights of the values that the basis was made for."""
+        """Return the features of the values that the basis was made for.
+
+        Equal to ``features(simulated, weights, xp)`` up to what the outer function does not see,
+        and linear in the weights, shape (..., n), so that gradients are exact.
+        """
 
     @abstractmethod
     def outer(self, *features: Any, xp: Any) -> Any:
-        """Return the discrepancy of the features; ``xp`` is `numpy` or `pytensor.tensor`."""
+        """Return the discrepancy of the features, shape (...); smaller is better.
+
+        Written with ``xp`` (`numpy` or `pytensor.tensor`), by functions that both have.
+        """
 
     @property
     def symbolic(self) -> bool:
-        """Whether `outer` can be written as a graph; else it is called as an operation without gradient."""
+        """Whether `outer` can be written as a graph; else it is an operation without gradient."""
         return True
 
     @property
@@ -110,16 +158,18 @@ class Discrepancy(ABC):
 
     @property
     def differentiable(self) -> bool:
-        """Whether the discrepancy has second derivatives in the values and weights of the population."""
+        """Whether the discrepancy has second derivatives in the population's values and weights."""
         return self.metric.minimum is Minimum.QUADRATIC
 
     def overlap(self, simulated: Floats, weights: Floats) -> Floats:
-        """Return the overlap of simulated and observed densities, (..., n) -> (...); one where there are none."""
-        return np.ones(np.shape(simulated)[:-1])
+        """Return the overlap of both densities, (..., n) -> (...); one where there are none."""
+        batch = np.shape(simulated)[:-1]
+        return np.ones(batch)
 
     def of(self, simulated: Floats, weights: Floats) -> Any:
         """Return the discrepancy of checked values (..., n) and weights that sum to at most one."""
-        return self.outer(*self.features(simulated, weights, np), xp=np)
+        features = self.features(simulated, weights, np)
+        return self.outer(*features, xp=np)
 
     def __call__(self, simulated: ArrayLike, weights: ArrayLike | None = None) -> Any:
         """Return the discrepancy of simulated responses.
@@ -137,28 +187,33 @@ class Discrepancy(ABC):
         """
         values = simulated_sample(simulated)
         w = sample_weights(weights, values.shape[-1])
-        result = self.of(np.broadcast_to(values, np.broadcast_shapes(values.shape, w.shape)), w)
+        shape = np.broadcast_shapes(values.shape, w.shape)
+        values = np.broadcast_to(values, shape)
+        result = self.of(values, w)
         return float(result) if np.ndim(result) == 0 else result
-
-
-def product(weights: Floats, matrix: Floats) -> Floats:
-    """Return weights @ matrix, shapes (..., n), (n, m), as one product of matrices."""
-    flat = weights.reshape(-1, weights.shape[-1]) @ matrix
-    return flat.reshape(*weights.shape[:-1], matrix.shape[-1])
 
 
 class Metric(ABC):
     """A calibration metric; ``against`` prepares the observed side once.
 
-    A new metric defines ``_prepare(observed, weights)``, which returns a ``Discrepancy``.
+    A metric of your own is a frozen dataclass that derives from this class. It defines
+    ``_prepare(observed, weights)``, which gets checked values, shape (N,), and weights that sum to
+    one, and returns a `Discrepancy`. What calibration may assume of it, it declares as class
+    attributes or properties:
 
     Attributes
     ----------
     minimum : Minimum
         How the discrepancy behaves around its minimum; unknown unless the metric declares it.
+    additive : bool
+        Whether its gradient in the hyperparameters is a mean over observations, as that of an outer
+        function linear in the observed density. If not, standard errors come from simulated data
+        sets. Metrics with a quadratic minimum are taken for additive unless they declare it.
+    takes_weights : bool
+        Whether simulated responses may have unequal weights, as under `Reweighted`.
     tail_responses : int
-        Simulated responses for each observation, all of equal weight, below which the metric sees too little of the
-        population's tails; zero where that does not matter.
+        Simulated responses for each observation, all of equal weight, below which the metric sees
+        too little of the population's tails; zero where that does not matter.
     likelihood : bool
         Whether N times the discrepancy is on the scale of a log-likelihood, so that epsilon is 1/N.
     """
@@ -178,7 +233,8 @@ class Metric(ABC):
         return True
 
     @abstractmethod
-    def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy: ...
+    def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
+        """Return the discrepancy from these observed values, both of shape (N,) and checked."""
 
     def against(self, observed: ArrayLike, weights: ArrayLike | None = None) -> Discrepancy:
         """Prepare the observed side.
@@ -198,8 +254,8 @@ class Metric(ABC):
         Raises
         ------
         TypeError, ValueError
-            If the observed values are not one-dimensional, real and finite, or if the metric needs a
-            bandwidth or bins and they are all equal.
+            If the observed values are not one-dimensional, real and finite, or if the metric needs
+            a bandwidth or bins and they are all equal.
         """
         sample = observed_sample(observed)
         w = sample_weights(weights, sample.size, "observed weights")
@@ -221,20 +277,45 @@ class Metric(ABC):
 
 @dataclass(frozen=True, eq=False)
 class DensityDiscrepancy(Discrepancy):
-    """A discrepancy of densities on cells; subclasses add the outer function."""
+    """A discrepancy of two densities on the same cells.
+
+    The only feature is the simulated density, shape (..., m). A metric that derives from this class
+    defines `outer`, and nothing else unless it needs further fields; ``on_cells`` makes it. In
+    ``outer``, ``self.density`` is the observed density, and an integral is a sum over the last axis
+    of values times ``self.cells.widths``. The last two cells are the mass below and above all
+    others.
+
+    Attributes
+    ----------
+    cells : Cells
+        Laid out once, from the values that the metric was prepared with.
+    density : ndarray, shape (m,) or (..., m)
+        Observed density on the cells, in 1 / units of the response; a row for each data set.
+    """
 
     cells: Cells
-    density: Floats = field(init=False)
+    density: Floats
     _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "density")
 
-    def __post_init__(self) -> None:
-        several = self.weights.ndim > 1
-        density = (
-            product(self.weights, self.cells.basis(self.observed))
-            if several
-            else self.cells.density(self.observed, self.weights)
-        )
-        object.__setattr__(self, "density", density)
+    @classmethod
+    def on_cells(cls, metric: Any, observed: Floats, weights: Floats, cells: Cells) -> Self:
+        """Return the discrepancy from observed values with their density on given cells.
+
+        Parameters
+        ----------
+        metric : Metric
+        observed, weights : ndarray, shape (N,)
+        cells : Cells
+            Usually those that the metric's estimator lays out for the observed values.
+        """
+        density = observed_density(cells, observed, weights)
+        return cls(metric, observed, weights, cells, density)
+
+    def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
+        """Return the same metric, on the same cells, against other values; for resampling."""
+        w = sample_weights(weights, observed.size)
+        density = observed_density(self.cells, observed, w)
+        return replace(self, observed=observed, weights=w, density=density)
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
         """Return the density on the cells."""
@@ -255,7 +336,7 @@ class DensityDiscrepancy(Discrepancy):
 
     @property
     def differentiable(self) -> bool:
-        """Whether the densities, as functions of the simulated values, are smooth too; those of a histogram are not."""
+        """Whether the densities are smooth in the simulated values too; a histogram's are not."""
         return super().differentiable and self.cells.smooth
 
     @property
@@ -264,14 +345,39 @@ class DensityDiscrepancy(Discrepancy):
         return 1.0
 
     def overlap(self, simulated: Floats, weights: Floats) -> Floats:
-        """Return the cosine of simulated and observed density, shape (...): one if they are equal, zero if disjoint."""
-        p, q, dz = self.cells.density(simulated, weights)[..., :-2], self.density[..., :-2], self.cells.widths[:-2]
-        size = np.sqrt(((p**2) * dz).sum(axis=-1) * ((q**2) * dz).sum(axis=-1))
-        return np.asarray(np.nan_to_num((p * q * dz).sum(axis=-1) / np.where(size > 0, size, 1.0)))
+        """Return the cosine of simulated and observed density, shape (...).
+
+        One if they are equal, zero if disjoint. Mass outside the inner cells counts in neither.
+        """
+        p = self.cells.density(simulated, weights)
+        p = p[..., :-2]
+        q = self.density[..., :-2]
+        dz = self.cells.widths[:-2]
+        # Integrals of p q, of p squared and of q squared.
+        mixed = (p * q * dz).sum(axis=-1)
+        simulated_square = ((p**2) * dz).sum(axis=-1)
+        observed_square = ((q**2) * dz).sum(axis=-1)
+        size = np.sqrt(simulated_square * observed_square)
+        size = np.where(size > 0, size, 1.0)
+        cosine = mixed / size
+        return np.asarray(np.nan_to_num(cosine))
 
     def floored(self, density: Any) -> Any:
-        """Mix a density with 1e-9 of the uniform density over all cells: the only floor in this package.
+        """Mix a density with 1e-9 of the uniform density over all cells: the package's only floor.
 
-        It bounds logarithms where a population leaves the observed values alone, at log(1e-9 / length).
+        It bounds logarithms where a population leaves the observed values alone, at
+        log(1e-9 / length).
         """
-        return (1 - _FLOOR) * density + _FLOOR / self.cells.widths.sum()
+        length = self.cells.widths.sum()
+        return (1 - _FLOOR) * density + _FLOOR / length
+
+
+def observed_density(cells: Cells, observed: Floats, weights: Floats) -> Floats:
+    """Return the density of observed values on cells, shapes (N,), (N,) -> (m,).
+
+    Weights of shape (..., N) are as many data sets: (..., m).
+    """
+    if weights.ndim == 1:
+        return cells.density(observed, weights)
+    basis = cells.basis(observed)
+    return product(weights, basis)

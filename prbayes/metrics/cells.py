@@ -1,7 +1,7 @@
 """Cells on which densities are compared: a grid for Gaussian kernels, and the bins of a histogram.
 
-A density is linear in the weights of the sample, and on a grid it is smooth in the sample's values; both
-derivatives are given.
+A density is linear in the weights of the sample, and on a grid it is smooth in the sample's values;
+both derivatives are given.
 """
 
 from __future__ import annotations
@@ -16,7 +16,21 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 from prbayes.metrics._loops import SPLINE, count, read, smooth
 
-NDArrayInt = NDArray[np.intp]
+# Of a bin's width: by how much a value may miss the outermost edge and still be in the last bin.
+# Edges are rounded to parts in 1e16 of their size, and there are at most some thousands of them.
+_EDGE = 1e-9
+
+
+def product(weights: Floats, matrix: Floats) -> Floats:
+    """Return weights @ matrix, shapes (..., n), (n, m) -> (..., m), as one product of two matrices.
+
+    NumPy would multiply a batch of vectors one after the other, many times slower.
+    """
+    *batch, n = weights.shape
+    m = matrix.shape[-1]
+    rows = weights.reshape(-1, n)
+    found = rows @ matrix
+    return found.reshape(*batch, m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +53,7 @@ class Cells(ABC):
 
     @abstractmethod
     def density(self, sample: Floats, weights: Floats) -> Floats:
-        """Return the density of weighted samples, shape (..., n) -> (..., m); NaN values count nowhere."""
+        """Return the density of weighted samples, (..., n) -> (..., m); NaN counts nowhere."""
 
     def basis(self, sample: Floats) -> Floats:
         """Return A, shape (n, m), with ``density(sample, w) == w @ A``."""
@@ -47,23 +61,39 @@ class Cells(ABC):
 
     @abstractmethod
     def reading(self, points: Floats, weights: Floats) -> Floats:
-        """Return r, shape (..., m), such that ``r @ g`` is the weighted mean of g (given on the cells) at the points.
+        """Return r such that ``r @ g`` is the weighted mean at points of g, given on the cells.
 
-        The points have shape (n,), their weights (..., n).
+        Shapes (n,), (..., n) -> (..., m).
         """
 
     @abstractmethod
     def value(self, sample: Floats, cotangent: Floats) -> Floats:
-        """Return the derivatives of ``(density(sample, weights) * cotangent).sum()`` for the weights."""
+        """Return the derivatives of a sum over the density, for the weights.
+
+        The sum is ``(density(sample, weights) * cotangent).sum()``. Shapes (..., n), (..., m) ->
+        (..., n), with as many leading axes in both.
+        """
 
     @abstractmethod
     def slope(self, sample: Floats, cotangent: Floats) -> Floats:
-        """Return its derivatives for the sample where all weights are one."""
+        """Return the derivatives of the same sum for the sample, where all weights are one."""
 
 
 @dataclass(frozen=True, eq=False)
 class KernelCells(Cells):
-    """Nodes of a regular grid; mass outside counts as one tight cluster on either side, at its most conspicuous."""
+    """Nodes of a regular grid; mass outside counts as one tight cluster on either side.
+
+    The cluster is a single kernel, which is where that mass is most conspicuous.
+
+    Attributes
+    ----------
+    bandwidth : float
+        Standard deviation of the kernel, in units of the response.
+    step : float
+        Distance of two nodes.
+    kernel : ndarray, shape (2 k + 1,)
+        The kernel that smooths counts at nodes into densities.
+    """
 
     bandwidth: float
     step: float
@@ -71,63 +101,122 @@ class KernelCells(Cells):
 
     @property
     def _low(self) -> float:
+        """Return the position of the first node, in steps."""
         return float(self.centers[0] / self.step)
 
     def density(self, sample: Floats, weights: Floats) -> Floats:
-        """Return densities at the nodes, then mass below and above divided by the width of a cluster."""
-        batch, n, g = sample.shape[:-1], sample.shape[-1], self.centers.size
+        """Return densities at the nodes, then mass below and above divided by a cluster's width."""
+        *batch, n = sample.shape
         rows = int(np.prod(batch, dtype=int))
-        equal = bool(weights.size) and (not any(weights.strides) or weights.min() == weights.max())
-        w = weights.ravel()[:1] if equal else np.broadcast_to(weights, (*batch, n)).ravel()
-        counts, outside = np.zeros((rows, g)), np.zeros((rows, 2))
-        flat = np.ascontiguousarray(sample, dtype=np.float64).reshape(rows, n)
-        count(flat, w, equal, self._low, 1 / self.step, counts, outside)
-        grid = self._smooth(counts)
-        return np.concatenate([grid, outside / self.widths[-1]], axis=-1).reshape(*batch, g + 2)
+        nodes = self.centers.size
+        # Equal weights, the usual case, are passed as a single number.
+        equal = _are_equal(weights)
+        each = weights if equal else np.broadcast_to(weights, sample.shape)
+        each = each.ravel()
+        # Bin the sample on the grid.
+        values = np.ascontiguousarray(sample, dtype=np.float64)
+        values = values.reshape(rows, n)
+        counts = np.zeros((rows, nodes))
+        outside = np.zeros((rows, 2))
+        count(values, each, equal, self._low, 1 / self.step, counts, outside)
+        # Smooth what the grid holds.
+        inner = self._smooth(counts)
+        outer = outside / self.widths[-1]
+        density = np.concatenate([inner, outer], axis=-1)
+        return density.reshape(*batch, nodes + 2)
 
     def _smooth(self, values: Floats) -> Floats:
+        """Return the convolution with the kernel of values at the nodes, shape (..., g)."""
         rows = np.ascontiguousarray(values).reshape(-1, self.centers.size)
         out = np.zeros_like(rows)
         smooth(rows, self.kernel, out)
         return out.reshape(values.shape)
 
     def reading(self, points: Floats, weights: Floats) -> Floats:
-        """Return cubic convolution weights (Keys 1981), which interpolate and are exact for parabolas."""
+        """Return cubic convolution weights (Keys 1981), which are exact for parabolas."""
+        # Where the points are: a node, and a fraction of a step beyond it.
         t = points / self.step - self._low
-        inside = (t >= 1) & (t < self.centers.size - 2)
+        last = self.centers.size - 2
+        inside = (t >= 1) & (t < last)
         t = np.where(inside, t, 1.0)
         node = t.astype(np.intp)
         t -= node
         s = 1 - t
-        keys = (-t * s**2 / 2, 1 - 2.5 * t**2 + 1.5 * t**3, 1 - 2.5 * s**2 + 1.5 * s**3, -s * t**2 / 2)
+        # What the four nodes around a point contribute.
+        keys = (
+            -t * s**2 / 2,
+            1 - 2.5 * t**2 + 1.5 * t**3,
+            1 - 2.5 * s**2 + 1.5 * s**3,
+            -s * t**2 / 2,
+        )
+        row = np.arange(points.size)
         each = np.zeros((points.size, self.widths.size))
-        for k, b in enumerate(keys):
-            each[np.arange(points.size), node - 1 + k] += np.where(inside, b, 0.0)
-        flat = weights.reshape(-1, points.size) @ each
-        return flat.reshape(*weights.shape[:-1], each.shape[1])
+        for k, share in enumerate(keys):
+            at = node - 1 + k
+            each[row, at] += np.where(inside, share, 0.0)
+        return product(weights, each)
 
     def value(self, sample: Floats, cotangent: Floats) -> Floats:
-        """Return the smoothed cotangent at the sample; the smoothing kernel is its own transpose."""
-        return self._interpolated(sample, cotangent, SPLINE, cotangent[..., -2:] / self.widths[-1])
+        """Return the smoothed cotangent at the sample; the kernel is its own transpose."""
+        outer = cotangent[..., -2:] / self.widths[-1]
+        return self._interpolated(sample, cotangent, SPLINE, outer)
 
     def slope(self, sample: Floats, cotangent: Floats) -> Floats:
         """Return the derivative of the smoothed cotangent at the sample."""
-        slopes = np.pad(SPLINE[:, 1:] * [1, 2, 3] / self.step, [(0, 0), (0, 1)])
-        return self._interpolated(sample, cotangent, slopes, np.zeros(2))
+        powers = [1, 2, 3]
+        derivatives = SPLINE[:, 1:] * powers / self.step
+        quadratics = np.pad(derivatives, [(0, 0), (0, 1)])
+        constant = np.zeros(2)
+        return self._interpolated(sample, cotangent, quadratics, constant)
 
-    def _interpolated(self, sample: Floats, cotangent: Floats, spline: Floats, outer: Floats) -> Floats:
-        """Evaluate the splines whose coefficients are a smoothed cotangent's; ``outer`` is for values off the grid."""
+    def _interpolated(
+        self, sample: Floats, cotangent: Floats, spline: Floats, outer: Floats
+    ) -> Floats:
+        """Return at a sample the splines whose coefficients are a smoothed cotangent's.
+
+        Parameters
+        ----------
+        sample : ndarray, shape (..., n)
+        cotangent : ndarray, shape (..., g + 2)
+        spline : ndarray, shape (4, 4)
+            Coefficients of powers of the fraction of a step, for the four splines that reach a
+            point.
+        outer : ndarray, shape (..., 2)
+            What values below and above the grid get.
+        """
         batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
-        rows, n, g = int(np.prod(batch, dtype=int)), sample.shape[-1], self.centers.size
+        rows = int(np.prod(batch, dtype=int))
+        n = sample.shape[-1]
+        nodes = self.centers.size
+        smoothed = self._smooth(cotangent[..., :-2])
+        smoothed = np.broadcast_to(smoothed, (*batch, nodes))
+        cubics = _cubics(smoothed.reshape(rows, nodes), spline)
+        # Values that all rows share are passed once.
         values = sample if sample.ndim == 1 else np.broadcast_to(sample, (*batch, n))
-        c = np.broadcast_to(self._smooth(cotangent[..., :-2]), (*batch, g)).reshape(rows, g)
-        near = np.pad(c, [(0, 0), (1, 2)])
-        powers = np.stack([near[:, k : k + g] for k in range(4)], axis=-1) @ spline
-        edge = np.ascontiguousarray(np.broadcast_to(outer, (*batch, 2)).reshape(rows, 2))
+        values = np.ascontiguousarray(values, dtype=np.float64)
+        values = values.reshape(-1, n)
+        # Read the cubics at the values.
+        ends = np.broadcast_to(outer, (*batch, 2))
+        ends = np.ascontiguousarray(ends.reshape(rows, 2))
         out = np.empty((rows, n))
-        flat = np.ascontiguousarray(values, dtype=np.float64).reshape(-1, n)
-        read(flat, powers, edge, self._low, 1 / self.step, out)
+        read(values, cubics, ends, self._low, 1 / self.step, out)
         return out.reshape(*batch, n)
+
+
+def _cubics(coefficients: Floats, spline: Floats) -> Floats:
+    """Return the cubic beyond each node, from the splines around: (rows, g) -> (rows, g, 4)."""
+    nodes = coefficients.shape[1]
+    padded = np.pad(coefficients, [(0, 0), (1, 2)])
+    near = [padded[:, k : k + nodes] for k in range(4)]
+    return np.stack(near, axis=-1) @ spline
+
+
+def _are_equal(weights: Floats) -> bool:
+    """Return whether there are weights, and all are the same number."""
+    if weights.size == 0:
+        return False
+    broadcast = not any(weights.strides)
+    return broadcast or bool(weights.min() == weights.max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,34 +225,53 @@ class BinCells(Cells):
 
     def density(self, sample: Floats, weights: Floats) -> Floats:
         """Return the normalised frequency per unit length of each bin, then of the outer two."""
-        bins, width = self.centers.size, self.widths[0]
-        batch, n = sample.shape[:-1], sample.shape[-1]
+        *batch, n = sample.shape
         rows = int(np.prod(batch, dtype=int))
-        cell = self._cell(sample).reshape(rows, n) + (bins + 3) * np.arange(rows)[:, None]
-        w = np.broadcast_to(weights, (*batch, n)).reshape(rows, n)
-        counts = np.bincount(cell.ravel(), w.ravel(), rows * (bins + 3)).reshape(*batch, bins + 3)
-        return cast(Floats, counts[..., :-1] / width)
+        # Every row has cells of its own: the bins, below, above, and NaN.
+        cells = self.centers.size + 3
+        first = cells * np.arange(rows)
+        cell = self._cell(sample).reshape(rows, n)
+        cell = cell + first[:, None]
+        # Count in all rows at once.
+        w = np.broadcast_to(weights, sample.shape)
+        counts = np.bincount(cell.ravel(), w.ravel(), rows * cells)
+        counts = counts.reshape(*batch, cells)
+        without_nan = counts[..., :-1]
+        return cast(Floats, without_nan / self.widths[0])
 
     def reading(self, points: Floats, weights: Floats) -> Floats:
         """Return the weight of the points in each bin."""
-        return np.asarray(weights @ self.basis(points) * self.widths)
+        density = weights @ self.basis(points)
+        return np.asarray(density * self.widths)
 
-    def _cell(self, sample: Floats) -> NDArrayInt:
+    def _cell(self, sample: Floats) -> NDArray[np.intp]:
         """Return cell numbers: bins, then below, above, and NaN."""
-        bins, width = self.centers.size, self.widths[0]
+        bins = self.centers.size
+        below, above, nowhere = bins, bins + 1, bins + 2
+        # Where the values are, in widths from the lower edge.
+        width = self.widths[0]
         low = self.centers[0] - width / 2
         position = (sample - low) / width
+        known = np.isfinite(position)
+        finite = np.where(known, position, 0.0)
         # The upper edge belongs to the last bin, also after rounding in low + bins * width.
-        slack = 1e-9
-        inner = np.clip(np.where(np.isfinite(position), position, 0.0), 0, bins - 1).astype(np.intp)
-        outer = np.where(position < -slack, bins, np.where(position > bins + slack, bins + 1, inner))
-        return np.where(np.isnan(position), bins + 2, outer)
+        inner = np.clip(finite, 0, bins - 1)
+        cell = inner.astype(np.intp)
+        too_high = position > bins + _EDGE
+        too_low = position < -_EDGE
+        cell = np.where(too_high, above, cell)
+        cell = np.where(too_low, below, cell)
+        return np.where(np.isnan(position), nowhere, cell)
 
     def value(self, sample: Floats, cotangent: Floats) -> Floats:
         """Return the cell's cotangent."""
-        padded = np.concatenate([cotangent, np.zeros_like(cotangent[..., :1])], axis=-1) / self.widths[0]
-        return np.take_along_axis(padded, self._cell(sample), axis=-1)
+        for_nan = np.zeros_like(cotangent[..., :1])
+        padded = np.concatenate([cotangent, for_nan], axis=-1)
+        per_width = padded / self.widths[0]
+        return np.take_along_axis(per_width, self._cell(sample), axis=-1)
 
     def slope(self, sample: Floats, cotangent: Floats) -> Floats:
         """Return zero: a step function."""
-        return np.zeros(np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1]) + sample.shape[-1:])
+        batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
+        shape = (*batch, sample.shape[-1])
+        return np.zeros(shape)

@@ -1,8 +1,8 @@
 """Density estimates: Gaussian kernels, histograms, bandwidth rules.
 
-A calibration metric compares the simulated density with the observed one on the same *cells*. The cells
-are laid out once, from the observed values; afterwards a density is linear in the weights of the sample,
-which is what makes every metric of this package cheap and differentiable.
+A calibration metric compares the simulated density with the observed one on the same *cells*. The
+cells are laid out once, from the observed values; afterwards a density is linear in the weights of
+the sample, which is what makes every metric of this package cheap and differentiable.
 """
 
 from __future__ import annotations
@@ -14,29 +14,45 @@ from dataclasses import dataclass
 import numpy as np
 
 from prbayes._checks import Floats, positive_integer, positive_number
+from prbayes._weighted import quantile
 from prbayes.metrics.cells import BinCells, Cells, KernelCells
 
-_MARGIN = 6.0  # bandwidths of grid beyond the outermost observation, at least
-_PER_BANDWIDTH = 4  # grid nodes per bandwidth
+# Bandwidths of grid beyond the outermost observation, at least. A Gaussian kernel has 1e-9 of its
+# mass farther out, as much as the floor of logarithms (`DensityDiscrepancy.floored`).
+_MARGIN = 6.0
+
+# Grid nodes per bandwidth. The density is then exact to 3e-5 of a kernel's peak, which a test
+# holds; with three nodes to 1e-4, with six to 6e-6. The cost of comparing densities grows in
+# proportion.
+_PER_BANDWIDTH = 4
+
+# By judgement: a limit to memory, 64 kB for the density of one population. It is met where an
+# outlier stands a thousand bandwidths away from the other observations.
 _MAX_CELLS = 8192
+
+# Standard deviations at which the smoothing kernel ends: 2e-11 of its peak.
+_KERNEL_REACH = 7
+
+# By judgement: bins of a histogram at least, so that few observations still show a shape.
+_MIN_BINS = 5
 
 BandwidthRule = Callable[[Floats, Floats], float]
 
 
-def weighted_quantile(sample: Floats, weights: Floats, probability: float) -> float:
-    """Return the quantile of a weighted sample, linear between the mid-points of its steps."""
-    order = np.argsort(sample, kind="stable")
-    w = weights[order]
-    return float(np.interp(probability, np.cumsum(w) - 0.5 * w, sample[order]))
-
-
 def spread(sample: Floats, weights: Floats) -> float:
-    """Return min(standard deviation, IQR / 1.34) of a weighted sample; the sd alone where the IQR is zero."""
+    """Return min(standard deviation, IQR / 1.34) of a weighted sample.
+
+    1.34 is the interquartile range of the standard normal distribution. Where the IQR is zero, it
+    is the standard deviation alone.
+    """
     sample = sample - sample.min()  # equal values give exactly zero
     mean = weights @ sample
-    sd = float(np.sqrt(weights @ (sample - mean) ** 2))
-    iqr = weighted_quantile(sample, weights, 0.75) - weighted_quantile(sample, weights, 0.25)
-    return float(min(sd, iqr / 1.34)) if iqr > 0 else sd
+    variance = weights @ (sample - mean) ** 2
+    sd = float(np.sqrt(variance))
+    upper = quantile(sample, weights, 0.75)
+    lower = quantile(sample, weights, 0.25)
+    iqr = float(upper - lower)
+    return min(sd, iqr / 1.34) if iqr > 0 else sd
 
 
 def silverman(sample: Floats, weights: Floats) -> float:
@@ -57,7 +73,8 @@ def silverman(sample: Floats, weights: Floats) -> float:
     >>> round(silverman(np.arange(32.0), np.full(32, 1 / 32)), 3)
     4.155
     """
-    return float(0.9 * spread(sample, weights) * (weights**2).sum() ** 0.2)
+    inverse_n = (weights**2).sum()
+    return float(0.9 * spread(sample, weights) * inverse_n**0.2)
 
 
 def twice_silverman(sample: Floats, weights: Floats) -> float:
@@ -69,9 +86,11 @@ def likelihood_bandwidth(sample: Floats, weights: Floats) -> float:
     """Return 0.35 min(sd, IQR/1.34) n^(-1/4), the default of the log-likelihood.
 
     Only the simulated side is smoothed there, which makes the fitted population too narrow by about
-    h^2 / (2 sd^2); with this rule that is at most a tenth of the sampling error sd / sqrt(2 n) for every n.
+    h^2 / (2 sd^2); with this rule that is at most a tenth of the sampling error sd / sqrt(2 n) for
+    every n.
     """
-    return float(0.35 * spread(sample, weights) * (weights**2).sum() ** 0.25)
+    inverse_n = (weights**2).sum()
+    return float(0.35 * spread(sample, weights) * inverse_n**0.25)
 
 
 class DensityEstimator(ABC):
@@ -86,22 +105,22 @@ class DensityEstimator(ABC):
 class GaussianKDE(DensityEstimator):
     """Gaussian kernel density with one bandwidth, fixed by the observed side, for both sides.
 
-    The sample is binned on a regular grid of four nodes per bandwidth, with cubic B-spline weights, and
-    smoothed there; the kernel is narrowed by the spline's variance, so that the density's variance is
-    exact, its error is of fourth order in the spacing, and it is twice differentiable in the sample inside the
-    grid.
+    The sample is binned on a regular grid of four nodes per bandwidth, with cubic B-spline weights,
+    and smoothed there; the kernel is narrowed by the spline's variance, so that the density's
+    variance is exact, its error is of fourth order in the spacing, and it is twice differentiable
+    in the sample inside the grid.
 
     Parameters
     ----------
     bandwidth : float or callable, optional
-        In units of the response, or a rule ``(observed, weights) -> float``. Two Silverman bandwidths
-        by default.
+        In units of the response, or a rule ``(observed, weights) -> float``. Two Silverman
+        bandwidths by default.
 
     Raises
     ------
     ValueError
-        If the observed values are all equal, so that no rule gives a bandwidth, or if they span so many
-        bandwidths that the grid would be unreasonably long.
+        If the observed values are all equal, so that no rule gives a bandwidth, or if they span so
+        many bandwidths that the grid would be unreasonably long.
 
     References
     ----------
@@ -125,42 +144,64 @@ class GaussianKDE(DensityEstimator):
             positive_number(self.bandwidth, "bandwidth")
 
     def cells(self, observed: Floats, weights: Floats) -> Cells:
-        """Return a grid over the observed range plus six bandwidths, or half the range, at either side."""
-        h = self.bandwidth(observed, weights) if callable(self.bandwidth) else float(self.bandwidth)
-        if not np.isfinite(h) or h <= 0:
-            raise ValueError(
-                f"bandwidth: got {h:g} from {observed.size} observed values with spread "
-                f"{np.ptp(observed):g}, expected a positive one; pass GaussianKDE(bandwidth=...) in units "
-                "of the response, or use AreaMetric, which needs none"
-            )
+        """Return a grid over the observed range and a margin: six bandwidths, or half the range."""
+        h = self._bandwidth(observed, weights)
         step = h / _PER_BANDWIDTH
-        margin = max(_MARGIN * h, float(np.ptp(observed)) / 2)
-        low = float(observed.min()) - margin
-        n_cells = int(np.ceil((float(observed.max()) - low + margin) / step)) + 1
-        if n_cells > _MAX_CELLS:
-            raise ValueError(
-                f"bandwidth: got {h:g} for observed values that span {np.ptp(observed):g}, expected a span "
-                f"below {_MAX_CELLS / _PER_BANDWIDTH / 2:g} bandwidths; look for outliers, pass a larger "
-                "GaussianKDE(bandwidth=...), or use AreaMetric"
-            )
+        low, n_nodes = _grid(observed, h, step)
         tight = 2 * np.sqrt(np.pi) * h  # the integral of a kernel's square is 1 / tight
-        s = np.sqrt(h**2 - step**2 / 3)
-        reach = int(np.ceil(7 * s / step))
-        offsets = step * np.arange(-reach, reach + 1)
-        kernel = np.exp(-0.5 * (offsets / s) ** 2) / (s * np.sqrt(2 * np.pi))
         return KernelCells(
-            widths=np.r_[np.full(n_cells, step), tight, tight],
-            centers=low + step * np.arange(n_cells, dtype=np.float64),
+            widths=np.r_[np.full(n_nodes, step), tight, tight],
+            centers=low + step * np.arange(n_nodes, dtype=np.float64),
             smooth=True,
             bandwidth=h,
             step=step,
-            kernel=kernel,
+            kernel=_narrowed_kernel(h, step),
         )
+
+    def _bandwidth(self, observed: Floats, weights: Floats) -> float:
+        """Return the bandwidth for observed values, or raise if it is not positive."""
+        rule = self.bandwidth
+        h = rule(observed, weights) if callable(rule) else float(rule)
+        if not np.isfinite(h) or h <= 0:
+            raise ValueError(
+                f"bandwidth: got {h:g} from {observed.size} observed values with spread "
+                f"{np.ptp(observed):g}, expected a positive one; pass GaussianKDE(bandwidth=...) "
+                "in units of the response, or use AreaMetric, which needs none"
+            )
+        return h
+
+
+def _grid(observed: Floats, h: float, step: float) -> tuple[float, int]:
+    """Return the first node of a grid over observed values and their margins, and its length."""
+    length = float(np.ptp(observed))
+    margin = max(_MARGIN * h, length / 2)
+    low = float(observed.min()) - margin
+    high = float(observed.max())
+    n_nodes = int(np.ceil((high - low + margin) / step)) + 1
+    if n_nodes > _MAX_CELLS:
+        allowed = _MAX_CELLS / _PER_BANDWIDTH / 2
+        raise ValueError(
+            f"bandwidth: got {h:g} for observed values that span {length:g}, expected a span below "
+            f"{allowed:g} bandwidths; look for outliers, pass a larger GaussianKDE(bandwidth=...), "
+            "or use AreaMetric"
+        )
+    return low, n_nodes
+
+
+def _narrowed_kernel(h: float, step: float) -> Floats:
+    """Return a Gaussian kernel at the nodes, less the variance step^2 / 3 of a cubic B-spline."""
+    s = np.sqrt(h**2 - step**2 / 3)
+    reach = int(np.ceil(_KERNEL_REACH * s / step))
+    nodes = np.arange(-reach, reach + 1)
+    u = step * nodes / s
+    height = np.exp(-0.5 * u**2)
+    area = s * np.sqrt(2 * np.pi)
+    return np.asarray(height / area)
 
 
 @dataclass(frozen=True)
 class Histogram(DensityEstimator):
-    """Normalised histogram on equal bins over the observed range, with two bins for the mass outside.
+    """Normalised histogram on equal bins over the observed range, and two for the mass outside.
 
     Parameters
     ----------
@@ -191,13 +232,10 @@ class Histogram(DensityEstimator):
         low, high = float(observed.min()), float(observed.max())
         if high <= low:
             raise ValueError(
-                f"histogram: got {observed.size} observed values, all {low:g}, expected at least two different "
-                "ones; use AreaMetric, which needs no bins"
+                f"histogram: got {observed.size} observed values, all {low:g}, expected at least "
+                "two different ones; use AreaMetric, which needs no bins"
             )
-        bins = self.bins
-        if bins is None:
-            wide = 2 * 1.34 * spread(observed, weights) * float((weights**2).sum()) ** (1 / 3)
-            bins = int(np.clip(np.ceil((high - low) / wide), 5, _MAX_CELLS)) if wide > 0 else _MAX_CELLS
+        bins = self._bins(high - low, observed, weights)
         width = (high - low) / bins
         return BinCells(
             widths=np.full(bins + 2, width),
@@ -205,9 +243,24 @@ class Histogram(DensityEstimator):
             smooth=False,
         )
 
+    def _bins(self, length: float, observed: Floats, weights: Floats) -> int:
+        """Return the number of bins over an observed range of this length."""
+        if self.bins is not None:
+            return self.bins
+        inverse_n = float((weights**2).sum())
+        width = 2 * 1.34 * spread(observed, weights) * inverse_n ** (1 / 3)
+        if not width > 0:
+            return _MAX_CELLS
+        return int(np.clip(np.ceil(length / width), _MIN_BINS, _MAX_CELLS))
+
 
 def density_estimator(density: object) -> None:
     """Refuse what is no estimator of densities."""
-    if not isinstance(density, DensityEstimator):
-        got = f"the class {density.__name__}" if isinstance(density, type) else f"{type(density).__name__} {density!r}"
-        raise TypeError(f"density: got {got}, expected prb.GaussianKDE() or prb.Histogram(), perhaps with arguments")
+    if isinstance(density, DensityEstimator):
+        return
+    got = f"{type(density).__name__} {density!r}"
+    if isinstance(density, type):
+        got = f"the class {density.__name__}"
+    raise TypeError(
+        f"density: got {got}, expected prb.GaussianKDE() or prb.Histogram(), perhaps with arguments"
+    )

@@ -15,13 +15,14 @@ class KullbackLeibler(Metric):
     r"""Kullback-Leibler divergence between the observed density q and the simulated density p.
 
     Forward (default): :math:`\int q \log(q / p)\,dz`; reverse: :math:`\int p \log(p / q)\,dz`. Both
-    densities have the same bandwidth and the floor of ``DensityDiscrepancy.floored``; the reverse one
-    depends on it, because the observed density vanishes quickly outside the data.
+    densities have the same bandwidth and the floor of ``DensityDiscrepancy.floored``; the reverse
+    one depends on it, because the observed density vanishes quickly outside the data.
 
-    Eq. 4 of [1]_ as printed, :math:`\sum_i p(z_i) \log(p(z_i)/q(z_i))` over the observed points with p
-    the simulated density, is ill-posed as an objective: its terms are not normalised over the points, so
-    that it goes negative, and it is made small by moving the population away from the data altogether.
-    Hence the integral, and the forward direction, which is maximum likelihood of smoothed data.
+    Eq. 4 of [1]_ as printed, :math:`\sum_i p(z_i) \log(p(z_i)/q(z_i))` over the observed points
+    with p the simulated density, is ill-posed as an objective: its terms are not normalised over
+    the points, so that it goes negative, and it is made small by moving the population away from
+    the data altogether. Hence the integral, and the forward direction, which is maximum likelihood
+    of smoothed data.
 
     Parameters
     ----------
@@ -54,7 +55,8 @@ class KullbackLeibler(Metric):
         return not self.reverse
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
-        return DivergenceDiscrepancy(self, observed, weights, self.density.cells(observed, weights))
+        cells = self.density.cells(observed, weights)
+        return DivergenceDiscrepancy.on_cells(self, observed, weights, cells)
 
 
 class DivergenceDiscrepancy(DensityDiscrepancy):
@@ -64,6 +66,9 @@ class DivergenceDiscrepancy(DensityDiscrepancy):
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the integral of a log(a / b), (a, b) = (q, p) forward, (p, q) in reverse."""
-        p, q = self.floored(features[0]), self.floored(self.density)
+        p = self.floored(features[0])
+        q = self.floored(self.density)
         a, b = (p, q) if self.metric.reverse else (q, p)
-        return (a * xp.log(a / b) * self.cells.widths).sum(axis=-1)
+        ratio = xp.log(a / b)
+        integrand = a * ratio
+        return (integrand * self.cells.widths).sum(axis=-1)

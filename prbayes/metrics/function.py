@@ -23,7 +23,8 @@ class FunctionMetric(Metric):
     Parameters
     ----------
     function : callable
-        ``function(simulated, observed) -> discrepancy``, shapes (..., n), (N,) -> (...); smaller is better.
+        ``function(simulated, observed) -> discrepancy``, shapes (..., n), (N,) -> (...); smaller is
+        better.
     weighted : bool
         Whether the function takes the weights of the simulated values, shape (..., n), as a third
         argument. `Reweighted` needs that; the other propagations do not.
@@ -36,7 +37,9 @@ class FunctionMetric(Metric):
     Examples
     --------
     >>> import numpy as np
-    >>> metric = FunctionMetric(lambda simulated, observed: abs(np.mean(simulated, -1) - observed.mean()))
+    >>> def difference(simulated, observed):
+    ...     return abs(np.mean(simulated, axis=-1) - observed.mean())
+    >>> metric = FunctionMetric(difference)
     >>> metric([0.0, 2.0], [4.0])
     3.0
     """
@@ -46,7 +49,8 @@ class FunctionMetric(Metric):
 
     def __post_init__(self) -> None:
         if not callable(self.function):
-            raise TypeError(f"function: got {type(self.function).__name__}, expected f(simulated, observed)")
+            got = type(self.function).__name__
+            raise TypeError(f"function: got {got}, expected f(simulated, observed)")
 
     @property
     def takes_weights(self) -> bool:
@@ -55,7 +59,10 @@ class FunctionMetric(Metric):
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         if not np.allclose(weights, weights[0]):
-            raise ValueError("observed weights: got unequal ones, expected none; a FunctionMetric has no use for them")
+            raise ValueError(
+                "observed weights: got unequal ones, expected none; "
+                "a FunctionMetric has no use for them"
+            )
         return FunctionDiscrepancy(self, observed, weights, observed.size)
 
 
@@ -86,41 +93,46 @@ class FunctionDiscrepancy(Discrepancy):
         return 1.0
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
-        """Return the value of the function."""
+        """Return the value of the function; the values for several data sets, (B, ...)."""
         if self.weights.ndim > 1:
             return (self._of_each(simulated, weights),)
         observed = repeated(self.observed, self.weights, self.size)
-        return (self._called(simulated, observed, weights),)
+        return (self._checked(simulated, observed, weights),)
 
     def _of_each(self, simulated: Floats, weights: Floats) -> Floats:
-        """Return the values for several data sets, (B, ...), from populations (B, ..., n) or (1, ..., n)."""
+        """Return values for B data sets, from populations (B, ..., n) or (1, ..., n)."""
         n_sets = len(self.weights)
         simulated = np.broadcast_to(simulated, (n_sets, *simulated.shape[1:]))
         weights = np.broadcast_to(weights, (n_sets, *weights.shape[1:]))
         found = np.empty(simulated.shape[:-1])
-        for i, counts in enumerate(self.weights.reshape(n_sets, -1)):
-            observed = repeated(self.observed, counts, self.size)
-            found[i] = self._called(simulated[i], observed, weights[i])
+        for i, own in enumerate(self.weights.reshape(n_sets, -1)):
+            observed = repeated(self.observed, own, self.size)
+            found[i] = self._checked(simulated[i], observed, weights[i])
         return found
 
-    def _called(self, simulated: Floats, observed: Floats, weights: Floats) -> Floats:
-        """Call the function for one data set, with weights if it takes them, and check what it returns."""
-        if self.metric.weighted:
-            value = self.metric.function(simulated, observed, np.broadcast_to(weights, simulated.shape))
-        elif not np.allclose(weights, np.asarray(weights)[..., :1]):
+    def _checked(self, simulated: Floats, observed: Floats, weights: Floats) -> Floats:
+        """Call the function for one data set, and check what it returns."""
+        value = np.asarray(self._called(simulated, observed, weights), dtype=np.float64)
+        expected = simulated.shape[:-1]
+        if value.shape != expected:
             raise ValueError(
-                "weights: got unequal ones for a FunctionMetric whose function takes none; write "
-                "function(simulated, observed, weights) and pass weighted=True, or use prb.Resimulated"
-            )
-        else:
-            value = self.metric.function(simulated, observed)
-        value = np.asarray(value, dtype=np.float64)
-        if value.shape != simulated.shape[:-1]:
-            raise ValueError(
-                f"FunctionMetric: got a result of shape {value.shape} for simulated values of shape "
-                f"{simulated.shape}, expected {simulated.shape[:-1]}; reduce over the last axis"
+                f"FunctionMetric: got a result of shape {value.shape} for simulated values of "
+                f"shape {simulated.shape}, expected {expected}; reduce over the last axis"
             )
         return value
+
+    def _called(self, simulated: Floats, observed: Floats, weights: Floats) -> Any:
+        """Call the function, with weights if it takes them; equal ones it need not know."""
+        function = self.metric.function
+        if self.metric.weighted:
+            return function(simulated, observed, np.broadcast_to(weights, simulated.shape))
+        if not np.allclose(weights, np.asarray(weights)[..., :1]):
+            raise ValueError(
+                "weights: got unequal ones for a FunctionMetric whose function takes none; "
+                "write function(simulated, observed, weights) and pass weighted=True, "
+                "or use prb.Resimulated"
+            )
+        return function(simulated, observed)
 
     def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
         """Return the simulated values themselves."""
@@ -128,7 +140,8 @@ class FunctionDiscrepancy(Discrepancy):
 
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return the value of the function."""
-        return self.features(np.broadcast_to(basis[0], weights.shape), weights, xp)
+        (values,) = basis
+        return self.features(np.broadcast_to(values, weights.shape), weights, xp)
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the value of the function."""
@@ -155,6 +168,7 @@ def repeated(values: Floats, weights: Floats, size: int) -> Floats:
         if np.abs(counts - whole).max() < _ROUNDING:
             return np.repeat(values, whole.astype(int))
     raise ValueError(
-        "observed weights: got weights that are no counts, expected repeated values; a FunctionMetric takes no "
-        "weights of observed values; use prb.bootstrap(optimum, parametric=True)"
+        "observed weights: got weights that are no counts, expected repeated values; a "
+        "FunctionMetric takes no weights of observed values; use "
+        "prb.bootstrap(optimum, parametric=True)"
     )

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Self
 
 from prbayes._checks import Floats
-from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric, Minimum
-from prbayes.metrics.density import DensityEstimator, GaussianKDE, density_estimator, likelihood_bandwidth
+from prbayes.metrics.base import (
+    DensityDiscrepancy,
+    Discrepancy,
+    Metric,
+    Minimum,
+    observed_density,
+)
+from prbayes.metrics.cells import Cells
+from prbayes.metrics.density import (
+    DensityEstimator,
+    GaussianKDE,
+    density_estimator,
+    likelihood_bandwidth,
+)
 
 
 @dataclass(frozen=True)
@@ -30,7 +42,8 @@ class LogLikelihood(Metric):
     >>> import numpy as np
     >>> from scipy.stats import norm
     >>> simulated = norm.ppf((np.arange(4000) + 0.5) / 4000)
-    >>> bool(np.isclose(LogLikelihood()(simulated, [-1.0, 0.0, 1.0]), -norm.logpdf([-1, 0, 1]).mean(), rtol=0.05))
+    >>> found = LogLikelihood()(simulated, [-1.0, 0.0, 1.0])
+    >>> bool(np.isclose(found, -norm.logpdf([-1, 0, 1]).mean(), rtol=0.05))
     True
     """
 
@@ -43,21 +56,39 @@ class LogLikelihood(Metric):
         density_estimator(self.density)
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
-        return LikelihoodDiscrepancy(self, observed, weights, self.density.cells(observed, weights))
+        cells = self.density.cells(observed, weights)
+        return LikelihoodDiscrepancy.on_cells(self, observed, weights, cells)
 
 
 @dataclass(frozen=True, eq=False)
 class LikelihoodDiscrepancy(DensityDiscrepancy):
-    """The mean log-likelihood of fixed observed values."""
+    """The mean log-likelihood of fixed observed values.
 
-    reading: Floats = field(init=False)
+    Attributes
+    ----------
+    reading : ndarray, shape (m,) or (..., m)
+        ``reading @ g`` is the weighted mean of g, given on the cells, at the observed values.
+    """
+
+    reading: Floats
     _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "density", "reading")
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "reading", self.cells.reading(self.observed, self.weights))
+    @classmethod
+    def on_cells(cls, metric: Any, observed: Floats, weights: Floats, cells: Cells) -> Self:
+        """Return the likelihood of observed values, to be read from densities on given cells."""
+        density = observed_density(cells, observed, weights)
+        reading = cells.reading(observed, weights)
+        return cls(metric, observed, weights, cells, density, reading)
+
+    def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
+        """Return the same metric, on the same cells, against other values; for resampling."""
+        other = super().with_observed(observed, weights)
+        reading = self.cells.reading(other.observed, other.weights)
+        return replace(other, reading=reading)
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return minus the weighted mean of log p at the observed values."""
         (p,) = features
-        return -(xp.log(self.floored(p)) * self.reading).sum(axis=-1)
+        logs = xp.log(self.floored(p))
+        mean = (logs * self.reading).sum(axis=-1)
+        return -mean

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from prbayes._checks import Floats, positive_number
-from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric, Minimum
+from prbayes.metrics.base import (
+    DensityDiscrepancy,
+    Discrepancy,
+    Metric,
+    Minimum,
+    observed_density,
+)
+from prbayes.metrics.cells import Cells
 from prbayes.metrics.density import DensityEstimator, GaussianKDE, density_estimator
 
 
@@ -16,16 +23,18 @@ from prbayes.metrics.density import DensityEstimator, GaussianKDE, density_estim
 class ProbabilityResidual(Metric):
     r"""Probability residual: the scaled squared difference of two densities.
 
-    With a `GaussianKDE` the integral form, :math:`S \int (p - q)^2 dz`, one bandwidth for both sides; it
-    equals a squared maximum mean discrepancy with a Gaussian kernel of bandwidth :math:`\sqrt 2 h`, so
-    its minimiser is right for every bandwidth. With a `Histogram` the sum form, :math:`S \sum (p_i - q_i)^2`
-    over densities in bins. The scale factor is :math:`S = C^{-\lfloor \log_{10} \max q \rfloor}`.
+    With a `GaussianKDE` the integral form, :math:`S \int (p - q)^2 dz`, one bandwidth for both
+    sides; it equals a squared maximum mean discrepancy with a Gaussian kernel of bandwidth
+    :math:`\sqrt 2 h`, so its minimiser is right for every bandwidth. With a `Histogram` the sum
+    form, :math:`S \sum (p_i - q_i)^2` over densities in bins. The scale factor is :math:`S =
+    C^{-\lfloor \log_{10} \max q \rfloor}`.
 
     Parameters
     ----------
     density : GaussianKDE or Histogram
     scale_base : float
-        The constant C. It has no influence on the minimiser, only on an optimiser's absolute tolerances.
+        The constant C. It has no influence on the minimiser, only on an optimiser's absolute
+        tolerances.
 
     Raises
     ------
@@ -56,7 +65,8 @@ class ProbabilityResidual(Metric):
         positive_number(self.scale_base, "scale_base")
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
-        return ResidualDiscrepancy(self, observed, weights, self.density.cells(observed, weights))
+        cells = self.density.cells(observed, weights)
+        return ResidualDiscrepancy.on_cells(self, observed, weights, cells)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,30 +74,34 @@ class ResidualDiscrepancy(DensityDiscrepancy):
     """The probability residual against fixed observed values; ``scale_factor`` is S of eq. 10."""
 
     metric: ProbabilityResidual
-    scale_factor: float = field(init=False)
+    scale_factor: float
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        power = np.floor(np.log10(self.density.max()))
-        object.__setattr__(self, "scale_factor", float(self.metric.scale_base**-power))
+    @classmethod
+    def on_cells(cls, metric: Any, observed: Floats, weights: Floats, cells: Cells) -> Self:
+        """Return the residual from observed values, S from the peak of their density (eq. 10).
 
-    def with_observed(self, observed: Floats, weights: Floats | None = None) -> Discrepancy:
-        """Return the same metric, with the same scale factor, on the same cells, against other values."""
-        other = super().with_observed(observed, weights)
-        object.__setattr__(other, "scale_factor", self.scale_factor)
-        return other
+        Against other values, by `with_observed`, it keeps this S.
+        """
+        density = observed_density(cells, observed, weights)
+        peak = density.max()
+        power = np.floor(np.log10(peak))
+        scale_factor = float(metric.scale_base**-power)
+        return cls(metric, observed, weights, cells, density, scale_factor)
 
     @property
     def _measure(self) -> Any:
+        """Return what a cell counts for: its width in the integral form, one in the sum form."""
         return self.cells.widths if self.cells.smooth else 1.0
 
     @property
     def scale(self) -> float:
-        """The residual of a population with no overlap and no density: S times the integral of q squared."""
-        return float(self.scale_factor * (self.density**2 * self._measure).sum())
+        """The residual of a population without any density: S times the integral of q squared."""
+        integrand = self.density**2 * self._measure
+        return float(self.scale_factor * integrand.sum())
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return S times the integral (or sum) of (p - q)^2: eq. 6, 8, 9."""
         (p,) = features
         q = self.density
-        return self.scale_factor * ((p - q) ** 2 * self._measure).sum(axis=-1)
+        integrand = (p - q) ** 2 * self._measure
+        return self.scale_factor * integrand.sum(axis=-1)

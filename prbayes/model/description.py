@@ -1,9 +1,10 @@
-"""What a model is, in words that go into a file: variables with their distributions, simulators with their inputs."""
+"""What a model is, in words that go into a file: variables, simulators, names of elements."""
 
 from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping, Set
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,14 @@ from pytensor.graph.traversal import walk
 
 from prbayes.model.simulator import Node, nodes
 
-_LONGEST = 60_000  # characters that an attribute of an HDF5 file can hold
-_LABELS = 40
+# Characters: an attribute of an HDF5 file holds less than 64 KiB, with what surrounds it.
+# JSON writes letters beyond ASCII as six characters of a byte each, so that these are bytes.
+_LONGEST = 60_000
+_MOST_LABELS = 40  # specimens that are named one by one; by judgement: three lines of a report
+
+# What is told of a variable and of a simulator.
+_VARIABLE = ("name", "role", "distribution")
+_SIMULATOR = ("name", "response", "inputs", "metric", "propagation", "n_points", "specimens")
 
 
 def describe(model: pm.Model) -> dict[str, Any]:
@@ -24,31 +31,31 @@ def describe(model: pm.Model) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``variables``: name, role and distribution of each; ``simulators``: name, response, inputs, metric, propagation,
-        the number of its points, and specimens.
+        ``variables``: name, role and distribution of each; ``simulators``: name, response, inputs,
+        metric, propagation, the number of its points, and specimens.
     """
     known = {*model.basic_RVs, *model.deterministics}
-    variables = [
-        {"name": str(rv.name), "role": "hyperparameter", "distribution": _distribution(rv, known)}
-        for rv in model.free_RVs
-    ]
-    variables += [
-        {"name": str(v.name), "role": "deterministic", "distribution": f"computed from {_above(v, known)}"}
-        for v in model.deterministics
-    ]
     simulators = nodes(model)
-    variables += [
-        {"name": str(rv.name), "role": "observed", "distribution": _distribution(rv, known)}
-        for rv in model.observed_RVs
-        if rv not in simulators
-    ]
-    return {"variables": variables, "simulators": [_simulator(node, known) for node in simulators.values()]}
+    variables = []
+    for rv in model.free_RVs:
+        variables.append(_variable(rv, "hyperparameter", _distribution(rv, known)))
+    for computed in model.deterministics:
+        text = f"computed from {_above(computed, known)}"
+        variables.append(_variable(computed, "deterministic", text))
+    for rv in model.observed_RVs:
+        if rv not in simulators:
+            variables.append(_variable(rv, "observed", _distribution(rv, known)))
+    described = [_simulator(node, known) for node in simulators.values()]
+    return {"variables": variables, "simulators": described}
 
 
 def without_addresses(configuration: object) -> str:
-    """Return the representation of a metric or propagation, the same in every session; functions by their names."""
-    text = re.sub(r" at 0x[0-9a-fA-F]+", "", repr(configuration))
-    return re.sub(r"<function ((?:[\w.]|<locals>|<lambda>)+)>", r"\1", text)
+    """Return the representation of a metric or propagation, the same in every session.
+
+    Functions are told by their names.
+    """
+    without = re.sub(r" at 0x[0-9a-fA-F]+", "", repr(configuration))
+    return re.sub(r"<function ((?:[\w.]|<locals>|<lambda>)+)>", r"\1", without)
 
 
 def as_attribute(model: pm.Model) -> dict[str, str]:
@@ -57,59 +64,82 @@ def as_attribute(model: pm.Model) -> dict[str, str]:
     return {"model": text} if len(text) <= _LONGEST else {}
 
 
-def from_attributes(attrs: Any) -> dict[str, Any] | None:
-    """Return the description that a file has, or None."""
+def from_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
+    """Return the description that a file has; None where there is none, or it is damaged."""
     try:
         found = json.loads(attrs["model"])
-        variables = [{k: str(v[k]) for k in ("name", "role", "distribution")} for v in found["variables"]]
-        keys = ("name", "response", "inputs", "metric", "propagation", "n_points", "specimens")
-        return {"variables": variables, "simulators": [{k: str(s[k]) for k in keys} for s in found["simulators"]]}
+        variables = [_texts(v, _VARIABLE) for v in found["variables"]]
+        simulators = [_texts(s, _SIMULATOR) for s in found["simulators"]]
     except (KeyError, TypeError, ValueError):
         return None
+    return {"variables": variables, "simulators": simulators}
 
 
-def _simulator(node: Node, known: set[Any]) -> dict[str, str]:
+def element_name(name: str, index: tuple[int, ...]) -> str:
+    """Return the name of an element of a variable, such as 'mu[1]'; of a scalar, its own."""
+    return f"{name}[{','.join(map(str, index))}]" if index else name
+
+
+def _texts(found: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, str]:
+    return {key: str(found[key]) for key in keys}
+
+
+def _variable(variable: Any, role: str, distribution: str) -> dict[str, str]:
+    return {"name": str(variable.name), "role": role, "distribution": distribution}
+
+
+def _simulator(node: Node, known: Set[Any]) -> dict[str, str]:
     inputs = node.bound.inputs
+    arguments = [_input(argument, inputs.aleatory, known) for argument in inputs.arguments]
     return {
         "name": node.name,
         "response": _called(node.bound.responses.function),
-        "inputs": ", ".join(_input(a, inputs.aleatory, known) for a in inputs.arguments),
+        "inputs": ", ".join(arguments),
         "metric": without_addresses(node.metric),
         "propagation": without_addresses(node.propagation),
         "n_points": str(node.bound.n_points),
-        "specimens": _labels(node),
+        "specimens": _specimens(node),
     }
 
 
 def _called(function: Any) -> str:
-    inner = getattr(function, "function", function)
+    inner = getattr(function, "function", function)  # of what `scalar` wraps
     return str(getattr(inner, "__name__", type(inner).__name__))
 
 
-def _input(argument: Any, aleatory: tuple[Any, ...], known: set[Any]) -> str:
+def _input(argument: Any, aleatory: tuple[Any, ...], known: Set[Any]) -> str:
+    """Return an argument of a simulator in words; an int is the place of an aleatory one."""
     if isinstance(argument, int):
         return _distribution(aleatory[argument], known)
     if isinstance(argument, Variable):
         return str(argument.name or f"an expression of {_above(argument, known)}")
     value = np.asarray(argument)
-    return f"{value.item():.6g}" if value.size == 1 else f"an array of shape {value.shape}"
+    if value.size == 1:
+        return f"{value.item():.6g}"
+    return f"an array of shape {value.shape}"
 
 
-def _distribution(rv: Any, known: set[Any]) -> str:
+def _distribution(rv: Any, known: Set[Any]) -> str:
     text: str = str_for_dist(rv, named_vars=known)
     return text.removeprefix(f"{rv.name} ~ ")
 
 
-def _above(variable: Any, known: set[Any]) -> str:
+def _above(variable: Any, known: Set[Any]) -> str:
     """Return the names of the model's variables next above one."""
-    inputs = [] if variable.owner is None else variable.owner.inputs
-    above = walk(inputs, lambda v: None if v in known or v.owner is None else v.owner.inputs)
-    return ", ".join(str(v.name) for v in above if v in known) or "constants"
+
+    def inputs_of(v: Any) -> Any:
+        # Not beyond a variable of the model
+        return None if v in known or v.owner is None else v.owner.inputs
+
+    start = [] if variable.owner is None else variable.owner.inputs
+    names = [str(v.name) for v in walk(start, inputs_of) if v in known]
+    return ", ".join(names) or "constants"
 
 
-def _labels(node: Node) -> str:
+def _specimens(node: Node) -> str:
     if node.specimens is None:
         return ""
     labels = list(dict.fromkeys(map(str, node.specimens.tolist())))
-    rest = f", and {len(labels) - _LABELS} more" if len(labels) > _LABELS else ""
-    return f"{len(labels)} specimens: {', '.join(labels[:_LABELS])}{rest}"
+    text = f"{len(labels)} specimens: {', '.join(labels[:_MOST_LABELS])}"
+    more = len(labels) - _MOST_LABELS
+    return f"{text}, and {more} more" if more > 0 else text

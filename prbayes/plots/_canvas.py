@@ -1,11 +1,12 @@
-"""What all pictures are drawn on: panels of an ArviZ `PlotCollection`, alike on each of its backends.
+"""What all pictures are drawn on: panels of an ArviZ `PlotCollection`, alike on each backend.
 
 Plotting libraries are imported when a canvas is made.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
@@ -13,40 +14,75 @@ import numpy as np
 import xarray as xr
 
 from prbayes._checks import Floats
+from prbayes.plots._legends import draw_legend, legend_entry
+from prbayes.plots._ticks import Ticks
 
-# Okabe and Ito's colours, which colour-blind readers tell apart; line styles tell them apart in grey.
-BLUE, ORANGE, GREEN, VERMILION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
-INK, GREY = "B1", "B2"  # against the background, whatever it is
+# Colours that colour-blind readers tell apart (Okabe and Ito, Color Universal Design, 2008); line
+# styles tell curves apart in grey.
+BLUE, ORANGE, GREEN = "#0072B2", "#E69F00", "#009E73"
+VERMILION, PURPLE = "#D55E00", "#CC79A7"
 CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE)
+# ArviZ's codes, which each backend translates: against the background, styles, markers.
+INK, GREY, PALE = "B1", "B2", "B3"
 SOLID, DASHED, DOTTED, DASHDOT = "C0", "C1", "C2", "C3"
 CIRCLE, CROSS, DIAMOND = "C0", "C3", "C4"
 
-Ticks = tuple[Sequence[float], Sequence[str]]  # positions and labels
+# Pixels below the panels that the legend takes, by judgement: two or three rows of text.
+_LEGEND_PIXELS = 60
+_LEGEND_PIXELS_BOKEH = 70  # for each row of panels: bokeh has a legend below each panel
+_PIXELS_PER_INCH = 100
 
+# What has no artist of its own to keep.
+_OF_AXES = frozenset({"title", "xlabel", "ylabel", "xlim", "ylim", "xticks", "yticks"})
 
-def named(name: str, labels: Mapping[str, str] | None) -> str:
-    """Return what a reader calls a variable: its label, that of the variable it is an element of, or its name."""
-    given = labels or {}
-    stem, bracket, rest = name.partition("[")
-    return given.get(name) or (f"{given[stem]}{bracket}{rest}" if stem in given else name)
+Limits = tuple[float, float]
 
 
 def grid_settings(
     panels: int, size: tuple[float, float], backend: str | None, pc_kwargs: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return keywords of `PlotCollection.wrap` for so many panels of a size in inches, one for each variable."""
+    """Return keywords of `PlotCollection.wrap` for so many panels of a size in inches."""
     arviz: Any = import_module("arviz")
-    settings: dict[str, Any] = {"cols": ["__variable__"], "col_wrap": 2 if panels == 4 else 3} | pc_kwargs
     backend = backend or arviz.rcParams["plot.backend"]
+
+    # Three panels a row; four make a square
+    settings = {"cols": ["__variable__"], "col_wrap": 2 if panels == 4 else 3, **pc_kwargs}
     columns = min(panels, settings["col_wrap"])
     rows = -(-panels // columns)
-    width, height = size[0] * columns, size[1] * rows
+
+    width, height = size
+    figure = _figure_settings(backend, width * columns, height * rows, rows)
+    figure |= settings.get("figure_kwargs", {})
+    return settings | {"backend": backend, "figure_kwargs": figure}
+
+
+def _figure_settings(backend: str, width: float, height: float, rows: int) -> dict[str, Any]:
+    """Return the keywords of a figure of so many inches."""
     if backend == "matplotlib":
-        figure: dict[str, Any] = {"figsize": (width, height), "figsize_units": "inches", "layout": "constrained"}
-    else:
-        room = 70 * rows if backend == "bokeh" else 60  # for the legend, which bokeh has below each panel
-        figure = {"figsize": (100 * width, 100 * height + room), "figsize_units": "dots"}
-    return settings | {"backend": backend, "figure_kwargs": figure | dict(settings.get("figure_kwargs", {}))}
+        # Its layout makes room for the legend
+        size = (width, height)
+        return {"figsize": size, "figsize_units": "inches", "layout": "constrained"}
+    legend = _LEGEND_PIXELS_BOKEH * rows if backend == "bokeh" else _LEGEND_PIXELS
+    across = _PIXELS_PER_INCH * width
+    down = _PIXELS_PER_INCH * height + legend
+    return {"figsize": (across, down), "figsize_units": "dots"}
+
+
+@dataclass(frozen=True, eq=False)
+class _Call:
+    """A call of a backend's function, without the panel that it is for."""
+
+    function: str
+    data: tuple[Any, ...]
+    keywords: dict[str, Any]
+
+    def on(self, target: Any, library: Any) -> Any:
+        """Make the call on a panel of the backend; return the artist, if there is one to keep."""
+        function = getattr(library, self.function)
+        artist = function(*self.data, target, **self.keywords)
+        if isinstance(artist, list):
+            return None  # plotly's contours, one for each level
+        return artist
 
 
 class Canvas:
@@ -59,59 +95,133 @@ class Canvas:
     size : (float, float)
         Of a panel, in inches.
     backend : str or None
+        That of ArviZ's settings by default.
     pc_kwargs : dict
         For `PlotCollection.wrap`.
     """
 
     def __init__(
-        self, panels: Sequence[str], *, size: tuple[float, float], backend: str | None, pc_kwargs: dict[str, Any]
+        self,
+        panels: Sequence[str],
+        *,
+        size: tuple[float, float],
+        backend: str | None,
+        pc_kwargs: dict[str, Any],
     ) -> None:
         arviz: Any = import_module("arviz")
-        self._settings = grid_settings(len(panels), size, backend, pc_kwargs)
-        self.backend = str(self._settings["backend"])
+        settings = grid_settings(len(panels), size, backend, pc_kwargs)
+        self.backend = str(settings["backend"])
         self._library: Any = import_module(f"arviz_plots.backend.{self.backend}")
-        data = xr.Dataset({name: (f"{name} point", np.zeros(2)) for name in panels})
-        self._collection: Any = arviz.PlotCollection.wrap(data, **self._settings)
-        self._drawn: dict[str, dict[str, tuple[str, tuple[Any, ...], dict[str, Any]]]] = {}
-        self._legend: dict[str, None] = {}
+        # One variable for each panel, of a dimension of its own
+        data = xr.Dataset()
+        for name in panels:
+            data[name] = (f"{name} point", np.zeros(2))
+        self._collection: Any = arviz.PlotCollection.wrap(data, **settings)
+        self._calls: dict[str, dict[str, _Call]] = {}
+        self._legend: set[str] = set()
 
-    def _add(self, visual: str, panel: str, function: str, *data: Any, legend: str = "", **how: Any) -> None:
-        self._drawn.setdefault(visual, {})[panel] = (function, data, how | self._legend_entry(legend))
+    def panel(self, name: str) -> Panel:
+        """Return the panel of a name, to draw on."""
+        return Panel(self, name)
 
-    def _legend_entry(self, text: str) -> dict[str, Any]:
-        if not text or self.backend == "none":
-            return {}
-        first = text not in self._legend
-        self._legend[text] = None
-        if self.backend == "plotly":
-            return {"name": text, "legendgroup": text, "showlegend": first}
-        return {"label": text} if self.backend == "matplotlib" else {"legend_label": text}
+    def add(
+        self,
+        panel: str,
+        visual: str,
+        function: str,
+        *data: Any,
+        legend: str = "",
+        **keywords: Any,
+    ) -> None:
+        """Plan a call of the backend's function, which will be ``visual`` of the panel."""
+        if legend:
+            first = legend not in self._legend
+            self._legend.add(legend)
+            keywords |= legend_entry(self.backend, legend, first=first)
+        by_panel = self._calls.setdefault(visual, {})
+        by_panel[panel] = _Call(function, data, keywords)
+
+    def finish(self) -> Any:
+        """Draw everything, with a legend below the panels, and return the `PlotCollection`."""
+        for visual, by_panel in self._calls.items():
+            self._draw(visual, by_panel)
+        if self._legend and self.backend != "none":
+            variables = self._collection.data.data_vars
+            targets = [self._collection.get_target(name, {}) for name in variables]
+            figure = self._collection.viz["figure"].item()
+            draw_legend(self.backend, figure, targets)
+        return self._collection
+
+    def _draw(self, visual: str, by_panel: dict[str, _Call]) -> None:
+        """Draw a visual on the panels that have it."""
+
+        def one(da: Any, target: Any, var_name: str, sel: Any, isel: Any) -> Any:
+            return by_panel[var_name].on(target, self._library)
+
+        self._collection.map(
+            one,
+            visual,
+            data=self._collection.data[list(by_panel)],
+            subset_info=True,
+            store_artist=visual not in _OF_AXES,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One panel of a canvas; each visual is drawn once on it.
+
+    Attributes
+    ----------
+    canvas : Canvas
+    name : str
+    """
+
+    canvas: Canvas
+    name: str
 
     def line(
         self,
-        panel: str,
         visual: str,
         x: Any,
         y: Any,
         color: str,
         *,
         style: str = SOLID,
-        width: float = 1.8,
+        width: float | None = 1.8,
         legend: str = "",
     ) -> None:
-        """Draw a line."""
-        how = {"color": color, "linestyle": style, "width": width}
-        self._add(visual, panel, "line", np.asarray(x), np.asarray(y), legend=legend, **how)
+        """Draw a line; without a width, of the backend's."""
+        how: dict[str, Any] = {"color": color, "linestyle": style}
+        if width is not None:
+            how["width"] = width
+        data = (np.asarray(x), np.asarray(y))
+        self.canvas.add(self.name, visual, "line", *data, legend=legend, **how)
 
     def band(
-        self, panel: str, visual: str, x: Floats, sides: tuple[Floats, Floats], color: str, *, legend: str = ""
+        self,
+        visual: str,
+        x: Floats,
+        sides: tuple[Floats, Floats],
+        color: str,
+        *,
+        alpha: float = 0.25,
+        legend: str = "",
     ) -> None:
-        """Shade what is between two curves."""
-        self._add(visual, panel, "fill_between_y", x, *sides, color=color, alpha=0.25, legend=legend)
+        """Shade what is between two curves, the lower one first."""
+        self.canvas.add(
+            self.name,
+            visual,
+            "fill_between_y",
+            x,
+            *sides,
+            legend=legend,
+            color=color,
+            alpha=alpha,
+        )
 
     def points(
         self,
-        panel: str,
         visual: str,
         x: Any,
         y: Any,
@@ -121,81 +231,66 @@ class Canvas:
         size: float = 30,
         legend: str = "",
     ) -> None:
-        """Draw markers."""
-        x, y = np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(y))
-        size = size**0.5 if self.backend == "bokeh" else size  # a diameter there, an area elsewhere
-        self._add(visual, panel, "scatter", x, y, color=color, marker=marker, size=size, legend=legend)
+        """Draw markers of an area, in square points."""
+        if self.canvas.backend == "bokeh":
+            size = size**0.5  # a diameter there
+        self.canvas.add(
+            self.name,
+            visual,
+            "scatter",
+            *np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(y)),
+            legend=legend,
+            color=color,
+            marker=marker,
+            size=size,
+        )
 
-    def heights(self, panel: str, visual: str, axes: tuple[Floats, Floats], z: Floats, levels: Floats) -> None:
-        """Draw heights over a plane, z of shape (x, y): pale colours from dark to light, and contours; even levels."""
+    def heights(self, visual: str, axes: tuple[Floats, Floats], z: Floats, levels: Floats) -> None:
+        """Draw heights over a plane, z of shape (x, y): colours from dark to light, and contours.
+
+        The levels are even; what is above the last has the colour of the last.
+        """
         how: dict[str, Any] = {"levels": levels, "cmap": "cividis", "alpha": 0.45}
-        if self.backend == "plotly":  # would choose levels of its own
-            how["contours"] = {"start": levels[0], "end": levels[-1], "size": levels[1] - levels[0]}
-        self._add(visual, panel, "contourf", *axes, np.minimum(z, levels[-1]), **how)
-        self._add(f"{visual}_lines", panel, "contour", *axes, z, levels=levels[1:-1], color=GREY, alpha=0.6)
+        if self.canvas.backend == "plotly":  # would choose levels of its own
+            how["contours"] = {
+                "start": levels[0],
+                "end": levels[-1],
+                "size": levels[1] - levels[0],
+            }
+        below = np.minimum(z, levels[-1])
+        self.canvas.add(self.name, visual, "contourf", *axes, below, **how)
+        self.canvas.add(
+            self.name,
+            f"{visual}_lines",
+            "contour",
+            *axes,
+            z,
+            levels=levels[1:-1],
+            color=GREY,
+            alpha=0.6,
+        )
 
     def axes(
         self,
-        panel: str,
         *,
         x: str = "",
         y: str = "",
         title: str = "",
-        xlim: tuple[float, float] | None = None,
-        ylim: tuple[float, float] | None = None,
+        xlim: Limits | None = None,
+        ylim: Limits | None = None,
         xticks: Ticks | None = None,
         yticks: Ticks | None = None,
     ) -> None:
-        """Name the axes of a panel, and say what they cover."""
-        for function, text in (("title", title), ("xlabel", x), ("ylabel", y)):
+        """Name the axes, and say what they cover; what is not given is left to the backend."""
+        given: dict[str, tuple[Any, ...]] = {}
+        for what, text in (("title", title), ("xlabel", x), ("ylabel", y)):
             if text:
-                self._add(function, panel, function, text)
-        for function, limits in (("xlim", xlim), ("ylim", ylim)):
+                given[what] = (text,)
+        for what, limits in (("xlim", xlim), ("ylim", ylim)):
             if limits is not None:
-                self._add(function, panel, function, limits)
-        for function, ticks in (("xticks", xticks), ("yticks", yticks)):
+                given[what] = (limits,)
+        for what, ticks in (("xticks", xticks), ("yticks", yticks)):
             if ticks is not None:
-                self._add(function, panel, function, *map(list, ticks))
-
-    def finish(self) -> Any:
-        """Draw everything, with a legend below the panels, and return the `PlotCollection`."""
-        for visual, panels in self._drawn.items():
-
-            def one(da: Any, target: Any, var_name: str, sel: Any, isel: Any, panels: Any = panels) -> Any:
-                function, data, how = panels[var_name]
-                drawn = getattr(self._library, function)(*data, target, **how)
-                return None if isinstance(drawn, list) else drawn  # plotly's contours, one for each level
-
-            kept = visual not in {"title", "xlabel", "ylabel", "xlim", "ylim", "xticks", "yticks"}
-            names = list(panels)
-            self._collection.map(one, visual, data=self._collection.data[names], subset_info=True, store_artist=kept)
-        if self._legend:
-            getattr(self, f"_legend_{self.backend}", lambda: None)()
-        return self._collection
-
-    def _targets(self) -> list[Any]:
-        return [self._collection.get_target(name, {}) for name in self._collection.data.data_vars]
-
-    def _legend_matplotlib(self) -> None:
-        handles: dict[str, Any] = {}
-        for axis in self._targets():
-            for handle, text in zip(*axis.get_legend_handles_labels(), strict=True):
-                handles.setdefault(text, handle)
-        figure = self._collection.viz["figure"].item()
-        characters = sum(len(text) + 8 for text in handles)
-        columns = max(1, min(len(handles), int(len(handles) * 11.5 * figure.get_figwidth() / characters)))
-        columns = -(-len(handles) // -(-len(handles) // columns))  # rows of equal length
-        figure.legend(handles.values(), handles, loc="outside lower center", ncols=columns, frameon=False)
-
-    def _legend_plotly(self) -> None:
-        figure = self._collection.viz["figure"].item()
-        below = {"orientation": "h", "xanchor": "center", "x": 0.5, "yanchor": "bottom", "yref": "container", "y": 0.02}
-        figure.update_layout(legend=below, margin={"l": 70, "r": 20, "t": 70, "b": 110})
-
-    def _legend_bokeh(self) -> None:
-        for target in self._targets():
-            if target.legend:
-                legend = target.legend[0]
-                widths = sorted(7 * len(i.label.value) + 40 for i in legend.items)
-                legend.ncols = 2 if sum(widths[-2:]) < target.width - 60 else 1
-                target.add_layout(legend, "below")
+                given[what] = ticks
+        for what, data in given.items():
+            self.canvas.add(self.name, what, what, *data)

@@ -1,138 +1,184 @@
-"""Curves behind the pictures, as numbers: densities, distribution functions, bands, ticks of logarithms."""
+"""Curves behind the pictures, as numbers: densities, distribution functions, bands, histograms."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._checks import Floats
-from prbayes.metrics.density import GaussianKDE, Histogram, silverman, weighted_quantile
+from prbayes._weighted import cumulated, distribution_function, quantile
+from prbayes.metrics.density import GaussianKDE, Histogram, silverman
+
+# Points of a curve, 256 steps: a step is about a pixel or two of a panel, by judgement.
+GRID_POINTS = 257
+# Populations that set the bandwidth of all, a median: by judgement, as their bandwidths differ
+# little beside what a bandwidth changes; all of them would cost a sort each.
+_BANDWIDTH_POPULATIONS = 40
+# Smallest bandwidth as a share of the grid, as the kernel's own cells are limited in number: half
+# of a grid's step, so that a narrower curve could not be drawn anyway.
+_SMALLEST_BANDWIDTH = 2e-3
+# Shares of populations whose own range need not fit on the axis, on each side, by judgement.
+_WIDE_POPULATIONS = 0.1
+
+
+def _finite_samples(values: Floats, weights: Floats) -> Iterator[tuple[Floats, Floats]]:
+    """Yield what is finite and has a weight, of samples of shape (P, n), with weights of sum 1."""
+    rows = np.broadcast_to(values, weights.shape)
+    for row, w in zip(rows, weights, strict=True):
+        used = np.isfinite(row) & (w > 0)
+        if used.any():
+            share = w[used]
+            yield row[used], share / share.sum()
 
 
 def typical_bandwidth(values: Floats, weights: Floats) -> float:
-    """Return the median of Silverman's bandwidths of weighted samples, shapes (P, n), leaving out what is not finite.
+    """Return the median of Silverman's bandwidths of weighted samples, shapes (P, n).
 
-    The effective number of values is that of the weights, so that uneven weights are smoothed more.
+    What is not finite is left out. The effective number of values is that of the weights, so that
+    uneven weights are smoothed more.
     """
     found = []
-    for row, w in zip(np.broadcast_to(values, weights.shape), weights, strict=True):
-        used = np.isfinite(row) & (w > 0)
-        if used.any():
-            found.append(silverman(row[used], w[used] / w[used].sum()))
+    for row, w in _finite_samples(values, weights):
+        found.append(silverman(row, w))
     return float(np.median(found)) if found else 0.0
 
 
-def densities(values: Floats, weights: Floats, grid: Floats, bandwidth: float) -> Floats:
-    """Return Gaussian kernel densities of weighted samples, shapes (..., n), on a grid, shape (g,): (..., g).
+def smooth_densities(values: Floats, weights: Floats, grid: Floats) -> Floats:
+    """Return densities, shape (P, g), of weighted samples, (P, n), smoothed by one bandwidth."""
+    some = slice(_BANDWIDTH_POPULATIONS)
+    bandwidth = typical_bandwidth(values[some], weights[some])
+    return densities(values, weights, grid, bandwidth)
 
-    What is not finite keeps its weight and appears nowhere: the area under the curve is the share of the rest.
+
+def densities(values: Floats, weights: Floats, grid: Floats, bandwidth: float) -> Floats:
+    """Return Gaussian kernel densities of weighted samples, shapes (..., n), on a grid: (..., g).
+
+    What is not finite keeps its weight and appears nowhere: the area under the curve is the share
+    of the finite values.
     """
-    ends = np.array([grid[0], grid[-1]])
-    # Grids of kernels have a limited number of nodes.
-    cells = GaussianKDE(max(bandwidth, 2e-3 * float(np.ptp(ends)))).cells(ends, np.array([0.5, 0.5]))
-    found = cells.density(np.broadcast_to(values, weights.shape), weights)[..., : cells.centers.size]
-    at = np.clip(np.searchsorted(cells.centers, grid) - 1, 0, cells.centers.size - 2)
-    part = (grid - cells.centers[at]) / np.diff(cells.centers)[at]
-    return np.asarray(np.maximum(found[..., at] * (1 - part) + found[..., at + 1] * part, 0.0))
+    # Densities at the centres of the kernel's own cells
+    ends = grid[[0, -1]]
+    smallest = _SMALLEST_BANDWIDTH * float(np.ptp(ends))
+    kernel = GaussianKDE(max(bandwidth, smallest))
+    cells = kernel.cells(ends, np.array([0.5, 0.5]))
+    centers = cells.centers
+    rows = np.broadcast_to(values, weights.shape)
+    found = cells.density(rows, weights)[..., : centers.size]
+
+    # Linear between them
+    at = np.searchsorted(centers, grid) - 1
+    at = np.clip(at, 0, centers.size - 2)
+    left, right = found[..., at], found[..., at + 1]
+    widths = np.diff(centers)
+    share = (grid - centers[at]) / widths[at]
+    between = left * (1 - share) + right * share
+    return np.asarray(np.maximum(between, 0.0))
 
 
 def bounded_density(draws: Floats, grid: Floats) -> Floats:
-    """Return the density of draws, shape (n,), on a grid, zero outside their range and without a dip at its ends.
+    """Return the density of draws, shape (n,), on a grid, without a dip at the ends of their range.
 
-    Draws are mirrored at the smallest and the largest, which matters where a bound of the support cuts the density.
+    Draws are mirrored at the smallest and the largest, which matters where a bound of the support
+    cuts the density; outside their range it is zero. Draws that are all the same have none: NaN.
     """
-    low, high = float(draws.min()), float(draws.max())
-    mirrored = np.concatenate([draws, 2 * low - draws, 2 * high - draws])
-    h = silverman(draws, np.full(draws.size, 1 / draws.size))
-    if not h > 0:
+    weights = np.full(draws.size, 1 / draws.size)
+    bandwidth = silverman(draws, weights)
+    if not bandwidth > 0:
         return np.full(grid.shape, np.nan)
-    found = densities(mirrored, np.full(mirrored.size, 1 / draws.size), grid, h)
-    return np.where((grid >= low) & (grid <= high), found, 0.0)
+
+    # Mirrored draws have their own weight: the area within the range is one
+    low, high = float(draws.min()), float(draws.max())
+    at_low = 2 * low - draws
+    at_high = 2 * high - draws
+    mirrored = np.concatenate([draws, at_low, at_high])
+    found = densities(mirrored, np.tile(weights, 3), grid, bandwidth)
+    inside = (grid >= low) & (grid <= high)
+    return np.where(inside, found, 0.0)
 
 
 def distribution_functions(values: Floats, weights: Floats, grid: Floats) -> Floats:
-    """Return the weight of values not above each point of a grid: shapes (P, n), (P, n), (g,) -> (P, g)."""
-    rows = np.broadcast_to(values, weights.shape)
-    out = np.empty((len(weights), grid.size))
-    shared = values.ndim == 1 or values.strides[0] == 0
-    order: NDArray[np.intp] | None = None
-    for i, (row, w) in enumerate(zip(rows, weights, strict=True)):
-        if order is None or not shared:
-            order = np.argsort(row, kind="stable")  # NaN last, above everything
-            at = np.searchsorted(row[order], grid, side="right")
-        out[i] = np.concatenate([[0.0], np.cumsum(w[order])])[at]
-    return out
+    """Return the weight of values, shape (P, n), not above each point of a grid: (P, g)."""
+    return np.ascontiguousarray(distribution_function(values, weights, grid))
 
 
 def pointwise_band(curves: Floats, level: float) -> tuple[Floats, Floats]:
-    """Return the two sides between which the share ``level`` of curves, shape (P, g), lies at each point."""
-    low, high = np.quantile(curves, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    """Return the sides between which the share ``level`` of curves, (P, g), lies at each point."""
+    low, high = np.quantile(curves, central_levels(level), axis=0)
     return low, high
 
 
+def central_levels(level: float) -> tuple[float, float]:
+    """Return the levels of the two quantiles that hold the share ``level`` between them."""
+    return (1 - level) / 2, (1 + level) / 2
+
+
 def central_range(values: Floats, weights: Floats, tail: float) -> tuple[float, float]:
-    """Return the quantiles at ``tail`` and ``1 - tail`` of weighted samples, (P, n), wide enough for most of them."""
-    ends = []
-    for row, w in zip(np.broadcast_to(values, weights.shape), weights, strict=True):
-        used = np.isfinite(row) & (w > 0)
-        if used.any():
-            share = w[used] / w[used].sum()
-            ends.append([weighted_quantile(row[used], share, p) for p in (tail, 1 - tail)])
-    low, high = np.array(ends).T
-    return float(np.quantile(low, 0.1)), float(np.quantile(high, 0.9))
+    """Return the range between quantiles, at ``tail`` and ``1 - tail``, of most of the samples.
+
+    Values and weights have shape (P, n); what is not finite is left out.
+    """
+    lows, highs = [], []
+    for row, w in _finite_samples(values, weights):
+        lows.append(quantile(row, w, tail))
+        highs.append(quantile(row, w, 1 - tail))
+    low = np.quantile(lows, _WIDE_POPULATIONS)
+    high = np.quantile(highs, 1 - _WIDE_POPULATIONS)
+    return float(low), float(high)
 
 
 def histogram(observed: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Return the corners of a histogram's bars, one after the other; their area is the share of finite values."""
+    """Return the corners of a histogram's bars; their area is the share of finite values."""
     finite = np.isfinite(observed)
-    values, w = observed[finite], weights[finite]
+    values = observed[finite]
+    w = weights[finite]
+    area = w.sum()
     if not np.ptp(values) > 0:
-        middle, half = values[0], max(abs(values[0]), 1.0) / 100
-        return np.repeat([middle - half, middle + half], 2), np.array([0.0, 1.0, 1.0, 0.0]) * w.sum() / (2 * half)
-    cells = Histogram().cells(values, w / w.sum())
-    heights = cells.density(values, w)[:-2]
+        return _one_bar(values[0], area)
+    cells = Histogram().cells(values, w / area)
+    heights = cells.density(values, w)[:-2]  # without what is below and above
     half = cells.widths[0] / 2
-    edges = np.append(cells.centers - half, cells.centers[-1] + half)
-    x = np.stack([edges[:-1], edges[:-1], edges[1:], edges[1:]], axis=1).ravel()
-    return x, (np.array([0.0, 1.0, 1.0, 0.0]) * heights[:, None]).ravel()
+    left = cells.centers - half
+    end = cells.centers[-1] + half
+    right = np.append(left[1:], end)
+
+    # Up at the left of each bar, down at its right
+    zero = np.zeros(heights.size)
+    x = np.column_stack([left, left, right, right])
+    y = np.column_stack([zero, heights, heights, zero])
+    return x.ravel(), y.ravel()
+
+
+def _one_bar(middle: float, area: float) -> tuple[Floats, Floats]:
+    """Return the corners of a bar around equal values, as wide as a fiftieth of them."""
+    half = max(abs(middle), 1.0) / 100
+    height = area / (2 * half)
+    left, right = middle - half, middle + half
+    x = np.array([left, left, right, right])
+    return x, np.array([0.0, height, height, 0.0])
 
 
 def staircase(observed: Floats, weights: Floats, low: float, high: float) -> tuple[Floats, Floats]:
-    """Return the corners of the distribution function of weighted values, from ``low`` to ``high``."""
+    """Return the corners of the distribution function of weighted values from low to high."""
     order = np.argsort(observed, kind="stable")
-    finite = np.isfinite(observed[order])
-    values, height = observed[order][finite], np.concatenate([[0.0], np.cumsum(weights[order])[finite]])
-    return np.concatenate([[low], np.repeat(values, 2), [high]]), np.repeat(height, 2)
+    values = observed[order]
+    finite = np.isfinite(values)
+    heights = cumulated(weights, order)[np.append(True, finite)]
+    return steps(values[finite], heights, low, high)
+
+
+def steps(values: Floats, heights: Floats, low: float, high: float) -> tuple[Floats, Floats]:
+    """Return the corners of a step function from low to high, which steps at sorted values.
+
+    It has one height more than values: the first is that before the first value.
+    """
+    twice = np.repeat(values, 2)
+    x = np.concatenate([[low], twice, [high]])
+    return x, np.repeat(heights, 2)
 
 
 def normal_density(x: Floats, mean: float, sd: float) -> Floats:
     """Return the density of a normal distribution."""
-    return np.asarray(np.exp(-0.5 * ((x - mean) / sd) ** 2) / (sd * np.sqrt(2 * np.pi)))
-
-
-def round_ticks(low: float, high: float, most: int = 5) -> tuple[list[float], list[str]]:
-    """Return at most so many round numbers within a range, and their labels."""
-    raw = max(high - low, 1e-300) / most
-    power = 10.0 ** np.floor(np.log10(raw))
-    step = next(f * power for f in (1.0, 2.0, 2.5, 5.0, 10.0) if f * power >= raw)
-    found = step * np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1)
-    return [float(x) for x in found], [f"{0.0 if abs(x) < step / 2 else x:.12g}" for x in found]
-
-
-def spans_decades(values: Floats) -> bool:
-    """Whether a logarithm shows values better: all positive, the largest more than twenty times the smallest."""
-    finite = values[np.isfinite(values)]
-    return bool(finite.size and finite.min() > 0 and finite.max() > 20 * finite.min())
-
-
-def log_ticks(values: Floats) -> tuple[list[float], list[str]]:
-    """Return positions, as base-10 logarithms, and labels of ticks for positive values: powers, or 1, 2, 5."""
-    finite = values[np.isfinite(values) & (values > 0)]
-    low, high = np.log10(finite.min()), np.log10(finite.max())
-    powers = np.arange(np.floor(low), np.ceil(high) + 1)
-    step = max(1, int(np.ceil(powers.size / 6)))
-    factors = (1, 2, 5) if high - low < 2 else (1,)
-    found = [(p + np.log10(f), f * 10.0**p) for p in powers[::step] for f in factors]
-    slack = 0.05 * (high - low) + 1e-9
-    kept = [(float(at), f"{value:g}") for at, value in found if low - slack <= at <= high + slack]
-    return [at for at, _ in kept], [text for _, text in kept]
+    exponent = -0.5 * ((x - mean) / sd) ** 2
+    area = sd * np.sqrt(2 * np.pi)
+    return np.asarray(np.exp(exponent) / area)

@@ -1,4 +1,4 @@
-"""The populations that a result stands for: thetas of a posterior, or around an optimum; and the one before it."""
+"""The populations that a result stands for: of a posterior, or around an optimum; and before it."""
 
 from __future__ import annotations
 
@@ -18,9 +18,17 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.simulator import model_on_context
 from prbayes.model.support import DesignError
 
-_FREE, _COSTLY = 200, 40  # populations in a band, where they cost no response and where they do
-_MOST = 1 << 22  # responses held in memory
-_THIN = 10.0  # weight effective sample size below which a curve is an artefact of the design
+# Populations in a band, whose sides are quantiles of so many curves: with 200 the standard error of
+# the share beyond one side of an 89% band is 1.6%, which a reader does not see; with 40, where each
+# costs responses, it is 3.6%. Never fewer than eight. By judgement.
+_FREE, _COSTLY, _FEWEST = 200, 40, 8
+_MOST_RESPONSES = 1 << 22  # held in memory at a time: 32 MiB of float64
+# A curve of fewer responses than ten, by their effective number, shows the design, no population; a
+# mean weight away from one says that the design misses a part of it. By judgement: a curve may be
+# worse than an estimate, which needs more (`model.support`).
+_LEAST_ESS = 10.0
+_MEAN_WEIGHTS = (0.5, 2.0)
+_ROUNDING = 1e-12  # of a sum of weights that is zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,10 +38,11 @@ class Ensemble:
     Attributes
     ----------
     evaluator : Evaluator
-    center : ndarray, shape (1, d), or None
-        The optimum.
+    center : ndarray, shape (0 or 1, d)
+        The optimum; a posterior has none.
     thetas : ndarray, shape (P, d)
-        Draws of the posterior, or from the optimum's sampling distribution; none where nothing is known of it.
+        Draws of the posterior, or from the optimum's sampling distribution; none where nothing is
+        known of it.
     label : str
         What the curve in the middle is called.
     spread : str
@@ -41,29 +50,44 @@ class Ensemble:
     """
 
     evaluator: Evaluator
-    center: Floats | None
+    center: Floats
     thetas: Floats
     label: str
     spread: str
 
+    @property
+    def every(self) -> Floats:
+        """All thetas, the centre first."""
+        return np.vstack([self.center, self.thetas])
+
 
 def supported(evaluator: Evaluator, thetas: Floats) -> NDArray[np.bool_]:
-    """Return which populations the designs of `Reweighted` support well enough to be drawn, shape (P,)."""
+    """Return which populations stored responses support well enough to be drawn, shape (P,)."""
     out = np.zeros(len(thetas), dtype=bool)
     where = np.flatnonzero(np.isfinite(thetas).all(axis=1))
     if where.size:
         where = where[evaluator.in_support(thetas[where])]
-    if where.size:
-        good = np.ones(where.size, dtype=bool)
-        for name, found in evaluator.support(thetas[where]).items():
-            good &= (found["weight_ess"] >= _THIN) & (found["mean_weight"] > 0.5) & (found["mean_weight"] < 2)
-            good &= found["lost_mass"] <= max(evaluator.designs[name].config.max_lost, 1e-12)
-        out[where[good]] = True
+    if not where.size:
+        return out
+    good = np.ones(where.size, dtype=bool)
+    lightest, heaviest = _MEAN_WEIGHTS
+    for name, found in evaluator.support(thetas[where]).items():
+        mean_weight = found["mean_weight"]
+        allowed = max(evaluator.designs[name].config.max_lost, _ROUNDING)
+        good &= found["weight_ess"] >= _LEAST_ESS
+        good &= (mean_weight > lightest) & (mean_weight < heaviest)
+        good &= found["lost_mass"] <= allowed
+    out[where] = good
     return out
 
 
 def read_result(
-    result: Optimum | xr.DataTree, model: pm.Model | None, caller: str, draws: int | None = None, *, free: bool = False
+    result: Optimum | xr.DataTree,
+    model: pm.Model | None,
+    caller: str,
+    draws: int | None = None,
+    *,
+    free: bool = False,
 ) -> Ensemble:
     """Return the populations of a result.
 
@@ -86,39 +110,72 @@ def read_result(
     DesignError
         If stored responses do not support most of the populations.
     """
-    if model is None and isinstance(result, Optimum):
-        model = result.model
-    model = model_on_context(model, caller)
-    own = isinstance(result, Optimum) and result.model is model
-    evaluator = result.evaluator if own and isinstance(result, Optimum) else Evaluator(model)
+    evaluator = _evaluator_of(result, model, caller)
     cost = 0 if free else evaluator.responses_per_theta
-    count = draws or (max(8, min(_COSTLY, _MOST // cost)) if cost else _FREE)
-    points, _ = populations_of(result, model, count, caller)
-    thetas = evaluator.thetas_of([points[str(rv.name)] for rv in model.free_RVs])
-    if not isinstance(result, Optimum):
-        ok = supported(evaluator, thetas) if not free else np.ones(len(thetas), dtype=bool)
-        if ok.mean() < 0.5:
-            raise DesignError(
-                f"{caller}: the stored responses support {ok.sum()} of {len(ok)} populations of the posterior, "
-                "expected most; call prb.refine(model) and sample again, or pass a larger n to prb.Reweighted"
-            )
-        return Ensemble(evaluator, None, thetas[ok], "posterior predictive", "posterior")
-    around = np.empty((0, thetas.shape[1]))
-    if np.isfinite(result.covariance).all():
-        rng = np.random.default_rng(0)
-        around = rng.multivariate_normal(thetas[0], result.covariance, size=count, method="eigh")
-        ok = evaluator.in_support(around) if free else supported(evaluator, around)
-        around = around[ok] if ok.mean() > 0.5 else around[:0]
-    return Ensemble(evaluator, thetas, around, "optimum", "standard error")
+    count = draws or _affordable(cost)
+    points, _ = populations_of(result, evaluator.model, count, caller)
+    values = [points[str(rv.name)] for rv in evaluator.model.free_RVs]
+    thetas = evaluator.thetas_of(values)
+    if isinstance(result, Optimum):
+        around = _around(result, evaluator, thetas[0], count, free=free)
+        return Ensemble(evaluator, thetas, around, "optimum", "standard error")
+    if not free:
+        thetas = _supported_draws(evaluator, thetas, caller)
+    return Ensemble(evaluator, thetas[:0], thetas, "posterior predictive", "posterior")
+
+
+def _evaluator_of(result: Optimum | xr.DataTree, model: pm.Model | None, caller: str) -> Evaluator:
+    """Return the optimum's own evaluator, or one of the model given or on the context."""
+    if isinstance(result, Optimum) and (model is None or model is result.model):
+        return result.evaluator
+    return Evaluator(model_on_context(model, caller))
+
+
+def _affordable(cost: int) -> int:
+    """Return how many populations are drawn if each costs so many responses."""
+    if not cost:
+        return _FREE
+    fitting = min(_COSTLY, _MOST_RESPONSES // cost)
+    return max(_FEWEST, fitting)
+
+
+def _supported_draws(evaluator: Evaluator, thetas: Floats, caller: str) -> Floats:
+    """Return the draws of a posterior that stored responses support, which must be most."""
+    ok = supported(evaluator, thetas)
+    if ok.mean() < 0.5:
+        raise DesignError(
+            f"{caller}: the stored responses support {ok.sum()} of {len(ok)} populations of the "
+            "posterior, expected most; call prb.refine(model) and sample again, or pass a larger n "
+            "to prb.Reweighted"
+        )
+    return thetas[ok]
+
+
+def _around(
+    optimum: Optimum, evaluator: Evaluator, center: Floats, count: int, *, free: bool
+) -> Floats:
+    """Draw from the optimum's sampling distribution, or return none where it is not known.
+
+    Draws without a population are left out; if they are most, the approximation is of no use.
+    """
+    nothing = np.empty((0, center.size))
+    if not np.isfinite(optimum.covariance).all():
+        return nothing
+    rng = np.random.default_rng(0)
+    drawn = rng.multivariate_normal(center, optimum.covariance, size=count, method="eigh")
+    ok = evaluator.in_support(drawn) if free else supported(evaluator, drawn)
+    return drawn[ok] if ok.mean() > 0.5 else nothing
 
 
 def read_before(
-    result: Optimum | xr.DataTree, evaluator: Evaluator, before: Mapping[str, Any] | bool | None
+    result: Optimum | xr.DataTree,
+    evaluator: Evaluator,
+    before: Mapping[str, Any] | bool | None,
 ) -> tuple[Floats, str]:
-    """Return theta before a calibration, shape (1, d) or (0, d) where there is none, and what it is.
+    """Return theta before a calibration, shape (1, d) or (0, d) for none, and what it is.
 
-    By default that is the optimiser's first point, if it was given a start or did not look for one; else the prior's
-    initial point, where PyMC's samplers start.
+    By default that is the optimiser's first point, if it was given a start or did not look for one;
+    else the prior's initial point, where PyMC's samplers start.
     """
     if before is False:
         return np.empty((0, evaluator.size)), ""
@@ -126,8 +183,11 @@ def read_before(
         return evaluator.unconstrained(dict(before))[None], "as given"
     if before not in (None, True):
         raise TypeError(
-            f"before: got {type(before).__name__}, expected a dict with a value for each hyperparameter, None or False"
+            f"before: got {type(before).__name__}, expected a dict with a value for each "
+            "hyperparameter, None or False"
         )
-    if isinstance(result, Optimum) and not result.n_screened and len(result.trace.get("theta", ())):
-        return result.trace["theta"][:1], "optimiser's first point"
+    if isinstance(result, Optimum) and not result.n_screened:
+        path = result.trace.get("theta")
+        if path is not None and len(path):
+            return path[:1], "optimiser's first point"
     return evaluator.initial[None], "prior's initial point"

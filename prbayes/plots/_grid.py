@@ -1,9 +1,8 @@
-"""The discrepancy over a grid of two hyperparameters."""
+"""The discrepancy over a grid of one or two hyperparameters."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -11,8 +10,19 @@ from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.plots._ensemble import supported
+from prbayes.plots._names import point_elements, variable_of
+from prbayes.plots._objective import free_elements, objective
 
-_SDS, _DRAWS, _STEPS = 4.0, 1000, 33
+# How far an axis goes from the optimum, in standard errors: the discrepancy is far above its lowest
+# there, and the normal approximation has no probability (6e-5). By judgement.
+_STANDARD_ERRORS = 4.0
+# Draws and quantiles of the prior that say how far an axis may follow the optimiser's path, by
+# judgement: ten draws lie beyond each.
+_PRIOR_DRAWS, _PRIOR_QUANTILES = 1000, (0.01, 0.99)
+# Points at which half an axis is checked against the priors' support, by judgement: its end is
+# short of the support's by less than a 32nd.
+_SUPPORT_POINTS = 33
+_MARGIN = 0.04  # of an axis, beyond what is marked on it; about the size of a marker
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +34,8 @@ class Landscape:
     axes : list of ndarray, shape (n,)
         One for each hyperparameter.
     heights : ndarray, shape (n,) or (n, n)
-        The sum of d_k / s_k, the first hyperparameter along the first axis; NaN where stored responses do not support
-        a population or the priors exclude it.
+        The sum of d_k / s_k, the first hyperparameter along the first axis; NaN where stored
+        responses do not support a population or the priors exclude it.
     path, rivals : ndarray, shape (m, 1 or 2)
         Where the optimiser went, and other optima.
     optimum : ndarray, shape (1, 1 or 2)
@@ -38,95 +48,142 @@ class Landscape:
     optimum: Floats
 
 
-def elements(evaluator: Evaluator, thetas: Floats) -> dict[str, Floats]:
-    """Return the elements of the free variables, in the user's own units, shape (P,), by names such as 'mu[1]'."""
-    values = evaluator.constrained(thetas)
-    found: dict[str, Floats] = {}
-    for rv in evaluator.model.free_RVs:
-        name = str(rv.name)
-        for i in np.ndindex(values[name].shape[1:]):
-            found[f"{name}[{','.join(map(str, i))}]" if i else name] = values[name][(slice(None), *i)]
-    return found
+@dataclass(frozen=True, eq=False)
+class _Plane:
+    """The plane along one or two hyperparameters through an optimum, where all others stand.
+
+    Attributes
+    ----------
+    evaluator : Evaluator
+    names : list of str
+        Of the hyperparameters along the axes.
+    center : dict of ndarray, shape (1,)
+        The optimum, by element name.
+    shapes : dict of tuple
+        Of the free variables.
+    """
+
+    evaluator: Evaluator
+    names: list[str]
+    center: dict[str, Floats]
+    shapes: dict[str, tuple[int, ...]]
+
+    def thetas(self, places: Floats) -> Floats:
+        """Return thetas of places, shape (P, 1 or 2); NaN outside the priors' support."""
+        size = len(places)
+        at: dict[str, list[Floats]] = {}
+        for name, value in self.center.items():
+            if name in self.names:
+                values = places[:, self.names.index(name)]
+            else:
+                values = np.repeat(value, size)
+            at.setdefault(variable_of(name), []).append(values)
+        draws = []
+        for variable, shape in self.shapes.items():
+            rows = np.column_stack(at[variable])
+            draws.append(rows.reshape(size, *shape))
+        with np.errstate(all="ignore"):
+            return self.evaluator.thetas_of(draws)
+
+    def within_support(self, name: str, end: float) -> float:
+        """Return how far an axis can go from the optimum towards an end within the support."""
+        start = self.center[name][0]
+        steps = np.linspace(start, end, _SUPPORT_POINTS)
+        places = np.tile(_columns(self.center, self.names), (_SUPPORT_POINTS, 1))
+        places[:, self.names.index(name)] = steps
+        thetas = self.thetas(places)
+        ok = np.isfinite(thetas).all(axis=1)
+        ok[ok] = self.evaluator.in_support(thetas[ok])
+        outside = np.flatnonzero(~ok)
+        if not outside.size:
+            return float(steps[-1])
+        last_inside = max(outside[0] - 1, 0)
+        return float(steps[last_inside])
 
 
 def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: int) -> Landscape:
     """Evaluate the objective on a grid of ``points`` along each of one or two hyperparameters."""
-    center = elements(evaluator, optimum.theta[None])
+    plane = _plane(optimum, evaluator, names)
 
-    def thetas(places: Floats) -> Floats:
-        """Return thetas of places, shape (P, m)."""
-        at = {name: np.repeat(value, len(places)) for name, value in center.items()}
-        at |= dict(zip(names, places.T, strict=True))
-        draws = []
-        for rv in evaluator.model.free_RVs:
-            own = [v for n, v in at.items() if n.partition("[")[0] == rv.name]
-            draws.append(np.stack(own, axis=-1).reshape(len(places), *map(int, rv.shape.eval())))
-        with np.errstate(all="ignore"):  # outside the support
-            return evaluator.thetas_of(draws)
+    # What is marked, by element
+    path = free_elements(evaluator, optimum.trace["theta"])
+    others = np.array([rival["theta"] for rival in optimum.rivals])
+    others = others.reshape(-1, optimum.theta.size)
+    rivals = free_elements(evaluator, others)
+    prior = free_elements(evaluator, evaluator.prior_thetas(_PRIOR_DRAWS, 0))
 
-    def along(name: str, end: float) -> float:
-        """Return how far the axis of a hyperparameter can go towards an end without leaving the priors' support."""
-        steps = np.linspace(center[name][0], end, _STEPS)
-        places = np.array([np.repeat(center[n][0], _STEPS) if n != name else steps for n in names]).T
-        rows = thetas(places)
-        ok = np.isfinite(rows).all(axis=1)
-        ok[ok] = evaluator.in_support(rows[ok])
-        return float(steps[max(int(np.argmin(np.append(ok, False))) - 1, 0)])
-
-    path, prior = elements(evaluator, optimum.trace["theta"]), elements(evaluator, evaluator.prior_thetas(_DRAWS, 0))
-    rivals = elements(evaluator, np.array([r["theta"] for r in optimum.rivals]).reshape(-1, optimum.theta.size))
+    # Axes
     axes = []
     for name in names:
-        low, high = np.quantile(prior[name], [0.01, 0.99])
-        sd = _stderr(optimum, name)
-        sd = sd if np.isfinite(sd) and sd > 0 else (high - low) / (2 * _SDS)
-        seen = np.concatenate([np.clip(path[name], low, high), rivals[name]])
-        near = center[name][0] + _SDS * sd * np.array([-1, 1])
-        room = 0.04 * np.ptp(np.append(near, seen))
-        ends = min(near[0], seen.min() - room), max(near[1], seen.max() + room)
-        axes.append(np.linspace(along(name, ends[0]), along(name, ends[1]), points))
-    rows = thetas(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(names)))
-    ok = supported(evaluator, rows)
-    heights = np.full(len(rows), np.nan)
-    heights[ok] = evaluator.total(rows[ok], np.array([optimum.scales[n.name] for n in evaluator.nodes]))
-    heights = np.where(np.isfinite(heights), heights, np.nan).reshape([points] * len(names))
-    where = (np.stack([found[n] for n in names], axis=-1) for found in (path, rivals, center))
-    return Landscape(axes, heights, *where)
+        # Of the path only what is inside the prior's bulk
+        bulk = np.quantile(prior[name], _PRIOR_QUANTILES)
+        marked = np.append(np.clip(path[name], *bulk), rivals[name])
+        error = _standard_error(optimum, name, bulk)
+        low, high = _ends(plane.center[name], error, marked)
+        low = plane.within_support(name, low)
+        high = plane.within_support(name, high)
+        axes.append(np.linspace(low, high, points))
+
+    # Heights where there is a population to judge
+    coordinates = np.meshgrid(*axes, indexing="ij")
+    places = np.column_stack([c.ravel() for c in coordinates])
+    thetas = plane.thetas(places)
+    ok = supported(evaluator, thetas)
+    heights = np.full(len(thetas), np.nan)
+    heights[ok] = objective(optimum, evaluator, thetas[ok])
+    heights[~np.isfinite(heights)] = np.nan
+    shape = coordinates[0].shape
+
+    return Landscape(
+        axes,
+        heights.reshape(shape),
+        path=_columns(path, names),
+        rivals=_columns(rivals, names),
+        optimum=_columns(plane.center, names),
+    )
 
 
-def _stderr(optimum: Optimum, name: str) -> float:
-    stem, bracket, rest = name.partition("[")
-    index = tuple(map(int, rest[:-1].split(","))) if bracket else ()
-    return float(np.asarray(optimum.stderr[stem])[index])
+def _plane(optimum: Optimum, evaluator: Evaluator, names: list[str]) -> _Plane:
+    center = optimum.theta[None]
+    values = evaluator.constrained(center)
+    shapes = {}
+    for rv in evaluator.model.free_RVs:
+        name = str(rv.name)
+        shapes[name] = values[name].shape[1:]
+    return _Plane(evaluator, names, free_elements(evaluator, center), shapes)
+
+
+def _standard_error(optimum: Optimum, name: str, bulk: Floats) -> float:
+    """Return the standard error, or if it is unknown what makes the axis as wide as the prior."""
+    error = point_elements(optimum.stderr)[name]
+    if np.isfinite(error) and error > 0:
+        return error
+    low, high = bulk
+    return float((high - low) / (2 * _STANDARD_ERRORS))
+
+
+def _ends(center: Floats, error: float, marked: Floats) -> tuple[float, float]:
+    """Return where an axis should end: beyond some standard errors, and beyond what is marked."""
+    first, last = center[0] + _STANDARD_ERRORS * error * np.array([-1, 1])
+    lowest, highest = marked.min(), marked.max()
+    margin = _MARGIN * (max(last, highest) - min(first, lowest))
+    return min(first, lowest - margin), max(last, highest + margin)
+
+
+def _columns(elements: dict[str, Floats], names: list[str]) -> Floats:
+    """Return the elements of some names side by side, shape (m, names)."""
+    return np.stack([elements[name] for name in names], axis=-1)
 
 
 def rooted(heights: Floats) -> tuple[Floats, float, float]:
-    """Return the root of heights over the lowest, in units of where nine tenths of the plane are below; and both.
+    """Return the root of heights over the lowest, one where nine tenths are below; and the two.
 
-    Even levels of the root crowd towards the optimum, and are evenly spaced around it where it is a parabola.
+    Even levels of the root crowd towards the optimum, and are evenly spaced around it where it is a
+    parabola.
     """
     finite = heights[np.isfinite(heights)]
-    low, high = float(finite.min()), float(np.quantile(finite, 0.9))
-    return np.sqrt(np.maximum(heights - low, 0.0) / max(high - low, 1e-300)), low, high
-
-
-_METRICS = {
-    "AreaMetric": "area metric",
-    "KullbackLeibler": "Kullback-Leibler",
-    "LogLikelihood": "log-likelihood",
-    "ProbabilityResidual": "probability residual",
-}
-
-
-def objective_of(optimum: Optimum) -> str:
-    if len(optimum.scales) > 1:
-        return "sum of d / s"
-    name = type(optimum.evaluator.nodes[0].metric).__name__
-    return f"discrepancy ({_METRICS.get(name, name)})"
-
-
-def check_optimum(optimum: Any, caller: str) -> None:
-    if not isinstance(optimum, Optimum):
-        raise TypeError(f"{caller}: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first")
-    if not len(optimum.trace.get("theta", ())):
-        raise ValueError(f"{caller}: got an optimum without a trace, expected one as prb.minimize returns it")
+    low = float(finite.min())
+    high = float(np.quantile(finite, 0.9))
+    unit = max(high - low, 1e-300)
+    above = np.maximum(heights - low, 0.0)
+    return np.sqrt(above / unit), low, high

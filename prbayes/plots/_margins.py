@@ -1,10 +1,11 @@
-"""The aleatory inputs of a model by name, and the densities of their margins at given hyperparameters."""
+"""The aleatory inputs of a model by name, and the densities of their margins."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,19 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluator
-from prbayes.plots._curves import central_range, densities, typical_bandwidth
+from prbayes.plots._curves import GRID_POINTS, central_range, smooth_densities
+from prbayes.plots._names import element_name, variable_of
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, is_mvnormal
+from prbayes.response.inputs import Inputs
 
-_SPECIMENS, _SOME = 400, 40  # random draws of inputs, never of responses, and from how many populations
+# Random draws of inputs, never of responses, that say what an axis covers: specimens from each of
+# some populations, by judgement.
+_SPECIMENS, _RANGE_POPULATIONS = 400, 40
+# Where a density is estimated from draws, as many more: the estimate's noise is half as large.
+_DENSITY_SPECIMENS = 4 * _SPECIMENS
+# Share of a population beyond each end of the axis, where a density is hardly above zero: of that
+# many specimens the outermost one.
 _TAIL = 0.002
 
 
@@ -29,7 +38,8 @@ class Margin:
     Attributes
     ----------
     name : str
-        That of the distribution if it has one, or of the response's argument; with the index of an element.
+        That of the distribution if it has one, or of the response's argument; with an element's
+        index.
     dist : variable
         The ``.dist()``.
     node, position : int
@@ -53,17 +63,20 @@ class Margin:
 def margins(evaluator: Evaluator) -> list[Margin]:
     """Return the margins of all aleatory inputs; an input of several simulators counts once."""
     found: list[Margin] = []
+    variables = evaluator.model.basic_RVs
+    taken = {str(variable.name) for variable in variables}
     for k, node in enumerate(evaluator.nodes):
-        inputs, arguments = node.bound.inputs, _arguments(node.bound.responses.function)
+        inputs = node.bound.inputs
+        arguments = _arguments(node.bound.responses.function)
         for position, dist in enumerate(inputs.aleatory):
-            if any(m.dist is dist for m in found):
+            if any(margin.dist is dist for margin in found):
                 continue
-            place = inputs.arguments.index(position)
-            name = dist.name or (arguments[place] if place < len(arguments) else f"input {place + 1}")
-            if name in {m.name.partition("[")[0] for m in found} | {str(v.name) for v in evaluator.model.basic_RVs}:
+            name = dist.name or _argument_of(position, inputs, arguments)
+            if name in taken:
                 name = f"{name} of {node.name}"
+            taken.add(name)
             for index in np.ndindex(inputs.event_shapes[position]):
-                element = f"{name}[{','.join(map(str, index))}]" if index else name
+                element = element_name(name, index)
                 found.append(Margin(element, dist, k, position, index))
     return found
 
@@ -78,8 +91,16 @@ def _arguments(function: Any) -> list[str]:
     return [p.name for p in parameters if p.kind in plain]
 
 
+def _argument_of(position: int, inputs: Inputs, arguments: list[str]) -> str:
+    """Return the name of the argument that takes an aleatory input, or its number."""
+    place = inputs.arguments.index(position)
+    if place < len(arguments):
+        return arguments[place]
+    return f"input {place + 1}"
+
+
 def chosen(known: list[Margin], inputs: Iterable[Any] | None) -> list[Margin]:
-    """Return those of the margins that a user asked for, by name, by the name without index, or as ``.dist()``.
+    """Return those margins that a user asked for: by name, with or without index, or ``.dist()``.
 
     Raises
     ------
@@ -88,69 +109,128 @@ def chosen(known: list[Margin], inputs: Iterable[Any] | None) -> list[Margin]:
     """
     if inputs is None:
         return known
-    wanted = [inputs] if isinstance(inputs, str | TensorVariable) else list(inputs)
+    if isinstance(inputs, str | TensorVariable):
+        inputs = [inputs]
     found: list[Margin] = []
-    for x in wanted:
-        new = [m for m in known if (x in (m.name, m.name.partition("[")[0]) if isinstance(x, str) else m.dist is x)]
+    for x in inputs:
+        new = [margin for margin in known if _is(margin, x)]
         if not new:
-            raise KeyError(f"inputs: got {x}, expected some of {[m.name for m in known]}, or their .dist() objects")
-        found += [m for m in new if m not in found]
+            names = [margin.name for margin in known]
+            raise KeyError(f"inputs: got {x}, expected some of {names}, or their .dist() objects")
+        found += [margin for margin in new if margin not in found]
     return found
 
 
-def margin_densities(evaluator: Evaluator, wanted: list[Margin], thetas: Floats) -> dict[str, tuple[Floats, Floats]]:
-    """Return by margin a grid, shape (g,), and the densities at thetas, shape (P, g); probabilities if it is discrete.
+def _is(margin: Margin, wanted: Any) -> bool:
+    """Whether a margin is, or is an element of, what a user asked for."""
+    if isinstance(wanted, str):
+        return wanted in (margin.name, variable_of(margin.name))
+    return margin.dist is wanted
 
-    They are exact where the input has an elementwise density or is a multivariate normal, and else kernel densities
-    of random draws. No response is computed.
+
+def margin_densities(
+    evaluator: Evaluator, wanted: list[Margin], thetas: Floats
+) -> dict[str, tuple[Floats, Floats]]:
+    """Return by margin a grid, shape (g,), and densities at thetas, shape (P, g); or probabilities.
+
+    They are exact where the input has an elementwise density or is a multivariate normal, and else
+    kernel densities, or shares, of random draws. No response is computed.
     """
-    out: dict[str, tuple[Floats, Floats]] = {}
-    for k in sorted({m.node for m in wanted}):
-        inputs, here = evaluator.nodes[k].bound.inputs, [m for m in wanted if m.node == k]
+    found: dict[str, tuple[Floats, Floats]] = {}
+    for k in sorted({margin.node for margin in wanted}):
+        inputs = evaluator.nodes[k].bound.inputs
         roots = evaluator.roots(thetas, k)
-        some = [r[:: max(1, len(thetas) // _SOME)] for r in roots]
-        sampler = PopulationSampler(inputs)
-        drawn, _ = sampler(some, _SPECIMENS, np.random.default_rng(0))
-        for m in here:
-            values = _element(drawn[m.position], m.index)
-            low, high = central_range(values, np.full(values.shape, 1 / values.shape[1]), _TAIL)
-            grid = np.arange(np.floor(low), np.ceil(high) + 1) if m.discrete else np.linspace(low, high, 257)
-            exact = None if inputs.nested else _exact(evaluator, m, roots, grid)
-            if exact is None:
-                every, _ = sampler(roots, 4 * _SPECIMENS, np.random.default_rng(1))
-                values = _element(every[m.position], m.index)
-                weights = np.full(values.shape, 1 / values.shape[1])
-                exact = (
-                    np.array([[(row == x).mean() for x in grid] for row in values])
-                    if m.discrete
-                    else densities(values, weights, grid, typical_bandwidth(values[:_SOME], weights[:_SOME]))
-                )
-            out[m.name] = grid, exact
-    return {m.name: out[m.name] for m in wanted}
+        drawn = _Draws(PopulationSampler(inputs), roots)
+        for margin in wanted:
+            if margin.node == k:
+                grid = _axis(margin, _values(drawn.few, margin))
+                y = None if inputs.nested else _exact(inputs, margin, roots, grid)
+                if y is None:
+                    y = _estimated(margin, _values(drawn.many, margin), grid)
+                found[margin.name] = grid, y
+    return {margin.name: found[margin.name] for margin in wanted}
 
 
-def _element(drawn: Any, index: tuple[int, ...]) -> Floats:
-    return np.asarray(drawn[(slice(None), slice(None), *index)], dtype=np.float64)
+@dataclass(frozen=True, eq=False)
+class _Draws:
+    """Random draws of the inputs of one simulator."""
+
+    sampler: PopulationSampler
+    roots: list[Floats]
+
+    @cached_property
+    def few(self) -> list[Any]:
+        """Specimens from some populations, by input."""
+        populations = len(self.roots[0])
+        step = max(1, populations // _RANGE_POPULATIONS)
+        some = [root[::step] for root in self.roots]
+        rng = np.random.default_rng(0)
+        return list(self.sampler(some, _SPECIMENS, rng)[0])
+
+    @cached_property
+    def many(self) -> list[Any]:
+        """Specimens from all populations, by input."""
+        rng = np.random.default_rng(1)
+        return list(self.sampler(self.roots, _DENSITY_SPECIMENS, rng)[0])
 
 
-def _exact(evaluator: Evaluator, margin: Margin, roots: list[Floats], grid: Floats) -> Floats | None:
+def _values(drawn: list[Any], margin: Margin) -> Floats:
+    """Return the draws of a margin, shape (P, n)."""
+    of_input = drawn[margin.position]
+    of_element = of_input[(slice(None), slice(None), *margin.index)]
+    return np.asarray(of_element, dtype=np.float64)
+
+
+def _equal_weights(values: Floats) -> Floats:
+    return np.full(values.shape, 1 / values.shape[1])
+
+
+def _axis(margin: Margin, values: Floats) -> Floats:
+    """Return where a density is evaluated: over most draws, or at the whole numbers there."""
+    low, high = central_range(values, _equal_weights(values), _TAIL)
+    if margin.discrete:
+        first, last = np.floor(low), np.ceil(high)
+        return np.arange(first, last + 1)
+    return np.linspace(low, high, GRID_POINTS)
+
+
+def _estimated(margin: Margin, values: Floats, grid: Floats) -> Floats:
+    """Return densities, or shares of whole numbers, of draws, shape (P, n): (P, g)."""
+    if margin.discrete:
+        shares = [(values == x).mean(axis=1) for x in grid]
+        return np.column_stack(shares)
+    return smooth_densities(values, _equal_weights(values), grid)
+
+
+def _exact(inputs: Inputs, margin: Margin, roots: list[Floats], grid: Floats) -> Floats | None:
     """Return the densities, shape (P, g), or None where PyMC has no density of one element."""
-    inputs = evaluator.nodes[margin.node].bound.inputs
     symbols = inputs.placeholders()
-    dist: Any = inputs.rebuilt(symbols)[0][margin.position]
+    dists, *_ = inputs.rebuilt(symbols)
+    dist: Any = dists[margin.position]
     x = pt.lvector("x") if margin.discrete else pt.dvector("x")
+    logp = _log_density(dist, margin.index, x)
+    if logp is None:
+        return None
+    function = compile_batched(symbols, [pt.exp(logp)], extra=[x])
+    (density,) = function(*roots, grid.astype(x.dtype))
+    density = np.nan_to_num(density)
+    return np.broadcast_to(density, (len(roots[0]), grid.size))
+
+
+def _log_density(dist: Any, index: tuple[int, ...], x: Any) -> Any:
+    """Return the log-density of an element at x, shape (g,), or None where there is none."""
+    if is_mvnormal(dist):
+        mean, covariance = dist.owner.op.dist_params(dist.owner)
+        (i,) = index
+        sd = pt.sqrt(covariance[i, i])
+        return pm.logp(pm.Normal.dist(mean[i], sd), x)
+    # All elements at the same value
+    columns = pt.shape_padright(x, dist.type.ndim)
+    everywhere = columns + pt.zeros_like(dist)
     try:
-        if is_mvnormal(dist):
-            mean, covariance = dist.owner.op.dist_params(dist.owner)
-            (i,) = margin.index
-            logp = pm.logp(pm.Normal.dist(mean[i], pt.sqrt(covariance[i, i])), x)
-        else:
-            columns = x[(slice(None), *(None,) * dist.type.ndim)]
-            logp = pm.logp(dist, columns + pt.zeros_like(dist), warn_rvs=False)
-            if logp.type.ndim != 1 + dist.type.ndim:
-                return None  # a density of all elements together
-            logp = logp[(slice(None), *margin.index)]
+        logp = pm.logp(dist, everywhere, warn_rvs=False)
     except NotImplementedError:
         return None
-    (found,) = compile_batched(symbols, [pt.exp(logp)], extra=[x])(*roots, grid.astype(x.dtype))
-    return np.broadcast_to(np.nan_to_num(found), (len(roots[0]), grid.size))
+    if logp.type.ndim != 1 + dist.type.ndim:
+        return None  # a density of all elements together
+    return logp[(slice(None), *index)]

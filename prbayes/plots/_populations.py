@@ -1,31 +1,62 @@
-"""What pictures of populations share: level, band, the calibrated curves."""
+"""What pictures of populations share: the level of a band, and the calibrated curve in its band."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 from prbayes._checks import Floats, positive_number
-from prbayes.plots._canvas import BLUE, Canvas
-from prbayes.plots._curves import (
-    pointwise_band,
-)
+from prbayes.plots._canvas import BLUE, Panel
+from prbayes.plots._curves import pointwise_band
 from prbayes.plots._ensemble import Ensemble
 
 
 def check_level(level: float) -> None:
+    """Refuse what is no probability strictly between 0 and 1."""
     if positive_number(level, "level") >= 1:
         raise ValueError(f"level: got {level}, expected a number between 0 and 1")
 
 
-def middle_and_band(curves: Floats, centers: int, level: float) -> tuple[Floats, tuple[Floats, Floats] | None]:
-    """Return the optimum's curve, or else the mean of the posterior's, and a band of the others."""
-    others = curves[centers:]
-    return curves[0] if centers else others.mean(axis=0), pointwise_band(others, level) if len(others) else None
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """The calibrated curve, shape (g,), and the two sides of its band, if there is one."""
+
+    middle: Floats
+    band: tuple[Floats, Floats] | None
+
+    @property
+    def top(self) -> float:
+        """How high it reaches."""
+        top = float(self.middle.max())
+        if self.band is None:
+            return top
+        _, upper = self.band
+        return max(top, float(upper.max()))
 
 
-def calibrated(
-    canvas: Canvas, panel: str, grid: Floats, after: Floats, band: Any, shown: Ensemble, level: float
+def calibrated(curves: Floats, shown: Ensemble, level: float) -> Calibrated:
+    """Return the optimum's curve, or else the mean of the posterior's, and the band of the others.
+
+    Parameters
+    ----------
+    curves : ndarray, shape (P, g)
+        Of ``shown.every``: the first is the optimum's, if there is one.
+    shown : Ensemble
+    level : float
+        Share of the curves within the band, at each point.
+    """
+    count = len(shown.center)
+    others = curves[count:]
+    middle = curves[0] if count else others.mean(axis=0)
+    band = pointwise_band(others, level) if len(others) else None
+    return Calibrated(middle, band)
+
+
+def draw_calibrated(
+    panel: Panel, grid: Floats, found: Calibrated, shown: Ensemble, level: float
 ) -> None:
-    if band is not None:
-        canvas.band(panel, "band", grid, band, BLUE, legend=f"{level:.0%} band of the {shown.spread}")
-    canvas.line(panel, "after", grid, after, BLUE, width=2.2, legend=f"calibrated: {shown.label}")
+    """Draw the calibrated curve in its band."""
+    if found.band is not None:
+        text = f"{level:.0%} band of the {shown.spread}"
+        panel.band("band", grid, found.band, BLUE, legend=text)
+    text = f"calibrated: {shown.label}"
+    panel.line("after", grid, found.middle, BLUE, width=2.2, legend=text)

@@ -8,10 +8,15 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes.plots._canvas import BLUE, DOTTED, GREY, INK, Canvas, named
-from prbayes.plots._curves import round_ticks
+from prbayes._checks import Floats
+from prbayes.plots._canvas import BLUE, DOTTED, GREY, INK, Canvas, Panel
+from prbayes.plots._names import named
+from prbayes.plots._ticks import round_ticks
 
-_TOLD = ("n_responses", "seconds")
+# What a comparison has by result besides scores.
+_COSTS = ("n_responses", "seconds")
+# Of an axis on each side, and of the distance of rows: markers at the ends are whole.
+_MARGIN, _ROW_MARGIN = 0.06, 0.6
 
 
 def plot_comparison(
@@ -22,15 +27,15 @@ def plot_comparison(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the estimate and the interval of each result, one row per result and one panel per hyperparameter.
+    """Draw the estimate and interval of each result, a row per result, a panel per hyperparameter.
 
     Parameters
     ----------
     comparison : xarray.Dataset
         From `compare`.
     scores : bool
-        Draw in their place the discrepancy of each result's population under each metric, one panel per metric; the
-        smaller the better, each metric in its own units.
+        Draw in their place the discrepancy of each result's population under each metric, one panel
+        per metric; the smaller the better, each metric in its own units.
     labels : mapping, optional
         What a reader calls a hyperparameter, by its name, with units; also a result or a score.
     backend : {"matplotlib", "bokeh", "plotly"}, optional
@@ -41,7 +46,8 @@ def plot_comparison(
     Returns
     -------
     arviz.PlotCollection
-        Its ``viz`` has the artists ``estimate`` and ``interval_0``, ``interval_1`` and so on by result; or ``score``.
+        Its ``viz`` has the artists ``estimate`` and ``interval_0``, ``interval_1`` and so on by
+        result; or ``score``.
 
     Raises
     ------
@@ -53,59 +59,103 @@ def plot_comparison(
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
     >>> table = prb.compare({"optimum": prb.minimize(model)}, model=model)
     >>> list(prb.plot_comparison(table, backend="none").viz["estimate"])
     ['mu']
     """
-    if not isinstance(comparison, xr.Dataset) or not {"estimate", "lower", "upper"} <= set(comparison.data_vars):
-        raise TypeError(f"plot_comparison: got {type(comparison).__name__}, expected the Dataset of prb.compare")
-    results = [str(r) for r in comparison.result.values]
-    rows = np.arange(len(results), dtype=np.float64)[::-1]
-    panels = [str(h) for h in comparison.hyperparameter.values]
+    if not _is_comparison(comparison):
+        got = type(comparison).__name__
+        raise TypeError(f"plot_comparison: got {got}, expected the Dataset of prb.compare")
     if scores:
-        panels = [str(n) for n, v in comparison.data_vars.items() if v.dims == ("result",) and n not in _TOLD]
-        if not panels:
-            raise ValueError("plot_comparison: got no scores, expected those of prb.compare(results, model=model)")
-    interval = f"{comparison.attrs.get('interval', 0.89):.0%} interval"
-    height = 1.6 + 0.34 * len(results)
-    canvas = Canvas(panels, size=(4.8, height), backend=backend, pc_kwargs=pc_kwargs)
-    for name in panels:
+        names = _scores(comparison)
+    else:
+        names = [str(name) for name in comparison.hyperparameter.values]
+    row_names = [named(str(result), labels) for result in comparison.result.values]
+    count = len(row_names)
+    rows = np.arange(count - 1.0, -1.0, -1.0)  # the first on top
+    limits = (-_ROW_MARGIN, count - 1 + _ROW_MARGIN)
+
+    height = 1.6 + 0.34 * count
+    canvas = Canvas(names, size=(4.8, height), backend=backend, pc_kwargs=pc_kwargs)
+    for name in names:
+        panel = canvas.panel(name)
         if scores:
-            at = comparison[name].values
-            known = np.isfinite(at)
-            canvas.points(name, "score", at[known], rows[known], BLUE, size=45)
+            shown = comparison[name].values
+            _draw_scores(panel, shown, rows)
         else:
             row = comparison.sel(hyperparameter=name)
-            first = row.estimate.values[:1]
-            if len(results) > 1:
-                text = f"estimate of {named(results[0], labels)}"
-                canvas.line(
-                    name,
-                    "first",
-                    np.repeat(first, 2),
-                    [-0.6, len(results) - 0.4],
-                    GREY,
-                    style=DOTTED,
-                    width=1.2,
-                    legend=text,
-                )
-            for i, (low, high) in enumerate(zip(row.lower.values, row.upper.values, strict=True)):
-                if np.isfinite([low, high]).all():
-                    canvas.line(name, f"interval_{i}", [low, high], [rows[i]] * 2, BLUE, width=3, legend=interval)
-            canvas.points(name, "estimate", row.estimate.values, rows, INK, size=45, legend="estimate")
-        known = comparison[name].values if scores else np.concatenate([row.lower, row.upper, row.estimate])
-        known = known[np.isfinite(known)]
-        low, high = (known.min(), known.max()) if known.size else (0.0, 1.0)
-        room = 0.06 * (high - low) or 0.01 * max(abs(low), 1.0)
-        limits = (float(low - room), float(high + room))
-        ticks = (rows.tolist(), [named(r, labels) for r in results])
-        canvas.axes(
-            name,
+            shown = np.concatenate([row.lower, row.upper, row.estimate])
+            if count > 1:
+                _draw_first(panel, row, limits, row_names[0])
+            _draw_intervals(panel, row, rows, _interval_text(comparison))
+        covered = _covered(shown)
+        panel.axes(
             x=named(name, labels),
-            xlim=limits,
-            xticks=round_ticks(*limits),
-            yticks=ticks,
-            ylim=(-0.6, len(results) - 0.4),
+            xlim=covered,
+            ylim=limits,
+            xticks=round_ticks(*covered),
+            yticks=(rows.tolist(), row_names),
         )
     return canvas.finish()
+
+
+def _is_comparison(comparison: Any) -> bool:
+    if not isinstance(comparison, xr.Dataset):
+        return False
+    return {"estimate", "lower", "upper"} <= set(comparison.data_vars)
+
+
+def _scores(comparison: xr.Dataset) -> list[str]:
+    """Return the names of the scores."""
+    found = []
+    for name, values in comparison.data_vars.items():
+        if values.dims == ("result",) and name not in _COSTS:
+            found.append(str(name))
+    if not found:
+        raise ValueError(
+            "plot_comparison: got no scores, expected those of prb.compare(results, model=model)"
+        )
+    return found
+
+
+def _interval_text(comparison: xr.Dataset) -> str:
+    return f"{comparison.attrs.get('interval', 0.89):.0%} interval"
+
+
+def _draw_scores(panel: Panel, scores: Floats, rows: Floats) -> None:
+    known = np.isfinite(scores)
+    x, y = scores[known], rows[known]
+    panel.points("score", x, y, BLUE, size=45)
+
+
+def _draw_first(panel: Panel, row: xr.Dataset, limits: tuple[float, float], name: str) -> None:
+    """Draw a line through the estimate of the first result, which the others are compared with."""
+    first = np.repeat(row.estimate.values[:1], 2)
+    text = f"estimate of {name}"
+    panel.line("first", first, limits, GREY, style=DOTTED, width=1.2, legend=text)
+
+
+def _draw_intervals(panel: Panel, row: xr.Dataset, rows: Floats, text: str) -> None:
+    """Draw the interval and the estimate of each result."""
+    ends = np.column_stack([row.lower, row.upper])
+    for i, interval in enumerate(ends):
+        if np.isfinite(interval).all():
+            visual = f"interval_{i}"
+            y = np.repeat(rows[i], 2)
+            panel.line(visual, interval, y, BLUE, width=3, legend=text)
+    panel.points("estimate", row.estimate.values, rows, INK, size=45, legend="estimate")
+
+
+def _covered(shown: Floats) -> tuple[float, float]:
+    """Return what the axis covers: all finite values, and a margin."""
+    known = shown[np.isfinite(shown)]
+    low, high = 0.0, 1.0
+    if known.size:
+        low, high = known.min(), known.max()
+    margin = _MARGIN * (high - low)
+    if not margin:
+        margin = 0.01 * max(abs(low), 1.0)
+    return float(low - margin), float(high + margin)

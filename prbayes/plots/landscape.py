@@ -11,16 +11,17 @@ import pymc as pm
 from prbayes._checks import Floats, positive_integer
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.evaluator import Evaluator
-from prbayes.plots._canvas import (
-    BLUE,
-    CROSS,
-    DIAMOND,
-    INK,
-    VERMILION,
-    Canvas,
-    named,
-)
-from prbayes.plots._grid import Landscape, check_optimum, elements, landscape, objective_of, rooted
+from prbayes.plots._canvas import BLUE, CROSS, DIAMOND, INK, VERMILION, Canvas, Panel
+from prbayes.plots._grid import Landscape, landscape, rooted
+from prbayes.plots._names import named
+from prbayes.plots._objective import check_optimum, free_elements, objective_label
+
+# Points along each axis, by the number of hyperparameters: contours of 41 look smooth, and as many
+# evaluations are drawn in about a second; a curve can have more. By judgement.
+_POINTS = {1: 161, 2: 41}
+_FEWEST_POINTS = 5  # fewer show no bowl
+_LEVELS = np.linspace(0, 1, 11)  # of the root of the objective over its lowest value: ten colours
+_PATH = "path of the optimiser"
 
 
 def plot_landscape(
@@ -34,26 +35,29 @@ def plot_landscape(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the objective over two hyperparameters around the optimum, with the optimiser's path and other optima.
+    """Draw the objective around the optimum over two hyperparameters, with the optimiser's path.
 
-    Darker is lower; contours are at even steps of the root of the objective over its lowest value, so that they crowd
-    towards the optimum; the title has the values at the ends. With one hyperparameter, or one name, it is a curve. All
-    other hyperparameters stand at the optimum, as the title says. Where stored responses do not support a population
-    the picture is blank. Path and other optima are those of all hyperparameters, projected.
+    Darker is lower; contours are at even steps of the root of the objective over its lowest value,
+    so that they crowd towards the optimum; the title has the values at the ends. With one
+    hyperparameter, or one name, it is a curve. All other hyperparameters stand at the optimum, as
+    the title says. Where stored responses do not support a population the picture is blank. Path
+    and other optima are those of all hyperparameters, projected.
 
     Parameters
     ----------
     optimum : Optimum
         From `minimize`.
     model : pymc.Model, optional
-        That of the optimum; another one with the same hyperparameters may be given, such as one with another metric.
+        That of the optimum; another one with the same hyperparameters may be given, such as one
+        with another metric.
     pair : sequence of str, optional
-        One or two names, such as ``("mu", "sigma")`` or ``("mu[0]", "mu[1]")``; the first two by default.
+        One or two names, such as ``("mu", "sigma")`` or ``("mu[0]", "mu[1]")``; the first two by
+        default.
     points : int, optional
         Along each axis; 41, or 161 for a curve.
     responses : int
-        Largest number of responses that may be computed. With `Reweighted` none is; with `Resimulated` and `Fresh`
-        every point of the picture costs n for each simulator.
+        Largest number of responses that may be computed. With `Reweighted` none is; with
+        `Resimulated` and `Fresh` every point of the picture costs n for each simulator.
     labels : mapping, optional
         What a reader calls a hyperparameter, by its name, with units.
     backend : {"matplotlib", "bokeh", "plotly"}, optional
@@ -64,7 +68,8 @@ def plot_landscape(
     Returns
     -------
     arviz.PlotCollection
-        Its ``viz`` has the artists ``landscape`` (``landscape_lines``), ``path``, ``optimum`` and ``rivals``.
+        Its ``viz`` has the artists ``landscape`` (``landscape_lines``), ``path``, ``optimum`` and
+        ``rivals``.
 
     Raises
     ------
@@ -76,80 +81,136 @@ def plot_landscape(
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
     >>> prb.plot_landscape(prb.minimize(model), backend="none").viz["optimum"].name
     'optimum'
     """
     check_optimum(optimum, "plot_landscape")
-    evaluator = optimum.evaluator if model is None or model is optimum.model else Evaluator(model)
-    if evaluator.names != optimum.names or [n.name for n in evaluator.nodes] != list(optimum.scales):
-        got = f"{evaluator.names} and {[n.name for n in evaluator.nodes]}"
-        raise ValueError(
-            f"model: got hyperparameters and simulators {got}, expected {optimum.names} and {list(optimum.scales)}"
-        )
-    known = list(elements(optimum.evaluator, optimum.theta[None]))
-    wanted = list(known[:2] if pair is None else [pair] if isinstance(pair, str) else pair)
-    if not 1 <= len(wanted) <= 2 or len(set(wanted)) != len(wanted) or not set(wanted) <= set(known):
-        raise KeyError(f"pair: got {pair}, expected one or two of {known}")
-    points = (41 if len(wanted) == 2 else 161) if points is None else positive_integer(points, "points", minimum=5)
-    cost = points ** len(wanted) * evaluator.responses_per_theta
-    if cost > responses:
-        raise ValueError(
-            f"plot_landscape: got responses={responses}, expected at least {cost}: {points ** len(wanted)} points with "
-            f"{evaluator.responses_per_theta} responses each; pass responses={cost}, fewer points, or use "
-            "prb.Reweighted(), whose pictures cost none"
-        )
-    found = landscape(optimum, evaluator, wanted, points)
+    evaluator = _evaluator_of(optimum, model)
+    known = list(free_elements(optimum.evaluator, optimum.theta[None]))
+    names = _chosen(pair, known)
+    if points is None:
+        points = _POINTS[len(names)]
+    else:
+        points = positive_integer(points, "points", minimum=_FEWEST_POINTS)
+    _check_cost(evaluator, points ** len(names), responses)
+
+    found = landscape(optimum, evaluator, names, points)
     if not np.isfinite(found.heights).any():
         raise ValueError(
-            "plot_landscape: got no finite objective, expected some around the optimum; look at its message"
+            "plot_landscape: got no finite objective, expected some around the optimum; look at "
+            "its message"
         )
+    others = [name for name in known if name not in names]
+    listed = ", ".join(named(name, labels) for name in others)
+    held = f"{listed} held at the optimum" if others else ""
+
     canvas = Canvas(["landscape"], size=(6.4, 5.4), backend=backend, pc_kwargs=pc_kwargs)
-    rest = [named(n, labels) for n in known if n not in wanted]
-    held = f"{', '.join(rest)} held at the optimum" if rest else ""
-    limits = [(float(axis[0]), float(axis[-1])) for axis in found.axes]
-    if len(wanted) == 1:
-        _curve(canvas, found, alone=not rest)
-        y = objective_of(optimum)
+    panel = canvas.panel("landscape")
+    height = objective_label(optimum)
+    x = named(names[0], labels)
+    if len(names) == 1:
+        _draw_curve(panel, found, alone=not others)
+        panel.axes(x=x, y=height, title=held, xlim=_ends(found.axes[0]))
     else:
-        roots, low, high = rooted(found.heights)
-        canvas.heights("landscape", "landscape", (found.axes[0], found.axes[1]), roots, np.linspace(0, 1, 11))
-        x, y = found.path.T
-        canvas.line("landscape", "path", x, y, INK, width=1.0)
-        canvas.points("landscape", "asked", x, y, INK, size=14, legend="path of the optimiser")
-        _marks(canvas, found.optimum.T, found.rivals.T)
-        y = named(wanted[1], labels)
-        held = "\n".join([f"{objective_of(optimum)}: {low:.3g} dark, {high:.3g} light", *([held] if held else [])])
-    canvas.axes(
-        "landscape",
-        x=named(wanted[0], labels),
-        y=y,
-        title=held,
-        xlim=limits[0],
-        ylim=limits[1] if len(wanted) == 2 else None,
-    )
+        low, high = _draw_plane(panel, found)
+        colours = f"{height}: {low:.3g} dark, {high:.3g} light"
+        panel.axes(
+            x=x,
+            y=named(names[1], labels),
+            title=f"{colours}\n{held}" if held else colours,
+            xlim=_ends(found.axes[0]),
+            ylim=_ends(found.axes[1]),
+        )
     return canvas.finish()
 
 
-def _curve(canvas: Canvas, found: Landscape, *, alone: bool) -> None:
-    """Draw the objective over one hyperparameter; what lies on the curve only if there are no others."""
-    (x,), heights = found.axes, found.heights
-    known = np.isfinite(heights)
-    canvas.line("landscape", "landscape", x[known], heights[known], BLUE)
-
-    def on_curve(places: Floats) -> tuple[Floats, Floats]:
-        at = places[:, 0][(places[:, 0] >= x[known][0]) & (places[:, 0] <= x[known][-1])]
-        return at, np.interp(at, x[known], heights[known])
-
-    if alone:
-        canvas.points("landscape", "asked", *on_curve(found.path), INK, size=14, legend="path of the optimiser")
-    _marks(canvas, on_curve(found.optimum), on_curve(found.rivals if alone else found.rivals[:0]))
-
-
-def _marks(canvas: Canvas, optimum: Any, rivals: Any) -> None:
-    """Mark the optimum and its rivals, each as x and y."""
-    canvas.points("landscape", "optimum", optimum[0], optimum[1], VERMILION, marker=DIAMOND, size=90, legend="optimum")
-    if np.size(rivals[0]):
-        canvas.points(
-            "landscape", "rivals", rivals[0], rivals[1], VERMILION, marker=CROSS, size=70, legend="other optima"
+def _evaluator_of(optimum: Optimum, model: pm.Model | None) -> Evaluator:
+    """Return the optimum's own evaluator, or one of another model with the same hyperparameters."""
+    if model is None or model is optimum.model:
+        return optimum.evaluator
+    evaluator = Evaluator(model)
+    simulators = [node.name for node in evaluator.nodes]
+    expected = list(optimum.scales)
+    if evaluator.names != optimum.names or simulators != expected:
+        raise ValueError(
+            f"model: got hyperparameters and simulators {evaluator.names} and {simulators}, "
+            f"expected {optimum.names} and {expected}"
         )
+    return evaluator
+
+
+def _chosen(pair: Sequence[str] | None, known: list[str]) -> list[str]:
+    """Return the one or two hyperparameters that are asked for, of those known."""
+    if pair is None:
+        return known[:2]
+    names = [pair] if isinstance(pair, str) else list(pair)
+    different = set(names)
+    allowed = different <= set(known) and len(different) == len(names)
+    if not allowed or len(names) not in _POINTS:
+        raise KeyError(f"pair: got {pair}, expected one or two of {known}")
+    return names
+
+
+def _check_cost(evaluator: Evaluator, points: int, responses: int) -> None:
+    """Refuse to compute more responses than allowed."""
+    each = evaluator.responses_per_theta
+    cost = points * each
+    if cost > responses:
+        raise ValueError(
+            f"plot_landscape: got responses={responses}, expected at least {cost}: {points} points "
+            f"with {each} responses each; pass responses={cost}, fewer points, or use "
+            "prb.Reweighted(), whose pictures cost none"
+        )
+
+
+def _ends(axis: Floats) -> tuple[float, float]:
+    return float(axis[0]), float(axis[-1])
+
+
+def _draw_plane(panel: Panel, found: Landscape) -> tuple[float, float]:
+    """Draw the objective over two hyperparameters; return its values at the ends of the colours."""
+    roots, low, high = rooted(found.heights)
+    first, second = found.axes
+    panel.heights("landscape", (first, second), roots, _LEVELS)
+    x, y = found.path.T
+    panel.line("path", x, y, INK, width=1.0)
+    panel.points("asked", x, y, INK, size=14, legend=_PATH)
+    _draw_optima(panel, found.optimum.T, found.rivals.T)
+    return low, high
+
+
+def _draw_curve(panel: Panel, found: Landscape, *, alone: bool) -> None:
+    """Draw the objective over one hyperparameter.
+
+    Path and other optima lie on the curve only if there are no other hyperparameters.
+    """
+    known = np.isfinite(found.heights)
+    (axis,) = found.axes
+    curve = (axis[known], found.heights[known])
+    panel.line("landscape", *curve, BLUE)
+    rivals = found.rivals[:0]
+    if alone:
+        rivals = found.rivals
+        x, y = _on_curve(found.path, *curve)
+        panel.points("asked", x, y, INK, size=14, legend=_PATH)
+    _draw_optima(panel, _on_curve(found.optimum, *curve), _on_curve(rivals, *curve))
+
+
+def _on_curve(places: Floats, x: Floats, heights: Floats) -> Floats:
+    """Return those places, shape (m, 1), that a curve covers, with its heights: shape (2, m)."""
+    at = places[:, 0]
+    covered = (at >= x[0]) & (at <= x[-1])
+    at = at[covered]
+    return np.stack([at, np.interp(at, x, heights)])
+
+
+def _draw_optima(panel: Panel, optimum: Floats, rivals: Floats) -> None:
+    """Mark the optimum and its rivals, shape (2, m) each."""
+    x, y = optimum
+    panel.points("optimum", x, y, VERMILION, marker=DIAMOND, size=90, legend="optimum")
+    if rivals.size:
+        x, y = rivals
+        panel.points("rivals", x, y, VERMILION, marker=CROSS, size=70, legend="other optima")

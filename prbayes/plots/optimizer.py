@@ -7,17 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
-from prbayes.plots._canvas import (
-    BLUE,
-    DASHED,
-    GREY,
-    VERMILION,
-    Canvas,
-    named,
-)
-from prbayes.plots._curves import log_ticks, spans_decades
-from prbayes.plots._grid import check_optimum, elements, objective_of
+from prbayes.plots._canvas import BLUE, DASHED, GREY, VERMILION, Canvas, Panel
+from prbayes.plots._names import named
+from prbayes.plots._objective import check_optimum, free_elements, objective, objective_label
+from prbayes.plots._ticks import log_ticks, spans_decades
 
 
 def plot_optimizer(
@@ -27,13 +22,14 @@ def plot_optimizer(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the objective and the hyperparameters that an optimiser asked for, against the number of evaluations.
+    """Draw the objective and hyperparameters that an optimiser asked for, by evaluation.
 
-    The first panel has the objective, the sum of d_k / s_k, of each point and the lowest so far, with logarithmic
-    ticks where it falls over more than a decade; a panel for each hyperparameter follows, in the user's own units,
-    with the optimum as a dashed line. With `Reweighted` the objective is that of the final design and scales,
-    evaluated anew without a response; elsewhere it is what the optimiser saw, and with several simulators, whose
-    scales may have changed on the way, nothing says which was lowest.
+    The first panel has the objective, the sum of d_k / s_k, of each point and the lowest so far,
+    with logarithmic ticks where it falls over more than a decade; a panel for each hyperparameter
+    follows, in the user's own units, with the optimum as a dashed line. With `Reweighted` the
+    objective is that of the final design and scales, evaluated anew without a response; elsewhere
+    it is what the optimiser saw, and with several simulators, whose scales may have changed on the
+    way, nothing says which was lowest.
 
     Parameters
     ----------
@@ -49,7 +45,8 @@ def plot_optimizer(
     Returns
     -------
     arviz.PlotCollection
-        Its ``viz`` has the artists ``asked`` and ``path``, ``best`` (first panel) and ``optimum`` (the others).
+        Its ``viz`` has the artists ``asked`` and ``path``, ``best`` (first panel) and ``optimum``
+        (the others).
 
     Raises
     ------
@@ -61,32 +58,52 @@ def plot_optimizer(
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
     >>> list(prb.plot_optimizer(prb.minimize(model), backend="none").viz["asked"])
     ['discrepancy', 'mu']
     """
     check_optimum(optimum, "plot_optimizer")
-    evaluator, x = optimum.evaluator, optimum.trace["evaluations"].astype(np.float64)
-    scales = np.array([optimum.scales[n.name] for n in evaluator.nodes])
-    free = not evaluator.responses_per_theta
-    values = evaluator.total(optimum.trace["theta"], scales) if free else optimum.trace["discrepancy"]
-    path = elements(optimum.evaluator, optimum.trace["theta"])
-    canvas = Canvas(["discrepancy", *path], size=(4.6, 3.4), backend=backend, pc_kwargs=pc_kwargs)
+    path = free_elements(optimum.evaluator, optimum.trace["theta"])
+    final = free_elements(optimum.evaluator, optimum.theta[None])
+    names = ["discrepancy", *path]
+    canvas = Canvas(names, size=(4.6, 3.4), backend=backend, pc_kwargs=pc_kwargs)
+    evaluations = optimum.trace["evaluations"].astype(np.float64)
+    _draw_objective(canvas.panel("discrepancy"), optimum, evaluations)
+    ends = evaluations[[0, -1]]
+    for name, values in path.items():
+        panel = canvas.panel(name)
+        at = np.repeat(final[name], 2)
+        panel.line("path", evaluations, values, GREY, width=0.8)
+        panel.points("asked", evaluations, values, GREY, size=16, legend="evaluated")
+        panel.line("optimum", ends, at, VERMILION, style=DASHED, legend="optimum")
+        panel.axes(x="evaluations", y=named(name, labels))
+    return canvas.finish()
+
+
+def _draw_objective(panel: Panel, optimum: Optimum, evaluations: Floats) -> None:
+    """Draw the objective of each point, and the lowest so far."""
+    # Anew with the final design and scales, where that costs no response
+    free = not optimum.evaluator.responses_per_theta
+    if free:
+        values = objective(optimum, optimum.evaluator, optimum.trace["theta"])
+    else:
+        values = optimum.trace["discrepancy"]
     shown = np.where(np.isfinite(values), values, np.nan)
     best = np.fmin.accumulate(shown)
-    ticks = log_ticks(shown) if spans_decades(shown) else None
-    if ticks is not None:
-        shown, best = np.log10(shown), np.log10(best)
+
+    # On an axis of logarithms where it falls by orders of magnitude
+    ticks = None
+    if spans_decades(shown):
+        ticks = log_ticks(shown)
+        shown = np.log10(shown)
+        best = np.log10(best)
+
     known = np.isfinite(shown)
-    canvas.points("discrepancy", "asked", x[known], shown[known], GREY, size=16, legend="evaluated")
-    if free or len(scales) == 1:
-        canvas.line("discrepancy", "best", x[known], best[known], BLUE, legend="lowest so far")
-    canvas.axes("discrepancy", x="evaluations", y=objective_of(optimum), yticks=ticks)
-    ends = np.array([x[0], x[-1]])
-    for name, at in path.items():
-        canvas.line(name, "path", x, at, GREY, width=0.8)
-        canvas.points(name, "asked", x, at, GREY, size=16, legend="evaluated")
-        final = float(elements(optimum.evaluator, optimum.theta[None])[name][0])
-        canvas.line(name, "optimum", ends, np.full(2, final), VERMILION, style=DASHED, legend="optimum")
-        canvas.axes(name, x="evaluations", y=named(name, labels))
-    return canvas.finish()
+    x, y = evaluations[known], shown[known]
+    panel.points("asked", x, y, GREY, size=16, legend="evaluated")
+    # Values of different scales cannot be compared
+    if free or len(optimum.scales) == 1:
+        panel.line("best", x, best[known], BLUE, legend="lowest so far")
+    panel.axes(x="evaluations", y=objective_label(optimum), yticks=ticks)

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import pymc as pm
 import xarray as xr
 
 from prbayes.estimate.optimum import Optimum
-from prbayes.plots._canvas import Canvas, named
+from prbayes.plots._canvas import Canvas
 from prbayes.plots._ensemble import read_result
 from prbayes.plots._margins import chosen, margin_densities, margins
-from prbayes.plots._populations import calibrated, check_level, middle_and_band
+from prbayes.plots._names import named
+from prbayes.plots._populations import calibrated, check_level, draw_calibrated
 
 
 def plot_population(
@@ -27,10 +27,12 @@ def plot_population(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the calibrated population of each aleatory input, with its uncertainty; of a multivariate one, its margins.
+    """Draw the calibrated population of each aleatory input, with its uncertainty.
 
-    The curve is the posterior predictive density of the input, or its density at the optimum; the band holds
-    the share ``level`` of the densities at each value. It computes no response.
+    Of a multivariate input each margin has a panel.
+
+    The curve is the posterior predictive density of the input, or its density at the optimum; the
+    band holds the share ``level`` of the densities at each value. It computes no response.
 
     Parameters
     ----------
@@ -39,7 +41,8 @@ def plot_population(
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
     inputs : sequence, optional
-        Names, or ``.dist()`` objects; all by default. An input is called as the response's argument that takes it.
+        Names, or ``.dist()`` objects; all by default. An input is called as the response's argument
+        that takes it.
     level : float
     draws : int, optional
         Number of populations in the band; 200 by default.
@@ -58,27 +61,31 @@ def plot_population(
     Raises
     ------
     TypeError, KeyError, ValueError
-        If an argument is not as described, there is no such input, or the result lacks a free variable.
+        If an argument is not as described, there is no such input, or the result lacks a free
+        variable.
 
     Examples
     --------
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda load: 2 * load, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator(
+    ...         "y", lambda load: 2 * load, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
     >>> list(prb.plot_population(prb.minimize(model), backend="none").viz["after"])
     ['load']
     """
     check_level(level)
     shown = read_result(result, model, "prb.plot_population", draws, free=True)
     wanted = chosen(margins(shown.evaluator), inputs)
-    center = shown.thetas[:0] if shown.center is None else shown.center
-    found = margin_densities(shown.evaluator, wanted, np.vstack([center, shown.thetas]))
-    canvas = Canvas([m.name for m in wanted], size=(4.6, 3.9), backend=backend, pc_kwargs=pc_kwargs)
+    found = margin_densities(shown.evaluator, wanted, shown.every)
+    names = [margin.name for margin in wanted]
+    canvas = Canvas(names, size=(4.6, 3.9), backend=backend, pc_kwargs=pc_kwargs)
     for margin in wanted:
+        panel = canvas.panel(margin.name)
         grid, curves = found[margin.name]
-        after, band = middle_and_band(curves, len(center), level)
-        calibrated(canvas, margin.name, grid, after, band, shown, level)
+        after = calibrated(curves, shown, level)
+        draw_calibrated(panel, grid, after, shown, level)
         y = "probability" if margin.discrete else "density"
-        canvas.axes(margin.name, x=named(margin.name, labels), y=y)
+        panel.axes(x=named(margin.name, labels), y=y)
     return canvas.finish()

@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats, positive_number
+from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.evaluator import Evaluator
-from prbayes.plots._canvas import BLUE, DASHED, DIAMOND, DOTTED, GREY, VERMILION, Canvas, named
-from prbayes.plots._curves import bounded_density, normal_density, round_ticks
+from prbayes.plots._canvas import BLUE, DASHED, DIAMOND, DOTTED, GREY, VERMILION, Canvas, Panel
+from prbayes.plots._curves import bounded_density, central_levels, normal_density
+from prbayes.plots._names import named, point_elements, split_elements
+from prbayes.plots._objective import free_elements
+from prbayes.plots._populations import check_level
+from prbayes.plots._ticks import round_ticks
 
+# Draws of the prior, whose density they show: at a normal's peak within 2%, by the sum of kernels.
 _PRIOR_DRAWS = 4000
+# Points of a curve: one or two pixels each, by judgement.
+_GRID_POINTS = 301
+# Heights of the two intervals below the axis, in units of the posterior's peak: the diamond of one
+# does not touch the dot of the other. By judgement.
+_ROWS = (-0.07, -0.15)
 
 
 def plot_posterior(
@@ -28,11 +39,11 @@ def plot_posterior(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the posterior of each hyperparameter against the optimum with its standard error, and the prior.
+    """Draw the posterior of each hyperparameter against the optimum and the prior.
 
-    The bar below the posterior is its equal-tailed interval, with the mean as a dot; the bar and the diamond below
-    that are the optimum and the interval of as much probability of the normal distribution with its standard error,
-    which the dashed curve shows.
+    The bar below the posterior is its equal-tailed interval, with the mean as a dot; the bar and
+    the diamond below that are the optimum and the interval of as much probability of the normal
+    distribution with its standard error, which the dashed curve shows.
 
     Parameters
     ----------
@@ -41,8 +52,8 @@ def plot_posterior(
     optimum : Optimum, optional
         From `minimize`.
     model : pymc.Model, optional
-        Restricts the picture to the model's free variables and adds their prior; by default all variables that
-        posterior and optimum share.
+        Restricts the picture to the model's free variables and adds their prior; by default all
+        variables that posterior and optimum share.
     level : float
         Probability of the intervals.
     labels : mapping, optional
@@ -55,8 +66,8 @@ def plot_posterior(
     Returns
     -------
     arviz.PlotCollection
-        Its ``viz`` has the artists ``posterior``, ``interval``, ``mean``, ``prior``, ``normal``, ``stderr`` and
-        ``optimum``.
+        Its ``viz`` has the artists ``posterior``, ``interval``, ``mean``, ``prior``, ``normal``,
+        ``stderr`` and ``optimum``.
 
     Raises
     ------
@@ -68,70 +79,160 @@ def plot_posterior(
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
     ...     optimum = prb.minimize()
-    ...     posterior = prb.sample_smc(100, chains=2, optimum=optimum, random_seed=1, progressbar=False)
+    ...     posterior = prb.sample_smc(
+    ...         100, chains=2, optimum=optimum, random_seed=1, progressbar=False
+    ...     )
     >>> list(prb.plot_posterior(posterior, optimum, model=model, backend="none").viz["posterior"])
     ['mu']
     """
-    if not isinstance(posterior, xr.DataTree) or "posterior" not in posterior:
-        raise TypeError(f"plot_posterior: got {type(posterior).__name__}, expected a DataTree with a posterior group")
-    if optimum is not None and not isinstance(optimum, Optimum):
-        raise TypeError(f"plot_posterior: optimum: got {type(optimum).__name__}, expected an Optimum from prb.minimize")
-    if positive_number(level, "level") >= 1:
-        raise ValueError(f"level: got {level}, expected a number between 0 and 1")
-    from scipy.special import ndtri  # takes longer to import than the whole package
-
-    z = -float(ndtri((1 - level) / 2))
-    group = posterior["posterior"].to_dataset()
-    draws = _elements({str(n): v.stack(s=("chain", "draw")).transpose("s", ...).values for n, v in group.items()})
-    best = {} if optimum is None else _elements({n: np.asarray(v)[None] for n, v in optimum.point.items()})
-    sd = {} if optimum is None else _elements({n: np.asarray(v)[None] for n, v in optimum.stderr.items()})
-    prior: dict[str, Floats] = {}
-    if model is not None:
-        evaluator = Evaluator(model)
-        prior = _elements(evaluator.constrained(evaluator.prior_thetas(_PRIOR_DRAWS, 0)))
-    free = None if model is None else {rv.name for rv in model.free_RVs}
-    names = [n for n in draws if (free is None or n.partition("[")[0] in free) and (not best or n in best)]
-    names = [n for n in names if np.ptp(draws[n]) > 0]
-    if not names:
-        raise ValueError(
-            f"plot_posterior: got a posterior of {list(draws)}, expected hyperparameters of optimum and model"
-        )
-    canvas = Canvas(names, size=(4.6, 3.6), backend=backend, pc_kwargs=pc_kwargs)
-    for name in names:
-        x = draws[name]
-        interval = np.quantile(x, [(1 - level) / 2, (1 + level) / 2])
-        center, error = (float(best[name][0]), float(sd[name][0])) if best else (np.nan, np.nan)
-        known = bool(np.isfinite(error) and error > 0)
-        reach = [float(x.min()), float(x.max()), *([center] if best else [])]
-        reach += [center - 3 * error, center + 3 * error] if known else []
-        grid = np.linspace(min(reach), max(reach), 301)
-        y = bounded_density(x, grid)
-        top = float(y.max())
-        if name in prior:
-            canvas.line(name, "prior", grid, bounded_density(prior[name], grid), GREY, style=DOTTED, legend="prior")
-        canvas.line(name, "posterior", grid, y, BLUE, width=2.2, legend="posterior")
-        rows = np.array([-0.07, -0.15]) * top
-        canvas.line(name, "interval", interval, np.repeat(rows[0], 2), BLUE, width=3, legend=f"{level:.0%} intervals")
-        canvas.points(name, "mean", x.mean(), rows[0], BLUE, size=90, legend="posterior mean")
-        if known:
-            normal = normal_density(grid, center, error)
-            canvas.line(
-                name, "normal", grid, normal, VERMILION, style=DASHED, legend="normal with the optimum's standard error"
-            )
-            ends = center + z * error * np.array([-1, 1])
-            canvas.line(name, "stderr", ends, np.repeat(rows[1], 2), VERMILION, width=3)
-        if best:
-            canvas.points(name, "optimum", center, rows[1], VERMILION, marker=DIAMOND, size=110, legend="optimum")
-        canvas.axes(name, x=named(name, labels), y="density", yticks=round_ticks(0.0, top))
+    _check_results(posterior, optimum)
+    check_level(level)
+    found = _read_hyperparameters(posterior, optimum, model)
+    canvas = Canvas(list(found), size=(4.6, 3.6), backend=backend, pc_kwargs=pc_kwargs)
+    for name, hyperparameter in found.items():
+        panel = canvas.panel(name)
+        top = _draw(panel, hyperparameter, level)
+        x = named(name, labels)
+        panel.axes(x=x, y="density", yticks=round_ticks(0.0, top))
     return canvas.finish()
 
 
-def _elements(values: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Return one-dimensional arrays by names such as 'mu[1]', of arrays of shape (n, *shape)."""
-    return {
-        f"{name}[{','.join(map(str, i))}]" if i else name: np.asarray(v)[(slice(None), *i)]
-        for name, v in values.items()
-        for i in np.ndindex(np.shape(v)[1:])
-    }
+def _check_results(posterior: Any, optimum: Any) -> None:
+    if not isinstance(posterior, xr.DataTree) or "posterior" not in posterior:
+        raise TypeError(
+            f"plot_posterior: got {type(posterior).__name__}, expected a DataTree with a "
+            "posterior group"
+        )
+    if optimum is not None and not isinstance(optimum, Optimum):
+        raise TypeError(
+            f"plot_posterior: optimum: got {type(optimum).__name__}, expected an Optimum from "
+            "prb.minimize"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Hyperparameter:
+    """What is known of one hyperparameter.
+
+    Attributes
+    ----------
+    draws : ndarray, shape (n,)
+        Of the posterior.
+    prior : ndarray, shape (m,), or None
+        Draws of the prior.
+    best, error : float or None
+        The optimum, and its standard error where it is known.
+    """
+
+    draws: Floats
+    prior: Floats | None
+    best: float | None
+    error: float | None
+
+    @property
+    def grid(self) -> Floats:
+        """What the axis covers: all draws, and three standard errors around the optimum."""
+        low = float(self.draws.min())
+        high = float(self.draws.max())
+        if self.best is not None:
+            reach = 3 * (self.error or 0.0)
+            low = min(low, self.best - reach)
+            high = max(high, self.best + reach)
+        return np.linspace(low, high, _GRID_POINTS)
+
+
+def _read_hyperparameters(
+    posterior: xr.DataTree, optimum: Optimum | None, model: pm.Model | None
+) -> dict[str, _Hyperparameter]:
+    """Return by element what posterior, optimum and model share."""
+    group = posterior["posterior"].to_dataset()
+    samples = {}
+    for name, values in group.items():
+        stacked = values.stack(s=("chain", "draw"))
+        samples[str(name)] = stacked.transpose("s", ...).values
+    draws = split_elements(samples)
+    shared = {name for name, x in draws.items() if np.ptp(x) > 0}
+
+    best, errors = {}, {}
+    if optimum is not None:
+        best = point_elements(optimum.point)
+        errors = point_elements(optimum.stderr)
+        shared &= set(best)
+    prior: dict[str, Floats] = {}
+    if model is not None:
+        evaluator = Evaluator(model)
+        thetas = evaluator.prior_thetas(_PRIOR_DRAWS, 0)
+        prior = free_elements(evaluator, thetas)
+        shared &= set(prior)
+
+    found = {}
+    for name, x in draws.items():
+        if name in shared:
+            error = errors.get(name, np.nan)
+            known = np.isfinite(error) and error > 0
+            found[name] = _Hyperparameter(
+                draws=x,
+                prior=prior.get(name),
+                best=best.get(name),
+                error=error if known else None,
+            )
+    if not found:
+        raise ValueError(
+            f"plot_posterior: got a posterior of {list(draws)}, expected hyperparameters of "
+            "optimum and model"
+        )
+    return found
+
+
+def _draw(panel: Panel, hyperparameter: _Hyperparameter, level: float) -> float:
+    """Draw densities, and the intervals below them; return how high the posterior reaches."""
+    draws, best = hyperparameter.draws, hyperparameter.best
+    grid = hyperparameter.grid
+    density = bounded_density(draws, grid)
+    top = float(density.max())
+    posterior_row, optimum_row = np.array(_ROWS) * top
+
+    if hyperparameter.prior is not None:
+        y = bounded_density(hyperparameter.prior, grid)
+        panel.line("prior", grid, y, GREY, style=DOTTED, legend="prior")
+
+    panel.line("posterior", grid, density, BLUE, width=2.2, legend="posterior")
+    interval = np.quantile(draws, central_levels(level))
+    row = np.repeat(posterior_row, 2)
+    text = f"{level:.0%} intervals"
+    panel.line("interval", interval, row, BLUE, width=3, legend=text)
+    mean = draws.mean()
+    panel.points("mean", mean, posterior_row, BLUE, size=90, legend="posterior mean")
+
+    if best is not None:
+        if hyperparameter.error is not None:
+            _draw_normal(panel, grid, best, hyperparameter.error, level, optimum_row)
+        panel.points(
+            "optimum",
+            best,
+            optimum_row,
+            VERMILION,
+            marker=DIAMOND,
+            size=110,
+            legend="optimum",
+        )
+    return top
+
+
+def _draw_normal(
+    panel: Panel, grid: Floats, best: float, error: float, level: float, row: float
+) -> None:
+    """Draw the normal distribution of the optimum's standard error, and its interval."""
+    from scipy.special import ndtri  # takes longer to import than the whole package
+
+    y = normal_density(grid, best, error)
+    text = "normal with the optimum's standard error"
+    panel.line("normal", grid, y, VERMILION, style=DASHED, legend=text)
+    tail = (1 - level) / 2
+    z = -float(ndtri(tail))
+    ends = best + z * error * np.array([-1, 1])
+    panel.line("stderr", ends, np.repeat(row, 2), VERMILION, width=3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,21 +13,29 @@ import xarray as xr
 
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
+from prbayes.model.evaluator import Evaluator
 from prbayes.model.simulator import Node
-from prbayes.plots._canvas import DASHED, INK, VERMILION, Canvas, named
+from prbayes.plots._canvas import DASHED, INK, VERMILION, Canvas, Panel
 from prbayes.plots._curves import (
+    GRID_POINTS,
     central_range,
-    densities,
     distribution_functions,
     histogram,
+    smooth_densities,
     staircase,
-    typical_bandwidth,
 )
 from prbayes.plots._ensemble import read_before, read_result, supported
-from prbayes.plots._populations import calibrated, check_level, middle_and_band
+from prbayes.plots._names import named
+from prbayes.plots._populations import calibrated, check_level, draw_calibrated
 
 _log = logging.getLogger("prbayes")
-_GRID, _SOME = 257, 40  # points of a curve; populations that set the bandwidth
+# Shares of a population beyond each end of the axis, by judgement: hardly any of the calibrated;
+# of the one before, which is there to be compared, more, and it widens the axis by at most half on
+# each side.
+_TAIL, _TAIL_BEFORE, _ROOM_BEFORE = 0.005, 0.05, 0.5
+_MARGIN = 0.03  # of the axis
+# A curve before that is more than twice as high as all else is cut off there, by judgement.
+_TALLEST = 2
 
 
 def plot_responses(
@@ -41,12 +50,12 @@ def plot_responses(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the responses before and after a calibration against the measured ones, one panel per simulator.
+    """Draw the responses before and after a calibration against the measured ones.
 
-    Measured responses are a histogram, in outline, with a mark for each, or steps. The calibrated curve is the
-    posterior predictive distribution, or the optimum's population. The band holds the share ``level`` of the
-    populations at each response: those of the posterior's draws, or of the optimum's sampling distribution where it
-    is known.
+    Measured responses are a histogram, in outline, with a mark for each, or steps. The calibrated
+    curve is the posterior predictive distribution, or the optimum's population. The band holds the
+    share ``level`` of the populations at each response: those of the posterior's draws, or of the
+    optimum's sampling distribution where it is known.
 
     Parameters
     ----------
@@ -55,17 +64,18 @@ def plot_responses(
     model : pymc.Model, optional
         That of the optimum, or the one on the context, by default.
     before : dict or bool, optional
-        Hyperparameters before the calibration, in the user's own units; False for none. By default the
-        optimiser's first point, if it was given a start or did not look for one, and else the prior's initial point;
-        the legend says which.
+        Hyperparameters before the calibration, in the user's own units; False for none. By default
+        the optimiser's first point, if it was given a start or did not look for one, and else the
+        prior's initial point; the legend says which.
     ecdf : bool
         Draw distribution functions, which need no bandwidth, in place of densities.
     level : float
     draws : int, optional
-        Number of populations in the band; 200 where they cost no response (`Reweighted`), 40 elsewhere, where each
-        costs n responses per simulator.
+        Number of populations in the band; 200 where they cost no response (`Reweighted`), 40
+        elsewhere, where each costs n responses per simulator.
     labels : mapping, optional
-        What a reader calls a simulator, by its name, with units: ``{"crack": "relative crack length"}``.
+        What a reader calls a simulator, by its name, with units: ``{"crack": "relative crack
+        length"}``.
     backend : {"matplotlib", "bokeh", "plotly"}, optional
         That of ArviZ's settings by default.
     **pc_kwargs
@@ -74,7 +84,8 @@ def plot_responses(
     Returns
     -------
     arviz.PlotCollection
-        Its ``viz`` has the artists ``measured``, ``rug`` (densities only), ``before``, ``band`` and ``after``.
+        Its ``viz`` has the artists ``measured``, ``rug`` (densities only), ``before``, ``band`` and
+        ``after``.
 
     Raises
     ------
@@ -85,73 +96,113 @@ def plot_responses(
 
     Notes
     -----
-    Densities of responses are Gaussian kernel densities with Silverman's bandwidth, widened where weights are
-    uneven. Specimens that failed (+inf) are missing from the area under a curve.
+    Densities of responses are Gaussian kernel densities with Silverman's bandwidth, widened where
+    weights are uneven. Specimens that failed (+inf) are missing from the area under a curve.
 
     Examples
     --------
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
     >>> prb.plot_responses(prb.minimize(model), backend="none").viz["after"].name
     'after'
     """
     check_level(level)
     shown = read_result(result, model, "prb.plot_responses", draws)
-    theta, what = read_before(result, shown.evaluator, before)
-    if len(theta) and not supported(shown.evaluator, theta)[0]:
-        _log.warning("plot_responses: before (%s): left out, because stored responses do not reach there", what)
-        theta = theta[:0]
-    center = shown.thetas[:0] if shown.center is None else shown.center
+    start, what = read_before(result, shown.evaluator, before)
+    if len(start) and not supported(shown.evaluator, start)[0]:
+        _log.warning(
+            "plot_responses: before (%s): left out, because stored responses do not reach there",
+            what,
+        )
+        start = start[:0]
     nodes = shown.evaluator.nodes
-    canvas = Canvas([n.name for n in nodes], size=(5.4, 4.2), backend=backend, pc_kwargs=pc_kwargs)
+    names = [node.name for node in nodes]
+    canvas = Canvas(names, size=(5.4, 4.2), backend=backend, pc_kwargs=pc_kwargs)
     for k, node in enumerate(nodes):
-        earlier = shown.evaluator.populations(theta, k) if len(theta) else None
-        values, weights = shown.evaluator.populations(np.vstack([center, shown.thetas]), k)
-        low, high = _reach(node, values, weights, earlier)
-        grid = np.linspace(low, high, _GRID)
-        curves = distribution_functions(values, weights, grid) if ecdf else _density(values, weights, grid)
-        after, band = middle_and_band(curves, len(center), level)
-        top = _measured(canvas, node, low, high, ecdf=ecdf)
-        top = max(top, after.max(), 0.0 if band is None else band[1].max())
+        panel = canvas.panel(node.name)
+        earlier = None
+        if len(start):
+            earlier = _simulate(shown.evaluator, start, k)
+        after = _simulate(shown.evaluator, shown.every, k)
+        covered = _covered(node, after, earlier)
+        grid = np.linspace(*covered, GRID_POINTS)
+
+        # From the data to what explains them, one over the other
+        curves = after.curves(grid, ecdf=ecdf)
+        found = calibrated(curves, shown, level)
+        data_top = _draw_measured(panel, node, covered, ecdf=ecdf)
         ylim = None
         if earlier is not None:
-            y = distribution_functions(*earlier, grid) if ecdf else _density(*earlier, grid)
-            canvas.line(node.name, "before", grid, y[0], VERMILION, style=DASHED, legend=f"before: {what}")
-            if y.max() > 2 * top:  # a narrow peak is cut off, not the rest flattened
-                ylim = (-0.05 * top, 2 * top)
-        calibrated(canvas, node.name, grid, after, band, shown, level)
-        count = f"{node.target.observed.size} measured values"
-        y_axis = "share of specimens" if ecdf else "density"
-        canvas.axes(node.name, x=named(node.name, labels), y=y_axis, title=count, xlim=(low, high), ylim=ylim)
+            (y,) = earlier.curves(grid, ecdf=ecdf)
+            text = f"before: {what}"
+            panel.line("before", grid, y, VERMILION, style=DASHED, legend=text)
+            ylim = _cut(y, max(data_top, found.top))
+        draw_calibrated(panel, grid, found, shown, level)
+        panel.axes(
+            x=named(node.name, labels),
+            y="share of specimens" if ecdf else "density",
+            title=f"{node.target.observed.size} measured values",
+            xlim=covered,
+            ylim=ylim,
+        )
     return canvas.finish()
 
 
-def _reach(node: Node, values: Floats, weights: Floats, earlier: tuple[Floats, Floats] | None) -> tuple[float, float]:
-    """Return what the axis covers: the data, the calibrated populations, and the earlier one unless it is far off."""
-    finite = node.target.observed[np.isfinite(node.target.observed)]
-    low, high = central_range(values, weights, 0.005)
-    low, high = min(low, finite.min()), max(high, finite.max())
+@dataclass(frozen=True, eq=False)
+class _Simulated:
+    """Responses and weights of populations, shape (P, n) each."""
+
+    values: Floats
+    weights: Floats
+
+    def curves(self, grid: Floats, *, ecdf: bool) -> Floats:
+        """Return distribution functions or densities on a grid, shape (P, g)."""
+        if ecdf:
+            return distribution_functions(self.values, self.weights, grid)
+        return smooth_densities(self.values, self.weights, grid)
+
+
+def _simulate(evaluator: Evaluator, thetas: Floats, k: int) -> _Simulated:
+    """Return the responses of the k-th simulator's populations."""
+    return _Simulated(*evaluator.populations(thetas, k))
+
+
+def _covered(node: Node, after: _Simulated, earlier: _Simulated | None) -> tuple[float, float]:
+    """Return what the axis covers: data and populations, the earlier one unless it is far off."""
+    observed = node.target.observed
+    finite = observed[np.isfinite(observed)]
+    low, high = central_range(after.values, after.weights, _TAIL)
+    low = min(low, finite.min())
+    high = max(high, finite.max())
     if earlier is not None:
-        first, last = central_range(*earlier, 0.05)
-        room = (high - low) / 2
-        low, high = max(min(first, low), low - room), min(max(last, high), high + room)
-    margin = 0.03 * (high - low)
+        first, last = central_range(earlier.values, earlier.weights, _TAIL_BEFORE)
+        room = _ROOM_BEFORE * (high - low)
+        low = min(low, max(first, low - room))
+        high = max(high, min(last, high + room))
+    margin = _MARGIN * (high - low)
     return float(low - margin), float(high + margin)
 
 
-def _density(values: Floats, weights: Floats, grid: Floats) -> Floats:
-    return densities(values, weights, grid, typical_bandwidth(values[:_SOME], weights[:_SOME]))
+def _cut(before: Floats, top: float) -> tuple[float, float] | None:
+    """Return where the axis ends if a narrow peak before would dwarf all else, up to ``top``."""
+    if before.max() <= _TALLEST * top:
+        return None
+    return -0.05 * top, _TALLEST * top
 
 
-def _measured(canvas: Canvas, node: Node, low: float, high: float, *, ecdf: bool) -> float:
+def _draw_measured(panel: Panel, node: Node, covered: tuple[float, float], *, ecdf: bool) -> float:
     """Draw the data; return how high they reach."""
     observed, weights = node.target.observed, node.target.weights
     if ecdf:
-        canvas.line(node.name, "measured", *staircase(observed, weights, low, high), INK, width=1.4, legend="measured")
+        x, y = staircase(observed, weights, *covered)
+        panel.line("measured", x, y, INK, width=1.4, legend="measured")
         return 1.0
     x, y = histogram(observed, weights)
-    canvas.line(node.name, "measured", x, y, INK, width=0.9, legend="measured")
-    canvas.points(node.name, "rug", observed[np.isfinite(observed)], 0.0, INK, marker="|", size=60)
+    panel.line("measured", x, y, INK, width=0.9, legend="measured")
+    each = observed[np.isfinite(observed)]
+    panel.points("rug", each, 0.0, INK, marker="|", size=60)
     return float(y.max())

@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from prbayes.plots._canvas import (
-    CYCLE,
-    DASHDOT,
-    DASHED,
-    DOTTED,
-    SOLID,
-    Canvas,
-    named,
-)
-from prbayes.plots._curves import log_ticks, spans_decades
+from prbayes._checks import Floats
+from prbayes.plots._canvas import CYCLE, DASHDOT, DASHED, DOTTED, SOLID, Canvas, Panel
+from prbayes.plots._names import named
+from prbayes.plots._ticks import Ticks, log_ticks, spans_decades
 
-_STAGES = {
+# What a reader calls a statistic, if he does not say.
+_LABELS = {
     "beta": "beta (1: posterior)",
     "accept_rate": "acceptance rate",
     "n_steps": "steps per stage",
     "log_marginal_likelihood": "log marginal likelihood",
 }
+# Chains differ in colour and in style; five times four before they repeat.
+_STYLES = (SOLID, DASHED, DOTTED, DASHDOT)
+# Whole numbers on an axis, so that they do not touch; by judgement.
+_MOST_TICKS = 10
 
 
 def plot_stages(
@@ -34,11 +34,12 @@ def plot_stages(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the stages of a sequential Monte Carlo run, one line per chain and one panel per statistic.
+    """Draw the stages of a sequential Monte Carlo run, a line per chain, a panel per statistic.
 
-    A statistic that is known at the end only, such as the log marginal likelihood, stands against the chain.
-    Beta goes from the prior, 0, to the posterior, 1; chains that need very different numbers of stages, or whose log
-    marginal likelihoods end far apart, have not seen the same posterior.
+    A statistic that is known at the end only, such as the log marginal likelihood, stands against
+    the chain. Beta goes from the prior, 0, to the posterior, 1; chains that need very different
+    numbers of stages, or whose log marginal likelihoods end far apart, have not seen the same
+    posterior.
 
     Parameters
     ----------
@@ -66,38 +67,100 @@ def plot_stages(
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0]
+    ...     )
     ...     posterior = prb.sample_smc(100, chains=2, random_seed=1, progressbar=False)
     >>> "chain_1" in prb.plot_stages(posterior, backend="none").viz
     True
     """
+    known = _read_statistics(posterior)
+    # Those of the last stage only come last
+    statistics = sorted(known, key=lambda statistic: statistic.once)
+    names = [statistic.name for statistic in statistics]
+    canvas = Canvas(names, size=(4.6, 3.4), backend=backend, pc_kwargs=pc_kwargs)
+    all_labels = _LABELS | dict(labels or {})
+    for statistic in statistics:
+        panel = canvas.panel(statistic.name)
+        _draw(panel, statistic, named(statistic.name, all_labels))
+    return canvas.finish()
+
+
+@dataclass(frozen=True, eq=False)
+class _Statistic:
+    """A statistic by chain and stage.
+
+    Attributes
+    ----------
+    name : str
+    chains : list
+        Names of the chains.
+    rows : ndarray, shape (chains, stages)
+        NaN where it is not known, or after the last stage of a chain.
+    """
+
+    name: str
+    chains: list[Any]
+    rows: Floats
+
+    @property
+    def once(self) -> bool:
+        """Whether it is known at one stage only."""
+        known = np.isfinite(self.rows).sum(axis=1)
+        return bool((known <= 1).all())
+
+
+def _read_statistics(posterior: xr.DataTree) -> list[_Statistic]:
+    """Return the statistics by stage, by order of the group."""
     if not isinstance(posterior, xr.DataTree) or "sample_stats" not in posterior:
         raise TypeError(
-            f"plot_stages: got {type(posterior).__name__}, expected the DataTree of prb.sample_smc, with sample_stats"
+            f"plot_stages: got {type(posterior).__name__}, expected the DataTree of "
+            "prb.sample_smc, with sample_stats"
         )
-    stats = {str(n): v for n, v in posterior["sample_stats"].data_vars.items() if set(v.dims) == {"chain", "stage"}}
-    if not stats:
-        raise ValueError("plot_stages: got sample_stats without dims (chain, stage), expected those of prb.sample_smc")
-    tables = {n: np.asarray(v.transpose("chain", "stage"), dtype=np.float64) for n, v in stats.items()}
-    single = {name: bool((np.isfinite(rows).sum(axis=1) <= 1).all()) for name, rows in tables.items()}
-    names = sorted(stats, key=lambda name: single[name])
-    canvas = Canvas(names, size=(4.6, 3.4), backend=backend, pc_kwargs=pc_kwargs)
-    for name in names:
-        rows, once, values = tables[name], single[name], stats[name]
-        ticks = log_ticks(rows) if name == "beta" and spans_decades(rows) else None
-        for c, (chain, row) in enumerate(zip(values.chain.values, rows, strict=True)):
-            known = np.isfinite(row)
-            y = np.log10(row[known]) if ticks is not None else row[known]
-            color, style = CYCLE[c % len(CYCLE)], (SOLID, DASHED, DOTTED, DASHDOT)[c % 4]
-            if once:
-                canvas.points(name, f"chain_{chain}", [c + 1.0], y[-1:], color, size=45)
-            else:
-                x = np.flatnonzero(known) + 1.0
-                canvas.line(name, f"chain_{chain}", x, y, color, style=style, legend=f"chain {chain}")
-        count = len(rows) if once else rows.shape[1]
-        whole = np.arange(1, count + 1, max(1, -(-count // 10)))
-        x_axis = "chain" if once else "stage"
-        numbers = (whole.tolist(), [str(values.chain.values[i - 1] if once else i) for i in whole])
-        y_axis = named(name, _STAGES | dict(labels or {}))
-        canvas.axes(name, x=x_axis, y=y_axis, xticks=numbers, yticks=ticks)
-    return canvas.finish()
+    found = []
+    for name, values in posterior["sample_stats"].data_vars.items():
+        if set(values.dims) == {"chain", "stage"}:
+            ordered = values.transpose("chain", "stage")
+            rows = np.asarray(ordered, dtype=np.float64)
+            chains = ordered.chain.values.tolist()
+            found.append(_Statistic(str(name), chains, rows))
+    if not found:
+        raise ValueError(
+            "plot_stages: got sample_stats without dims (chain, stage), expected those of "
+            "prb.sample_smc"
+        )
+    return found
+
+
+def _draw(panel: Panel, statistic: _Statistic, label: str) -> None:
+    """Draw a statistic of each chain: by stage, or by chain if it is known once."""
+    # Beta starts at a small value and grows by orders of magnitude
+    ticks, rows = None, statistic.rows
+    if statistic.name == "beta" and spans_decades(rows):
+        ticks, rows = log_ticks(rows), np.log10(rows)
+
+    for c, chain in enumerate(statistic.chains):
+        visual, text = f"chain_{chain}", f"chain {chain}"
+        color = CYCLE[c % len(CYCLE)]
+        known = np.flatnonzero(np.isfinite(rows[c]))
+        y = rows[c][known]
+        if statistic.once:
+            panel.points(visual, [c + 1.0], y[-1:], color, size=45)
+        else:
+            style = _STYLES[c % len(_STYLES)]
+            panel.line(visual, known + 1.0, y, color, style=style, legend=text)
+
+    if statistic.once:
+        x = "chain"
+        names = [str(chain) for chain in statistic.chains]
+    else:
+        x = "stage"
+        names = [str(stage + 1) for stage in range(rows.shape[1])]
+    panel.axes(x=x, y=label, xticks=_whole(names), yticks=ticks)
+
+
+def _whole(names: list[str]) -> Ticks:
+    """Return ticks at 1, 2 and so on, or at some of them where there are many."""
+    every = -(-len(names) // _MOST_TICKS)
+    at = [float(place + 1) for place in range(0, len(names), every)]
+    return at, names[::every]

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from importlib import import_module
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 from prbayes._checks import Floats
-from prbayes.plots._canvas import BLUE, DASHED, INK, VERMILION, grid_settings
+from prbayes.plots._canvas import BLUE, DASHED, INK, PALE, VERMILION, Canvas, Panel
+from prbayes.plots._curves import steps
 from prbayes.validation.validity import ValidityTest
 
 
@@ -21,10 +20,11 @@ def plot_validity(
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
-    """Draw the ECDF of the u-values against the identity, with the area between them and the verdict.
+    """Draw the ECDF of the u-values against the identity, the area between them, the verdict.
 
-    The shaded area is the statistic. The title has the critical value and the verdict; the band holds the whole
-    ECDF with probability 1 - level if the null is true, calibration uncertainty included.
+    The shaded area is the statistic. The title has the critical value and the verdict; the band
+    holds the whole ECDF with probability 1 - level if the null is true, calibration uncertainty
+    included.
 
     Parameters
     ----------
@@ -40,7 +40,8 @@ def plot_validity(
     Returns
     -------
     arviz.PlotCollection
-        With ``savefig``; its ``viz`` has the artists ``area``, ``envelope``, ``identity`` and ``ecdf``.
+        With ``savefig``; its ``viz`` has the artists ``area``, ``envelope``, ``identity`` and
+        ``ecdf``.
 
     Raises
     ------
@@ -56,78 +57,95 @@ def plot_validity(
     >>> prb.plot_validity(test, backend="none").viz["ecdf"].name
     'ecdf'
     """
+    by_name = _by_name(tests)
+    # The panel of a test alone has a name nevertheless
+    panels = [name or "u" for name in by_name]
+    canvas = Canvas(panels, size=(4.6, 4.8), backend=backend, pc_kwargs=pc_kwargs)
+    for name, test in by_name.items():
+        panel = canvas.panel(name or "u")
+        _draw(panel, test, _title(name, test), envelope=envelope)
+    return canvas.finish()
+
+
+def _by_name(tests: ValidityTest | Mapping[str, ValidityTest]) -> dict[str, ValidityTest]:
+    """Return tests by name, a single one without."""
     by_name = dict(tests) if isinstance(tests, Mapping) else {"": tests}
-    if not by_name or not all(isinstance(t, ValidityTest) for t in by_name.values()):
-        got = ", ".join(sorted({type(t).__name__ for t in by_name.values()})) or "nothing"
-        raise TypeError(f"plot_validity: got {got}, expected a ValidityTest from prb.area_test, or several by name")
-    # Heavy, and partly annotated.
-    arviz: Any = import_module("arviz")
-    visuals: Any = import_module("arviz_plots.visuals")
-    # One variable, of a dimension of its own, for each panel: tests differ in size.
-    data = xr.Dataset({name or "u": (f"{name} rank", _tested(test)) for name, test in by_name.items()})
-    pc = arviz.PlotCollection.wrap(data, **grid_settings(len(by_name), (4.6, 4.8), backend, pc_kwargs))
+    others = [test for test in by_name.values() if not isinstance(test, ValidityTest)]
+    if others or not by_name:
+        kinds = {type(test).__name__ for test in by_name.values()}
+        got = ", ".join(sorted(kinds)) or "nothing"
+        raise TypeError(
+            f"plot_validity: got {got}, expected a ValidityTest from prb.area_test, or several by "
+            "name"
+        )
+    return by_name
 
-    def draw(what: str, function: Any, keywords: Callable[[str, ValidityTest], dict[str, Any]], **same: Any) -> None:
-        own = {name or "u": keywords(name, test) for name, test in by_name.items()}
 
-        def one(da: Any, target: Any, var_name: str, sel: Any, isel: Any) -> Any:
-            return function(da, target, **own[var_name], **same)
-
-        pc.map(one, what, subset_info=True, ignore_aes="all", store_artist=function in pictures)
-
-    pictures = (visuals.fill_between_y, visuals.line_xy)
-    diagonal = np.array([0.0, 1.0])
+def _draw(panel: Panel, test: ValidityTest, title: str, *, envelope: bool) -> None:
+    """Draw the ECDF of a test's values, and its distance from the identity."""
+    values, name = test.u_values, "u-value"
+    if test.folded:
+        values, name = np.abs(2 * values - 1), "|2u - 1|"
+    color = VERMILION if test.rejected else BLUE
     if envelope:
-        draw("envelope", visuals.fill_between_y, lambda _, t: _band(t), color="B3", alpha=0.4)
-    draw("area", visuals.fill_between_y, lambda _, t: _between(t) | {"color": _color(t)}, alpha=0.4)
-    draw("identity", visuals.line_xy, lambda _, t: {"x": diagonal, "y": diagonal}, color=INK, linestyle=DASHED)
-    draw("ecdf", visuals.line_xy, lambda _, t: _ecdf(t) | {"color": _color(t)})
-    draw("title", visuals.labelled_title, lambda name, t: {"text": _title(name, t)})
-    draw("xlabel", visuals.labelled_x, lambda _, t: {"text": "|2u - 1|" if t.folded else "u-value"})
-    draw("ylabel", visuals.labelled_y, lambda _, t: {"text": f"share of {t.u_values.size} values"})
-    return pc
-
-
-def _tested(test: ValidityTest) -> Floats:
-    return np.sort(np.abs(2 * test.u_values - 1) if test.folded else test.u_values)
-
-
-def _color(test: ValidityTest) -> str:
-    return VERMILION if test.rejected else BLUE
+        at, sides = _envelope(test)
+        panel.band("envelope", at, sides, PALE, alpha=0.4)
+    x, y = _ecdf(np.sort(values))
+    at, sides = _between(x, y)
+    panel.band("area", at, sides, color, alpha=0.4)
+    diagonal = np.array([0.0, 1.0])
+    panel.line("identity", diagonal, diagonal, INK, style=DASHED, width=None)
+    panel.line("ecdf", x, y, color, width=None)
+    panel.axes(x=name, y=f"share of {values.size} values", title=title)
 
 
 def _title(name: str, test: ValidityTest) -> str:
-    sign, verdict = (">", "rejected") if test.rejected else ("<", "not rejected")
-    first = f"{name}, p = {test.p_value:.2g}" if name else f"p = {test.p_value:.2g}, level {test.level:.0%}"
-    return f"{first}\narea {test.statistic:.3f} {sign} critical {test.critical_value:.3f}: {verdict}"
+    if name:
+        first = f"{name}, p = {test.p_value:.2g}"
+    else:
+        first = f"p = {test.p_value:.2g}, level {test.level:.0%}"
+    sign, verdict = "<", "not rejected"
+    if test.rejected:
+        sign, verdict = ">", "rejected"
+    area = f"area {test.statistic:.3f}"
+    critical = f"critical {test.critical_value:.3f}"
+    return f"{first}\n{area} {sign} {critical}: {verdict}"
 
 
-def _corners(values: Floats) -> tuple[Floats, Floats]:
+def _ecdf(values: Floats) -> tuple[Floats, Floats]:
     """Return the corners of the ECDF of sorted values on [0, 1]."""
-    height = np.arange(values.size + 1) / values.size
-    return np.concatenate([[0.0], np.repeat(values, 2), [1.0]]), np.repeat(height, 2)
+    counts = np.arange(values.size + 1)
+    return steps(values, counts / values.size, 0.0, 1.0)
 
 
-def _ecdf(test: ValidityTest) -> dict[str, Floats]:
-    x, y = _corners(_tested(test))
-    return {"x": x, "y": y}
+def _between(x: Floats, y: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
+    """Return places, and the lower and upper side of the area between an ECDF and the identity."""
+    # Where a step crosses the identity there is a corner too: between two corners of one height
+    before = x[:-1] < y[:-1]
+    after = x[1:] > y[:-1]
+    at = np.flatnonzero(before & after)
+    height = y[at]
+    x = np.insert(x, at + 1, height)
+    y = np.insert(y, at + 1, height)
+    return x, (np.minimum(x, y), np.maximum(x, y))
 
 
-def _between(test: ValidityTest) -> dict[str, Floats]:
-    """Return the area between the ECDF and the identity, with the points where they cross."""
-    x, y = _corners(_tested(test))
-    crossing = (x[:-1] < y[:-1]) & (y[:-1] < x[1:])
-    at = np.flatnonzero(crossing) + 1
-    x, y = np.insert(x, at, y[at - 1]), np.insert(y, at, y[at - 1])
-    return {"x": x, "y_bottom": np.minimum(x, y), "y_top": np.maximum(x, y)}
+def _envelope(test: ValidityTest) -> tuple[Floats, tuple[Floats, Floats]]:
+    """Return places, and the lower and upper side of the envelope, with the corners of both.
+
+    The envelope is of sorted values, of which the smallest make the highest ECDF.
+    """
+    smallest, largest = test.envelope
+    corners = np.concatenate([[0.0], smallest, largest, [1.0]])
+    places = np.unique(corners)
+    low = _at_corners(largest, places)
+    high = _at_corners(smallest, places)
+    return np.repeat(places, 2), (low, high)
 
 
-def _band(test: ValidityTest) -> dict[str, Floats]:
-    """Return the ECDFs of the envelope's two sides at the corners of both."""
-    low, high = test.envelope
-    x = np.repeat(np.unique(np.concatenate([[0.0], low, high, [1.0]])), 2)
-    bottom, top = (
-        np.where(np.arange(x.size) % 2, *(np.searchsorted(v, x, side=s) for s in ("right", "left"))) / v.size
-        for v in (high, low)
-    )
-    return {"x": x, "y_bottom": bottom, "y_top": top}
+def _at_corners(values: Floats, places: Floats) -> Floats:
+    """Return the ECDF of sorted values just below and at each place, one after the other."""
+    below = np.searchsorted(values, places, side="left")
+    at = np.searchsorted(values, places, side="right")
+    counts = np.column_stack([below, at])
+    return counts.ravel() / values.size

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from importlib import import_module
 from subprocess import CalledProcessError
 from typing import Any
@@ -20,10 +20,30 @@ from prbayes.plots.posterior import plot_posterior
 from prbayes.plots.responses import plot_responses
 from prbayes.plots.stages import plot_stages
 from prbayes.plots.validity import plot_validity
+from prbayes.reports.images import image
 from prbayes.reports.material import Material
 from prbayes.reports.section import Section
 
 _log = logging.getLogger("prbayes")
+
+
+@dataclass(frozen=True)
+class Call:
+    """The arguments of a picture."""
+
+    arguments: tuple[Any, ...]
+    keywords: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class NotDrawn:
+    """Why there is no picture, in words that a sentence ends with."""
+
+    reason: str
+
+
+# Of what a picture is made; None where the report does not have what it shows.
+Request = Call | NotDrawn | None
 
 
 @dataclass(frozen=True)
@@ -36,113 +56,154 @@ class Illustration:
         Title of the section that it belongs to.
     function : callable
         Returns an ArviZ `PlotCollection`.
-    arguments : callable
-        Of the material: arguments and keywords; None where something is lacking.
+    request : callable
+        From the material to a `Request`.
     title, alt, caption : str
     """
 
     after: str
     function: Callable[..., Any]
-    arguments: Callable[[Material], tuple[tuple[Any, ...], dict[str, Any]] | None]
+    request: Callable[[Material], Request]
     title: str
     alt: str
     caption: str
 
 
-def _answer(m: Material) -> Any:
-    """Return the first posterior, or else the first optimum that is not from a file."""
-    return next(iter((*m.posteriors.values(), *m.found.values())), None)
+# -- what pictures are made of ---------------------------------------------------------------
 
 
-def _with_model(m: Material) -> Any:
-    answer = _answer(m)
-    return None if m.model is None or answer is None else ((answer,), {"model": m.model})
+def _first(results: Mapping[str, Any]) -> Any:
+    return next(iter(results.values()), None)
 
 
-def _spends(model: pm.Model) -> bool:
-    """Return whether a draw of the model's simulators computes responses."""
+def _computes_responses(model: pm.Model) -> bool:
+    """Return whether a draw of the model's simulators computes responses: a report spends none."""
     return any(node.bound.n_per_theta for node in nodes(model).values())
 
 
-def _responses(m: Material) -> Any:
-    """Return the same, unless the picture would compute responses: a report spends none."""
-    if m.model is not None and _spends(m.model):
-        raise NotImplementedError("it would compute responses anew; call prb.plot_responses for it")
-    return _with_model(m)
+def _population(m: Material) -> Request:
+    """Ask for the population of the first posterior, or else of the first optimum."""
+    # An optimum from a file has no population: that takes its evaluator.
+    answer = _first(m.posteriors | m.found)
+    if m.model is None or answer is None:
+        return None
+    return Call((answer,), {"model": m.model})
 
 
-def _posterior(m: Material) -> Any:
+def _responses(m: Material) -> Request:
+    if m.model is not None and _computes_responses(m.model):
+        return NotDrawn("it would compute responses anew; call prb.plot_responses for it")
+    return _population(m)
+
+
+def _posterior(m: Material) -> Request:
     if not m.posteriors:
         return None
-    optimum = next(iter(m.found.values()), None)
-    return (next(iter(m.posteriors.values())), optimum), {"model": m.model}
+    return Call((_first(m.posteriors), _first(m.found)), {"model": m.model})
 
 
-def _stages(m: Material) -> Any:
-    first = next(iter(m.posteriors.values()), None)
-    return None if first is None or "stage" not in getattr(first.get("sample_stats"), "dims", ()) else ((first,), {})
+def _stages(m: Material) -> Request:
+    posterior = _first(m.posteriors)
+    if posterior is None or "sample_stats" not in posterior:
+        return None
+    return Call((posterior,)) if "stage" in posterior["sample_stats"].dims else None
 
 
-def _optimizer(m: Material) -> Any:
-    return ((next(iter(m.found.values())),), {"col_wrap": 2}) if m.found else None
+def _optimizer(m: Material) -> Request:
+    return Call((_first(m.found),), {"col_wrap": 2}) if m.found else None
 
 
-def _landscape(m: Material) -> Any:
-    return ((next(iter(m.found.values())),), {"model": m.model}) if m.found and m.model is not None else None
+def _landscape(m: Material) -> Request:
+    if m.model is None or not m.found:
+        return None
+    return Call((_first(m.found),), {"model": m.model})
 
 
-def _comparison(m: Material) -> Any:
-    return None if m.comparison is None else ((m.comparison,), {})
+def _comparison(m: Material) -> Request:
+    return None if m.comparison is None else Call((m.comparison,))
 
 
-def _validity(m: Material) -> Any:
-    single = len(m.tests) == 1
-    return ((next(iter(m.tests.values())) if single else m.tests,), {}) if m.tests else None
+def _validity(m: Material) -> Request:
+    if not m.tests:
+        return None
+    return Call((_first(m.tests),)) if len(m.tests) == 1 else Call((m.tests,))
 
 
+# In the order of the report, and within a section in this order.
 ILLUSTRATIONS = (
     Illustration(
-        "Data", plot_responses, _responses, "Measured and calibrated responses",
-        "Distribution of the measured responses with that of the calibrated population, one panel per simulator.",
-        "Measured responses and the calibrated population.",
+        after="Data",
+        function=plot_responses,
+        request=_responses,
+        title="Measured and calibrated responses",
+        alt="Distribution of the measured responses with that of the calibrated population, "
+        "one panel per simulator.",
+        caption="Measured responses and the calibrated population.",
     ),
     Illustration(
-        "Optimum", plot_optimizer, _optimizer, "Path of the optimiser",
-        "Discrepancy, and hyperparameters, against the number of evaluations.",
-        "The objective at the points that the optimiser asked for.",
+        after="Optimum",
+        function=plot_optimizer,
+        request=_optimizer,
+        title="Path of the optimiser",
+        alt="Discrepancy, and hyperparameters, against the number of evaluations.",
+        caption="The objective at the points that the optimiser asked for.",
     ),
     Illustration(
-        "Optimum", plot_landscape, _landscape, "Discrepancy around the optimum",
-        "Discrepancy over the hyperparameters, with the optimum marked.",
-        "How the discrepancy rises around the optimum.",
+        after="Optimum",
+        function=plot_landscape,
+        request=_landscape,
+        title="Discrepancy around the optimum",
+        alt="Discrepancy over the hyperparameters, with the optimum marked.",
+        caption="How the discrepancy rises around the optimum.",
     ),
     Illustration(
-        "Posterior", plot_posterior, _posterior, "Marginal posteriors",
-        "Posterior density of each hyperparameter, with its interval.",
-        "What is known of each hyperparameter after the calibration.",
+        after="Posterior",
+        function=plot_posterior,
+        request=_posterior,
+        title="Marginal posteriors",
+        alt="Posterior density of each hyperparameter, with its interval.",
+        caption="What is known of each hyperparameter after the calibration.",
     ),
     Illustration(
-        "Posterior", plot_population, _with_model, "Calibrated population of the inputs",
-        "Distribution of each input over the specimens, with a band for its uncertainty.",
-        "How the inputs vary from specimen to specimen.",
+        after="Posterior",
+        function=plot_population,
+        request=_population,
+        title="Calibrated population of the inputs",
+        alt="Distribution of each input over the specimens, with a band for its uncertainty.",
+        caption="How the inputs vary from specimen to specimen.",
     ),
     Illustration(
-        "Posterior", plot_stages, _stages, "Stages of the sampler",
-        "Tempering, acceptance rate and moves against the stages of the sampler, one line per chain.",
-        "How the sampler went from the prior to the posterior.",
+        after="Posterior",
+        function=plot_stages,
+        request=_stages,
+        title="Stages of the sampler",
+        alt="Tempering, acceptance rate and moves against the stages of the sampler, "
+        "one line per chain.",
+        caption="How the sampler went from the prior to the posterior.",
     ),
     Illustration(
-        "Comparison", plot_comparison, _comparison, "Estimates side by side",
-        "Estimate and interval of each result, one panel per hyperparameter.",
-        "Estimates with their intervals.",
+        after="Comparison",
+        function=plot_comparison,
+        request=_comparison,
+        title="Estimates side by side",
+        alt="Estimate and interval of each result, one panel per hyperparameter.",
+        caption="Estimates with their intervals.",
     ),
     Illustration(
-        "Validity", plot_validity, _validity, "Distribution of the u-values",
-        "Step curve of the sorted u-values against the diagonal, with the area between them and an acceptance band.",
-        "Where the measured responses stand in the predicted distribution. A right model keeps near the diagonal; the "
-        "shaded area is the statistic, and the band holds the whole curve with the stated probability.",
+        after="Validity",
+        function=plot_validity,
+        request=_validity,
+        title="Distribution of the u-values",
+        alt="Step curve of the sorted u-values against the diagonal, "
+        "with the area between them and an acceptance band.",
+        caption="Where the measured responses stand in the predicted distribution. "
+        "A right model keeps near the diagonal; the shaded area is the statistic, "
+        "and the band holds the whole curve with the stated probability.",
     ),
-)  # fmt: skip
+)
+
+
+# -- drawing ---------------------------------------------------------------------------------
 
 
 def illustrate(sections: tuple[Section, ...], material: Material) -> tuple[Section, ...]:
@@ -150,74 +211,134 @@ def illustrate(sections: tuple[Section, ...], material: Material) -> tuple[Secti
     made: list[Section] = []
     pending: list[Section] = []
     for section in sections:
-        if section.level == 2:
+        if section.level == 2:  # pictures come after all parts of the section before
             made += pending
-            pending = [s for i in ILLUSTRATIONS if i.after == section.title for s in _made(i, material)]
+            pending = _pictures(section.title, material)
         made.append(section)
     return (*made, *pending)
 
 
-def _made(illustration: Illustration, material: Material) -> list[Section]:
+def _pictures(title: str, material: Material) -> list[Section]:
+    """Return the pictures of the section with a title."""
+    found = []
+    for illustration in ILLUSTRATIONS:
+        if illustration.after == title:
+            found.append(_picture(illustration, material))
+    return [section for section in found if section is not None]
+
+
+def _picture(illustration: Illustration, material: Material) -> Section | None:
+    """Return a picture, or why there is none, as a section; nothing where nothing is to be seen."""
+    request = illustration.request(material)
+    if request is None:
+        return None
+    drawn = request if isinstance(request, NotDrawn) else _drawn(illustration, request)
+    if isinstance(drawn, NotDrawn):
+        _log.warning("report: no picture by %s: %s", illustration.function.__name__, drawn.reason)
+        text = f"This picture could not be made: {drawn.reason}"
+        return Section(illustration.title, text, level=3)
+    return Section(
+        illustration.title,
+        picture=drawn,
+        alt=illustration.alt,
+        caption=illustration.caption,
+        level=3,
+    )
+
+
+def _drawn(illustration: Illustration, call: Call) -> bytes | NotDrawn:
     # Heavy, and partly annotated.
     pyplot: Any = import_module("matplotlib.pyplot")
     arviz: Any = import_module("arviz")
     before = set(pyplot.get_fignums())
     try:
-        found = illustration.arguments(material)
-        if found is None:
-            return []
-        arguments, keywords = found
         with arviz.rc_context({"plot.backend": "matplotlib"}):
-            picture = illustration.function(*arguments, **keywords)
-        alt, caption = illustration.alt, illustration.caption
-        return [Section(illustration.title, picture=picture, alt=alt, caption=caption, level=3)]
+            return image(illustration.function(*call.arguments, **call.keywords))
     except (TypeError, ValueError, NotImplementedError) as error:
-        _log.warning("report: no picture by %s: %s", illustration.function.__name__, error)
-        return [Section(illustration.title, f"This picture could not be made: {error}", level=3)]
+        # What pictures refuse; and distributions for which PyMC has no formula
+        return NotDrawn(str(error))
     finally:
-        for number in set(pyplot.get_fignums()) - before:
-            pyplot.close(number)
+        for figure in set(pyplot.get_fignums()) - before:
+            pyplot.close(figure)
+
+
+# -- the model's graph -----------------------------------------------------------------------
 
 
 def with_graph(sections: tuple[Section, ...], m: Material) -> tuple[Section, ...]:
-    """Add the model's graph after the parts of the section on the model; or say why there is none."""
+    """Add the model's graph after the parts of the section on the model."""
     if m.model is None:
         return sections
-    place = next(i for i, s in enumerate(sections) if s.title == "Model") + 1
+    titles = [section.title for section in sections]
+    place = titles.index("Model") + 1
     while place < len(sections) and sections[place].level == 3:
         place += 1
+    return (*sections[:place], _graph_section(m.model, m.variables), *sections[place:])
+
+
+def _graph_section(model: pm.Model, variables: list[dict[str, Any]]) -> Section:
+    """Return the model's graph, or why there is none."""
+    drawn = _graph(model)
+    if isinstance(drawn, NotDrawn):
+        return Section("Graph", f"The model's graph is not drawn: {drawn.reason}.", level=3)
+    names = ", ".join(variable["name"] for variable in variables)
+    return Section(
+        "Graph",
+        picture=drawn,
+        alt=f"Graph of the model: arrows from its variables ({names}) to the simulators.",
+        caption="Variables of the model; filled: compared with measured responses.",
+        level=3,
+    )
+
+
+def _graph(model: pm.Model) -> bytes | NotDrawn:
     try:
-        import_module("graphviz")
-        if _spends(m.model):  # PyMC draws each variable once for its shape
-            raise NotImplementedError
-        drawn = _graph(m.model)
-        names = ", ".join(v["name"] for v in (m.description or {"variables": []})["variables"])
-        alt = f"Graph of the model: arrows from its variables ({names}) to the simulators."
-        caption = "Variables of the model; filled: compared with measured responses."
-        section = Section("Graph", picture=drawn, alt=alt, caption=caption, level=3)
+        graphviz: Any = import_module("graphviz")  # a package that users may lack
     except ImportError:
-        section = Section("Graph", "The model's graph is not drawn: there is no Python package graphviz.", level=3)
-    except NotImplementedError:
-        text = "The model's graph is not drawn: PyMC would compute responses for it. See pm.model_to_graphviz(model)."
-        section = Section("Graph", text, level=3)
-    except (RuntimeError, OSError, CalledProcessError) as error:
-        lacking = isinstance(error, RuntimeError | OSError)
-        why = "there is no program dot of Graphviz" if lacking else "Graphviz does not take a name in it"
-        section = Section("Graph", f"The model's graph is not drawn: {why}.", level=3)
-    return (*sections[:place], section, *sections[place:])
+        return NotDrawn("there is no Python package graphviz")
+    if _computes_responses(model):  # PyMC draws each variable once for its shape
+        return NotDrawn("PyMC would compute responses for it. See pm.model_to_graphviz(model)")
+    try:
+        return _svg(model)
+    except (graphviz.ExecutableNotFound, OSError):
+        return NotDrawn("there is no program dot of Graphviz")
+    except CalledProcessError:
+        return NotDrawn("Graphviz does not take a name in it")
 
 
-def _graph(model: Any) -> bytes:
+def _svg(model: pm.Model) -> bytes:
+    """Return PyMC's graph of a model, with simulators called so."""
     graphs: Any = import_module("pymc.model_graph")
-    own = {node.name for node in nodes(model).values()}
-    plain = graphs.DEFAULT_NODE_FORMATTERS[graphs.NodeType.OBSERVED_RV]
-
-    def observed(rv: Any) -> dict[str, Any]:
-        style: dict[str, Any] = plain(rv)
-        return {**style, "label": f"{rv.name}\n~\nSimulator"} if rv.name in own else style
-
-    graph = pm.model_to_graphviz(model, node_formatters={"Observed Random Variable": observed})
-    for attributes in (graph.graph_attr, graph.node_attr):
+    whole = graphs.ModelGraph(model)
+    # PyMC collects variables and edges in sets of names, whose order changes from process to
+    # process; in the model's order the drawing is always the same.
+    order = {name: place for place, name in enumerate(model.named_vars)}
+    plates = whole.get_plates()
+    for plate in plates:
+        plate.variables.sort(key=lambda variable: order[variable.var.name])
+    plates.sort(key=lambda plate: order[plate.variables[0].var.name])
+    drawn = graphs.make_graph(
+        model.name,
+        plates=plates,
+        edges=sorted(whole.edges()),
+        node_formatters={"Observed Random Variable": _observed_formatter(model)},
+    )
+    for attributes in (drawn.graph_attr, drawn.node_attr):
         attributes.update(fontname="Helvetica,Arial,sans-serif", fontsize="11")
-    svg: bytes = graph.pipe(format="svg", quiet=True)
+    svg: bytes = drawn.pipe(format="svg", quiet=True)
     return svg
+
+
+def _observed_formatter(model: pm.Model) -> Callable[[Any], dict[str, Any]]:
+    """Return a function from an observed variable to what Graphviz is told of it."""
+    graphs: Any = import_module("pymc.model_graph")
+    plain = graphs.DEFAULT_NODE_FORMATTERS[graphs.NodeType.OBSERVED_RV]
+    simulators = {node.name for node in nodes(model).values()}
+
+    def formatted(rv: Any) -> dict[str, Any]:
+        style: dict[str, Any] = plain(rv)
+        if rv.name in simulators:
+            return {**style, "label": f"{rv.name}\n~\nSimulator"}
+        return style
+
+    return formatted

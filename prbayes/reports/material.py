@@ -14,7 +14,7 @@ from prbayes._checks import Floats
 from prbayes._compare import compare
 from prbayes._diagnose import Diagnosis, diagnose
 from prbayes.estimate.optimum import Optimum
-from prbayes.model.description import describe, from_attributes
+from prbayes.model.description import describe, element_name, from_attributes
 from prbayes.model.simulator import nodes
 from prbayes.validation.validity import ValidityTest
 
@@ -54,19 +54,33 @@ class Material:
         """Optima and posteriors."""
         return self.optima | self.posteriors
 
+    @property
+    def calibrations(self) -> dict[str, xr.Dataset]:
+        """Discrepancies, metrics and epsilons, of those results that have them."""
+        found = {}
+        for label, tree in self.results.items():
+            if "calibration" in tree.children:
+                found[label] = tree.children["calibration"].to_dataset()
+        return found
+
     def attrs(self, label: str) -> dict[Any, Any]:
         """Return what a result says about itself."""
-        tree = self.results[label]
-        return dict(tree["posterior" if label in self.posteriors else "optimum"].attrs)
+        return dict(_answer(self.results[label]).attrs)
+
+    @property
+    def variables(self) -> list[dict[str, Any]]:
+        """The variables of the model; none where they are not known."""
+        return [] if self.description is None else list(self.description["variables"])
 
     @property
     def hyperparameters(self) -> list[str]:
         """Names of the hyperparameters, without deterministics where they are known as such."""
         if self.description is not None:
-            return [v["name"] for v in self.description["variables"] if v["role"] == "hyperparameter"]
-        first = next(iter(self.results.values()), None)
-        group = None if first is None else first["posterior" if "posterior" in first else "optimum"]
-        return [] if group is None else list(map(str, group.data_vars))
+            return [v["name"] for v in self.variables if v["role"] == "hyperparameter"]
+        if not self.results:
+            return []
+        first = next(iter(self.results.values()))
+        return list(map(str, _answer(first).data_vars))
 
 
 def gather(model: Any, optimum: Any, posterior: Any, validity: Any, comparison: Any) -> Material:
@@ -77,30 +91,31 @@ def gather(model: Any, optimum: Any, posterior: Any, validity: Any, comparison: 
     TypeError, ValueError
         If a result is not what it is given as.
     """
-    if model is not None and not isinstance(model, pm.Model):
-        raise TypeError(f"Report: model: got {type(model).__name__}, expected a pm.Model")
-    if comparison is not None and not (isinstance(comparison, xr.Dataset) and "estimate" in comparison):
-        raise TypeError(f"Report: comparison: got {type(comparison).__name__}, expected the Dataset of prb.compare")
-    given, posteriors = _labelled(optimum, "optimum"), _labelled(posterior, "posterior")
+    given = _labelled(optimum, "optimum")
+    posteriors = _labelled(posterior, "posterior")
     tests = _labelled(validity, "validity")
-    twice = sorted(set(given) & set(posteriors))
-    if twice:
-        raise ValueError(f"Report: got the names {twice} for optima and posteriors, expected different ones")
+
+    # Refuse what is not as described
+    _require_model(model)
+    _require_comparison(comparison)
+    _require_different_names(given, posteriors)
     for label, test in tests.items():
-        if not isinstance(test, ValidityTest):
-            raise TypeError(f"Report: {label}: got {type(test).__name__}, expected a ValidityTest from prb.area_test")
+        _require_test(label, test)
     for label, tree in posteriors.items():
         _require(label, tree, "posterior", ("chain", "draw"), "prb.sample_smc")
-    optima = {label: o.to_datatree() if isinstance(o, Optimum) else o for label, o in given.items()}
-    for label, tree in optima.items():
-        _require(label, tree, "optimum", (), "prb.minimize")
-        if "stderr" not in tree:
-            raise TypeError(f"Report: {label}: got a DataTree without the group stderr, expected one of prb.minimize")
     found = {label: o for label, o in given.items() if isinstance(o, Optimum)}
+    optima = given | {label: o.to_datatree() for label, o in found.items()}
+    for label, tree in optima.items():
+        _require_optimum(label, tree)
+
+    # Find out what was not given
     results = optima | posteriors
-    description = describe(model) if model is not None else _stored_description(results)
+    description = _stored_description(results) if model is None else describe(model)
     if comparison is None and len(results) > 1:
         comparison = _free_only(compare(results | found, model=model), description)
+    diagnoses = {}
+    for label, result in (results | found).items():
+        diagnoses[label] = _diagnosis(result, model)
     return Material(
         model=model,
         description=description,
@@ -110,8 +125,31 @@ def gather(model: Any, optimum: Any, posterior: Any, validity: Any, comparison: 
         tests=tests,
         comparison=comparison,
         observed=_observed(model, results),
-        diagnoses={label: _diagnosis(found.get(label, tree), model) for label, tree in results.items()},
+        diagnoses=diagnoses,
     )
+
+
+def draws_by_element(group: xr.Dataset) -> dict[str, Floats]:
+    """Return the draws of each element, such as 'mu[1]', of a group with dimensions chain, draw."""
+    found: dict[str, Floats] = {}
+    for name, variable in group.data_vars.items():
+        values = variable.transpose("chain", "draw", ...).values
+        draws = values.reshape(-1, *values.shape[2:])
+        for index in np.ndindex(draws.shape[1:]):
+            found[element_name(str(name), index)] = draws[(slice(None), *index)]
+    return found
+
+
+def single_values(group: xr.Dataset) -> dict[str, float]:
+    """Return the value of each element, such as 'mu[1]', of a group of an optimum."""
+    found: dict[str, float] = {}
+    for name, variable in group.data_vars.items():
+        for index in np.ndindex(variable.shape):
+            found[element_name(str(name), index)] = float(variable.values[index])
+    return found
+
+
+# -- checks ----------------------------------------------------------------------------------
 
 
 def _labelled(given: Any, kind: str) -> dict[str, Any]:
@@ -122,26 +160,85 @@ def _labelled(given: Any, kind: str) -> dict[str, Any]:
     return {kind: given}
 
 
+def _require_model(model: Any) -> None:
+    if model is not None and not isinstance(model, pm.Model):
+        raise TypeError(f"Report: model: got {type(model).__name__}, expected a pm.Model")
+
+
+def _require_comparison(comparison: Any) -> None:
+    if comparison is None:
+        return
+    if not isinstance(comparison, xr.Dataset) or "estimate" not in comparison:
+        raise TypeError(
+            f"Report: comparison: got {type(comparison).__name__}, "
+            "expected the Dataset of prb.compare"
+        )
+
+
+def _require_different_names(optima: dict[str, Any], posteriors: dict[str, Any]) -> None:
+    twice = sorted(set(optima) & set(posteriors))
+    if twice:
+        raise ValueError(
+            f"Report: got the names {twice} for optima and posteriors, expected different ones"
+        )
+
+
+def _require_test(label: str, test: Any) -> None:
+    if not isinstance(test, ValidityTest):
+        raise TypeError(
+            f"Report: {label}: got {type(test).__name__}, "
+            "expected a ValidityTest from prb.area_test"
+        )
+
+
 def _require(label: str, tree: Any, group: str, dims: tuple[str, ...], origin: str) -> None:
     if not isinstance(tree, xr.DataTree) or group not in tree or not tree[group].data_vars:
         raise TypeError(
-            f"Report: {label}: got {type(tree).__name__}, expected a DataTree with the group {group}, from {origin}"
+            f"Report: {label}: got {type(tree).__name__}, "
+            f"expected a DataTree with the group {group}, from {origin}"
         )
-    lacking = [str(n) for n, v in tree[group].data_vars.items() if not set(dims) <= set(v.dims)]
+    variables = tree[group].data_vars.items()
+    lacking = [str(name) for name, values in variables if not set(dims) <= set(values.dims)]
     if lacking:
-        raise ValueError(f"Report: {label}: got {lacking} without the dimensions {dims}, expected draws of {origin}")
+        raise ValueError(
+            f"Report: {label}: got {lacking} without the dimensions {dims}, "
+            f"expected draws of {origin}"
+        )
+
+
+def _require_optimum(label: str, tree: Any) -> None:
+    _require(label, tree, "optimum", (), "prb.minimize")
+    if "stderr" not in tree:
+        raise TypeError(
+            f"Report: {label}: got a DataTree without the group stderr, "
+            "expected one of prb.minimize"
+        )
+
+
+# -- what was not given ----------------------------------------------------------------------
+
+
+def _answer(tree: xr.DataTree) -> xr.DataTree:
+    """Return the group of a result that has its estimates."""
+    return tree.children["posterior" if "posterior" in tree else "optimum"]
 
 
 def _stored_description(results: dict[str, xr.DataTree]) -> dict[str, Any] | None:
-    groups = [tree[g] for tree in results.values() for g in ("posterior", "optimum") if g in tree]
-    return next((d for d in (from_attributes(g.attrs) for g in groups) if d is not None), None)
+    """Return the first description of the model that a result has."""
+    for tree in results.values():
+        description = from_attributes(_answer(tree).attrs)
+        if description is not None:
+            return description
+    return None
 
 
 def _free_only(comparison: xr.Dataset, description: dict[str, Any] | None) -> xr.Dataset:
     """Leave out deterministics, as `compare` does where it has the model."""
-    roles = {v["name"]: v["role"] for v in (description or {"variables": []})["variables"]}
+    if description is None:
+        return comparison
+    others = {v["name"] for v in description["variables"] if v["role"] != "hyperparameter"}
     names = comparison["hyperparameter"].values.tolist()
-    kept = [n for n in names if roles.get(n.split("[")[0], "hyperparameter") == "hyperparameter"]
+    kept = [name for name in names if name.partition("[")[0] not in others]
     return comparison.sel(hyperparameter=kept or names)
 
 
@@ -150,31 +247,16 @@ def _observed(model: pm.Model | None, results: dict[str, xr.DataTree]) -> dict[s
         return {node.name: node.target.observed for node in nodes(model).values()}
     for tree in results.values():
         if "observed_data" in tree:
-            return {str(n): np.ravel(v.values) for n, v in tree["observed_data"].data_vars.items()}
+            stored = tree["observed_data"].data_vars.items()
+            return {str(name): np.ravel(values.values) for name, values in stored}
     return {}
 
 
-def _diagnosis(result: Any, model: pm.Model | None) -> Diagnosis | None:
+def _diagnosis(result: Optimum | xr.DataTree, model: pm.Model | None) -> Diagnosis | None:
+    """Return what is wrong with a result; None where only the model could tell."""
     if isinstance(result, Optimum):
         return diagnose(result)
-    if "posterior" in result:
-        known = model is not None or "calibration" in result
-        return diagnose(result, model=model) if known else None
-    attrs = result["optimum"].attrs
-    lines = str(attrs.get("warnings", "")).splitlines()
-    messages = [f"{line[0].upper()}{line[1:]}." for line in lines if line]
-    if not attrs.get("converged", 1):
-        messages.append(f"The optimiser did not converge ({attrs.get('message', '')}).")
-    return Diagnosis(tuple(messages), xr.Dataset())
-
-
-def elements(group: Any) -> dict[str, Floats]:
-    """Return values by element, such as 'mu[1]', of a group's variables; draws as one axis."""
-    found: dict[str, Floats] = {}
-    for name, variable in group.data_vars.items():
-        leading = [d for d in ("chain", "draw") if d in variable.dims]
-        values = variable.transpose(*leading, ...).values
-        values = values.reshape(-1, *values.shape[len(leading) :]) if leading else values[None]
-        for i in np.ndindex(values.shape[1:]):
-            found[f"{name}[{','.join(map(str, i))}]" if i else str(name)] = values[(slice(None), *i)]
-    return found
+    stored = "optimum" in result or "calibration" in result
+    if model is None and not stored:
+        return None
+    return diagnose(result, model=model)

@@ -5,104 +5,40 @@ from __future__ import annotations
 import base64
 import html
 import re
-from collections.abc import Mapping
-from dataclasses import InitVar, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pymc as pm
 import xarray as xr
 
 from prbayes.estimate.optimum import Optimum
 from prbayes.reports.contents import contents
-from prbayes.reports.section import Section, cells
+from prbayes.reports.section import Section
+from prbayes.reports.tables import cells
 from prbayes.validation.validity import ValidityTest
 
-# What Markdown, or HTML inside it, would read as markup.
+# What Markdown, or HTML inside it, would read as markup (CommonMark 0.31, 2.4; tables and
+# strikethrough of GitHub; formulas between dollars).
 _MARKUP = re.compile(r"([\\`*_{}\[\]<>|&~$!])")
+# Headings, items, rules and underlines begin a line (CommonMark 0.31, 4.1 to 4.3 and 5.2).
 _AT_START = re.compile(r"^(?:#+|[-+](?=\s|$)|-{2,}|={1,}|\d{1,9}(?=[.)](?:\s|$)))")
+_LONGEST_NAME = 40  # characters of a picture's file name; any value that file systems take will do
 
 
 @dataclass(frozen=True, eq=False)
-class Report:
-    """A calibration as a document: what was calibrated, with which data, the answer, and whether it may be trusted.
-
-    What is not given is left out. Pictures are made when the report is; after that it is data, and a writer gives the
-    same bytes each time.
-
-    Parameters
-    ----------
-    title : str
-    model : pymc.Model, optional
-        What needs it are distributions of populations, and the graph; the rest is in the results.
-    optimum : Optimum or xarray.DataTree, or a mapping of such, optional
-        From `minimize`, or its ``to_datatree()``; several by name.
-    posterior : xarray.DataTree, or a mapping of such, optional
-        From `sample_smc`, `bootstrap` or a sampler of PyMC; also read from a file.
-    validity : ValidityTest, or a mapping of such, optional
-        From `area_test`; several by name.
-    comparison : xarray.Dataset, optional
-        From `compare`; that of the optima and posteriors by default, where there are two or more.
-    sections : tuple of Section
-        By default those of the results. With them given, results are not looked at.
-    author, date : str
-        Below the title. No date is made up.
-    pictures : bool
-        Whether pictures are made of the results.
-
-    Attributes
-    ----------
-    sections : tuple of Section
-        For a report of your own: ``report.with_section``, or ``dataclasses.replace(report, sections=...)``.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is not as described.
-
-    Examples
-    --------
-    >>> import numpy as np, pymc as pm, prbayes as prb
-    >>> with pm.Model() as model:
-    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
-    >>> report = prb.Report("Shaft stiffness", model=model, optimum=prb.minimize(model), pictures=False)
-    >>> [section.title for section in report.sections if section.level == 2][:3]
-    ['Summary', 'Model', 'Data']
-    """
+class _Document:
+    """A title and sections, and how they are written."""
 
     title: str
-    sections: tuple[Section, ...] = ()
-    author: str = ""
-    date: str = ""
-    model: InitVar[pm.Model | None] = None
-    optimum: InitVar[Optimum | xr.DataTree | Mapping[str, Optimum | xr.DataTree] | None] = None
-    posterior: InitVar[xr.DataTree | Mapping[str, xr.DataTree] | None] = None
-    validity: InitVar[ValidityTest | Mapping[str, ValidityTest] | None] = None
-    comparison: InitVar[xr.Dataset | None] = None
-    pictures: InitVar[bool] = True
+    sections: tuple[Section, ...]
+    author: str
+    date: str
 
-    def __post_init__(
-        self,
-        model: pm.Model | None,
-        optimum: Optimum | xr.DataTree | Mapping[str, Optimum | xr.DataTree] | None,
-        posterior: xr.DataTree | Mapping[str, xr.DataTree] | None,
-        validity: ValidityTest | Mapping[str, ValidityTest] | None,
-        comparison: xr.Dataset | None,
-        pictures: bool,
-    ) -> None:
-        """Make the sections, if none are given."""
-        if not isinstance(self.title, str) or not self.title.strip():
-            raise TypeError(f"Report: title: got {self.title!r:.60}, expected a text")
-        made = tuple(self.sections) or contents(model, optimum, posterior, validity, comparison, pictures=pictures)
-        wrong = [s for s in made if not isinstance(s, Section)]
-        if wrong:
-            raise TypeError(f"Report: sections: got {type(wrong[0]).__name__}, expected prb.Section objects")
-        object.__setattr__(self, "sections", made)
-
-    def with_section(self, section: Section, *, after: str | None = None) -> Report:
+    def with_section(self, section: Section, *, after: str | None = None) -> Self:
         """Return a report with one more section.
 
         Parameters
@@ -116,33 +52,41 @@ class Report:
         KeyError
             If no section has that title.
         """
-        place = len(self.sections)
-        if after is not None:
-            titles = [s.title for s in self.sections]
-            if after not in titles:
-                raise KeyError(f"after: got {after!r}, expected the title of a section: {titles}")
-            start = titles.index(after)
-            level = self.sections[start].level
-            ends = [i for i in range(start + 1, place) if self.sections[i].level <= max(level, section.level)]
-            place = min(ends, default=place)
-        return replace(self, sections=(*self.sections[:place], section, *self.sections[place:]))
+        place = len(self.sections) if after is None else self._end_of(after, section.level)
+        before, behind = self.sections[:place], self.sections[place:]
+        return replace(self, sections=(*before, section, *behind))
+
+    def _end_of(self, title: str, level: int) -> int:
+        """Return the place behind a section, and behind its parts for one of its own level."""
+        titles = [section.title for section in self.sections]
+        if title not in titles:
+            raise KeyError(f"after: got {title!r}, expected the title of a section: {titles}")
+        start = titles.index(title)
+        highest = max(self.sections[start].level, level)
+        for place in range(start + 1, len(titles)):
+            if self.sections[place].level <= highest:
+                return place
+        return len(titles)
 
     def to_html(self, path: str | PathLike[str]) -> Path:
         """Write one file that holds everything, for a browser and for print; return its path."""
         return _write(Path(path), self._html())
 
     def to_markdown(self, folder: str | PathLike[str]) -> Path:
-        """Write ``report.md``, and pictures as files beside it, into a folder; return the path of ``report.md``."""
+        """Write ``report.md``, and pictures as files beside it, into a folder.
+
+        The path of ``report.md`` is returned.
+        """
         folder = Path(folder)
-        files = [
-            None if s.picture is None else f"{i:02d}-{_slug(s.title)}.{s.kind}" for i, s in enumerate(self.sections, 1)
-        ]
+        files = [_file_name(i, section) for i, section in enumerate(self.sections, 1)]
         text = (
-            _markdown().get_template("report.md.j2").render(report=self, byline=self._byline, cells=cells, files=files)
+            _markdown()
+            .get_template("report.md.j2")
+            .render(report=self, byline=self._byline, cells=cells, files=files)
         )
         folder.mkdir(parents=True, exist_ok=True)
         for section, name in zip(self.sections, files, strict=True):
-            if name is not None:
+            if name is not None and section.picture is not None:
                 (folder / name).write_bytes(section.picture)
         return _write(folder / "report.md", text.rstrip("\n") + "\n")
 
@@ -152,28 +96,108 @@ class Report:
 
     def _html(self) -> str:
         environment = _environment()
-        chapters = [(i, s.title) for i, s in enumerate(self.sections, 1) if s.level == 2 and i > 1]
+        chapters = []
+        for i, section in enumerate(self.sections, 1):
+            if section.level == 2 and i > 1:  # the summary comes before the list of contents
+                chapters.append((i, section.title))
         rendered: str = environment.get_template("report.html.j2").render(
             report=self,
             byline=self._byline,
             style=environment.get_template("report.css").render(),
             contents=chapters,
             cells=cells,
-            base64=lambda data: base64.b64encode(data).decode("ascii"),
+            base64=_base64,
         )
         return rendered + "\n"
 
     def _repr_html_(self) -> str:
         """Show the report in a notebook, in a frame of its own."""
         text = html.escape(self._html(), quote=True)
-        return f'<iframe sandbox srcdoc="{text}" title="report" style="width: 100%; height: 40rem; border: 0"></iframe>'
+        style = "width: 100%; height: 40rem; border: 0"
+        return f'<iframe sandbox srcdoc="{text}" title="report" style="{style}"></iframe>'
+
+
+class Report(_Document):
+    """A calibration as a document: what was calibrated, the answer, whether it may be trusted.
+
+    What is not given is left out. Pictures are made when the report is; after that it is data,
+    and a writer gives the same bytes each time.
+
+    Parameters
+    ----------
+    title : str
+    sections : tuple of Section
+        By default those of the results. With them given, results are not looked at.
+    author, date : str
+        Below the title. No date is made up.
+    model : pymc.Model, optional
+        What needs it are distributions of populations, and the graph; the rest is in the results.
+    optimum : Optimum or xarray.DataTree, or a mapping of such, optional
+        From `minimize`, or its ``to_datatree()``; several by name.
+    posterior : xarray.DataTree, or a mapping of such, optional
+        From `sample_smc`, `bootstrap` or a sampler of PyMC; also read from a file.
+    validity : ValidityTest, or a mapping of such, optional
+        From `area_test`; several by name.
+    comparison : xarray.Dataset, optional
+        From `compare`; that of the optima and posteriors by default, where there are two or more.
+    pictures : bool
+        Whether pictures are made of the results.
+
+    Attributes
+    ----------
+    sections : tuple of Section
+        For a report of your own: ``report.with_section``, or
+        ``dataclasses.replace(report, sections=...)``.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not as described.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0, 2, 4])
+    >>> optimum = prb.minimize(model)
+    >>> report = prb.Report("Shaft stiffness", model=model, optimum=optimum, pictures=False)
+    >>> [section.title for section in report.sections if section.level == 2][:3]
+    ['Summary', 'Model', 'Data']
+    """
+
+    def __init__(
+        self,
+        title: str,
+        sections: Sequence[Section] = (),
+        author: str = "",
+        date: str = "",
+        model: pm.Model | None = None,
+        optimum: Optimum | xr.DataTree | Mapping[str, Optimum | xr.DataTree] | None = None,
+        posterior: xr.DataTree | Mapping[str, xr.DataTree] | None = None,
+        validity: ValidityTest | Mapping[str, ValidityTest] | None = None,
+        comparison: xr.Dataset | None = None,
+        pictures: bool = True,
+    ) -> None:
+        if not isinstance(title, str) or not title.strip():
+            raise TypeError(f"Report: title: got {title!r:.60}, expected a text")
+        made = tuple(sections)
+        if not made:
+            made = contents(model, optimum, posterior, validity, comparison, pictures=pictures)
+        for section in made:
+            if not isinstance(section, Section):
+                got = type(section).__name__
+                raise TypeError(f"Report: sections: got {got}, expected prb.Section objects")
+        super().__init__(title, made, author, date)
 
 
 @cache
 def _environment() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    return Environment(loader=PackageLoader("prbayes.reports"), autoescape=True, undefined=StrictUndefined)
+    return Environment(
+        loader=PackageLoader("prbayes.reports"), autoescape=True, undefined=StrictUndefined
+    )
 
 
 @cache
@@ -185,18 +209,35 @@ def _markdown() -> Any:
         return str(value) if isinstance(value, Markup) else _literal(str(value))
 
     return Environment(
-        loader=PackageLoader("prbayes.reports"), autoescape=False, finalize=escaped, undefined=StrictUndefined
+        loader=PackageLoader("prbayes.reports"),
+        autoescape=False,
+        finalize=escaped,
+        undefined=StrictUndefined,
     )
 
 
 def _literal(text: str) -> str:
     """Return a text, in one line, that Markdown shows as it is."""
     line = _MARKUP.sub(r"\\\1", " ".join(text.split()))
-    return _AT_START.sub(lambda m: f"{m[0]}\\" if m[0].isdigit() else f"\\{m[0]}", line)
+    return _AT_START.sub(_escaped_start, line)
 
 
-def _slug(title: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40] or "picture"
+def _escaped_start(found: re.Match[str]) -> str:
+    # Of '1.' the point is escaped, as digits cannot be.
+    start = found[0]
+    return f"{start}\\" if start.isdigit() else f"\\{start}"
+
+
+def _base64(picture: bytes) -> str:
+    return base64.b64encode(picture).decode("ascii")
+
+
+def _file_name(i: int, section: Section) -> str | None:
+    """Return the name of the file with a section's picture, if it has one."""
+    if section.picture is None:
+        return None
+    slug = re.sub(r"[^a-z0-9]+", "-", section.title.lower()).strip("-")[:_LONGEST_NAME]
+    return f"{i:02d}-{slug or 'picture'}.{section.kind}"
 
 
 def _write(path: Path, text: str) -> Path:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from prbayes.reports.material import Material, elements
-from prbayes.reports.section import number, plus_minus
+from prbayes.reports.material import Material, draws_by_element, single_values
+from prbayes.reports.numbers import counted, number, percentage, plus_minus
 from prbayes.validation.validity import ValidityTest
 
-_MOST = 6  # hyperparameters that the summary lists
-_WORDS = {
+_MOST = 6  # by judgement: more hyperparameters than this make a list, which a table shows better
+
+# How the metrics that ship are called in a sentence; one of the user's own has its class's name.
+_IN_WORDS = {
     "ProbabilityResidual": "probability residual",
     "KullbackLeibler": "Kullback-Leibler divergence",
     "AreaMetric": "area metric",
@@ -21,105 +21,129 @@ _WORDS = {
 
 def summary(m: Material) -> list[str]:
     """Return the sentences, as paragraphs."""
-    said = [_what(m), f"{_answer(m)} {_agreement(m)}", _trust(m)]
-    return [s.strip() for s in (*said, *(verdict(label, t, m) for label, t in m.tests.items())) if s.strip()]
-
-
-def counted(n: int, what: str) -> str:
-    """Return a number with a noun."""
-    return f"{n} {what}" if n == 1 else f"{n} {what}s"
-
-
-def shown(seconds: float) -> str:
-    """Return seconds, to a tenth below ten."""
-    return f"{seconds:.1f}" if seconds < 9.95 else f"{seconds:.0f}"
+    paragraphs = [_what_was_calibrated(m), f"{_answer(m)} {_agreement(m)}", _trust(m)]
+    paragraphs += [verdict(label, test, m) for label, test in m.tests.items()]
+    stripped = map(str.strip, paragraphs)
+    return list(filter(None, stripped))
 
 
 def verdict(label: str, test: ValidityTest, m: Material) -> str:
     """Return what a test found, in one sentence."""
-    n, of = test.u_values.size, int(np.unique(test.specimens).size)
     who = f"{label}: " if len(m.tests) > 1 else ""
-    what = "the spread of the responses" if test.folded else "the responses"
+    aspect = "the spread of the responses" if test.folded else "the responses"
+    specimens = counted(int(np.unique(test.specimens).size), "specimen")
+    values = counted(test.u_values.size, "value")
     found = "is rejected" if test.rejected else "is not rejected"
     sign = ">" if test.statistic > test.critical_value else "≤"
     return (
-        f"{who}On {what} of {counted(of, 'specimen')} ({counted(n, 'value')}), the calibrated model {found} at level "
-        f"{100 * test.level:g}% (area {test.statistic:.3f} {sign} critical {test.critical_value:.3f}, "
+        f"{who}On {aspect} of {specimens} ({values}), the calibrated model {found} "
+        f"at level {percentage(test.level)} "
+        f"(area {test.statistic:.3f} {sign} critical {test.critical_value:.3f}, "
         f"p = {test.p_value:.2g})."
     )
 
 
-def _what(m: Material) -> str:
+def _what_was_calibrated(m: Material) -> str:
     names = m.hyperparameters
     if not names:
         return ""
-    few = f" ({', '.join(names)})" if len(names) <= _MOST else ""
-    data = [f"{counted(v.size, 'measured response')} of {name}" for name, v in m.observed.items()]
-    on = f" on {_listed(data)}" if data else ""
-    metrics = _metrics(m)
-    by = f", by the {_listed(metrics)}" if metrics else ""
+    hyperparameters = counted(len(names), "hyperparameter")
+    if len(names) <= _MOST:
+        hyperparameters += f" ({', '.join(names)})"
     if not m.results:
-        return f"The model has {counted(len(names), 'hyperparameter')}{few}. No result of a calibration was given."
-    return f"{counted(len(names), 'hyperparameter')}{few} of the model {_were(len(names))} calibrated{on}{by}."
-
-
-def _were(n: int) -> str:
-    return "was" if n == 1 else "were"
+        return f"The model has {hyperparameters}. No result of a calibration was given."
+    were = "was" if len(names) == 1 else "were"
+    data = [f"{counted(y.size, 'measured response')} of {name}" for name, y in m.observed.items()]
+    on = f" on {_enumerated(data)}" if data else ""
+    metrics = _metrics(m)
+    by = f", by the {_enumerated(metrics)}" if metrics else ""
+    return f"{hyperparameters} of the model {were} calibrated{on}{by}."
 
 
 def _metrics(m: Material) -> list[str]:
+    """Return the metrics in words, each once."""
+    described: list[str] = []
     if m.description is not None:
-        found = [str(s["metric"]) for s in m.description["simulators"]]
-    else:
-        trees = [tree["calibration"].to_dataset() for tree in m.results.values() if "calibration" in tree]
-        found = [str(v) for tree in trees[:1] for v in tree["metric"].values.tolist()]
-    return list(dict.fromkeys(_WORDS.get(called := name.partition("(")[0], called) for name in found))
+        described = [str(s["metric"]) for s in m.description["simulators"]]
+    elif m.calibrations:
+        first = next(iter(m.calibrations.values()))
+        described = list(map(str, first["metric"].values.tolist()))
+    classes = [description.partition("(")[0] for description in described]
+    in_words = [_IN_WORDS.get(name, name) for name in classes]
+    return list(dict.fromkeys(in_words))
 
 
-def _listed(items: list[str]) -> str:
-    return " and ".join(filter(None, [", ".join(items[:-1]), items[-1]]))
+def _enumerated(items: list[str]) -> str:
+    *first, last = items
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _answer(m: Material) -> str:
     """Return the estimates of the first posterior, or else of the first optimum."""
-    if m.posteriors:
-        label, tree = next(iter(m.posteriors.items()))
-        draws = elements(tree["posterior"].to_dataset())
-        found = {name: (float(v.mean()), float(v.std(ddof=1))) for name, v in draws.items()}
-        what = "mean and standard deviation of the posterior"
-    elif m.optima:
-        label, tree = next(iter(m.optima.items()))
-        points, errors = elements(tree["optimum"].to_dataset()), elements(tree["stderr"].to_dataset())
-        found = {name: (float(v[0]), float(errors[name][0])) for name, v in points.items()}
-        what = "optimum and standard error"
-    else:
+    if not m.results:
         return ""
-    names = [n for n in found if n.split("[")[0] in m.hyperparameters]
-    if not names or len(names) > _MOST:
-        return f"The answer is in the table of the {'posterior' if m.posteriors else 'optimum'}."
-    values = ", ".join(f"{name} = {plus_minus(*found[name])}" for name in names)
-    several = len(m.posteriors or m.optima) > 1
-    return f"The answer{f' of {label}' if several else ''} is {values} ({what})."
+    if m.posteriors:
+        of_kind, kind = m.posteriors, "posterior"
+        what = "mean and standard deviation of the posterior"
+    else:
+        of_kind, kind = m.optima, "optimum"
+        what = "optimum and standard error"
+    label = next(iter(of_kind))
+    estimates = _estimates(m, label)
+    if not estimates or len(estimates) > _MOST:
+        return f"The answer is in the table of the {kind}."
+    pairs = [f"{name} = {plus_minus(value, sd)}" for name, (value, sd) in estimates.items()]
+    which = f" of {label}" if len(of_kind) > 1 else ""
+    return f"The answer{which} is {', '.join(pairs)} ({what})."
+
+
+def _estimates(m: Material, label: str) -> dict[str, tuple[float, float]]:
+    """Return estimate and spread of each element of the hyperparameters, by a result."""
+    found: dict[str, tuple[float, float]] = {}
+    if label in m.posteriors:
+        posterior = m.posteriors[label]["posterior"]
+        draws = draws_by_element(posterior.to_dataset())
+        for name, values in draws.items():
+            mean, sd = values.mean(), values.std(ddof=1)
+            found[name] = (float(mean), float(sd))
+    else:
+        tree = m.optima[label]
+        point = single_values(tree["optimum"].to_dataset())
+        stderr = single_values(tree["stderr"].to_dataset())
+        for name, value in point.items():
+            found[name] = (value, stderr[name])
+    known = m.hyperparameters
+    return {name: pair for name, pair in found.items() if name.partition("[")[0] in known}
 
 
 def _agreement(m: Material) -> str:
-    """Return how far apart optimum and posterior are."""
+    """Return how far apart two results are; nothing of more."""
     if m.comparison is None or m.comparison.sizes["result"] != 2:
         return ""
-    shifts: Any = np.abs(m.comparison["shift"].values)
-    names = m.comparison["result"].values.tolist()
-    worst = float(np.nanmax(shifts)) if np.isfinite(shifts).any() else np.nan
-    if not np.isfinite(worst):
+    shifts = np.abs(m.comparison["shift"].values)
+    if not np.isfinite(shifts).any():
         return ""
-    return f"The estimates of {names[0]} and {names[1]} differ by at most {number(worst, 2)} standard deviations."
+    largest = float(np.nanmax(shifts))
+    if not np.isfinite(largest):
+        return ""
+    first, second = m.comparison["result"].values.tolist()
+    return (
+        f"The estimates of {first} and {second} differ by at most {number(largest, 2)} "
+        "standard deviations."
+    )
 
 
 def _trust(m: Material) -> str:
-    known = {label: d for label, d in m.diagnoses.items() if d is not None}
+    known = {label: found for label, found in m.diagnoses.items() if found is not None}
     if not known:
         return ""
-    bad = {label: len(d.messages) for label, d in known.items() if not d.ok}
-    if not bad:
+    problems = []
+    for label, found in known.items():
+        if not found.ok:
+            problems.append(f"{counted(len(found.messages), 'problem')} with {label}")
+    if not problems:
         return "The diagnostics found no problem."
-    problems = _listed([f"{counted(n, 'problem')} with {label}" for label, n in bad.items()])
-    return f"The diagnostics found {problems}; see the section on diagnostics before the answer is used."
+    return (
+        f"The diagnostics found {_enumerated(problems)}; "
+        "see the section on diagnostics before the answer is used."
+    )

@@ -1,1 +1,1 @@
-"""The user's response: its inputs, how it is called, what happens when it fails, where it is kept."""
+"""The user's response: its inputs, how it is called, when it fails, where it is kept."""

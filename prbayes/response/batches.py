@@ -10,8 +10,9 @@ import numpy as np
 
 def batch_shape(values: Sequence[Any], event_ndims: Sequence[int]) -> tuple[int, ...]:
     """Return the shape that the leading axes of arrays (..., *event) broadcast to."""
-    pairs = zip(values, event_ndims, strict=True)
-    leading = [v.shape[: v.ndim - event] for v, event in pairs]
+    leading = []
+    for v, event_ndim in zip(values, event_ndims, strict=True):
+        leading.append(v.shape[: v.ndim - event_ndim])
     return np.broadcast_shapes(*leading)
 
 
@@ -19,5 +20,8 @@ def broadcast_batch(
     values: Sequence[Any], event_ndims: Sequence[int], batch: tuple[int, ...]
 ) -> list[Any]:
     """Return arrays (..., *event) with their leading axes broadcast to ``batch``."""
-    pairs = zip(values, event_ndims, strict=True)
-    return [np.broadcast_to(v, batch + v.shape[v.ndim - event :]) for v, event in pairs]
+    full = []
+    for v, event_ndim in zip(values, event_ndims, strict=True):
+        event = v.shape[v.ndim - event_ndim :]
+        full.append(np.broadcast_to(v, batch + event))
+    return full

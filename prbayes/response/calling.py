@@ -1,4 +1,9 @@
-"""Calling an expensive response at many points: on an executor, in chunks, with a store and a failure policy."""
+"""Calling an expensive response at many points: in chunks, stored, with a failure policy.
+
+`respond` is the whole of it. Points are looked up in the store; `chunks` sends out those that are
+missing, a few chunks at a time, and gives back each as it is done; `compute` is what a worker does
+with one.
+"""
 
 from __future__ import annotations
 
@@ -7,20 +12,39 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from prbayes._checks import Floats
 from prbayes._progress import progress
-from prbayes.response.failures import Abort, OnFailure, Replace, Retry
+from prbayes.response.failures import Abort, OnFailure
 from prbayes.response.store import Store
 
 _log = logging.getLogger("prbayes")
-_CHUNK_SECONDS = 0.2  # that a task should take: long against sending it, short against losing it
-_ALONE_SECONDS = 0.01  # from which a response of one specimen at a time is a task of its own
-_MANY = 1024  # tasks sent out to an executor that does not tell how many workers it has
+
+Rows = NDArray[np.intp]
+
+# Seconds that a chunk should take: long against the 4.5 ms that sending one costs (`python -m
+# benchmarks.scale`), short against what is lost with a worker. By judgement.
+_CHUNK_SECONDS = 0.2
+# Seconds from which a response of one specimen at a time is a chunk of its own, so that none waits
+# for others to be stored. By judgement: twice what sending it costs.
+_ALONE_SECONDS = 0.01
+# Points of the first chunk of a response that takes arrays, whose cost is not known yet. By
+# judgement: what a call costs by itself is spread over a few, and a response of minutes is not
+# called for long.
+_FIRST = 16
+# Share of earlier chunks in the measured cost of a response; it only sizes the next chunks. By
+# judgement.
+_MEMORY = 0.7
+# Chunks sent out at a time to an executor that does not tell how many workers it has: as many as
+# workers that are known of in practice; what one costs in memory is measured by `python -m
+# benchmarks.scale`. By judgement.
+_MANY = 1024
 
 
 class ResponseError(RuntimeError):
@@ -55,268 +79,398 @@ class scalar:  # noqa: N801 (reads as a function in a model)
 
     def __init__(self, function: Callable[..., float]) -> None:
         if not callable(function):
-            raise TypeError(f"scalar: got {type(function).__name__}, expected a function of one specimen's inputs")
+            got = type(function).__name__
+            raise TypeError(f"scalar: got {got}, expected a function of one specimen's inputs")
         self.function = function
 
     def __call__(self, *inputs: Any) -> Floats:
         """Call the function for each element of arrays that broadcast against each other."""
         arrays = np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in inputs))
-        values = [float(self.function(*row)) for row in zip(*(a.ravel() for a in arrays), strict=True)]
+        specimens = zip(*(a.ravel() for a in arrays), strict=True)
+        values = [float(self.function(*specimen)) for specimen in specimens]
         return np.array(values).reshape(arrays[0].shape)
 
 
-class Caller:
-    """Computes a function at points, each point once.
+@dataclass(frozen=True)
+class Points:
+    """Points at which a response is wanted.
 
-    Parameters
+    Attributes
+    ----------
+    arguments : sequence
+        Of the response: arrays (n, *event) where ``varying``, and else constants.
+    varying : sequence of bool
+    """
+
+    arguments: Sequence[Any]
+    varying: Sequence[bool]
+
+    def __len__(self) -> int:
+        return len(self.arguments[list(self.varying).index(True)])
+
+    def at(self, rows: Rows | int) -> Points:
+        """Return some of the points; with a number that one, without the leading axis."""
+        pairs = zip(self.arguments, self.varying, strict=True)
+        return Points([a[rows] if varies else a for a, varies in pairs], self.varying)
+
+    def keys(self) -> Floats:
+        """Return all numbers that a response depends on, constants included, shape (n, columns)."""
+        n = len(self)
+        columns = []
+        for a, varies in zip(self.arguments, self.varying, strict=True):
+            each = a if varies else np.broadcast_to(a, (n, *np.shape(a)))
+            columns.append(each.reshape(n, int(np.prod(each.shape[1:], dtype=int))))
+        return np.concatenate(columns, axis=1).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """What a worker gives back for the points of a chunk.
+
+    Attributes
+    ----------
+    values : ndarray, shape (m,)
+        NaN where the response raised, or was not called since an earlier point raised.
+    raised : dict
+        What was raised, in words, by position.
+    seconds : float
+        How long it took.
+    """
+
+    values: Floats
+    raised: dict[int, str]
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Calling:
+    """How a response is called.
+
+    Attributes
     ----------
     name : str
         Of the simulator, for messages.
     function : callable or scalar
-        ``function(*arguments)``; arrays (m, *event) or constants.
+        ``function(*arguments)``.
     executor : concurrent.futures.Executor or None
-    on_failure : OnFailure
+        Where; None is here.
     store : Store or None
+        Where responses are kept.
+    on_failure : OnFailure
+    """
+
+    name: str
+    function: Callable[..., Any]
+    executor: Executor | None = None
+    store: Store | None = None
+    on_failure: OnFailure = field(default_factory=Abort)
+
+
+@dataclass
+class Tally:
+    """What calling a response has come to so far.
 
     Attributes
     ----------
-    count : int
-        Responses computed, retried ones included.
+    computed : int
+        Responses computed, those that were tried again included; not those found in a store.
     failures : int
-        Points whose response raised or was NaN in the end.
+        Points whose response failed in the end and was replaced.
+    seconds : float
+        That one response takes, measured; 0 as long as nothing is known.
     """
 
-    def __init__(
-        self,
-        name: str,
-        function: Callable[..., Any],
-        executor: Executor | None,
-        on_failure: OnFailure,
-        store: Store | None,
-    ) -> None:
-        self.name = name
-        self.function = function
-        self.executor = executor
-        self.on_failure = on_failure
-        self.store = store
-        self.count = 0
-        self.failures = 0
-        self._cost = 0.0  # seconds for one response, measured
-        self._workers, self._window = 1, 1  # tasks at work, and those sent out, at any time
+    computed: int = 0
+    failures: int = 0
+    seconds: float = 0.0
 
-    def __call__(self, arguments: Sequence[Any], varying: Sequence[bool], keys: Floats) -> Floats:
-        """Return responses, shape (n,).
+    def take(self, size: int, seconds: float) -> None:
+        """Take note of a chunk of so many responses."""
+        self.computed += size
+        each = seconds / size
+        known = self.seconds != 0
+        self.seconds = _MEMORY * self.seconds + (1 - _MEMORY) * each if known else each
 
-        Parameters
-        ----------
-        arguments : sequence
-            Arrays (n, *event) where ``varying``, and else constants.
-        varying : sequence of bool
-        keys : ndarray, shape (n, columns)
-            All that a response depends on.
-        """
-        values = np.full(len(keys), np.nan)
-        missing = np.arange(len(keys))
-        if self.store is not None:
-            values, known = self.store.find(keys)
-            missing = np.flatnonzero(~known)
-        times = 1 + (self.on_failure.times if isinstance(self.on_failure, Retry) else 0)
-        for attempt in range(times):
-            last = attempt == times - 1
-            policy = self._policy(last=last)
-            tolerant = not isinstance(policy, Abort)
-            messages: dict[int, str] = {}
-            for rows, found, said in self._computed(arguments, varying, missing, tolerant):
-                values[rows] = found
-                messages.update({int(rows[i]): text for i, text in said.items()})
-                settled = rows if last and (tolerant or not said) else rows[~np.isnan(found)]
-                if self.store is not None and settled.size:
-                    self.store.add(keys[settled], values[settled])
-            if messages and not tolerant:
-                self._raise(messages)
-            missing = missing[np.isnan(values[missing])]
-            if not missing.size:
-                break
-        if self.store is not None:
-            self.store.merge()
-        return self._settled(values, messages)
 
-    def _policy(self, *, last: bool) -> OnFailure | None:
-        """Return what holds for a failure now; None while it will be tried again."""
-        if isinstance(self.on_failure, Retry):
-            return self.on_failure.then if last else None
-        return self.on_failure
+def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
+    """Return the responses at points, shape (n,), from the store or computed and then stored.
 
-    def _settled(self, values: Floats, messages: dict[int, str]) -> Floats:
-        bad = np.isnan(values)
-        if not bad.any():
-            return values
-        policy = self._policy(last=True)
-        first = next(iter(messages.values()), "it is NaN")
-        if isinstance(policy, Abort) and policy.on_nan:
-            self._raise(messages or {0: first})
-        if isinstance(policy, Replace):
-            self.failures += int(bad.sum())
-            _log.warning("%s: %d of %d responses failed, replaced by %s; the first: %s", self.name, bad.sum(), bad.size,
-                         policy.value, first)  # fmt: skip
-            values[bad] = policy.value
+    Raises
+    ------
+    ResponseError
+        If a response fails and the policy says so, or if it is no response.
+    """
+    policy = calling.on_failure
+    keys = points.keys() if calling.store is not None else np.empty((len(points), 0))
+    values, missing = _stored(calling.store, keys)
+    raised: dict[int, str] = {}
+    for attempt in range(policy.tries):
+        last = attempt == policy.tries - 1
+        tolerant = policy.final.goes_on or not last
+        raised = {}
+        for rows, chunk in chunks(calling, points, missing, tolerant, tally):
+            values[rows] = chunk.values
+            raised.update({int(rows[i]): text for i, text in chunk.raised.items()})
+            if calling.store is not None:
+                # NaN is a result, too, after the last try, but not where a chunk broke off.
+                whole = tolerant or not chunk.raised
+                keep = ~np.isnan(chunk.values) | (last and whole)
+                _keep(calling.store, keys[rows], chunk, keep)
+        if raised and not tolerant:
+            raise _failed(calling, raised)
+        missing = missing[np.isnan(values[missing])]
+        if not missing.size:
+            break
+    return _settled(calling, values, raised, tally)
+
+
+def _stored(store: Store | None, keys: Floats) -> tuple[Floats, Rows]:
+    """Return responses that are stored, shape (n,), and the rows of those that are not."""
+    if store is None:
+        return np.full(len(keys), np.nan), np.arange(len(keys))
+    values, known = store.find(keys)
+    return values, np.flatnonzero(~known)
+
+
+def _keep(store: Store, keys: Floats, chunk: Chunk, keep: NDArray[np.bool_]) -> None:
+    """Store the responses of a chunk that are to be kept, with what was raised in place of some."""
+    kept = np.flatnonzero(keep)
+    if kept.size:
+        reasons = {}
+        for i, row in enumerate(kept):
+            if int(row) in chunk.raised:
+                reasons[i] = chunk.raised[int(row)]
+        store.add(keys[kept], chunk.values[kept], reasons)
+
+
+def _settled(calling: Calling, values: Floats, raised: dict[int, str], tally: Tally) -> Floats:
+    """Return responses with what the policy puts in the place of those that are NaN."""
+    bad = np.isnan(values)
+    policy = calling.on_failure.final
+    n_bad = int(bad.sum())
+    if not n_bad:
         return values
-
-    def _raise(self, messages: dict[int, str]) -> None:
-        kept = f"; {len(self.store)} responses are kept in {self.store.folder}" if self.store is not None else ""
-        raise ResponseError(
-            f"{self.name}: the response failed at {len(messages)} point(s): {next(iter(messages.values()))}{kept}; "
-            "repair it, or pass on_failure=prb.Replace() or prb.Retry() to the propagation or surrogate"
-        )
-
-    def _computed(
-        self, arguments: Sequence[Any], varying: Sequence[bool], missing: Any, tolerant: bool
-    ) -> Iterator[tuple[Any, Floats, dict[int, str]]]:
-        """Yield rows, their responses (NaN if they raised) and messages by position, as they are computed.
-
-        After a failure that is not tolerated nothing more is begun, and what was begun is waited for and kept.
-        """
-        here = self.executor is None or isinstance(self.executor, ThreadPoolExecutor)
-        work = partial(_compute, self.function) if here else partial(_remote, _packed(self.function))
-        self._workers, self._window = _capacity(self.executor)
-        begun: dict[Future[Any], Any] = {}
-        at = 0
-        error: BaseException | None = None
-        with progress(f"responses of {self.name}", missing.size) as report:
-            while at < missing.size or begun:
-                while at < missing.size and len(begun) < self._window:
-                    rows = missing[at : at + self._chunk(missing.size - at)]
-                    at += rows.size
-                    part = [a[rows] if v else a for a, v in zip(arguments, varying, strict=True)]
-                    future = _submitted(self.executor, work, part, list(varying), tolerant)
-                    begun[future] = rows
-                for future in wait(begun, return_when=FIRST_COMPLETED).done:
-                    rows = begun.pop(future)
-                    if future.exception() is not None:
-                        error = error or future.exception()
-                        at = missing.size
-                        continue
-                    if future.result()[1] and not tolerant:
-                        at = missing.size
-                    yield self._take(rows, future.result(), report)
-        if isinstance(error, ResponseError):
-            raise ResponseError(f"{self.name}: {error}") from None
-        if error is not None:
-            raise ResponseError(
-                f"{self.name}: a worker was lost ({type(error).__name__}: {error}); run again: with store= "
-                "nothing that was computed is computed again"
-            ) from error
-
-    def _take(self, rows: Any, result: tuple[Floats, dict[int, str], float], report: Any) -> tuple[Any, Floats, Any]:
-        values, messages, seconds = result
-        self.count += rows.size
-        cost = seconds / rows.size
-        self._cost = cost if self._cost == 0 else 0.7 * self._cost + 0.3 * cost
-        report(rows.size, f"{self._workers / max(self._cost, 1e-9):.3g}/s")
-        return rows, values, messages
-
-    def _chunk(self, left: int) -> int:
-        """Return how many points the next task gets."""
-        if self._cost == 0:
-            return 1 if isinstance(self.function, scalar) else min(left, 16)
-        if isinstance(self.function, scalar) and self._cost >= _ALONE_SECONDS:
-            return 1
-        share = max(1, left // (2 * self._workers)) if self.executor is not None else left
-        return int(max(1, min(share, _CHUNK_SECONDS / self._cost)))
+    first = next(iter(raised.values()), "it is NaN")
+    if policy.refuses_nan:
+        raise _failed(calling, raised or {0: first})
+    if policy.replacement is not None:
+        tally.failures += n_bad
+        text = f"{n_bad} of {bad.size} responses failed, replaced by {policy.replacement}"
+        _log.warning("%s: %s; the first: %s", calling.name, text, first)
+        values[bad] = policy.replacement
+    return values
 
 
-def _capacity(executor: Executor | None) -> tuple[int, int]:
-    """Return how many workers an executor has, and how many tasks to send out at a time.
+def _failed(calling: Calling, raised: dict[int, str]) -> ResponseError:
+    first = next(iter(raised.values()))
+    kept = ""
+    if calling.store is not None:
+        kept = f"; {len(calling.store)} responses are kept in {calling.store.folder}"
+    return ResponseError(
+        f"{calling.name}: the response failed at {len(raised)} point(s): {first}{kept}; "
+        "repair it, or pass on_failure=prb.Replace() or prb.Retry() to the propagation or surrogate"
+    )
 
-    The interface does not tell: processes, threads and loky keep ``_max_workers``, MPI ``num_workers``, and Dask's
-    client knows. Of others many tasks are sent out, lest workers wait.
+
+# -- sending out -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """How many workers an executor has, and how many chunks it is sent at a time."""
+
+    workers: int
+    chunks: int
+
+
+def capacity(executor: Executor | None) -> Capacity:
+    """Return how much an executor takes.
+
+    The interface does not tell: processes, threads and loky keep ``_max_workers``, MPI
+    ``num_workers``, and Dask's client knows. Of others many chunks are sent out, lest workers wait.
     """
     if executor is None:
-        return 1, 1
-    nthreads = getattr(getattr(executor, "_client", None), "nthreads", None)
-    known = getattr(executor, "_max_workers", 0) or getattr(executor, "num_workers", 0)
-    workers = int(known or (sum(nthreads().values()) if callable(nthreads) else 0))
-    return (workers, 2 * workers) if workers else (os.cpu_count() or 1, _MANY)
+        return Capacity(1, 1)
+    workers = getattr(executor, "_max_workers", 0) or getattr(executor, "num_workers", 0)
+    threads = getattr(getattr(executor, "_client", None), "nthreads", None)
+    if not workers and callable(threads):
+        workers = sum(threads().values())
+    if not workers:
+        return Capacity(os.cpu_count() or 1, _MANY)
+    # While a worker computes a chunk, the next one is there already.
+    return Capacity(int(workers), 2 * int(workers))
 
 
-def _submitted(executor: Executor | None, work: Callable[..., Any], *job: Any) -> Future[Any]:
-    """Return the work as a future: done already if there is no executor, failed if the executor is broken."""
-    future: Future[Any] = Future()
+def chunk_size(calling: Calling, tally: Tally, left: int, workers: int) -> int:
+    """Return how many of the points that are left go into the next chunk."""
+    alone = isinstance(calling.function, scalar)
+    if tally.seconds == 0:
+        return 1 if alone else min(left, _FIRST)
+    if alone and tally.seconds >= _ALONE_SECONDS:
+        return 1
+    # Towards the end chunks get smaller, so that all workers have some.
+    share = left if calling.executor is None else max(1, left // (2 * workers))
+    return int(max(1, min(share, _CHUNK_SECONDS / tally.seconds)))
+
+
+def chunks(
+    calling: Calling, points: Points, rows: Rows, tolerant: bool, tally: Tally
+) -> Iterator[tuple[Rows, Chunk]]:
+    """Compute the responses at some rows of the points, and yield chunks of them as they are done.
+
+    After a failure that is not tolerated nothing more is begun, and what was begun is waited for
+    and yielded.
+
+    Raises
+    ------
+    ResponseError
+        After everything else, if a worker was lost, or a result is no response.
+    """
+    work, room = _work(calling), capacity(calling.executor)
+    begun: dict[Future[Chunk], Rows] = {}
+    left = rows
+    error: BaseException | None = None
+    with progress(f"responses of {calling.name}", rows.size) as report:
+        while left.size or begun:
+            # Send out as many chunks as the executor takes.
+            while left.size and len(begun) < room.chunks:
+                size = chunk_size(calling, tally, left.size, room.workers)
+                some, left = left[:size], left[size:]
+                begun[_submitted(calling.executor, work, points.at(some), tolerant)] = some
+            # Take what is done.
+            for future in wait(begun, return_when=FIRST_COMPLETED).done:
+                some = begun.pop(future)
+                failure = future.exception()
+                if failure is not None:
+                    error = error or failure
+                    left = left[:0]
+                    continue
+                chunk = future.result()
+                if chunk.raised and not tolerant:
+                    left = left[:0]
+                tally.take(some.size, chunk.seconds)
+                report(some.size, f"{room.workers / max(tally.seconds, 1e-9):.3g}/s")
+                yield some, chunk
+    if error is not None:
+        _raise_lost(calling.name, error)
+
+
+def _raise_lost(name: str, error: BaseException) -> None:
+    if isinstance(error, ResponseError):
+        raise ResponseError(f"{name}: {error}") from None
+    raise ResponseError(
+        f"{name}: a worker was lost ({type(error).__name__}: {error}); run again: with store= "
+        "nothing that was computed is computed again"
+    ) from error
+
+
+def _work(calling: Calling) -> Callable[[Points, bool], Chunk]:
+    """Return what is done with points; to other processes the function travels packed."""
+    if calling.executor is None or isinstance(calling.executor, ThreadPoolExecutor):
+        return partial(compute, calling.function)
+    return partial(compute_packed, packed(calling.function))
+
+
+def _submitted(
+    executor: Executor | None, work: Callable[[Points, bool], Chunk], points: Points, tolerant: bool
+) -> Future[Chunk]:
+    """Return the work as a future: done already without an executor, failed if that is broken."""
+    future: Future[Chunk] = Future()
     try:
         if executor is not None:
-            return executor.submit(work, *job)
-        future.set_result(work(*job))
+            return executor.submit(work, points, tolerant)
+        future.set_result(work(points, tolerant))
     except Exception as error:
         future.set_exception(error)
     return future
 
 
-def _compute(
-    function: Callable[..., Any], arguments: Sequence[Any], varying: Sequence[bool], tolerant: bool
-) -> tuple[Floats, dict[int, str], float]:
-    """Return responses, what was raised by position, and the seconds it took."""
+# -- at work ---------------------------------------------------------------------------------------
+
+
+def compute(function: Callable[..., Any], points: Points, tolerant: bool) -> Chunk:
+    """Return the responses at points; unless failures are tolerated, those up to the first one."""
     clock = time.perf_counter()
-    size = len(arguments[list(varying).index(True)])
-    values, messages = np.full(size, np.nan), {}
     if isinstance(function, scalar):
-        for i in range(size):
-            try:
-                with np.errstate(all="ignore"):
-                    values[i] = float(function.function(*_row(arguments, varying, i)))
-            except Exception as error:
-                messages[i] = f"it raised {type(error).__name__}: {error}"
-                if not tolerant:
-                    break
-        return values, messages, time.perf_counter() - clock
+        values, raised = _one_by_one(function, points, tolerant)
+    else:
+        values, raised = _at_once(function, points, tolerant)
+    return Chunk(values, raised, time.perf_counter() - clock)
+
+
+def _one_by_one(function: scalar, points: Points, tolerant: bool) -> tuple[Floats, dict[int, str]]:
+    values, raised = np.full(len(points), np.nan), {}
+    for i in range(len(points)):
+        try:
+            with np.errstate(all="ignore"):
+                values[i] = float(function.function(*points.at(i).arguments))
+        except Exception as error:
+            raised[i] = _said(error)
+            if not tolerant:
+                break
+    return values, raised
+
+
+def _at_once(
+    function: Callable[..., Any], points: Points, tolerant: bool
+) -> tuple[Floats, dict[int, str]]:
+    size = len(points)
     try:
         with np.errstate(all="ignore"):
-            result = function(*arguments)
+            result = function(*points.arguments)
     except Exception as error:
         if not tolerant or size == 1:
-            messages = {0: f"it raised {type(error).__name__}: {error}"}
-        else:  # halve until the points that fail are alone
-            for part in (np.arange(size // 2), np.arange(size // 2, size)):
-                some = [a[part] if v else a for a, v in zip(arguments, varying, strict=True)]
-                values[part], said, _ = _compute(function, some, varying, tolerant)
-                messages.update({int(part[i]): text for i, text in said.items()})
+            return np.full(size, np.nan), {0: _said(error)}
     else:
-        values = checked(result, (size,), arguments)
-    return values, messages, time.perf_counter() - clock
+        return checked(result, (size,), points.arguments), {}
+    # Halve until the points that fail are alone.
+    values, raised = np.full(size, np.nan), {}
+    for half in (np.arange(size // 2), np.arange(size // 2, size)):
+        values[half], said = _at_once(function, points.at(half), tolerant)
+        raised.update({int(half[i]): text for i, text in said.items()})
+    return values, raised
 
 
-def _row(arguments: Sequence[Any], varying: Sequence[bool], i: int) -> list[Any]:
-    """Return the arguments of one point."""
-    return [a[i] if v else a for a, v in zip(arguments, varying, strict=True)]
+def _said(error: Exception) -> str:
+    return f"it raised {type(error).__name__}: {error}"
 
 
 def checked(result: Any, batch: tuple[int, ...], arguments: Sequence[Any]) -> Floats:
-    """Return a response's result as floats, or raise if it is not real numbers in the batch shape."""
+    """Return a response's result as floats; it has to be real numbers in the batch shape."""
     array = np.asarray(result)
     if array.dtype.kind not in "fiub":
-        got = "complex numbers" if array.dtype.kind == "c" else f"{type(result).__name__} of dtype {array.dtype}"
+        got = f"{type(result).__name__} of dtype {array.dtype}"
+        if array.dtype.kind == "c":
+            got = "complex numbers"
         raise ResponseError(f"the response returned {got}, expected an array of real numbers")
     if array.shape != batch:
-        shapes = ", ".join(str(np.shape(a)) for a in arguments)
         raise ResponseError(
-            f"the response returned shape {array.shape} for inputs of shapes {shapes}, expected {batch}: one response "
-            "per specimen; reduce over the event axis only (the last one), or wrap a function of one specimen in "
-            "prb.scalar"
+            f"the response returned shape {array.shape} for inputs of shapes {shapes(arguments)}, "
+            f"expected {batch}: one response per specimen; reduce over the event axis only (the "
+            "last one), or wrap a function of one specimen in prb.scalar"
         )
     return array.astype(np.float64)
 
 
-def _packed(function: Callable[..., Any]) -> bytes:
+def shapes(arguments: Sequence[Any]) -> str:
+    """Return the shapes of a response's arguments, for messages."""
+    return ", ".join(str(np.shape(a)) for a in arguments)
+
+
+def packed(function: Callable[..., Any]) -> bytes:
+    """Return a function as it travels to another process."""
     import cloudpickle
 
     return bytes(cloudpickle.dumps(function))
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=8)  # responses at work at the same time, such as those of several simulators
 def _unpacked(payload: bytes) -> Callable[..., Any]:
     import cloudpickle
 
     return cloudpickle.loads(payload)  # type: ignore[no-any-return]
 
 
-def _remote(payload: bytes, *job: Any) -> tuple[Floats, dict[int, str], float]:
-    return _compute(_unpacked(payload), *job)
+def compute_packed(payload: bytes, points: Points, tolerant: bool) -> Chunk:
+    """Unpack the function, once for all chunks of a worker, and compute."""
+    return compute(_unpacked(payload), points, tolerant)

@@ -19,16 +19,24 @@ from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats
-from prbayes.response.compilation import PLAIN, compile_batched
+from prbayes.response.compilation import PLAIN, compile_batched, with_leading_axis
 from prbayes.response.inputs import Inputs, event_shape, is_random
 
 
-def log_density(inputs: Inputs, aleatory: Sequence[TensorVariable], values: Sequence[Any]) -> TensorVariable:
-    """Return log p(x), shape (n,), of values x, shapes (n, *event), summed over the aleatory inputs."""
+def log_density(
+    inputs: Inputs, aleatory: Sequence[TensorVariable], values: Sequence[Any]
+) -> TensorVariable:
+    """Return log p(x), shape (n,), of values (n, *event), summed over the aleatory inputs."""
     total: Any = 0.0
     for dist, x, shape in zip(aleatory, values, inputs.event_shapes, strict=True):
-        logp = _mvnormal_logp(dist, x, shape[0]) if is_mvnormal(dist) else pm.logp(dist, x, warn_rvs=False)
-        total = total + (logp.sum(axis=tuple(range(1, logp.type.ndim))) if logp.type.ndim > 1 else logp)
+        if is_mvnormal(dist):
+            logp = _mvnormal_logp(dist, x, shape[0])
+        else:
+            logp = pm.logp(dist, x, warn_rvs=False)
+        # Elements of a vector of independent inputs.
+        if logp.type.ndim > 1:
+            logp = logp.sum(axis=tuple(range(1, logp.type.ndim)))
+        total = total + logp
     return total
 
 
@@ -38,13 +46,20 @@ def is_mvnormal(dist: TensorVariable) -> bool:
 
 
 def _mvnormal_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
-    """Return log p(x) by forward substitution, elementwise; PyMC's own solves once per theta and point in a batch."""
+    """Return log p(x) by forward substitution, elementwise.
+
+    PyMC's own density solves once for each theta and point of a batch.
+    """
     mean, covariance = dist.owner.op.dist_params(dist.owner)
     root = pt.linalg.cholesky(covariance, on_error="nan")
+    # Solve root z = x - mean.
     z: list[Any] = []
     for i in range(size):
-        z.append((x[..., i] - mean[i] - sum(root[i, j] * z[j] for j in range(i))) / root[i, i])
-    logp = sum(-0.5 * z_i**2 - pt.log(root[i, i]) - 0.5 * np.log(2 * np.pi) for i, z_i in enumerate(z))
+        above = sum(root[i, j] * z[j] for j in range(i))
+        z.append((x[..., i] - mean[i] - above) / root[i, i])
+    logp: Any = 0
+    for i, z_i in enumerate(z):
+        logp = logp + (-0.5 * z_i**2 - pt.log(root[i, i]) - 0.5 * np.log(2 * np.pi))
     return pt.switch(pt.isnan(logp), -np.inf, logp)
 
 
@@ -59,8 +74,9 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
         If the distribution is discrete or has no inverse distribution function in PyMC.
     """
     op = dist.owner.op
+    other = "use propagation=prb.Reweighted() or prb.Fresh()"
     if dist.dtype.startswith(("int", "uint", "bool")):
-        raise TypeError(f"{name}: {op} is discrete; use propagation=prb.Reweighted() or prb.Fresh()")
+        raise TypeError(f"{name}: {op} is discrete; {other}")
     if is_mvnormal(dist):
         mean, covariance = op.dist_params(dist.owner)
         z = pm.icdf(pm.Normal.dist(0.0, 1.0), u)
@@ -69,9 +85,35 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
         return pm.icdf(dist, u, warn_rvs=False)
     except NotImplementedError:
         raise TypeError(
-            f"{name}: {op} has no inverse distribution function in PyMC; "
-            "use propagation=prb.Reweighted() or prb.Fresh()"
+            f"{name}: {op} has no inverse distribution function in PyMC; {other}"
         ) from None
+
+
+def valid(inputs: Inputs, aleatory: Sequence[TensorVariable]) -> TensorVariable:
+    """Return whether the parameters of all aleatory inputs are valid, a boolean scalar."""
+    from pymc.logprob.utils import CheckParameterValue
+
+    if inputs.nested:
+        return pt.constant(True)
+    # The densities check their parameters, such as sigma > 0, wherever they are evaluated.
+    logps = [pm.logp(d, pt.zeros_like(d), warn_rvs=False) for d in aleatory]
+    conditions = []
+    for v in ancestors(logps):
+        if v.owner is not None and isinstance(v.owner.op, CheckParameterValue):
+            _, *checked = v.owner.inputs
+            conditions += [pt.all(c) for c in checked]
+    return pt.all(conditions) if conditions else pt.constant(True)
+
+
+def _generators(function: Any) -> list[Any]:
+    """Return the random number generators of a compiled function."""
+    return [v for v in function.get_shared() if isinstance(v.type, RandomGeneratorType)]
+
+
+def _seed(generators: Sequence[Any], rng: np.random.Generator) -> None:
+    """Give each generator a stream of its own."""
+    for shared, child in zip(generators, rng.spawn(len(generators)), strict=True):
+        shared.set_value(child, borrow=True)
 
 
 class PriorSampler:
@@ -80,32 +122,40 @@ class PriorSampler:
     def __init__(self, roots: Sequence[TensorVariable]) -> None:
         self._names = ", ".join(str(r.name) for r in roots)
         n = pt.iscalar("n")
-        first = [r for r in roots if not any(a in roots for a in ancestors([r]) if a is not r)]
-        self._batched = True
         try:
-            outputs = vectorize_graph(list(roots), {v: change_dist_size(v, (n,), expand=True) for v in first})
+            # Variables that depend on no other are drawn n times; the others follow.
+            batches = {}
+            for root in roots:
+                if not any(a in roots for a in ancestors([root]) if a is not root):
+                    batches[root] = change_dist_size(root, (n,), expand=True)
+            outputs = vectorize_graph(list(roots), batches)
             self._function = pm.compile([n], outputs, mode=PLAIN)
-        except (NotImplementedError, ValueError, MissingInputError):  # not vectorized, or not resized: one at a time
-            self._batched = False
+            self._batched = True
+        except (NotImplementedError, ValueError, MissingInputError):
+            # Not vectorized, or not resized: one draw at a time.
             self._function = pm.compile([n], list(roots), mode=PLAIN, on_unused_input="ignore")
-        self._generators = [v for v in self._function.get_shared() if isinstance(v.type, RandomGeneratorType)]
+            self._batched = False
+        self._generators = _generators(self._function)
 
     def __call__(self, k: int, seed: int) -> list[Floats]:
         """Return k draws of each variable, shapes (k, *shape)."""
-        for shared, child in zip(
-            self._generators, np.random.default_rng(seed).spawn(len(self._generators)), strict=True
-        ):
-            shared.set_value(child, borrow=True)
+        _seed(self._generators, np.random.default_rng(seed))
         try:
             if self._batched:
                 return [np.asarray(v) for v in self._function(k)]
-            values = [self._function(k) for _ in range(k)]
+            draws = [self._function(k) for _ in range(k)]
         except NotImplementedError as error:
             raise TypeError(
-                f"priors: got {self._names}, of which one cannot be drawn ({error}), expected proper priors; "
-                "replace pm.Flat and pm.HalfFlat by a wide pm.Normal or pm.HalfNormal"
+                f"priors: got {self._names}, of which one cannot be drawn ({error}), expected "
+                "proper priors; replace pm.Flat and pm.HalfFlat by a wide pm.Normal or "
+                "pm.HalfNormal"
             ) from None
-        return [np.array(column) for column in zip(*values, strict=True)]
+        return [np.array(column) for column in zip(*draws, strict=True)]
+
+
+def prior_draws(roots: Sequence[TensorVariable], k: int, seed: int) -> list[Floats]:
+    """Draw the roots k times from the prior; arrays of shape (k, *shape)."""
+    return PriorSampler(roots)(k, seed)
 
 
 class PriorPoints:
@@ -119,40 +169,26 @@ class PriorPoints:
 
     def __init__(self, variables: Sequence[TensorVariable]) -> None:
         self._shapes = [event_shape(v) for v in variables]
-        self.size = sum(int(np.prod(s, dtype=int)) for s in self._shapes)
+        self._sizes = [int(np.prod(s, dtype=int)) for s in self._shapes]
+        self.size = sum(self._sizes)
         symbols = [pt.tensor(dtype="float64", shape=s) for s in self._shapes]
         placed: dict[Variable, Variable] = {}
         for v, u in zip(variables, symbols, strict=True):
-            placed[v] = quantiles("priors", graph_replace([v], placed, strict=False)[0], u)
+            (given,) = graph_replace([v], placed, strict=False)
+            placed[v] = quantiles("priors", given, u)
         if any(is_random(v) for v in ancestors(list(placed.values()))):
-            raise TypeError("priors: got one that depends on a random variable which is not in the model")
+            raise TypeError(
+                "priors: got one that depends on a random variable which is not in the model"
+            )
         self._function = compile_batched(symbols, list(placed.values()))
 
     def __call__(self, cube: Floats) -> list[Floats]:
         """Return values of each variable, shapes (k, *shape), for points of shape (k, size)."""
-        edges = np.cumsum([0, *(int(np.prod(s, dtype=int)) for s in self._shapes)])
-        parts = [cube[:, a:b] for a, b in pairwise(edges)]
-        values = self._function(*(p.reshape(len(cube), *s) for p, s in zip(parts, self._shapes, strict=True)))
-        return [np.asarray(v) for v in values]
-
-
-def prior_draws(roots: Sequence[TensorVariable], k: int, seed: int) -> list[Floats]:
-    """Draw the roots k times from the prior; arrays of shape (k, *shape)."""
-    return PriorSampler(roots)(k, seed)
-
-
-def valid(inputs: Inputs, aleatory: Sequence[TensorVariable]) -> TensorVariable:
-    """Return whether the parameters of all aleatory inputs are valid (sigma > 0 and such), a boolean scalar."""
-    from pymc.logprob.utils import CheckParameterValue
-
-    logps = [pm.logp(d, pt.zeros_like(d), warn_rvs=False) for d in aleatory] if not inputs.nested else []
-    conditions = [
-        pt.all(c)
-        for v in ancestors(logps)
-        if v.owner is not None and isinstance(v.owner.op, CheckParameterValue)
-        for c in v.owner.inputs[1:]
-    ]
-    return pt.all(conditions) if conditions else pt.constant(True)
+        edges = np.cumsum([0, *self._sizes])
+        parts = []
+        for (a, b), shape in zip(pairwise(edges), self._shapes, strict=True):
+            parts.append(cube[:, a:b].reshape(len(cube), *shape))
+        return [np.asarray(v) for v in self._function(*parts)]
 
 
 class PopulationSampler:
@@ -160,43 +196,82 @@ class PopulationSampler:
 
     def __init__(self, inputs: Inputs) -> None:
         symbols = inputs.placeholders()
-        dists, epistemic = inputs.rebuilt(symbols)
+        aleatory, epistemic = inputs.rebuilt(symbols)
         n = pt.iscalar("n")
-        batched = [pt.tensor(name=s.name, dtype=s.dtype, shape=(None, *s.type.shape)) for s in symbols]
-        size = (batched[0].shape[0], n)
-        per_specimen: dict[Variable, Variable] = {
-            s: pt.broadcast_to(b[:, None], (*size, *(b.shape[i] for i in range(1, b.ndim))))
-            for s, b in zip(symbols, batched, strict=True)
-        }
-        # Distributions without any root above them are not batched by their parameters: resize them.
-        for v in ancestors(dists):
-            if is_random(v) and not any(a in symbols or (a is not v and is_random(a)) for a in ancestors([v])):
-                per_specimen[v] = change_dist_size(v, size, expand=True)
+        batched = with_leading_axis(symbols)
+        per_specimen = _per_specimen(aleatory, symbols, batched, n)
         self._batched = True
         try:
-            outputs = vectorize_graph(dists, per_specimen)
-            common = vectorize_graph(epistemic, dict(zip(symbols, batched, strict=True))) if epistemic else []
-        except (NotImplementedError, ValueError):  # what PyTensor does not vectorize: one population at a time
-            self._batched, batched = False, symbols
-            # Resized before the roots are replaced, since PyMC resizes a CustomDist with its first parameters.
-            resized = [change_dist_size(d, (n,), expand=True) for d in inputs.aleatory]
-            outputs = graph_replace(resized, dict(zip(inputs.roots, symbols, strict=True)), strict=False)
+            specimens = vectorize_graph(aleatory, per_specimen)
             common = epistemic
-        self._n_aleatory = len(dists)
+            if epistemic:
+                common = vectorize_graph(epistemic, dict(zip(symbols, batched, strict=True)))
+        except (NotImplementedError, ValueError):
+            # What PyTensor does not vectorize: one population at a time.
+            self._batched, batched = False, symbols
+            # Resized before the roots are replaced, since PyMC resizes a CustomDist with its first
+            # parameters.
+            resized = [change_dist_size(d, (n,), expand=True) for d in inputs.aleatory]
+            replaced = dict(zip(inputs.roots, symbols, strict=True))
+            specimens = graph_replace(resized, replaced, strict=False)
+            common = epistemic
+        self._n_aleatory = len(aleatory)
         self._epistemic_ndims = [e.type.ndim for e in epistemic]
         self._function = pm.compile(
-            [n, *batched], [*outputs, *common], mode=PLAIN, on_unused_input="ignore", allow_input_downcast=True
+            [n, *batched],
+            [*specimens, *common],
+            mode=PLAIN,
+            on_unused_input="ignore",
+            allow_input_downcast=True,
         )
-        self._generators = [v for v in self._function.get_shared() if isinstance(v.type, RandomGeneratorType)]
+        self._generators = _generators(self._function)
 
-    def __call__(self, params: Sequence[Any], n: int, rng: np.random.Generator) -> tuple[list[Floats], list[Floats]]:
-        """Return aleatory draws, shapes (k, n, *event), and epistemic values, shapes (k, 1, *event) or (*event)."""
-        for shared, child in zip(self._generators, rng.spawn(len(self._generators)), strict=True):
-            shared.set_value(child, borrow=True)
+    def __call__(
+        self, params: Sequence[Any], n: int, rng: np.random.Generator
+    ) -> tuple[list[Floats], list[Floats]]:
+        """Draw n specimens from each of k populations.
+
+        Parameters
+        ----------
+        params : sequence of ndarray, shapes (k, *shape)
+            Values of the roots.
+        n : int
+        rng : Generator
+
+        Returns
+        -------
+        aleatory : list of ndarray, shapes (k, n, *event)
+        epistemic : list of ndarray, shapes (k, 1, *event), or (*event) where they depend on no root
+        """
+        _seed(self._generators, rng)
         if self._batched:
             values = self._function(n, *params)
         else:
-            rows = [self._function(n, *row) for row in zip(*params, strict=True)]
-            values = [np.stack(column) for column in zip(*rows, strict=True)]
-        common = zip(values[self._n_aleatory :], self._epistemic_ndims, strict=True)
-        return values[: self._n_aleatory], [v[:, None] if v.ndim > d else v for v, d in common]
+            populations = [self._function(n, *row) for row in zip(*params, strict=True)]
+            values = [np.stack(column) for column in zip(*populations, strict=True)]
+        epistemic = []
+        for v, ndim in zip(values[self._n_aleatory :], self._epistemic_ndims, strict=True):
+            epistemic.append(v[:, None] if v.ndim > ndim else v)
+        return values[: self._n_aleatory], epistemic
+
+
+def _per_specimen(
+    aleatory: Sequence[TensorVariable],
+    symbols: Sequence[TensorVariable],
+    batched: Sequence[TensorVariable],
+    n: TensorVariable,
+) -> dict[Variable, Variable]:
+    """Return what stands for roots and distributions in a graph of n specimens of each theta."""
+    size = (batched[0].shape[0], n)
+    replaced: dict[Variable, Variable] = {}
+    for symbol, batch in zip(symbols, batched, strict=True):
+        shape = [batch.shape[i] for i in range(1, batch.ndim)]
+        replaced[symbol] = pt.broadcast_to(batch[:, None], (*size, *shape))
+    # Distributions without any root above them are not batched by their parameters: resize them.
+    for v in ancestors(aleatory):
+        if not is_random(v):
+            continue
+        above = [a for a in ancestors([v]) if a is not v]
+        if not any(a in symbols or is_random(a) for a in above):
+            replaced[v] = change_dist_size(v, size, expand=True)
+    return replaced

@@ -12,16 +12,43 @@ from prbayes._checks import positive_integer
 class OnFailure:
     """What to do with a point whose response raises or is NaN; see `Abort`, `Replace`, `Retry`."""
 
+    @property
+    def tries(self) -> int:
+        """How often a point is computed, at most."""
+        return 1
+
+    @property
+    def final(self) -> OnFailure:
+        """What holds after the last try."""
+        return self
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether the run goes on when a response raises at the last try."""
+        return True
+
+    @property
+    def refuses_nan(self) -> bool:
+        """Whether a response that is NaN after the last try ends the run."""
+        return False
+
+    @property
+    def replacement(self) -> float | None:
+        """What takes the place of a response that failed; without it NaN stays, as a result."""
+        return None
+
 
 @dataclass(frozen=True)
 class Abort(OnFailure):
-    """Stop when a response raises, and, if asked for, when one is NaN; what was computed stays in the store.
+    """Stop when a response raises, and, if asked for, when one is NaN.
+
+    What was computed stays in the store.
 
     Parameters
     ----------
     on_nan : bool
-        By default NaN is a result: a point that could not be computed keeps its weight, which is reported as
-        lost mass.
+        By default NaN is a result: a point that could not be computed keeps its weight, which is
+        reported as lost mass.
 
     Examples
     --------
@@ -30,6 +57,16 @@ class Abort(OnFailure):
     """
 
     on_nan: bool = False
+
+    @property
+    def goes_on(self) -> bool:
+        """It does not."""
+        return False
+
+    @property
+    def refuses_nan(self) -> bool:
+        """If asked for."""
+        return self.on_nan
 
 
 @dataclass(frozen=True)
@@ -55,8 +92,15 @@ class Replace(OnFailure):
     value: float = np.nan
 
     def __post_init__(self) -> None:
-        if isinstance(self.value, bool) or not isinstance(self.value, int | float | np.floating):
-            raise TypeError(f"Replace: value: got {type(self.value).__name__} {self.value!r:.60}, expected a number")
+        number = isinstance(self.value, int | float | np.floating)
+        if isinstance(self.value, bool) or not number:
+            got = f"{type(self.value).__name__} {self.value!r:.60}"
+            raise TypeError(f"Replace: value: got {got}, expected a number")
+
+    @property
+    def replacement(self) -> float:
+        """The value."""
+        return self.value
 
 
 @dataclass(frozen=True)
@@ -85,5 +129,16 @@ class Retry(OnFailure):
 
     def __post_init__(self) -> None:
         positive_integer(self.times, "Retry: times")
-        if not isinstance(self.then, Abort | Replace):
-            raise TypeError(f"Retry: then: got {type(self.then).__name__}, expected prb.Abort() or prb.Replace()")
+        if not isinstance(self.then, OnFailure) or self.then.final is not self.then:
+            got = type(self.then).__name__
+            raise TypeError(f"Retry: then: got {got}, expected prb.Abort() or prb.Replace()")
+
+    @property
+    def tries(self) -> int:
+        """Once, and as often again as was asked for."""
+        return 1 + self.times
+
+    @property
+    def final(self) -> OnFailure:
+        """What was asked for."""
+        return self.then

@@ -27,7 +27,8 @@ class Inputs:
     Attributes
     ----------
     arguments : tuple
-        One entry per argument: an int (position in ``aleatory``), a variable (epistemic), or an array.
+        One entry per argument: an int (position in ``aleatory``), a variable (epistemic), or an
+        array.
     aleatory : tuple of random variables
         The distinct ``.dist()`` objects.
     roots : tuple of variables
@@ -58,10 +59,14 @@ class Inputs:
 
     def fill(self, aleatory: Sequence[Any], epistemic: Sequence[Any]) -> list[Any]:
         """Return the response's arguments from values for the aleatory and the epistemic inputs."""
-        rest = iter(epistemic)
-        return [
-            next(rest) if isinstance(a, Variable) else aleatory[a] if isinstance(a, int) else a for a in self.arguments
-        ]
+        common = iter(epistemic)
+        filled = []
+        for a in self.arguments:
+            if isinstance(a, Variable):
+                filled.append(next(common))
+            else:
+                filled.append(aleatory[a] if isinstance(a, int) else a)
+        return filled
 
     @cached_property
     def event_shapes(self) -> tuple[tuple[int, ...], ...]:
@@ -88,7 +93,8 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
     Raises
     ------
     TypeError, ValueError
-        If one is none of the three, if none is aleatory, or if no model variable is above any of them.
+        If one is none of the three, if none is aleatory, or if no model variable is above any of
+        them.
     """
     known = set(model.basic_RVs)
     arguments: list[Any] = []
@@ -100,17 +106,10 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
         if not isinstance(x, Variable):
             arguments.append(_constant(x, label))
             continue
-        above = list(walk([x], lambda v: None if v in known or v.owner is None else v.owner.inputs))
+        above = _ancestry(x, known)
         roots.update((v, None) for v in above if v in known)
         latent = [v for v in above if v not in known and is_random(v)]
-        # PyMC gives a `str_repr` to the variables of a model, and none to a `.dist()`.
-        foreign = [v for v in latent if hasattr(v, "str_repr")]
-        strays = [v for v in above if v.owner is None and not _is_bound(v)] + foreign
-        if strays:
-            raise TypeError(
-                f"{label}: got {x} which depends on {strays[0]}, expected a `.dist()`, a variable of this model "
-                "or a constant; create the variables it depends on inside the same `with pm.Model()`"
-            )
+        _refuse_strays(x, above, latent, label)
         if x in known or not latent:
             arguments.append(x)
             continue
@@ -123,17 +122,51 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
         if x not in aleatory:
             aleatory.append(x)
         arguments.append(aleatory.index(x))
+    _refuse_too_little(name, len(inputs), bool(aleatory), bool(roots))
+    return Inputs(tuple(arguments), tuple(aleatory), tuple(roots), nested)
+
+
+def _refuse_too_little(name: str, n: int, aleatory: bool, roots: bool) -> None:
+    """Refuse inputs of which none varies between specimens, or none is to be calibrated."""
     if not aleatory:
         raise ValueError(
-            f"{name}: got {len(inputs)} inputs, none of them aleatory, expected at least one that varies between "
-            "specimens; pass a distribution made with `.dist()`, such as pm.Normal.dist(mu, sigma)"
+            f"{name}: got {n} inputs, none of them aleatory, expected at least one that "
+            "varies between specimens; pass a distribution made with `.dist()`, such as "
+            "pm.Normal.dist(mu, sigma)"
         )
     if not roots:
         raise ValueError(
-            f"{name}: got inputs that depend on no variable of the model, expected hyperparameters to calibrate; "
-            "give the `.dist()` parameters that are model variables, such as mu = pm.Normal('mu', 0, 1)"
+            f"{name}: got inputs that depend on no variable of the model, expected hyperparameters "
+            "to calibrate; give the `.dist()` parameters that are model variables, such as "
+            "mu = pm.Normal('mu', 0, 1)"
         )
-    return Inputs(tuple(arguments), tuple(aleatory), tuple(roots), nested)
+
+
+def _ancestry(x: Variable, known: set[Variable]) -> list[Variable]:
+    """Return an input and what is above it, up to the model's variables."""
+
+    def parents(variable: Variable) -> Any:
+        if variable in known or variable.owner is None:
+            return None
+        return variable.owner.inputs
+
+    return list(walk([x], parents))
+
+
+def _refuse_strays(
+    x: Variable, above: Sequence[Variable], latent: Sequence[Variable], label: str
+) -> None:
+    """Refuse an input that depends on a loose symbol, or on a variable of another model."""
+    loose = [v for v in above if v.owner is None and not _is_bound(v)]
+    # PyMC gives a `str_repr` to the variables of a model, and none to a `.dist()`.
+    foreign = [v for v in latent if hasattr(v, "str_repr")]
+    strays = [*loose, *foreign]
+    if strays:
+        raise TypeError(
+            f"{label}: got {x} which depends on {strays[0]}, expected a `.dist()`, a variable of "
+            "this model or a constant; create the variables it depends on inside the same "
+            "`with pm.Model()`"
+        )
 
 
 def _constant(x: object, label: str) -> Any:
@@ -141,10 +174,13 @@ def _constant(x: object, label: str) -> Any:
         array = real_array(x, label)  # type: ignore[arg-type]
     except TypeError as error:
         raise TypeError(
-            f"{error}; an input is a `.dist()` (varies between specimens), a model variable (common to all) or a number"
+            f"{error}; an input is a `.dist()` (varies between specimens), a model variable "
+            "(common to all) or a number"
         ) from None
     if not np.isfinite(array).all():
-        raise ValueError(f"{label}: got a constant that is not finite ({x!r:.60}), expected a number")
+        raise ValueError(
+            f"{label}: got a constant that is not finite ({x!r:.60}), expected a number"
+        )
     return float(array) if array.ndim == 0 else array
 
 
@@ -161,7 +197,11 @@ def is_random(variable: Variable) -> bool:
 
 def _is_bound(variable: Variable) -> bool:
     """Whether a graph's leaf has a value: constants, shared variables, generators."""
-    return hasattr(variable, "data") or hasattr(variable, "get_value") or not isinstance(variable, TensorVariable)
+    return (
+        hasattr(variable, "data")
+        or hasattr(variable, "get_value")
+        or not isinstance(variable, TensorVariable)
+    )
 
 
 def event_shape(dist: TensorVariable) -> tuple[int, ...]:

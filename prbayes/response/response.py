@@ -1,4 +1,4 @@
-"""The user's response: shapes, checks, counting."""
+"""The user's response: a function, its inputs, and how it is called; shapes and counts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,17 @@ import numpy as np
 from pytensor.graph.basic import Variable
 
 from prbayes._checks import Floats
-from prbayes.response.calling import Caller, ResponseError, checked, scalar
+from prbayes.response.batches import batch_shape, broadcast_batch
+from prbayes.response.calling import (
+    Calling,
+    Points,
+    ResponseError,
+    Tally,
+    checked,
+    respond,
+    scalar,
+    shapes,
+)
 from prbayes.response.failures import Abort, OnFailure
 from prbayes.response.inputs import Inputs
 from prbayes.response.store import Store
@@ -19,14 +29,20 @@ from prbayes.response.store import Store
 def refuse_uncallable(name: str, function: object) -> None:
     """Raise if a response is no function: often the inputs were given first."""
     if not callable(function):
+        got = type(function).__name__
         raise TypeError(
-            f"{name}: response: got {type(function).__name__}, expected a function of the inputs, such as "
-            "lambda x: x**2; the order is Simulator(name, response, *inputs, metric=..., observed=...)"
+            f"{name}: response: got {got}, expected a function of the inputs, such as "
+            "lambda x: x**2; the order is Simulator(name, response, *inputs, metric=..., "
+            "observed=...)"
         )
 
 
 class Responses:
-    """The user's response function.
+    """The user's response: a function of inputs, and how it is called.
+
+    A function that takes whole batches, with nothing else asked for, is called once for each batch
+    (``plain``). Every other goes through `respond`: on an executor, in chunks, with a store and a
+    failure policy.
 
     Parameters
     ----------
@@ -57,70 +73,76 @@ class Responses:
         on_failure: OnFailure | None = None,
     ) -> None:
         refuse_uncallable(name, function)
+        policy = on_failure or Abort()
+        kept = None if store is None else Store(store, name, _columns(inputs))
         self.name = name
         self.function = function
         self.inputs = inputs
-        # A function that takes whole batches, and nothing else asked for, is called once for each.
-        self.plain = executor is store is None and not isinstance(function, scalar) and on_failure in (None, Abort())
-        self._event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
-        self._caller: Caller | None = None
-        if not self.plain:
-            kept = None if store is None else Store(store, name, self._columns())
-            self._caller = Caller(name, function, executor, on_failure or Abort(), kept)
+        self.plain = (
+            executor is None
+            and store is None
+            and policy == Abort()
+            and not isinstance(function, scalar)
+        )
         self.count = 0
-
-    def _columns(self) -> int:
-        """Return of how many numbers the inputs of one point are made."""
-        sizes = [int(np.prod(s, dtype=int)) for s in self.inputs.event_shapes]
-        sizes += [int(np.prod(e.shape.eval() if e.type.ndim else (), dtype=int)) for e in self.inputs.epistemic]
-        return sum(sizes) + sum(np.size(a) for a in self.inputs.arguments if not isinstance(a, int | Variable))
+        self._calling = Calling(name, function, executor, kept, policy)
+        self._tally = Tally()
+        self._event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
 
     @property
     def computed(self) -> int:
-        """Scalar responses computed here: without those found in a store, with those computed again."""
-        return self.count if self._caller is None else self._caller.count
+        """Responses computed here: without those found in a store, with those tried again."""
+        return self.count if self.plain else self._tally.computed
 
     @property
     def failures(self) -> int:
         """Points whose response failed and was replaced."""
-        return 0 if self._caller is None else self._caller.failures
+        return self._tally.failures
 
     def same_as(self, other: Responses) -> bool:
         """Return whether another has the same function, aleatory inputs and constants."""
-        a, b = self.inputs, other.inputs
-        if self.function is not other.function or len(a.arguments) != len(b.arguments):
+        mine, others = self.inputs.arguments, other.inputs.arguments
+        if self.function is not other.function or len(mine) != len(others):
             return False
-        pairs = list(zip(a.arguments, b.arguments, strict=True))
-        return all(isinstance(x, int) is isinstance(y, int) and not isinstance(x, Variable) for x, y in pairs) and all(
-            a.aleatory[x] is b.aleatory[y] if isinstance(x, int) else np.array_equal(x, y) for x, y in pairs
-        )
+        pairs = zip(mine, others, strict=True)
+        return all(_same(self.inputs, x, other.inputs, y) for x, y in pairs)
 
     def __call__(self, aleatory: Sequence[Floats], epistemic: Sequence[Floats]) -> Floats:
-        """Return responses, shape (...), for aleatory values (..., *event) and epistemic ones (..., *event).
+        """Return responses, shape (...), for values of the inputs, shapes (..., *event).
 
         Raises
         ------
         ResponseError
             If the response raises, or if its result is not real numbers in the batch shape.
         """
-        values = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
-        leading = [v.shape[: v.ndim - e] for v, e in zip(values, self._event_ndims, strict=True)]
-        batch = np.broadcast_shapes(*leading)
-        full = [
-            np.broadcast_to(v, batch + v.shape[v.ndim - e :]) for v, e in zip(values, self._event_ndims, strict=True)
-        ]
-        k = len(aleatory)
-        if self._caller is not None:
-            return self._call_each(full, k, batch)
-        arguments = self.inputs.fill(full[:k], full[k:])
+        given = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
+        batch = batch_shape(given, self._event_ndims)
+        values = broadcast_batch(given, self._event_ndims, batch)
+        if self.plain:
+            return self._at_once(self._filled(values), batch)
+        # Here a point is a row.
+        n = int(np.prod(batch, dtype=int))
+        flat = [v.reshape(n, *v.shape[len(batch) :]) for v in values]
+        varying = [isinstance(a, int | Variable) for a in self.inputs.arguments]
+        self.count += n
+        found = respond(self._calling, Points(self._filled(flat), varying), self._tally)
+        return found.reshape(batch)
+
+    def _filled(self, values: Sequence[Floats]) -> list[Any]:
+        """Return the function's arguments from values of aleatory, then epistemic inputs."""
+        k = len(self.inputs.aleatory)
+        return self.inputs.fill(values[:k], values[k:])
+
+    def _at_once(self, arguments: Sequence[Any], batch: tuple[int, ...]) -> Floats:
+        """Call the function once for a batch of any shape."""
         try:
             with np.errstate(all="ignore"):
                 result = self.function(*arguments)
         except Exception as error:
-            shapes = ", ".join(str(np.shape(a)) for a in arguments)
             raise ResponseError(
-                f"{self.name}: the response raised {type(error).__name__}: {error}; it was called with inputs of "
-                f"shapes {shapes} and is expected to take arrays of any leading shape, or to be wrapped in prb.scalar"
+                f"{self.name}: the response raised {type(error).__name__}: {error}; it was called "
+                f"with inputs of shapes {shapes(arguments)} and is expected to take arrays of any "
+                "leading shape, or to be wrapped in prb.scalar"
             ) from error
         self.count += int(np.prod(batch, dtype=int))
         try:
@@ -128,16 +150,20 @@ class Responses:
         except ResponseError as error:
             raise ResponseError(f"{self.name}: {error}") from None
 
-    def _call_each(self, full: Sequence[Floats], k: int, batch: tuple[int, ...]) -> Floats:
-        """Call through the executor, the store and the failure policy, with one leading axis."""
-        n = int(np.prod(batch, dtype=int))
-        flat = [v.reshape(n, *v.shape[len(batch) :]) for v in full]
-        arguments = self.inputs.fill(flat[:k], flat[k:])
-        varying = [isinstance(a, int | Variable) for a in self.inputs.arguments]
-        keys = [
-            (a if v else np.broadcast_to(a, (n, *np.shape(a)))).reshape(n, -1)
-            for a, v in zip(arguments, varying, strict=True)
-        ]
-        assert self._caller is not None
-        self.count += n
-        return self._caller(arguments, varying, np.concatenate(keys, axis=1).astype(np.float64)).reshape(batch)
+
+def _columns(inputs: Inputs) -> int:
+    """Return of how many numbers the inputs of one point are made, constants included."""
+    sizes = [int(np.prod(shape, dtype=int)) for shape in inputs.event_shapes]
+    for variable in inputs.epistemic:
+        shape = variable.shape.eval() if variable.type.ndim else ()
+        sizes.append(int(np.prod(shape, dtype=int)))
+    constants = [a for a in inputs.arguments if not isinstance(a, int | Variable)]
+    return sum(sizes) + sum(np.size(a) for a in constants)
+
+
+def _same(inputs: Inputs, x: Any, others: Inputs, y: Any) -> bool:
+    """Return whether arguments of two responses are the same aleatory input, or equal constants."""
+    if isinstance(x, int) or isinstance(y, int):
+        both = isinstance(x, int) and isinstance(y, int)
+        return both and inputs.aleatory[x] is others.aleatory[y]
+    return not isinstance(x, Variable) and np.array_equal(x, y)

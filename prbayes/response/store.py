@@ -1,34 +1,93 @@
 """Computed responses on disk, keyed by their inputs: none is computed twice, none is lost.
 
-Responses are appended to a journal, and flushed to disk, as soon as they are known; from time to time, and at
-the end, the journal is merged into one netCDF file, which is written beside the old one and then put in its
-place. Whatever moment a run is killed at, what was computed before is found again.
+A store is a folder with one SQLite file for all simulators that were given it. Runs are only ever
+appended, a transaction for each chunk of them: whatever moment a process is killed at, what was
+committed is found again, and several processes may write at once. Every run carries a checksum: a
+damaged file is refused with a sentence, and never read as other numbers.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
-import struct
-import zlib
+import sqlite3
+import threading
+import weakref
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
+from prbayes.response.database import (
+    COMPUTED,
+    FAILED,
+    INSERT_RESPONSE,
+    INSERT_RUN,
+    SELECT_RESPONSES,
+    SELECT_RUNS,
+    Complaint,
+    checksum,
+    complaint_about,
+    complaint_of,
+    connected,
+    create,
+    damaged,
+    transaction,
+)
+from prbayes.response.old_store import old_responses
 
-_MAGIC = b"prbayes1"
-_HEADER = struct.Struct("<III")  # columns, rows, crc of the payload
+_FILE = "responses.sqlite"  # what users see in their folder
+_NAN = np.array(np.nan, dtype="<f8").tobytes()
 
 
 class StoreError(RuntimeError):
-    """A store that cannot be read, or belongs to something else; it is never overwritten."""
+    """A store that cannot be read or written, or is of something else; never overwritten."""
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A response in the file: its number there, and of how many values its inputs are made."""
+
+    number: int
+    columns: int
+
+
+@dataclass(eq=False)
+class _Session:
+    """The file as one thread of one process has it open, and what it has read of it.
+
+    Attributes
+    ----------
+    connection : sqlite3.Connection
+    opened : tuple of int
+        Process, and device and number of the file.
+    entry : _Entry
+    known : dict
+        Values of the store's response by keys, both as bytes.
+    seen : int
+        The last run that was read, of any response.
+    """
+
+    connection: sqlite3.Connection
+    opened: tuple[int, ...]
+    entry: _Entry
+    known: dict[bytes, bytes] = field(default_factory=dict)
+    seen: int = 0
+
+    def __post_init__(self) -> None:
+        self.close = weakref.finalize(self, _close, self.connection, os.getpid())
 
 
 class Store:
-    """The stored responses of one simulator: ``<folder>/<name>.nc`` and its journal.
+    """The stored responses of one simulator, in ``<folder>/responses.sqlite``.
+
+    Several processes and threads of one machine may use a folder at once. Each opens the file by
+    itself when it needs it, also after a fork, and where the store was sent to another process.
 
     Parameters
     ----------
@@ -36,133 +95,242 @@ class Store:
         Made if it does not exist.
     name : str
         Of the simulator.
-    columns : int
-        Number of values that the inputs of one point are made of.
+    columns : int, optional
+        Number of values that the inputs of one point are made of. By default that of the stored
+        responses; there must be some, then.
 
     Raises
     ------
     StoreError
         If there is a file that cannot be read, or that was made for other inputs.
+
+    Examples
+    --------
+    >>> import tempfile, numpy as np
+    >>> folder = tempfile.mkdtemp()
+    >>> store = Store(folder, "y", 2)
+    >>> store.add(np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([10.0, 20.0]))
+    >>> store.find(np.array([[3.0, 4.0], [5.0, 6.0]]))
+    (array([20., nan]), array([ True, False]))
+    >>> Store(folder, "y").to_dataset()["response"].values
+    array([10., 20.])
     """
 
-    def __init__(self, folder: str | os.PathLike[str], name: str, columns: int) -> None:
+    def __init__(
+        self, folder: str | os.PathLike[str], name: str, columns: int | None = None
+    ) -> None:
         self.folder = Path(folder)
-        if self.folder.exists() and not self.folder.is_dir():
-            raise StoreError(f"{name}: store: got {self.folder}, which is a file, expected a folder")
-        self.folder.mkdir(parents=True, exist_ok=True)
         self.name = name
         self.columns = columns
-        safe = "".join(c if c.isalnum() or c in "-_." else f"%{ord(c):x}" for c in name)
-        self.path = self.folder / f"{safe}.nc"
-        self.journal = self.folder / f"{safe}.journal"
-        self._known: dict[bytes, float] = {}
-        self._rows: list[Floats] = []
-        self._values: list[Floats] = []
-        if self.path.exists():
-            self._take(*self._read())
-        self._merged = len(self._known)
-        if self.journal.exists():
-            for inputs, values in self._replay():
-                self._take(inputs, values)
+        self._local = threading.local()
+        self._read()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"folder": self.folder, "name": self.name, "columns": self.columns}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._local = threading.local()
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.folder / _FILE
 
     def __len__(self) -> int:
-        return len(self._known)
+        return len(self._read().known)
 
     def find(self, inputs: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return stored responses of inputs (n, columns), and which of them were found, shapes (n,)."""
-        found = [self._known.get(row.tobytes()) for row in np.ascontiguousarray(inputs)]
-        known = np.array([v is not None for v in found], dtype=bool)
-        return np.array([np.nan if v is None else v for v in found]), known
+        """Return stored responses of inputs (n, columns), and which were found, shapes (n,)."""
+        known = self._read().known
+        found = [known.get(key) for key in _keys(inputs)]
+        present = np.array([value is not None for value in found], dtype=bool)
+        return _numbers(_NAN if value is None else value for value in found), present
 
-    def add(self, inputs: Floats, values: Floats) -> None:
-        """Append responses to the journal, safe on disk when this returns."""
-        payload = np.ascontiguousarray(np.column_stack([inputs, values]), dtype="<f8").tobytes()
-        with self.journal.open("ab") as file:
-            if not file.tell():
-                file.write(_MAGIC)
-            file.write(_HEADER.pack(self.columns, len(values), zlib.crc32(payload)) + payload)
-            file.flush()
-            os.fsync(file.fileno())
-        self._take(inputs, values)
+    def add(self, inputs: Floats, values: Floats, reasons: Mapping[int, str] | None = None) -> None:
+        """Append responses, safe on disk when this returns.
 
-    def merge(self, *, always: bool = False) -> None:
-        """Write everything into the netCDF file, and drop the journal, if that has grown to the file's size."""
-        if not self.journal.exists() or (not always and 2 * self._merged > len(self._known)):
-            return
-        self._merged = len(self._known)
-        data = xr.Dataset(
+        Parameters
+        ----------
+        inputs : ndarray, shape (n, columns)
+        values : ndarray, shape (n,)
+        reasons : mapping, optional
+            Of those that failed: why, by row.
+        """
+        session = self._read()
+        rows = _rows(session.entry.number, inputs, values, reasons or {})
+        with self._explained(), transaction(session.connection):
+            session.connection.executemany(INSERT_RUN, rows)
+
+    def to_dataset(self) -> xr.Dataset:
+        """Return the stored responses for other programs: ``store.to_dataset().to_netcdf(path)``.
+
+        Returns
+        -------
+        Dataset
+            ``inputs``, dims (point, column), and ``response``, dim (point), in the order in which
+            they came.
+        """
+        session = self._read()
+        inputs = _numbers(session.known).reshape(-1, session.entry.columns)
+        return xr.Dataset(
             {
-                "inputs": (["point", "column"], np.concatenate(self._rows)),
-                "response": ("point", np.concatenate(self._values)),
+                "inputs": (["point", "column"], inputs),
+                "response": ("point", _numbers(session.known.values())),
             },
-            attrs={"prbayes_store": 1, "simulator": self.name},
+            attrs={"simulator": self.name},
         )
-        data.attrs["digest"] = _digest(data)
-        part = self.path.with_suffix(".part")
-        data.to_netcdf(part, engine="h5netcdf")
-        with part.open("rb") as file:
-            os.fsync(file.fileno())
-        part.replace(self.path)
-        self.journal.unlink()
 
-    def _take(self, inputs: Floats, values: Floats) -> None:
-        for row, value in zip(np.ascontiguousarray(inputs, dtype=np.float64), values, strict=True):
-            self._known[row.tobytes()] = float(value)
-        self._rows.append(np.array(inputs, dtype=np.float64))
-        self._values.append(np.array(values, dtype=np.float64))
+    def close(self) -> None:
+        """Close the file in this thread; it is opened again when it is needed."""
+        session: _Session | None = getattr(self._local, "session", None)
+        if session is not None:
+            session.close()
+            del self._local.session
 
-    def _read(self) -> tuple[Floats, Floats]:
+    def _read(self) -> _Session:
+        """Return the session of this thread, after reading what others have written meanwhile."""
+        session: _Session | None = getattr(self._local, "session", None)
+        with self._explained():
+            # After a fork, and where another file is in its place, the session is an old one. It is
+            # closed first: closing deletes the log of writes, by name.
+            if session is not None and session.opened != self._opened():
+                session.close()
+                session = None
+            if session is None:
+                session = self._open()
+            self._read_on(session)
+        self._local.session = session
+        return session
+
+    def _opened(self) -> tuple[int, ...]:
+        """Return what tells processes and files apart; nothing if there is no file."""
         try:
-            with xr.open_dataset(self.path, engine="h5netcdf") as data:
-                data.load()
-            inputs, values = data["inputs"].values, data["response"].values
-            sound = data.attrs.get("digest") == _digest(data)
-        except Exception as error:
-            raise StoreError(self._refusal(f"cannot be read ({type(error).__name__}: {error})")) from error
-        if not sound:
-            raise StoreError(self._refusal("is damaged: its contents do not match their digest"))
-        if inputs.ndim != 2 or inputs.shape[1] != self.columns or data.attrs.get("simulator") != self.name:
-            what = f"holds inputs of {inputs.shape[-1]} values for simulator {data.attrs.get('simulator')!r}, expected "
-            raise StoreError(self._refusal(f"{what}{self.columns} values for {self.name!r}"))
-        return inputs, values
+            file = self.path.stat()
+        except FileNotFoundError:
+            return ()
+        return os.getpid(), file.st_dev, file.st_ino
 
-    def _replay(self) -> list[tuple[Floats, Floats]]:
-        """Return the journal's records; the last may have been cut short by the end of a run."""
-        text = self.journal.read_bytes()
-        if text and not text.startswith(_MAGIC[: len(text)]):
-            raise StoreError(self._refusal("has a journal that is no journal of prbayes"))
-        if len(text) < len(_MAGIC):  # the run ended before the first record
-            self.journal.unlink()
-            return []
-        records, at = [], len(_MAGIC)
-        while at < len(text):
-            head = text[at : at + _HEADER.size]
-            columns, rows, crc = _HEADER.unpack(head) if len(head) == _HEADER.size else (self.columns, 0, -1)
-            if columns != self.columns:
-                raise StoreError(
-                    self._refusal(f"has a journal for inputs of {columns} values, expected {self.columns}")
-                )
-            size = 8 * rows * (columns + 1)
-            payload = text[at + _HEADER.size : at + _HEADER.size + size]
-            if len(payload) < size or zlib.crc32(payload) != crc:
-                if at + _HEADER.size + size < len(text):
-                    raise StoreError(self._refusal("has a journal that is damaged in the middle"))
-                with self.journal.open("r+b") as file:
-                    file.truncate(at)
-                break
-            table = np.frombuffer(payload, dtype="<f8").reshape(rows, columns + 1)
-            records.append((table[:, :-1], table[:, -1]))
-            at += _HEADER.size + size
-        return records
+    def _open(self) -> _Session:
+        """Open the file, made if it does not exist, after a look whether it is a sound store."""
+        if self.folder.exists() and not self.folder.is_dir():
+            raise StoreError(
+                f"{self.name}: store: got {self.folder}, which is a file, expected a folder"
+            )
+        if not self.path.exists():
+            create(self.path)
+        connection = connected(self.path)
+        try:
+            complaint = complaint_about(self.path, connection)
+            if complaint is not None:
+                raise self._refusal(complaint)
+            return _Session(connection, self._opened(), self._entry(connection))
+        except BaseException:
+            connection.close()
+            raise
 
-    def _refusal(self, what: str) -> str:
-        return (
-            f"{self.name}: store: {self.path} {what}; nothing was changed: move it and its journal away, or pass "
-            "another folder"
+    def _entry(self, connection: sqlite3.Connection) -> _Entry:
+        """Return the store's response in the file, where it is entered if it is new."""
+        if self.name not in self._entries(connection):
+            self._enter(connection)
+        entries = self._entries(connection)
+        if self.name not in entries:
+            got = f"which holds no responses of simulator {self.name!r}"
+            todo = "look at name and folder"
+            raise self._refusal(Complaint(got, f"one of {list(entries)}", todo))
+        entry = entries[self.name]
+        if self.columns not in (None, entry.columns):
+            got = f"which holds inputs of {entry.columns} values for simulator {self.name!r}"
+            todo = "nothing was changed: give the simulator another name, or pass another folder"
+            raise self._refusal(Complaint(got, f"{self.columns} values", todo))
+        return entry
+
+    def _enter(self, connection: sqlite3.Connection) -> None:
+        """Enter the response, unless another process has, with what an old store knows of it."""
+        old = self._old()
+        columns = self.columns if old is None else old.shape[1] - 1
+        if columns is None:
+            return
+        row = (self.name, columns, None, None, None)
+        with transaction(connection):
+            made = connection.execute(INSERT_RESPONSE, (*row, checksum(*row), self.name))
+            if made.rowcount == 1 and old is not None:
+                runs = _rows(int(made.lastrowid or 0), old[:, :-1], old[:, -1], {})
+                connection.executemany(INSERT_RUN, runs)
+
+    def _old(self) -> Floats | None:
+        try:
+            return old_responses(self.folder, self.name)
+        except Exception as error:  # of what reads netCDF
+            got = f"beside files of an older version that cannot be read ({error})"
+            todo = "nothing was changed: move them away, or pass another folder"
+            raise self._refusal(Complaint(got, "sound ones", todo)) from error
+
+    def _entries(self, connection: sqlite3.Connection) -> dict[str, _Entry]:
+        """Return the responses in the file, by name."""
+        entries = {}
+        for number, *row, written in connection.execute(SELECT_RESPONSES).fetchall():
+            if written != checksum(*row):
+                raise self._refusal(damaged(f"response {number} does not match its checksum"))
+            name, columns, *_ = row
+            entries[name] = _Entry(number, columns)
+        return entries
+
+    def _read_on(self, session: _Session) -> None:
+        """Read the runs that the session has not seen; every one has to be there, and sound."""
+        with closing(session.connection.execute(SELECT_RUNS, (session.seen,))) as runs:
+            for number, *row, written in runs:
+                if number != session.seen + 1:
+                    raise self._refusal(damaged(f"run {session.seen + 1} is missing"))
+                if written != checksum(*row):
+                    raise self._refusal(damaged(f"run {number} does not match its checksum"))
+                response, key, _, _, value = row
+                if response == session.entry.number:
+                    session.known[key] = value
+                session.seen = number
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Turn what SQLite reports into a sentence."""
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise self._refusal(complaint_of(error)) from error
+
+    def _refusal(self, complaint: Complaint) -> StoreError:
+        return StoreError(
+            f"{self.name}: store: got {self.path}, {complaint.got}, expected {complaint.expected}; "
+            f"{complaint.todo}"
         )
 
 
-def _digest(data: xr.Dataset) -> str:
-    """Return a digest of the stored numbers."""
-    parts = [np.ascontiguousarray(data[key].values, dtype="<f8").tobytes() for key in ("inputs", "response")]
-    return hashlib.sha256(b"".join(parts)).hexdigest()
+def _keys(inputs: Floats) -> list[bytes]:
+    return [row.tobytes() for row in np.ascontiguousarray(inputs, dtype="<f8")]
+
+
+def _numbers(values: Iterable[bytes]) -> Floats:
+    return np.frombuffer(bytearray(b"".join(values)), dtype="<f8").astype(np.float64)
+
+
+def _rows(
+    response: int, inputs: Floats, values: Floats, reasons: Mapping[int, str]
+) -> list[tuple[Any, ...]]:
+    """Return rows of the table of runs."""
+    numbers = np.asarray(values, dtype="<f8")
+    rows = []
+    for i, key in enumerate(_keys(inputs)):
+        state = FAILED if i in reasons else COMPUTED
+        row = (response, key, state, reasons.get(i), numbers[i].tobytes())
+        rows.append((*row, checksum(*row)))
+    return rows
+
+
+# Connections that came with a fork: they are the parent's, and must not be closed here.
+_inherited: list[sqlite3.Connection] = []
+
+
+def _close(connection: sqlite3.Connection, process: int) -> None:
+    if process == os.getpid():
+        connection.close()
+    else:
+        _inherited.append(connection)

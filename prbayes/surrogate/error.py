@@ -1,4 +1,4 @@
-"""The cross-validated error of a surrogate."""
+"""The error of a surrogate by cross-validation."""
 
 from __future__ import annotations
 
@@ -8,21 +8,26 @@ from typing import Any
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes.surrogate.surfaces import FOLDS, fitted
+from prbayes.surrogate.surfaces import Surface, fitted
+
+# Tenfold: Kohavi (1995), A study of cross-validation and bootstrap for accuracy estimation and
+# model selection, IJCAI. More folds are nearer to the surface through all points, and cost as many
+# more fits.
+FOLDS = 10
 
 
 @dataclass(frozen=True, eq=False)
-class SurrogateError:
-    """The cross-validated error of a surrogate.
+class CrossValidation:
+    """The error of a surrogate by cross-validation.
 
     Attributes
     ----------
     residuals : ndarray, shape (n,)
-        Response less surrogate at each design point, fitted without a tenth of the points that this one belongs to;
-        in units of the response, NaN where the response failed.
+        Response less surrogate at each design point, fitted without a tenth of the points that this
+        one belongs to; in units of the response, NaN where the response failed.
     population_sd : float
-        Standard deviation of the response: over the prior predictive distribution where an input is a ``.dist()``, and
-        else over the ranges.
+        Standard deviation of the response: over the prior predictive distribution where an input is
+        a ``.dist()``, and else over the ranges.
     """
 
     residuals: Floats = field(repr=False)
@@ -44,14 +49,48 @@ class SurrogateError:
         return self.rms / self.population_sd
 
     def __str__(self) -> str:
-        return f"rms {self.rms:.3g} ({self.relative:.2%} of the population's sd), largest {self.largest:.3g}"
+        return (
+            f"rms {self.rms:.3g} ({self.relative:.2%} of the population's sd), "
+            f"largest {self.largest:.3g}"
+        )
 
 
-def cross_validated(model: Any, x: Floats, y: Floats, seed: int) -> Floats:
-    """Return responses less what the surface says that was fitted without their tenth of the points, shape (n,)."""
-    order = np.random.default_rng(seed).permutation(len(y))
+def cross_validated(model: Any, x: Floats, y: Floats, random_seed: int) -> Floats:
+    """Return responses less what a surface says that was fitted without their tenth of the points.
+
+    Parameters
+    ----------
+    model : Surface or regressor
+    x : ndarray, shape (n, d)
+        In the unit cube.
+    y : ndarray, shape (n,)
+    random_seed : int
+        Of the order in which points are dealt out to folds.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+    """
+    order = np.random.default_rng(random_seed).permutation(len(y))
     residuals = np.empty(len(y))
     for fold in np.array_split(order, min(FOLDS, len(y))):
-        rest = np.setdiff1d(order, fold)
-        residuals[fold] = y[fold] - fitted(model, x[rest], y[rest])(x[fold])
+        kept = np.setdiff1d(order, fold)
+        surface = fitted(model, x[kept], y[kept])
+        residuals[fold] = y[fold] - surface(x[fold])
     return residuals
+
+
+def points_needed(model: Any, dimensions: int) -> int:
+    """Return how many design points a surface needs, so that nine tenths of them determine it."""
+    # Nothing is known of a regressor: a constant is the least that it fits.
+    terms = model.terms(dimensions) if isinstance(model, Surface) else 1
+    n = terms + 2
+    while n - _largest_fold(n) < terms + 1:
+        n += 1
+    return n
+
+
+def _largest_fold(n: int) -> int:
+    """Return the size of the largest fold of n points."""
+    folds = min(FOLDS, n)
+    return -(-n // folds)

@@ -1,8 +1,8 @@
-"""Where a surrogate holds: a range for each input of a response, given or from a prior predictive distribution."""
+"""Where a surrogate holds: a range for each input of a response."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -12,46 +12,79 @@ from numpy.typing import ArrayLike, NDArray
 from pytensor.graph.basic import Variable
 
 from prbayes._checks import Floats, real_array
-from prbayes.model.simulator import model_on_context
 from prbayes.propagation.points import sobol
-from prbayes.response.compilation import compile_batched
-from prbayes.response.distributions import PopulationSampler, prior_draws, valid
-from prbayes.response.inputs import read_inputs
+from prbayes.surrogate.prior_predictive import POPULATIONS, SPECIMENS, predictive_inputs
 
-_POPULATIONS, _SPECIMENS = 512, 64  # of the prior predictive, by which inputs get their ranges
-_ROUNDING = 1e-9  # of a range
+# Share of a range by which a number may lie outside of it, for a bound that was computed in another
+# way: far above the rounding of double precision, and far below any distance at which a surface
+# would go astray.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Input:
-    """The range of one input: its lowest and highest value, shape (*event)."""
+class Range:
+    """The range of one input.
+
+    Attributes
+    ----------
+    name : str
+    low, high : ndarray, shape (*event)
+        Lowest and highest value, in the input's own units.
+    constant : bool
+        Whether it is one value only.
+    """
 
     name: str
     low: Floats
     high: Floats
     constant: bool = False
 
+    @property
+    def proper(self) -> bool:
+        """Whether it is finite, and not empty unless it is to be constant."""
+        finite = np.isfinite(self.low) & np.isfinite(self.high)
+        wide = self.low < self.high
+        return bool((finite & (wide | self.constant)).all())
+
+    @property
+    def size(self) -> int:
+        """Of how many numbers the input is made."""
+        return self.low.size
+
+    @property
+    def event(self) -> tuple[int, ...]:
+        """The shape of one value."""
+        return self.low.shape
+
 
 @dataclass(frozen=True, eq=False)
-class Region:
-    """The ranges of all inputs; specimens are rows with one column for each number."""
+class Ranges:
+    """The ranges of all inputs; specimens are rows with one column for each number.
 
-    inputs: tuple[Input, ...]
+    Attributes
+    ----------
+    inputs : tuple of Range
+    """
+
+    inputs: tuple[Range, ...]
 
     @cached_property
     def low(self) -> Floats:
         """Lowest values, shape (columns,)."""
-        return np.concatenate([e.low.ravel() for e in self.inputs])
+        return np.concatenate([one.low.ravel() for one in self.inputs])
 
     @cached_property
     def high(self) -> Floats:
         """Highest values, shape (columns,)."""
-        return np.concatenate([e.high.ravel() for e in self.inputs])
+        return np.concatenate([one.high.ravel() for one in self.inputs])
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
         """Which columns are not constant."""
-        return np.concatenate([np.full(e.low.size, not e.constant) for e in self.inputs])
+        return np.repeat(
+            [not one.constant for one in self.inputs],
+            [one.size for one in self.inputs],
+        )
 
     @property
     def dimensions(self) -> int:
@@ -60,118 +93,205 @@ class Region:
 
     def scaled(self, columns: Floats) -> Floats:
         """Return the free columns with their ranges mapped to [0, 1]."""
-        low, high = self.low[self.free], self.high[self.free]
+        low = self.low[self.free]
+        high = self.high[self.free]
         return np.asarray((columns[:, self.free] - low) / (high - low))
 
     def at(self, unit: Floats) -> Floats:
-        """Return rows for points of the unit cube."""
+        """Return rows for points of the unit cube, shape (n, dimensions)."""
         columns = np.tile(self.low, (len(unit), 1))
         columns[:, self.free] += unit * (self.high - self.low)[self.free]
         return columns
 
     def outside(self, columns: Floats) -> NDArray[np.bool_]:
-        """Return which numbers are outside of their range, NaN included."""
+        """Return which numbers are outside of their range, NaN included, shape (n, columns)."""
         slack = _ROUNDING * (self.high - self.low)
-        return np.asarray(~((columns >= self.low - slack) & (columns <= self.high + slack)))
+        above_low = columns >= self.low - slack
+        below_high = columns <= self.high + slack
+        # Comparisons with NaN are false.
+        return np.asarray(~(above_low & below_high))
 
     def complaint(self, columns: Floats, out: NDArray[np.bool_]) -> str:
-        """Say which inputs are outside."""
-        said, at = [], 0
-        for e in self.inputs:
-            part, wrong = columns[:, at : at + e.low.size], out[:, at : at + e.low.size]
-            at += e.low.size
-            if wrong.any():
-                got = f"{part[wrong].min():.6g} to {part[wrong].max():.6g}"
-                said.append(f"{e.name} from {got}, expected {np.min(e.low):.6g} to {np.max(e.high):.6g}")
-        return f"got {out.any(axis=1).sum()} of {len(columns)} points outside its design: {'; '.join(said)}"
+        """Say which inputs of rows are outside, given what `outside` returned."""
+        said = []
+        for one, where in self._by_input():
+            wrong = columns[:, where][out[:, where]]
+            if not wrong.size:
+                continue
+            got = f"{wrong.min():.6g} to {wrong.max():.6g}"
+            expected = f"{np.min(one.low):.6g} to {np.max(one.high):.6g}"
+            said.append(f"{one.name} from {got}, expected {expected}")
+        bad = out.any(axis=1).sum()
+        return f"got {bad} of {len(columns)} points outside its design: {'; '.join(said)}"
 
     def arguments(self, columns: Floats) -> list[Any]:
         """Return the response's arguments for rows: arrays (n, *event), and numbers."""
-        edges = np.cumsum([0, *(e.low.size for e in self.inputs)])
-        return [
-            float(e.low) if e.constant else columns[:, a:b].reshape(-1, *e.low.shape)
-            for e, a, b in zip(self.inputs, edges[:-1], edges[1:], strict=True)
-        ]
+        found: list[Any] = []
+        for one, where in self._by_input():
+            if one.constant:
+                found.append(float(one.low))
+            else:
+                found.append(columns[:, where].reshape(-1, *one.event))
+        return found
 
     def columns(self, values: Sequence[ArrayLike]) -> tuple[Floats, tuple[int, ...]]:
-        """Return inputs, shapes (..., *event), as rows, and their leading shape."""
+        """Return inputs as rows, and their leading shape.
+
+        Parameters
+        ----------
+        values : sequence of array_like, shapes (..., *event)
+            One per input; leading shapes broadcast.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If there are too few or many inputs, or one has the wrong shape.
+        """
         if len(values) != len(self.inputs):
-            names = ", ".join(e.name for e in self.inputs)
-            raise TypeError(f"surrogate: got {len(values)} inputs, expected {len(self.inputs)}: {names}")
-        arrays = [real_array(x, e.name) for x, e in zip(values, self.inputs, strict=True)]
-        for a, e in zip(arrays, self.inputs, strict=True):
-            if e.low.ndim and a.shape[-e.low.ndim :] != e.low.shape:
-                raise ValueError(f"{e.name}: got shape {a.shape}, expected (..., {', '.join(map(str, e.low.shape))})")
-        batch = np.broadcast_shapes(*(a.shape[: a.ndim - e.low.ndim] for a, e in zip(arrays, self.inputs, strict=True)))
-        full = [np.broadcast_to(a, batch + e.low.shape) for a, e in zip(arrays, self.inputs, strict=True)]
-        return np.concatenate(
-            [a.reshape(-1, e.low.size) for a, e in zip(full, self.inputs, strict=True)], axis=1
-        ), batch
+            names = ", ".join(one.name for one in self.inputs)
+            raise TypeError(
+                f"surrogate: got {len(values)} inputs, expected {len(self.inputs)}: {names}"
+            )
+        arrays = []
+        leading = []
+        for one, value in zip(self.inputs, values, strict=True):
+            array = real_array(value, one.name)
+            arrays.append(array)
+            leading.append(_leading_shape(one, array))
+        batch = np.broadcast_shapes(*leading)
+        rows = []
+        for one, array in zip(self.inputs, arrays, strict=True):
+            full = np.broadcast_to(array, batch + one.event)
+            rows.append(full.reshape(-1, one.size))
+        return np.concatenate(rows, axis=1), batch
+
+    def _by_input(self) -> Iterator[tuple[Range, slice]]:
+        """Yield inputs with their columns."""
+        start = 0
+        for one in self.inputs:
+            yield one, slice(start, start + one.size)
+            start += one.size
 
 
-def read_region(name: str, inputs: Any, coverage: float, seed: int) -> tuple[Region, Floats | None]:
-    """Return the ranges of inputs, and rows from the prior predictive distribution inside them if one is random.
+def _leading_shape(one: Range, array: Floats) -> tuple[int, ...]:
+    """Return the shape of an input without its event axes."""
+    axes = len(one.event)
+    if axes and array.shape[-axes:] != one.event:
+        event = ", ".join(map(str, one.event))
+        raise ValueError(f"{one.name}: got shape {array.shape}, expected (..., {event})")
+    return array.shape[: array.ndim - axes]
+
+
+def read_ranges(
+    name: str, inputs: Any, coverage: float, random_seed: int
+) -> tuple[Ranges, Floats | None]:
+    """Return the ranges of inputs, and rows of the prior predictive distribution inside them.
+
+    Parameters
+    ----------
+    name : str
+        For messages.
+    inputs : mapping or sequence
+        One entry per input: (low, high), a ``.dist()``, a variable of the model, or a number.
+    coverage : float
+        Share of its prior predictive distribution that the range of a random input covers.
+    random_seed : int
+
+    Returns
+    -------
+    ranges : Ranges
+    rows : ndarray, shape (n, columns), or None
+        None where no input is random; inputs with a range are uniform.
 
     Raises
     ------
     TypeError, ValueError
         If an input is no range, distribution or number, a range is empty, or all are constants.
     """
-    if not isinstance(inputs, Mapping | Sequence) or isinstance(inputs, str) or not len(inputs):
-        raise TypeError(f"{name}: inputs: got {inputs!r:.60}, expected a dict such as {{'k': (200, 300)}}, or a list")
+    is_list = isinstance(inputs, Mapping | Sequence) and not isinstance(inputs, str)
+    if not is_list or not len(inputs):
+        raise TypeError(
+            f"{name}: inputs: got {inputs!r:.60}, expected a dict such as {{'k': (200, 300)}}, "
+            "or a list"
+        )
     named = dict(inputs) if isinstance(inputs, Mapping) else dict(enumerate(inputs, 1))
-    random = [key for key, x in named.items() if isinstance(x, Variable)]
-    drawn = dict(zip(random, _predictive(name, [named[k] for k in random], seed), strict=True)) if random else {}
+    drawn = _drawn(name, named, random_seed)
+    ranges = _ranges(name, named, drawn, coverage)
+    if not drawn:
+        return ranges, None
+    rows = _predictive_rows(ranges, list(named), drawn, random_seed)
+    inside = ~ranges.outside(rows).any(axis=1)
+    return ranges, rows[inside]
+
+
+def _drawn(name: str, named: dict[Any, Any], random_seed: int) -> dict[Any, Floats]:
+    """Return prior predictive draws of the inputs that are random."""
+    random = {key: x for key, x in named.items() if isinstance(x, Variable)}
+    if not random:
+        return {}
+    draws = predictive_inputs(name, list(random.values()), random_seed)
+    return dict(zip(random, draws, strict=True))
+
+
+def _ranges(name: str, named: dict[Any, Any], drawn: dict[Any, Floats], coverage: float) -> Ranges:
+    """Return the ranges, given or from draws, each checked."""
     found = []
     for key, x in named.items():
-        label = key if isinstance(key, str) else str(getattr(x, "name", None) or f"input {key}")
-        e = _covering(label, drawn[key], coverage) if key in drawn else _range(name, label, x)
-        if not (np.isfinite(e.low) & np.isfinite(e.high) & (e.constant | (e.low < e.high))).all():
-            raise ValueError(f"{name}: {label}: got {e.low} to {e.high}, expected a range (low, high) with low < high")
-        found.append(e)
-    region = Region(tuple(found))
-    if not region.dimensions:
-        raise ValueError(f"{name}: inputs: got constants only, expected at least one range or distribution")
-    if not random:
-        return region, None
-    uniform = region.columns(region.arguments(region.at(sobol(_POPULATIONS * _SPECIMENS, region.dimensions, seed))))[0]
-    full = [drawn.get(key, values) for key, values in zip(named, region.arguments(uniform), strict=True)]
-    rows, _ = region.columns(
-        [f.reshape(-1, *e.low.shape) if np.ndim(f) else f for f, e in zip(full, found, strict=True)]
-    )
-    return region, rows[~region.outside(rows).any(axis=1)]
+        label = _label(key, x)
+        draws = drawn.get(key)
+        one = _given(name, label, x) if draws is None else _covering(label, draws, coverage)
+        if not one.proper:
+            raise ValueError(
+                f"{name}: {label}: got {one.low} to {one.high}, expected a range (low, high) with "
+                "low < high"
+            )
+        found.append(one)
+    ranges = Ranges(tuple(found))
+    if not ranges.dimensions:
+        raise ValueError(
+            f"{name}: inputs: got constants only, expected at least one range or distribution"
+        )
+    return ranges
 
 
-def _range(name: str, label: str, x: Any) -> Input:
+def _label(key: str | int, x: Any) -> str:
+    """Return what messages call an input."""
+    if isinstance(key, str):
+        return key
+    return str(getattr(x, "name", None) or f"input {key}")
+
+
+def _given(name: str, label: str, x: Any) -> Range:
+    """Return the range that was given, or a constant."""
     array = real_array(x, f"{name}: {label}")
     if array.shape == ():
-        return Input(label, array, array, constant=True)
+        return Range(label, array, array, constant=True)
     if array.shape != (2,):
         raise ValueError(
-            f"{name}: {label}: got shape {array.shape}, expected a range (low, high), a `.dist()`, a variable of the "
-            "model or a number"
+            f"{name}: {label}: got shape {array.shape}, expected a range (low, high), a `.dist()`, "
+            "a variable of the model or a number"
         )
-    return Input(label, array[0, ...], array[1, ...])
+    return Range(label, array[0, ...], array[1, ...])
 
 
-def _covering(label: str, draws: Floats, coverage: float) -> Input:
+def _covering(label: str, draws: Floats, coverage: float) -> Range:
+    """Return the range that covers the central share of draws, (populations, specimens, *event)."""
     tail = (1 - coverage) / 2
     low, high = np.quantile(draws, [tail, 1 - tail], axis=(0, 1))
-    return Input(label, np.asarray(low), np.asarray(high))
+    return Range(label, np.asarray(low), np.asarray(high))
 
 
-def _predictive(name: str, variables: list[Any], seed: int) -> list[Floats]:
-    """Return prior predictive draws of variables, shapes (populations, specimens, *event)."""
-    inputs = read_inputs(name, variables, model_on_context(None, f"{name}: inputs that are distributions"))
-    symbols = inputs.placeholders()
-    thetas = prior_draws(inputs.roots, _POPULATIONS, seed)
-    ok = compile_batched(symbols, [valid(inputs, inputs.rebuilt(symbols)[0])])(*thetas)[0]
-    usable = np.flatnonzero(np.broadcast_to(ok, _POPULATIONS))
-    if not usable.size:
-        raise ValueError(
-            f"{name}: got invalid parameters of the inputs at all draws of the priors, expected valid ones"
-        )
-    chosen = usable[np.arange(_POPULATIONS) % usable.size]
-    drawn = PopulationSampler(inputs)([t[chosen] for t in thetas], _SPECIMENS, np.random.default_rng(seed))
-    size = (_POPULATIONS, _SPECIMENS)
-    return [np.broadcast_to(x, (*size, *x.shape[2:])).astype(np.float64) for x in inputs.fill(*drawn)]
+def _predictive_rows(
+    ranges: Ranges, keys: list[Any], drawn: dict[Any, Floats], random_seed: int
+) -> Floats:
+    """Return rows of the prior predictive distribution; inputs with a range are uniform."""
+    unit = sobol(POPULATIONS * SPECIMENS, ranges.dimensions, random_seed)
+    uniform = ranges.arguments(ranges.at(unit))
+    values: list[Any] = []
+    for key, one, otherwise in zip(keys, ranges.inputs, uniform, strict=True):
+        if key in drawn:
+            values.append(drawn[key].reshape(-1, *one.event))
+        else:
+            values.append(otherwise)
+    rows, _ = ranges.columns(values)
+    return rows

@@ -1,35 +1,67 @@
-"""What a surrogate is made of: response surfaces, their cross-validation, residuals that repeat for the same input."""
+"""Response surfaces: radial basis functions, polynomials, and what users bring along."""
 
 from __future__ import annotations
 
 import copy
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import product
 from math import comb
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
 
-FOLDS = 10
-_KERNELS = {"linear": 0, "thin_plate_spline": 1, "cubic": 1, "quintic": 2}  # and the degree that each needs
+# The lowest degree with which each kernel is conditionally positive definite, so that the
+# interpolant is unique: Wendland (2005), Scattered Data Approximation, ch. 8;
+# scipy.interpolate.RBFInterpolator warns below it.
+_LOWEST_DEGREE = {"linear": 0, "thin_plate_spline": 1, "cubic": 1, "quintic": 2}
 
 Predict = Callable[[Floats], Floats]
 
 
-class Surface:
-    """A response surface that ships: `RadialBasis`, `Polynomial`."""
+class Surface(ABC):
+    """A kind of response surface: `RadialBasis`, `Polynomial`, or one of your own.
 
+    A surface of your own derives from it and says how many points it needs, and what passes through
+    them.
+
+    Examples
+    --------
+    >>> import numpy as np, prbayes as prb
+    >>> from prbayes.surrogate import Surface
+    >>> class Constant(Surface):
+    ...     def terms(self, dimensions):
+    ...         return 1
+    ...
+    ...     def through(self, x, y):
+    ...         return lambda at: np.full(len(at), y.mean())
+    >>> prb.Surrogate.fit(lambda x: 0 * x + 3, {"x": (0, 1)}, 8, model=Constant())(0.5)
+    array(3.)
+    """
+
+    @abstractmethod
     def terms(self, dimensions: int) -> int:
-        """Return how many points it needs at least."""
-        raise NotImplementedError
+        """Return how many points it needs at least, for inputs of so many dimensions."""
 
+    @abstractmethod
     def through(self, x: Floats, y: Floats) -> Predict:
-        """Return the surface through (for least squares: along) points x, shape (n, d), in the unit cube."""
-        raise NotImplementedError
+        """Return the surface through points, or, by least squares, along them.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n, d)
+            In the unit cube.
+        y : ndarray, shape (n,)
+            Responses, of mean 0 and standard deviation 1.
+
+        Returns
+        -------
+        callable
+            From points, shape (k, d), to values, shape (k,).
+        """
 
 
 @dataclass(frozen=True)
@@ -39,13 +71,15 @@ class RadialBasis(Surface):
     Parameters
     ----------
     kernel : str
-        Of `scipy.interpolate.RBFInterpolator`: linear, thin_plate_spline, cubic or quintic, which need no scale.
+        Of `scipy.interpolate.RBFInterpolator`: linear, thin_plate_spline, cubic or quintic, which
+        need no scale.
     degree : int, optional
         Of the polynomial; by default the lowest that the kernel needs.
     smoothing : float
         0 passes through the points; more smooths a response that is noisy.
     neighbors : int, optional
-        How many of the nearest points are used; all by default. Some 50, where there are thousands of points.
+        How many of the nearest points are used; all by default. Some 50, where there are thousands
+        of points.
 
     Raises
     ------
@@ -64,29 +98,45 @@ class RadialBasis(Surface):
     neighbors: int | None = None
 
     def __post_init__(self) -> None:
-        if self.kernel not in _KERNELS:
-            raise ValueError(f"RadialBasis: kernel: got {self.kernel!r}, expected one of {list(_KERNELS)}")
+        if self.kernel not in _LOWEST_DEGREE:
+            kernels = list(_LOWEST_DEGREE)
+            raise ValueError(f"RadialBasis: kernel: got {self.kernel!r}, expected one of {kernels}")
         if self.degree is not None:
-            positive_integer(self.degree, "RadialBasis: degree", minimum=_KERNELS[self.kernel])
-        if not isinstance(self.smoothing, int | float) or not 0 <= self.smoothing < np.inf:
-            raise ValueError(f"RadialBasis: smoothing: got {self.smoothing!r}, expected a number >= 0")
+            lowest = _LOWEST_DEGREE[self.kernel]
+            positive_integer(self.degree, "RadialBasis: degree", minimum=lowest)
+        is_number = isinstance(self.smoothing, int | float)
+        if not is_number or not 0 <= self.smoothing < np.inf:
+            raise ValueError(
+                f"RadialBasis: smoothing: got {self.smoothing!r}, expected a number >= 0"
+            )
         if self.neighbors is not None:
             positive_integer(self.neighbors, "RadialBasis: neighbors", minimum=2)
 
     def terms(self, dimensions: int) -> int:
         """Return the number of terms of the polynomial."""
-        degree = _KERNELS[self.kernel] if self.degree is None else self.degree
+        degree = self._degree()
         return comb(dimensions + degree, degree)
 
     def through(self, x: Floats, y: Floats) -> Predict:
         """Return the interpolant."""
-        from scipy.interpolate import RBFInterpolator  # takes as long to import as the whole package
+        from scipy.interpolate import (
+            RBFInterpolator,
+        )  # takes as long to import as the whole package
 
-        degree = _KERNELS[self.kernel] if self.degree is None else self.degree
-        found: Predict = RBFInterpolator(
-            x, y, neighbors=self.neighbors, smoothing=self.smoothing, kernel=self.kernel, degree=degree
+        surface: Predict = RBFInterpolator(
+            x,
+            y,
+            neighbors=self.neighbors,
+            smoothing=self.smoothing,
+            kernel=self.kernel,
+            degree=self._degree(),
         )
-        return found
+        return surface
+
+    def _degree(self) -> int:
+        if self.degree is None:
+            return _LOWEST_DEGREE[self.kernel]
+        return self.degree
 
 
 @dataclass(frozen=True)
@@ -118,20 +168,66 @@ class Polynomial(Surface):
         """Return the number of coefficients."""
         return comb(dimensions + self.degree, self.degree)
 
-    def _basis(self, x: Floats) -> Floats:
-        single = np.polynomial.legendre.legvander(2 * x - 1, self.degree)  # (n, d, degree + 1)
-        powers = [p for p in product(range(self.degree + 1), repeat=x.shape[1]) if sum(p) <= self.degree]
-        return np.stack([np.prod([single[:, i, k] for i, k in enumerate(p)], axis=0) for p in powers], axis=1)
-
     def through(self, x: Floats, y: Floats) -> Predict:
         """Return the polynomial of least squares."""
         coefficients = np.linalg.lstsq(self._basis(x), y, rcond=None)[0]
         return lambda at: np.asarray(self._basis(at) @ coefficients)
 
+    def _basis(self, x: Floats) -> Floats:
+        """Return products of Legendre polynomials at points of the unit cube, shape (n, terms)."""
+        dimensions = x.shape[1]
+        # One input at a time, shape (n, d, degree + 1).
+        single = np.polynomial.legendre.legvander(2 * x - 1, self.degree)
+        columns = []
+        for degrees in product(range(self.degree + 1), repeat=dimensions):
+            if sum(degrees) > self.degree:
+                continue
+            factors = [single[:, i, k] for i, k in enumerate(degrees)]
+            columns.append(np.prod(factors, axis=0))
+        return np.stack(columns, axis=1)
+
+
+# Those that a file can name, so that it is read without being handed the surface.
+_SHIPPED: dict[str, type[RadialBasis] | type[Polynomial]] = {
+    "RadialBasis": RadialBasis,
+    "Polynomial": Polynomial,
+}
+
+
+def settings_of(model: Any) -> dict[str, Any]:
+    """Return what a file keeps of a surface that ships with prbayes; of any other one nothing."""
+    if isinstance(model, RadialBasis | Polynomial):
+        return asdict(model)
+    return {}
+
+
+def shipped(kind: str, settings: dict[str, Any]) -> Surface | None:
+    """Return the surface with such settings, or None if no such kind ships with prbayes."""
+    if kind not in _SHIPPED:
+        return None
+    return _SHIPPED[kind](**settings)
+
 
 def fitted(model: Any, x: Floats, y: Floats) -> Predict:
-    """Return a surface, or a copy of a regressor with ``fit`` and ``predict``, fitted to responses of unit spread."""
-    center, spread = y.mean(), y.std() or 1.0
+    """Return a surface, or a copy of a regressor, fitted to responses of unit spread.
+
+    Parameters
+    ----------
+    model : Surface or regressor
+        A regressor has ``fit(X, y)`` and ``predict(X)``.
+    x : ndarray, shape (n, d)
+        In the unit cube.
+    y : ndarray, shape (n,)
+        In units of the response.
+
+    Returns
+    -------
+    callable
+        From points, shape (k, d), to responses, shape (k,).
+    """
+    center = y.mean()
+    # A response that is constant has no spread to divide by.
+    spread = y.std() or 1.0
     z = (y - center) / spread
     if isinstance(model, Surface):
         predict = model.through(x, z)
@@ -139,27 +235,10 @@ def fitted(model: Any, x: Floats, y: Floats) -> Predict:
         regressor = copy.deepcopy(model)
         regressor.fit(x, z)
         predict = regressor.predict
-    return lambda at: center + spread * np.asarray(predict(at), dtype=np.float64).reshape(len(at))
 
+    def in_units(at: Floats) -> Floats:
+        values = np.asarray(predict(at), dtype=np.float64)
+        # Some regressors give a column.
+        return np.asarray(center + spread * values.reshape(len(at)))
 
-def required(model: Any, dimensions: int) -> int:
-    """Return how many design points a surface needs, so that nine tenths of them determine it."""
-    terms = model.terms(dimensions) if isinstance(model, Surface) else 1
-    n = terms + 2
-    while n - -(-n // min(FOLDS, n)) < terms + 1:
-        n += 1
-    return n
-
-
-def scattered(x: Floats, seed: int) -> NDArray[np.uint64]:
-    """Return a number for each row of x, shape (n, d), that is the same for the same row, and else as if random.
-
-    The rows' bits go through the finalizer of splitmix64 (Steele, Lea and Flood 2014, doi:10.1145/2660193.2660195).
-    """
-    h = np.full(len(x), seed, dtype=np.uint64)
-    for column in np.ascontiguousarray(x.T + 0.0):  # -0.0 is 0.0
-        h = (h ^ column.view(np.uint64)) + np.uint64(0x9E3779B97F4A7C15)
-        h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        h = h ^ (h >> np.uint64(31))
-    return h
+    return in_units

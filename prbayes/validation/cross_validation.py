@@ -1,25 +1,35 @@
-"""Cross-validation of a discrepancy: `held_out`."""
+"""Cross-validation of a discrepancy: `cross_validate`."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
-from prbayes._checks import positive_integer
+from prbayes._checks import Floats, positive_integer
 from prbayes.estimate.data_sets import DataSets, specimens
 from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refit import SamplingDistribution
+from prbayes.metrics.base import Discrepancy
+from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import versions
+from prbayes.model.simulator import Node
+
+# Sets the random numbers of folds apart from others with the same seed; any integer does.
+_STREAM = 3
 
 
-def held_out(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) -> xr.Dataset:
+def cross_validate(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) -> xr.Dataset:
     """Calibrate on parts of the specimens, and return the discrepancy of those left out.
 
-    In place of LOO and WAIC, which do not apply to a discrepancy: it is one value for all specimens together.
-    The smaller the mean, the better the family of populations predicts other specimens. Only discrepancies of
-    the same metric, data and folds are to be compared: between families, responses or inputs, not between
-    metrics. Minimisations start at the optimum and, with `Reweighted`, compute no response.
+    In place of LOO and WAIC, which do not apply to a discrepancy: it is one value for all specimens
+    together. The smaller the mean, the better the family of populations predicts other specimens.
+    Only discrepancies of the same metric, data and folds are to be compared: between families,
+    responses or inputs, not between metrics. Minimisations start at the optimum and, with
+    `Reweighted`, compute no response.
 
     Parameters
     ----------
@@ -33,20 +43,20 @@ def held_out(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) -> xr.Da
     Returns
     -------
     xarray.Dataset
-        Dims (fold, simulator): ``discrepancy`` of the specimens left out, ``calibrated`` of the others, in
-        units of the metric; ``n_held_out``; and ``converged`` by fold. Where a fold has no observation of a
-        simulator its discrepancy is NaN.
+        Dims (fold, simulator): ``discrepancy`` of the specimens left out, ``calibrated`` of the
+        others, in units of the metric; ``n_held_out``; and ``converged`` by fold. Where a fold has
+        no observation of a simulator its discrepancy is NaN.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is not as described, there are fewer specimens than two per fold, or nothing is known
-        of a metric or propagation (`FunctionMetric`, `Fresh`).
+        If an argument is not as described, there are fewer specimens than two per fold, or nothing
+        is known of a metric or propagation (`FunctionMetric`, `Fresh`).
 
     References
     ----------
-    .. [1] Geisser, S. (1975), The predictive sample reuse method with applications, J. Am. Stat. Assoc. 70, 320-328,
-       doi:10.1080/01621459.1975.10479865.
+    .. [1] Geisser, S. (1975), The predictive sample reuse method with applications, J. Am. Stat.
+       Assoc. 70, 320-328, doi:10.1080/01621459.1975.10479865.
 
     Examples
     --------
@@ -55,48 +65,139 @@ def held_out(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) -> xr.Da
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
     ...     y = prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=data)
-    >>> found = prb.held_out(prb.minimize(model))
+    >>> found = prb.cross_validate(prb.minimize(model))
     >>> found.discrepancy.dims, bool((found.discrepancy > found.calibrated).mean() > 0.5)
     (('fold', 'simulator'), True)
     """
     if not isinstance(optimum, Optimum):
-        raise TypeError(f"held_out: got {type(optimum).__name__}, expected an Optimum; call prb.minimize() first")
-    evaluator = surveyed(optimum, "held_out").evaluator
+        raise TypeError(
+            f"cross_validate: got {type(optimum).__name__}, expected an Optimum; call "
+            "prb.minimize() first"
+        )
+    evaluator = surveyed(optimum, "cross_validate").evaluator
     reason = refit_obstacle(evaluator)
     if reason:
-        raise ValueError(f"held_out: {reason}, so that the model cannot be calibrated anew")
+        raise ValueError(f"cross_validate: {reason}, so that the model cannot be calibrated anew")
     folds = positive_integer(folds, "folds", minimum=2)
-    numbers, total = specimens(evaluator.nodes)
-    if total < 2 * folds:
-        raise ValueError(f"folds: got {folds} for {total} specimens, expected at most {total // 2}")
-    fold = np.random.default_rng([random_seed, 3]).permutation(np.arange(total) % folds)
-    targets = [n.target for n in evaluator.nodes]
-    out = [fold[number] == np.arange(folds)[:, None] for number in numbers]
-    kept = [np.where(o, 0.0, t.weights) for o, t in zip(out, targets, strict=True)]
-    few = [n.name for n, w in zip(evaluator.nodes, kept, strict=True) if ((w > 0).sum(axis=1) < 2).any()]
-    if few:
-        raise ValueError(f"folds: got {folds}, with fewer than 2 observations of {few} in the others, expected fewer")
-    kept = [w / w.sum(axis=1, keepdims=True) for w in kept]
-    scales = np.array(list(optimum.scales.values()))
-    sampling = SamplingDistribution.of(evaluator, optimum.theta, scales)
-    x, converged = sampling.refit(DataSets([t.observed for t in targets], kept))
-    thetas = sampling.thetas(x)
-    found = np.full((2, folds, len(targets)), np.nan)
-    for k, target in enumerate(targets):
-        values, weights = evaluator.populations(thetas, k)
-        for i in range(folds):
-            for j, w in enumerate((np.where(out[k][i], target.weights, 0.0), kept[k][i])):
-                if w.sum() > 0:
-                    other = target.with_observed(target.observed, w / w.sum())
-                    found[j, i, k] = other.of(values[i : i + 1], weights[i : i + 1])[0]
+    parts = _Folds.dealt(evaluator.nodes, folds, random_seed)
+
+    # Calibrate on the others of each fold.
+    observed = [node.target.observed for node in evaluator.nodes]
+    units = np.array(list(optimum.scales.values()))
+    neighbourhood = SamplingDistribution.of(evaluator, optimum.theta, units)
+    x, converged = neighbourhood.refit(DataSets(observed, parts.kept))
+    thetas = neighbourhood.thetas(x)
+
+    # Compare what was found with both parts.
+    left_out = _discrepancies(evaluator, thetas, parts.left_out)
+    calibrated = _discrepancies(evaluator, thetas, parts.kept)
+
     where = ["fold", "simulator"]
     return xr.Dataset(
         {
-            "discrepancy": (where, found[0]),
-            "calibrated": (where, found[1]),
-            "n_held_out": (where, np.array([o.sum(axis=1) for o in out]).T),
+            "discrepancy": (where, left_out),
+            "calibrated": (where, calibrated),
+            "n_held_out": (where, parts.sizes),
             "converged": ("fold", converged),
         },
-        coords={"fold": np.arange(folds), "simulator": [n.name for n in evaluator.nodes]},
+        coords={
+            "fold": np.arange(folds),
+            "simulator": [node.name for node in evaluator.nodes],
+        },
         attrs={"random_seed": str(random_seed), **versions()},
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Folds:
+    """The parts of the specimens, as weights of the observations.
+
+    Attributes
+    ----------
+    left_out, kept : list of ndarray, shapes (folds, n_k)
+        By simulator: weights of the observations of a fold, and of the others; those kept sum to
+        one.
+    sizes : ndarray of int, shape (folds, simulators)
+        Observations left out.
+    """
+
+    left_out: list[Floats]
+    kept: list[Floats]
+    sizes: NDArray[np.intp]
+
+    @classmethod
+    def dealt(cls, nodes: list[Node], folds: int, random_seed: int) -> _Folds:
+        """Deal specimens out at random, those with the same label together."""
+        numbers, total = specimens(nodes)
+        if total < 2 * folds:
+            raise ValueError(
+                f"folds: got {folds} for {total} specimens, expected at most {total // 2}"
+            )
+        rng = np.random.default_rng([random_seed, _STREAM])
+        fold_of = rng.permutation(np.arange(total) % folds)
+        left_out = []
+        kept = []
+        sizes = []
+        few = []
+        for node, number in zip(nodes, numbers, strict=True):
+            weights = node.target.weights
+            out = fold_of[number] == np.arange(folds)[:, None]
+            others = np.where(out, 0.0, weights)
+            left = (others > 0).sum(axis=1)
+            if (left < 2).any():
+                few.append(node.name)
+            left_out.append(np.where(out, weights, 0.0))
+            kept.append(others)
+            sizes.append(out.sum(axis=1))
+        if few:
+            raise ValueError(
+                f"folds: got {folds}, with fewer than 2 observations of {few} in the others, "
+                "expected fewer"
+            )
+        kept = [w / w.sum(axis=1, keepdims=True) for w in kept]
+        return cls(left_out, kept, np.array(sizes).T)
+
+
+def _discrepancies(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> Floats:
+    """Return discrepancies of populations from weighted data.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    thetas : ndarray, shape (folds, d)
+    data : list of ndarray, shapes (folds, n_k)
+        By simulator: weights of the observations.
+
+    Returns
+    -------
+    ndarray, shape (folds, simulators)
+    """
+    columns = []
+    for k, node in enumerate(evaluator.nodes):
+        values, weights = evaluator.populations(thetas, k)
+        column = []
+        for i in range(len(thetas)):
+            one = slice(i, i + 1)
+            found = _discrepancy(node.target, data[k][i], values[one], weights[one])
+            column.append(found)
+        columns.append(column)
+    return np.array(columns).T
+
+
+def _discrepancy(target: Discrepancy, data: Floats, values: Floats, weights: Floats) -> float:
+    """Return the discrepancy of a population from weighted data, or NaN if there are none.
+
+    Parameters
+    ----------
+    target : Discrepancy
+        Of all observations.
+    data : ndarray, shape (n,)
+        Weights of the observations.
+    values, weights : ndarray, shape (1, m)
+        The population.
+    """
+    total = data.sum()
+    if not total > 0:
+        return np.nan
+    other = target.with_observed(target.observed, data / total)
+    return float(other.of(values, weights)[0])

@@ -15,33 +15,50 @@ from prbayes.estimate.data_sets import groups, sets_at, simulated_points, specim
 from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, surveyed
 from prbayes.estimate.refit import SamplingDistribution
+from prbayes.model.simulator import Node
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
-from prbayes.validation.nulls import Case, Condition, Predictive, SimulatedNull
+from prbayes.validation.conditions import Case, Condition
+from prbayes.validation.nulls import LEAST_REPLICATES, SimulatedNull
+from prbayes.validation.predictive import Predictive
 
-_DIFFERENT = 0.1  # between distribution functions of predicted values and of the population at the optimum
+# Between the distribution functions of predicted values and of the population at the optimum. By
+# judgement: 500 random samples of a population differ from it by .06 at 5%, and those of `predict`
+# by far less; a normal population a quarter of a standard deviation away differs by .1.
+_DIFFERENT = 0.1
+
+# Probabilities at which the two are compared; between them a distribution function moves by .05,
+# half of the above.
+_PROBED = np.linspace(0.05, 0.95, 19)
+
+# Share of minimisations that must converge. By judgement: replicates are then those of most data
+# sets, and not of an odd few.
+_CONVERGED = 0.5
 
 
 @dataclass(frozen=True)
 class JointNull(SimulatedNull):
-    """Calibration and test data come together from the calibrated model, which is calibrated anew each time.
+    """Calibration and test data come together from the calibrated model.
 
-    For tests on the calibration's own specimens, under the same conditions or others: a model that was fitted
-    to them follows them more closely than fresh ones. Each replicate draws specimens from the population at
-    the optimum, minimises the discrepancy for their calibration data, and tests their responses against the
-    population found. The predicted population is that of `predict` with the optimum. Minimisations are those of
-    the parametric `bootstrap`: with `Reweighted` they compute no response.
+    The model is calibrated anew each time.
+
+    For tests on the calibration's own specimens, under the same conditions or others: a model that
+    was fitted to them follows them more closely than fresh ones. Each replicate draws specimens
+    from the population at the optimum, minimises the discrepancy for their calibration data, and
+    tests their responses against the population found. The predicted population is that of
+    `predict` with the optimum. Minimisations are those of the parametric `bootstrap`: with
+    `Reweighted` they compute no response.
 
     Parameters
     ----------
     optimum : Optimum
         From `minimize`, without the prior.
     responses : tuple or mapping, optional
-        ``(response, *inputs)`` of the tested condition, or such tuples by the names of conditions, as they were
-        given to `predict`. Conditions without one are the model's simulators, by name; one condition alone is
-        the only simulator.
+        ``(response, *inputs)`` of the tested condition, or such tuples by the names of conditions,
+        as they were given to `predict`. Conditions without one are the model's simulators, by name;
+        one condition alone is the only simulator.
     replicates : int
-    seed : int
+    random_seed : int
 
     Raises
     ------
@@ -59,138 +76,245 @@ class JointNull(SimulatedNull):
     ...     y = prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=data)
     >>> optimum = prb.minimize(model)
     >>> predicted = prb.predict(optimum, np.positive, x, random_seed=1)
-    >>> prb.area_test(data, predicted, null=prb.JointNull(optimum, replicates=199)).rejected
+    >>> null = prb.validation.JointNull(optimum, replicates=199)
+    >>> prb.area_test(data, predicted, null=null).rejected
     False
     """
 
     own_specimens: ClassVar[bool] = True
 
     optimum: Optimum = field(repr=False)
-    responses: tuple[Any, ...] | Mapping[str, tuple[Any, ...]] | None = field(default=None, repr=False)
+    responses: tuple[Any, ...] | Mapping[str, tuple[Any, ...]] | None = field(
+        default=None, repr=False
+    )
     replicates: int = 999
-    seed: int = 0
+    random_seed: int = 0
 
     def __post_init__(self) -> None:
         if not isinstance(self.optimum, Optimum):
             raise TypeError(
-                f"JointNull: got {type(self.optimum).__name__}, expected an Optimum; call prb.minimize() first"
+                f"JointNull: got {type(self.optimum).__name__}, expected an Optimum; call "
+                "prb.minimize() first"
             )
         reason = refit_obstacle(surveyed(self.optimum, "JointNull").evaluator)
         if reason:
-            raise ValueError(f"JointNull: {reason}, so that the model cannot be calibrated anew; use PosteriorNull()")
-        positive_integer(self.replicates, "JointNull: replicates", minimum=19)
-        positive_integer(self.seed, "JointNull: seed", minimum=0)
+            raise ValueError(
+                f"JointNull: {reason}, so that the model cannot be calibrated anew; use "
+                "prb.validation.PosteriorNull()"
+            )
+        positive_integer(self.replicates, "JointNull: replicates", minimum=LEAST_REPLICATES)
+        positive_integer(self.random_seed, "JointNull: random_seed", minimum=0)
 
     def replicates_of(self, case: Case) -> Iterator[Floats]:
         """Draw, calibrate, test."""
-        evaluator, theta, ties = self.optimum.evaluator, self.optimum.theta, case.rng(1)
-        found = [self._served(case, c) for c in case.conditions]
-        numbers, total = self._numbers(case, [k for k, _ in found])
-        populations = [evaluator.populations(theta[None], k) for k in range(len(evaluator.nodes))]
-        for c, (k, values) in zip(case.conditions, found, strict=True):
-            _refuse_other(c, populations[k][0][0] if values is None else values, populations[k][1][0])
-        points = simulated_points(evaluator, populations, self.replicates, self.seed, more=total)
-        scales = np.array(list(self.optimum.scales.values()))
-        sampling = SamplingDistribution.of(evaluator, theta, scales)
-        x, converged = sampling.refit(sets_at(evaluator, populations, points))
-        if converged.mean() < 0.5:
-            raise ValueError(
-                f"JointNull: got {converged.mean():.0%} of the minimisations converged, expected most; look at "
-                "prb.diagnose(optimum)"
-            )
-        thetas = sampling.thetas(x[converged])
-        u: list[Floats] = []
-        for (k, values), number in zip(found, numbers, strict=True):
-            measured = (populations[k][0][0] if values is None else values)[points[k][converged][:, number]]
-            refitted, weights = evaluator.populations(thetas, k)
-            own = refitted if values is None else np.broadcast_to(values, weights.shape)
-            rows = zip(own, weights, measured, strict=True)
-            u.append(np.array([Predictive(v, w).transform(y, ties) for v, w, y in rows]))
-        together = np.concatenate(u, axis=1)
-        yield together[~np.isnan(together).any(axis=1)]
+        evaluator = self.optimum.evaluator
+        theta = self.optimum.theta
+        ties = case.rng(1)
+        served = [self._served(case, condition) for condition in case.conditions]
+        numbers, more = _specimen_numbers(evaluator.nodes, served)
+        simulators = range(len(evaluator.nodes))
+        populations = [evaluator.populations(theta[None], k) for k in simulators]
+        for one in served:
+            values, weights = populations[one.simulator]
+            _refuse_other(one.condition, one.values_or(values[0]), weights[0])
 
-    def _served(self, case: Case, condition: Condition) -> tuple[int, Floats | None]:
-        """Return the simulator whose points are the specimens, and responses at them unless they are its own."""
-        nodes = self.optimum.evaluator.nodes
-        names = [n.name for n in nodes]
+        # Draw specimens, and calibrate the model to what is measured on them.
+        points = simulated_points(
+            evaluator, populations, self.replicates, self.random_seed, more=more
+        )
+        thetas, converged = self._calibrated(populations, points)
+
+        # Test their responses against the population that was found.
+        u: list[Floats] = []
+        for one, number in zip(served, numbers, strict=True):
+            at_optimum, _ = populations[one.simulator]
+            drawn = points[one.simulator][converged][:, number]
+            measured = one.values_or(at_optimum[0])[drawn]
+            refitted, weights = evaluator.populations(thetas, one.simulator)
+            values = np.broadcast_to(one.values_or(refitted), weights.shape)
+            found = []
+            for row, weight, y in zip(values, weights, measured, strict=True):
+                found.append(Predictive(row, weight).transform(y, ties))
+            u.append(np.array(found))
+        together = np.concatenate(u, axis=1)
+        missing = np.isnan(together).any(axis=1)
+        yield together[~missing]
+
+    def describe(self, case: Case) -> str:
+        """Return what is held to be true."""
+        return (
+            "calibration and test data come from the calibrated model, which is calibrated anew in "
+            "each replicate"
+        )
+
+    def _calibrated(
+        self, populations: list[tuple[Floats, Floats]], points: list[NDArray[np.intp]]
+    ) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return the minimisers of the replicates that converged, (r, d), and which did."""
+        evaluator = self.optimum.evaluator
+        units = np.array(list(self.optimum.scales.values()))
+        neighbourhood = SamplingDistribution.of(evaluator, self.optimum.theta, units)
+        x, converged = neighbourhood.refit(sets_at(evaluator, populations, points))
+        if converged.mean() < _CONVERGED:
+            raise ValueError(
+                f"JointNull: got {converged.mean():.0%} of the minimisations converged, expected "
+                "most; look at prb.diagnose(optimum)"
+            )
+        return neighbourhood.thetas(x[converged]), converged
+
+    def _served(self, case: Case, condition: Condition) -> _Served:
+        """Return the simulator whose points are the specimens, and the responses at them."""
         if condition.predicted.shape[0] > 1:
             raise ValueError(
-                f"{condition.name}: predicted: got {len(condition.predicted)} draws, expected the one population at "
-                "the optimum, which JointNull calibrates anew; pass prb.predict(optimum, ...)"
+                f"{condition.name}: predicted: got {len(condition.predicted)} draws, expected the "
+                "one population at the optimum, which JointNull calibrates anew; pass "
+                "prb.predict(optimum, ...)"
             )
         given = self.responses
         if isinstance(given, Mapping):
             given = given.get(condition.name)
         if given is None:
-            if len(case.conditions) == len(nodes) == 1:
-                return 0, None
-            if condition.name in names:
-                return names.index(condition.name), None
-            raise ValueError(
-                f"JointNull: got the condition {condition.name!r}, expected the name of a simulator, {names}; or pass "
-                f"responses={{{condition.name!r}: (response, *inputs)}}"
-            )
+            return _Served(condition, self._own_simulator(case, condition), None)
+
         response, *inputs = given
         refuse_uncallable(condition.name, response)
         sorted_inputs = read_inputs(condition.name, inputs, self.optimum.model)
-        labels = set(condition.labels or ())
-        # First the simulators that measured these specimens.
-        among = sorted(nodes, key=lambda n: n.specimens is None or not labels & set(specimen_names(n.specimens)))
         called = Responses(condition.name, response, sorted_inputs)
-        node = serving(among, called)
+        nodes = self.optimum.evaluator.nodes
+        node = serving(_measuring_first(nodes, condition), called)
         if node is None:
             raise ValueError(
-                f"{condition.name}: responses: got inputs that no simulator with prb.Reweighted has, expected its "
-                ".dist() objects; only then is it known which responses belong to the specimens of the calibration"
+                f"{condition.name}: responses: got inputs that no simulator with prb.Reweighted "
+                "has, expected its .dist() objects; only then is it known which responses belong "
+                "to the specimens of the calibration"
             )
         assert node.design is not None
-        return nodes.index(node), node.design.values_of(called)
+        return _Served(condition, nodes.index(node), node.design.values_of(called))
 
-    def _numbers(self, case: Case, served: list[int]) -> tuple[list[NDArray[np.intp]], int]:
-        """Return the specimens of each condition, those of the calibration by their numbers, and how many are new."""
-        nodes = self.optimum.evaluator.nodes
-        own, total = specimens(nodes)
-        together = {k: i for i, group in enumerate(groups(nodes)) for k in group}
-        known: dict[str, tuple[int, int]] = {}  # number, and group of simulators whose points are drawn together
-        for k, node in enumerate(nodes):
-            if node.specimens is not None:
-                known |= {s: (int(i), together[k]) for s, i in zip(specimen_names(node.specimens), own[k], strict=True)}
-        more, out = 0, []
-        for j, (c, k) in enumerate(zip(case.conditions, served, strict=True)):
-            if data_digest(c.observed) == data_digest(nodes[k].target.observed):
-                number = np.empty(c.observed.size, dtype=np.intp)
-                number[np.argsort(c.observed, kind="stable")] = own[k][
-                    np.argsort(nodes[k].target.observed, kind="stable")
-                ]
-                out.append(number)
-                continue
-            labels = c.labels or tuple(f"{j}, {i}" for i in range(c.observed.size))
-            for label in labels:
-                if label not in known:
-                    known[label] = total + more, together[k]
-                    more += 1
-                elif known[label][1] != together[k]:
-                    raise ValueError(
-                        f"{c.name}: specimens: got {label!r}, which other simulators measured than {nodes[k].name}, "
-                        "whose design points serve here; expected simulators that share labels and .dist() objects"
-                    )
-            out.append(np.array([known[label][0] for label in labels], dtype=np.intp))
-        return out, more
+    def _own_simulator(self, case: Case, condition: Condition) -> int:
+        """Return the simulator that a condition without a response stands for."""
+        names = [node.name for node in self.optimum.evaluator.nodes]
+        if len(case.conditions) == len(names) == 1:
+            return 0
+        if condition.name in names:
+            return names.index(condition.name)
+        raise ValueError(
+            f"JointNull: got the condition {condition.name!r}, expected the name of a simulator, "
+            f"{names}; or pass responses={{{condition.name!r}: (response, *inputs)}}"
+        )
 
-    def describe(self, case: Case) -> str:
-        """Return what is held to be true."""
-        return "calibration and test data come from the calibrated model, which is calibrated anew in each replicate"
+
+@dataclass(frozen=True, eq=False)
+class _Served:
+    """A condition, and the simulator whose points are its specimens.
+
+    Attributes
+    ----------
+    condition : Condition
+    simulator : int
+    values : ndarray, shape (points,), or None
+        Responses at the simulator's points, unless they are its own.
+    """
+
+    condition: Condition
+    simulator: int
+    values: Floats | None
+
+    def values_or(self, own: Floats) -> Floats:
+        """Return the responses, or the simulator's own ones."""
+        return own if self.values is None else self.values
+
+
+def _measuring_first(nodes: list[Node], condition: Condition) -> list[Node]:
+    """Return the simulators, first those that measured a condition's specimens."""
+    labels = set(condition.labels or ())
+
+    def measured_others(node: Node) -> bool:
+        return node.specimens is None or not labels & set(specimen_names(node.specimens))
+
+    return sorted(nodes, key=measured_others)
+
+
+def _specimen_numbers(
+    nodes: list[Node], served: list[_Served]
+) -> tuple[list[NDArray[np.intp]], int]:
+    """Return the specimens of each condition, those of the calibration by their numbers.
+
+    Returns
+    -------
+    numbers : list of ndarray of int, shapes (n,)
+        By condition.
+    more : int
+        How many specimens are not of the calibration.
+    """
+    own, total = specimens(nodes)
+    known = _known_specimens(nodes, own)
+    group_of = _groups_of(nodes)
+    more = 0
+    numbers = []
+    for j, one in enumerate(served):
+        condition = one.condition
+        node = nodes[one.simulator]
+        measured = node.target.observed
+        if data_digest(condition.observed) == data_digest(measured):
+            numbers.append(_matched(condition.observed, measured, own[one.simulator]))
+            continue
+        group = group_of[one.simulator]
+        # Without labels every value is of a new specimen.
+        labels = condition.labels or tuple(f"{j}, {i}" for i in range(condition.observed.size))
+        for label in labels:
+            if label not in known:
+                known[label] = total + more, group
+                more += 1
+            elif known[label][1] != group:
+                raise ValueError(
+                    f"{condition.name}: specimens: got {label!r}, which other simulators measured "
+                    f"than {node.name}, whose design points serve here; expected simulators that "
+                    "share labels and .dist() objects"
+                )
+        numbers.append(np.array([known[label][0] for label in labels], dtype=np.intp))
+    return numbers, more
+
+
+def _groups_of(nodes: list[Node]) -> dict[int, int]:
+    """Return the group of each simulator; the points of a group are drawn together."""
+    found: dict[int, int] = {}
+    for number, group in enumerate(groups(nodes)):
+        found |= dict.fromkeys(group, number)
+    return found
+
+
+def _known_specimens(nodes: list[Node], own: list[NDArray[np.intp]]) -> dict[str, tuple[int, int]]:
+    """Return number and group of the specimens of the calibration, by label."""
+    group_of = _groups_of(nodes)
+    known = {}
+    for k, node in enumerate(nodes):
+        if node.specimens is None:
+            continue
+        for label, number in zip(specimen_names(node.specimens), own[k], strict=True):
+            known[label] = int(number), group_of[k]
+    return known
+
+
+def _matched(observed: Floats, measured: Floats, numbers: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return the specimens of values that are those of a simulator in another order."""
+    found = np.empty(observed.size, dtype=np.intp)
+    by_size = np.argsort(measured, kind="stable")
+    found[np.argsort(observed, kind="stable")] = numbers[by_size]
+    return found
 
 
 def _refuse_other(condition: Condition, values: Floats, weights: Floats) -> None:
     """Raise if the predicted population is not that at the optimum."""
-    at = np.quantile(condition.predicted[~np.isnan(condition.predicted)], np.linspace(0.05, 0.95, 19), method="nearest")
-    apart = np.abs(
-        Predictive(values, weights).transform(at, None) - Predictive(condition.predicted).transform(at, None)
-    ).max()
+    predicted = condition.predicted[~np.isnan(condition.predicted)]
+    at = np.quantile(predicted, _PROBED, method="nearest")
+    expected = Predictive(values, weights).transform(at, None)
+    got = Predictive(condition.predicted).transform(at, None)
+    apart = np.abs(expected - got).max()
     if apart > _DIFFERENT:
         raise ValueError(
-            f"{condition.name}: predicted: got values whose distribution function differs by {apart:.2f} from that of "
-            "the population at the optimum, expected prb.predict(optimum, response, *inputs) of the same condition; "
-            "for another condition than a simulator's pass responses="
+            f"{condition.name}: predicted: got values whose distribution function differs by "
+            f"{apart:.2f} from that of the population at the optimum, expected "
+            "prb.predict(optimum, response, *inputs) of the same condition; for another condition "
+            "than a simulator's pass responses="
         )

@@ -308,7 +308,7 @@ def test_a_population_that_collapsed_within_the_bandwidth_is_no_convergence() ->
     said = prb.diagnose(optimum).messages
     assert "collapsed" in said[0]
     assert not any("did not converge" in line for line in said)
-    for call in (prb.calibrate_epsilon, prb.bootstrap, prb.held_out, prb.JointNull):
+    for call in (prb.calibrate_epsilon, prb.bootstrap, prb.cross_validate, prb.JointNull):
         with pytest.raises(ValueError, match=f"{call.__name__}: .*sigma ran to the edge"):
             call(optimum)
     with pytest.raises(ValueError, match=r"sample_smc: .*sigma ran to the edge .*adjust=False"):

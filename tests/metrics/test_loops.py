@@ -9,8 +9,10 @@ from prbayes._checks import Floats
 from prbayes.metrics.density import GaussianKDE
 
 
-def test_without_a_folder_for_it_the_compiled_loop_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Numba refuses to decorate where neither the package's folder nor one of the user's can be written to."""
+def test_without_a_folder_for_it_the_compiled_loop_is_not_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Numba refuses to decorate where it can write neither to the package's folder nor a user's."""
     import numba
 
     asked: list[dict[str, Any]] = []

@@ -1,10 +1,11 @@
-"""Calling the response: executors, chunks, failure policies, the store, and runs that are killed."""
+"""Calling the response: executors, chunks, failures, what is stored, and runs that are killed."""
 
 from __future__ import annotations
 
 import logging
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import threading
@@ -18,12 +19,22 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
-import xarray as xr
 
 import prbayes as prb
 from prbayes.model.simulator import nodes
-from prbayes.response.calling import Caller
-from prbayes.response.failures import Abort, OnFailure
+from prbayes.response.calling import (
+    Calling,
+    Capacity,
+    Points,
+    Tally,
+    capacity,
+    checked,
+    chunk_size,
+    chunks,
+    compute,
+    respond,
+)
+from prbayes.response.failures import OnFailure
 from prbayes.response.store import Store
 
 N = 64
@@ -33,7 +44,15 @@ def model(response: Any, propagation: Any = None, **keywords: Any) -> pm.Model:
     propagation = prb.Reweighted(N, **keywords) if propagation is None else propagation
     with pm.Model() as found:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
-        prb.Simulator("y", response, x, 2.0, metric=prb.AreaMetric(), observed=[1, 2, 3, 5.0], propagation=propagation)
+        prb.Simulator(
+            "y",
+            response,
+            x,
+            2.0,
+            metric=prb.AreaMetric(),
+            observed=[1, 2, 3, 5.0],
+            propagation=propagation,
+        )
     return found
 
 
@@ -69,7 +88,7 @@ EXPECTED = stored(model(times))
 POINTS = EXPECTED / 2
 
 
-# -- the same numbers, wherever they are computed --------------------------------------------------------
+# -- the same numbers, wherever they are computed --------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +118,12 @@ def test_resimulated_and_fresh_use_the_executor_too() -> None:
         for propagation in (prb.Resimulated(N, executor=pool), prb.Fresh(N, executor=pool)):
             seen.clear()
             prb.sample_smc(
-                20, chains=1, model=model(response, propagation), epsilon=1.0, random_seed=1, progressbar=False
+                20,
+                chains=1,
+                model=model(response, propagation),
+                epsilon=1.0,
+                random_seed=1,
+                progressbar=False,
             )
             assert seen
             assert all(name.startswith("far") for name in seen)
@@ -115,10 +139,20 @@ def test_a_multivariate_input_arrives_whole_at_a_scalar_function() -> None:
     with pm.Model() as found:
         x = pm.MvNormal.dist(pm.Normal("mu", 0, 1, shape=2), np.eye(2))
         prb.Simulator(
-            "y", prb.scalar(length), x, metric=prb.AreaMetric(), observed=[1, 2.0], propagation=prb.Reweighted(N)
+            "y",
+            prb.scalar(length),
+            x,
+            metric=prb.AreaMetric(),
+            observed=[1, 2.0],
+            propagation=prb.Reweighted(N),
         )
     assert shapes == {(2,)}
     assert (stored(found) > 0).all()
+
+
+def line(n: int) -> Points:
+    """The numbers 0 to n - 1, and a constant."""
+    return Points([np.arange(float(n)), 2.0], [True, False])
 
 
 def test_chunks_follow_the_measured_cost() -> None:
@@ -129,28 +163,133 @@ def test_chunks_follow_the_measured_cost() -> None:
         time.sleep(0.01 * len(x))
         return a * x
 
-    caller = Caller("y", response, None, Abort(), None)
-    x = np.arange(100.0)
-    np.testing.assert_array_equal(caller([x, 2.0], [True, False], x[:, None]), 2 * x)
+    tally = Tally()
+    found = respond(Calling("y", response), line(100), tally)
+    np.testing.assert_array_equal(found, 2 * np.arange(100.0))
     assert sizes[0] == 16
     # 10 ms each: at most 20 of them make up the 200 ms of a chunk; a slow machine makes them fewer.
     assert all(5 <= s <= 20 for s in sizes[1:-1])
+    assert tally.computed == 100
 
 
 def test_a_scalar_function_that_is_slow_is_a_task_of_its_own() -> None:
-    caller = Caller("y", prb.scalar(lambda x: time.sleep(0.02) or x), None, Abort(), None)
-    x = np.arange(5.0)
-    taken = [rows.size for rows, _, _ in caller._computed([x], [True], np.arange(5), False)]
+    calling = Calling("y", prb.scalar(lambda x, a: time.sleep(0.02) or x))
+    taken = [rows.size for rows, _ in chunks(calling, line(5), np.arange(5), False, Tally())]
     assert taken == [1] * 5
 
 
-# -- failures --------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("seconds", "left", "workers", "alone", "batched"),
+    [
+        (0.0, 1000, 1, 1, 16),  # nothing is known yet
+        (0.0, 10, 1, 1, 10),
+        (1e-5, 1000, 1, 1000, 1000),  # all fit into 0.2 s
+        (1e-3, 1000, 1, 200, 200),
+        (0.02, 1000, 1, 1, 10),
+        (1.0, 1000, 1, 1, 1),
+        (1e-5, 1000, 5, 100, 100),  # the workers share them, and once more
+        (1e-5, 3, 5, 1, 1),
+    ],
+)
+def test_the_size_of_a_chunk(
+    seconds: float, left: int, workers: int, alone: int, batched: int
+) -> None:
+    with ThreadPoolExecutor(workers) as pool:
+        executor = pool if workers > 1 else None
+        for function, expected in ((prb.scalar(times), alone), (times, batched)):
+            calling = Calling("y", function, executor)
+            found = chunk_size(calling, Tally(seconds=seconds), left, workers)
+            assert found == pytest.approx(expected, abs=1)
+            assert 1 <= found <= left
+
+
+def test_a_tally_forgets_old_chunks_slowly() -> None:
+    tally = Tally()
+    tally.take(10, 5.0)
+    assert tally == Tally(computed=10, seconds=0.5)
+    tally.take(2, 3.0)
+    assert tally.computed == 12
+    assert tally.seconds == pytest.approx(0.7 * 0.5 + 0.3 * 1.5)
+
+
+def test_how_much_an_executor_takes() -> None:
+    class Mpi:
+        num_workers = 7
+
+    class Silent:
+        pass
+
+    assert capacity(None) == Capacity(1, 1)
+    with ThreadPoolExecutor(3) as pool:
+        assert capacity(pool) == Capacity(3, 6)
+    assert capacity(Mpi()) == Capacity(7, 14)  # type: ignore[arg-type]
+    assert capacity(Silent()).chunks == 1024  # type: ignore[arg-type]
+
+
+def test_points_give_keys_of_all_numbers_in_the_order_of_the_arguments() -> None:
+    x, z = np.arange(3.0), np.arange(6.0).reshape(3, 2)
+    points = Points([z, 7.0, x, np.array([8.0, 9.0])], [True, False, True, False])
+    assert len(points) == 3
+    expected = [[0, 1, 7, 0, 8, 9], [2, 3, 7, 1, 8, 9], [4, 5, 7, 2, 8, 9]]
+    np.testing.assert_array_equal(points.keys(), expected)
+    np.testing.assert_array_equal(points.at(np.array([2, 0])).keys(), np.array(expected)[[2, 0]])
+    first, constant, number, _ = points.at(1).arguments
+    np.testing.assert_array_equal(first, [2.0, 3.0])
+    assert (constant, number) == (7.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("result", "message"),
+    [
+        (np.ones(3) + 1j, "complex numbers, expected an array of real numbers"),
+        (None, "NoneType of dtype object"),
+        (np.ones((3, 1)), r"shape \(3, 1\) for inputs of shapes \(3,\), \(\), expected \(3,\)"),
+        (1.0, r"shape \(\) .* wrap a function of one specimen in prb.scalar"),
+    ],
+)
+def test_what_is_no_response_is_refused(result: Any, message: str) -> None:
+    with pytest.raises(prb.ResponseError, match=f"the response returned {message}"):
+        checked(result, (3,), [np.zeros(3), 1.0])
+    np.testing.assert_array_equal(checked([1, True, np.nan], (3,), []), [1.0, 1.0, np.nan])
+
+
+def test_a_scalar_needs_a_function() -> None:
+    with pytest.raises(TypeError, match=r"scalar: got int, expected a function of one specimen's"):
+        prb.scalar(3)  # type: ignore[arg-type]
+
+
+def test_points_that_fail_are_found_by_halving() -> None:
+    seen: list[int] = []
+
+    def response(x: Any, a: Any) -> Any:
+        seen.append(len(x))
+        if np.isin(x, [3.0, 4.0]).any():
+            raise ArithmeticError(f"at {x[0]:.0f}")
+        return a * x
+
+    chunk = compute(response, line(8), True)
+    expected = [0.0, 2.0, 4.0, np.nan, np.nan, 10.0, 12.0, 14.0]
+    np.testing.assert_array_equal(chunk.values, expected)
+    text = "it raised ArithmeticError: at "
+    assert chunk.raised == {3: text + "3", 4: text + "4"}
+    assert seen == [8, 4, 2, 2, 1, 1, 4, 2, 1, 1, 2]
+    # Not tolerated: no more calls.
+    seen.clear()
+    chunk = compute(response, line(8), False)
+    assert seen == [8]
+    assert np.isnan(chunk.values).all()
+    assert list(chunk.raised) == [0]
+
+
+# -- failures --------------------------------------------------------------------------------------
 
 STEEP = POINTS > 2
 BATCHED = pytest.mark.parametrize("kind", ["scalar", "batched", "threads"])
 
 
-def failing(kind: str, function: Any, on_failure: OnFailure | None = None, **keywords: Any) -> pm.Model:
+def failing(
+    kind: str, function: Any, on_failure: OnFailure | None = None, **keywords: Any
+) -> pm.Model:
     keywords |= {} if on_failure is None else {"on_failure": on_failure}
     if kind == "batched":
         return model(lambda x, a: np.array([function(v, a) for v in x]), **keywords)
@@ -197,7 +336,8 @@ def test_retried_once_and_then_it_works() -> None:
 
     found = failing("scalar", moody, prb.Retry(1, then=prb.Abort()))
     np.testing.assert_array_equal(stored(found), EXPECTED)
-    # The simulator tries 16 points of the prior only where it has to; here every design point, the steep ones twice.
+    # The simulator tries 16 points of the prior only where it has to; here every design point,
+    # the steep ones twice.
     assert sorted(set(calls.values())) == [1, 2]
     assert responses(found).computed == N + STEEP.sum()
 
@@ -208,6 +348,17 @@ def test_retried_in_vain() -> None:
     assert responses(found).computed == N + 2 * STEEP.sum()
     with pytest.raises(prb.ResponseError, match="too steep"):
         failing("scalar", fails_above_two, prb.Retry(2, then=prb.Abort()))
+
+
+@BATCHED
+def test_the_store_knows_which_points_failed_and_why(kind: str, tmp_path: Path) -> None:
+    failing(kind, fails_above_two, prb.Retry(1, then=prb.Replace(-1.0)), store=tmp_path)
+    connection = sqlite3.connect(tmp_path / "responses.sqlite")
+    query = "SELECT key, reason FROM run WHERE state = 'failed'"
+    found = dict(connection.execute(query).fetchall())
+    connection.close()
+    keys = [np.array([x, 2.0]).tobytes() for x in POINTS[STEEP]]
+    assert found == dict.fromkeys(keys, "it raised ArithmeticError: too steep")
 
 
 def test_a_wrong_shape_is_a_mistake_and_no_failure() -> None:
@@ -223,24 +374,7 @@ def test_a_lost_worker_is_named() -> None:
         model(prb.scalar(lambda x, a: os._exit(3)), executor=pool)
 
 
-@pytest.mark.parametrize(
-    ("make", "error", "message"),
-    [
-        (lambda: prb.Replace("a"), TypeError, "Replace: value: got str"),
-        (lambda: prb.Retry(0), ValueError, "Retry: times: got 0"),
-        (lambda: prb.Retry(1, then=prb.Retry()), TypeError, "Retry: then: got Retry"),
-        (lambda: prb.scalar(3), TypeError, "scalar: got int"),
-        (lambda: prb.Reweighted(N, executor=3), TypeError, "executor: got int"),
-        (lambda: prb.Reweighted(N, store=3), TypeError, "store: got int"),
-        (lambda: prb.Resimulated(N, on_failure="abort"), TypeError, "on_failure: got str 'abort'"),
-    ],
-)
-def test_bad_settings(make: Any, error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
-        make()
-
-
-# -- the store -------------------------------------------------------------------------------------------
+# -- what is stored --------------------------------------------------------------------------------
 
 
 def test_nothing_is_computed_twice(tmp_path: Path) -> None:
@@ -250,11 +384,10 @@ def test_nothing_is_computed_twice(tmp_path: Path) -> None:
     assert (responses(first).computed, responses(second).computed) == (N, 0)
     more = model(prb.scalar(times), propagation=prb.Reweighted(N, random_seed=1, store=tmp_path))
     assert responses(more).computed == N  # other points
-    assert {p.suffix for p in tmp_path.iterdir()} == {".nc"}
-    with xr.open_dataset(tmp_path / "y.nc") as data:
-        assert data["response"].size == 2 * N
-        np.testing.assert_allclose(data["response"], 2 * data["inputs"][:, 0])  # the constant is the second column
-        np.testing.assert_array_equal(data["inputs"][:, 1], 2.0)
+    data = Store(tmp_path, "y").to_dataset()
+    assert data["response"].size == 2 * N
+    np.testing.assert_allclose(data["response"], 2 * data["inputs"][:, 0])
+    np.testing.assert_array_equal(data["inputs"][:, 1], 2.0)  # the constant
 
 
 def test_an_optimum_tells_what_was_computed_and_what_it_rests_on(tmp_path: Path) -> None:
@@ -298,7 +431,12 @@ def test_an_executor_that_does_not_tell_its_size_gets_work_for_many() -> None:
         most = 0
 
         def __init__(self, pool: ThreadPoolExecutor) -> None:
-            self.pool, self.under_way, self.lock, self.full = pool, 0, threading.Lock(), threading.Event()
+            self.pool, self.under_way, self.lock, self.full = (
+                pool,
+                0,
+                threading.Lock(),
+                threading.Event(),
+            )
 
         def submit(self, function: Any, *arguments: Any) -> Any:
             with self.lock:
@@ -318,14 +456,17 @@ def test_an_executor_that_does_not_tell_its_size_gets_work_for_many() -> None:
 
     with ThreadPoolExecutor(N) as pool:
         cluster = Cluster(pool)
-        caller = Caller("y", prb.scalar(lambda x: 2 * x), cluster, Abort(), None)  # type: ignore[arg-type]
-        np.testing.assert_array_equal(caller([POINTS], [True], POINTS[:, None]), 2 * POINTS)
+        calling = Calling("y", prb.scalar(lambda x: 2 * x), cluster)  # type: ignore[arg-type]
+        found = respond(calling, Points([POINTS], [True]), Tally())
+    np.testing.assert_array_equal(found, 2 * POINTS)
     assert cluster.most == N
 
 
 @pytest.mark.parametrize("error", [ArithmeticError, BrokenExecutor])
-def test_what_is_being_computed_when_one_fails_is_kept(error: type[Exception], tmp_path: Path) -> None:
-    """The first of four tasks that are begun fails at once; the others are waited for, and nothing more is begun."""
+def test_what_is_being_computed_when_one_fails_is_kept(
+    error: type[Exception], tmp_path: Path
+) -> None:
+    """Four tasks are begun, the first fails: the others are waited for, and no more are begun."""
 
     def function(x: float) -> float:
         if x == 0:
@@ -337,15 +478,15 @@ def test_what_is_being_computed_when_one_fails_is_kept(error: type[Exception], t
         """Loses a worker, rather than an answer, at a `BrokenExecutor`."""
 
         def submit(self, work: Any, /, *job: Any, **keywords: Any) -> Any:
-            if error is BrokenExecutor and job[0][0][0] == 0:
+            if error is BrokenExecutor and job[0].arguments[0][0] == 0:
                 raise error("too steep")
             return super().submit(work, *job, **keywords)
 
-    keys = np.arange(12.0)[:, None]
+    points = Points([np.arange(12.0)], [True])
     store = Store(tmp_path, "y", 1)
     with Pool(2) as pool, pytest.raises(prb.ResponseError, match="too steep"):
-        Caller("y", prb.scalar(function), pool, Abort(), store)([keys[:, 0]], [True], keys)
-    values, known = store.find(keys)
+        respond(Calling("y", prb.scalar(function), pool, store), points, Tally())
+    values, known = store.find(points.keys())
     np.testing.assert_array_equal(np.flatnonzero(known), [1, 2, 3])
     np.testing.assert_array_equal(values[known], [2.0, 4.0, 6.0])
 
@@ -357,68 +498,7 @@ def test_stored_failures_are_replaced_as_the_policy_of_the_day_says(tmp_path: Pa
     assert responses(found).computed == 0
 
 
-def filled(folder: Path) -> Store:
-    store = Store(folder, "y", 1)
-    for i in range(3):
-        store.add(np.array([[float(i)], [i + 0.5]]), np.array([10.0 * i, np.nan]))
-    return store
-
-
-def test_the_journal_survives_a_cut_at_any_byte(tmp_path: Path) -> None:
-    store = filled(tmp_path)
-    whole = store.journal.read_bytes()
-    for size in range(len(whole) + 1):
-        store.journal.write_bytes(whole[:size])
-        again = Store(tmp_path, "y", 1)
-        # Only the record that was cut is lost; and appending goes on from there.
-        assert len(again) == 2 * max(0, (size - 8) // ((len(whole) - 8) // 3))
-        again.add(np.array([[7.0]]), np.array([70.0]))
-        values, known = Store(tmp_path, "y", 1).find(np.array([[7.0]]))
-        assert known.all()
-        assert values[0] == 70.0
-
-
-def test_damage_is_named_and_left_alone(tmp_path: Path) -> None:
-    store = filled(tmp_path)
-    text = bytearray(store.journal.read_bytes())
-    text[30] ^= 255
-    store.journal.write_bytes(text)
-    with pytest.raises(prb.StoreError, match=r"y: store: .* damaged in the middle; nothing was changed: move it"):
-        Store(tmp_path, "y", 1)
-    assert store.journal.read_bytes() == text
-    store.journal.unlink()
-    store = filled(tmp_path)
-    store.merge(always=True)
-    assert not store.journal.exists()
-    assert len(Store(tmp_path, "y", 1)) == 6
-    sound = store.path.read_bytes()
-    for damaged in (sound[:100], b"", sound[: len(sound) // 2], b"not a file of ours"):
-        store.path.write_bytes(damaged)
-        with pytest.raises(prb.StoreError, match=r"y: store: .*cannot be read"):
-            Store(tmp_path, "y", 1)
-        assert store.path.read_bytes() == damaged
-    store.path.write_bytes(sound)
-    with xr.open_dataset(store.path) as data:
-        data.load()
-    data["response"][0] = 99.0
-    store.path.unlink()
-    data.to_netcdf(store.path, engine="h5netcdf")
-    with pytest.raises(prb.StoreError, match="do not match their digest"):
-        Store(tmp_path, "y", 1)
-
-
-def test_a_store_of_other_inputs_or_another_simulator_is_refused(tmp_path: Path) -> None:
-    filled(tmp_path).merge(always=True)
-    with pytest.raises(prb.StoreError, match=r"holds inputs of 1 values for simulator 'y', expected 2 values for 'y'"):
-        Store(tmp_path, "y", 2)
-    (tmp_path / "y.nc").rename(tmp_path / "z.nc")
-    with pytest.raises(prb.StoreError, match="for simulator 'y', expected 1 values for 'z'"):
-        Store(tmp_path, "z", 1)
-    with pytest.raises(prb.StoreError, match="which is a file, expected a folder"):
-        Store(tmp_path / "z.nc", "z", 1)
-
-
-# -- killed ----------------------------------------------------------------------------------------------
+# -- killed ----------------------------------------------------------------------------------------
 
 SCRIPT = """
 import sys, time
@@ -438,14 +518,24 @@ with pm.Model() as model:
         propagation = prb.Reweighted(100, store=folder + "/store")
     else:
         propagation = prb.Resimulated(4, store=folder + "/store")
-    prb.Simulator("y", prb.scalar(response), pm.Normal.dist(mu, 1.0), metric=prb.AreaMetric(), observed=[1.0, 2.0, 4.0],
-                  epsilon=2.0, propagation=propagation)
-    idata = prb.sample_smc(10, chains=2, random_seed=1, checkpoint=folder + "/run.nc", progressbar=False)
+    prb.Simulator(
+        "y",
+        prb.scalar(response),
+        pm.Normal.dist(mu, 1.0),
+        metric=prb.AreaMetric(),
+        observed=[1.0, 2.0, 4.0],
+        epsilon=2.0,
+        propagation=propagation,
+    )
+    settings = {"checkpoint": folder + "/run.nc", "progressbar": False}
+    idata = prb.sample_smc(10, chains=2, random_seed=1, **settings)
 print(repr(float(idata.posterior["mu"].sum())))
 """
 
 
-def undisturbed(folder: Path, kind: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
+def undisturbed(
+    folder: Path, kind: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> str:
     """Run the script in this process."""
     folder.mkdir()
     monkeypatch.setattr(sys, "argv", ["script", str(folder), kind])
@@ -458,7 +548,10 @@ def run(folder: Path, kind: str, *, kill_at: int | None = None) -> str:
     """Run the script; kill it, hard, as soon as so many responses were computed."""
     folder.mkdir(exist_ok=True)
     process = subprocess.Popen(
-        [sys.executable, "-c", SCRIPT, str(folder), kind], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", SCRIPT, str(folder), kind],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     calls = folder / "calls"
     while kill_at is not None and process.poll() is None:
@@ -472,7 +565,11 @@ def run(folder: Path, kind: str, *, kill_at: int | None = None) -> str:
 
 @pytest.mark.parametrize(("kind", "kills"), [("reweighted", [40]), ("resimulated", [200])])
 def test_a_killed_run_computes_nothing_again_and_gives_the_same(
-    kind: str, kills: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    kind: str,
+    kills: list[int],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     once = undisturbed(tmp_path / "a", kind, monkeypatch, capsys)
     for at in kills:
@@ -481,6 +578,6 @@ def test_a_killed_run_computes_nothing_again_and_gives_the_same(
     expected = (tmp_path / "a" / "calls").read_text().splitlines()
     calls = (tmp_path / "b" / "calls").read_text().splitlines()
     assert len(expected) == len(set(expected))
-    # A kill may fall between the end of a response and its record: then that one response is computed again.
+    # A kill may fall between the end of a response and its record: then that one is computed again.
     assert len(calls) - len(set(calls)) <= len(kills)
     assert set(calls) == set(expected)

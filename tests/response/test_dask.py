@@ -1,4 +1,4 @@
-"""A real Dask cluster on the loopback interface, one worker of which is killed while it computes."""
+"""A real Dask cluster on the loopback interface; one worker is killed while it computes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 
 import prbayes as prb
 from prbayes.model.simulator import nodes
-from prbayes.response.calling import _capacity
+from prbayes.response.calling import Capacity, capacity
 
 distributed = pytest.importorskip("distributed")
 
@@ -46,7 +46,8 @@ def test_a_worker_is_killed_and_nothing_is_lost(tmp_path: Path) -> None:
         n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
     )
     with cluster, distributed.Client(cluster) as client:
-        assert _capacity(client.get_executor(pure=False)) == (2, 4)  # of the cluster, not of this machine
+        # That of the cluster, not of this machine.
+        assert capacity(client.get_executor(pure=False)) == Capacity(2, 4)
         pids = list(client.run(os.getpid).values())
         killer = threading.Timer(0.6, os.kill, (pids[0], signal.SIGKILL))
         killer.start()
@@ -56,6 +57,8 @@ def test_a_worker_is_killed_and_nothing_is_lost(tmp_path: Path) -> None:
         killer.join()
         assert pids[0] not in client.run(os.getpid).values()
     responses = next(iter(nodes(model).values())).bound
-    np.testing.assert_array_equal(responses.values, next(iter(nodes(build()).values())).bound.values)
+    np.testing.assert_array_equal(
+        responses.values, next(iter(nodes(build()).values())).bound.values
+    )
     again = next(iter(nodes(build(store=tmp_path)).values())).bound.responses
     assert again.computed == 0

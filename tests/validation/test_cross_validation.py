@@ -27,7 +27,7 @@ def optimum(family: Any = pm.LogNormal) -> prb.Optimum:
 
 def test_each_fold_is_a_calibration_on_the_other_specimens() -> None:
     before = optimum().evaluator.n_responses
-    found = prb.held_out(optimum(), folds=4, random_seed=3)
+    found = prb.cross_validate(optimum(), folds=4, random_seed=3)
     assert optimum().evaluator.n_responses == before
     assert found.sizes == {"fold": 4, "simulator": 1}
     assert found.n_held_out.values.ravel().tolist() == [15] * 4
@@ -38,11 +38,13 @@ def test_each_fold_is_a_calibration_on_the_other_specimens() -> None:
         assert float(found.calibrated[i, 0]) == pytest.approx(other.discrepancy, rel=0.01)
         z = np.random.default_rng(1).normal(size=400_000)
         population = np.exp(other.point["mu"] + other.point["sigma"] * z)
-        assert float(found.discrepancy[i, 0]) == pytest.approx(METRIC(population, DATA[fold == i]), rel=0.03)
+        assert float(found.discrepancy[i, 0]) == pytest.approx(
+            METRIC(population, DATA[fold == i]), rel=0.03
+        )
 
 
 def test_the_wrong_family_predicts_worse() -> None:
-    right, wrong = (prb.held_out(optimum(f)) for f in (pm.LogNormal, pm.Normal))
+    right, wrong = (prb.cross_validate(optimum(f)) for f in (pm.LogNormal, pm.Normal))
     assert float(wrong.discrepancy.mean()) > 1.1 * float(right.discrepancy.mean())
     assert float(right.discrepancy.mean()) > float(right.calibrated.mean())
 
@@ -51,20 +53,24 @@ def test_specimens_are_dealt_out_whole() -> None:
     with pm.Model() as model:
         x = pm.LogNormal.dist(pm.Normal("mu", 0.5, 1), pm.HalfNormal("sigma", 1))
         for name, f, size in (("first", np.positive, 60), ("second", np.sqrt, 50)):
-            prb.Simulator(name, f, x, metric=METRIC, observed=f(DATA[:size]), specimens=np.arange(size))
-    found = prb.held_out(prb.minimize(model), folds=5)
+            prb.Simulator(
+                name, f, x, metric=METRIC, observed=f(DATA[:size]), specimens=np.arange(size)
+            )
+    found = prb.cross_validate(prb.minimize(model), folds=5)
     assert found.n_held_out.sum("fold").values.tolist() == [60, 50]
     fold = np.random.default_rng([0, 3]).permutation(np.arange(60) % 5)
-    np.testing.assert_array_equal(found.n_held_out.sel(simulator="second"), np.bincount(fold[:50], minlength=5))
+    np.testing.assert_array_equal(
+        found.n_held_out.sel(simulator="second"), np.bincount(fold[:50], minlength=5)
+    )
 
 
 def test_refusals() -> None:
     with pytest.raises(TypeError, match="got dict, expected an Optimum"):
-        prb.held_out({})  # type: ignore[arg-type]
+        prb.cross_validate({})  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="folds: got 1"):
-        prb.held_out(optimum(), folds=1)
+        prb.cross_validate(optimum(), folds=1)
     with pytest.raises(ValueError, match="folds: got 40 for 60 specimens, expected at most 30"):
-        prb.held_out(optimum(), folds=40)
+        prb.cross_validate(optimum(), folds=40)
     fresh = prb.minimize(build(propagation=prb.Fresh(60)), method="Nelder-Mead")
     with pytest.raises(ValueError, match="cannot be calibrated anew"):
-        prb.held_out(fresh)
+        prb.cross_validate(fresh)

@@ -1,30 +1,20 @@
-"""Pictures: what is drawn, and that ArviZ's predictive checks take our trees."""
+"""The u-values of a validity test against their envelope."""
 
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import arviz as az
-import matplotlib.pyplot as plt
 import numpy as np
-import pymc as pm
 import pytest
-import xarray as xr
 from matplotlib.image import imread
 
 import prbayes as prb
-from prbayes.validation.nulls import area
 
 RNG = np.random.default_rng(1)
 PREDICTED = RNG.normal(RNG.normal(0, 0.25, (200, 1)), 1.0, (200, 500))
 FRESH = RNG.normal(0, 1, 20)
 QUICK = prb.PosteriorNull(999)
-
-
-@pytest.fixture(autouse=True)
-def _close() -> Any:
-    yield
-    plt.close("all")
 
 
 @cache
@@ -66,7 +56,11 @@ def test_the_verdict_stands_in_the_title() -> None:
         assert axis.get_title() == f"p = {test.p_value:.2g}, level 5%\n{expected}"
         assert axis.get_xlabel() == "u-value"
     assert (
-        prb.plot_validity(validity(0.0, True), backend="matplotlib").viz["plot"]["u"].item().get_xlabel() == "|2u - 1|"
+        prb.plot_validity(validity(0.0, True), backend="matplotlib")
+        .viz["plot"]["u"]
+        .item()
+        .get_xlabel()
+        == "|2u - 1|"
     )
 
 
@@ -94,7 +88,10 @@ def test_several_tests_of_different_sizes_get_a_panel_each(tmp_path: Path) -> No
     pc = prb.plot_validity({"all": validity(), "some": small}, backend="matplotlib")
     axes = pc.viz["plot"]
     assert [axes[n].item().get_title().split(",")[0] for n in ("all", "some")] == ["all", "some"]
-    assert [axes[n].item().get_ylabel() for n in ("all", "some")] == ["share of 20 values", "share of 7 values"]
+    assert [axes[n].item().get_ylabel() for n in ("all", "some")] == [
+        "share of 20 values",
+        "share of 7 values",
+    ]
     pc.savefig(tmp_path / "v.png")
     image = imread(tmp_path / "v.png")[..., :3]
     assert (image.min(axis=2) < 0.9).mean() > 0.05
@@ -102,8 +99,15 @@ def test_several_tests_of_different_sizes_get_a_panel_each(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("backend", ["plotly", "bokeh"])
 def test_other_backends_draw_the_same_steps(backend: str) -> None:
-    ours, other = (prb.plot_validity(validity(), backend=b).viz["ecdf"]["u"].item() for b in ("matplotlib", backend))
-    found = (other.x, other.y) if backend == "plotly" else [other.data_source.data[k] for k in ("x", "y")]
+    ours, other = (
+        prb.plot_validity(validity(), backend=b).viz["ecdf"]["u"].item()
+        for b in ("matplotlib", backend)
+    )
+    found = (
+        (other.x, other.y)
+        if backend == "plotly"
+        else [other.data_source.data[k] for k in ("x", "y")]
+    )
     np.testing.assert_allclose(found, ours.get_data())
 
 
@@ -116,49 +120,3 @@ def test_refusals() -> None:
     for bad in (3, {}, {"a": 3}):
         with pytest.raises(TypeError, match=r"expected a ValidityTest from prb\.area_test"):
             prb.plot_validity(bad)  # type: ignore[arg-type]
-
-
-# -- predictive checks of ArviZ --------------------------------------------------------------------------
-
-
-@cache
-def checked() -> xr.DataTree:
-    """A posterior with predictive draws of as many specimens as were measured."""
-    with pm.Model():
-        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
-        observed = np.random.default_rng(2).normal(1, 0.5, 40)
-        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=observed)
-        idata = prb.sample_smc(200, chains=2, random_seed=1, progressbar=False)
-        pm.sample_posterior_predictive(idata, extend_inferencedata=True, random_seed=1, progressbar=False)
-    return idata
-
-
-@pytest.mark.parametrize(
-    ("plot", "keywords"),
-    [
-        ("plot_ppc_dist", {}),
-        ("plot_ppc_dist", {"kind": "ecdf"}),
-        ("plot_ppc_tstat", {"t_stat": "std"}),
-        ("plot_ppc_pit", {}),
-    ],
-)
-def test_predictive_checks_take_our_trees(plot: str, keywords: dict[str, Any], tmp_path: Path) -> None:
-    pc = getattr(az, plot)(checked(), backend="matplotlib", **keywords)
-    pc.savefig(tmp_path / "figure.png")
-    assert (tmp_path / "figure.png").stat().st_size > 5000
-
-
-def test_predictive_draws_are_of_the_right_population() -> None:
-    drawn = checked()["posterior_predictive"]["y"]
-    assert drawn.sizes["y_dim_0" if "y_dim_0" in drawn.dims else drawn.dims[-1]] == 40
-    assert float(drawn.mean()) == pytest.approx(float(checked()["observed_data"]["y"].mean()), abs=0.1)
-
-
-def test_predictions_of_unequal_size_give_u_values_that_arviz_draws(tmp_path: Path) -> None:
-    """20 measured and 100 000 predicted responses: the PIT-ECDF with our envelope, and ArviZ's own test of u."""
-    test = validity()
-    tree = xr.DataTree.from_dict({"posterior": xr.Dataset({"u": ("observation", test.u_values)})})
-    pc = az.plot_ecdf_pit(tree, group="posterior", sample_dims="observation", backend="matplotlib")
-    pc.savefig(tmp_path / "figure.png")
-    assert (tmp_path / "figure.png").stat().st_size > 5000
-    assert area(test.u_values) == test.statistic

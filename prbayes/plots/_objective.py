@@ -1,0 +1,53 @@
+"""The objective of an optimum, as the pictures of the optimiser and of the landscape show it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from prbayes._checks import Floats
+from prbayes.estimate.optimum import Optimum
+from prbayes.model.evaluator import Evaluator
+from prbayes.plots._names import split_elements
+
+# What a reader calls a metric of the package; any other one goes by the name of its class.
+_METRIC_LABELS = {
+    "AreaMetric": "area metric",
+    "KullbackLeibler": "Kullback-Leibler",
+    "LogLikelihood": "log-likelihood",
+    "ProbabilityResidual": "probability residual",
+}
+
+
+def check_optimum(optimum: Any, caller: str) -> None:
+    """Refuse what is no optimum, or has no trace."""
+    if not isinstance(optimum, Optimum):
+        got = type(optimum).__name__
+        raise TypeError(f"{caller}: got {got}, expected an Optimum; call prb.minimize() first")
+    if not len(optimum.trace.get("theta", ())):
+        raise ValueError(
+            f"{caller}: got an optimum without a trace, expected one as prb.minimize returns it"
+        )
+
+
+def objective_label(optimum: Optimum) -> str:
+    """Return what a reader calls the objective."""
+    if len(optimum.scales) > 1:
+        return "sum of d / s"
+    name = type(optimum.evaluator.nodes[0].metric).__name__
+    label = _METRIC_LABELS.get(name, name)
+    return f"discrepancy ({label})"
+
+
+def objective(optimum: Optimum, evaluator: Evaluator, thetas: Floats) -> Floats:
+    """Return the sum of d_k / s_k with the optimum's scales, shape (P,)."""
+    scales = [optimum.scales[node.name] for node in evaluator.nodes]
+    return evaluator.total(thetas, np.array(scales))
+
+
+def free_elements(evaluator: Evaluator, thetas: Floats) -> dict[str, Floats]:
+    """Return the free variables' elements in the user's own units, shape (P,), by element name."""
+    values = evaluator.constrained(thetas)
+    names = [str(rv.name) for rv in evaluator.model.free_RVs]
+    return split_elements({name: values[name] for name in names})

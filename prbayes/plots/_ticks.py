@@ -1,0 +1,71 @@
+"""Ticks: round numbers within a range, and values on an axis of logarithms."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from prbayes._checks import Floats
+
+# Most ticks of an axis whose labels stand side by side, by judgement.
+_MOST_ROUND, _MOST_POWERS = 5, 6
+# Steps of round numbers, over a power of ten: those that people count by.
+_ROUND_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
+# Ratio of the largest to the smallest value above which a logarithm shows them better: on an even
+# axis the smallest would be within a twentieth of the bottom. By judgement.
+_DECADES_RATIO = 20
+# Of a step: what rounding may put on the wrong side of an end.
+_ROUNDING = 1e-9
+
+Ticks = tuple[list[float], list[str]]  # positions and labels
+
+
+def round_ticks(low: float, high: float) -> Ticks:
+    """Return a few round numbers within a range, and their labels."""
+    # The smallest round step that is not too many
+    smallest = max(high - low, 1e-300) / _MOST_ROUND
+    power = 10.0 ** np.floor(np.log10(smallest))
+    steps = power * np.array(_ROUND_STEPS)
+    step = steps[steps >= smallest][0]
+
+    first = np.ceil(low / step - _ROUNDING)
+    last = np.floor(high / step + _ROUNDING)
+    at = step * np.arange(first, last + 1)
+    labels = []
+    for x in at:
+        zero = abs(x) < step / 2  # not 1e-17
+        labels.append("0" if zero else f"{x:.12g}")
+    return at.tolist(), labels
+
+
+def spans_decades(values: Floats) -> bool:
+    """Whether a logarithm shows values better: all are positive, and of different orders."""
+    finite = values[np.isfinite(values)]
+    if not finite.size or finite.min() <= 0:
+        return False
+    threshold = _DECADES_RATIO * finite.min()
+    return bool(finite.max() > threshold)
+
+
+def log_ticks(values: Floats) -> Ticks:
+    """Return ticks of positive values: positions as base-10 logarithms, labels of the values."""
+    finite = values[np.isfinite(values)]
+    shown = np.log10(finite[finite > 0])
+    low, high = shown.min(), shown.max()
+
+    # Powers of ten, every second or third where there are many; 1, 2, 5 where there are few
+    first, last = np.floor(low), np.ceil(high)
+    powers = np.arange(first, last + 1)
+    every = -(-powers.size // _MOST_POWERS)
+    factors = (1, 2, 5) if high - low < 2 else (1,)
+
+    # Ticks a little outside the values are still on the axis, which has a margin of a twentieth
+    slack = 0.05 * (high - low) + _ROUNDING
+    at: list[float] = []
+    labels: list[str] = []
+    for power in powers[::every]:
+        for factor in factors:
+            place = power + np.log10(factor)
+            if low - slack <= place <= high + slack:
+                at.append(float(place))
+                labels.append(f"{factor * 10.0**power:g}")
+    return at, labels

@@ -1,0 +1,141 @@
+"""The sections with the answers: optima and posteriors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from prbayes._compare import INTERVAL
+from prbayes.reports.material import Material, draws_by_element, single_values
+from prbayes.reports.numbers import NOTHING, alike, counted, number, places
+from prbayes.reports.section import Section
+from prbayes.reports.tables import rows_table
+
+
+def optima(m: Material) -> list[Section]:
+    """Return a section for each optimum."""
+    sections = []
+    for label, tree in m.optima.items():
+        text = [_how_it_ended(tree["optimum"].attrs)]
+        if label in m.found:
+            text += [_other_optimum(rival) for rival in m.found[label].rivals]
+        text.append(
+            "Standard errors are those of the estimator over repeated sets of as many specimens."
+        )
+        title = _titled("Optimum", label, m.optima)
+        sections.append(Section(title, text, rows_table(_optimum_rows(tree))))
+    return sections
+
+
+def _optimum_rows(tree: xr.DataTree) -> list[dict[str, Any]]:
+    point = single_values(tree["optimum"].to_dataset())
+    stderr = single_values(tree["stderr"].to_dataset())
+    rows = []
+    for name, value in point.items():
+        estimate, error = alike((value, stderr[name]), stderr[name])
+        rows.append({"hyperparameter": name, "estimate": estimate, "standard error": error})
+    return rows
+
+
+def _how_it_ended(attrs: Mapping[Any, Any]) -> str:
+    ended = "converged" if attrs.get("converged") else "did not converge"
+    evaluations = counted(int(attrs.get("n_evaluations", 0)), "evaluation")
+    message = str(attrs.get("message", "")).rstrip(".")
+    return f"The optimiser {ended} after {evaluations} of the objective: {message}."
+
+
+def _other_optimum(rival: Mapping[str, Any]) -> str:
+    scalars = {name: value for name, value in rival["point"].items() if np.ndim(value) == 0}
+    at = ", ".join(f"{name} = {number(value)}" for name, value in scalars.items())
+    discrepancy = number(float(rival["discrepancy"]))
+    if rival["comparable"]:
+        judged = "the data could as well come from there"
+    else:
+        judged = "the data speak against it"
+    return f"Another optimum is at {at}, with discrepancy {discrepancy}: {judged}."
+
+
+def posteriors(m: Material) -> list[Section]:
+    """Return a section for each posterior."""
+    sections = []
+    for label, tree in m.posteriors.items():
+        text = [_size(tree["posterior"]), *_width(tree)]
+        title = _titled("Posterior", label, m.posteriors)
+        sections.append(Section(title, text, rows_table(_posterior_rows(tree))))
+    return sections
+
+
+def _titled(what: str, label: str, among: Mapping[str, Any]) -> str:
+    return what if len(among) == 1 else f"{what}: {label}"
+
+
+def _posterior_rows(tree: xr.DataTree) -> list[dict[str, Any]]:
+    arviz: Any = import_module("arviz")  # heavy, and partly annotated
+    with np.errstate(all="ignore"):  # a variable that never moves
+        table = arviz.summary(tree, kind="all", ci_prob=INTERVAL, ci_kind="eti", round_to="none")
+    # ArviZ names elements by their coordinates; all else in a report does by their place.
+    names = list(draws_by_element(tree["posterior"].to_dataset()))
+    percent = f"{100 * INTERVAL:.0f}"
+    rows = []
+    for name, (_, found) in zip(names, table.iterrows(), strict=True):
+        in_units = [found[k] for k in ("mean", "sd", f"eti{percent}_lb", f"eti{percent}_ub")]
+        mean, sd, lower, upper = alike(in_units, float(found["sd"]))
+        rows.append(
+            {
+                "variable": name,
+                "mean": mean,
+                "sd": sd,
+                f"{percent}% from": lower,
+                "to": upper,
+                "ESS, bulk": _whole(float(found["ess_bulk"])),
+                "ESS, tail": _whole(float(found["ess_tail"])),
+                "R-hat": _rhat(float(found["r_hat"])),
+                "error of mean": _error(float(found["mcse_mean"])),
+            }
+        )
+    return rows
+
+
+def _size(posterior: Any) -> str:
+    chains = counted(int(posterior.sizes["chain"]), "chain")
+    by = f" by {posterior.attrs['sampler']}" if "sampler" in posterior.attrs else ""
+    return (
+        f"{chains} of {posterior.sizes['draw']} draws{by}. "
+        f"Intervals hold {INTERVAL:.0%} of the draws, with equal tails."
+    )
+
+
+def _width(tree: xr.DataTree) -> list[str]:
+    """Say what the width of the draws is, of results of `sample_smc`."""
+    attrs = tree["posterior"].attrs
+    if "adjustment" not in attrs:
+        return []
+    adjustment = str(attrs["adjustment"])
+    if "unadjusted" in tree:
+        return [
+            "The draws are adjusted to the width that the data warrant: "
+            "that of the metric's own estimate over repeated sets of specimens, "
+            f"combined with the prior ({adjustment})."
+        ]
+    reason = adjustment.removeprefix("none").removeprefix(": ")
+    why = f" ({reason})" if reason else ""
+    return [f"The draws are not adjusted{why}: their width is that of epsilon."]
+
+
+def _whole(value: float) -> str:
+    return f"{value:.0f}" if math.isfinite(value) else NOTHING
+
+
+def _rhat(value: float) -> str:
+    return NOTHING if math.isnan(value) else f"{value:.3f}"
+
+
+def _error(value: float) -> str:
+    """Return a Monte Carlo error with two significant digits."""
+    decimals = places(value, 2)
+    return number(value) if decimals is None else f"{value:.{decimals}f}"

@@ -1,0 +1,66 @@
+"""Pictures as bytes, of a kind that every reader of a report shows."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+# How files of these kinds begin (PNG: ISO/IEC 15948, 5.2; JPEG: ITU T.81, B.1, marker SOI).
+_BEGINNINGS = (
+    (b"\x89PNG\r\n", "png", "image/png"),
+    (b"\xff\xd8\xff", "jpg", "image/jpeg"),
+)
+# By judgement: where the tag must begin, after a declaration, a DOCTYPE and a comment.
+_BEFORE_SVG_TAG = 2000
+# By judgement, in bytes: the pictures of this package have a fifth of it. What is larger, such as a
+# scatter of ten thousand points, is kept as pixels, so that a browser opens a report at once.
+_LARGEST_SVG = 500_000
+_PIXELS_PER_INCH = 200  # by judgement: sharp in print at a column's width
+
+
+def image(picture: Any) -> bytes:
+    """Return the bytes of a picture; those of a figure are the same each time.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is neither bytes of a known kind nor a figure.
+    """
+    if isinstance(picture, bytes):
+        kind_of(picture)  # raises what is wrong with it
+        return picture
+    if not hasattr(picture, "savefig"):
+        raise TypeError(
+            f"picture: got {type(picture).__name__}, expected bytes (SVG, PNG, JPEG) "
+            "or a figure with savefig"
+        )
+    from matplotlib import rc_context  # heavy, and only needed for pictures
+
+    reproducible: Any = {"svg.hashsalt": "prbayes", "svg.fonttype": "path"}
+    with tempfile.TemporaryDirectory() as folder, rc_context(reproducible):
+        vector = Path(folder, "picture.svg")
+        picture.savefig(vector, bbox_inches="tight", metadata={"Date": None})
+        if vector.stat().st_size <= _LARGEST_SVG:
+            return vector.read_bytes()
+        pixels = Path(folder, "picture.png")
+        picture.savefig(pixels, bbox_inches="tight", dpi=_PIXELS_PER_INCH)
+        return pixels.read_bytes()
+
+
+def kind_of(picture: bytes) -> tuple[str, str]:
+    """Return a file's ending and the media type of a picture.
+
+    Raises
+    ------
+    ValueError
+        If the bytes are of no kind that a report can hold.
+    """
+    for beginning, ending, media_type in _BEGINNINGS:
+        if picture.startswith(beginning):
+            return ending, media_type
+    if b"<svg" in picture[:_BEFORE_SVG_TAG]:
+        return "svg", "image/svg+xml"
+    raise ValueError(
+        f"picture: got bytes that begin with {picture[:8]!r}, expected SVG, PNG or JPEG"
+    )

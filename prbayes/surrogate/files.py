@@ -1,0 +1,150 @@
+"""Files of surrogates: what a surface is fitted to and how, without code."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any, cast
+
+import numpy as np
+import xarray as xr
+
+from prbayes._checks import Floats
+from prbayes.response.failures import Abort, OnFailure, Replace
+from prbayes.response.store import StoreError
+from prbayes.surrogate.error import CrossValidation
+from prbayes.surrogate.ranges import Range, Ranges
+
+# Of the files' layout.
+_VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """What a file keeps of a surrogate.
+
+    Attributes
+    ----------
+    ranges : Ranges
+    points : ndarray, shape (n, columns)
+    responses : ndarray, shape (n,)
+    error : CrossValidation
+    kind : str
+        Of the surface: the name of its class.
+    settings : dict
+        Of the surface, if it ships with prbayes.
+    outside : OnFailure
+    noise : int or None
+    n_runs : int
+    probes : ndarray, shape (k,)
+        Values of the surface at fixed points, by which another surface is known.
+    """
+
+    ranges: Ranges
+    points: Floats
+    responses: Floats
+    error: CrossValidation
+    kind: str
+    settings: dict[str, Any]
+    outside: OnFailure
+    noise: int | None
+    n_runs: int
+    probes: Floats
+
+
+def write(path: str | PathLike[str], kept: Kept) -> None:
+    """Write netCDF."""
+    data = xr.Dataset(
+        {
+            "points": (["point", "column"], kept.points),
+            "responses": ("point", kept.responses),
+            "residuals": ("point", kept.error.residuals),
+            "low": ("column", kept.ranges.low),
+            "high": ("column", kept.ranges.high),
+            "population_sd": kept.error.population_sd,
+            "probes": ("probe", kept.probes),
+        },
+        attrs={
+            "prbayes_surrogate": _VERSION,
+            "configuration": json.dumps(_configuration(kept)),
+        },
+    )
+    data.to_netcdf(path, engine="h5netcdf")
+
+
+def read(path: str | PathLike[str]) -> Kept:
+    """Read what `write` wrote.
+
+    Raises
+    ------
+    StoreError
+        If the file cannot be read, or is no surrogate.
+    """
+    try:
+        with xr.open_dataset(path, engine="h5netcdf") as data:
+            data.load()
+        config = json.loads(data.attrs["configuration"])
+        surface = config["model"]
+        residuals = data["residuals"].values
+        population_sd = float(data["population_sd"])
+        return Kept(
+            ranges=_ranges(config["inputs"], data["low"].values, data["high"].values),
+            points=data["points"].values,
+            responses=data["responses"].values,
+            error=CrossValidation(residuals, population_sd),
+            kind=surface.pop("kind"),
+            settings=surface,
+            outside=_outside(config["outside"]),
+            noise=config["noise"],
+            n_runs=config["n_runs"],
+            probes=data["probes"].values,
+        )
+    # Damaged files raise whatever the library that meets the damage raises.
+    except Exception as error:
+        raise StoreError(
+            f"Surrogate.load: {path} is no surrogate that can be read "
+            f"({type(error).__name__}: {error})"
+        ) from error
+
+
+def _configuration(kept: Kept) -> dict[str, Any]:
+    """Return what JSON keeps."""
+    inputs = []
+    for one in kept.ranges.inputs:
+        inputs.append({"name": one.name, "shape": list(one.event), "constant": one.constant})
+    outside = None
+    if not isinstance(kept.outside, Abort):
+        # As text: JSON has no NaN.
+        outside = str(cast(Replace, kept.outside).value)
+    return {
+        "inputs": inputs,
+        "model": {"kind": kept.kind, **kept.settings},
+        "outside": outside,
+        "noise": kept.noise,
+        "n_runs": kept.n_runs,
+    }
+
+
+def _ranges(inputs: list[dict[str, Any]], low: Floats, high: Floats) -> Ranges:
+    """Return ranges from their columns."""
+    found = []
+    start = 0
+    for entry in inputs:
+        shape = entry["shape"]
+        where = slice(start, start + int(np.prod(shape, dtype=int)))
+        found.append(
+            Range(
+                entry["name"],
+                low[where].reshape(shape),
+                high[where].reshape(shape),
+                entry["constant"],
+            )
+        )
+        start = where.stop
+    return Ranges(tuple(found))
+
+
+def _outside(value: str | None) -> OnFailure:
+    """Return what happens outside the ranges: `Abort` for None."""
+    return Abort() if value is None else Replace(float(value))

@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from prbayes._checks import Floats
+from prbayes.metrics.base import Minimum
+from prbayes.metrics.density import GaussianKDE, Histogram, likelihood_bandwidth
+from prbayes.metrics.likelihood import LikelihoodDiscrepancy, LogLikelihood
+
+Draw = Callable[..., tuple[Floats, Floats, Floats, Floats]]
+
+
+@pytest.mark.parametrize(
+    "case", [(0, 1, 0, 1.3), (0.5, 1, 0, 1), (-0.8, 0.8, 0.2, 1), (1, 1.2, 0, 1)]
+)
+@pytest.mark.parametrize("h", [0.4, 0.6])
+@pytest.mark.parametrize("a", [1e-3, 1.0, 70.0])
+def test_the_likelihood_of_a_normal_density(
+    normal: Callable[..., Floats], case: tuple[float, ...], h: float, a: float
+) -> None:
+    m, s, mu, sd = case
+    x, z = a * normal(m, s, 100_000), a * normal(mu, sd, 99_000)
+    vp, d = a**2 * (s**2 + h**2), a * (m - mu)
+    expected = np.log(2 * np.pi * vp) / 2 + (a**2 * sd**2 + d**2) / (2 * vp)
+    np.testing.assert_allclose(LogLikelihood(GaussianKDE(a * h))(x, z), expected, rtol=3e-3)
+
+
+@pytest.mark.parametrize("observed", [[0.1], [0.1, 0.1], np.full(6, 0.1)])
+def test_equal_observed_values_need_a_bandwidth(draw: Draw, observed: Floats) -> None:
+    x, w, _, _ = draw(11)
+    expected = -np.log(w @ norm.pdf(x, 0.1, 0.4))
+    found = LogLikelihood(GaussianKDE(0.4))(x, observed, weights=w)
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
+    with pytest.raises(ValueError, match=r"bandwidth: got 0 .*GaussianKDE\(bandwidth=.*AreaMetric"):
+        LogLikelihood()(x, observed)
+
+
+def test_with_a_histogram_it_is_the_frequency_of_each_bin() -> None:
+    # Two bins of width 2; 3 of 4 simulated values in the first.
+    expected = -(2 * np.log(3 / 8) + np.log(1 / 8)) / 3
+    found = LogLikelihood(Histogram(2))([0.1, 0.2, 1.9, 3.0], [0.0, 1.0, 4.0])
+    assert found == pytest.approx(expected, abs=1e-7)
+
+
+def test_other_observed_values_are_read_where_they_are(draw: Draw) -> None:
+    x, w, z, u = draw(12)
+    d = LogLikelihood(GaussianKDE(0.4)).against(z, u)
+    other = d.with_observed(np.array([0.25]))
+    assert isinstance(other, LikelihoodDiscrepancy)
+    assert other(x, w) == pytest.approx(-np.log(w @ norm.pdf(x, 0.25, 0.4)), rel=1e-3)
+    several = d.with_observed(z, np.stack([u, u[::-1]]))
+    assert isinstance(several, LikelihoodDiscrepancy)
+    np.testing.assert_array_equal(several.rows([1]).reading, several.reading[[1]])
+
+
+def test_what_it_declares() -> None:
+    assert LogLikelihood.minimum is Minimum.QUADRATIC
+    assert LogLikelihood.likelihood
+    assert LogLikelihood().additive
+    assert LogLikelihood().density == GaussianKDE(likelihood_bandwidth)
+    assert LogLikelihood().against([0.0, 1.0, 5.0]).scale == 1

@@ -1,0 +1,144 @@
+"""Results that all plots are tested with, made once for each worker, and how to read a plot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+from scipy import stats
+
+import prbayes as prb
+from prbayes.propagation.base import Propagation
+
+Array = np.ndarray[Any, Any]
+
+
+@pytest.fixture(autouse=True)
+def _close() -> Iterator[None]:
+    yield
+    plt.close("all")
+
+
+@pytest.fixture(scope="session")
+def known() -> SimpleNamespace:
+    """Draws of a posterior, shape (2, 150) each, and 30 measured values: quantiles of N(1, 0.5)."""
+    rng = np.random.default_rng(4)
+    mu = rng.normal(1.0, 0.1, (2, 150))
+    sigma = rng.normal(0.5, 0.03, (2, 150))
+    observed = 1 + 0.5 * stats.norm.ppf((np.arange(30) + 0.5) / 30)
+    return SimpleNamespace(mu=mu, sigma=sigma, observed=observed)
+
+
+@pytest.fixture(scope="session")
+def build(known: SimpleNamespace) -> Callable[..., pm.Model]:
+    """How to build a normal population of unknown mean and standard deviation."""
+
+    def model_of(
+        propagation: Propagation, response: Any = np.positive, **keywords: Any
+    ) -> pm.Model:
+        how = {"metric": prb.AreaMetric(), "observed": known.observed} | keywords
+        with pm.Model() as model:
+            x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
+            prb.Simulator("y", response, x, propagation=propagation, **how)
+        return model
+
+    return model_of
+
+
+@pytest.fixture(scope="session")
+def optimum(build: Callable[..., pm.Model]) -> prb.Optimum:
+    return prb.minimize(build(prb.Reweighted(1024)))
+
+
+@pytest.fixture(scope="session")
+def posterior(known: SimpleNamespace) -> xr.DataTree:
+    """Draws that are known, with statistics of stages: three of the first chain, two of the second."""
+    nan = np.nan
+    stages = {
+        "beta": [[1e-3, 0.1, 1.0], [2e-3, 1.0, nan]],
+        "accept_rate": [[0.2, 0.3, 0.4], [0.5, 0.6, nan]],
+        "log_marginal_likelihood": [[nan, nan, -3.0], [nan, -4.0, nan]],
+    }
+    draws = {"mu": (("chain", "draw"), known.mu), "sigma": (("chain", "draw"), known.sigma)}
+    coords = {"chain": [0, 1], "draw": np.arange(150)}
+    statistics = {name: (("chain", "stage"), np.array(rows)) for name, rows in stages.items()}
+    return xr.DataTree.from_dict(
+        {
+            "posterior": xr.Dataset(draws, coords=coords),
+            "sample_stats": xr.Dataset(statistics, coords={"chain": [0, 1]}),
+        }
+    )
+
+
+@pytest.fixture(scope="session")
+def comparison(optimum: prb.Optimum, posterior: xr.DataTree) -> xr.Dataset:
+    return prb.compare({"optimum": optimum, "draws": posterior}, model=optimum.model)
+
+
+@pytest.fixture(scope="session")
+def read() -> SimpleNamespace:
+    """How to read a plot: its artists, their places, the sides of a band, the legend's texts."""
+
+    def artist(pc: Any, visual: str, panel: str) -> Any:
+        return pc.viz[visual][panel].item()
+
+    def xy(pc: Any, visual: str, panel: str) -> Array:
+        """Return the places of a line or of markers, shape (2, n), on any backend."""
+        drawn = artist(pc, visual, panel)
+        if pc.backend == "plotly":
+            return np.array([drawn.x, drawn.y], dtype=float)
+        if pc.backend == "bokeh":
+            return np.array([drawn.data_source.data[k] for k in ("x", "y")], dtype=float)
+        if hasattr(drawn, "get_offsets"):
+            return np.array(drawn.get_offsets().T, dtype=float)
+        return np.array(drawn.get_data(), dtype=float)
+
+    def sides(pc: Any, visual: str, panel: str, at: Array) -> Array:
+        """Return the lower and the upper side of a band at some places, shape (2, n)."""
+        x, y = np.asarray(artist(pc, visual, panel).get_paths()[0].vertices).T
+        there = [y[np.isclose(x, place, atol=1e-9)] for place in at]
+        return np.array([[v.min() for v in there], [v.max() for v in there]])
+
+    def texts(pc: Any) -> list[str]:
+        (legend,) = pc.viz["figure"].item().legends
+        return [text.get_text() for text in legend.get_texts()]
+
+    return SimpleNamespace(artist=artist, xy=xy, sides=sides, texts=texts)
+
+
+@pytest.fixture(scope="session")
+def pictures(
+    optimum: prb.Optimum, posterior: xr.DataTree, comparison: xr.Dataset
+) -> dict[str, Callable[..., Any]]:
+    """Return every plot with a legend or a panel for each result, by name."""
+    model = optimum.model
+    return {
+        "responses": lambda **k: prb.plot_responses(posterior, model=model, **k),
+        "ecdf": lambda **k: prb.plot_responses(optimum, ecdf=True, **k),
+        "population": lambda **k: prb.plot_population(posterior, model=model, **k),
+        "posterior": lambda **k: prb.plot_posterior(posterior, optimum, model=model, **k),
+        "optimizer": lambda **k: prb.plot_optimizer(optimum, **k),
+        "landscape": lambda **k: prb.plot_landscape(optimum, points=21, **k),
+        "curve": lambda **k: prb.plot_landscape(optimum, pair="sigma", points=21, **k),
+        "stages": lambda **k: prb.plot_stages(posterior, **k),
+        "comparison": lambda **k: prb.plot_comparison(comparison, **k),
+        "scores": lambda **k: prb.plot_comparison(comparison, scores=True, **k),
+    }
+
+
+@pytest.fixture(scope="session")
+def drawn(pictures: dict[str, Callable[..., Any]]) -> Callable[[str, str], Any]:
+    """How to get a picture on a backend, drawn once; it must not be changed."""
+
+    @cache
+    def draw(picture: str, backend: str = "matplotlib") -> Any:
+        return pictures[picture](backend=backend)
+
+    return draw

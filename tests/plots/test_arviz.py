@@ -1,0 +1,65 @@
+"""ArviZ's own plots take our trees."""
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import arviz as az
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+
+import prbayes as prb
+from prbayes.validation.statistic import area
+
+
+@cache
+def checked() -> xr.DataTree:
+    """A posterior with predictive draws of as many specimens as were measured."""
+    with pm.Model():
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
+        observed = np.random.default_rng(2).normal(1, 0.5, 40)
+        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=observed)
+        idata = prb.sample_smc(60, chains=2, random_seed=1, progressbar=False)
+        pm.sample_posterior_predictive(
+            idata, extend_inferencedata=True, random_seed=1, progressbar=False
+        )
+    return idata
+
+
+@pytest.mark.parametrize(
+    ("plot", "keywords"),
+    [
+        ("plot_ppc_dist", {}),
+        ("plot_ppc_dist", {"kind": "ecdf"}),
+        ("plot_ppc_tstat", {"t_stat": "std"}),
+        ("plot_ppc_pit", {}),
+    ],
+)
+def test_predictive_checks_take_our_trees(
+    plot: str, keywords: dict[str, Any], tmp_path: Path
+) -> None:
+    pc = getattr(az, plot)(checked(), backend="matplotlib", **keywords)
+    pc.savefig(tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").stat().st_size > 5000
+
+
+def test_predictive_draws_are_of_the_right_population() -> None:
+    drawn = checked()["posterior_predictive"]["y"]
+    assert drawn.sizes["y_dim_0" if "y_dim_0" in drawn.dims else drawn.dims[-1]] == 40
+    assert float(drawn.mean()) == pytest.approx(
+        float(checked()["observed_data"]["y"].mean()), abs=0.1
+    )
+
+
+def test_predictions_of_unequal_size_give_u_values_that_arviz_draws(tmp_path: Path) -> None:
+    """20 measured and 100 000 predicted responses: the PIT-ECDF with our envelope, and ArviZ's own test of u."""
+    rng = np.random.default_rng(1)
+    predicted = rng.normal(rng.normal(0, 0.25, (200, 1)), 1.0, (200, 500))
+    test = prb.area_test(rng.normal(0, 1, 20), predicted, null=prb.PosteriorNull(99))
+    tree = xr.DataTree.from_dict({"posterior": xr.Dataset({"u": ("observation", test.u_values)})})
+    pc = az.plot_ecdf_pit(tree, group="posterior", sample_dims="observation", backend="matplotlib")
+    pc.savefig(tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").stat().st_size > 5000
+    assert area(test.u_values) == test.statistic

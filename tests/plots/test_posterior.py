@@ -1,0 +1,74 @@
+"""The posterior of each hyperparameter stands against optimum and prior."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import stats
+
+import prbayes as prb
+from prbayes.plots._canvas import BLUE, VERMILION
+
+
+def test_the_posterior_stands_against_the_optimum(
+    optimum: prb.Optimum, posterior: xr.DataTree, known: SimpleNamespace, read: SimpleNamespace
+) -> None:
+    pc = prb.plot_posterior(
+        posterior, optimum, model=optimum.model, level=0.8, backend="matplotlib"
+    )
+    for name, draws in (("mu", known.mu), ("sigma", known.sigma)):
+        x, y = read.xy(pc, "posterior", name)
+        expected = stats.norm.pdf(x, draws.mean(), draws.std())
+        np.testing.assert_allclose(y, expected, atol=0.25 * expected.max())
+        assert np.trapezoid(y, x) == pytest.approx(1, abs=0.02)
+        np.testing.assert_allclose(read.xy(pc, "interval", name)[0], np.quantile(draws, [0.1, 0.9]))
+        np.testing.assert_allclose(read.xy(pc, "mean", name)[0], draws.mean())
+        center, error = optimum.point[name], optimum.stderr[name]
+        np.testing.assert_allclose(read.xy(pc, "optimum", name)[0], center)
+        np.testing.assert_allclose(
+            read.xy(pc, "stderr", name)[0], center + error * np.array([-1.2816, 1.2816]), rtol=1e-4
+        )
+        x, y = read.xy(pc, "normal", name)
+        np.testing.assert_allclose(y, stats.norm.pdf(x, center, error))
+        assert (read.xy(pc, "interval", name)[1] < 0).all()
+        assert min(pc.viz["plot"][name].item().get_yticks()) == 0
+    x, y = read.xy(pc, "prior", "sigma")
+    np.testing.assert_allclose(y, stats.halfnorm.pdf(x, scale=2), atol=0.06)
+
+
+def test_posterior_and_optimum_have_their_own_colours_and_rows(
+    drawn: Callable[..., Any], read: SimpleNamespace
+) -> None:
+    pc = drawn("posterior", "matplotlib")
+    for visual in ("posterior", "interval"):
+        assert read.artist(pc, visual, "mu").get_color() == BLUE
+    for visual in ("normal", "stderr"):
+        assert read.artist(pc, visual, "mu").get_color() == VERMILION
+    visuals = ("interval", "mean", "stderr", "optimum")
+    rows = {visual: float(read.xy(pc, visual, "mu")[1, 0]) for visual in visuals}
+    assert 0 > rows["interval"] == rows["mean"] > rows["stderr"] == rows["optimum"]
+
+
+def test_a_posterior_alone(optimum: prb.Optimum, posterior: xr.DataTree) -> None:
+    pc = prb.plot_posterior(posterior, backend="matplotlib")
+    assert not {"optimum", "normal", "prior"} & set(pc.viz.children)
+    blind = replace(optimum, stderr={"mu": np.inf, "sigma": np.nan})
+    pc = prb.plot_posterior(posterior, blind, backend="matplotlib")
+    assert "optimum" in pc.viz
+    assert "normal" not in pc.viz
+
+
+def test_wrong_arguments_are_refused(optimum: prb.Optimum, posterior: xr.DataTree) -> None:
+    with pytest.raises(TypeError, match="got Optimum, expected a DataTree"):
+        prb.plot_posterior(optimum)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="optimum: got int, expected an Optimum"):
+        prb.plot_posterior(posterior, 3)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"level: got 2\.0"):
+        prb.plot_posterior(posterior, level=2.0)
+    constant = xr.DataTree.from_dict({"posterior": posterior["posterior"].to_dataset() * 0})
+    with pytest.raises(ValueError, match=r"got a posterior of \['mu', 'sigma'\]"):
+        prb.plot_posterior(constant)

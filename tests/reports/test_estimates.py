@@ -1,0 +1,112 @@
+"""Optima and posteriors: the numbers are those of the results."""
+
+import dataclasses
+from typing import Any
+
+import arviz as az
+import numpy as np
+import pytest
+import xarray as xr
+
+import prbayes as prb
+from prbayes.reports.tables import cells
+
+
+def test_optimum(calibrated: Any, report: prb.Report, page: Any, row: Any, section: Any) -> None:
+    _, optimum, _, _ = calibrated
+    for name in ("mu", "sigma", "cv"):
+        found = row(name, "standard error", page)
+        assert float(found["standard error"]) == pytest.approx(optimum.stderr[name], rel=6e-3)
+        assert float(found["estimate"]) == pytest.approx(
+            optimum.point[name], abs=optimum.stderr[name] * 6e-3
+        )
+    assert f"after {optimum.n_evaluations} evaluations" in " ".join(section(report, "Optimum").text)
+
+
+def test_posterior(calibrated: Any, page: Any, row: Any) -> None:
+    _, _, posterior, _ = calibrated
+    summary = az.summary(posterior, ci_prob=0.89, ci_kind="eti", round_to="none")
+    for name in ("mu", "sigma", "cv"):
+        found, exact = row(name, "R-hat", page), summary.loc[name]
+        draws = posterior["posterior"][name].values
+        low, high = np.quantile(draws, [0.055, 0.945])
+        for key, value in (
+            ("mean", draws.mean()),
+            ("sd", draws.std(ddof=1)),
+            ("89% from", low),
+            ("to", high),
+        ):
+            assert float(found[key]) == pytest.approx(value, abs=exact["sd"] * 6e-3)
+        assert float(found["ESS, bulk"]) == pytest.approx(exact["ess_bulk"], abs=0.6)
+        assert float(found["ESS, tail"]) == pytest.approx(exact["ess_tail"], abs=0.6)
+        assert float(found["R-hat"]) == pytest.approx(exact["r_hat"], abs=6e-4)
+        assert float(found["error of mean"]) == pytest.approx(exact["mcse_mean"], rel=0.06)
+
+
+def test_elements_have_the_same_names_in_every_table(section: Any) -> None:
+    """ArviZ names elements by their coordinates, and in its own order."""
+    rng = np.random.default_rng(2)
+    means = np.array([[10.0, 20.0, 30.0], [40.0, 50.0, 60.0]])
+    values = means + rng.normal(size=(2, 30, 2, 3))
+    coords = {"part": ["shaft", "disk"], "load": [5, 6, 7]}
+    posterior = xr.Dataset(
+        {
+            "z": (["chain", "draw"], 70 + rng.normal(size=(2, 30))),
+            "a": (["chain", "draw", "part", "load"], values),
+        },
+        coords,
+    )
+    tree = xr.DataTree.from_dict({"posterior": posterior})
+    made = prb.Report("x", posterior=tree, pictures=False)
+    rows = cells(section(made, "Posterior").table).rows
+    names = ["z", "a[0,0]", "a[0,1]", "a[0,2]", "a[1,0]", "a[1,1]", "a[1,2]"]
+    assert [r[0] for r in rows] == names
+    found = [float(r[1]) for r in rows]
+    np.testing.assert_allclose(found, [70, *means.ravel()], atol=1)
+
+
+@pytest.mark.parametrize("note", ["none", "none: there are few draws", "Affine(n_sets=200)"])
+@pytest.mark.parametrize("adjusted", [False, True])
+def test_whether_draws_are_adjusted_is_told_by_the_tree(
+    note: str, adjusted: bool, section: Any
+) -> None:
+    draws = xr.Dataset({"p": (["chain", "draw"], np.random.default_rng(1).normal(size=(2, 20)))})
+    groups = {"posterior": draws.assign_attrs(adjustment=note)}
+    if adjusted:
+        groups["unadjusted"] = draws
+    made = prb.Report("x", posterior=xr.DataTree.from_dict(groups), pictures=False)
+    said = section(made, "Posterior").text[1]
+    if adjusted:
+        assert said.startswith("The draws are adjusted to the width that the data warrant")
+        assert said.endswith(f"combined with the prior ({note}).")
+    elif note == "none":
+        assert said == "The draws are not adjusted: their width is that of epsilon."
+    elif note.startswith("none"):
+        assert "not adjusted (there are few draws): their width" in said
+
+
+def test_other_optima_are_told(calibrated: Any, section: Any) -> None:
+    rivals = tuple(
+        {"point": {"mu": mu, "w": np.ones(2)}, "discrepancy": 0.25, "comparable": comparable}
+        for mu, comparable in ((-1.5, True), (3.0, False))
+    )
+    optimum = dataclasses.replace(
+        calibrated.optimum, rivals=rivals, converged=False, message="stopped."
+    )
+    text = section(prb.Report("x", optimum=optimum, pictures=False), "Optimum").text
+    assert text[0].startswith("The optimiser did not converge after ")
+    assert text[0].endswith("of the objective: stopped.")
+    assert text[1] == (
+        "Another optimum is at mu = -1.500, with discrepancy 0.2500: "
+        "the data could as well come from there."
+    )
+    assert text[2].endswith("at mu = 3.000, with discrepancy 0.2500: the data speak against it.")
+
+
+def test_a_variable_that_never_moves_is_shown() -> None:
+    tree = xr.DataTree.from_dict(
+        {"posterior": xr.Dataset({"p": (["chain", "draw"], np.ones((2, 20)))})}
+    )
+    made = prb.Report("x", posterior=tree, pictures=False)
+    (row,) = cells(made.sections[1].table).rows
+    assert row[:2] == ("p", "1.000")

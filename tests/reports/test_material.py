@@ -1,0 +1,120 @@
+"""Results of any origin are brought into one form, or refused."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import prbayes as prb
+from prbayes.reports.material import draws_by_element, gather, single_values
+from prbayes.reports.tables import cells
+
+
+def test_files_alone_tell_the_same(tmp_path: Path, calibrated: Any, section: Any) -> None:
+    model, optimum, posterior, _ = calibrated
+    posterior.to_netcdf(tmp_path / "p.nc", engine="h5netcdf")
+    optimum.to_datatree().to_netcdf(tmp_path / "o.nc", engine="h5netcdf")
+    trees = [xr.open_datatree(tmp_path / f, engine="h5netcdf").load() for f in ("p.nc", "o.nc")]
+    alone = prb.Report("Shaft", posterior=trees[0], optimum=trees[1], pictures=False)
+    full = prb.Report("Shaft", posterior=posterior, optimum=optimum, model=model, pictures=False)
+    for title in (
+        "Summary",
+        "Model",
+        "Simulators",
+        "Data",
+        "Optimum",
+        "Posterior",
+        "Comparison",
+        "Cost and origin",
+    ):
+        a, b = section(alone, title), section(full, title)
+        assert a.text == b.text, title
+        if a.table is not None:
+            assert cells(a.table) == cells(b.table), title
+    del trees[0]["posterior"].attrs["model"]
+    without = prb.Report("Shaft", posterior=trees[0], pictures=False)
+    assert "Model" not in [s.title for s in without.sections]
+    assert "Posterior" in [s.title for s in without.sections]
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "[]", "3", '{"variables": 4}', '{"variables": [{"name": 1}], "simulators": []}']
+)
+def test_damaged_descriptions_are_ignored(text: str, calibrated: Any) -> None:
+    posterior = calibrated[2].copy()
+    posterior["posterior"].attrs["model"] = text
+    titles = [s.title for s in prb.Report("x", posterior=posterior, pictures=False).sections]
+    assert "Model" not in titles
+    assert "Posterior" in titles
+
+
+@pytest.mark.parametrize(
+    ("keywords", "words"),
+    [
+        ({"model": 3}, r"expected a pm\.Model"),
+        ({"posterior": "an optimum"}, "group posterior"),
+        ({"optimum": "a posterior"}, "group optimum"),
+        ({"optimum": "no errors"}, "without the group stderr"),
+        ({"posterior": "no draws"}, "without the dimensions"),
+        ({"validity": "a posterior"}, "ValidityTest"),
+        ({"comparison": 3}, r"prb\.compare"),
+        ({"comparison": xr.Dataset()}, r"prb\.compare"),
+    ],
+)
+def test_what_is_given_as_something_else_is_refused(
+    keywords: dict[str, Any], words: str, calibrated: Any
+) -> None:
+    results = {
+        "an optimum": calibrated.optimum,
+        "a posterior": calibrated.posterior,
+        "no errors": xr.DataTree.from_dict({"optimum": xr.Dataset({"mu": 1.0})}),
+        "no draws": xr.DataTree.from_dict({"posterior": xr.Dataset({"mu": 1.0})}),
+    }
+    ((kind, value),) = keywords.items()
+    wrong = results[value] if isinstance(value, str) else value
+    nothing = dict.fromkeys(("model", "optimum", "posterior", "validity", "comparison"))
+    with pytest.raises((TypeError, ValueError), match=words):
+        gather(**(nothing | {kind: wrong}))
+
+
+def test_a_name_is_given_once(calibrated: Any) -> None:
+    with pytest.raises(ValueError, match="different ones"):
+        prb.Report("x", optimum={"a": calibrated.optimum}, posterior={"a": calibrated.posterior})
+
+
+def test_a_saved_optimum_is_diagnosed_as_in_memory(calibrated: Any) -> None:
+    lost = replace(
+        calibrated.optimum, converged=False, message="stopped", warnings=("the data do not see mu",)
+    )
+    given = dict.fromkeys(("model", "posterior", "validity", "comparison"))
+    memory = gather(optimum=lost, **given).diagnoses["optimum"]
+    saved = gather(optimum=lost.to_datatree(), **given).diagnoses["optimum"]
+    assert memory is not None
+    assert saved is not None
+    assert memory.messages == saved.messages
+    assert saved.messages[0] == "The data do not see mu."
+    assert "did not converge (stopped)" in saved.messages[1]
+
+
+def test_values_by_element() -> None:
+    w = np.arange(24.0).reshape(2, 3, 4)
+    group = xr.Dataset({"mu": (["chain", "draw"], w[..., 0]), "w": (["chain", "draw", "i"], w)})
+    found = draws_by_element(group)
+    assert list(found) == ["mu", "w[0]", "w[1]", "w[2]", "w[3]"]
+    np.testing.assert_array_equal(found["w[2]"], w[..., 2].ravel())
+    turned = draws_by_element(group.transpose("i", "draw", "chain"))
+    np.testing.assert_array_equal(turned["w[2]"], found["w[2]"])
+    point = xr.Dataset({"w": (["i", "j"], [[1.0, 2.0], [3.0, 4.0]]), "mu": 5.0})
+    values = {"w[0,0]": 1.0, "w[0,1]": 2.0, "w[1,0]": 3.0, "w[1,1]": 4.0, "mu": 5.0}
+    assert single_values(point) == values
+
+
+def test_deterministics_of_a_file_are_not_compared(calibrated: Any) -> None:
+    given = dict.fromkeys(("model", "validity", "comparison"))
+    trees = {"optimum": calibrated.optimum.to_datatree(), "posterior": calibrated.posterior}
+    comparison = gather(**given, **trees).comparison
+    assert comparison is not None
+    assert comparison["hyperparameter"].values.tolist() == ["mu", "sigma"]

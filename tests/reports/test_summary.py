@@ -1,0 +1,93 @@
+"""The summary says what was calibrated, the answer, and whether it may be trusted."""
+
+import dataclasses
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import prbayes as prb
+from prbayes.reports.material import gather
+from prbayes.reports.summary import summary, verdict
+
+
+def test_the_summary_has_the_answer(calibrated: Any, report: prb.Report) -> None:
+    _, _, posterior, _ = calibrated
+    text = " ".join(report.sections[0].text)
+    for name in ("mu", "sigma"):
+        mean, sd = map(float, re.findall(rf"{name} = (-?[\d.]+) ± ([\d.]+)", text)[0])
+        draws = posterior["posterior"][name].values
+        assert sd == pytest.approx(draws.std(ddof=1), rel=0.06)
+        assert mean == pytest.approx(draws.mean(), abs=0.06 * sd)
+    assert "cv =" not in text, "a deterministic is no hyperparameter"
+    assert (
+        "2 hyperparameters (mu, sigma) of the model were calibrated on 30 measured responses of y"
+        in text
+    )
+    assert "by the Kullback-Leibler divergence" in text
+    assert "not rejected at level 5%" in text
+
+
+def test_problems_are_counted_in_the_summary(calibrated: Any, section: Any) -> None:
+    posterior = calibrated[2].copy(deep=True)
+    posterior["posterior"]["mu"][0] += 5.0
+    bad = prb.Report("x", posterior=posterior, pictures=False)
+    assert any("R-hat" in p for p in section(bad, "Diagnostics").text)
+    assert any("problem" in p and "found no problem" not in p for p in bad.sections[0].text)
+    posterior["posterior"].attrs["warnings"] = "the data do not see mu"
+    again = prb.Report("x", posterior=posterior, pictures=False)
+    assert "Posterior: The data do not see mu." in section(again, "Diagnostics").text
+
+
+def material(**given: Any) -> Any:
+    nothing = dict.fromkeys(("model", "optimum", "posterior", "validity", "comparison"))
+    return gather(**(nothing | given))
+
+
+def draws(**values: Any) -> xr.DataTree:
+    variables = {name: (["chain", "draw"], v) for name, v in values.items()}
+    return xr.DataTree.from_dict({"posterior": xr.Dataset(variables)})
+
+
+def test_the_answer_of_many_hyperparameters_is_in_a_table() -> None:
+    rng = np.random.default_rng(1)
+    many = {f"p{i}": rng.normal(size=(2, 20)) for i in range(7)}
+    text = " ".join(summary(material(posterior=draws(**many))))
+    assert "7 hyperparameters of the model were calibrated" in text
+    assert "The answer is in the table of the posterior." in text
+    del many["p6"]
+    text = " ".join(summary(material(posterior=draws(**many))))
+    assert "6 hyperparameters (p0, p1, p2, p3, p4, p5) of" in text
+    assert "The answer is p0 = " in text
+
+
+def test_one_hyperparameter_and_several_results() -> None:
+    one = draws(p=np.array([[1.0, 2.0, 3.0], [2.0, 2.0, 2.0]]))
+    other = draws(p=np.array([[4.0, 5.0, 6.0], [5.0, 5.0, 5.0]]))
+    text = " ".join(summary(material(posterior={"a": one, "b": other})))
+    assert "1 hyperparameter (p) of the model was calibrated" in text
+    assert "The answer of a is p = 2.00 ± 0.63 (mean and standard deviation" in text
+    # (5 - 2) / .632
+    assert "The estimates of a and b differ by at most 4.7 standard deviations." in text
+    third = {"a": one, "b": other, "c": one}
+    assert "differ by" not in " ".join(summary(material(posterior=third)))
+
+
+def test_without_spread_nothing_is_said_of_the_distance() -> None:
+    fixed = draws(p=np.ones((1, 5)))
+    other = draws(p=np.full((1, 5), 2.0))
+    text = " ".join(summary(material(posterior={"a": fixed, "b": other})))
+    assert "differ by" not in text
+
+
+def test_a_verdict_names_the_sign(calibrated: Any) -> None:
+    test = calibrated.test
+    above = dataclasses.replace(test, statistic=0.4, critical_value=0.2, p_value=0.012, folded=True)
+    m = material(validity=above)
+    (text,) = summary(m)
+    assert "On the spread of the responses of 12 specimens (12 values)" in text
+    assert "is rejected at level 5% (area 0.400 > critical 0.200, p = 0.012)." in text
+    below = dataclasses.replace(above, statistic=0.1, p_value=0.4)
+    assert "is not rejected at level 5% (area 0.100 ≤ critical 0.200" in verdict("x", below, m)

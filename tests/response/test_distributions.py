@@ -1,0 +1,170 @@
+"""What is read off distributions agrees with closed forms: densities, quantiles, draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+from scipy import stats
+
+from prbayes.response.compilation import PLAIN, compile_batched
+from prbayes.response.distributions import (
+    PopulationSampler,
+    PriorPoints,
+    PriorSampler,
+    is_mvnormal,
+    log_density,
+    prior_draws,
+    quantiles,
+    valid,
+)
+from prbayes.response.inputs import Inputs, read_inputs
+
+COVARIANCE = np.array([[1.0, 0.3], [0.3, 0.36]])
+
+
+def inputs_of(make: Callable[[Any, Any], list[Any]]) -> tuple[Inputs, pm.Model]:
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1)
+        return read_inputs("y", make(mu, sigma), model), model
+
+
+def test_log_densities_are_summed_over_the_inputs_and_their_elements() -> None:
+    inputs, _ = inputs_of(
+        lambda mu, sigma: [
+            pm.Normal.dist(mu, sigma),
+            pm.MvNormal.dist(pt.stack([mu, 0.5]), COVARIANCE),
+            pm.Gamma.dist(2.0, sigma, shape=3),
+        ]
+    )
+    rng = np.random.default_rng(1)
+    values = [rng.normal(size=5), rng.normal(size=(5, 2)), rng.gamma(2.0, size=(5, 3))]
+    symbols = inputs.placeholders()
+    graph = log_density(inputs, inputs.rebuilt(symbols)[0], [pt.constant(v) for v in values])
+    (found,) = compile_batched(symbols, [graph])(np.array([2.0, -1.0]), np.array([0.7, 1.5]))
+    for row, mu, sigma in zip(found, (2.0, -1.0), (0.7, 1.5), strict=True):
+        expected = stats.norm(mu, sigma).logpdf(values[0])
+        expected = expected + stats.multivariate_normal([mu, 0.5], COVARIANCE).logpdf(values[1])
+        expected = expected + stats.gamma(2.0, scale=1 / sigma).logpdf(values[2]).sum(axis=1)
+        np.testing.assert_allclose(row, expected, rtol=1e-12)
+
+
+def test_an_impossible_covariance_has_no_density() -> None:
+    inputs, _ = inputs_of(
+        lambda mu, sigma: [pm.MvNormal.dist(np.zeros(2), pt.stacklists([[1.0, mu], [mu, 1.0]]))]
+    )
+    symbols = inputs.placeholders()
+    graph = log_density(inputs, inputs.rebuilt(symbols)[0], [pt.constant(np.zeros((1, 2)))])
+    (found,) = compile_batched(symbols, [graph])(np.array([0.5, 1.5]))
+    assert list(np.isneginf(found[:, 0])) == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("dist", "expected"),
+    [
+        (pm.Normal.dist(1.0, 2.0), stats.norm(1, 2)),
+        (pm.Weibull.dist(2.0, 1.5), stats.weibull_min(2, scale=1.5)),
+        (pm.Uniform.dist(1.0, 3.0), stats.uniform(1, 2)),
+    ],
+    ids=["Normal", "Weibull", "Uniform"],
+)
+def test_quantiles(dist: Any, expected: Any) -> None:
+    u = np.array([0.01, 0.3, 0.5, 0.99])
+    found = quantiles("y", dist, u).eval(mode=PLAIN)
+    np.testing.assert_allclose(found, expected.ppf(u), rtol=1e-9)
+
+
+def test_quantiles_of_a_multivariate_normal_have_its_mean_and_covariance() -> None:
+    u = np.array([[0.5, 0.5], [stats.norm.cdf(1.0), 0.5], [0.5, stats.norm.cdf(1.0)]])
+    dist = pm.MvNormal.dist(np.array([1.0, 2.0]), COVARIANCE)
+    assert is_mvnormal(dist)
+    assert not is_mvnormal(pm.Normal.dist())
+    center, one, two = quantiles("y", dist, u).eval(mode=PLAIN)
+    np.testing.assert_allclose(center, [1.0, 2.0], atol=1e-12)
+    root = np.column_stack([one - center, two - center])
+    np.testing.assert_allclose(root @ root.T, COVARIANCE, rtol=1e-9)
+    assert root[0, 1] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_has_no_quantiles_is_refused() -> None:
+    with pytest.raises(TypeError, match=r"y: poisson.* is discrete; use propagation=prb.Reweigh"):
+        quantiles("y", pm.Poisson.dist(2.0), 0.5)
+    with pytest.raises(
+        TypeError, match=r"y: vonmises.* has no inverse distribution function .*Fresh"
+    ):
+        quantiles("y", pm.VonMises.dist(0.0, 1.0), 0.5)
+
+
+def test_priors_are_drawn_together_and_the_seed_decides() -> None:
+    with pm.Model() as model:
+        center = pm.Normal("center", 5, 1)
+        pm.Normal("offset", center, 0.1, shape=2)
+    draws = PriorSampler(model.basic_RVs)
+    first, again, other = draws(400, 1), draws(400, 1), draws(400, 2)
+    assert [v.shape for v in first] == [(400,), (400, 2)]
+    for a, b, c in zip(first, again, other, strict=True):
+        np.testing.assert_array_equal(a, b)
+        assert not np.isin(a, c).any()
+    # Drawn given the variable above, from the prior: four standard errors.
+    assert abs((first[1] - first[0][:, None]).std() - 0.1) < 4 * 0.1 / np.sqrt(2 * 800)
+    assert abs(first[0].mean() - 5) < 4 / 20
+    np.testing.assert_array_equal(prior_draws(model.basic_RVs, 400, 1)[0], first[0])
+
+
+def test_priors_that_cannot_be_drawn_are_refused() -> None:
+    with pm.Model() as model:
+        pm.Flat("mu")
+    with pytest.raises(TypeError, match=r"priors: got mu, .*cannot be drawn .*replace pm.Flat and"):
+        prior_draws(model.basic_RVs, 3, 1)
+
+
+def test_points_of_a_cube_are_brought_to_the_prior_in_order() -> None:
+    with pm.Model() as model:
+        center = pm.Normal("center", 5, 2)
+        pm.Normal("offset", center, 0.1, shape=2)
+    points = PriorPoints(model.basic_RVs)
+    assert points.size == 3
+    cube = np.array([[0.5, 0.5, 0.5], [stats.norm.cdf(1), 0.5, stats.norm.cdf(-1)]])
+    found_center, found_offset = points(cube)
+    np.testing.assert_allclose(found_center, [5.0, 7.0])
+    np.testing.assert_allclose(found_offset, [[5.0, 5.0], [7.0, 6.9]])
+    with pytest.raises(TypeError, match="depends on a random variable which is not in the model"):
+        PriorPoints([pm.Normal.dist(center, 1.0)])
+
+
+def test_parameters_are_valid_where_densities_say_so() -> None:
+    inputs, _ = inputs_of(lambda mu, sigma: [pm.Normal.dist(0, mu), pm.Gamma.dist(sigma, 1.0)])
+    symbols = inputs.placeholders()
+    graph = valid(inputs, inputs.rebuilt(symbols)[0])
+    values = {"mu": np.array([1.0, -1.0, 1.0, np.nan]), "sigma": np.array([1.0, 1.0, -1.0, 1.0])}
+    (found,) = compile_batched(symbols, [graph])(*(values[str(s.name)] for s in symbols))
+    np.testing.assert_array_equal(found, [True, False, False, False])
+
+
+def test_populations_are_drawn_at_their_own_roots() -> None:
+    inputs, _ = inputs_of(
+        lambda mu, sigma: [
+            pm.Normal.dist(mu, 0.1),
+            sigma,
+            pm.Normal.dist(0, 1),
+            pt.constant(4.0) * 1,
+        ]
+    )
+    names = [str(r.name) for r in inputs.roots]
+    given = {"mu": np.array([1.0, 5.0, 9.0]), "sigma": np.array([0.1, 0.2, 0.3])}
+    sampler = PopulationSampler(inputs)
+    params = [given[n] for n in names]
+    aleatory, epistemic = sampler(params, 400, np.random.default_rng(1))
+    assert [a.shape for a in aleatory] == [(3, 400), (3, 400)]
+    np.testing.assert_array_equal(epistemic[0], given["sigma"][:, None])
+    # Four standard errors of a mean of 400; and no two specimens are the same.
+    np.testing.assert_allclose(aleatory[0].mean(axis=1), given["mu"], atol=4 * 0.1 / 20)
+    np.testing.assert_allclose(aleatory[1].mean(axis=1), 0.0, atol=4 / 20)
+    assert np.unique(aleatory[1]).size == 1200
+    for seed, same in ((1, True), (2, False)):
+        again, _ = sampler(params, 400, np.random.default_rng(seed))
+        assert np.array_equal(again[0], aleatory[0]) == same

@@ -1,0 +1,142 @@
+"""Inputs: aleatory, epistemic or constant; what is none of the three is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+
+from prbayes.response.inputs import Inputs, event_shape, is_random, read_inputs
+
+with pm.Model():
+    STRANGER = pm.Normal("stranger")
+
+
+def read(make: Callable[[Any, Any], list[Any]]) -> tuple[Inputs, list[Any], list[Any]]:
+    """Read the inputs that are made of mu and sigma; return them, what was given, and the two."""
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1)
+        given = make(mu, sigma)
+        return read_inputs("y", given, model), given, [mu, sigma]
+
+
+def test_inputs_are_sorted_in_the_order_of_the_arguments() -> None:
+    def make(mu: Any, sigma: Any) -> list[Any]:
+        x, z = pm.Normal.dist(mu, 1.0), pm.MvNormal.dist(pt.stack([mu, mu]), np.eye(2))
+        return [3, z, x, 2 * sigma, np.array([4, 5]), z]
+
+    inputs, (_, z, x, doubled, _, _), roots = read(make)
+    assert inputs.aleatory == (z, x)
+    assert inputs.epistemic == (doubled,)
+    assert set(inputs.roots) == set(roots)
+    assert not inputs.nested
+    assert inputs.event_shapes == ((2,), ())
+    assert inputs.event_ndims == (1, 0)
+    # Constants are floats, positions of aleatory inputs are integers.
+    constant, *positions, vector, again = inputs.arguments
+    assert (constant, type(constant)) == (3.0, float)
+    assert positions == [0, 1, doubled]
+    np.testing.assert_array_equal(vector, [4.0, 5.0])
+    assert again == 0
+    filled = inputs.fill(["z", "x"], ["doubled"])
+    assert filled[:4] == [3.0, "z", "x", "doubled"]
+    assert filled[5] == "z"
+
+
+def test_roots_are_the_model_variables_above_the_inputs_only() -> None:
+    inputs, _, (mu, _) = read(
+        lambda mu, sigma: [pm.Normal.dist(pt.exp(mu), 1.0), pm.Data("d", 1.0)]
+    )
+    assert inputs.roots == (mu,)
+
+
+def test_a_dist_below_another_is_nested() -> None:
+    inputs, _, _ = read(lambda mu, sigma: [pm.Normal.dist(pm.Normal.dist(mu, 1.0), sigma)])
+    assert inputs.nested
+
+
+def test_inputs_are_rebuilt_from_other_roots() -> None:
+    inputs, _, _ = read(lambda mu, sigma: [pm.Normal.dist(mu, sigma), mu - sigma])
+    (mu, sigma) = inputs.placeholders()
+    assert (mu.name, sigma.name) == ("mu", "sigma")
+    (x,), (difference,) = inputs.rebuilt([np.float64(7.0), np.float64(1e-9)])
+    assert difference.eval() == pytest.approx(7.0)
+    assert pm.draw(x, random_seed=1) == pytest.approx(7.0, abs=1e-6)
+
+
+def test_leading_axes_of_length_one_are_dropped() -> None:
+    inputs, _, _ = read(lambda mu, sigma: [pm.Normal.dist(mu, sigma)])
+    assert [p.shape for p in inputs.core([np.ones((1, 1)), np.ones(1)])] == [(), ()]
+
+
+def test_shapes_and_randomness() -> None:
+    n = pt.constant(3)
+    unknown = pm.MvNormal.dist(pt.zeros(n), pt.eye(n))
+    assert event_shape(unknown) == (3,)
+    assert event_shape(pm.Normal.dist(0, 1)) == ()
+    assert is_random(pm.Normal.dist(0, 1))
+    assert is_random(pm.Censored.dist(pm.Normal.dist(0, 1), lower=0, upper=1))
+    assert not is_random(2 * pm.Normal.dist(0, 1))
+    assert not is_random(pt.dscalar())
+
+
+SENTENCE = r"write the expression inside the response"
+BAD: dict[str, tuple[Callable[[Any, Any], list[Any]], type[Exception], str]] = {
+    "string": (lambda m, s: [pm.Normal.dist(m, s), "C"], TypeError, r"2: got str 'C', .*a `.dist"),
+    "object": (lambda m, s: [object()], TypeError, r"1: got object .*a `.dist\(\)`"),
+    "class": (lambda m, s: [pm.Normal], TypeError, r"1: got .*a `.dist\(\)`"),
+    "None": (lambda m, s: [None], ValueError, r"1: got .*None.* expected a number"),
+    "NaN": (lambda m, s: [np.nan], ValueError, r"1: .*not finite \(nan\), expected a number"),
+    "inf": (lambda m, s: [[1, np.inf]], ValueError, r"1: .*not finite"),
+    "complex": (lambda m, s: [1j], TypeError, r"1: got complex numbers"),
+    "multiple": (lambda m, s: [2 * pm.Normal.dist(m, s)], TypeError, SENTENCE),
+    "exp": (lambda m, s: [pt.exp(pm.Normal.dist(m, s))], TypeError, SENTENCE),
+    "part": (
+        lambda m, s: [pm.MvNormal.dist(pt.stack([m, m]), np.eye(2))[0]],
+        TypeError,
+        SENTENCE,
+    ),
+    "loose symbol": (
+        lambda m, s: [pm.Normal.dist(m, pt.dscalar("loose"))],
+        TypeError,
+        r"1: .*depends on loose.*inside the same `with pm.Model\(\)`",
+    ),
+    "another model, above": (
+        lambda m, s: [pm.Normal.dist(STRANGER, s)],
+        TypeError,
+        r"1: .*depends on stranger.*inside the same `with pm.Model\(\)`",
+    ),
+    "another model": (
+        lambda m, s: [pm.Normal.dist(m, s), STRANGER],
+        TypeError,
+        r"2: .*stranger.*inside the same `with pm.Model\(\)`",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_inputs_are_refused(case: str) -> None:
+    make, error, message = BAD[case]
+    with pytest.raises(error, match=f"y: input {message}" if message != SENTENCE else SENTENCE):
+        read(make)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda m, s: [], r"y: got 0 inputs, none of them aleatory.*dist\(\)"),
+        (lambda m, s: [m, 2.0], r"y: got 2 inputs, none of them aleatory"),
+        (
+            lambda m, s: [pm.Normal.dist(0, 1)],
+            r"y: got inputs that depend on no variable of the model.*such as mu = pm.Normal\('mu'",
+        ),
+    ],
+    ids=["none", "nothing aleatory", "no hyperparameter"],
+)
+def test_inputs_that_are_too_little_are_refused(make: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        read(make)

@@ -1,0 +1,127 @@
+"""The response: shapes of what goes in and comes out, counts, and what makes two the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+
+from prbayes.response.calling import ResponseError, scalar
+from prbayes.response.failures import Abort, Replace
+from prbayes.response.inputs import Inputs, read_inputs
+from prbayes.response.response import Responses, refuse_uncallable
+
+with pm.Model() as MODEL:
+    MU = pm.Normal("mu")
+    X = pm.Normal.dist(MU, 1.0)
+    PAIR = pm.MvNormal.dist(pt.stack([MU, MU]), np.eye(2))
+
+
+def inputs(*given: Any) -> Inputs:
+    return read_inputs("y", given, MODEL)
+
+
+def weighted(pair: Any, a: Any, x: Any, slope: Any) -> Any:
+    return a * pair[..., 0] + 10 * pair[..., 1] + 100 * x + 1000 * slope
+
+
+ALL = (PAIR, 2.0, X, MU)  # aleatory, constant, aleatory, epistemic
+RNG = np.random.default_rng(1)
+PAIRS, XS, SLOPES = RNG.normal(size=(4, 3, 2)), RNG.normal(size=(4, 3)), RNG.normal(size=(4, 1))
+EXPECTED = weighted(PAIRS, 2.0, XS, SLOPES)
+
+
+def by_rows(pair: Any, a: Any, x: Any, slope: Any) -> Any:
+    assert np.ndim(x) == 1
+    assert np.shape(pair) == (len(x), 2)
+    return weighted(pair, a, x, slope)
+
+
+@pytest.mark.parametrize("way", ["plain", "scalar", "stored", "tolerant"])
+def test_every_way_of_calling_gives_the_same_in_the_shape_of_the_batch(
+    way: str, tmp_path: Path
+) -> None:
+    settings: dict[str, dict[str, Any]] = {
+        "plain": {"function": weighted},
+        "scalar": {"function": scalar(weighted)},
+        "stored": {"function": by_rows, "store": tmp_path},
+        "tolerant": {"function": by_rows, "on_failure": Replace()},
+    }
+    responses = Responses("y", inputs=inputs(*ALL), **settings[way])
+    assert responses.plain == (way == "plain")
+    np.testing.assert_array_equal(responses([PAIRS, XS], [SLOPES]), EXPECTED)
+    assert (responses.count, responses.computed, responses.failures) == (12, 12, 0)
+    np.testing.assert_array_equal(responses([PAIRS[:1], XS[0]], [SLOPES[0, 0]]), EXPECTED[:1])
+    assert responses.count == 15
+    assert responses.computed == (12 if way == "stored" else 15)
+    assert responses([PAIRS[:0], XS[:0]], [SLOPES[:0]]).shape == (0, 3)
+
+
+def test_a_point_of_a_store_is_all_that_goes_into_the_response(tmp_path: Path) -> None:
+    def count(*given: Any) -> int:
+        responses = Responses("y", by_rows, inputs(*given), store=tmp_path)
+        responses([PAIRS, XS], [SLOPES])
+        return responses.computed
+
+    assert [count(*ALL), count(*ALL)] == [12, 0]
+    assert count(PAIR, 3.0, X, MU) == 12  # another constant is another input
+
+
+def test_failures_are_counted(tmp_path: Path) -> None:
+    def steep(x: Any) -> Any:
+        return np.where(x > 0, np.nan, x)
+
+    responses = Responses("y", steep, inputs(X), on_failure=Replace(-9.0))
+    found = responses([np.array([1.0, -1.0, 2.0])], [])
+    np.testing.assert_array_equal(found, [-9.0, -1.0, -9.0])
+    assert responses.failures == 2
+    plain = Responses("y", steep, inputs(X), on_failure=Abort())
+    assert plain.plain
+    np.testing.assert_array_equal(plain([np.array([1.0, -1.0])], []), [np.nan, -1.0])
+    assert plain.failures == 0
+
+
+def test_mistakes_are_named() -> None:
+    def call(function: Any, **keywords: Any) -> None:
+        Responses("y", function, inputs(X), **keywords)([np.zeros((2, 3))], [])
+
+    with pytest.raises(
+        ResponseError, match=r"y: the response raised KeyError: 'k'; .*\(2, 3\).*scalar"
+    ):
+        call(lambda x: {}["k"])
+    with pytest.raises(
+        ResponseError, match=r"y: .*returned shape \(3,\) .* \(2, 3\), expected \(2, 3\)"
+    ):
+        call(lambda x: x[0])
+    with pytest.raises(
+        ResponseError, match=r"y: .*returned shape \(2,\) .* \(6,\), expected \(6,\)"
+    ):
+        call(lambda x: x[:2], on_failure=Replace())
+    with pytest.raises(
+        TypeError, match=r"y: response: got float, expected a function .*the order is"
+    ):
+        call(3.0)
+    refuse_uncallable("y", np.square)
+
+
+def test_two_responses_are_the_same_by_function_inputs_and_constants() -> None:
+    with MODEL:
+        other = pm.Normal.dist(MU, 1.0)
+
+    def same(function: Any, *given: Any) -> bool:
+        one = Responses("y", weighted, inputs(PAIR, 2.0, X))
+        return one.same_as(Responses("z", function, inputs(*given)))
+
+    assert same(weighted, PAIR, 2.0, X)
+    assert not same(by_rows, PAIR, 2.0, X)
+    assert not same(weighted, PAIR, 3.0, X)
+    assert not same(weighted, X, 2.0, PAIR)
+    assert not same(weighted, PAIR, 2.0, other)
+    assert not same(weighted, PAIR, 2.0)
+    assert not same(weighted, PAIR, X, X)
+    epistemic = Responses("y", weighted, inputs(X, MU))
+    assert not epistemic.same_as(Responses("y", weighted, inputs(X, MU)))
