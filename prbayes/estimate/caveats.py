@@ -6,7 +6,7 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.estimate.differences import cross
-from prbayes.estimate.identifiability import blind_directions
+from prbayes.estimate.identifiability import unidentified_directions
 from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.rivals import Rival
 from prbayes.estimate.sampling import Local
@@ -126,7 +126,7 @@ def caveats(
         lines.append(_of_design(evaluator, design_error))
     lines += [_of_rival(evaluator, rival) for rival in others if rival.comparable]
     if local is not None:
-        directions = blind_directions(local.blind, evaluator.readable_names)
+        directions = unidentified_directions(local.unidentified, evaluator.readable_names)
         lines += map(_of_direction, directions)
     return tuple(lines)
 

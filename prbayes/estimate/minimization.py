@@ -15,6 +15,7 @@ from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes._progress import shown
 from prbayes.estimate.caveats import breakdown, caveats, elements_at_edge
 from prbayes.estimate.methods import Method
+from prbayes.estimate.obstacles import sampling_obstacle
 from prbayes.estimate.optimum import Optimum
 from prbayes.estimate.refinement import (
     AGREE,
@@ -26,13 +27,12 @@ from prbayes.estimate.refinement import (
     refuse,
     spread_around,
 )
-from prbayes.estimate.refit import Neighbourhood
+from prbayes.estimate.refit import SamplingDistribution
 from prbayes.estimate.rivals import Rival, rivals
 from prbayes.estimate.sampling import Local
 from prbayes.estimate.search import Run, Search, Trace, approach, minimise, settle
 from prbayes.estimate.search import start as begin
 from prbayes.estimate.solution import assemble, rival_record
-from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import model_on_context
 from prbayes.model.support import shortcomings
@@ -316,7 +316,7 @@ class _State:
         By which the simulators' discrepancies are divided.
     run : Run
         The last one, with the trace of all.
-    sampling : Neighbourhood or None
+    sampling : SamplingDistribution or None
         The sampling distribution of the minimiser around theta; None where nothing is known of it.
     design_error : float
         Of the design, in standard errors; NaN where it is not known.
@@ -329,7 +329,7 @@ class _State:
     theta: Floats
     scales: Floats
     run: Run
-    sampling: Neighbourhood | None
+    sampling: SamplingDistribution | None
     design_error: float = np.nan
     cloud: Floats | None = None
     restart: Floats | None = None
@@ -493,11 +493,11 @@ def _breakdown(plan: _Plan, state: _State) -> tuple[tuple[str, ...], tuple[str, 
     return edge, jump
 
 
-def _sampling(evaluator: Evaluator, theta: Floats, scales: Floats) -> Neighbourhood | None:
+def _sampling(evaluator: Evaluator, theta: Floats, scales: Floats) -> SamplingDistribution | None:
     """Return the sampling distribution of the minimiser, or None where nothing is known of it."""
-    if any(n.metric.minimum is Minimum.UNKNOWN or n.bound.random for n in evaluator.nodes):
+    if sampling_obstacle(evaluator) is not None:
         return None
-    return Neighbourhood.of(evaluator, theta, scales, evaluator.prior_sd)
+    return SamplingDistribution.of(evaluator, theta, scales)
 
 
 def _covariance(state: _State) -> Floats:

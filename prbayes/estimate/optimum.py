@@ -11,7 +11,8 @@ import xarray as xr
 
 from prbayes._checks import Floats
 from prbayes.estimate.caveats import breakdown
-from prbayes.estimate.refit import Neighbourhood, inapplicable
+from prbayes.estimate.obstacles import refit_obstacle, sampling_obstacle
+from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Identity, as_attributes, from_attributes
@@ -123,7 +124,7 @@ class Optimum:
         """Responses computed for the model so far: without those found in a store, with those computed again."""
         return sum(node.bound.responses.computed for node in self.evaluator.nodes)
 
-    def sampling(self, *, weakest: float = 1.0) -> Neighbourhood:
+    def sampling(self, *, weakest: float = 1.0) -> SamplingDistribution:
         """Return the sampling distribution of the minimiser around the optimum.
 
         Parameters
@@ -139,12 +140,11 @@ class Optimum:
             If a metric declares nothing of its minimum, or a discrepancy is random.
         """
         require_sampling(self, "sampling")
-        reason = inapplicable(self.evaluator)
-        if reason:
-            raise TypeError(f"sampling: {reason}")
+        obstacle = sampling_obstacle(self.evaluator)
+        if obstacle is not None:
+            raise TypeError(f"sampling: {obstacle}")
         scales = np.array(list(self.scales.values()))
-        prior_sd = self.evaluator.prior_sd
-        return Neighbourhood.of(self.evaluator, self.theta, scales, prior_sd, weakest)
+        return SamplingDistribution.of(self.evaluator, self.theta, scales, weakest)
 
     def to_datatree(self) -> xr.DataTree:
         """Return the optimum as a DataTree with groups ``optimum``, ``stderr``, ``trace`` and ``calibration``."""
@@ -197,9 +197,9 @@ def require_refits(optimum: object, caller: str, advice: str) -> Optimum:
     if not isinstance(optimum, Optimum):
         got = type(optimum).__name__
         raise TypeError(f"{caller}: got {got}, expected an Optimum; call prb.minimize() first")
-    reason = inapplicable(require_sampling(optimum, caller).evaluator)
-    if reason:
-        raise ValueError(f"{caller}: {reason}{advice}")
+    obstacle = refit_obstacle(require_sampling(optimum, caller).evaluator)
+    if obstacle is not None:
+        raise ValueError(f"{caller}: {obstacle}{advice}")
     return optimum
 
 

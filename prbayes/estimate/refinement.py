@@ -152,7 +152,7 @@ def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int = 200) -> Floa
     """Return the mean discrepancy of data sets drawn from the model at theta, (k,) by simulator."""
     floors = []
     for k in range(len(evaluator.nodes)):
-        information = Information(evaluator, k, theta, evaluator.prior_sd, n_sets=n_sets)
+        information = Information(evaluator, k, theta, n_sets=n_sets)
         floors.append(information.noise_floor)
     return np.array(floors)
 
