@@ -186,7 +186,7 @@ def minimize(
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
     ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0,
-    4.0])
+    ...     4.0])
     >>> optimum = prb.minimize(model)
     >>> bool(abs(optimum.point["mu"] - 1) < 0.1)
     True
