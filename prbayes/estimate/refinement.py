@@ -19,7 +19,8 @@ MAX_ROUNDS = 8
 # Standard errors within which the optima of two independent designs are to be: a tenth adds half a
 # per cent to the width of an interval.
 AGREE = 0.1
-# Thetas that stand for the populations around an optimum; by judgement: more cost time, not responses.
+# Thetas that stand for the populations around an optimum; by judgement: more cost time, not
+# responses.
 _THETAS = 256
 # The power of its size with which the error of a design of several inputs falls, about; it only
 # says how many points are added at a time (benchmarks/dimensions.py).

@@ -70,7 +70,8 @@ def rivals(
     best : ndarray, shape (d,)
     scales : ndarray, shape (k,)
     local : Local
-        What the data see at ``best``; where they are blind, rivals are reported at the same place as ``best``.
+        What the data see at ``best``; where they are blind, rivals are reported at the same place
+        as ``best``.
     noise : float
         A difference of the objective that sampling explains.
     starts : int
