@@ -619,7 +619,7 @@ def test_a_users_own_metric_is_minimised_and_has_standard_errors() -> None:
         weighted=True,
     )
     optimum = prb.minimize(normal_model(metric), method="Nelder-Mead")
-    np.testing.assert_allclose(pair(optimum), [MEAN, SD], atol=1e-3)
+    np.testing.assert_allclose(pair(optimum), [MEAN, SD], atol=3e-3)  # 0.05 standard errors
     # Those of the mean and of the standard deviation of 50 normal values.
     expected = [SD / 50**0.5, SD / 100**0.5]
     np.testing.assert_allclose(errors(optimum), expected, rtol=0.25)
