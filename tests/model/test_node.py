@@ -103,7 +103,8 @@ def test_a_copy_gives_the_same_optimum(way: str) -> None:
     model = build(prb.Reweighted(64))
     other = COPIES[way](model)
     first, second = (prb.minimize(m, starts=0, **QUIET) for m in (model, other))
-    # PyMC's clones may order the variables, and so the starting points, in another way: up to the tolerance
+    # PyMC's clones may order the variables, and so the starting points, in another way: up to the
+    # tolerance
     for name in ("mu", "sigma"):
         assert abs(first.point[name] - second.point[name]) < 0.01 * first.stderr[name]
         assert first.stderr[name] == pytest.approx(second.stderr[name], rel=0.01)
