@@ -32,7 +32,30 @@ _LEVELS = (0.055, 0.5, 0.945)
 _WIDTH = 3.2
 # Prior draws that tell its mean and precision along the axes.
 _PRIOR_DRAWS = 1024
-_WITHOUT = "none: {}"
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """What an adjustment made of draws.
+
+    Attributes
+    ----------
+    thetas : ndarray, shape (..., d)
+        The draws; the given ones if nothing was done.
+    done : str
+        What was done; empty if nothing.
+    reason : str or None
+        Why nothing was done, None if something was.
+    """
+
+    thetas: Floats
+    done: str = ""
+    reason: str | None = None
+
+    @property
+    def note(self) -> str:
+        """What was done, or why nothing, as results state it."""
+        return self.done if self.reason is None else f"none: {self.reason}"
 
 
 @dataclass(frozen=True)
@@ -93,7 +116,7 @@ class Affine:
 
     def __call__(
         self, evaluator: Evaluator, thetas: Floats, optima: Sequence[Floats]
-    ) -> tuple[Floats, str]:
+    ) -> Adjusted:
         """Map draws of the pseudo-posterior, each mode by itself.
 
         Parameters
@@ -106,21 +129,19 @@ class Affine:
 
         Returns
         -------
-        thetas : ndarray, shape (..., d)
-        note : str
-            What was done, or why nothing.
+        Adjusted
         """
         obstacle = refit_obstacle(evaluator)
         if obstacle is not None:
-            return thetas, _WITHOUT.format(obstacle)
+            return Adjusted(thetas, reason=obstacle)
         draws = thetas.reshape(-1, thetas.shape[-1])
         modes = _identified_modes(evaluator, optima)
         if not modes:
             reason = "the data tell less than the prior about every hyperparameter"
-            return thetas, _WITHOUT.format(reason)
+            return Adjusted(thetas, reason=reason)
         distances = np.array([_distance(mode, draws) for mode in modes])
         if _run_together(distances):
-            return thetas, _WITHOUT.format("the posterior has modes that run into each other")
+            return Adjusted(thetas, reason="the posterior has modes that run into each other")
         nearest = distances.argmin(axis=0)
         out = draws.copy()
         count, far = 0, 0
@@ -132,14 +153,14 @@ class Affine:
             far += int(outside.sum())
             count += 1
         if not count:
-            return thetas, _WITHOUT.format(f"there are fewer than {_FEWEST} draws of a mode")
-        note = f"{self!r}"
+            return Adjusted(thetas, reason=f"there are fewer than {_FEWEST} draws of a mode")
+        done = f"{self!r}"
         if len(modes) > 1:
-            note += f", {count} modes each by itself"
+            done += f", {count} modes each by itself"
         if far:
             share = far / len(draws)
-            note += f", {share:.1%} of the draws drawn in to {_FAR:.0f} standard deviations"
-        return out.reshape(thetas.shape), note
+            done += f", {share:.1%} of the draws drawn in to {_FAR:.0f} standard deviations"
+        return Adjusted(out.reshape(thetas.shape), done)
 
     def _mapped(
         self, sampling: SamplingDistribution, draws: Floats
