@@ -1,4 +1,4 @@
-"""`bootstrap` against theory, and `simulation_based_calibration` against what it promises, wherever it runs."""
+"""`simulation_based_calibration` against what it promises, wherever it runs."""
 
 import logging
 import multiprocessing
@@ -56,81 +56,6 @@ def build(
             **({"propagation": R256} | keywords),
         )
     return model
-
-
-# -- bootstrap
-# -------------------------------------------------------------------------------------------
-
-
-@cache
-def fit(name: str, propagation: Any = R256) -> prb.Optimum:
-    return prb.minimize(
-        build(METRICS[name], propagation=propagation), method="Nelder-Mead", starts=0
-    )
-
-
-@pytest.mark.parametrize("name", [pytest.param("ll", marks=pytest.mark.slow), "kl"])
-@pytest.mark.parametrize("parametric", [False, True])
-def test_standard_deviations_of_a_normal_mean(name: str, parametric: bool) -> None:
-    result = prb.bootstrap(fit(name), 1000, parametric=parametric)
-    draws = result.posterior["mu"]
-    assert draws.shape == (1, 1000)
-    # The minimiser is about the mean: its Dirichlet weighted variance is s^2 / (N + 1), its
-    # sampling variance 0.5^2 / N with the model's sd. 1000 draws: 2.2%; the mean is not quite the
-    # minimiser, nor these data normal: 6%.
-    expected = 0.5 / N**0.5 if parametric else SD / (N + 1) ** 0.5
-    np.testing.assert_allclose(float(draws.std()), expected, rtol=4 * 0.022 + 0.06)
-    assert abs(0.5 / SD - 1) > 0.1  # the two are told apart
-    assert (
-        abs(float(draws.mean()) - fit(name).point["mu"])
-        < 4 * expected / 1000**0.5 + 0.05 * expected
-    )
-    assert result.posterior.attrs["converged"] == 1.0
-    assert result.posterior.attrs["sampler"].startswith(
-        "parametric" if parametric else "loss-likelihood"
-    )
-    np.testing.assert_array_equal(result.observed_data["y"], OBSERVED)
-
-
-@pytest.mark.parametrize("name", ["pr", "area"])
-def test_the_parametric_bootstrap_agrees_with_the_standard_error(name: str) -> None:
-    # One by refitting, one to first order: 2.2% and 5% of sampling error, and curvature.
-    draws = prb.bootstrap(fit(name), 1000, parametric=True, random_seed=3).posterior["mu"]
-    np.testing.assert_allclose(float(draws.std()), fit(name).stderr["mu"], rtol=0.2)
-
-
-def test_no_response_is_computed_and_nothing_is_random() -> None:
-    optimum = fit("kl")
-    before = optimum.evaluator.n_responses
-    one, two, other = (prb.bootstrap(optimum, 20, random_seed=seed).posterior for seed in (1, 1, 2))
-    assert optimum.evaluator.n_responses == before
-    xr.testing.assert_equal(one.to_dataset(), two.to_dataset())
-    assert (one["mu"].values != other["mu"].values).any()
-
-
-def test_bootstrap_without_a_design_is_of_first_order() -> None:
-    draws = prb.bootstrap(fit("kl", prb.Resimulated(256)), 500).posterior["mu"]
-    np.testing.assert_allclose(float(draws.std()), SD / (N + 1) ** 0.5, rtol=4 * 0.032 + 0.06)
-
-
-def test_what_cannot_be_bootstrapped_is_refused() -> None:
-    with pytest.raises(TypeError, match="bootstrap: got dict, expected an Optimum"):
-        prb.bootstrap({"mu": 1.0})  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="draws"):
-        prb.bootstrap(fit("kl"), 1)
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
-        pm.Normal("idle", 3, 2)
-        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
-    optimum = prb.minimize(model, starts=0)
-    for parametric in (False, True):
-        with pytest.raises(
-            ValueError, match="bootstrap: the data tell less than the prior about idle, along which"
-        ):
-            prb.bootstrap(optimum, 10, parametric=parametric)
-    model = build(propagation=prb.Fresh(64))
-    with pytest.raises(ValueError, match=r"bootstrap: y has prb\.Fresh"):
-        prb.bootstrap(prb.minimize(model, method="Nelder-Mead", max_evaluations=5), 10)
 
 
 # -- simulation-based calibration: where it runs

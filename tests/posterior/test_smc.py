@@ -11,7 +11,6 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
-from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 from scipy.stats import norm
 
 import prbayes as prb
@@ -460,63 +459,7 @@ def test_storage_in_netcdf(tmp_path: Path) -> None:
         loaded.close()
 
 
-# -- the kernel under PyMC's own sampler, and what it relies on
-# ------------------------------------------
-
-
-def test_the_methods_that_the_kernel_relies_on_exist() -> None:
-    for name in (
-        "initialize", "set_rng", "_reset_state", "_initialize_kernel", "setup_kernel", "update_beta_and_weights",
-        "step", "resample", "tune", "mutate", "sample_stats", "sample_settings",
-    ):  # fmt: skip
-        assert callable(getattr(SMC_KERNEL, name)), name
-    index = systematic_resampling(np.array([0.5, 0.0, 0.5]), np.random.default_rng(1))
-    assert sorted(index) in ([0, 0, 2], [0, 2, 2])
-    kernel = prb.posterior.BatchedKernel(20, model=area_run()[0], random_seed=1)
-    for name in (
-        "tempered_posterior",
-        "prior_logp",
-        "likelihood_logp",
-        "beta",
-        "iteration",
-        "weights",
-    ):
-        assert hasattr(kernel, name), name
-    assert kernel.beta == 0
-    assert kernel.log_marginal_likelihood == 0
-
-
-class Recording(prb.posterior.BatchedKernel):
-    calls: list[str]
-
-    def __getattribute__(self, name: str) -> Any:
-        if name in RECORDED:
-            RECORD.append(name)
-        return super().__getattribute__(name)
-
-
-RECORD: list[str] = []
-RECORDED = {
-    "initialize", "set_rng", "_reset_state", "_initialize_kernel", "setup_kernel", "update_beta_and_weights", "step",
-    "resample", "tune", "mutate", "sample_stats", "sample_settings",
-}  # fmt: skip
-
-
-def test_pymc_calls_the_kernel_in_the_documented_order() -> None:
-    RECORD.clear()
-    keywords = {
-        "draws": 60,
-        "chains": 1,
-        "cores": 1,
-        "progressbar": False,
-        "compute_convergence_checks": False,
-    }
-    idata = pm.sample_smc(kernel=Recording, model=area_run()[0], random_seed=1, **keywords)
-    stages = idata.sample_stats["beta"].size
-    first = RECORD.index("initialize")
-    start = ["initialize", "_reset_state", "set_rng", "_initialize_kernel", "setup_kernel"]
-    stage = ["update_beta_and_weights", "step", "resample", "tune", "mutate", "sample_stats"]
-    assert RECORD[first:] == start + stages * stage + ["sample_settings"]
+# -- the kernel under PyMC's own sampler
 
 
 def test_the_kernel_draws_the_same_posterior_under_pymc() -> None:
@@ -538,13 +481,3 @@ def test_the_kernel_draws_the_same_posterior_under_pymc() -> None:
     chain = idata.sample_stats["log_marginal_likelihood"].values
     last = [np.asarray(row, dtype=float)[-1] for row in chain]
     assert abs(np.mean(last) - evidence) < 4 * 0.15 / 2**0.5
-
-
-def test_the_kernel_needs_an_epsilon() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu"), 1.0)
-        prb.Simulator(
-            "y", same, x, metric=prb.AreaMetric(), observed=OBSERVED, propagation=prb.Reweighted(16)
-        )
-    with pytest.raises(ValueError, match=r"y: epsilon is not set; call prb\.set_epsilon"):
-        prb.posterior.BatchedKernel(50, model=model)

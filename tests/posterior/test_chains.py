@@ -1,0 +1,123 @@
+"""Chains that were killed go on where they stopped, and give the particles they would have given."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import prbayes as prb
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.identity import identity_of
+from prbayes.posterior.chains import Chains, Particles
+from prbayes.posterior.checkpoint import Checkpoint
+from prbayes.posterior.smc_kernel import BatchedKernel
+
+OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 20)
+DRAWS, CHAINS = 20, 3
+PROPAGATIONS: dict[str, Any] = {"stored": prb.Reweighted(64), "random": prb.Fresh(32)}
+
+
+class Killed(Exception):  # noqa: N818
+    pass
+
+
+def evaluator(name: str) -> Evaluator:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
+        prb.Simulator(
+            "y",
+            np.positive,
+            x,
+            metric=prb.AreaMetric(),
+            observed=OBSERVED,
+            epsilon=0.05,
+            propagation=PROPAGATIONS[name],
+        )
+    return Evaluator(model)
+
+
+def run(name: str, path: Path | None = None) -> Particles:
+    own = evaluator(name)
+    checkpoint = None if path is None else Checkpoint(path, identity_of(own), {})
+    chains = Chains(own, DRAWS, 0.5, checkpoint)
+    return chains(np.random.SeedSequence(3).spawn(CHAINS), False)
+
+
+@cache
+def undisturbed(name: str) -> Particles:
+    return run(name)
+
+
+def kill_after(n_stages: int, patch: pytest.MonkeyPatch) -> None:
+    """Raise at the stage after so many."""
+    original, done = BatchedKernel.mutate, [0]
+
+    def mutate(self: BatchedKernel) -> None:
+        if done[0] == n_stages:
+            raise Killed
+        done[0] += 1
+        original(self)
+
+    patch.setattr(BatchedKernel, "mutate", mutate)
+
+
+def stages_of(particles: Particles) -> list[int]:
+    return [len(stages["beta"]) for stages in particles.stats]
+
+
+@pytest.mark.parametrize("name", PROPAGATIONS)
+@pytest.mark.parametrize("where", ["in the first", "between", "in the last"])
+def test_a_chain_that_was_killed_gives_the_same_particles(
+    name: str, where: str, tmp_path: Path
+) -> None:
+    expected = undisturbed(name)
+    first, second, _ = stages_of(expected)
+    n_stages = {"in the first": 1, "between": first, "in the last": first + second + 1}[where]
+    with pytest.MonkeyPatch.context() as patch:
+        kill_after(n_stages, patch)
+        with pytest.raises(Killed):
+            run(name, tmp_path / "run.nc")
+    found = run(name, tmp_path / "run.nc")
+    np.testing.assert_array_equal(found.thetas, expected.thetas)
+    np.testing.assert_array_equal(found.discrepancies, expected.discrepancies)
+    assert stages_of(found) == stages_of(expected)
+
+
+def test_finished_chains_compute_nothing_again(tmp_path: Path) -> None:
+    run("stored", tmp_path / "run.nc")
+    with pytest.MonkeyPatch.context() as patch:
+        kill_after(0, patch)
+        found = run("stored", tmp_path / "run.nc")
+    np.testing.assert_array_equal(found.thetas, undisturbed("stored").thetas)
+
+
+def test_chains_are_independent_of_one_another() -> None:
+    thetas = undisturbed("stored").thetas
+    assert thetas.shape == (CHAINS, DRAWS, 1)
+    for one in range(CHAINS):
+        for other in range(one):
+            assert not np.isin(thetas[one], thetas[other]).any()
+
+
+def test_the_discrepancies_are_those_of_the_particles() -> None:
+    found = undisturbed("stored")
+    again = evaluator("stored")(found.thetas.reshape(-1, 1)).discrepancies
+    np.testing.assert_allclose(found.discrepancies.reshape(-1, 1), again)
+
+
+def test_a_saved_refinement_is_of_rounds_that_are_over(tmp_path: Path) -> None:
+    own = evaluator("stored")
+    checkpoint = Checkpoint(tmp_path / "run.nc", identity_of(own), {})
+    chains = Chains(own, DRAWS, 0.5, checkpoint)
+    assert chains.saved_refinement(0) is None
+    at = np.array([[0.5], [1.5]])
+    checkpoint.save({"refined0_thetas": at}, {"round": 1})
+    again = Checkpoint(tmp_path / "run.nc", identity_of(own), {})
+    chains = Chains(own, DRAWS, 0.5, again)
+    np.testing.assert_array_equal(chains.saved_refinement(0), at)
+    assert chains.saved_refinement(1) is None
