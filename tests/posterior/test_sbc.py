@@ -21,7 +21,7 @@ from prbayes.model.node import nodes
 from prbayes.posterior import sbc
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
-N, SD = OBSERVED.size, float(OBSERVED.std())
+N = OBSERVED.size
 METRICS = {
     "ll": prb.LogLikelihood(),
     "kl": prb.KullbackLeibler(),
