@@ -28,7 +28,7 @@ _FAR = 2.0
 # changes 2e-7 at most, and the way back to the prior's middle 7e-4 at least: any value in
 # [1e-6, 1e-4] gives the same verdicts on them, on four processors and with noise of 1e-12.
 _UNCHANGED = 1e-5
-# Draws of the prior that tell its middle to a sixteenth of a spread.
+# Draws of the prior, whose median is known from them to a twelfth of a spread.
 _PRIOR_DRAWS = 256
 # Distance between distribution functions from which two populations differ. A half of the mass
 # whose spread shrinks by a factor of 1.3 makes 0.035; where a population stands still it is a

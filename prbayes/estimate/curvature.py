@@ -23,8 +23,10 @@ def stencil(r: int) -> Floats:
     unit = np.eye(r)
     rows = list(cross(np.zeros(r), np.ones(r)))
     for i, j in _pairs(r):
+        one = unit[i]
+        other = unit[j]
         for a, b in _CORNERS:
-            corner = a * unit[i] + b * unit[j]
+            corner = a * one + b * other
             rows.append(corner)
     return np.array(rows)
 
@@ -32,13 +34,15 @@ def stencil(r: int) -> Floats:
 def hessian_of(values: Floats, r: int) -> Floats:
     """Return the Hessian, (r, r), from values at the points of `stencil`, by unit differences."""
     here = values[0]
-    _, up, down, corners = np.split(values, [1, 1 + r, 1 + 2 * r])
+    cross_ends = [1, 1 + r, 1 + 2 * r]
+    _, up, down, corners = np.split(values, cross_ends)
     # What is not finite gives what is not a number, and is the caller's to judge.
     with np.errstate(invalid="ignore"):
         along = up - 2 * here + down
         out = np.diag(along)
         mixed = corners.reshape(-1, len(_CORNERS))
-        for (i, j), (pp, pm, mp, mm) in zip(_pairs(r), mixed, strict=True):
+        for (i, j), around in zip(_pairs(r), mixed, strict=True):
+            pp, pm, mp, mm = around
             twist = (pp - pm - mp + mm) / 4
             out[i, j] = twist
             out[j, i] = twist

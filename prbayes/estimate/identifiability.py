@@ -38,11 +38,13 @@ def unidentified_directions(unidentified: Floats, names: list[str]) -> list[str]
         projector = left @ left.T
         within = np.diag(projector)
         i = int(np.argmax(within))
-        direction = projector[i] / np.sqrt(within[i])
+        length = np.sqrt(within[i])
+        direction = projector[i] / length
         found.append(_named(direction, names))
         # What is left is orthogonal to it.
         along = np.outer(direction, direction @ left)
-        axes, strength, _ = np.linalg.svd(left - along, full_matrices=False)
+        without = left - along
+        axes, strength, _ = np.linalg.svd(without, full_matrices=False)
         left = axes[:, strength > _NOTHING]
     return found
 
@@ -137,6 +139,7 @@ def seen_by_curvature(
     floor = 0.0
     total = float(np.trace(hessian))
     if total > 0:
-        floor = _ROUNDING * float(np.trace(noise)) / total
+        variance = float(np.trace(noise))
+        floor = _ROUNDING * variance / total
     precise = noise_along < (weakest * values) ** 2
     return values, vectors, (values > floor) & precise

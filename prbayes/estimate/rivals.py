@@ -88,7 +88,8 @@ def _starts(objective: _Objective, n: int, noise: float, seed: int) -> tuple[Flo
     chosen = points[some[:n]]
     finite = values[np.isfinite(values)]
     quantiles = np.quantile(finite, [0.0, 0.5])
-    size = max(float(np.ptp(quantiles)), noise)
+    half = float(np.ptp(quantiles))
+    size = max(half, noise)
     shifts = (chosen - objective.best) / objective.prior_sd
     return shifts, size
 
@@ -146,9 +147,11 @@ def rivals(
         if not np.isfinite(value):
             continue
         end = objective.theta(ends[i])
-        if all(_separate(objective, end, value, *other, noise) for other in kept):
+        separate = [_separate(objective, end, value, *other, noise) for other in kept]
+        if all(separate):
             kept.append((end, value))
-    return [_rival(theta, value, lowest, noise) for theta, value in kept[1:]]
+    found = kept[1:]
+    return [_rival(theta, value, lowest, noise) for theta, value in found]
 
 
 def _in_line(

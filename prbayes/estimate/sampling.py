@@ -90,7 +90,8 @@ def _expanded(
         if one.node.metric.minimum is Minimum.QUADRATIC:
             gradients = one.gradients(observed, weights)
             force -= gradients @ directions / scale
-            curvature += directions.T @ one.hessian @ directions / scale
+            hessian = directions.T @ one.hessian
+            curvature += hessian @ directions / scale
         else:
             area = one.area(observed, weights)
             slopes = directions.T @ area.slopes
@@ -102,12 +103,14 @@ def _expanded(
 def _solved(expansion: _Expansion, shifts: Floats) -> Floats:
     """Return the minimisers with each |gap| as a parabola through its value at ``shifts``."""
     n_sets, r = shifts.shape
-    left = np.broadcast_to(expansion.curvature, (n_sets, r, r)).copy()
+    curvature = np.broadcast_to(expansion.curvature, (n_sets, r, r))
+    left = curvature.copy()
     right = expansion.force.copy()
     for area in expansion.areas:
         slopes = area.slopes
         gaps = area.gaps + shifts @ slopes
-        weight = area.lengths / np.sqrt(gaps**2 + _KINK)
+        sizes = np.sqrt(gaps**2 + _KINK)
+        weight = area.lengths / sizes
         pull = weight * area.gaps
         left += np.einsum("bm,im,jm->bij", weight, slopes, slopes, optimize=True)
         right -= np.einsum("bm,im->bi", pull, slopes, optimize=True)
@@ -169,8 +172,9 @@ def _sandwich(information: list[Information], scales: Floats, weakest: float) ->
     """Return H^-1 J H^-1 along the directions that the data identify."""
     prior_sd = information[0].prior_sd
     unit = np.outer(prior_sd, prior_sd)
-    weighed = list(zip(information, scales, strict=True))
-    total = sum(one.hessian / s for one, s in weighed)
+    total: Any = 0
+    for one, scale in zip(information, scales, strict=True):
+        total = total + one.hessian / scale
     hessian = unit * total
     noise = unit * _gradient_covariance(information, scales)
     values, vectors, seen = seen_by_curvature(hessian, noise, weakest)

@@ -28,7 +28,8 @@ _LEVEL = 0.89
 _WIDER = 3.0
 # Times the noise floor: between these epsilon is looked for.
 _RANGE = (1e-3, 10.0)
-_BISECTIONS = 40  # of a range of 10^4 on a logarithmic scale: to rounding
+# Halvings of a range of 10^4 on a logarithmic scale: to rounding.
+_BISECTIONS = 40
 
 
 def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
@@ -125,15 +126,19 @@ def _sandwich(information: Information) -> float:
     values, vectors, seen = seen_by_curvature(hessian, noise)
     _refuse_unidentified(information, int(seen.sum()))
     along = np.einsum("ik,ij,jk->k", vectors, noise, vectors)
-    return float(np.mean(along[seen] / values[seen]))
+    shares = along[seen] / values[seen]
+    return float(np.mean(shares))
 
 
 def _refuse_unidentified(information: Information, identified: int) -> None:
-    if not identified:
-        raise ValueError(
-            f"{information.node.name}: the data tell less than the prior about every hyperparameter, so epsilon "
-            "cannot be calibrated; look at the optimum, widen the priors, or pass epsilon="
-        )
+    """Raise where no direction is identified."""
+    if identified:
+        return
+    name = information.node.name
+    raise ValueError(
+        f"{name}: the data tell less than the prior about every hyperparameter, so epsilon cannot "
+        "be calibrated; look at the optimum, widen the priors, or pass epsilon="
+    )
 
 
 def _by_refits(information: Information) -> float:
@@ -144,7 +149,11 @@ def _by_refits(information: Information) -> float:
     """
     scales = np.ones(len(information.evaluator.nodes))
     refits = Refits.at(
-        information.evaluator, information.theta, scales, simulators=[information.k], n_sets=_SETS
+        information.evaluator,
+        information.theta,
+        scales,
+        simulators=[information.k],
+        n_sets=_SETS,
     )
     local = refits.local()
     p = local.identified.shape[1]
@@ -152,13 +161,18 @@ def _by_refits(information: Information) -> float:
     # One delta for each data set, and its opposite; steps in units of the prior's spread.
     rng = np.random.default_rng(information.seed)
     z = rng.standard_normal((len(refits.shifts), p))
-    delta = z @ np.linalg.cholesky(local.covariance).T @ local.identified.T
+    root = np.linalg.cholesky(local.covariance)
+    delta = z @ root.T @ local.identified.T
     shares = np.array([1.5, 0.5, -0.5, -1.5])
-    steps = refits.shifts[:, None] + shares[:, None] * delta[:, None]
-    d = refits.objective(refits.theta + steps * refits.prior_sd, slice(None))
-    slopes = ((d[:, 0] - d[:, 1]) + (d[:, 3] - d[:, 2])) / 2
+    away = shares[:, None] * delta[:, None]
+    steps = refits.shifts[:, None] + away
+    thetas = refits.theta + steps * refits.prior_sd
+    values = refits.objective(thetas, slice(None))
+    far, near, opposite, far_opposite = values.T
+    slopes = ((far - near) + (far_opposite - opposite)) / 2
     # Where a population leaves the design's reach nothing is known.
-    return float(slopes[np.isfinite(slopes)].mean() / p)
+    known = slopes[np.isfinite(slopes)]
+    return float(known.mean() / p)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,35 +192,50 @@ class _Cloud:
     @classmethod
     def around(cls, area: LinearArea, directions: Floats, seed: int) -> _Cloud:
         """Draw the thetas; directions, (d, r), are one standard error long."""
-        z = np.random.default_rng(seed).standard_normal((_CLOUD, directions.shape[1]))
-        change = _WIDER * (z @ directions.T) @ area.slopes
-        distances = [(np.abs(gap + change) * area.lengths).sum(axis=-1) for gap in area.gaps]
+        rng = np.random.default_rng(seed)
+        z = rng.standard_normal((_CLOUD, directions.shape[1]))
+        shifts = _WIDER * (z @ directions.T)
+        change = shifts @ area.slopes
+        distances = []
+        for gap in area.gaps:
+            gaps = np.abs(gap + change)
+            distance = (gaps * area.lengths).sum(axis=-1)
+            distances.append(distance)
         return cls(z, np.array(distances))
 
     def coverage(self, epsilon: float) -> float:
         """Return how often the data sets' posterior intervals contain the optimum, on average."""
         log_proposal = -0.5 * (self.z**2).sum(axis=-1)
         logs = -self.distances / epsilon - log_proposal
-        weights = np.exp(logs - logs.max(axis=1, keepdims=True))
+        highest = logs.max(axis=1, keepdims=True)
+        weights = np.exp(logs - highest)
         weights /= weights.sum(axis=1, keepdims=True)
         # The optimum is at zero: the posterior probability below it, by data set and axis.
-        below = [(weights * (z < 0)).sum(axis=1) for z in self.z.T]
-        inside = np.abs(np.stack(below) - 0.5) < _LEVEL / 2
+        below = []
+        for z in self.z.T:
+            share = (weights * (z < 0)).sum(axis=1)
+            below.append(share)
+        off_center = np.abs(np.stack(below) - 0.5)
+        inside = off_center < _LEVEL / 2
         return float(np.mean(inside))
 
 
 def _by_coverage(information: Information) -> float:
     """Solve for the epsilon whose posteriors cover, the features taken as linear in theta."""
     area = information.area(*information.data_set)
-    # Strongest last. What a sample of one response tells beyond two directions, close to its
-    # location and its spread, is of the order of the error of derivatives of stored weights.
+    # Strongest last. What a sample of one response tells beyond two directions, close to its location
+    # and its spread, is of the order of the error of derivatives of stored weights.
     basis = seen_by_area(information)[:, -2:]
     _refuse_unidentified(information, basis.shape[1])
-    shifts = first_order_shifts([information], np.ones(1), basis, information.data_sets)
+    sets = information.data_sets
+    shifts = first_order_shifts([information], np.ones(1), basis, sets)
     # The cloud spans the directions seen, wider than the estimator's sampling distribution.
-    values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(shifts, rowvar=False)))
-    axes = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
-    cloud = _Cloud.around(area, axes * information.prior_sd[:, None], information.seed)
+    covariance = np.atleast_2d(np.cov(shifts, rowvar=False))
+    variances, vectors = np.linalg.eigh(covariance)
+    errors = np.sqrt(np.maximum(variances, 0))
+    axes = basis @ (vectors * errors)
+    directions = axes * information.prior_sd[:, None]
+    cloud = _Cloud.around(area, directions, information.seed)
     # Coverage grows with epsilon.
     low, high = (information.noise_floor * factor for factor in _RANGE)
     for _ in range(_BISECTIONS):
