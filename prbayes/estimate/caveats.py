@@ -42,15 +42,16 @@ def breakdown(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> list[str]:
     if at_edge:
         names = ", ".join(at_edge)
         lines.append(
-            f"{names} ran to the edge of the support, where the discrepancy no longer changes; perhaps "
-            "the population has collapsed within the bandwidth of the metric: use a smaller bandwidth, "
-            "or prb.AreaMetric(), which has none"
+            f"{names} ran to the edge of the support, where the discrepancy no longer changes; "
+            "perhaps the population has collapsed within the bandwidth of the metric: use a "
+            "smaller bandwidth, or prb.AreaMetric(), which has none"
         )
     if at_jump:
         names = ", ".join(at_jump)
         lines.append(
-            f"{names}: points lose their response at the optimum, and the discrepancy jumps there by "
-            "more than it changes otherwise: use prb.AreaMetric(), prb.Reweighted(), or more responses"
+            f"{names}: points lose their response at the optimum, and the discrepancy jumps "
+            "there by more than it changes otherwise: use prb.AreaMetric(), prb.Reweighted(), or "
+            "more responses"
         )
     return lines
 
@@ -121,7 +122,7 @@ def elements_at_edge(
 
 
 def _apart(evaluator: Evaluator, a: Floats, b: Floats) -> float:
-    """Return the largest distance between distribution functions of the populations at two thetas."""
+    """Return the largest distance between the populations' distribution functions at two thetas."""
     largest = 0.0
     both = np.array([a, b])
     for k in range(len(evaluator.nodes)):

@@ -41,7 +41,7 @@ class DataSets:
 
 
 def specimens(nodes: list[Node]) -> tuple[list[NDArray[np.intp]], int]:
-    """Return the number of the specimen of each observation, by simulator, and how many specimens there are.
+    """Return the specimen's number of each observation, by simulator, and the number of specimens.
 
     Observations without labels are specimens of their own.
     """
@@ -72,7 +72,7 @@ def dependent(nodes: list[Node]) -> bool:
 
 
 def groups(nodes: list[Node]) -> list[list[int]]:
-    """Return the simulators by their position, those together that share specimens, be it through others."""
+    """Return simulators by position, those together that share specimens, even through others."""
     numbers, _ = specimens(nodes)
     found: list[tuple[list[int], set[int]]] = []
     for k, number in enumerate(numbers):
@@ -93,7 +93,7 @@ def groups(nodes: list[Node]) -> list[list[int]]:
 
 
 def siblings(nodes: list[Node], names: set[str]) -> set[str]:
-    """Return names with those of simulators that share specimens with them, whose designs have to stay the same."""
+    """Return names with those of simulators that share specimens, and so a design, with them."""
     found = set(names)
     for group in groups(nodes):
         together = {nodes[k].name for k in group}
@@ -218,7 +218,7 @@ def _counted(places: NDArray[np.intp], own: Floats, *, size: int) -> Floats:
 
 
 def thinned(values: Floats, weights: Floats, node: Node) -> tuple[Floats, Floats]:
-    """Return the first 2^15 points of resimulated populations, (k, n) each, which all have equal weights."""
+    """Return the first 2^15 points, of equal weights, of resimulated populations, (k, n) each."""
     if node.bound.stored or values.shape[-1] <= _MOST:
         return values, weights
     equal = np.broadcast_to(1 / _MOST, (len(values), _MOST))
@@ -244,7 +244,7 @@ def _draw(
 
 
 def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) -> dict[str, Floats]:
-    """Draw one data set from the populations at theta by calling the response, not from design points.
+    """Draw one data set from the populations at theta by calling the response.
 
     Specimens whose response is not finite cannot be observed; others take their place.
 
@@ -307,7 +307,7 @@ def observed_set(evaluator: Evaluator) -> DataSets:
 
 
 def reweighted_sets(evaluator: Evaluator, n_sets: int, seed: int = 0) -> DataSets:
-    """Give the observed specimens Dirichlet weights (Bayesian bootstrap), on top of the observations' own."""
+    """Give the observed specimens Dirichlet weights (Bayesian bootstrap), times their own."""
     rng = np.random.default_rng([seed, 2])
     numbers, total = specimens(evaluator.nodes)
     gains = rng.standard_exponential((n_sets, total))

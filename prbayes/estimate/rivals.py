@@ -147,7 +147,7 @@ def rivals(
         if not np.isfinite(value):
             continue
         end = objective.theta(ends[i])
-        separate = [_separate(objective, end, value, *other, noise) for other in kept]
+        separate = (_separate(objective, end, value, *other, noise) for other in kept)
         if all(separate):
             kept.append((end, value))
     found = kept[1:]
@@ -161,7 +161,7 @@ def _in_line(
     values: Floats,
     noise: float,
 ) -> tuple[Floats, Floats]:
-    """Move ends to where the best is along directions that are not identified, if that is as good."""
+    """Move ends to where the best is along what is not identified, if that is as good."""
     hidden = ends @ unidentified @ unidentified.T
     in_line = ends - hidden
     also = objective.along(in_line, None)

@@ -1,4 +1,4 @@
-"""Adjustment of a pseudo-posterior's draws, so that their width is that of the metric's own estimate."""
+"""Adjustment of a pseudo-posterior's draws to the width of the metric's own estimate."""
 
 from __future__ import annotations
 
@@ -37,15 +37,16 @@ _WITHOUT = "none: {}"
 
 @dataclass(frozen=True)
 class Affine:
-    r"""An affine map of the draws, in unconstrained space, to the covariance and centre that the data warrant.
+    r"""An affine map of the draws of theta to the covariance and centre that the data warrant.
 
     Data sets are drawn from the model at the optimum, and each is fitted anew. The covariance of
     the minimisers is the inverse of A, the (Godambe) information in the data, and their median
     shift is the bias b of the minimiser; those that run away, as where a scale may be zero, count
     as three standard errors off. With prior mean :math:`\theta_0` and precision P the draws get
     covariance :math:`(A + P)^{-1}` and median
-    :math:`(A + P)^{-1} (A (\hat\theta - b) + P \theta_0)`, in the directions about which the data tell at least a
-    quarter of what the prior does; along the others they keep their distribution given those.
+    :math:`(A + P)^{-1} (A (\hat\theta - b) + P \theta_0)`, in the directions about which the data
+    tell at least a quarter of what the prior does; along the others they keep their distribution
+    given those.
 
     Parameters
     ----------
@@ -55,8 +56,8 @@ class Affine:
 
     References
     ----------
-    .. [1] Shaby, B. A. (2014), The open-faced sandwich adjustment for MCMC using estimating functions,
-       J. Comput. Graph. Stat. 23, 853-876, doi:10.1080/10618600.2013.842174.
+    .. [1] Shaby, B. A. (2014), The open-faced sandwich adjustment for MCMC using estimating
+       functions, J. Comput. Graph. Stat. 23, 853-876, doi:10.1080/10618600.2013.842174.
 
     Examples
     --------
@@ -79,8 +80,8 @@ class Affine:
         (center,), _ = sampling.refit(observed_set(evaluator))
         at = sampling.thetas(center)
         sets = simulated_sets(evaluator, at, self.n_sets, self.random_seed)
-        # What the data tell: the minimiser's information and its bias, which as a median is the same in
-        # every parametrisation, as where a scale comes near zero.
+        # What the data tell: the minimiser's information and its bias, which as a median is the
+        # same in every parametrisation, as where a scale comes near zero.
         x, converged = sampling.refit(sets)
         away = x[converged] - center
         shifts = np.clip(away, -_REACH, _REACH)
@@ -198,7 +199,7 @@ def transported(
     center: Floats,
     covariance: Floats,
 ) -> Floats:
-    """Map draws to a median and covariance along the axes, as normal distributions are, with the least motion.
+    """Map draws to a median and covariance along the axes as one normal distribution to another.
 
     What remains follows as its regression on them says. Draws count as refits do: their median, and
     no farther from it than three standard deviations.

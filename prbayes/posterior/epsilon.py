@@ -33,20 +33,21 @@ _BISECTIONS = 40
 
 
 def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
-    """Return an epsilon for each simulator, such that the posterior is about as wide as the data warrant.
+    """Return an epsilon for each simulator, so that the posterior is as wide as the data warrant.
 
     - KLD and log-likelihood: 1/N, which puts them on the scale of a log-likelihood.
-    - Other smooth metrics (probability residual): trace(H^-1 J) / p over the p identified directions, H the
-      Hessian of the discrepancy at the optimum and J the sampling covariance of its gradient: then
-      the posterior's covariance epsilon H^-1 matches the estimator's H^-1 J H^-1 on average.
-    - Area metric: the epsilon with which 89% intervals of the posteriors of data sets simulated at the
-      optimum contain the optimum in 89% of cases, on average over the two directions that the data
-      see best.
-    - Metrics that declare nothing of their minimum, such as a `FunctionMetric` (`Reweighted` only): the mean, over
-      data sets simulated at the optimum and refitted, of delta . grad d / p at the minimiser plus
-      delta, delta drawn from the sampling distribution. For any density proportional to exp(-d /
-      epsilon) that mean is epsilon, by integration by parts; for a quadratic d it is trace(H Sigma)
-      / p, which is the sandwich's.
+    - Other smooth metrics (probability residual): trace(H^-1 J) / p over the p identified
+      directions, H the Hessian of the discrepancy at the optimum and J the sampling covariance of
+      its gradient: then the posterior's covariance epsilon H^-1 matches the estimator's
+      H^-1 J H^-1 on average.
+    - Area metric: the epsilon with which 89% intervals of the posteriors of data sets simulated at
+      the optimum contain the optimum in 89% of cases, on average over the two directions that the
+      data identify best.
+    - Metrics that declare nothing of their minimum, such as a `FunctionMetric` (`Reweighted` only):
+      the mean, over data sets simulated at the optimum and refitted, of delta . grad d / p at the
+      minimiser plus delta, delta drawn from the sampling distribution. For any density proportional
+      to exp(-d / epsilon) that mean is epsilon, by integration by parts; for a quadratic d it is
+      trace(H Sigma) / p, which is the sandwich's.
 
     No response is computed under `Reweighted`.
 
@@ -71,17 +72,19 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
 
     References
     ----------
-    .. [1] Shaby, B. A. (2014), The open-faced sandwich adjustment for MCMC using estimating functions,
-       J. Comput. Graph. Stat. 23, 853-876.
-    .. [2] Syring, N. and R. Martin (2019), Calibrating general posterior credible regions, Biometrika 106,
-       479-486, doi:10.1093/biomet/asy054.
+    .. [1] Shaby, B. A. (2014), The open-faced sandwich adjustment for MCMC using estimating
+       functions, J. Comput. Graph. Stat. 23, 853-876.
+    .. [2] Syring, N. and R. Martin (2019), Calibrating general posterior credible regions,
+       Biometrika 106, 479-486, doi:10.1093/biomet/asy054.
 
     Examples
     --------
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.KullbackLeibler(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.KullbackLeibler(), observed=[0.0, 2.0, 4.0]
+    ...     )
     >>> prb.calibrate_epsilon(prb.minimize(model))
     {'y': 0.3333333333333333}
     """
@@ -106,8 +109,8 @@ def _epsilon(information: Information) -> float:
     obstacle = simulator_obstacle(information.evaluator, information.k)
     if obstacle is not None:
         raise TypeError(
-            f"epsilon cannot be calibrated: {obstacle}; pass epsilon= to prb.Simulator (the standard deviation of the "
-            "discrepancy at a good theta is a start)"
+            f"epsilon cannot be calibrated: {obstacle}; pass epsilon= to prb.Simulator (the "
+            "standard deviation of the discrepancy at a good theta is a start)"
         )
     match node.metric.minimum:
         case Minimum.QUADRATIC:
@@ -223,8 +226,8 @@ class _Cloud:
 def _by_coverage(information: Information) -> float:
     """Solve for the epsilon whose posteriors cover, the features taken as linear in theta."""
     area = information.area(*information.data_set)
-    # Strongest last. What a sample of one response tells beyond two directions, close to its location
-    # and its spread, is of the order of the error of derivatives of stored weights.
+    # Strongest last. What a sample of one response tells beyond two directions, close to its
+    # location and its spread, is of the order of the error of derivatives of stored weights.
     basis = seen_by_area(information)[:, -2:]
     _refuse_unidentified(information, basis.shape[1])
     sets = information.data_sets
