@@ -197,32 +197,35 @@ def analyse(
     """Calibrate one data set; return the estimate, and by posterior: probability below the truth, mean, sd."""
     from prbayes.estimate.data_sets import reweighted_sets
     from prbayes.estimate.minimization import find_optimum
-    from prbayes.estimate.refit import Neighbourhood
-    from prbayes.posterior.adjustment import Affine, moved
+    from prbayes.estimate.refit import SamplingDistribution
+    from prbayes.posterior.adjustment import Affine, transported
     from prbayes.posterior.epsilon import calibrate_epsilon
 
     ev = evaluator.observing({"y": data})
     optimum = find_optimum(ev, tolerance=1e-6, starts=0)
     epsilon = np.array([calibrate_epsilon(optimum)["y"]])
     ev.nodes[0].epsilon.set_value(epsilon[0])
-    hood = Neighbourhood.of(ev, optimum.theta, epsilon, ev.prior_sd)
-    r = hood.sd.size
-    spread = 2.0 * (hood.frame * hood.sd**2) @ hood.frame.T + hood.local.blind @ hood.local.blind.T
-    thetas, log_q = proposal(optimum.theta, spread * np.outer(hood.local.scale, hood.local.scale))
+    sampling = SamplingDistribution.of(ev, optimum.theta, epsilon)
+    r = sampling.stderr.size
+    spread = (
+        2.0 * (sampling.axes * sampling.stderr**2) @ sampling.axes.T
+        + sampling.local.unidentified @ sampling.local.unidentified.T
+    )
+    thetas, log_q = proposal(optimum.theta, spread * np.outer(sampling.local.prior_sd, sampling.local.prior_sd))
     found = ev(thetas)
     draws, ess = weighted(found.log_prior + found.log_likelihood(epsilon) - log_q, thetas)
     exact, ess_exact = weighted(found.log_prior + log_likelihood(thetas) - log_q, thetas)
-    x, rest = hood.coordinates(draws)
-    prior, _ = hood.coordinates(ev.prior_thetas(1024, 0))
+    x, remainder = sampling.coordinates(draws)
+    prior, _ = sampling.coordinates(ev.prior_thetas(1024, 0))
     first_order = np.linalg.inv(np.eye(r) + np.linalg.inv(np.cov(prior, rowvar=False).reshape(r, r)))
     posteriors = {
         "plain": draws,
-        "sandwich": moved(hood, x, rest, np.zeros(r), first_order),
+        "sandwich": transported(sampling, x, remainder, np.zeros(r), first_order),
         "affine": Affine(n_sets=100)(ev, draws, [optimum.theta])[0],
         "exact": exact,
     }
     if bootstrap:
-        posteriors["bootstrap"] = hood.thetas(hood.refit(reweighted_sets(ev, 100))[0])
+        posteriors["bootstrap"] = sampling.thetas(sampling.refit(reweighted_sets(ev, 100))[0])
     return {
         "estimate": optimum.theta.tolist(),
         "epsilon": float(epsilon[0]),

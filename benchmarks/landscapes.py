@@ -126,7 +126,7 @@ def main() -> None:
                     axis.plot((starts[here, 0] - mu) / sigma, starts[here, 1] - np.log(sigma), "o", ms=4.5, color=color,
                               mec="white", mew=0.4, label=f"start that leads to: {label}")  # fmt: skip
             axis.plot(0, 0, "w*", ms=14, mec="k")
-            axis.set_title(f"{metric}: Hessian positive definite (yellow) on {convex:.0%};\n{arrive:.0%} of starts arrive, "  # noqa: E501
+            axis.set_title(f"{metric}: Hessian positive definite (yellow) on {convex:.0%};\n{arrive:.0%} of starts arrive, "
                            f"{arrive_led:.0%} with the area metric as guide", fontsize=10)  # fmt: skip
         for axis in axes[-1]:
             axis.set_xlabel("mu, standard deviations from the truth")

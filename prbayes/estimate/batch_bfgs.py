@@ -1,8 +1,15 @@
-"""Many small minimisations at once: BFGS on rows that share an objective's form but not its data."""
+"""Many small minimisations at once: BFGS on rows that share an objective's form but not its data.
+
+Single minimisations run scipy's methods. Those of hundreds of data sets are small and alike, and
+what they cost is calls of NumPy, so that all of them go in step: one call evaluates every row. No
+library at hand does that, which is why the package has this minimiser of its own, and beside it
+`batch_simplex` for functions without slopes.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +18,66 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 
 _HALVINGS = 8
-_LONGEST = 3.0  # of a step, in the units of the parameters
+# Longest element of a step, in the units of the parameters: beyond a few standard errors, or prior
+# standard deviations, a quadratic model says nothing.
+_LONGEST = 3.0
+# Of the promised gain, that a step has to keep (Nocedal and Wright, eq. 3.4).
+_ARMIJO = 1e-4
+# Cosine of step and change of gradient below which an update would spoil the inverse Hessian.
+_CURVED = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """B functions and the differences that give their gradients."""
+
+    value: Callable[[Floats, Any], Floats]
+    step: float
+    stencil: Floats
+
+    @classmethod
+    def of(cls, value: Callable[[Floats, Any], Floats], r: int, step: float) -> _Problem:
+        around = np.concatenate([np.zeros((1, r)), np.eye(r), -np.eye(r)])
+        return cls(value, step, step * around)
+
+    def __call__(self, x: Floats, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
+        """Return values (A,) and gradients (A, r) of some rows at one point each, (A, r)."""
+        r = x.shape[-1]
+        found = self.value(x[:, None] + self.stencil, rows)
+        up, down = found[:, 1 : 1 + r], found[:, 1 + r :]
+        with np.errstate(invalid="ignore"):
+            return found[:, 0], (up - down) / (2 * self.step)
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """What some of the rows are to do next.
+
+    Attributes
+    ----------
+    rows : ndarray of int, shape (A,)
+    steps : ndarray, shape (A, r)
+    promise : ndarray, shape (A,)
+        Twice the gain that a quadratic model promises.
+    """
+
+    rows: NDArray[np.intp]
+    steps: Floats
+    promise: Floats
+
+    def only(self, these: NDArray[np.bool_]) -> _Steps:
+        """Return those of some rows."""
+        return _Steps(self.rows[these], self.steps[these], self.promise[these])
+
+
+@dataclass(frozen=True, eq=False)
+class _Accepted:
+    """Where a line search arrived: points, values and gradients, and which rows gained nothing."""
+
+    x: Floats
+    f: Floats
+    g: Floats
+    stuck: NDArray[np.intp]
 
 
 def descend(
@@ -25,8 +91,8 @@ def descend(
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Minimise B functions of r parameters of order one, each from its own start, all in step.
 
-    Gradients are central differences. A row has converged when its next step promises to gain less than
-    ``tolerance``, or when no shorter step gains anything.
+    Gradients are central differences. A row has converged when its next step promises to gain less
+    than ``tolerance``, or when no shorter step gains anything.
 
     Parameters
     ----------
@@ -47,6 +113,11 @@ def descend(
     values : ndarray, shape (B,)
     converged : ndarray of bool, shape (B,)
 
+    References
+    ----------
+    .. [1] Nocedal, J. and S. J. Wright (2006), Numerical Optimization, chapter 6,
+       doi:10.1007/978-0-387-40065-5.
+
     Examples
     --------
     >>> import numpy as np
@@ -57,54 +128,68 @@ def descend(
     np.True_
     """
     size, r = start.shape
+    problem = _Problem.of(value, r, step)
     x, inverse = start.copy(), np.repeat(inverse_hessian[None], size, axis=0)
-    stencil = step * np.concatenate([np.zeros((1, r)), np.eye(r), -np.eye(r)])
-
-    def look(points: Floats, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
-        found = value(points[:, None] + stencil, rows)
-        with np.errstate(invalid="ignore"):
-            return found[:, 0], (found[:, 1 : 1 + r] - found[:, 1 + r :]) / (2 * step)
-
     active = np.arange(size)
-    f, g = look(x, active)
+    f, g = problem(x, active)
     converged = np.zeros(size, dtype=bool)
     active = active[np.isfinite(f) & np.isfinite(g).all(axis=-1)]
     for _ in range(max_iterations):
-        with np.errstate(over="ignore", invalid="ignore"):
-            move = -np.einsum("bij,bj->bi", inverse[active], g[active])
-            promise = -(move * g[active]).sum(axis=-1)
-            length = np.abs(move).max(axis=-1)
-        astray = ~np.isfinite(promise) | ~np.isfinite(length)
-        active, move, promise, length = active[~astray], move[~astray], promise[~astray], length[~astray]
-        done = promise < 2 * tolerance
-        converged[active[done]] = True
-        active, move, promise, length = active[~done], move[~done], promise[~done], length[~done]
-        if not active.size:
+        # Rows whose step is no number stop; those that promise next to nothing have converged.
+        plan = _planned(active, inverse, g)
+        done = plan.promise < 2 * tolerance
+        converged[plan.rows[done]] = True
+        plan = plan.only(~done)
+        if not plan.rows.size:
             break
-        move *= (_LONGEST / np.maximum(length, _LONGEST))[:, None]
-        moved, new_f, new_g = x[active].copy(), f[active].copy(), g[active].copy()
-        waiting, share = np.arange(active.size), 1.0
-        for _ in range(_HALVINGS):
-            trial = x[active[waiting]] + share * move[waiting]
-            trial_f, trial_g = look(trial, active[waiting])
-            with np.errstate(invalid="ignore"):
-                ok = (trial_f <= f[active[waiting]] - 1e-4 * share * promise[waiting]) & np.isfinite(trial_g).all(-1)
-            at = waiting[ok]
-            moved[at], new_f[at], new_g[at] = trial[ok], trial_f[ok], trial_g[ok]
-            waiting, share = waiting[~ok], share / 2
-            if not waiting.size:
-                break
-        inverse[active] = _updated(inverse[active], moved - x[active], new_g - g[active])
-        x[active], f[active], g[active] = moved, new_f, new_g
-        converged[active[waiting]] = True
-        active = np.delete(active, waiting)
+        accepted = _line_search(problem, plan, x, f, g)
+        active = plan.rows
+        inverse[active] = _updated(inverse[active], accepted.x - x[active], accepted.g - g[active])
+        x[active], f[active], g[active] = accepted.x, accepted.f, accepted.g
+        # Rows that no shorter step helped stay where they are.
+        converged[active[accepted.stuck]] = True
+        active = np.delete(active, accepted.stuck)
     return x, f, converged
 
 
+def _planned(active: NDArray[np.intp], inverse: Floats, g: Floats) -> _Steps:
+    """Return quasi-Newton steps of the active rows, none too long."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        steps = -np.einsum("bij,bj->bi", inverse[active], g[active])
+        promise = -(steps * g[active]).sum(axis=-1)
+        length = np.abs(steps).max(axis=-1)
+        steps = steps * (_LONGEST / np.maximum(length, _LONGEST))[:, None]
+    sound = np.isfinite(promise) & np.isfinite(length)
+    return _Steps(active, steps, promise).only(sound)
+
+
+def _line_search(problem: _Problem, plan: _Steps, x: Floats, f: Floats, g: Floats) -> _Accepted:
+    """Halve the steps until they keep enough of what they promise."""
+    rows = plan.rows
+    new_x, new_f, new_g = x[rows].copy(), f[rows].copy(), g[rows].copy()
+    waiting, share = np.arange(rows.size), 1.0
+    for _ in range(_HALVINGS):
+        trial = x[rows[waiting]] + share * plan.steps[waiting]
+        trial_f, trial_g = problem(trial, rows[waiting])
+        with np.errstate(invalid="ignore"):
+            enough = f[rows[waiting]] - _ARMIJO * share * plan.promise[waiting]
+            kept = (trial_f <= enough) & np.isfinite(trial_g).all(-1)
+        at = waiting[kept]
+        new_x[at], new_f[at], new_g[at] = trial[kept], trial_f[kept], trial_g[kept]
+        waiting, share = waiting[~kept], share / 2
+        if not waiting.size:
+            break
+    return _Accepted(new_x, new_f, new_g, waiting)
+
+
 def _updated(inverse: Floats, s: Floats, y: Floats) -> Floats:
-    """Return the BFGS update of inverse Hessians, shape (B, r, r), where it keeps them positive definite."""
+    """Return the BFGS update of inverse Hessians, (B, r, r), where it keeps them positive definite.
+
+    Nocedal and Wright, eq. 6.17.
+    """
     sy = (s * y).sum(axis=-1)
-    good = sy > 1e-4 * np.linalg.norm(s, axis=-1) * np.linalg.norm(y, axis=-1)
+    good = sy > _CURVED * np.linalg.norm(s, axis=-1) * np.linalg.norm(y, axis=-1)
     rho = np.where(good, 1 / np.where(good, sy, 1.0), 0.0)[:, None, None]
     left = np.eye(s.shape[-1]) - rho * s[:, :, None] * y[:, None, :]
-    return np.asarray(left @ inverse @ np.swapaxes(left, -1, -2) + rho * s[:, :, None] * s[:, None, :])
+    right = np.swapaxes(left, -1, -2)
+    return np.asarray(left @ inverse @ right + rho * s[:, :, None] * s[:, None, :])

@@ -6,7 +6,7 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.estimate.differences import cross
-from prbayes.estimate.identifiability import blind_directions
+from prbayes.estimate.identifiability import unidentified_directions
 from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.rivals import Rival
 from prbayes.estimate.sampling import Local
@@ -28,8 +28,9 @@ _FAR = 2.0
 # changes 2e-7 at most, and the way back to the prior's middle 7e-4 at least: any value in
 # [1e-6, 1e-4] gives the same verdicts on them, on four processors and with noise of 1e-12.
 _UNCHANGED = 1e-5
-# Distance between distribution functions from which two populations differ. A half of the mass whose
-# spread shrinks by a factor of 1.3 makes 0.035; where a population stands still it is a point's 1/n.
+# Distance between distribution functions from which two populations differ. A half of the mass
+# whose spread shrinks by a factor of 1.3 makes 0.035; where a population stands still it is a
+# point's 1/n.
 _DIFFERENT = 0.02
 
 
@@ -64,9 +65,10 @@ def elements_at_edge(
 ) -> tuple[str, ...]:
     """Return the elements that ran to an edge: the population goes on changing there, and its discrepancy does not.
 
-    Standard errors cannot tell: curvature and noise are both rounding errors at an edge, and their ratio is anything.
-    The way back to the middle of the prior does change the discrepancy, unlike that of a hyperparameter without effect.
-    At the bound of a prior the population itself stands still: that is a minimum under a constraint.
+    Standard errors cannot tell: curvature and noise are both rounding errors at an edge, and their
+    ratio is anything. The way back to the middle of the prior does change the discrepancy, unlike
+    that of a hyperparameter without effect. At the bound of a prior the population itself stands
+    still: that is a minimum under a constraint.
 
     Parameters
     ----------
@@ -76,7 +78,8 @@ def elements_at_edge(
     size : float
         Typical size of the objective.
     tolerance : float
-        Of the minimiser: it stops where the objective changes by less than that in one spread of the prior.
+        Of the minimiser: it stops where the objective changes by less than that in one spread of
+        the prior.
     seed : int
     """
     middle = np.median(evaluator.prior_thetas(256, seed), axis=0)
@@ -126,7 +129,7 @@ def caveats(
         lines.append(_of_design(evaluator, design_error))
     lines += [_of_rival(evaluator, rival) for rival in others if rival.comparable]
     if local is not None:
-        directions = blind_directions(local.blind, evaluator.readable_names)
+        directions = unidentified_directions(local.unidentified, evaluator.readable_names)
         lines += map(_of_direction, directions)
     return tuple(lines)
 

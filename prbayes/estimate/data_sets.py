@@ -17,8 +17,11 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node
 from prbayes.response.distributions import PopulationSampler
 
-_MOST = 1 << 15  # points of a resimulated population from which data sets are drawn
-_SPARE = 4  # draws for each specimen that is needed, in case responses are not finite
+# Points of a resimulated population from which data sets are drawn: hundreds of data sets are then
+# weights of some ten million numbers at most.
+_MOST = 1 << 15
+# Draws for each specimen that is needed, in case three of four responses are not finite.
+_SPARE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +48,17 @@ def specimens(nodes: list[Node]) -> tuple[list[NDArray[np.intp]], int]:
     numbers: dict[object, int] = {}
     out = []
     for k, node in enumerate(nodes):
-        size = node.target.observed.size
-        labels = [(k, i) for i in range(size)] if node.specimens is None else node.specimens.tolist()
-        out.append(np.array([numbers.setdefault(label, len(numbers)) for label in labels], dtype=np.intp))
+        labels = _labels(node, k)
+        found = [numbers.setdefault(label, len(numbers)) for label in labels]
+        out.append(np.array(found, dtype=np.intp))
     return out, len(numbers)
+
+
+def _labels(node: Node, k: int) -> list[object]:
+    """Return the labels of the k-th simulator's observations; one for each if there are none."""
+    if node.specimens is not None:
+        return list(node.specimens.tolist())
+    return [(k, i) for i in range(node.target.observed.size)]
 
 
 def dependent(nodes: list[Node]) -> bool:
@@ -61,29 +71,43 @@ def groups(nodes: list[Node]) -> list[list[int]]:
     """Return the simulators by their position, those together that share specimens, be it through others."""
     numbers, _ = specimens(nodes)
     found: list[tuple[list[int], set[int]]] = []
-    for k, own in enumerate(set(n.tolist()) for n in numbers):
-        joined = [g for g in found if g[1] & own]
-        found = [g for g in found if not g[1] & own]
-        found.append((sorted([k, *(i for g in joined for i in g[0])]), own.union(*(g[1] for g in joined))))
-    return sorted(g[0] for g in found)
+    for k, number in enumerate(numbers):
+        members, shared = [k], set(number.tolist())
+        # Groups that have a specimen of this simulator become one with it.
+        apart = []
+        for group, own in found:
+            if own.isdisjoint(number.tolist()):
+                apart.append((group, own))
+            else:
+                members, shared = members + group, shared | own
+        found = [*apart, (sorted(members), shared)]
+    return sorted(members for members, _ in found)
 
 
 def siblings(nodes: list[Node], names: set[str]) -> set[str]:
     """Return names with those of simulators that share specimens with them, whose designs have to stay the same."""
-    together = [{nodes[k].name for k in group} for group in groups(nodes)]
-    return names.union(*(g for g in together if g & names))
+    found = set(names)
+    for group in groups(nodes):
+        together = {nodes[k].name for k in group}
+        if together & names:
+            found |= together
+    return found
 
 
 def aligned(nodes: list[Node]) -> bool:
     """Return whether the i-th points of all simulators' populations are the same specimen."""
-    first = nodes[0].bound
-    return all(
-        list(map(id, n.bound.inputs.aleatory)) == list(map(id, first.inputs.aleatory))
-        and type(n.bound) is type(first)
-        and n.propagation == nodes[0].propagation
-        and n.bound.same_points(first)
-        for n in nodes
-    )
+    return all(_same_specimens(node, nodes[0]) for node in nodes)
+
+
+def _same_specimens(node: Node, other: Node) -> bool:
+    """Return whether two simulators have the same inputs at the same points."""
+    inputs = [id(x) for x in node.bound.inputs.aleatory]
+    others = [id(x) for x in other.bound.inputs.aleatory]
+    if inputs != others:
+        return False
+    if type(node.bound) is not type(other.bound) or node.propagation != other.propagation:
+        return False
+    return node.bound.same_points(other.bound)
 
 
 def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int = 0) -> DataSets:
@@ -99,12 +123,21 @@ def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int =
         If specimens are shared by simulators whose inputs are not the same ``.dist()`` objects, or whose
         designs differ, so that the model does not say how their responses depend on each other.
     """
-    populations = [thinned(*evaluator.populations(theta[None], k), n) for k, n in enumerate(evaluator.nodes)]
-    return sets_at(evaluator, populations, simulated_points(evaluator, populations, n_sets, seed))
+    populations = []
+    for k, node in enumerate(evaluator.nodes):
+        values, weights = evaluator.populations(theta[None], k)
+        populations.append(thinned(values, weights, node))
+    points = simulated_points(evaluator, populations, n_sets, seed)
+    return sets_at(evaluator, populations, points)
 
 
 def simulated_points(
-    evaluator: Evaluator, populations: list[tuple[Floats, Floats]], n_sets: int, seed: int = 0, *, more: int = 0
+    evaluator: Evaluator,
+    populations: list[tuple[Floats, Floats]],
+    n_sets: int,
+    seed: int = 0,
+    *,
+    more: int = 0,
 ) -> list[NDArray[np.intp]]:
     """Draw the specimens of data sets: by simulator the points of its population, (n_sets, specimens + more).
 
@@ -123,13 +156,17 @@ def simulated_points(
     draws: dict[int, NDArray[np.intp]] = {}
     for group in groups(nodes):
         _refuse_unlike([nodes[k] for k in group])
-        ok = np.all([np.isfinite(populations[k][0][0]) for k in group], axis=0)
-        drawn = _draw(populations[group[0]][1][0], ok, (n_sets, total + more), rng)
+        # All that share specimens have the same points, with the same weights.
+        finite = [np.isfinite(populations[k][0][0]) for k in group]
+        weights = populations[group[0]][1][0]
+        drawn = _draw(weights, np.all(finite, axis=0), (n_sets, total + more), rng)
         draws |= dict.fromkeys(group, drawn)
     return [draws[k] for k in range(len(nodes))]
 
 
-def sets_at(evaluator: Evaluator, populations: list[tuple[Floats, Floats]], points: list[NDArray[np.intp]]) -> DataSets:
+def sets_at(
+    evaluator: Evaluator, populations: list[tuple[Floats, Floats]], points: list[NDArray[np.intp]]
+) -> DataSets:
     """Return the data sets that are measured on specimens, given by `simulated_points`."""
     numbers, _ = specimens(evaluator.nodes)
     n_sets = len(points[0])
@@ -137,10 +174,13 @@ def sets_at(evaluator: Evaluator, populations: list[tuple[Floats, Floats]], poin
     for k, node in enumerate(evaluator.nodes):
         responses = populations[k][0][0]
         finite = np.isfinite(responses)
-        where = np.cumsum(finite) - 1
+        place = np.cumsum(finite) - 1
         size = int(finite.sum())
-        cells = where[points[k][:, numbers[k]]] + size * np.arange(n_sets)[:, None]
-        count = np.bincount(cells.ravel(), np.tile(node.target.weights, n_sets), n_sets * size)
+        # Add up the observations' weights at the values drawn, for all data sets in one row.
+        drawn = place[points[k][:, numbers[k]]]
+        cells = drawn + size * np.arange(n_sets)[:, None]
+        own = np.tile(node.target.weights, n_sets)
+        count = np.bincount(cells.ravel(), own, n_sets * size)
         values.append(responses[finite])
         weights.append(count.reshape(n_sets, size))
     return DataSets(values, weights)
@@ -181,24 +221,36 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
     """
     nodes = evaluator.nodes
     numbers, total = specimens(nodes)
-    data = {}
     together = groups(nodes)
-    columns, finite = [np.empty(0)] * len(nodes), [np.empty(0, dtype=bool)] * len(nodes)
-    for group, seed in zip(together, rng.spawn(len(together)), strict=True):
-        _refuse_unlike([nodes[k] for k in group])
-        for k in group:
-            sampler = PopulationSampler(nodes[k].bound.inputs)
-            # The same generator for all that share specimens: the same inputs, one row per specimen.
-            aleatory, epistemic = sampler(evaluator.roots(theta[None], k), _SPARE * total, copy.deepcopy(seed))
-            columns[k] = nodes[k].bound.responses(aleatory, epistemic)[0]
-        ok = np.all([np.isfinite(columns[k]) for k in group], axis=0)
-        for k in group:
-            finite[k] = ok
-    for node, number, column, ok in zip(nodes, numbers, columns, finite, strict=True):
-        if ok.sum() < total:
-            raise ValueError(f"{node.name}: got {ok.sum()} finite responses of {ok.size}, expected at least {total}")
-        data[node.name] = column[ok][number]
-    return data
+    data = {}
+    for group, generator in zip(together, rng.spawn(len(together)), strict=True):
+        members = [nodes[k] for k in group]
+        _refuse_unlike(members)
+        columns = [_responses(evaluator, theta, k, _SPARE * total, generator) for k in group]
+        finite = np.isfinite(columns).all(axis=0)
+        for k, column in zip(group, columns, strict=True):
+            _refuse_few(nodes[k], finite, total)
+            data[nodes[k].name] = column[finite][numbers[k]]
+    return {node.name: data[node.name] for node in nodes}
+
+
+def _responses(
+    evaluator: Evaluator, theta: Floats, k: int, size: int, generator: np.random.Generator
+) -> Floats:
+    """Return responses of new specimens, the same ones for the same generator, shape (size,)."""
+    bound = evaluator.nodes[k].bound
+    sampler = PopulationSampler(bound.inputs)
+    roots = evaluator.roots(theta[None], k)
+    aleatory, epistemic = sampler(roots, size, copy.deepcopy(generator))
+    return np.asarray(bound.responses(aleatory, epistemic)[0])
+
+
+def _refuse_few(node: Node, finite: NDArray[np.bool_], expected: int) -> None:
+    if finite.sum() < expected:
+        raise ValueError(
+            f"{node.name}: got {finite.sum()} finite responses of {finite.size}, expected at least "
+            f"{expected}"
+        )
 
 
 def observed_set(evaluator: Evaluator) -> DataSets:
@@ -212,8 +264,9 @@ def reweighted_sets(evaluator: Evaluator, n_sets: int, seed: int = 0) -> DataSet
     rng = np.random.default_rng([seed, 2])
     numbers, total = specimens(evaluator.nodes)
     gains = rng.standard_exponential((n_sets, total))
-    weights = [gains[:, i] * n.target.weights for i, n in zip(numbers, evaluator.nodes, strict=True)]
-    return DataSets(
-        [n.target.observed for n in evaluator.nodes],
-        [w / w.sum(axis=-1, keepdims=True) for w in weights],
-    )
+    values, weights = [], []
+    for number, node in zip(numbers, evaluator.nodes, strict=True):
+        w = gains[:, number] * node.target.weights
+        values.append(node.target.observed)
+        weights.append(w / w.sum(axis=-1, keepdims=True))
+    return DataSets(values, weights)

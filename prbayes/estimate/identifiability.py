@@ -1,4 +1,4 @@
-"""Which directions of the hyperparameters the data see, and the names of those they do not."""
+"""Which directions of the hyperparameters the data identify, and the names of those they do not."""
 
 from __future__ import annotations
 
@@ -6,70 +6,121 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
-from prbayes.estimate.sandwich import Information
+from prbayes.estimate.sandwich import Information, LinearArea
 
-_SHARE = 0.15  # of an element in a direction below which it is not mentioned
+# Of the largest element of a direction, below which another is not mentioned.
+_SHARE = 0.15
+# Of the largest element, from which on another is called equal to it.
+_EQUAL = 0.95
+# Singular values below which directions are used up; those left are 1 up to rounding.
+_NOTHING = 1e-6
 
 
-def blind_directions(blind: Floats, names: list[str]) -> list[str]:
-    """Name the directions about which the data tell less than the prior, such as 'mu[0] - 0.8 mu[1]'."""
+def unidentified_directions(unidentified: Floats, names: list[str]) -> list[str]:
+    """Name the directions about which the data tell less than the prior.
+
+    Parameters
+    ----------
+    unidentified : ndarray, shape (d, q)
+        Orthonormal columns.
+    names : list of str
+        Of the d elements.
+
+    Returns
+    -------
+    list of str
+        Such as 'mu[0] - 0.8 mu[1]'; rotated so that elements stand alone where they can.
+    """
     found = []
-    # Rotated so that elements stand alone where they can.
-    basis = blind
+    basis = unidentified
     while basis.shape[1]:
+        # The element that lies closest to the space that is left, projected on it.
         projector = basis @ basis.T
         i = int(np.argmax(np.diag(projector)))
         direction = projector[i] / np.sqrt(projector[i, i])
         found.append(_named(direction, names))
-        rest = basis - np.outer(direction, direction @ basis)
-        left, strength, _ = np.linalg.svd(rest, full_matrices=False)
-        basis = left[:, strength > 1e-6]
+        # What is left is orthogonal to it.
+        without = basis - np.outer(direction, direction @ basis)
+        left, strength, _ = np.linalg.svd(without, full_matrices=False)
+        basis = left[:, strength > _NOTHING]
     return found
 
 
 def _named(direction: Floats, names: list[str]) -> str:
     largest = direction[np.argmax(np.abs(direction))]
-    parts = []
-    for share, name in sorted(zip(direction / largest, names, strict=True), key=lambda p: -abs(p[0])):
-        if abs(share) > _SHARE:
-            size = "" if abs(share) > 0.95 else f"{abs(share):.1f} "
-            parts.append(f"{'-' if share < 0 else '+'} {size}{name}")
-    return " ".join(parts).removeprefix("+ ")
+    shares = zip(direction / largest, names, strict=True)
+    terms = []
+    for share, name in sorted(shares, key=lambda term: -abs(term[0])):
+        if abs(share) <= _SHARE:
+            continue
+        sign = "-" if share < 0 else "+"
+        size = "" if abs(share) > _EQUAL else f"{abs(share):.1f} "
+        terms.append(f"{sign} {size}{name}")
+    return " ".join(terms).removeprefix("+ ")
 
 
-_HALVED = 256  # points from which two halves can be held against each other
-_AGREEMENT = 0.35  # correlation of the changes of two halves of the points from which a change is taken as real
-_ROUNDING = 0.01  # curvature, in units of the gradient's variance over the curvature, that is a rounding error
+# Points from which two halves can be held against each other.
+_HALVED = 256
+# Correlation of the changes of two halves of the points from which a change is taken as real.
+_AGREEMENT = 0.35
+# Change of the area over one prior standard deviation, in units of the noise floor, that is seen.
+_CHANGE = 0.5
+# Curvature, in units of the gradient's variance over the curvature, that is a rounding error.
+_ROUNDING = 0.01
 
 
-def seen_by_area(part: Information) -> Floats:
-    """Return the directions that an area metric sees, orthonormal in units of the prior's spread, shape (d, r).
+def seen_by_area(information: Information) -> Floats:
+    """Return the directions that an area metric identifies, the strongest last, shape (d, r).
 
-    A direction is not seen if one prior standard deviation along it changes the area by less than half the
-    noise floor, or if two halves of the points do not agree on the change: then it is the points' own error.
+    Orthonormal in units of the prior's spread. A direction is not seen if one prior standard
+    deviation along it changes the area by less than half the noise floor, or if two halves of the
+    points do not agree on the change: then it is the points' own error.
     """
-    _, slopes, lengths = part.area(*part.data_set)
-    slopes = slopes * part.scale[:, None]
-    _, vectors = np.linalg.eigh((slopes * lengths) @ slopes.T)
-    change = (np.abs(vectors.T @ slopes) * lengths).sum(axis=-1)
-    enough = change > 0.5 * part.noise_floor
-    blocks = part.evaluator.nodes[part.k].bound.blocks
-    if blocks.size >= _HALVED:
-        halves = (part.area(*part.data_set, blocks % 2 == i)[1] * part.scale[:, None] for i in (0, 1))
-        a, b = (vectors.T @ s for s in halves)
-        both, one, other = ((x * lengths).sum(axis=-1) for x in (a * b, a**2, b**2))
-        enough &= both > _AGREEMENT * np.sqrt(one * other)
-    return np.asarray(vectors[:, enough])
+    area = information.area(*information.data_set)
+    slopes = _in_prior_sd(area, information)
+    _, vectors = np.linalg.eigh((slopes * area.lengths) @ slopes.T)
+    changes = np.abs(vectors.T @ slopes)
+    seen = (changes * area.lengths).sum(axis=-1) > _CHANGE * information.noise_floor
+    if information.node.bound.blocks.size >= _HALVED:
+        seen &= _halves_agree(information, vectors)
+    return np.asarray(vectors[:, seen])
 
 
-def seen_by_curvature(hessian: Floats, noise: Floats, weakest: float = 1.0) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def _halves_agree(information: Information, vectors: Floats) -> NDArray[np.bool_]:
+    """Return along which directions both halves of the points change alike, shape (d,)."""
+    blocks = information.node.bound.blocks
+    changes = []
+    for half in (0, 1):
+        area = information.area(*information.data_set, blocks % 2 == half)
+        changes.append(vectors.T @ _in_prior_sd(area, information))
+    first, second = changes
+    # The knots are the same: they are values that occur, and both halves know all of them.
+    both = (first * second * area.lengths).sum(axis=-1)
+    one = (first**2 * area.lengths).sum(axis=-1)
+    other = (second**2 * area.lengths).sum(axis=-1)
+    return np.asarray(both > _AGREEMENT * np.sqrt(one * other))
+
+
+def _in_prior_sd(area: LinearArea, information: Information) -> Floats:
+    return np.asarray(area.slopes * information.prior_sd[:, None])
+
+
+def seen_by_curvature(
+    hessian: Floats, noise: Floats, weakest: float = 1.0
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Return eigenvalues and eigenvectors of the Hessian, and along which the data tell enough.
 
-    Both matrices are in units of the prior's spread: the standard error has to be below ``weakest``.
+    Parameters
+    ----------
+    hessian, noise : ndarray, shape (d, d)
+        H and J of the sandwich, in units of the prior's spread.
+    weakest : float
+        Below which the standard error has to be, in prior standard deviations.
     """
     values, vectors = np.linalg.eigh((hessian + hessian.T) / 2)
     along = np.einsum("ik,ij,jk->k", vectors, noise, vectors)
     # Where the data see nothing both are rounding errors, and small against their ratio elsewhere.
     total = float(np.trace(hessian))
     floor = _ROUNDING * float(np.trace(noise)) / total if total > 0 else 0.0
-    return values, vectors, (values > floor) & (along < (weakest * values) ** 2)
+    precise = along < (weakest * values) ** 2
+    return values, vectors, (values > floor) & precise

@@ -25,11 +25,12 @@ class Method:
     Parameters
     ----------
     method : str or callable
-        Scipy's name of a method that needs no Hessian, or a function as `scipy.optimize.minimize` takes it:
-        ``method(fun, x0, args, jac=..., callback=..., **options) -> OptimizeResult``. It works on standardised
-        parameters, that start at zero; ``jac`` is None under `Fresh`.
+        Scipy's name of a method that needs no Hessian, or a function as `scipy.optimize.minimize`
+        takes it: ``method(fun, x0, args, jac=..., callback=..., **options) -> OptimizeResult``. It
+        works on standardised parameters, that start at zero; ``jac`` is None under `Fresh`.
     options : mapping
-        For scipy's ``options=``, in units of the standardised problem; they replace those that `minimize` would set.
+        For scipy's ``options=``, in units of the standardised problem; they replace those that
+        `minimize` would set.
 
     Raises
     ------
@@ -38,7 +39,8 @@ class Method:
 
     References
     ----------
-    .. [1] Nocedal, J. and S. J. Wright (2006), Numerical Optimization, doi:10.1007/978-0-387-40065-5.
+    .. [1] Nocedal, J. and S. J. Wright (2006), Numerical Optimization,
+    doi:10.1007/978-0-387-40065-5.
 
     Examples
     --------

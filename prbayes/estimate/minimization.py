@@ -15,6 +15,7 @@ from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes._progress import shown
 from prbayes.estimate.caveats import breakdown, caveats, elements_at_edge
 from prbayes.estimate.methods import Method
+from prbayes.estimate.obstacles import sampling_obstacle
 from prbayes.estimate.optimum import Optimum
 from prbayes.estimate.refinement import (
     AGREE,
@@ -26,13 +27,12 @@ from prbayes.estimate.refinement import (
     refuse,
     spread_around,
 )
-from prbayes.estimate.refit import Neighbourhood
+from prbayes.estimate.refit import SamplingDistribution
 from prbayes.estimate.rivals import Rival, rivals
 from prbayes.estimate.sampling import Local
 from prbayes.estimate.search import Run, Search, Trace, approach, minimise, settle
 from prbayes.estimate.search import start as begin
 from prbayes.estimate.solution import assemble, rival_record
-from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import model_on_context
 from prbayes.model.support import shortcomings
@@ -43,8 +43,8 @@ _log = logging.getLogger("prbayes")
 def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[str, int]:
     """Add design points where the posterior's populations live, until the designs support them.
 
-    `minimize` and `sample_smc` call it; call it yourself before `pymc.sample` on models with several
-    aleatory inputs or wide priors.
+    `minimize` and `sample_smc` call it; call it yourself before `pymc.sample` on models with
+    several aleatory inputs or wide priors.
 
     Parameters
     ----------
@@ -65,7 +65,8 @@ def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[
 
     References
     ----------
-    .. [1] Owen, A. and Y. Zhou (2000), Safe and effective importance sampling, J. Am. Stat. Assoc. 95, 135-143.
+    .. [1] Owen, A. and Y. Zhou (2000), Safe and effective importance sampling, J. Am. Stat. Assoc.
+    95, 135-143.
 
     Examples
     --------
@@ -96,7 +97,8 @@ _STARTS = 32
 # Spreads of the prior from which what is known of an optimum is looked up again: a simplex that
 # settles a line search moves it by less, and standard errors change by less.
 _MOVED = 0.01
-# Of the noise floor: about the difference of the discrepancy between the data's fit and the truth's.
+# Of the noise floor: about the difference of the discrepancy between the data's fit and the
+# truth's.
 _FLOOR = 0.3
 # Data sets that tell the noise floor, which only says when optima are compared.
 _FLOOR_SETS = 50
@@ -118,38 +120,44 @@ def minimize(
 ) -> Optimum:
     """Find the hyperparameters with the smallest discrepancy, inside the support of their priors.
 
-    The parameters are unconstrained through PyMC's transforms and standardised by the prior's spread.
-    With several simulators the sum of d_k / s_k is minimised: s_k is epsilon where it was given, and else
-    the sampling noise of d_k, the mean discrepancy of data sets drawn from the model, at a pilot optimum.
+    The parameters are unconstrained through PyMC's transforms and standardised by the prior's
+    spread. With several simulators the sum of d_k / s_k is minimised: s_k is epsilon where it was
+    given, and else the sampling noise of d_k, the mean discrepancy of data sets drawn from the
+    model, at a pilot optimum.
 
     Parameters
     ----------
     model : pymc.Model, optional
         The one on the context by default.
     start : dict, optional
-        A value for each free variable, in the user's own units. By default the best of 256 Sobol points of the prior
-        where they cost no response (`Reweighted`), and else the model's initial point. Where no simulated response is
-        near the data at the start, the area metric leads from there to where some are.
+        A value for each free variable, in the user's own units. By default the best of 256 Sobol
+        points of the prior where they cost no response (`Reweighted`), and else the model's initial
+        point. Where no simulated response is near the data at the start, the area metric leads from
+        there to where some are.
     method : str or callable, optional
-        BFGS by default, with exact gradients where there are any (`Reweighted`; `Resimulated` if the response accepts
-        PyTensor variables, which is tried) and differences on common points elsewhere. Any other method of
-        `scipy.optimize.minimize` that needs no Hessian, by its name, or a function as scipy takes it:
-        ``method(fun, x0, args, jac=..., callback=..., **options) -> OptimizeResult``. It works on standardised
-        parameters, that start at zero; ``jac`` is None under `Fresh`.
+        BFGS by default, with exact gradients where there are any (`Reweighted`; `Resimulated` if
+        the response accepts PyTensor variables, which is tried) and differences on common points
+        elsewhere. Any other method of `scipy.optimize.minimize` that needs no Hessian, by its name,
+        or a function as scipy takes it: ``method(fun, x0, args, jac=..., callback=..., **options)
+        -> OptimizeResult``. It works on standardised parameters, that start at zero; ``jac`` is
+        None under `Fresh`.
     options : mapping, optional
-        For scipy's ``options=``, in units of the standardised problem; they replace those that are set otherwise.
+        For scipy's ``options=``, in units of the standardised problem; they replace those that are
+        set otherwise.
     prior : bool
         Add minus the log prior (then discrepancies should be divided by calibrated epsilons).
     tolerance : float
-        Of the standardised problem: the gradient's largest element, or the smallest step of methods without gradient,
-        with parameters in units of the prior's spread and the objective in units of its typical size.
+        Of the standardised problem: the gradient's largest element, or the smallest step of methods
+        without gradient, with parameters in units of the prior's spread and the objective in units
+        of its typical size.
     max_evaluations : int
         Largest number of evaluations of the objective by the optimiser in all, whatever the method.
     refine : bool
         Whether designs of `Reweighted` that do not support the optimum get more points.
     starts : int, optional
-        Number of Sobol points of the prior from which other optima, such as mirror solutions, are searched for, all at
-        once; 0 for none. By default 32 where a theta costs no response (`Reweighted`), and else none.
+        Number of Sobol points of the prior from which other optima, such as mirror solutions, are
+        searched for, all at once; 0 for none. By default 32 where a theta costs no response
+        (`Reweighted`), and else none.
     random_seed : int
         Seed of the starting points.
     progressbar : bool
@@ -177,7 +185,8 @@ def minimize(
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0,
+    ...     4.0])
     >>> optimum = prb.minimize(model)
     >>> bool(abs(optimum.point["mu"] - 1) < 0.1)
     True
@@ -316,7 +325,7 @@ class _State:
         By which the simulators' discrepancies are divided.
     run : Run
         The last one, with the trace of all.
-    sampling : Neighbourhood or None
+    sampling : SamplingDistribution or None
         The sampling distribution of the minimiser around theta; None where nothing is known of it.
     design_error : float
         Of the design, in standard errors; NaN where it is not known.
@@ -329,7 +338,7 @@ class _State:
     theta: Floats
     scales: Floats
     run: Run
-    sampling: Neighbourhood | None
+    sampling: SamplingDistribution | None
     design_error: float = np.nan
     cloud: Floats | None = None
     restart: Floats | None = None
@@ -493,11 +502,11 @@ def _breakdown(plan: _Plan, state: _State) -> tuple[tuple[str, ...], tuple[str, 
     return edge, jump
 
 
-def _sampling(evaluator: Evaluator, theta: Floats, scales: Floats) -> Neighbourhood | None:
+def _sampling(evaluator: Evaluator, theta: Floats, scales: Floats) -> SamplingDistribution | None:
     """Return the sampling distribution of the minimiser, or None where nothing is known of it."""
-    if any(n.metric.minimum is Minimum.UNKNOWN or n.bound.random for n in evaluator.nodes):
+    if sampling_obstacle(evaluator) is not None:
         return None
-    return Neighbourhood.of(evaluator, theta, scales, evaluator.prior_sd)
+    return SamplingDistribution.of(evaluator, theta, scales)
 
 
 def _covariance(state: _State) -> Floats:

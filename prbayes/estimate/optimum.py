@@ -11,7 +11,8 @@ import xarray as xr
 
 from prbayes._checks import Floats
 from prbayes.estimate.caveats import breakdown
-from prbayes.estimate.refit import Neighbourhood, inapplicable
+from prbayes.estimate.obstacles import refit_obstacle, sampling_obstacle
+from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Identity, as_attributes, from_attributes
@@ -33,20 +34,20 @@ class Optimum:
     scales : dict
         The s_k by simulator.
     n_evaluations : int
-        Evaluations of the objective by the optimiser; one with an exact gradient counts as one, each of those that
-        make a gradient by differences counts too.
+        Evaluations of the objective by the optimiser; one with an exact gradient counts as one,
+        each of those that make a gradient by differences counts too.
     n_screened : int
         Points of the prior that were tried as starting points, in one batch.
     n_responses : int
-        Scalar responses that this optimum took, the design's included, and those found in a store; `n_computed` has
-        how many were computed.
+        Scalar responses that this optimum took, the design's included, and those found in a store;
+        `n_computed` has how many were computed.
     converged : bool
     message : str
         What the optimiser said.
     stderr : dict
-        Standard errors by name, in the user's own units: the estimator's sampling standard deviation;
-        infinite along directions that the data do not identify; NaN where nothing is known, as at the edge
-        of a support.
+        Standard errors by name, in the user's own units: the estimator's sampling standard
+        deviation; infinite along directions that the data do not identify; NaN where nothing is
+        known, as at the edge of a support.
     covariance : ndarray, shape (d, d)
         Sampling covariance in unconstrained space.
     theta : ndarray, shape (d,)
@@ -54,25 +55,29 @@ class Optimum:
     names : list of str
         Names of the elements of theta.
     support : dict
-        By simulator with `Reweighted`: ``weight_ess``, ``mean_weight`` and ``lost_mass`` at the optimum.
+        By simulator with `Reweighted`: ``weight_ess``, ``mean_weight`` and ``lost_mass`` at the
+        optimum.
     trace : dict
-        ``theta`` (n, d), ``discrepancy`` (n,) and ``evaluations`` (n,) of each point that the optimiser asked for:
-        unconstrained hyperparameters, the objective there, and how many evaluations there were until then.
+        ``theta`` (n, d), ``discrepancy`` (n,) and ``evaluations`` (n,) of each point that the
+        optimiser asked for: unconstrained hyperparameters, the objective there, and how many
+        evaluations there were until then.
     seconds : float
     design_error : float
-        How far the optimum of an independent design of the same size would be, in standard errors, along the worst
-        direction; NaN where it is not known (`Resimulated`) or is negligible (one input).
+        How far the optimum of an independent design of the same size would be, in standard errors,
+        along the worst direction; NaN where it is not known (`Resimulated`) or is negligible (one
+        input).
     rivals : tuple of dict
-        Other optima, such as mirror solutions: ``point``, ``discrepancy`` (the sum of d_k / s_k), ``theta``, and
-        ``comparable``, whether the data could as well come from there.
+        Other optima, such as mirror solutions: ``point``, ``discrepancy`` (the sum of d_k / s_k),
+        ``theta``, and ``comparable``, whether the data could as well come from there.
     warnings : tuple of str
         What is not identified, in sentences; also logged.
     at_edge : tuple of str
-        Elements that went far out, where no change of them changes the discrepancy: their best value is at the edge of
-        the support, the optimiser has not converged, and nothing is known of standard errors.
+        Elements that went far out, where no change of them changes the discrepancy: their best
+        value is at the edge of the support, the optimiser has not converged, and nothing is known
+        of standard errors.
     at_jump : tuple of str
-        Simulators whose discrepancy jumps at the optimum, since points lose their response there: nothing is known of
-        standard errors.
+        Simulators whose discrepancy jumps at the optimum, since points lose their response there:
+        nothing is known of standard errors.
     identity : Identity or None
         Of the problem that was solved, by which it is known again.
     """
@@ -123,13 +128,14 @@ class Optimum:
         """Responses computed for the model so far: without those found in a store, with those computed again."""
         return sum(node.bound.responses.computed for node in self.evaluator.nodes)
 
-    def sampling(self, *, weakest: float = 1.0) -> Neighbourhood:
+    def sampling(self, *, weakest: float = 1.0) -> SamplingDistribution:
         """Return the sampling distribution of the minimiser around the optimum.
 
         Parameters
         ----------
         weakest : float
-            Largest standard error of a direction that counts as identified, in spreads of the prior.
+            Largest standard error of a direction that counts as identified, in spreads of the
+            prior.
 
         Raises
         ------
@@ -139,12 +145,11 @@ class Optimum:
             If a metric declares nothing of its minimum, or a discrepancy is random.
         """
         require_sampling(self, "sampling")
-        reason = inapplicable(self.evaluator)
-        if reason:
-            raise TypeError(f"sampling: {reason}")
+        obstacle = sampling_obstacle(self.evaluator)
+        if obstacle is not None:
+            raise TypeError(f"sampling: {obstacle}")
         scales = np.array(list(self.scales.values()))
-        prior_sd = self.evaluator.prior_sd
-        return Neighbourhood.of(self.evaluator, self.theta, scales, prior_sd, weakest)
+        return SamplingDistribution.of(self.evaluator, self.theta, scales, weakest)
 
     def to_datatree(self) -> xr.DataTree:
         """Return the optimum as a DataTree with groups ``optimum``, ``stderr``, ``trace`` and ``calibration``."""
@@ -197,9 +202,9 @@ def require_refits(optimum: object, caller: str, advice: str) -> Optimum:
     if not isinstance(optimum, Optimum):
         got = type(optimum).__name__
         raise TypeError(f"{caller}: got {got}, expected an Optimum; call prb.minimize() first")
-    reason = inapplicable(require_sampling(optimum, caller).evaluator)
-    if reason:
-        raise ValueError(f"{caller}: {reason}{advice}")
+    obstacle = refit_obstacle(require_sampling(optimum, caller).evaluator)
+    if obstacle is not None:
+        raise ValueError(f"{caller}: {obstacle}{advice}")
     return optimum
 
 

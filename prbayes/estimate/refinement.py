@@ -19,7 +19,8 @@ MAX_ROUNDS = 8
 # Standard errors within which the optima of two independent designs are to be: a tenth adds half a
 # per cent to the width of an interval.
 AGREE = 0.1
-# Thetas that stand for the populations around an optimum; by judgement: more cost time, not responses.
+# Thetas that stand for the populations around an optimum; by judgement: more cost time, not
+# responses.
 _THETAS = 256
 # The power of its size with which the error of a design of several inputs falls, about; it only
 # says how many points are added at a time (benchmarks/dimensions.py).
@@ -152,7 +153,7 @@ def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int = 200) -> Floa
     """Return the mean discrepancy of data sets drawn from the model at theta, (k,) by simulator."""
     floors = []
     for k in range(len(evaluator.nodes)):
-        information = Information(evaluator, k, theta, evaluator.prior_sd, n_sets=n_sets)
+        information = Information(evaluator, k, theta, n_sets=n_sets)
         floors.append(information.noise_floor)
     return np.array(floors)
 

@@ -70,7 +70,8 @@ def rivals(
     best : ndarray, shape (d,)
     scales : ndarray, shape (k,)
     local : Local
-        What the data see at ``best``; where they are blind, rivals are reported at the same place as ``best``.
+        What the data see at ``best``; where they are blind, rivals are reported at the same place
+        as ``best``.
     noise : float
         A difference of the objective that sampling explains.
     starts : int
@@ -87,7 +88,7 @@ def rivals(
         return evaluator.total(flat, scales).reshape(thetas.shape[:-1])
 
     # Starts: the better half of points of the prior, without crowding.
-    units = local.scale
+    units = local.prior_sd
     points = evaluator.prior_points(_CANDIDATES * starts, seed)
     first = objective(points)
     ranked = np.argsort(first, kind="stable")
@@ -106,7 +107,7 @@ def rivals(
         tolerance=_TOLERANCE * noise,
     )
     lowest = float(objective(best[None])[0])
-    ends, values = _in_line(objective, best, units, local.blind, ends, values, noise)
+    ends, values = _in_line(objective, best, units, local.unidentified, ends, values, noise)
 
     # Keep those that a barrier separates from all that are kept already.
     kept = [(best, lowest)]

@@ -1,7 +1,7 @@
-"""The two halves of the sandwich at one theta: the Hessian, and the sampling covariance of the gradient.
+"""The two halves of the sandwich at one theta: the Hessian, and the covariance of the gradient.
 
-Everything is computed from the model's own population there, so that under `Reweighted` no response is
-computed. Derivatives are central differences of stored weights, exact to rounding.
+Everything is computed from the model's own population there, so that under `Reweighted` no response
+is computed. Derivatives are central differences of stored weights, exact to rounding.
 """
 
 from __future__ import annotations
@@ -16,18 +16,62 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 from prbayes._weighted import distribution_function, reached
 from prbayes.estimate.data_sets import DataSets, dependent, simulated_sets, thinned
+from prbayes.metrics.base import Discrepancy
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.node import Node
 
-_STEP = 1e-3  # of the prior's standard deviation; densities are twice differentiable
-_WIDE_STEP = 0.05  # where a distribution function of simulated values, a step function, or a jump is differenced
-_KNOTS = 400  # on which distribution functions are linearised
-_BLOCK = 1 << 20  # numbers held at a time where data sets meet the features of a stencil
-_POINTS = 1000  # single observations over which the covariance of an additive gradient is taken
+# Of the prior's standard deviation; densities are twice differentiable.
+_STEP = 1e-3
+# Where a distribution function of simulated values, a step function, or a jump is differenced.
+_WIDE_STEP = 0.05
+# On which distribution functions are linearised.
+_KNOTS = 400
+# Numbers held at a time where data sets meet the features of a stencil: 8 MiB.
+_BLOCK = 1 << 20
+# Single observations over which the covariance of an additive gradient is taken.
+_POINTS = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class LinearArea:
+    """The area metric of data sets, with distribution functions that are linear in theta.
+
+    At theta + delta it is the sum over intervals of |gaps + delta @ slopes| lengths.
+
+    Attributes
+    ----------
+    gaps : ndarray, shape (n_sets, m)
+        Simulated less observed distribution function on each interval between knots.
+    slopes : ndarray, shape (d, m)
+        Derivatives of the simulated one.
+    lengths : ndarray, shape (m,)
+        Of the intervals.
+    """
+
+    gaps: Floats
+    slopes: Floats
+    lengths: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Stencil:
+    """Populations around theta: at it, a step to either side along each element, and at corners.
+
+    Attributes
+    ----------
+    share : float
+        The step, in prior standard deviations.
+    values, weights : ndarray, shape (s, n)
+    """
+
+    share: float
+    values: Floats
+    weights: Floats
 
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Local information about theta in the data of one simulator, were they drawn from the model at ``theta``.
+    """Information about theta in the data of one simulator, were they drawn from the model there.
 
     Parameters
     ----------
@@ -35,128 +79,156 @@ class Information:
     k : int
         Which simulator.
     theta : ndarray, shape (d,)
-    scale : ndarray, shape (d,)
-        The prior's standard deviations; sets the step of the differences.
     n_sets : int
         Number of simulated data sets, each of the observed size.
     seed : int
     wide : float
-        Step in units of the scale where the discrepancy is a step function of theta, or jumps.
+        Step in prior standard deviations where the discrepancy is a step function of theta, or
+        jumps.
     """
 
     evaluator: Evaluator
     k: int
     theta: Floats
-    scale: Floats
     n_sets: int = 200
     seed: int = 0
     wide: float = _WIDE_STEP
 
     @property
-    def _smooth(self) -> bool:
-        return self.evaluator.nodes[self.k].target.differentiable
+    def node(self) -> Node:
+        """The simulator."""
+        return self.evaluator.nodes[self.k]
+
+    @property
+    def prior_sd(self) -> Floats:
+        """The prior's standard deviations, shape (d,)."""
+        return self.evaluator.prior_sd
+
+    @property
+    def _target(self) -> Discrepancy:
+        return self.node.target
 
     @property
     def jumps(self) -> bool:
         """Whether points lose their response close to theta, where a smooth discrepancy jumps."""
-        return self._smooth and self._around[0] > _STEP
+        return self._target.differentiable and self._stencil.share > _STEP
 
     @cached_property
-    def _around(self) -> tuple[float, tuple[Floats, Floats]]:
-        """The step, in prior standard deviations, and the populations around theta."""
-
-        def look(step: float) -> tuple[float, tuple[Floats, Floats]]:
-            return step, self.evaluator.populations(self.theta + self._stencil(step), self.k)
-
-        if self.evaluator.nodes[self.k].bound.stored:
-            return look(_STEP)
-        if self._smooth:
-            narrow = look(_STEP)
-            finite = np.isfinite(narrow[1][0])
+    def _stencil(self) -> Stencil:
+        """The populations around theta, as close as the discrepancy can be differenced."""
+        if self.node.bound.stored:
+            return self._around(_STEP)
+        if self._target.differentiable:
+            narrow = self._around(_STEP)
+            finite = np.isfinite(narrow.values)
             if (finite == finite[0]).all():
                 return narrow
-        return look(self.wide)
+        return self._around(self.wide)
+
+    def _around(self, share: float) -> Stencil:
+        steps = self._displacements(share)
+        values, weights = self.evaluator.populations(self.theta + steps, self.k)
+        return Stencil(share, values, weights)
+
+    def _displacements(self, share: float) -> Floats:
+        """Return displacements: none, +- each, and the four corners of each pair."""
+        d = self.theta.size
+        unit = share * np.diag(self.prior_sd)
+        rows = [np.zeros(d)]
+        for u in unit:
+            rows += [u, -u]
+        for i in range(d):
+            for j in range(i):
+                rows += [a * unit[i] + b * unit[j] for a in (1, -1) for b in (1, -1)]
+        return np.array(rows)
 
     @property
     def _step(self) -> Floats:
-        return self._around[0] * self.scale
-
-    @property
-    def _populations(self) -> tuple[Floats, Floats]:
-        return self._around[1]
-
-    def _stencil(self, step: float) -> Floats:
-        """Displacements: none, +- each, and the four corners of each pair."""
-        d = self.theta.size
-        unit = step * np.diag(self.scale)
-        rows = [np.zeros(d), *(s * u for u in unit for s in (1, -1))]
-        for i in range(d):
-            rows += [a * unit[i] + b * unit[j] for j in range(i) for a in (1, -1) for b in (1, -1)]
-        return np.array(rows)
+        return self._stencil.share * self.prior_sd
 
     @cached_property
     def _center(self) -> tuple[Floats, Floats]:
-        """The population at theta that could be observed: finite responses, weights that sum to one."""
-        values, weights = self._populations
-        finite = np.isfinite(values[0])
-        w = weights[0][finite]
-        return values[0][finite], w / w.sum()
+        """The population at theta that could be observed: finite, with weights that sum to one."""
+        values, weights = self._stencil.values[0], self._stencil.weights[0]
+        finite = np.isfinite(values)
+        w = weights[finite]
+        return values[finite], w / w.sum()
 
     @cached_property
     def data_sets(self) -> DataSets:
-        """Data sets drawn from the model at theta, for all simulators; the same for all parts of one seed."""
+        """Data sets drawn from the model at theta, for all simulators; the same for one seed."""
         return simulated_sets(self.evaluator, self.theta, self.n_sets, self.seed)
 
     @property
     def data_set(self) -> tuple[Floats, Floats]:
-        """The values and weights of this simulator's data sets, shapes (n,), (n_sets, n)."""
+        """Values and weights of this simulator's data sets, shapes (n,), (n_sets, n)."""
         return self.data_sets.values[self.k], self.data_sets.weights[self.k]
 
     @cached_property
     def _features(self) -> Any:
         """Features at the stencil, of a metric whose features do not depend on the observed side."""
-        return self.evaluator.nodes[self.k].target.features(*self._populations, np)
+        return self._target.features(self._stencil.values, self._stencil.weights, np)
 
     def _along_stencil(self, observed: Floats, weights: Floats) -> Floats:
-        target = self.evaluator.nodes[self.k].target
-        at_once = max(1, _BLOCK // sum(f.size for f in self._features)) if weights.ndim > 1 else len(weights)
-        blocks = [weights[i : i + at_once] for i in range(0, len(weights), at_once)]
-        return np.concatenate(
-            [np.atleast_1d(target.with_observed(observed, w).outer(*self._features, xp=np)) for w in blocks]
-        )
+        """Return the discrepancies at the stencil, (s,) or (n_sets, s), some data sets at a time."""
+        at_once = len(weights)
+        if weights.ndim > 1:
+            at_once = max(1, _BLOCK // sum(f.size for f in self._features))
+        found = []
+        for i in range(0, len(weights), at_once):
+            target = self._target.with_observed(observed, weights[i : i + at_once])
+            found.append(np.atleast_1d(target.outer(*self._features, xp=np)))
+        return np.concatenate(found)
 
     @cached_property
     def noise_floor(self) -> float:
         """The mean discrepancy between the population at theta and data sets drawn from it."""
-        target = self.evaluator.nodes[self.k].target
-        values, weights = thinned(self._populations[0][:1], self._populations[1][:1], self.evaluator.nodes[self.k])
-        observed, u = self.data_set
-        return float(np.mean([target.with_observed(observed[v > 0], v[v > 0]).of(values, weights) for v in u]))
+        first = self._stencil.values[:1], self._stencil.weights[:1]
+        values, weights = thinned(*first, self.node)
+        observed, data_sets = self.data_set
+        found = []
+        for w in data_sets:
+            drawn = w > 0
+            target = self._target.with_observed(observed[drawn], w[drawn])
+            found.append(target.of(values, weights))
+        return float(np.mean(found))
 
     def gradients(self, observed: Floats, weights: Floats) -> Floats:
-        """Return the gradients of the discrepancy at theta for data sets (n,), (n_sets, n), shape (n_sets, d)."""
-        values = self._along_stencil(observed, weights[:, None])[:, 1 : 1 + 2 * self.theta.size]
-        return np.asarray((values[:, 0::2] - values[:, 1::2]) / (2 * self._step))
+        """Return the gradients of the discrepancy at theta for data sets, shape (n_sets, d).
+
+        Parameters
+        ----------
+        observed : ndarray, shape (n,)
+        weights : ndarray, shape (n_sets, n)
+        """
+        values = self._along_stencil(observed, weights[:, None])
+        beside = values[:, 1 : 1 + 2 * self.theta.size]
+        up, down = beside[:, 0::2], beside[:, 1::2]
+        return np.asarray((up - down) / (2 * self._step))
 
     @cached_property
     def sampling_covariance(self) -> Floats:
         """J: the covariance of the gradient over data sets of the observed size, shape (d, d)."""
-        target = self.evaluator.nodes[self.k].target
-        if not target.metric.additive or dependent([self.evaluator.nodes[self.k]]):
+        if not self.node.metric.additive or dependent([self.node]):
             return np.atleast_2d(np.cov(self.gradients(*self.data_set), rowvar=False))
+        # A mean over observations: of single ones, at equal steps of probability, the covariance by N.
+        slopes = self.gradients(self._quantiles(_POINTS), np.eye(_POINTS))
+        return np.atleast_2d(np.cov(slopes, rowvar=False)) / self._target.n_effective
+
+    def _quantiles(self, n: int) -> Floats:
+        """Return values of the population at theta at n equal steps of probability."""
         values, weights = self._center
         order = np.argsort(values)
-        levels = (np.arange(_POINTS) + 0.5) / _POINTS
-        points = values[order][reached(weights[order], levels)]
-        slopes = self.gradients(points, np.eye(_POINTS))
-        return np.atleast_2d(np.cov(slopes, rowvar=False)) / target.n_effective
+        levels = (np.arange(n) + 0.5) / n
+        return np.asarray(values[order][reached(weights[order], levels)])
 
     @cached_property
     def hessian(self) -> Floats:
-        """H: the Hessian of the discrepancy at theta against the population at theta, shape (d, d)."""
+        """H: the Hessian of the discrepancy against the population at theta, shape (d, d)."""
         f = self._along_stencil(*self._center)
         d, h = self.theta.size, self._step
-        out = np.diag((f[1 : 1 + 2 * d : 2] - 2 * f[0] + f[2 : 2 + 2 * d : 2]) / h**2)
+        up, down = f[1 : 1 + 2 * d : 2], f[2 : 2 + 2 * d : 2]
+        out = np.diag((up - 2 * f[0] + down) / h**2)
         row = 1 + 2 * d
         for i in range(d):
             for j in range(i):
@@ -167,23 +239,30 @@ class Information:
 
     def area(
         self, observed: Floats, weights: Floats, among: NDArray[np.bool_] | None = None
-    ) -> tuple[Floats, Floats, Floats]:
-        """Return a linear model of the area metric for data sets (n,), (n_sets, n), from all points or from some.
+    ) -> LinearArea:
+        """Return a linear model of the area metric around theta.
 
-        Returns
-        -------
-        tuple of ndarray
-            Gaps between distribution functions (n_sets, m), their slopes (d, m), lengths (m,).
+        Parameters
+        ----------
+        observed : ndarray, shape (n,)
+        weights : ndarray, shape (n_sets, n)
+        among : ndarray of bool, optional
+            The points of the population that count; all by default.
         """
-        values, w = self._populations
+        values, w = self._stencil.values, self._stencil.weights
         if among is not None:
             w = w * among / (w * among).sum(axis=-1, keepdims=True)
-        knots = np.unique(np.concatenate([values[0][np.isfinite(values[0])], observed]))
-        knots = knots[np.unique(np.linspace(0, knots.size - 1, _KNOTS).astype(int))]
+        # Knots are values that occur, so that the functions are exact there.
+        finite = values[0][np.isfinite(values[0])]
+        knots = np.unique(np.concatenate([finite, observed]))
+        some = np.linspace(0, knots.size - 1, _KNOTS).astype(int)
+        knots = knots[np.unique(some)]
         if np.array_equal(values[0], values[-1], equal_nan=True):
             values = values[0]
         cdf = distribution_function(values, w, knots, kind="quicksort")
         measured = distribution_function(observed, weights, knots, kind="quicksort")
+        gaps = cdf[0] - measured
         d = self.theta.size
-        slopes = (cdf[1 : 1 + 2 * d : 2] - cdf[2 : 2 + 2 * d : 2]) / (2 * self._step[:, None])
-        return (cdf[0] - measured)[:, :-1], slopes[:, :-1], np.diff(knots)
+        up, down = cdf[1 : 1 + 2 * d : 2], cdf[2 : 2 + 2 * d : 2]
+        slopes = (up - down) / (2 * self._step[:, None])
+        return LinearArea(gaps[:, :-1], slopes[:, :-1], np.diff(knots))

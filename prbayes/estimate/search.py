@@ -36,7 +36,8 @@ _SIMPLEX_EVALUATIONS = 60
 _SETTLED = 1e-4
 # Points of the prior that are tried as starts where a theta costs no response: they take one batch.
 _SCREENED = 256
-# Evaluations in a line search without progress; those of scipy that arrive take fewer. By judgement.
+# Evaluations in a line search without progress; those of scipy that arrive take fewer. By
+# judgement.
 _PATIENCE = 15
 # Step of differences in spreads of the prior: errors of rounding, 1e-16 / step, and of curvature,
 # step^2, are then both below the tolerance.
@@ -311,9 +312,9 @@ class Approach:
 def approach(search: Search, theta: Floats, scales: Floats, seed: int) -> Approach:
     """Go to where simulated responses overlap with the data, by the area metric.
 
-    Without overlap a density metric hardly changes, or changes so that populations get wider without
-    end; the gradient of the area metric does not vanish. Where a theta costs no response, points of
-    the prior are looked at first. Returns theta itself where there is overlap.
+    Without overlap a density metric hardly changes, or changes so that populations get wider
+    without end; the gradient of the area metric does not vanish. Where a theta costs no response,
+    points of the prior are looked at first. Returns theta itself where there is overlap.
     """
     evaluator = search.evaluator
     if not _astray(evaluator, theta):

@@ -15,7 +15,8 @@ from prbayes.estimate.search import Run, Search
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import identity_of
 
-# Step of differences from theta to the user's units, in spreads of the prior: transforms are smooth.
+# Step of differences from theta to the user's units, in spreads of the prior: transforms are
+# smooth.
 _STEP = 1e-4
 # Variance, in squared spreads of the prior, below which it can be that of rounding errors; whether
 # it is, the discrepancy tells.

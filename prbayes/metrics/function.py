@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 from prbayes.metrics.base import Discrepancy, Metric
 
+# Of counts that are computed from weights; weights that are no counts differ from such by far more.
+_ROUNDING = 1e-6
+
 
 @dataclass(frozen=True)
 class FunctionMetric(Metric):
@@ -60,13 +63,24 @@ class FunctionMetric(Metric):
                 "observed weights: got unequal ones, expected none; "
                 "a FunctionMetric has no use for them"
             )
-        return FunctionDiscrepancy(self, observed, weights)
+        return FunctionDiscrepancy(self, observed, weights, observed.size)
 
 
+@dataclass(frozen=True, eq=False)
 class FunctionDiscrepancy(Discrepancy):
-    """A user's metric against fixed observed values."""
+    """A user's metric against fixed observed values.
+
+    The function takes observed values without weights: a data set that is given by weights of
+    values is handed to it as a sample, in which each value is repeated by its count.
+
+    Attributes
+    ----------
+    size : int
+        Number of values in such a sample.
+    """
 
     metric: FunctionMetric
+    size: int
 
     @property
     def symbolic(self) -> bool:
@@ -79,28 +93,46 @@ class FunctionDiscrepancy(Discrepancy):
         return 1.0
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
-        """Return the value of the function."""
-        value = np.asarray(self._called(simulated, weights), dtype=np.float64)
+        """Return the value of the function; the values for several data sets, (B, ...)."""
+        if self.weights.ndim > 1:
+            return (self._of_each(simulated, weights),)
+        observed = repeated(self.observed, self.weights, self.size)
+        return (self._checked(simulated, observed, weights),)
+
+    def _of_each(self, simulated: Floats, weights: Floats) -> Floats:
+        """Return values for B data sets, from populations (B, ..., n) or (1, ..., n)."""
+        n_sets = len(self.weights)
+        simulated = np.broadcast_to(simulated, (n_sets, *simulated.shape[1:]))
+        weights = np.broadcast_to(weights, (n_sets, *weights.shape[1:]))
+        found = np.empty(simulated.shape[:-1])
+        for i, own in enumerate(self.weights.reshape(n_sets, -1)):
+            observed = repeated(self.observed, own, self.size)
+            found[i] = self._checked(simulated[i], observed, weights[i])
+        return found
+
+    def _checked(self, simulated: Floats, observed: Floats, weights: Floats) -> Floats:
+        """Call the function for one data set, and check what it returns."""
+        value = np.asarray(self._called(simulated, observed, weights), dtype=np.float64)
         expected = simulated.shape[:-1]
         if value.shape != expected:
             raise ValueError(
                 f"FunctionMetric: got a result of shape {value.shape} for simulated values of "
                 f"shape {simulated.shape}, expected {expected}; reduce over the last axis"
             )
-        return (value,)
+        return value
 
-    def _called(self, simulated: Floats, weights: Floats) -> Any:
+    def _called(self, simulated: Floats, observed: Floats, weights: Floats) -> Any:
         """Call the function, with weights if it takes them; equal ones it need not know."""
         function = self.metric.function
         if self.metric.weighted:
-            return function(simulated, self.observed, np.broadcast_to(weights, simulated.shape))
+            return function(simulated, observed, np.broadcast_to(weights, simulated.shape))
         if not np.allclose(weights, np.asarray(weights)[..., :1]):
             raise ValueError(
                 "weights: got unequal ones for a FunctionMetric whose function takes none; "
                 "write function(simulated, observed, weights) and pass weighted=True, "
                 "or use prb.Resimulated"
             )
-        return function(simulated, self.observed)
+        return function(simulated, observed)
 
     def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
         """Return the simulated values themselves."""
@@ -114,3 +146,29 @@ class FunctionDiscrepancy(Discrepancy):
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the value of the function."""
         return features[0]
+
+
+def repeated(values: Floats, weights: Floats, size: int) -> Floats:
+    """Return a sample in which each value occurs as often as its weight says.
+
+    Parameters
+    ----------
+    values, weights : ndarray, shape (n,)
+    size : int
+        Number of values in the sample, if the weights are multiples of its inverse. If they are
+        not, the value of smallest weight occurs once, as where some were left out.
+
+    Raises
+    ------
+    ValueError
+        If the weights are no counts, as those of the loss-likelihood bootstrap.
+    """
+    for counts in (weights * size, weights / weights[weights > 0].min()):
+        whole = np.round(counts)
+        if np.abs(counts - whole).max() < _ROUNDING:
+            return np.repeat(values, whole.astype(int))
+    raise ValueError(
+        "observed weights: got weights that are no counts, expected repeated values; a "
+        "FunctionMetric takes no weights of observed values; use "
+        "prb.bootstrap(optimum, parametric=True)"
+    )

@@ -6,19 +6,32 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.estimate.data_sets import observed_set, simulated_sets
-from prbayes.estimate.refit import Neighbourhood, inapplicable
+from prbayes.estimate.obstacles import refit_obstacle
+from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 
-_FEWEST = 50  # draws of a mode below which it is left as it is
-_APART = 1.5  # ratio of distances to two modes below which a draw is between them
-_BETWEEN = 0.05  # share of such draws above which modes are not separate
-_FAR = 6.0  # standard deviations to which draws farther out are drawn in
-_REACH = 3.0  # standard errors beyond which a refit counts as so far away, and no farther
-_WEAKEST = 2.0  # standard error, in units of the prior's spread, up to which refits follow a direction
-_WIDTH = 3.2  # of the middle 89% of a normal distribution, in standard deviations
+# Draws of a mode below which it is left as it is: a covariance needs some.
+_FEWEST = 50
+# Ratio of distances to two modes below which a draw is between them.
+_APART = 1.5
+# Share of such draws above which modes are not separate.
+_BETWEEN = 0.05
+# Standard deviations to which draws farther out are drawn in.
+_FAR = 6.0
+# Standard errors beyond which a refit counts as so far away, and no farther.
+_REACH = 3.0
+# Standard error, in units of the prior's spread, up to which refits follow a direction.
+_WEAKEST = 2.0
+# Levels of the middle 89% of draws, and the width of a normal distribution's in standard deviations.
+_LEVELS = (0.055, 0.5, 0.945)
+_WIDTH = 3.2
+# Prior draws that tell its mean and precision along the axes.
+_PRIOR_DRAWS = 1024
+_WITHOUT = "none: {}"
 
 
 @dataclass(frozen=True)
@@ -56,20 +69,29 @@ class Affine:
         positive_integer(self.n_sets, "Affine: n_sets", minimum=20)
         positive_integer(self.random_seed, "Affine: random_seed", minimum=0)
 
-    def target(self, hood: Neighbourhood) -> tuple[Floats, Floats]:
-        """Return the centre (r,) and covariance (r, r) that draws should have, in the coordinates of ``hood``."""
-        evaluator, r = hood.evaluator, hood.sd.size
-        (center,), _ = hood.refit(observed_set(evaluator))
-        x, ok = hood.refit(simulated_sets(evaluator, hood.thetas(center), self.n_sets, self.random_seed))
-        shifts = np.clip(x[ok] - center, -_REACH, _REACH)
+    def target(self, sampling: SamplingDistribution) -> tuple[Floats, Floats]:
+        """Return the centre (r,) and covariance (r, r) that draws should have, in coordinates."""
+        evaluator, r = sampling.evaluator, sampling.stderr.size
+        # What the data tell: the minimiser, its information and its bias.
+        (center,), _ = sampling.refit(observed_set(evaluator))
+        at = sampling.thetas(center)
+        x, converged = sampling.refit(simulated_sets(evaluator, at, self.n_sets, self.random_seed))
+        shifts = np.clip(x[converged] - center, -_REACH, _REACH)
         information = np.linalg.inv(np.cov(shifts, rowvar=False).reshape(r, r))
-        bias = np.median(shifts, axis=0)  # the same in every parametrisation, as where a scale comes near zero
-        prior, _ = hood.coordinates(evaluator.prior_thetas(1024, self.random_seed))
+        bias = np.median(
+            shifts, axis=0
+        )  # the same in every parametrisation, as where a scale comes near zero
+        # What the prior tells.
+        prior, _ = sampling.coordinates(evaluator.prior_thetas(_PRIOR_DRAWS, self.random_seed))
         precision = np.linalg.inv(np.cov(prior, rowvar=False).reshape(r, r))
+        # Both together.
         covariance = np.linalg.inv(information + precision)
-        return covariance @ (information @ (center - bias) + precision @ prior.mean(axis=0)), covariance
+        force = information @ (center - bias) + precision @ prior.mean(axis=0)
+        return covariance @ force, covariance
 
-    def __call__(self, evaluator: Evaluator, thetas: Floats, optima: Sequence[Floats]) -> tuple[Floats, str]:
+    def __call__(
+        self, evaluator: Evaluator, thetas: Floats, optima: Sequence[Floats]
+    ) -> tuple[Floats, str]:
         """Map draws of the pseudo-posterior, each mode by itself.
 
         Parameters
@@ -86,73 +108,116 @@ class Affine:
         note : str
             What was done, or why nothing.
         """
-        reason = inapplicable(evaluator)
-        if reason:
-            return thetas, f"none: {reason}"
-        flat, scale = thetas.reshape(-1, thetas.shape[-1]), evaluator.prior_sd
-        hoods = [Neighbourhood.of(evaluator, theta, evaluator.epsilon, scale, _WEAKEST) for theta in optima]
-        hoods = [h for h in hoods if h.sd.size]
-        if not hoods:
-            return thetas, "none: the data tell less than the prior about every hyperparameter"
-        distances = np.array([np.linalg.norm(h.coordinates(flat)[0], axis=-1) / np.sqrt(h.sd.size) for h in hoods])
+        obstacle = refit_obstacle(evaluator)
+        if obstacle is not None:
+            return thetas, _WITHOUT.format(obstacle)
+        draws = thetas.reshape(-1, thetas.shape[-1])
+        modes = _identified_modes(evaluator, optima)
+        if not modes:
+            reason = "the data tell less than the prior about every hyperparameter"
+            return thetas, _WITHOUT.format(reason)
+        distances = np.array([_distance(mode, draws) for mode in modes])
+        if _run_together(distances):
+            return thetas, _WITHOUT.format("the posterior has modes that run into each other")
         nearest = distances.argmin(axis=0)
-        if len(hoods) > 1:
-            first, second = np.sort(distances, axis=0)[:2]
-            if np.mean(second < _APART * first) > _BETWEEN:
-                return thetas, "none: the posterior has modes that run into each other"
-        out = flat.copy()
+        out = draws.copy()
         count, far = 0, 0
-        for m, hood in enumerate(hoods):
-            mine = nearest == m
-            if mine.sum() >= _FEWEST:
-                hood = _among(hood, flat[mine])
-                x, rest = hood.coordinates(flat[mine])
-                out[mine] = moved(hood, x, rest, *self.target(hood))
-                far += int((_drawn_in(x, _FAR) != x).any(axis=1).sum())
-                count += 1
+        for m, mode in enumerate(modes):
+            own = nearest == m
+            if own.sum() < _FEWEST:
+                continue
+            out[own], outside = self._mapped(mode, draws[own])
+            far += int(outside.sum())
+            count += 1
         if not count:
-            return thetas, f"none: there are fewer than {_FEWEST} draws of a mode"
-        modes = "" if len(hoods) == 1 else f", {count} modes each by itself"
-        drawn_in = f", {far / len(flat):.1%} of the draws drawn in to {_FAR:.0f} standard deviations" if far else ""
-        return out.reshape(thetas.shape), f"{self!r}{modes}{drawn_in}"
+            return thetas, _WITHOUT.format(f"there are fewer than {_FEWEST} draws of a mode")
+        note = f"{self!r}"
+        if len(modes) > 1:
+            note += f", {count} modes each by itself"
+        if far:
+            share = far / len(draws)
+            note += f", {share:.1%} of the draws drawn in to {_FAR:.0f} standard deviations"
+        return out.reshape(thetas.shape), note
+
+    def _mapped(
+        self, sampling: SamplingDistribution, draws: Floats
+    ) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return the draws of one mode where they should be, and which of them were far out."""
+        sampling = _among(sampling, draws)
+        x, remainder = sampling.coordinates(draws)
+        center, covariance = self.target(sampling)
+        out = transported(sampling, x, remainder, center, covariance)
+        return out, (_drawn_in(x, _FAR) != x).any(axis=1)
 
 
-def moved(hood: Neighbourhood, x: Floats, rest: Floats, center: Floats, covariance: Floats) -> Floats:
-    """Move draws to a median and covariance along the frame; what is left follows as its regression on them says.
+def _identified_modes(evaluator: Evaluator, optima: Sequence[Floats]) -> list[SamplingDistribution]:
+    """Return the sampling distributions at optima about which the data tell something."""
+    scales = evaluator.epsilon
+    found = [SamplingDistribution.of(evaluator, theta, scales, _WEAKEST) for theta in optima]
+    return [sampling for sampling in found if sampling.stderr.size]
 
-    Draws count as refits do: their median, and no farther from it than three standard deviations.
+
+def _distance(sampling: SamplingDistribution, draws: Floats) -> Floats:
+    """Return how far draws, (n, d), are from an optimum, in its standard errors, shape (n,)."""
+    x, _ = sampling.coordinates(draws)
+    return np.asarray(np.linalg.norm(x, axis=-1) / np.sqrt(sampling.stderr.size))
+
+
+def _run_together(distances: Floats) -> bool:
+    """Return whether too many draws are between modes; distances have shape (modes, n)."""
+    if len(distances) < 2:
+        return False
+    first, second = np.sort(distances, axis=0)[:2]
+    return bool(np.mean(second < _APART * first) > _BETWEEN)
+
+
+def transported(
+    sampling: SamplingDistribution,
+    x: Floats,
+    remainder: Floats,
+    center: Floats,
+    covariance: Floats,
+) -> Floats:
+    """Map draws to a median and covariance along the axes, as normal distributions are, with the least motion.
+
+    What remains follows as its regression on them says. Draws count as refits do: their median, and
+    no farther from it than three standard deviations.
     """
-    r = hood.sd.size
+    r = sampling.stderr.size
     x = _drawn_in(x, _FAR)
+    # The symmetric map between two normal distributions.
     root = _root(np.cov(_drawn_in(x, _REACH), rowvar=False).reshape(r, r))
     inverse = np.linalg.inv(root)
-    to = center + (x - np.median(x, axis=0)) @ (inverse @ _root(root @ covariance @ root) @ inverse).T
+    matrix = inverse @ _root(root @ covariance @ root) @ inverse
+    to = center + (x - np.median(x, axis=0)) @ matrix.T
+    # The regression of the remainder on the coordinates.
     apart = x - x.mean(axis=0)
-    slopes = np.linalg.solve(apart.T @ apart, apart.T @ (rest - rest.mean(axis=0)))
-    return hood.thetas(to, rest + (to - x) @ slopes)
+    slopes = np.linalg.solve(apart.T @ apart, apart.T @ (remainder - remainder.mean(axis=0)))
+    return sampling.thetas(to, remainder + (to - x) @ slopes)
 
 
-def _among(hood: Neighbourhood, thetas: Floats) -> Neighbourhood:
-    """Return the neighbourhood at the median of draws, (n, d), along the blind directions.
+def _among(sampling: SamplingDistribution, thetas: Floats) -> SamplingDistribution:
+    """Return the distribution at the median of draws, (n, d), along directions not identified.
 
     The optimum is anywhere along them, where the prior may hardly be; refits hold them at one place.
     """
-    local = hood.local
-    if not local.blind.size:
-        return hood
-    t = (np.median(thetas, axis=0) - hood.theta) / local.scale
-    place = hood.theta + (t - local.directions @ (local.directions.T @ t)) * local.scale
-    found = Neighbourhood.of(hood.evaluator, place, hood.scales, local.scale, _WEAKEST)
-    return found if found.sd.size == hood.sd.size else hood
+    local = sampling.local
+    if not local.unidentified.size:
+        return sampling
+    shift = (np.median(thetas, axis=0) - sampling.theta) / local.prior_sd
+    along = local.identified @ (local.identified.T @ shift)
+    place = sampling.theta + (shift - along) * local.prior_sd
+    found = SamplingDistribution.of(sampling.evaluator, place, sampling.scales, _WEAKEST)
+    return found if found.stderr.size == sampling.stderr.size else sampling
 
 
 def _drawn_in(x: Floats, most: float) -> Floats:
-    """Return draws, (n, r), at most so many standard deviations from the median, as the middle 89% tells them.
+    """Return draws, (n, r), at most so many standard deviations from the median.
 
-    A few in a thousand far out, as where a bounded parameter comes near its bound, would otherwise decide how
-    all others are moved.
+    The middle 89% tell the standard deviation. A few in a thousand far out, as where a bounded
+    parameter comes near its bound, would otherwise decide how all others are mapped.
     """
-    low, middle, high = np.quantile(x, [0.055, 0.5, 0.945], axis=0)
+    low, middle, high = np.quantile(x, _LEVELS, axis=0)
     far = most * (high - low) / _WIDTH
     return np.clip(x, middle - far, middle + far)
 

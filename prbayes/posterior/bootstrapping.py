@@ -9,7 +9,7 @@ import xarray as xr
 from prbayes._checks import positive_integer
 from prbayes._progress import shown
 from prbayes.estimate.data_sets import reweighted_sets, simulated_sets
-from prbayes.estimate.identifiability import blind_directions
+from prbayes.estimate.identifiability import unidentified_directions
 from prbayes.estimate.optimum import Optimum, require_refits
 from prbayes.posterior.trees import bootstrap_tree
 
@@ -73,8 +73,8 @@ def bootstrap(
     clock = time.perf_counter()
     evaluator = require_refits(optimum, "bootstrap", "; use prb.sample_smc").evaluator
     positive_integer(draws, "draws", minimum=2)
-    hood = optimum.sampling()
-    blind = blind_directions(hood.local.blind, evaluator.readable_names)
+    sampling = optimum.sampling()
+    blind = unidentified_directions(sampling.local.unidentified, evaluator.readable_names)
     if blind:
         raise ValueError(
             f"bootstrap: the data tell less than the prior about {', '.join(blind)}, along which the minimiser is "
@@ -85,10 +85,10 @@ def bootstrap(
     else:
         data = reweighted_sets(evaluator, draws, random_seed)
     with shown(progressbar):
-        x, converged = hood.refit(data)
+        x, converged = sampling.refit(data)
     return bootstrap_tree(
         evaluator,
-        hood.thetas(x)[None],
+        sampling.thetas(x)[None],
         sampler="parametric bootstrap" if parametric else "loss-likelihood bootstrap",
         converged=float(converged.mean()),
         seed=random_seed,

@@ -17,9 +17,9 @@ import xarray as xr
 from prbayes._checks import Floats, positive_integer
 from prbayes._progress import shown
 from prbayes.estimate.minimization import find_optimum
+from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, require_sampling
 from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse
-from prbayes.estimate.refit import inapplicable
 from prbayes.model.epsilon import checked_epsilon
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import identity_of, require_same
@@ -320,7 +320,7 @@ def _adjustment(adjust: Affine | bool, evaluator: Evaluator, unset: list[Node]) 
 
 
 def _needs_optimum(evaluator: Evaluator, unset: list[Node], adjustment: Affine | None) -> bool:
-    return bool(unset) or (adjustment is not None and not inapplicable(evaluator))
+    return bool(unset) or (adjustment is not None and refit_obstacle(evaluator) is None)
 
 
 def _evaluator(model: pm.Model, optimum: Optimum | None) -> Evaluator:

@@ -11,7 +11,6 @@ from scipy import optimize
 import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.estimate import refit
-from prbayes.estimate.batch_bfgs import _updated, descend
 from prbayes.estimate.data_sets import (
     DataSets,
     aligned,
@@ -25,12 +24,17 @@ from prbayes.estimate.data_sets import (
     specimens,
 )
 from prbayes.estimate.differences import differences
-from prbayes.estimate.refit import Neighbourhood, _mean_hessian
+from prbayes.estimate.refit import SamplingDistribution, _mean_hessian
 from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 N = OBSERVED.size
-KL, LL, PR, AREA = prb.KullbackLeibler(), prb.LogLikelihood(), prb.ProbabilityResidual(), prb.AreaMetric()
+KL, LL, PR, AREA = (
+    prb.KullbackLeibler(),
+    prb.LogLikelihood(),
+    prb.ProbabilityResidual(),
+    prb.AreaMetric(),
+)
 METRICS = {"kl": KL, "ll": LL, "pr": PR, "area": AREA}
 R256 = prb.Reweighted(256)
 TRUTH = np.array([1.0])
@@ -48,85 +52,52 @@ def double(x: Any) -> Any:
     return 2 * x
 
 
-def build(metric: prb.Metric = KL, observed: Floats = OBSERVED, sd: float | None = 0.5, **keywords: Any) -> pm.Model:
+def build(
+    metric: prb.Metric = KL, observed: Floats = OBSERVED, sd: float | None = 0.5, **keywords: Any
+) -> pm.Model:
     keywords = {"propagation": R256} | keywords
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1) if sd is None else sd)
-        prb.Simulator("y", keywords.pop("response", same), x, metric=metric, observed=observed, **keywords)
+        prb.Simulator(
+            "y", keywords.pop("response", same), x, metric=metric, observed=observed, **keywords
+        )
     return model
 
 
-def pair(a: Any, b: Any, propagation: Any = R256, *, other_input: bool = False, seed: int = 0) -> Evaluator:
+def pair(
+    a: Any, b: Any, propagation: Any = R256, *, other_input: bool = False, seed: int = 0
+) -> Evaluator:
     """Two responses to one input, y and 2 y, with specimen labels; a third one, of another input, without."""
     with pm.Model() as model:
         mu = pm.Normal("mu", 0, 2)
         x = pm.Normal.dist(mu, 0.5)
         z = pm.Normal.dist(mu, 0.5)
-        prb.Simulator("a", same, x, metric=KL, observed=OBSERVED, specimens=a, propagation=propagation)
+        prb.Simulator(
+            "a", same, x, metric=KL, observed=OBSERVED, specimens=a, propagation=propagation
+        )
         other = prb.Reweighted(256, random_seed=seed) if seed else propagation
         prb.Simulator(
-            "b", double, z if other_input else x, metric=KL, observed=2 * OBSERVED, specimens=b, propagation=other
+            "b",
+            double,
+            z if other_input else x,
+            metric=KL,
+            observed=2 * OBSERVED,
+            specimens=b,
+            propagation=other,
         )
-        prb.Simulator("c", same, pm.Normal.dist(mu, 1.0), metric=KL, observed=OBSERVED[:9], propagation=propagation)
+        prb.Simulator(
+            "c",
+            same,
+            pm.Normal.dist(mu, 1.0),
+            metric=KL,
+            observed=OBSERVED[:9],
+            propagation=propagation,
+        )
     return Evaluator(model)
 
 
 def means(sets: DataSets) -> list[Floats]:
     return [w @ v for v, w in zip(sets.values, sets.weights, strict=True)]
-
-
-# -- many minimisations at once --------------------------------------------------------------------------
-
-
-def test_quadratics_with_their_own_data() -> None:
-    rng = np.random.default_rng(1)
-    centers = rng.normal(size=(30, 3))
-    roots = rng.normal(size=(30, 3, 3))
-    curvatures = roots @ roots.transpose(0, 2, 1) + 0.3 * np.eye(3)
-
-    def value(x: Floats, rows: Any) -> Floats:
-        gap = x - centers[rows][:, None]
-        return np.einsum("bsi,bij,bsj->bs", gap, curvatures[rows], gap) + rows[:, None]
-
-    x, values, converged = descend(value, np.zeros((30, 3)), np.eye(3), step=1e-3, tolerance=1e-10)
-    assert converged.all()
-    # A promise below 2 tol leaves |x - c|^2 < tol / curvature, at least 0.3, by a Hessian that is not quite learned.
-    np.testing.assert_allclose(x, centers, atol=1e-3)
-    np.testing.assert_allclose(values, np.arange(30), atol=1e-6)
-
-
-def test_a_curved_valley_and_a_wall() -> None:
-    # Rosenbrock's function, infinite on one side: steps have to be shortened, and the valley followed.
-    def value(x: Floats, rows: Any) -> Floats:
-        f = 5 * (x[..., 1] - x[..., 0] ** 2) ** 2 + (1 - x[..., 0]) ** 2
-        return np.where(x[..., 0] > 1.5, np.inf, f)
-
-    starts = np.array([[-1.2, 1.0], [1.4, -1.0], [0.0, 0.0], [2.0, 2.0]])
-    x, values, converged = descend(value, starts, np.eye(2), step=1e-4, tolerance=1e-9, max_iterations=200)
-    np.testing.assert_allclose(x[:3], 1.0, atol=1e-3)
-    assert converged[:3].all()
-    # Where the function is infinite nothing is known, and it says so.
-    assert not converged[3]
-    assert np.isinf(values[3])
-    np.testing.assert_array_equal(x[3], starts[3])
-
-
-def test_too_few_iterations_are_not_convergence() -> None:
-    _, _, converged = descend(lambda x, rows: (x**2).sum(-1), np.full((2, 1), 50.0), np.eye(1), step=1e-3,
-                              tolerance=1e-9, max_iterations=2)  # fmt: skip
-    assert not converged.any()
-
-
-def test_inverse_hessians_satisfy_the_secant_equation_or_stay() -> None:
-    rng = np.random.default_rng(2)
-    inverse = np.repeat(np.diag([1.0, 2.0])[None], 5, axis=0)
-    s, y = rng.normal(size=(5, 2)), rng.normal(size=(5, 2))
-    y *= np.sign((s * y).sum(-1, keepdims=True))
-    y[4] *= -1  # negative curvature
-    new = _updated(inverse, s, y)
-    np.testing.assert_allclose(np.einsum("bij,bj->bi", new, y)[:4], s[:4], atol=1e-12)
-    np.testing.assert_array_equal(new[4], inverse[4])
-    assert (np.linalg.eigvalsh(new) > 0).all()
 
 
 # -- specimens -------------------------------------------------------------------------------------------
@@ -157,8 +128,21 @@ def test_specimens_are_shared_through_others() -> None:
     # a and c have no label in common, but both share with b: if one design moves, all three do.
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
-        for name, labels in (("a", range(10)), ("c", range(10, 20)), ("b", range(5, 15)), ("d", range(30, 40))):
-            prb.Simulator(name, same, x, metric=KL, observed=OBSERVED[:10], specimens=list(labels), propagation=R256)
+        for name, labels in (
+            ("a", range(10)),
+            ("c", range(10, 20)),
+            ("b", range(5, 15)),
+            ("d", range(30, 40)),
+        ):
+            prb.Simulator(
+                name,
+                same,
+                x,
+                metric=KL,
+                observed=OBSERVED[:10],
+                specimens=list(labels),
+                propagation=R256,
+            )
     nodes = Evaluator(model).nodes
     assert groups(nodes) == [[0, 1, 2], [3]]
     assert siblings(nodes, {"a"}) == {"a", "b", "c"}
@@ -213,7 +197,10 @@ def test_shared_labels_of_different_inputs_or_designs_are_refused(keywords: dict
         lambda: simulated_sets(evaluator, TRUTH, 5),
         lambda: fresh_data(evaluator, TRUTH, np.random.default_rng(0)),
     ):
-        with pytest.raises(ValueError, match=r"same labels in a, b with different inputs or designs.*same .dist\(\)"):
+        with pytest.raises(
+            ValueError,
+            match=r"same labels in a, b with different inputs or designs.*same .dist\(\)",
+        ):
             draw()
     # Without labels the model has nothing to say, and need not.
     assert len(simulated_sets(pair(None, None, **keywords), TRUTH, 5).values) == 3
@@ -227,7 +214,12 @@ def test_responses_that_are_not_finite_cannot_be_observed() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
         prb.Simulator(
-            "y", failing, x, metric=AREA, observed=OBSERVED[OBSERVED < 1], propagation=prb.Reweighted(256, max_lost=0.9)
+            "y",
+            failing,
+            x,
+            metric=AREA,
+            observed=OBSERVED[OBSERVED < 1],
+            propagation=prb.Reweighted(256, max_lost=0.9),
         )
     evaluator = Evaluator(model)
     sets = simulated_sets(evaluator, TRUTH, 50)
@@ -259,7 +251,9 @@ def test_fresh_data_of_shared_and_repeated_specimens() -> None:
     assert not np.isin(data["c"], data["a"]).any()
     apart = fresh_data(pair(None, None), TRUTH, np.random.default_rng(5))
     assert abs(np.corrcoef(apart["a"], apart["b"])[0, 1]) < 4 / N**0.5
-    repeated = fresh_data(Evaluator(build(specimens=labels // 2)), TRUTH, np.random.default_rng(5))["y"]
+    repeated = fresh_data(Evaluator(build(specimens=labels // 2)), TRUTH, np.random.default_rng(5))[
+        "y"
+    ]
     np.testing.assert_array_equal(repeated[::2], repeated[1::2])
     assert np.unique(repeated).size == N // 2
 
@@ -275,7 +269,9 @@ def test_dirichlet_weights() -> None:
     # Var of an element of Dirichlet(1, ..., 1); the variance of 4000 squares of nearly exponential numbers: 5%.
     np.testing.assert_allclose(weights.var(axis=0).mean(), (N - 1) / (N**2 * (N + 1)), rtol=0.03)
     (weighted,) = reweighted_sets(Evaluator(build(weights=own)), 4000).weights
-    np.testing.assert_allclose(weighted, weights * own / (weights * own).sum(axis=1, keepdims=True), rtol=1e-10)
+    np.testing.assert_allclose(
+        weighted, weights * own / (weights * own).sum(axis=1, keepdims=True), rtol=1e-10
+    )
 
 
 def test_shared_specimens_have_one_weight() -> None:
@@ -292,23 +288,25 @@ def test_shared_specimens_have_one_weight() -> None:
 
 
 @cache
-def neighbourhood(name: str, *, design: bool = True) -> Neighbourhood:
+def neighbourhood(name: str, *, design: bool = True) -> SamplingDistribution:
     model = build(METRICS[name], sd=None, propagation=R256 if design else prb.Resimulated(512))
     optimum = prb.minimize(model, method="Nelder-Mead", starts=0)
     evaluator = optimum.evaluator
-    return Neighbourhood.of(evaluator, optimum.theta, np.array(list(optimum.scales.values())), evaluator.prior_sd)
+    return SamplingDistribution.of(
+        evaluator, optimum.theta, np.array(list(optimum.scales.values()))
+    )
 
 
 def test_coordinates_are_standard_errors_along_a_frame() -> None:
-    hood = neighbourhood("kl")
-    thetas = hood.theta + np.random.default_rng(6).normal(size=(7, 2))
-    x, rest = hood.coordinates(thetas)
-    np.testing.assert_allclose(hood.thetas(x, rest), thetas)
-    np.testing.assert_allclose(rest, 0, atol=1e-12)  # two hyperparameters, both seen
-    np.testing.assert_allclose(hood.frame.T @ hood.frame, np.eye(2), atol=1e-12)
+    sampling = neighbourhood("kl")
+    thetas = sampling.theta + np.random.default_rng(6).normal(size=(7, 2))
+    x, remainder = sampling.coordinates(thetas)
+    np.testing.assert_allclose(sampling.thetas(x, remainder), thetas)
+    np.testing.assert_allclose(remainder, 0, atol=1e-12)  # two hyperparameters, both seen
+    np.testing.assert_allclose(sampling.axes.T @ sampling.axes, np.eye(2), atol=1e-12)
     # One unit along each direction, together, make up the sampling covariance of theta.
-    steps = hood.thetas(np.eye(2)) - hood.theta
-    np.testing.assert_allclose(steps.T @ steps, hood.local.in_theta)
+    steps = sampling.thetas(np.eye(2)) - sampling.theta
+    np.testing.assert_allclose(steps.T @ steps, sampling.local.in_theta)
 
 
 def test_what_is_not_seen_is_left_over() -> None:
@@ -317,28 +315,32 @@ def test_what_is_not_seen_is_left_over() -> None:
         pm.Normal("idle", 0, 3)
         prb.Simulator("y", same, x, metric=KL, observed=OBSERVED, propagation=R256)
     evaluator = Evaluator(model)
-    hood = Neighbourhood.of(evaluator, np.array([1.0, 0.0]), np.ones(1), evaluator.prior_sd)
-    x, rest = hood.coordinates(np.array([[1.5, 2.0]]))
+    sampling = SamplingDistribution.of(evaluator, np.array([1.0, 0.0]), np.ones(1))
+    x, remainder = sampling.coordinates(np.array([[1.5, 2.0]]))
     assert x.shape == (1, 1)
-    np.testing.assert_allclose(rest, [[0.0, 2.0]], atol=1e-9)
-    np.testing.assert_allclose(hood.thetas(x, rest), [[1.5, 2.0]])
+    np.testing.assert_allclose(remainder, [[0.0, 2.0]], atol=1e-9)
+    np.testing.assert_allclose(sampling.thetas(x, remainder), [[1.5, 2.0]])
 
 
 @pytest.mark.parametrize("name", ["kl", slow("ll"), slow("pr"), "area"])
 def test_refits_are_minimisers(name: str) -> None:
     # Against a simplex on each data set by itself.
-    hood = neighbourhood(name)
-    sets = reweighted_sets(hood.evaluator, 6)
-    x, converged = hood.refit(sets)
+    sampling = neighbourhood(name)
+    sets = reweighted_sets(sampling.evaluator, 6)
+    x, converged = sampling.refit(sets)
     assert converged.all()
-    target = hood.evaluator.nodes[0].target
+    target = sampling.evaluator.nodes[0].target
     for found, weights in zip(x, sets.weights[0], strict=True):
         own = target.with_observed(sets.values[0], weights)
 
         def value(point: Floats, own: Any = own) -> float:
-            return float(own.of(*hood.evaluator.populations(hood.thetas(point)[None], 0))[0])
+            return float(
+                own.of(*sampling.evaluator.populations(sampling.thetas(point)[None], 0))[0]
+            )
 
-        best = optimize.minimize(value, np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-12})
+        best = optimize.minimize(
+            value, np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-12}
+        )
         # Gains of 1e-4 of a standard error's are left on the table: 0.02 standard errors, the area's kinks more.
         np.testing.assert_allclose(found, best.x, atol=0.15 if name == "area" else 0.04)
 
@@ -353,22 +355,24 @@ def test_the_observed_responses_are_fitted_by_the_optimum() -> None:
 @pytest.mark.parametrize("name", [slow("kl"), "pr", "area"])
 def test_first_order_without_a_design(name: str) -> None:
     # The optima differ little between 512 fixed points and a design; data sets of the observed specimens are the same.
-    hood, first = neighbourhood(name), neighbourhood(name, design=False)
-    sets = reweighted_sets(hood.evaluator, 100)
-    a = hood.thetas(hood.refit(sets)[0]) - hood.theta
+    sampling, first = neighbourhood(name), neighbourhood(name, design=False)
+    sets = reweighted_sets(sampling.evaluator, 100)
+    a = sampling.thetas(sampling.refit(sets)[0]) - sampling.theta
     b = first.thetas(first.refit(sets)[0]) - first.theta
     for i in range(2):
         assert np.corrcoef(a[:, i], b[:, i])[0, 1] > 0.9
         # A linear model of distribution functions knows the spread of other data to 30%, one of densities to 10%.
-        np.testing.assert_allclose(b[:, i].std(), a[:, i].std(), rtol=0.35 if name == "area" else 0.15)
+        np.testing.assert_allclose(
+            b[:, i].std(), a[:, i].std(), rtol=0.35 if name == "area" else 0.15
+        )
 
 
 def test_blocks_of_data_sets_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
-    hood = neighbourhood("kl")
-    sets = simulated_sets(hood.evaluator, hood.theta, 23)
-    whole, _ = hood.refit(sets)
+    sampling = neighbourhood("kl")
+    sets = simulated_sets(sampling.evaluator, sampling.theta, 23)
+    whole, _ = sampling.refit(sets)
     monkeypatch.setattr(refit, "_BLOCK", 10 * 5 * (256 + sets.values[0].size))
-    parts, converged = hood.refit(sets)
+    parts, converged = sampling.refit(sets)
     assert converged.size == 23
     # Each block guesses its curvature from its own data sets, so that paths differ, but not where they lead.
     np.testing.assert_allclose(parts, whole, atol=0.04)
@@ -378,18 +382,20 @@ def test_two_simulators_are_weighed_by_their_scales() -> None:
     # A normal mean with known sd: both minimisers are about the means of the data, weighed by N_k.
     labels = np.arange(N)
     evaluator = pair(labels, labels)
-    hood = Neighbourhood.of(evaluator, TRUTH, np.array([1 / N, 1e9, 1e9]), evaluator.prior_sd)
+    sampling = SamplingDistribution.of(evaluator, TRUTH, np.array([1 / N, 1e9, 1e9]))
     sets = reweighted_sets(evaluator, 20)
-    only_a, _ = hood.refit(sets)
+    only_a, _ = sampling.refit(sets)
     alone = Evaluator(build(KL))
-    by_itself = Neighbourhood.of(alone, TRUTH, np.array([1 / N]), alone.prior_sd)
+    by_itself = SamplingDistribution.of(alone, TRUTH, np.array([1 / N]))
     expected, _ = by_itself.refit(DataSets(sets.values[:1], sets.weights[:1]))
-    np.testing.assert_allclose(hood.thetas(only_a), by_itself.thetas(expected), atol=0.003)
+    np.testing.assert_allclose(sampling.thetas(only_a), by_itself.thetas(expected), atol=0.003)
 
 
 def test_mean_hessian_of_a_parabola() -> None:
     exact = np.array([[3.0, 1.0, 0.5], [1.0, 2.0, 0.0], [0.5, 0.0, 1.0]])
-    found = _mean_hessian(lambda x: 0.5 * np.einsum("bsi,ij,bsj->s", x, exact, x) + x.sum(axis=(0, 2)), 3)
+    found = _mean_hessian(
+        lambda x: 0.5 * np.einsum("bsi,ij,bsj->s", x, exact, x) + x.sum(axis=(0, 2)), 3
+    )
     np.testing.assert_allclose(found, exact, atol=1e-10)
     lifted = _mean_hessian(lambda x: 0.5 * (x[0, :, 0] ** 2 - x[0, :, 1] ** 2), 2)
     np.testing.assert_allclose(lifted, np.diag([1.0, 0.05]), atol=1e-10)
@@ -407,7 +413,10 @@ def test_observing_is_the_model_of_other_data(name: str) -> None:
     evaluator = Evaluator(model)
     thetas = evaluator.prior_thetas(20, 1)
     before = evaluator(thetas).discrepancies
-    other, built = evaluator.observing({"y": data}), Evaluator(build(metric, data, sd=None, weights=weights))
+    other, built = (
+        evaluator.observing({"y": data}),
+        Evaluator(build(metric, data, sd=None, weights=weights)),
+    )
     for size in (1, 20):
         found, expected = other(thetas[:size]), built(thetas[:size])
         np.testing.assert_allclose(found.discrepancies, expected.discrepancies, rtol=1e-10)
@@ -420,7 +429,9 @@ def test_observing_is_the_model_of_other_data(name: str) -> None:
     scales = np.array([0.3])
     value, gradient, _ = differences(lambda t: other.total(t, scales), np.full(2, 1e-4))(thetas[0])
     exact = built.objective(prior=False, gradient=True)(thetas[0], scales)
-    np.testing.assert_allclose([value, *other.objective(prior=False, gradient=False)(thetas[0], scales)], exact[0])
+    np.testing.assert_allclose(
+        [value, *other.objective(prior=False, gradient=False)(thetas[0], scales)], exact[0]
+    )
     np.testing.assert_allclose(gradient, exact[1], rtol=1e-3, atol=1e-3 * np.abs(exact[1]).max())
     for prior, slopes in ((True, False), (False, True)):
         with pytest.raises(NotImplementedError):
@@ -442,7 +453,10 @@ def test_batches_added_inside_are_undone() -> None:
     thetas = evaluator.prior_thetas(30, 1)
     before, support = evaluator(thetas).discrepancies, evaluator.support(thetas)["y"]
     inside = []
-    for at in (thetas[:3], thetas[3:6]):  # one after the other, without a look at the first design between them
+    for at in (
+        thetas[:3],
+        thetas[3:6],
+    ):  # one after the other, without a look at the first design between them
         with design.undone():
             design.add(evaluator.roots(at, 0))
             assert design.n_points == 512

@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.estimate.identifiability import blind_directions, seen_by_curvature
+from prbayes.estimate.identifiability import seen_by_curvature, unidentified_directions
 from prbayes.estimate.rivals import rivals
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
@@ -42,7 +42,9 @@ def mirrored(metric: prb.Metric, **keywords: Any) -> pm.Model:
     """Symmetric about mu = 1, the prior too: the data cannot tell one side from the other."""
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1.5), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", parabola, x, metric=metric, observed=DATA, **({"propagation": R256} | keywords))
+        prb.Simulator(
+            "y", parabola, x, metric=metric, observed=DATA, **({"propagation": R256} | keywords)
+        )
     return model
 
 
@@ -53,7 +55,9 @@ def fit(name: str) -> prb.Optimum:
 
 @cache
 def posterior(name: str) -> xr.DataTree:
-    return prb.sample_smc(500, chains=2, optimum=fit(name), model=fit(name).model, random_seed=1, progressbar=False)
+    return prb.sample_smc(
+        500, chains=2, optimum=fit(name), model=fit(name).model, random_seed=1, progressbar=False
+    )
 
 
 # -- mirror solutions ------------------------------------------------------------------------------------
@@ -71,7 +75,9 @@ def test_both_optima_are_found(name: str) -> None:
     assert abs(np.log(optimum.point["sigma"] / rival["point"]["sigma"])) < 0.1
     np.testing.assert_allclose(rival["discrepancy"], optimum.discrepancy, rtol=0.05)
     evaluator = Evaluator(optimum.model)
-    assert evaluator(rival["theta"][None]).discrepancies[0, 0] == pytest.approx(rival["discrepancy"])
+    assert evaluator(rival["theta"][None]).discrepancies[0, 0] == pytest.approx(
+        rival["discrepancy"]
+    )
     (line,) = optimum.warnings
     assert "the data could as well come from mu = " in line
     assert f"{rival['point']['mu']:.3f}"[:4] in line
@@ -122,7 +128,9 @@ def test_a_worse_optimum_is_left_for_the_better_one() -> None:
     with pm.Model() as rough:
         z = pm.Normal.dist(pm.Normal("mu", 0, 3), 0.3)
         data = np.random.default_rng(5).normal(4.0, 0.3, 60)
-        prb.Simulator("y", wrong, z, metric=METRICS["ll"], observed=data, propagation=prb.Reweighted(2048))
+        prb.Simulator(
+            "y", wrong, z, metric=METRICS["ll"], observed=data, propagation=prb.Reweighted(2048)
+        )
     stuck = prb.minimize(rough, start={"mu": -2.0}, starts=0)
     assert abs(stuck.point["mu"] + 2) < 0.2
     found = prb.minimize(rough, start={"mu": -2.0})
@@ -139,7 +147,14 @@ def test_a_worse_optimum_is_left_for_the_better_one() -> None:
 def test_a_linear_problem_has_no_rivals(name: str) -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", lambda x: 3 * x + 1, x, metric=METRICS[name], observed=3 * OBSERVED + 1, propagation=R256)
+        prb.Simulator(
+            "y",
+            lambda x: 3 * x + 1,
+            x,
+            metric=METRICS[name],
+            observed=3 * OBSERVED + 1,
+            propagation=R256,
+        )
     optimum = prb.minimize(model)
     assert optimum.rivals == ()
     assert optimum.warnings == ()
@@ -160,7 +175,9 @@ def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
 @pytest.mark.parametrize("name", [slow("ll"), "pr", "area"])
 def test_each_mode_is_adjusted_by_itself(name: str) -> None:
     optimum, idata = fit(name), posterior(name)
-    assert idata.posterior.attrs["adjustment"].startswith("Affine(n_sets=200, random_seed=0), 2 modes each by itself")
+    assert idata.posterior.attrs["adjustment"].startswith(
+        "Affine(n_sets=200, random_seed=0), 2 modes each by itself"
+    )
     mu, before = idata.posterior["mu"].values.ravel(), idata.unadjusted["mu"].values.ravel()
     # No draw changes sides; 1000 of them keep the shares to 1.6%, and resampling adds drift.
     np.testing.assert_array_equal(mu > 1, before > 1)
@@ -178,7 +195,10 @@ def test_modes_that_run_into_each_other_are_left_alone(caplog: pytest.LogCapture
             200, chains=1, model=fit("pr").model, optimum=fit("pr"), epsilon=5.0, adjust=prb.Affine(), random_seed=1,
             progressbar=False,
         )  # fmt: skip
-    assert idata.posterior.attrs["adjustment"] == "none: the posterior has modes that run into each other"
+    assert (
+        idata.posterior.attrs["adjustment"]
+        == "none: the posterior has modes that run into each other"
+    )
     assert "unadjusted" not in idata.children
     assert "modes that run into each other; their width is epsilon's" in caplog.text
 
@@ -206,7 +226,10 @@ def local(blind: Any) -> Local:
 )
 def test_directions_have_names(blind: Any, lines: list[str]) -> None:
     assert [
-        sorted_signs(d) for d in blind_directions(np.linalg.qr(np.array(blind, dtype=float).T)[0], ["a", "b", "c"])
+        sorted_signs(d)
+        for d in unidentified_directions(
+            np.linalg.qr(np.array(blind, dtype=float).T)[0], ["a", "b", "c"]
+        )
     ] == lines
 
 
@@ -216,7 +239,7 @@ def sorted_signs(line: str) -> str:
 
 
 def test_nothing_is_blind() -> None:
-    assert blind_directions(np.zeros((2, 0)), ["a", "b"]) == []
+    assert unidentified_directions(np.zeros((2, 0)), ["a", "b"]) == []
 
 
 @pytest.mark.parametrize("name", [slow("ll"), slow("kl"), "pr"])
@@ -231,7 +254,9 @@ def test_a_sum_hides_a_difference(name: str) -> None:
         )  # fmt: skip
     optimum = prb.minimize(model)
     (line,) = optimum.warnings
-    assert line.startswith("the data tell less than the prior about a - 0.5 b[0] (in units of the priors'")
+    assert line.startswith(
+        "the data tell less than the prior about a - 0.5 b[0] (in units of the priors'"
+    )
     assert np.isinf(optimum.stderr["a"])
     assert np.isinf(optimum.stderr["b"]).all()
 
@@ -239,7 +264,10 @@ def test_a_sum_hides_a_difference(name: str) -> None:
 def test_rounding_errors_are_not_information() -> None:
     noise = np.diag([0.5, 1e-13])
     # Curvature and noise of the second direction are rounding errors; their ratio looks like a standard error of 0.1.
-    assert list(seen_by_curvature(np.diag([5.0, 3e-6]), noise)[2]) == [False, True]  # sorted by curvature
+    assert list(seen_by_curvature(np.diag([5.0, 3e-6]), noise)[2]) == [
+        False,
+        True,
+    ]  # sorted by curvature
     # A direction that says a little more than the prior is seen beside one that says much more.
     assert seen_by_curvature(np.diag([500.0, 0.15]), np.diag([50.0, 0.015]))[2].all()
     # Where nothing changes, nothing is seen.
@@ -258,7 +286,7 @@ def test_a_hyperparameter_without_effect_is_named_and_makes_no_rivals() -> None:
     assert line.endswith("it is not identified by them, and its posterior rests on the prior")
 
 
-def test_rivals_stand_where_the_optimum_does_along_blind_directions() -> None:
+def test_rivals_stand_where_the_optimum_does_along_unidentified_directions() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1.5), 0.5)
         pm.Normal("idle", 3, 2)
@@ -276,7 +304,11 @@ def test_a_ridge_under_the_area_metric_is_seen_through_few_points(n: int) -> Non
     with pm.Model() as model:
         u = pm.Normal.dist(1, pm.HalfNormal("sigma", 1))
         v = pm.Normal.dist(0, pm.HalfNormal("noise", 1))
-        keywords = {"metric": prb.AreaMetric(), "observed": OBSERVED, "propagation": prb.Resimulated(n)}
+        keywords = {
+            "metric": prb.AreaMetric(),
+            "observed": OBSERVED,
+            "propagation": prb.Resimulated(n),
+        }
         prb.Simulator("y", lambda u, v: u + v, u, v, **keywords)
     optimum = prb.minimize(model)
     assert all(np.isinf(optimum.stderr[name]) for name in ("sigma", "noise"))
@@ -289,7 +321,11 @@ def test_what_is_seen_under_the_area_metric_is_seen_through_few_points_as_well()
     with pm.Model() as model:
         u = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
         v = pm.Normal.dist(0, 0.2)
-        keywords = {"metric": prb.AreaMetric(), "observed": OBSERVED, "propagation": prb.Resimulated(256)}
+        keywords = {
+            "metric": prb.AreaMetric(),
+            "observed": OBSERVED,
+            "propagation": prb.Resimulated(256),
+        }
         prb.Simulator("y", lambda u, v: u + v, u, v, **keywords)
     optimum = prb.minimize(model)
     assert all(np.isfinite(optimum.stderr[name]) for name in ("mu", "sigma"))

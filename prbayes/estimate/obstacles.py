@@ -1,0 +1,89 @@
+"""What a model's metrics and propagations do not allow: sampling distributions, refits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from prbayes.metrics.base import Minimum
+from prbayes.model.evaluator import Evaluator
+
+
+class Cause(Enum):
+    """Why a model cannot be calibrated to other data sets.
+
+    Attributes
+    ----------
+    RANDOM
+        A simulator's discrepancy is drawn anew at every evaluation.
+    COSTLY
+        A metric declares nothing of its minimum, and its refits would compute responses.
+    OTHER_TERMS
+        There are likelihood terms or potentials besides the simulators.
+    """
+
+    RANDOM = "random"
+    COSTLY = "costly"
+    OTHER_TERMS = "other terms"
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """Why something cannot be done.
+
+    Attributes
+    ----------
+    cause : Cause
+    reason : str
+        In words, as the end of a sentence.
+    """
+
+    cause: Cause
+    reason: str
+
+    def __str__(self) -> str:
+        """Return the reason."""
+        return self.reason
+
+
+def simulator_obstacle(evaluator: Evaluator, k: int) -> Obstacle | None:
+    """Return why nothing is known of the minimiser of one simulator's discrepancy, or None."""
+    node = evaluator.nodes[k]
+    if node.bound.random:
+        return Obstacle(Cause.RANDOM, f"{node.name} has prb.Fresh, whose discrepancy is random")
+    if node.metric.minimum is Minimum.UNKNOWN and not node.bound.stored:
+        metric = type(node.metric).__name__
+        reason = (
+            f"{node.name} has a {metric}, of which nothing is known without refits, and these need "
+            "stored responses: use propagation=prb.Reweighted()"
+        )
+        return Obstacle(Cause.COSTLY, reason)
+    return None
+
+
+def sampling_obstacle(evaluator: Evaluator) -> Obstacle | None:
+    """Return why there is no sampling distribution of the minimiser, or None."""
+    found = [simulator_obstacle(evaluator, k) for k in range(len(evaluator.nodes))]
+    several = measured_by_refits(evaluator) and not all(n.bound.stored for n in evaluator.nodes)
+    if several and not any(found):
+        names = ", ".join(n.name for n in evaluator.nodes if not n.bound.stored)
+        reason = f"another metric needs refits, and the responses of {names} are not stored"
+        found.append(Obstacle(Cause.COSTLY, reason))
+    return next((obstacle for obstacle in found if obstacle is not None), None)
+
+
+def refit_obstacle(evaluator: Evaluator) -> Obstacle | None:
+    """Return why the model cannot be calibrated to other data sets, or None."""
+    obstacle = sampling_obstacle(evaluator)
+    if obstacle is not None:
+        return obstacle
+    ordinary = len(evaluator.model.observed_RVs) > len(evaluator.nodes)
+    if ordinary or evaluator.model.potentials:
+        reason = "the model has likelihood terms or potentials besides its simulators"
+        return Obstacle(Cause.OTHER_TERMS, reason)
+    return None
+
+
+def measured_by_refits(evaluator: Evaluator) -> bool:
+    """Return whether a metric declares nothing of its minimum, so that refits have to tell."""
+    return any(node.metric.minimum is Minimum.UNKNOWN for node in evaluator.nodes)
