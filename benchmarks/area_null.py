@@ -1,16 +1,19 @@
 r"""The null distribution of the area test: the area between the ECDF of n uniform numbers and the identity.
 
-Makes the table that ships with the package, `prbayes/validation/area_null.csv`: quantiles of sqrt(n) times the area.
+Makes the table that ships with the package, `prbayes/validation/area_null.csv`: quantiles of
+sqrt(n) times the area.
 
-The number of points below v moves as a Poisson process that is conditioned on its end. With the area as a phase,
+The number of points below v moves as a Poisson process that is conditioned on its end. With the
+area as a phase,
 
     phi(t) = E exp(i t sqrt(n) int |F_n(v) - v| dv)
 
-follows from n + 1 numbers that are carried from v = 0 to v = 1: over each cell of a grid they are turned by the
-phase of their state, exactly, and convolved with the Poisson distribution of the points that the cell adds. That is
-the distribution of numbers rounded to the cells' midpoints; two grids and Richardson's extrapolation remove the
-rounding. A Fourier series on an interval that holds all the probability gives the distribution function, to about
-1e-8 for n >= 6. For n = 2 and 3, where phi decays slowly, the unit cube is summed on a lattice; n = 1 is closed form.
+follows from n + 1 numbers that are carried from v = 0 to v = 1: over each cell of a grid they are
+turned by the phase of their state, exactly, and convolved with the Poisson distribution of the
+points that the cell adds. That is the distribution of numbers rounded to the cells' midpoints; two
+grids and Richardson's extrapolation remove the rounding. A Fourier series on an interval that holds
+all the probability gives the distribution function, to about 1e-8 for n >= 6. For n = 2 and 3,
+where phi decays slowly, the unit cube is summed on a lattice; n = 1 is closed form.
 
     uv run python -m benchmarks.area_null [--out prbayes/validation/area_null.csv]
 """
@@ -26,7 +29,27 @@ from typing import Any
 import numpy as np
 from scipy.stats import poisson
 
-SIZES = (*range(1, 21), 22, 25, 28, 32, 36, 40, 45, 50, 60, 70, 85, 100, 125, 150, 200, 300, 500, 1000)
+SIZES = (
+    *range(1, 21),
+    22,
+    25,
+    28,
+    32,
+    36,
+    40,
+    45,
+    50,
+    60,
+    70,
+    85,
+    100,
+    125,
+    150,
+    200,
+    300,
+    500,
+    1000,
+)
 LEVELS = (0.9999, 0.999, 0.99, 0.975, 0.95, 0.925, *np.round(np.arange(0.9, 0.1, -0.05), 2), 0.1, 0.08, 0.065, 0.05,
           0.04, 0.03, 0.025, 0.02, 0.015, 0.01, 7e-3, 5e-3, 3e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, 1e-5, 1e-6)  # fmt: skip
 OUT = Path(__file__).parents[1] / "prbayes" / "validation" / "area_null.csv"
@@ -73,7 +96,9 @@ def lattice(n: int, x: Any) -> Any:
     found = np.zeros(x.size)
     for first in points:
         rest = np.meshgrid(*[points] * (n - 1), indexing="ij")
-        u = np.sort(np.stack([np.full(rest[0].size, first), *(r.ravel() for r in rest)], axis=-1), axis=-1)
+        u = np.sort(
+            np.stack([np.full(rest[0].size, first), *(r.ravel() for r in rest)], axis=-1), axis=-1
+        )
         found += u.shape[0] - np.searchsorted(np.sort(np.sqrt(n) * areas(u)), x, side="right")
     return found / side**n
 

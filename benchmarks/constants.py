@@ -1,16 +1,17 @@
 """What changes where a constant of the package is half or twice as large.
 
-Every number that stands at the top of a module, by its syntax tree, in the rooms that touch statistics. Each is set to
-half and to twice its value, in a process of its own, and five problems are calibrated: optimum, standard errors and
-an adjusted posterior of 400 draws. The table has, over all problems and hyperparameters, the largest change of
+Every number that stands at the top of a module, by its syntax tree, in the rooms that touch
+statistics. Each is set to half and to twice its value, in a process of its own, and five problems
+are calibrated: optimum, standard errors and an adjusted posterior of 400 draws. The table has, over
+all problems and hyperparameters, the largest change of
 
 - the optimum, in standard errors; the standard errors, as a factor;
 - the posterior's mean, in its standard deviations; its standard deviation, as a factor;
 - the number of responses, as a factor; and the problems whose verdict (converged, warnings by their number) changes,
   or that end in an error.
 
-A posterior of 400 draws with another seed differs by about .05 standard deviations in the mean, and by 1.04 in the
-standard deviation: the first row says how much on these problems.
+A posterior of 400 draws with another seed differs by about .05 standard deviations in the mean, and
+by 1.04 in the standard deviation: the first row says how much on these problems.
 
     uv run python -m benchmarks.constants [--only sandwich] [--workers 2] [--out constants.json]
 """
@@ -44,7 +45,9 @@ def numbers() -> dict[str, float]:
     for room in ROOMS:
         for path in sorted((PACKAGE / room).glob("*.py")):
             for statement in ast.parse(path.read_text(encoding="utf-8")).body:
-                if not isinstance(statement, ast.Assign) or not isinstance(statement.targets[0], ast.Name):
+                if not isinstance(statement, ast.Assign) or not isinstance(
+                    statement.targets[0], ast.Name
+                ):
                     continue
                 module = importlib.import_module(f"prbayes.{room}.{path.stem}")
                 value = getattr(module, statement.targets[0].id)
@@ -57,7 +60,9 @@ def one_input(response: Any, observed: Any, metric: prb.Metric) -> pm.Model:
     """Return a model of one normal input."""
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1.2, 1.0), pm.HalfNormal("sigma", 1.0))
-        prb.Simulator("y", response, x, metric=metric, observed=observed, propagation=prb.Reweighted(256))
+        prb.Simulator(
+            "y", response, x, metric=metric, observed=observed, propagation=prb.Reweighted(256)
+        )
     return model
 
 
@@ -102,7 +107,12 @@ def answers(random_seed: int = 1) -> dict[str, Any]:
         try:
             optimum = prb.minimize(model, progressbar=False)
             posterior = prb.sample_smc(
-                400, chains=1, model=model, optimum=optimum, random_seed=random_seed, progressbar=False
+                400,
+                chains=1,
+                model=model,
+                optimum=optimum,
+                random_seed=random_seed,
+                progressbar=False,
             )
         except Exception as error:
             out[name] = {"error": f"{type(error).__name__}: {error}"[:200]}
@@ -125,7 +135,9 @@ def with_constant(name: str, value: float) -> dict[str, Any]:
     here = importlib.import_module(f"prbayes.{module}")
     old = getattr(here, constant)
     for other in [m for key, m in sys.modules.items() if key.startswith("prbayes")]:
-        if other is here or (not constant.startswith("_") and getattr(other, constant, None) == old):
+        if other is here or (
+            not constant.startswith("_") and getattr(other, constant, None) == old
+        ):
             setattr(other, constant, value)
     return answers()
 
@@ -140,7 +152,9 @@ def change(found: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
             if a != b:
                 other.append(name)
             continue
-        arrays = {key: (np.array(a[key]), np.array(b[key])) for key in ("theta", "stderr", "mean", "sd")}
+        arrays = {
+            key: (np.array(a[key]), np.array(b[key])) for key in ("theta", "stderr", "mean", "sd")
+        }
         known = np.isfinite(arrays["stderr"][0]) & np.isfinite(arrays["stderr"][1])
         new, old = ({key: pair[i][known] for key, pair in arrays.items()} for i in (0, 1))
         values = {
@@ -160,7 +174,9 @@ def change(found: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
 
 def main() -> None:
     """Make the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", default="", help="constants whose name has this in it")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("constants.json"))

@@ -1,9 +1,9 @@
 """What gross outliers do to each metric: shift of the posterior, in standard deviations of the clean posterior.
 
-Data are normal, N(10, 1), with N = 50; then 5% of them, 2 or 3 values at random, are replaced by gross
-outliers 8 standard deviations above the mean. The same data sets, clean and contaminated, are calibrated with
-each metric, and the shift of the posterior mean and the ratio of the posterior's sd to the clean one are
-averaged.
+Data are normal, N(10, 1), with N = 50; then 5% of them, 2 or 3 values at random, are replaced by
+gross outliers 8 standard deviations above the mean. The same data sets, clean and contaminated, are
+calibrated with each metric, and the shift of the posterior mean and the ratio of the posterior's sd
+to the clean one are averaged.
 
     uv run python -m benchmarks.contamination [--replicates 40] [--out contamination.json]
 """
@@ -57,7 +57,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("contamination.json"))
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
-    table: dict[str, Any] = {"replicates": arguments.replicates, "N": SIZE, "share": SHARE, "distance": DISTANCE}
+    table: dict[str, Any] = {
+        "replicates": arguments.replicates,
+        "N": SIZE,
+        "share": SHARE,
+        "distance": DISTANCE,
+    }
     print(f"{'metric':20s} {'posterior':10s} {'shift mu':>9s} {'se':>5s} {'shift sigma':>12s} {'se':>5s} "
           f"{'sd ratio mu':>12s} {'sd ratio sigma':>15s}")  # fmt: skip
     for metric in METRICS:
@@ -70,7 +75,10 @@ def main() -> None:
                 dirty = data.copy()
                 n_bad = int(SHARE * SIZE) + (rng.random() < SHARE * SIZE % 1)
                 dirty[SIZE - n_bad :] = 10 + DISTANCE
-                clean, after = posterior(evaluator, data, adjust), posterior(evaluator, dirty, adjust)
+                clean, after = (
+                    posterior(evaluator, data, adjust),
+                    posterior(evaluator, dirty, adjust),
+                )
                 shifts.append((after[:, 0] - clean[:, 0]) / clean[:, 1])
                 ratios.append(after[:, 1] / clean[:, 1])
             shift, ratio = np.mean(shifts, axis=0), np.median(ratios, axis=0)

@@ -1,14 +1,15 @@
 """Frequentist coverage of posterior intervals, and their width against the sampling spread of the estimate.
 
-Each problem has a true population. Many data sets are drawn from it, by the response itself and not from
-design points; each is calibrated, and the posterior probability below the truth is kept: uniform numbers are
-what a posterior of the right width gives. Replicates run in parallel and are stored as they come, so that an
-interrupted study goes on where it stopped:
+Each problem has a true population. Many data sets are drawn from it, by the response itself and not
+from design points; each is calibrated, and the posterior probability below the truth is kept:
+uniform numbers are what a posterior of the right width gives. Replicates run in parallel and are
+stored as they come, so that an interrupted study goes on where it stopped:
 
     uv run python -m benchmarks.coverage --replicates 400
 
-The pseudo-posterior is integrated by importance sampling around the optimum (1024 points), which takes the
-place of `sample_smc` at a hundredth of its cost; everything else is the code that users run.
+The pseudo-posterior is integrated by importance sampling around the optimum (1024 points), which
+takes the place of `sample_smc` at a hundredth of its cost; everything else is the code that users
+run.
 """
 
 from __future__ import annotations
@@ -52,10 +53,14 @@ class Problem:
     draw: Callable[[np.random.Generator, int], Any]
     density: Callable[[Any, Any, Any], Any]
     n: int = 512
-    max_points: int | None = None  # a study of hundreds of data sets can do with designs whose error is .2 stderr
+    max_points: int | None = (
+        None  # a study of hundreds of data sets can do with designs whose error is .2 stderr
+    )
 
 
-def _normal_input(priors: Callable[[], tuple[Any, Any]]) -> Callable[[], tuple[list[Any], list[Any]]]:
+def _normal_input(
+    priors: Callable[[], tuple[Any, Any]],
+) -> Callable[[], tuple[list[Any], list[Any]]]:
     def build() -> tuple[list[Any], list[Any]]:
         import pymc as pm
 
@@ -129,7 +134,9 @@ def _pair_density(y: Any, mu: Any, sigma: Any) -> Any:
 
 
 PROBLEMS = {
-    "linear": Problem((10.0, 1.0), lambda x: x, _normal_input(_wide), lambda rng, n: rng.normal(10, 1, n), normal),
+    "linear": Problem(
+        (10.0, 1.0), lambda x: x, _normal_input(_wide), lambda rng, n: rng.normal(10, 1, n), normal
+    ),
     "quadratic": Problem(
         (2.0, 0.5),
         lambda x: x**2 - 2 * x + 1,
@@ -137,7 +144,13 @@ PROBLEMS = {
         lambda rng, n: rng.normal(2, 0.5, n),
         _quadratic_density,
     ),
-    "bell": Problem((0.1, 0.03), _bell, _normal_input(_small), lambda rng, n: rng.normal(0.1, 0.03, n), _bell_density),
+    "bell": Problem(
+        (0.1, 0.03),
+        _bell,
+        _normal_input(_small),
+        lambda rng, n: rng.normal(0.1, 0.03, n),
+        _bell_density,
+    ),
     "lognormal": Problem(
         (1.1, 0.2),
         lambda x: x,
@@ -146,7 +159,13 @@ PROBLEMS = {
         lambda y, mu, sigma: normal(np.log(y), mu, sigma) / y,
     ),
     "correlated": Problem(
-        (3.0, 0.5), lambda x: x[..., 0] * np.exp(x[..., 1]), _pair, _draw_pair, _pair_density, n=1024, max_points=4096
+        (3.0, 0.5),
+        lambda x: x[..., 0] * np.exp(x[..., 1]),
+        _pair,
+        _draw_pair,
+        _pair_density,
+        n=1024,
+        max_points=4096,
     ),
 }
 
@@ -211,13 +230,17 @@ def analyse(
         2.0 * (sampling.axes * sampling.stderr**2) @ sampling.axes.T
         + sampling.local.unidentified @ sampling.local.unidentified.T
     )
-    thetas, log_q = proposal(optimum.theta, spread * np.outer(sampling.local.prior_sd, sampling.local.prior_sd))
+    thetas, log_q = proposal(
+        optimum.theta, spread * np.outer(sampling.local.prior_sd, sampling.local.prior_sd)
+    )
     found = ev(thetas)
     draws, ess = weighted(found.log_prior + found.log_likelihood(epsilon) - log_q, thetas)
     exact, ess_exact = weighted(found.log_prior + log_likelihood(thetas) - log_q, thetas)
     x, remainder = sampling.coordinates(draws)
     prior, _ = sampling.coordinates(ev.prior_thetas(1024, 0))
-    first_order = np.linalg.inv(np.eye(r) + np.linalg.inv(np.cov(prior, rowvar=False).reshape(r, r)))
+    first_order = np.linalg.inv(
+        np.eye(r) + np.linalg.inv(np.cov(prior, rowvar=False).reshape(r, r))
+    )
     posteriors = {
         "plain": draws,
         "sandwich": transported(sampling, x, remainder, np.zeros(r), first_order),
@@ -234,13 +257,19 @@ def analyse(
         "seen": r,
         "responses": ev.n_responses,
         **{
-            name: [np.mean(d < truth, axis=0).tolist(), d.mean(axis=0).tolist(), d.std(axis=0).tolist()]
+            name: [
+                np.mean(d < truth, axis=0).tolist(),
+                d.mean(axis=0).tolist(),
+                d.std(axis=0).tolist(),
+            ]
             for name, d in posteriors.items()
         },
     }
 
 
-def block(problem: str, size: int, first: int, count: int, metrics: tuple[str, ...]) -> list[dict[str, Any]]:
+def block(
+    problem: str, size: int, first: int, count: int, metrics: tuple[str, ...]
+) -> list[dict[str, Any]]:
     """Analyse some replicates with all metrics."""
     import logging
 
@@ -249,7 +278,9 @@ def block(problem: str, size: int, first: int, count: int, metrics: tuple[str, .
     evaluators = {m: build(problem, m, size) for m in metrics}
     any_one = evaluators[metrics[0]]
     free = [rv.name for rv in any_one.model.free_RVs]
-    truth = any_one.thetas_of([np.array([dict(zip(("mu", "sigma"), p.truth, strict=True))[n]]) for n in free])[0]
+    truth = any_one.thetas_of(
+        [np.array([dict(zip(("mu", "sigma"), p.truth, strict=True))[n]]) for n in free]
+    )[0]
     rows = []
     for i in range(first, first + count):
         data = p.response(p.draw(np.random.default_rng([i, size]), size))
@@ -263,7 +294,9 @@ def block(problem: str, size: int, first: int, count: int, metrics: tuple[str, .
         for m in metrics:
             try:
                 with evaluators[m].designs["y"].undone():
-                    row[m] = analyse(evaluators[m], data, truth, log_likelihood, bootstrap=i < BOOTSTRAPPED)
+                    row[m] = analyse(
+                        evaluators[m], data, truth, log_likelihood, bootstrap=i < BOOTSTRAPPED
+                    )
             except Exception as error:  # a failure is a result
                 row[m] = {"error": f"{type(error).__name__}: {error}"[:300]}
         rows.append(row)
@@ -278,7 +311,9 @@ def spread(estimates: Any) -> Any:
     middle = np.median(estimates, axis=0)
     robust = np.subtract(*np.quantile(estimates, [0.945, 0.055], axis=0)) / (2 * norm.ppf(0.945))
     inside = np.abs(estimates - middle) < 4 * robust
-    return np.array([column[ok].std(ddof=1) for column, ok in zip(estimates.T, inside.T, strict=True)])
+    return np.array(
+        [column[ok].std(ddof=1) for column, ok in zip(estimates.T, inside.T, strict=True)]
+    )
 
 
 def summarise(rows: list[dict[str, Any]], metric: str, posterior: str) -> dict[str, Any]:
@@ -295,11 +330,15 @@ def summarise(rows: list[dict[str, Any]], metric: str, posterior: str) -> dict[s
     return {
         "replicates": len(good),
         "failed": failed,
-        **{f"coverage_{level:.0%}": np.mean(np.abs(u - 0.5) < level / 2, axis=0).tolist() for level in LEVELS},
+        **{
+            f"coverage_{level:.0%}": np.mean(np.abs(u - 0.5) < level / 2, axis=0).tolist()
+            for level in LEVELS
+        },
         "sd_over_own_sampling_sd": (np.median(sd, axis=0) / spread(estimate)).tolist(),
         "sd_over_exact_sd": np.median(sd / exact_sd, axis=0).tolist(),
         "rmse_over_exact_rmse": np.sqrt(
-            np.quantile((estimate - truth) ** 2, 0.7, axis=0) / np.quantile((exact_mean - truth) ** 2, 0.7, axis=0)
+            np.quantile((estimate - truth) ** 2, 0.7, axis=0)
+            / np.quantile((exact_mean - truth) ** 2, 0.7, axis=0)
         ).tolist(),
     }
 
@@ -309,12 +348,18 @@ def table(store: Path) -> dict[str, Any]:
     cells: dict[str, Any] = {}
     for problem in PROBLEMS:
         for size in SIZES:
-            rows = [r for f in sorted(store.glob(f"{problem}-{size}-*.json")) for r in json.loads(f.read_text())]
+            rows = [
+                r
+                for f in sorted(store.glob(f"{problem}-{size}-*.json"))
+                for r in json.loads(f.read_text())
+            ]
             if not rows:
                 continue
             for metric in METRICS:
                 for posterior in POSTERIORS:
-                    cells[f"{problem}/{size}/{metric}/{posterior}"] = summarise(rows, metric, posterior)
+                    cells[f"{problem}/{size}/{metric}/{posterior}"] = summarise(
+                        rows, metric, posterior
+                    )
     print(
         f"{'problem':12s}{'N':>4s} {'metric':20s} {'posterior':10s} {'50%':>11s} {'89%':>11s} {'95%':>11s} "
         f"{'sd/own':>11s} {'sd/exact':>11s} {'rmse ratio':>11s}"
@@ -322,8 +367,12 @@ def table(store: Path) -> dict[str, Any]:
     for key, c in cells.items():
         problem, size, metric, posterior = key.split("/")
         figures = [c[f"coverage_{level:.0%}"] for level in LEVELS]
-        figures += [c[k] for k in ("sd_over_own_sampling_sd", "sd_over_exact_sd", "rmse_over_exact_rmse")]
-        shown = " ".join("/".join(f"{v:.2f}".replace("0.", ".", 1) for v in f).rjust(11) for f in figures)
+        figures += [
+            c[k] for k in ("sd_over_own_sampling_sd", "sd_over_exact_sd", "rmse_over_exact_rmse")
+        ]
+        shown = " ".join(
+            "/".join(f"{v:.2f}".replace("0.", ".", 1) for v in f).rjust(11) for f in figures
+        )
         print(f"{problem:12s}{size:>4s} {metric:20s} {posterior:10s} {shown}")
     pooled: dict[str, Any] = {}
     print("\npooled over hyperparameters and cells; held-out problems: " + ", ".join(HELD_OUT))
@@ -376,7 +425,10 @@ def main() -> None:
         from rich.progress import track
 
         with ProcessPoolExecutor(arguments.workers, mp_context=get_context("spawn")) as pool:
-            jobs = {pool.submit(block, p, s, first, _BLOCK, METRICS): (p, s, first) for p, s, first in missing}
+            jobs = {
+                pool.submit(block, p, s, first, _BLOCK, METRICS): (p, s, first)
+                for p, s, first in missing
+            }
             for job in track(as_completed(jobs), "blocks of data sets", total=len(jobs)):
                 problem, size, first = jobs[job]
                 path = arguments.store / f"{problem}-{size}-{first:05d}.json"

@@ -1,8 +1,9 @@
 """How many responses a design takes when the population of 1 to 8 inputs is unknown, and how exact it then is.
 
-The response is the root of the mean square of d inputs, all normal with the same unknown mean and standard deviation;
-N = 50. Reweighted(n) grows until another design's optimum would be within a tenth of a standard error, or says that it
-does not get there; Resimulated(65 536) is the reference for the minimiser.
+The response is the root of the mean square of d inputs, all normal with the same unknown mean and
+standard deviation; N = 50. Reweighted(n) grows until another design's optimum would be within a
+tenth of a standard error, or says that it does not get there; Resimulated(65 536) is the reference
+for the minimiser.
 
 Run: uv run python -m benchmarks.dimensions [--seeds 2] [--out benchmarks/results/dimensions.json]
 """
@@ -34,7 +35,9 @@ def build(d: int, n: int, metric: prb.Metric, observed: Any, propagation: Any) -
     with pm.Model() as model:
         mu, sigma = pm.Normal("mu", 3.0, 1.0), pm.HalfNormal("sigma", 1.0)
         inputs = [pm.Normal.dist(mu, sigma) for _ in range(d)]
-        prb.Simulator("y", response, *inputs, metric=metric, observed=observed, propagation=propagation(n))
+        prb.Simulator(
+            "y", response, *inputs, metric=metric, observed=observed, propagation=propagation(n)
+        )
     return model
 
 
@@ -44,14 +47,20 @@ def case(d: int, n: int, metric: str, seed: int) -> dict[str, Any]:
     observed = response(*rng.normal(3.0, 0.5, (d, 50)))
     clock = time.perf_counter()
     try:
-        optimum = prb.minimize(build(d, n, METRICS[metric], observed, prb.Reweighted), progressbar=False)
-    except prb.DesignError as error:
+        optimum = prb.minimize(
+            build(d, n, METRICS[metric], observed, prb.Reweighted), progressbar=False
+        )
+    except prb.propagation.DesignError as error:
         return {"refused": str(error)[:200], "seconds": time.perf_counter() - clock}
     seconds = time.perf_counter() - clock
     reference = prb.minimize(
-        build(d, 65_536, METRICS[metric], observed, prb.Resimulated), start=optimum.point, progressbar=False
+        build(d, 65_536, METRICS[metric], observed, prb.Resimulated),
+        start=optimum.point,
+        progressbar=False,
     )
-    off = max(abs(optimum.point[k] - reference.point[k]) / reference.stderr[k] for k in reference.point)
+    off = max(
+        abs(optimum.point[k] - reference.point[k]) / reference.stderr[k] for k in reference.point
+    )
     return {
         "responses": optimum.n_responses,
         "design_error": float(optimum.design_error),
@@ -69,12 +78,16 @@ def main() -> None:
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
     table: dict[str, Any] = {}
-    print(f"{'inputs':>6s} {'metric':>6s}  responses, distance from the reference in standard errors, by data set")
+    print(
+        f"{'inputs':>6s} {'metric':>6s}  responses, distance from the reference in standard errors, by data set"
+    )
     for d in (1, 2, 3, 4, 6, 8):
         for metric in METRICS:
             rows = [case(d, arguments.n, metric, seed) for seed in range(arguments.seeds)]
             table[f"{d}/{metric}"] = rows
-            cells = [f"{r['responses']} ({r['off']:.2f})" if "off" in r else "refused" for r in rows]
+            cells = [
+                f"{r['responses']} ({r['off']:.2f})" if "off" in r else "refused" for r in rows
+            ]
             print(f"{d:6d} {metric:>6s}  " + "   ".join(cells), flush=True)
             record.save(arguments.out, table)
 

@@ -32,7 +32,9 @@ def main():
     arguments = parser.parse_args()
     times = []
     for _ in range(arguments.runs + 1):
-        text = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True).stdout
+        text = subprocess.run(
+            [sys.executable, "-c", CODE], capture_output=True, text=True, check=True
+        ).stdout
         times.append([float(t) for t in text.split()])
     pymc_times, own_times = zip(*times[1:], strict=True)  # the first run fills the disk cache
     ratio = statistics.median(o / p for p, o in times[1:])

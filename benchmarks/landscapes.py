@@ -1,10 +1,11 @@
 """Landscapes of the four metrics over (mu, log sigma), where they are convex, and basins of attraction.
 
-Convexity: the probability residual is a quadratic form of the simulated density, so convex in it; as a function of
-the hyperparameters it is not. On a grid over (mu, log sigma), in standard deviations of the true population: the share
-where the Hessian is positive definite, the share where the gradient is below a thousandth of its largest, and the
-share of starts from which BFGS with exact derivatives reaches an optimum (the true one or its mirror image), followed
-as they are and with the area metric as a guide where densities do not overlap.
+Convexity: the probability residual is a quadratic form of the simulated density, so convex in it;
+as a function of the hyperparameters it is not. On a grid over (mu, log sigma), in standard
+deviations of the true population: the share where the Hessian is positive definite, the share where
+the gradient is below a thousandth of its largest, and the share of starts from which BFGS with
+exact derivatives reaches an optimum (the true one or its mirror image), followed as they are and
+with the area metric as a guide where densities do not overlap.
 
     uv run python -m benchmarks.landscapes [--out landscapes.json] [--images docs/images]
 """
@@ -29,7 +30,10 @@ from prbayes.estimate.methods import Method
 from prbayes.estimate.search import Search, Trace, approach, minimise, settle
 
 SIZE = 1000
-REACH = {"linear": (-12.0, 12.0), "nonlinear A": (-12.0, 8.0)}  # of mu, in standard deviations from the truth
+REACH = {
+    "linear": (-12.0, 12.0),
+    "nonlinear A": (-12.0, 8.0),
+}  # of mu, in standard deviations from the truth
 MIRROR = {"linear": None, "nonlinear A": 0.0}  # mu of the mirror solution
 LOGS = (-2.5, 2.5)  # of log(sigma / true sigma)
 NODES = (97, 81)
@@ -65,7 +69,9 @@ def basins(evaluator: Any, name: str, metric: str, *, guided: bool) -> tuple[Any
     mu, sigma = SYSTEMS[name].truth
     labels, counts = [], []
     for theta in thetas(name, STARTS):
-        search = Search(evaluator, np.array([sigma, 1.0]), Method("BFGS"), prior=False, tolerance=1e-5, most=500)
+        search = Search(
+            evaluator, np.array([sigma, 1.0]), Method("BFGS"), prior=False, tolerance=1e-5, most=500
+        )
         start, trace = theta, Trace()
         if guided:
             led = approach(search, theta, np.ones(1), 0)
@@ -100,14 +106,19 @@ def main() -> None:
             continue
         base = system.evaluator(prb.Resimulated(4096))
         observed = system.data(np.random.default_rng(0), SIZE)
-        figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained", sharex=True, sharey=True)
+        figure, axes = plt.subplots(
+            2, 2, figsize=(11, 8), layout="constrained", sharex=True, sharey=True
+        )
         for axis, (metric, configured) in zip(axes.ravel(), METRICS.items(), strict=True):
             evaluator = base.observing({"y": observed}, configured)
             values = evaluator(thetas(name, NODES)).discrepancies[:, 0].reshape(NODES)
             convex, flat, where = shares(values, name)
             free, count = basins(evaluator, name, metric, guided=False)
             led, led_count = basins(evaluator, name, metric, guided=True)
-            arrive, arrive_led = float((free != "elsewhere").mean()), float((led != "elsewhere").mean())
+            arrive, arrive_led = (
+                float((free != "elsewhere").mean()),
+                float((led != "elsewhere").mean()),
+            )
             out[f"{name}/{metric}"] = {
                 "convex": convex, "flat": flat, "arrive": arrive, "evaluations": count,
                 "arrive_guided": arrive_led, "evaluations_guided": led_count,

@@ -1,10 +1,11 @@
 """A normal model where the truth is not normal, where data are few, tied or rounded: what each metric does.
 
-True inputs: Weibull (shape 1.5), gamma (shape 2), a mixture (80% N(0, 1), 20% N(4, 0.5)), and normal; the response is
-the input itself, and the calibrated family is normal. The table has, as medians over data sets, the error of the mean
-in true standard deviations, the ratio of the standard deviations, the area between the calibrated and the true
-distribution function in true standard deviations, and the error of the 95% quantile. Ties and rounding: normal data
-of N = 50, rounded to multiples of 0.1 to 2 standard deviations, or with half of the values equal to the median.
+True inputs: Weibull (shape 1.5), gamma (shape 2), a mixture (80% N(0, 1), 20% N(4, 0.5)), and
+normal; the response is the input itself, and the calibrated family is normal. The table has, as
+medians over data sets, the error of the mean in true standard deviations, the ratio of the standard
+deviations, the area between the calibrated and the true distribution function in true standard
+deviations, and the error of the 95% quantile. Ties and rounding: normal data of N = 50, rounded to
+multiples of 0.1 to 2 standard deviations, or with half of the values equal to the median.
 
     uv run python -m benchmarks.misspecified [--seeds 20] [--out misspecified.json]
 """
@@ -59,7 +60,14 @@ def evaluator() -> Evaluator:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
         data = np.random.default_rng(0).normal(size=50)
-        prb.Simulator("y", lambda x: x, x, metric=METRICS["PR"], observed=data, propagation=prb.Resimulated(4096))
+        prb.Simulator(
+            "y",
+            lambda x: x,
+            x,
+            metric=METRICS["PR"],
+            observed=data,
+            propagation=prb.Resimulated(4096),
+        )
     return Evaluator(model)
 
 
@@ -87,7 +95,10 @@ def families(base: Evaluator, seeds: int) -> dict[str, Any]:
         truth = quantiles(family)
         for n in SIZES:
             for metric in METRICS:
-                found = [fit(base, draw(family, np.random.default_rng([s, n]), n), metric) for s in range(seeds)]
+                found = [
+                    fit(base, draw(family, np.random.default_rng([s, n]), n), metric)
+                    for s in range(seeds)
+                ]
                 mu, sigma = np.array([f[:2] for f in found]).T
                 gaps = mu[:, None] + sigma[:, None] * z - truth
                 row = [

@@ -1,11 +1,14 @@
 """What the optimiser costs: one evaluation, evaluations to the optimum, time against a plain script, Sobol points.
 
-1. One evaluation of the probability residual at 1e6 responses, over the propagation itself: new draws or fixed
+1. One evaluation of the probability residual at 1e6 responses, over the propagation itself: new
+draws or fixed
    standard normal numbers mapped to x, and the response.
-2. Evaluations (of value and gradient) to the optimum by `prb.minimize`, from the initial values of the case study.
-3. Time to the optimum, compilation included and import excluded, against `scipy.stats.gaussian_kde` with
-   `scipy.optimize.minimize(method="Nelder-Mead")` as one would write them down; and the error of either by its
-   finite number of simulated responses: the spread of the optimum over random seeds, in standard errors.
+2. Evaluations (of value and gradient) to the optimum by `prb.minimize`, from the initial values of
+the case study. 3. Time to the optimum, compilation included and import excluded, against
+`scipy.stats.gaussian_kde` with
+   `scipy.optimize.minimize(method="Nelder-Mead")` as one would write them down; and the error of
+   either by its finite number of simulated responses: the spread of the optimum over random seeds,
+   in standard errors.
 4. The error of 4096 Sobol points against that of one million random points, likewise.
 
 All ratios are of times in one run, on one core.
@@ -48,7 +51,10 @@ def best_time(function: Callable[[], Any], repeats: int) -> float:
 def smooth_model(system: System, metric: prb.Metric, observed: Any, propagation: Any) -> pm.Model:
     """Return the model without the coin, which the smooth systems have no use for."""
     with pm.Model() as model:
-        mu, sigma = pm.Normal("mu", system.initial[0], system.spread[0]), pm.HalfNormal("sigma", system.spread[1])
+        mu, sigma = (
+            pm.Normal("mu", system.initial[0], system.spread[0]),
+            pm.HalfNormal("sigma", system.spread[1]),
+        )
         x = pm.Normal.dist(mu, sigma)
         prb.Simulator("y", lambda x: system.response(x, None), x, metric=metric, observed=observed,
                       propagation=propagation)  # fmt: skip
@@ -80,9 +86,15 @@ def evaluation(repeats: int) -> dict[str, Any]:
             "draw": best_time(lambda mu=mu, sigma=sigma: rng.normal(mu, sigma, MILLION), repeats),
             "map": best_time(lambda mu=mu, sigma=sigma: mu + sigma * z, repeats),
             "response": best_time(lambda x=x, system=system: system.response(x, None), repeats),
-            "metric": best_time(lambda target=target, y=y, weights=weights: target.of(y, weights), repeats),
-            "objective": best_time(lambda value=value, theta=theta: value(theta, np.ones(1)), repeats),
-            "with_gradient": best_time(lambda gradient=gradient, theta=theta: gradient(theta, np.ones(1)), repeats),
+            "metric": best_time(
+                lambda target=target, y=y, weights=weights: target.of(y, weights), repeats
+            ),
+            "objective": best_time(
+                lambda value=value, theta=theta: value(theta, np.ones(1)), repeats
+            ),
+            "with_gradient": best_time(
+                lambda gradient=gradient, theta=theta: gradient(theta, np.ones(1)), repeats
+            ),
         }
         row["over_draw"] = row["metric"] / (row["draw"] + row["response"])
         row["over_map"] = row["metric"] / (row["map"] + row["response"])
@@ -110,7 +122,9 @@ def evaluations() -> dict[str, Any]:
     return out
 
 
-def plain_script(data: Any, n: int, seed: int, *, evaluations: int | None = None) -> tuple[Any, int, float]:
+def plain_script(
+    data: Any, n: int, seed: int, *, evaluations: int | None = None
+) -> tuple[Any, int, float]:
     """Calibrate the linear system as one would write it down: mu and sigma, evaluations, seconds."""
     from scipy.optimize import minimize
     from scipy.stats import gaussian_kde
@@ -147,8 +161,13 @@ def against_plain(repeats: int) -> dict[str, Any]:
         times.append(time.perf_counter() - clock)
         found.append([optimum.point["mu"], optimum.point["sigma"]])
     errors = np.array([optimum.stderr["mu"], optimum.stderr["sigma"]])
-    ours = {"seconds": float(np.median(times)), "error": float((np.std(found, axis=0, ddof=1) / errors).max())}
-    print(f"\n{'linear, PR':42s} {'seconds':>9s} {'evaluations':>12s} {'error, standard errors':>23s}")
+    ours = {
+        "seconds": float(np.median(times)),
+        "error": float((np.std(found, axis=0, ddof=1) / errors).max()),
+    }
+    print(
+        f"\n{'linear, PR':42s} {'seconds':>9s} {'evaluations':>12s} {'error, standard errors':>23s}"
+    )
     print(f"{'prb.minimize, 4096 Sobol points':42s} {ours['seconds']:9.2f} {optimum.n_evaluations:12d} "
           f"{ours['error']:23.4f}", flush=True)  # fmt: skip
     out: dict[str, Any] = {"prbayes": ours}
@@ -173,7 +192,10 @@ def against_plain(repeats: int) -> dict[str, Any]:
     print(f"{'the same, 1000000 random':42s} {per_evaluation * count:9.0f} {count:12d} "
           f"{out['plain 1000000']['error']:23.4f}   (one evaluation timed; error by 1/sqrt(n))")  # fmt: skip
     needed = 10_000 * (out["plain 10000"]["error"] / ours["error"]) ** 2
-    out["equal_accuracy"] = {"points": needed, "ratio": per_evaluation * count * needed / MILLION / ours["seconds"]}
+    out["equal_accuracy"] = {
+        "points": needed,
+        "ratio": per_evaluation * count * needed / MILLION / ours["seconds"],
+    }
     print(
         f"the script's error equals ours with {needed:.2g} points: {out['equal_accuracy']['ratio']:.0f} times our time"
     )
@@ -183,20 +205,30 @@ def against_plain(repeats: int) -> dict[str, Any]:
 def sobol_accuracy(repeats: int) -> dict[str, Any]:
     """Compare the errors of the optimum by 4096 Sobol points and by a million random ones."""
     out: dict[str, Any] = {}
-    print(f"\nspread of the optimum over {repeats} seeds, in standard errors for N = {SIZE}, mean / sd")
+    print(
+        f"\nspread of the optimum over {repeats} seeds, in standard errors for N = {SIZE}, mean / sd"
+    )
     for name in SMOOTH:
         system, row = SYSTEMS[name], {}
         start = dict(zip(("mu", "sigma"), system.truth, strict=True))
-        for label, n, points in (("sobol 4096", 4096, "sobol"), ("random 1e6", MILLION, "monte_carlo")):
+        for label, n, points in (
+            ("sobol 4096", 4096, "sobol"),
+            ("random 1e6", MILLION, "monte_carlo"),
+        ):
             found = []
             for seed in range(repeats):
                 propagation = prb.Resimulated(n, random_seed=seed, points=points)
-                optimum = prb.minimize(smooth_model(system, METRICS["PR"], observed(name), propagation), start=start)
+                optimum = prb.minimize(
+                    smooth_model(system, METRICS["PR"], observed(name), propagation), start=start
+                )
                 found.append([optimum.point["mu"], optimum.point["sigma"]])
             errors = [optimum.stderr["mu"], optimum.stderr["sigma"]]
             row[label] = (np.std(found, axis=0, ddof=1) / errors).tolist()
         out[name] = row
-        print(f"{name:12s} " + "   ".join(f"{k}: {v[0]:.4f} / {v[1]:.4f}" for k, v in row.items()), flush=True)
+        print(
+            f"{name:12s} " + "   ".join(f"{k}: {v[0]:.4f} / {v[1]:.4f}" for k, v in row.items()),
+            flush=True,
+        )
     return out
 
 

@@ -1,11 +1,12 @@
 """Time and peak memory against the number of simulated responses and of particles; what the engine of an executor sees.
 
-Each measurement is a process of its own. ``n`` is the size of one population, evaluated at eight thetas; the design of
-`Reweighted` is set up once, with a mixture density of 512 components (nobody needs one of ten million points).
-``particles`` are evaluated in one call, as the sampler does, and sampled. Peak memory is that of the whole process, of
-which importing takes the part that is stated. Times are CPU seconds; *growth* is that against the row above, for
-ten times the size. ``tasks`` sends responses that cost nothing, each a task of its own, to a Dask cluster of two
-processes on the loopback interface: what a task costs the client, the scheduler and a worker together.
+Each measurement is a process of its own. ``n`` is the size of one population, evaluated at eight
+thetas; the design of `Reweighted` is set up once, with a mixture density of 512 components (nobody
+needs one of ten million points). ``particles`` are evaluated in one call, as the sampler does, and
+sampled. Peak memory is that of the whole process, of which importing takes the part that is stated.
+Times are CPU seconds; *growth* is that against the row above, for ten times the size. ``tasks``
+sends responses that cost nothing, each a task of its own, to a Dask cluster of two processes on the
+loopback interface: what a task costs the client, the scheduler and a worker together.
 
     uv run python -m benchmarks.scale [--out scale.json]
 """
@@ -53,7 +54,14 @@ def model_of(metric: str, propagation: Any) -> Any:
     observed = np.random.default_rng(1).normal(20, 2, N)
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 10, 3), pm.HalfNormal("sigma", 3))
-        prb.Simulator("y", linear, x, metric=getattr(prb, metric)(), observed=observed, propagation=propagation)
+        prb.Simulator(
+            "y",
+            linear,
+            x,
+            metric=getattr(prb, metric)(),
+            observed=observed,
+            propagation=propagation,
+        )
     return model
 
 
@@ -75,9 +83,9 @@ def one(kind: str, metric: str, size: int) -> dict[str, float]:
         how = prb.Resimulated(100) if propagation == "resimulated" else prb.Reweighted(256)
     model = model_of(metric, how)
     evaluator = Evaluator(model)
-    thetas = evaluator.unconstrained({"mu": 10.0, "sigma": 1.0}) + 0.05 * np.random.default_rng(2).normal(
-        size=(THETAS if what == "n" else size, 2)
-    )
+    thetas = evaluator.unconstrained({"mu": 10.0, "sigma": 1.0}) + 0.05 * np.random.default_rng(
+        2
+    ).normal(size=(THETAS if what == "n" else size, 2))
     evaluator(thetas[:1])
     built = time.process_time() - clock
     spent = np.inf
@@ -85,12 +93,22 @@ def one(kind: str, metric: str, size: int) -> dict[str, float]:
         clock = time.process_time()
         evaluator(thetas)
         spent = min(spent, time.process_time() - clock)
-    out = {"import MiB": before, "set-up s": built, "s": spent, "MiB": peak(), "responses": evaluator.n_responses}
+    out = {
+        "import MiB": before,
+        "set-up s": built,
+        "s": spent,
+        "MiB": peak(),
+        "responses": evaluator.n_responses,
+    }
     if what == "particles":
         clock = time.process_time()
         prb.set_epsilon(model, {"y": 0.1})
         prb.sample_smc(size, chains=1, model=model, random_seed=1, progressbar=False, adjust=False)
-        out |= {"sampling s": time.process_time() - clock, "MiB": peak(), "responses": evaluator.n_responses}
+        out |= {
+            "sampling s": time.process_time() - clock,
+            "MiB": peak(),
+            "responses": evaluator.n_responses,
+        }
     return out
 
 
@@ -124,14 +142,21 @@ def tasks(size: int) -> dict[str, float]:
         spent = time.perf_counter() - clock
     one, packed = points.at(np.arange(1)), calling.packed(function)
     task = cloudpickle.dumps((calling.compute_packed, packed, one, False))
-    return {"seconds a task": spent / size, "bytes a task": len(task), "MiB more": peak() - before, "tasks": size}
+    return {
+        "seconds a task": spent / size,
+        "bytes a task": len(task),
+        "MiB more": peak() - before,
+        "tasks": size,
+    }
 
 
 def main() -> None:
     """Run everything, print a table and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("scale.json"))
-    parser.add_argument("--only", choices=(*KINDS, "tasks"), help="replace these rows of what is in --out")
+    parser.add_argument(
+        "--only", choices=(*KINDS, "tasks"), help="replace these rows of what is in --out"
+    )
     parser.add_argument("--child", nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.child:
@@ -145,7 +170,13 @@ def main() -> None:
     for kind in [k for k in KINDS if only in (None, k)]:
         for metric in METRICS:
             last = np.nan
-            for size in SIZES if kind == "n resimulated" else SIZES[:-1] if kind == "n reweighted" else PARTICLES:
+            for size in (
+                SIZES
+                if kind == "n resimulated"
+                else SIZES[:-1]
+                if kind == "n reweighted"
+                else PARTICLES
+            ):
                 found: dict[str, Any] = {
                     "kind": kind,
                     "metric": metric,
@@ -161,7 +192,9 @@ def main() -> None:
                     f"{found['responses']:12d}",
                     flush=True,
                 )
-    print(f"importing takes {np.median([row['import MiB'] for row in table if 'import MiB' in row]):.0f} MiB")
+    print(
+        f"importing takes {np.median([row['import MiB'] for row in table if 'import MiB' in row]):.0f} MiB"
+    )
     for size in TASKS if only in (None, "tasks") else ():
         found = {"kind": "tasks", **child("benchmarks.scale", "tasks", "-", str(size))}
         table.append(found)

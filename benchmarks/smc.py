@@ -1,11 +1,11 @@
 """Sampling against stock PyMC and pyABC: time, responses and effective draws at equal accuracy; and a slow response.
 
-One data set per problem, the 50 quantiles of the true response, so that all consistent estimators agree; the area
-metric; the exact posterior from the likelihood on a grid. Each system has the loosest settings found that bring its
-means within 0.15 exact standard deviations and its standard deviations within 20%; the table says whether they
-do. Every run is a process of its own, on one core, and import is not counted. Cold is a run with an empty
-compilation cache. ELFI 0.8.8 cannot be installed beside PyMC 6: it needs matplotlib 3.8, which does not build on
-Python 3.13.
+One data set per problem, the 50 quantiles of the true response, so that all consistent estimators
+agree; the area metric; the exact posterior from the likelihood on a grid. Each system has the
+loosest settings found that bring its means within 0.15 exact standard deviations and its standard
+deviations within 20%; the table says whether they do. Every run is a process of its own, on one
+core, and import is not counted. Cold is a run with an empty compilation cache. ELFI 0.8.8 cannot be
+installed beside PyMC 6: it needs matplotlib 3.8, which does not build on Python 3.13.
 
     uv run --with pyabc python -m benchmarks.smc [--runs 3] [--only pymc] [--out smc.json]
 """
@@ -31,10 +31,20 @@ LEVELS = (np.arange(N) + 0.5) / N
 PROBLEMS = ("linear", "quadratic")
 SYSTEMS = ("reweighted", "resimulated", "pymc", "pyabc")
 DRAWS, CHAINS = 1000, 4
-# Before the clock starts; the last four are imported by xarray, PyTensor and SciPy when they are first used.
-_IMPORTED = ("arviz", "pymc", "prbayes", "dask.array", "setuptools", "scipy.optimize", "scipy.stats")
-# Largest epsilons, and draws by chain, that were found accurate enough: the discrepancy of 50 against 50 values. At
-# the next larger (0.020, 0.012, 0.2, 0.14) they were not; stock PyMC's second problem at 0.010 needs 2000 draws.
+# Before the clock starts; the last four are imported by xarray, PyTensor and SciPy when they are
+# first used.
+_IMPORTED = (
+    "arviz",
+    "pymc",
+    "prbayes",
+    "dask.array",
+    "setuptools",
+    "scipy.optimize",
+    "scipy.stats",
+)
+# Largest epsilons, and draws by chain, that were found accurate enough: the discrepancy of 50
+# against 50 values. At the next larger (0.020, 0.012, 0.2, 0.14) they were not; stock PyMC's second
+# problem at 0.010 needs 2000 draws.
 SETTINGS = {
     ("pymc", "linear"): (0.016, 1000),
     ("pymc", "quadratic"): (0.010, 2000),
@@ -80,18 +90,25 @@ def exact(problem: str) -> dict[str, float]:
     mu = np.linspace(center - scale, center + scale, 601)[:, None]
     sigma = np.linspace(0.2, 2, 601)[None]
     if problem == "linear":
-        logs = norm.logpdf(observed[:, None, None], mu, sigma).sum(axis=0) + norm.logpdf(mu, center, scale)
+        logs = norm.logpdf(observed[:, None, None], mu, sigma).sum(axis=0) + norm.logpdf(
+            mu, center, scale
+        )
     else:
         root = np.sqrt(observed)[:, None, None]
         density = (norm.pdf(1 + root, mu, sigma) + norm.pdf(1 - root, mu, sigma)) / (2 * root)
-        logs = np.log(density).sum(axis=0) + truncnorm.logpdf(mu, (1 - center) / scale, np.inf, center, scale)
+        logs = np.log(density).sum(axis=0) + truncnorm.logpdf(
+            mu, (1 - center) / scale, np.inf, center, scale
+        )
     logs = logs + halfnorm.logpdf(sigma, scale=scale)
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     out = {}
     for name, value in (("mu", mu), ("sigma", sigma)):
         mean = float((value * weights).sum())
-        out |= {f"{name} mean": mean, f"{name} sd": float(np.sqrt(((value - mean) ** 2 * weights).sum()))}
+        out |= {
+            f"{name} mean": mean,
+            f"{name} sd": float(np.sqrt(((value - mean) ** 2 * weights).sum())),
+        }
     return out
 
 
@@ -130,10 +147,14 @@ def with_prbayes(problem: str, propagation: str) -> dict[str, Any]:
     with pm.Model() as model:
         x = pm.Normal.dist(*_priors(problem))
         kind = prb.Reweighted(256) if propagation == "reweighted" else prb.Resimulated(256)
-        prb.Simulator("y", response, x, metric=prb.AreaMetric(), observed=observed, propagation=kind)
+        prb.Simulator(
+            "y", response, x, metric=prb.AreaMetric(), observed=observed, propagation=kind
+        )
     optimum = prb.minimize(model, starts=0)
     setup = clock()
-    tree = prb.sample_smc(DRAWS, chains=CHAINS, optimum=optimum, model=model, random_seed=1, progressbar=False)
+    tree = prb.sample_smc(
+        DRAWS, chains=CHAINS, optimum=optimum, model=model, random_seed=1, progressbar=False
+    )
     return _summary(tree.posterior, setup, clock()) | {"responses": optimum.evaluator.n_responses}
 
 
@@ -158,10 +179,17 @@ def with_pymc(problem: str) -> dict[str, Any]:
     clock = Clock()
     with pm.Model():
         mu, sigma = _priors(problem)
-        pm.Simulator("y", simulate, mu, sigma, distance=distance, epsilon=epsilon, observed=observed)
+        pm.Simulator(
+            "y", simulate, mu, sigma, distance=distance, epsilon=epsilon, observed=observed
+        )
         setup = clock()
         tree = pm.sample_smc(
-            draws, chains=CHAINS, cores=1, random_seed=1, progressbar=False, compute_convergence_checks=False
+            draws,
+            chains=CHAINS,
+            cores=1,
+            random_seed=1,
+            progressbar=False,
+            compute_convergence_checks=False,
         )
     return _summary(tree.posterior, setup, clock())
 
@@ -183,7 +211,11 @@ def with_pyabc(problem: str) -> dict[str, Any]:
 
     from scipy.stats import halfnorm, norm, truncnorm
 
-    mu = norm(center, scale) if problem == "linear" else truncnorm((1 - center) / scale, np.inf, center, scale)
+    mu = (
+        norm(center, scale)
+        if problem == "linear"
+        else truncnorm((1 - center) / scale, np.inf, center, scale)
+    )
     epsilon, draws = SETTINGS["pyabc", problem]
     clock = Clock()
     prior = pyabc.Distribution(mu=_Frozen(mu), sigma=_Frozen(halfnorm(scale=scale)))
@@ -204,7 +236,10 @@ def with_pyabc(problem: str) -> dict[str, Any]:
     out: dict[str, Any] = {"ess": float(1 / (weights**2).sum())}
     for name in ("mu", "sigma"):
         mean = float((frame[name] * weights).sum())
-        out |= {f"{name} mean": mean, f"{name} sd": float(np.sqrt(((frame[name] - mean) ** 2 * weights).sum()))}
+        out |= {
+            f"{name} mean": mean,
+            f"{name} sd": float(np.sqrt(((frame[name] - mean) ** 2 * weights).sum())),
+        }
     return out | _costs(setup, spent)
 
 
@@ -232,12 +267,19 @@ def _costs(setup: tuple[float, float], total: tuple[float, float]) -> dict[str, 
     }
 
 
-def _summary(posterior: Any, setup: tuple[float, float], total: tuple[float, float]) -> dict[str, Any]:
+def _summary(
+    posterior: Any, setup: tuple[float, float], total: tuple[float, float]
+) -> dict[str, Any]:
     import arviz as az
 
-    out: dict[str, Any] = {"ess": min(float(az.ess(posterior[n].to_numpy())) for n in ("mu", "sigma"))}
+    out: dict[str, Any] = {
+        "ess": min(float(az.ess(posterior[n].to_numpy())) for n in ("mu", "sigma"))
+    }
     for name in ("mu", "sigma"):
-        out |= {f"{name} mean": float(posterior[name].mean()), f"{name} sd": float(posterior[name].std())}
+        out |= {
+            f"{name} mean": float(posterior[name].mean()),
+            f"{name} sd": float(posterior[name].std()),
+        }
     return out | _costs(setup, total)
 
 
@@ -279,8 +321,19 @@ def slow(system: str) -> dict[str, float]:
     with ThreadPoolExecutor(2) as pool:
         with pm.Model() as model:
             x = pm.Normal.dist(*_priors("linear"))
-            kind = prb.Reweighted(1024, executor=pool) if system == "reweighted" else prb.Resimulated(64, executor=pool)
-            prb.Simulator("y", prb.scalar(response), x, metric=prb.AreaMetric(), observed=observed, propagation=kind)
+            kind = (
+                prb.Reweighted(1024, executor=pool)
+                if system == "reweighted"
+                else prb.Resimulated(64, executor=pool)
+            )
+            prb.Simulator(
+                "y",
+                prb.scalar(response),
+                x,
+                metric=prb.AreaMetric(),
+                observed=observed,
+                propagation=kind,
+            )
         built = time.perf_counter() - clock
         share = inside[0] / (2 * built)
         if system == "resimulated":
@@ -295,7 +348,9 @@ def main() -> None:
     """Run everything, print a table and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=3)
-    parser.add_argument("--only", choices=(*SYSTEMS, "10ms"), help="replace these rows of what is in --out")
+    parser.add_argument(
+        "--only", choices=(*SYSTEMS, "10ms"), help="replace these rows of what is in --out"
+    )
     parser.add_argument("--out", type=Path, default=Path("smc.json"))
     parser.add_argument("--child", nargs="+", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -304,15 +359,24 @@ def main() -> None:
         print(json.dumps(one(system, *problem) if problem else slow(system)))
         return
     table: dict[str, Any] = record.load(arguments.out, {}) if arguments.only else {}
-    print(f"{'':24} accurate  mean off  sd ratio  responses     wall      cpu  after set-up: wall  cpu   draws/s cpu")
+    print(
+        f"{'':24} accurate  mean off  sd ratio  responses     wall      cpu  after set-up: wall  cpu   draws/s cpu"
+    )
     for problem in PROBLEMS:
         reference = exact(problem)
         for system in [s for s in SYSTEMS if arguments.only in (None, s)]:
             runs = [child("benchmarks.smc", system, problem) for _ in range(arguments.runs)]
-            found = runs[0] | {k: float(np.median([r[k] for r in runs])) for k in runs[0] if "wall" in k or "cpu" in k}
+            found = runs[0] | {
+                k: float(np.median([r[k] for r in runs]))
+                for k in runs[0]
+                if "wall" in k or "cpu" in k
+            }
             if system in ("reweighted", "resimulated"):
                 found["wall, cold"] = child("benchmarks.smc", system, problem, cold=True)["wall"]
-            off = [(found[f"{n} mean"] - reference[f"{n} mean"]) / reference[f"{n} sd"] for n in ("mu", "sigma")]
+            off = [
+                (found[f"{n} mean"] - reference[f"{n} mean"]) / reference[f"{n} sd"]
+                for n in ("mu", "sigma")
+            ]
             ratio = [found[f"{n} sd"] / reference[f"{n} sd"] for n in ("mu", "sigma")]
             found |= {"mean off": off, "sd ratio": ratio}
             found["accurate"] = max(map(abs, off)) <= 0.15 and max(abs(r - 1) for r in ratio) <= 0.2
@@ -327,7 +391,9 @@ def main() -> None:
                 flush=True,
             )
     if arguments.only in (None, "10ms"):
-        table["10 ms"] = {system: child("benchmarks.smc", system) for system in ("reweighted", "resimulated")}
+        table["10 ms"] = {
+            system: child("benchmarks.smc", system) for system in ("reweighted", "resimulated")
+        }
         print("response of 10 ms, two workers:", table["10 ms"])
     record.save(arguments.out, table)
 

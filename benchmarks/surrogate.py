@@ -1,9 +1,10 @@
 """How many runs of the rotor does a calibration need, with a surrogate and without one, and what error is left?
 
-The contact stiffness of examples/rotor is calibrated from 15 crest factors by PR, with the populations of bearing
-stiffness and damping known: three inputs. The error is that of the optimum (root mean square over both
-hyperparameters and four designs) in standard errors, against a reference with 16384 runs and no surrogate. At the
-end, the fit of the first natural frequency to its stated distribution for two families of stiffness.
+The contact stiffness of examples/rotor is calibrated from 15 crest factors by PR, with the
+populations of bearing stiffness and damping known: three inputs. The error is that of the optimum
+(root mean square over both hyperparameters and four designs) in standard errors, against a
+reference with 16384 runs and no surrogate. At the end, the fit of the first natural frequency to
+its stated distribution for two families of stiffness.
 
 Run: uv run python -m benchmarks.surrogate
 """
@@ -37,14 +38,20 @@ def calibrate(response, propagation, *, only_contact=False):
         inputs = (265.0, 10.0, contact) if only_contact else (k, c, contact)
         observed = synthetic_tests(*CREST, 15, seed=2020)
         metric = METRICS["PR"]
-        prb.Simulator("crest", response, *inputs, metric=metric, observed=observed, propagation=propagation)
+        prb.Simulator(
+            "crest", response, *inputs, metric=metric, observed=observed, propagation=propagation
+        )
     return prb.minimize(model)
 
 
 def surrogate_and_optimum(n, model, seed):
     """Return runs, the surrogate's relative error, and the optimum through it."""
     surrogate = prb.Surrogate.fit(crest_factor, RANGES, n, model=model, random_seed=seed)
-    return surrogate.n_runs, surrogate.error.relative, calibrate(surrogate, prb.Resimulated(1024, random_seed=seed))
+    return (
+        surrogate.n_runs,
+        surrogate.error.relative,
+        calibrate(surrogate, prb.Resimulated(1024, random_seed=seed)),
+    )
 
 
 def main():
@@ -71,29 +78,53 @@ def main():
         print(f"{what:58s} {row['runs']:6d} runs  cv error {shown}  "
               f"error {row['error']:.3f} se ({time.perf_counter() - clock:.0f} s)", flush=True)  # fmt: skip
 
-    for model, sizes in ((prb.RadialBasis(), (16, 32, 64, 128)), (prb.Polynomial(4), (64, 128))):
+    for model, sizes in (
+        (prb.surrogate.RadialBasis(), (16, 32, 64, 128)),
+        (prb.surrogate.Polynomial(4), (64, 128)),
+    ):
         for n in sizes:
             found = [surrogate_and_optimum(n, model, seed) for seed in range(DESIGNS)]
             add(f"surrogate, {type(model).__name__}, {n}; Resimulated(1024)", found)
     for n in (256, 1024):
-        optima = [calibrate(crest_factor, prb.Reweighted(n, random_seed=seed)) for seed in range(DESIGNS)]
-        add(f"no surrogate, Reweighted({n}) and its refinement", [(o.n_responses, np.nan, o) for o in optima])
+        optima = [
+            calibrate(crest_factor, prb.Reweighted(n, random_seed=seed)) for seed in range(DESIGNS)
+        ]
+        add(
+            f"no surrogate, Reweighted({n}) and its refinement",
+            [(o.n_responses, np.nan, o) for o in optima],
+        )
     for n in (32, 64, 128):
         optima = [
-            calibrate(crest_factor, prb.Reweighted(n, random_seed=seed), only_contact=True) for seed in range(DESIGNS)
+            calibrate(crest_factor, prb.Reweighted(n, random_seed=seed), only_contact=True)
+            for seed in range(DESIGNS)
         ]
-        add(f"no surrogate, bearings at their means, Reweighted({n})", [(o.n_responses, np.nan, o) for o in optima])
+        add(
+            f"no surrogate, bearings at their means, Reweighted({n})",
+            [(o.n_responses, np.nan, o) for o in optima],
+        )
     families = {"normal": pm.Normal.dist, "gamma": lambda m, s: pm.Gamma.dist(mu=m, sigma=s)}
     fits = {}
     for name, family in families.items():
         for label, metric in METRICS.items():
             with pm.Model() as model:
                 k = family(pm.Normal("mu", 266, 40), pm.HalfNormal("sd", 30))
-                prb.Simulator("f", first_frequency, k, 10.55, metric=metric, observed=stated_values(*FREQUENCY))
+                prb.Simulator(
+                    "f",
+                    first_frequency,
+                    k,
+                    10.55,
+                    metric=metric,
+                    observed=stated_values(*FREQUENCY),
+                )
             mean, sd = moments(prb.minimize(model), first_frequency, (k, 10.55))
-            fits[f"{name}, {label}"] = [float(100 * (mean / FREQUENCY[0] - 1)), float(100 * (sd / FREQUENCY[1] - 1))]
+            fits[f"{name}, {label}"] = [
+                float(100 * (mean / FREQUENCY[0] - 1)),
+                float(100 * (sd / FREQUENCY[1] - 1)),
+            ]
             mean_error, sd_error = fits[f"{name}, {label}"]
-            print(f"stiffness {name:7s} {label:15s} error of the mean {mean_error:+.3f}%, of the sd {sd_error:+.2f}%")
+            print(
+                f"stiffness {name:7s} {label:15s} error of the mean {mean_error:+.3f}%, of the sd {sd_error:+.2f}%"
+            )
     path = ROOT / "results" / "surrogate.json"
     record.save(path, {"rows": rows, "stated frequency, errors in %": fits})
     print(f"{path.name}; {time.perf_counter() - clock:.0f} s")

@@ -1,8 +1,8 @@
 """The four system functions of the paper, eq. 11 to 14, with the true and initial values of the studies.
 
-The paper states no values. The elliptical system has two branches, of which a fair coin chooses one, and no response
-where |x - 2| > 1: such points are NaN, which is how a lost point is said to the package, and data are drawn under
-the condition that there is a response.
+The paper states no values. The elliptical system has two branches, of which a fair coin chooses
+one, and no response where |x - 2| > 1: such points are NaN, which is how a lost point is said to
+the package, and data are drawn under the condition that there is a response.
 """
 
 from __future__ import annotations
@@ -46,12 +46,16 @@ class System:
             mu = pm.Normal("mu", self.initial[0], self.spread[0])
             sigma = pm.HalfNormal("sigma", self.spread[1])
             x, u = pm.Normal.dist(mu, sigma), pm.Uniform.dist(0, 1)
-            prb.Simulator("y", self.response, x, u, metric=metric, observed=observed, propagation=propagation)
+            prb.Simulator(
+                "y", self.response, x, u, metric=metric, observed=observed, propagation=propagation
+            )
         return model
 
     def evaluator(self, propagation: Any) -> Evaluator:
         """Return an evaluator of the model, to be given data and metrics."""
-        return Evaluator(self.model(METRICS["PR"], self.data(np.random.default_rng(0), 100), propagation))
+        return Evaluator(
+            self.model(METRICS["PR"], self.data(np.random.default_rng(0), 100), propagation)
+        )
 
 
 def _elliptical(x: Any, u: Any) -> Any:
@@ -62,6 +66,8 @@ def _elliptical(x: Any, u: Any) -> Any:
 SYSTEMS = {
     "linear": System(lambda x, u: 0.75 * x, (10.0, 1.0), (9.0, 1.5), (2.0, 2.0)),
     "nonlinear A": System(lambda x, u: x**2 - 2 * x + 1, (2.0, 0.5), (2.3, 0.8), (1.0, 1.0)),
-    "nonlinear B": System(lambda x, u: np.exp(-1 / (1 + 100 * x**2)), (0.1, 0.03), (0.13, 0.05), (0.1, 0.1)),
+    "nonlinear B": System(
+        lambda x, u: np.exp(-1 / (1 + 100 * x**2)), (0.1, 0.03), (0.13, 0.05), (0.1, 0.1)
+    ),
     "elliptical": System(_elliptical, (1.5, 0.1), (1.65, 0.15), (0.5, 0.3)),
 }

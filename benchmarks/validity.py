@@ -1,14 +1,15 @@
 """Size and power of the area test on fresh data, after a calibration on n0 data.
 
-Sizes: n0 normal data give the exact posterior under Jeffreys' prior; n fresh data of the same population are tested
-at nominal 1, 5 and 10%: by the default null, and by the constructions that it replaces (the best fit taken as exact;
-u-values in the posterior's pool taken as uniform). The same through prbayes itself: `minimize`, `sample_smc`, `predict`
-with the area metric, and `JointNull` on the calibration's own data.
+Sizes: n0 normal data give the exact posterior under Jeffreys' prior; n fresh data of the same
+population are tested at nominal 1, 5 and 10%: by the default null, and by the constructions that it
+replaces (the best fit taken as exact; u-values in the posterior's pool taken as uniform). The same
+through prbayes itself: `minimize`, `sample_smc`, `predict` with the area metric, and `JointNull` on
+the calibration's own data.
 
-Power: the same test against shifts of the mean and ratios of the standard deviation, beside Kolmogorov-Smirnov,
-Cramer-von Mises, Anderson-Darling and ArviZ's tests of uniformity, all on the same u-values in the posterior's pool (in
-closed form, Student's t), and all with critical values from the same simulation of a right model, so that each has
-the nominal size.
+Power: the same test against shifts of the mean and ratios of the standard deviation, beside
+Kolmogorov-Smirnov, Cramer-von Mises, Anderson-Darling and ArviZ's tests of uniformity, all on the
+same u-values in the posterior's pool (in closed form, Student's t), and all with critical values
+from the same simulation of a right model, so that each has the nominal size.
 
     uv run python -m benchmarks.validity [--parts size pipeline power] [--out validity.json]
 """
@@ -42,7 +43,9 @@ ALTERNATIVES = {f"mean + {d:g} sd": (d, 1.0) for d in (0.5, 0.75, 1.0)} | {
 ARVIZ = ("pot_c", "prit_c", "piet_c")
 
 
-def posterior_populations(data: Any, rng: np.random.Generator, draws: int = 400, n_samples: int = 100) -> Any:
+def posterior_populations(
+    data: Any, rng: np.random.Generator, draws: int = 400, n_samples: int = 100
+) -> Any:
     """Return one population per draw of the exact posterior of a normal sample under Jeffreys' prior."""
     n = data.size
     sd = data.std(ddof=1) * np.sqrt((n - 1) / rng.chisquare(n - 1, (draws, 1)))
@@ -52,18 +55,24 @@ def posterior_populations(data: Any, rng: np.random.Generator, draws: int = 400,
 
 def sizes(n0: int, replicates: int) -> dict[str, dict[str, Any]]:
     """Return p-values of a right model, by the number of fresh data and the null."""
-    exact = prb.ExactModel()
-    found: dict[str, dict[str, Any]] = {str(n): {"default": [], "best fit": [], "pool, uniform": []} for n in FRESH}
+    exact = prb.validation.ExactModel()
+    found: dict[str, dict[str, Any]] = {
+        str(n): {"default": [], "best fit": [], "pool, uniform": []} for n in FRESH
+    }
     for i in range(replicates):
         rng = np.random.default_rng([7, n0, i])
         data = rng.normal(size=n0)
         predicted = posterior_populations(data, rng)
         for n in FRESH:
             fresh = rng.normal(size=n)
-            test = prb.area_test(fresh, predicted, null=prb.PosteriorNull(1999, random_seed=i))
+            test = prb.area_test(
+                fresh, predicted, null=prb.validation.PosteriorNull(1999, random_seed=i)
+            )
             p = found[str(n)]
             p["default"].append(test.p_value)
-            p["best fit"].append(exact.p_value(float(area(ndtr((fresh - data.mean()) / data.std(ddof=1)))), n))
+            p["best fit"].append(
+                exact.p_value(float(area(ndtr((fresh - data.mean()) / data.std(ddof=1)))), n)
+            )
             p["pool, uniform"].append(exact.p_value(test.statistic, n))
     return found
 
@@ -101,11 +110,17 @@ def pipeline(n0: int, n: int, replicates: int) -> dict[str, Any]:
         posterior = sample(other, draws=400, optimum=optimum, random_seed=i)
         predicted = prb.predict(posterior, same, x, model=evaluator.model, random_seed=i)
         best = prb.predict(optimum, same, x, random_seed=i)
-        found["default"].append(prb.area_test(fresh, predicted, null=prb.PosteriorNull(1999, random_seed=i)).p_value)
+        found["default"].append(
+            prb.area_test(
+                fresh, predicted, null=prb.validation.PosteriorNull(1999, random_seed=i)
+            ).p_value
+        )
         found["optimum, ExactModel"].append(prb.area_test(fresh, best).p_value)
-        own = prb.area_test(data, best, null=prb.JointNull(optimum, replicates=199, random_seed=i))
+        own = prb.area_test(
+            data, best, null=prb.validation.JointNull(optimum, replicates=199, random_seed=i)
+        )
         found["own data, JointNull"].append(own.p_value)
-        found["own data, ExactModel"].append(prb.ExactModel().p_value(own.statistic, n0))
+        found["own data, ExactModel"].append(prb.validation.ExactModel().p_value(own.statistic, n0))
     return found
 
 
@@ -131,7 +146,8 @@ def statistics(u: Any) -> dict[str, Any]:
         "area of |2u - 1|": area(np.abs(2 * u - 1)),
         "Kolmogorov-Smirnov": np.array([kstest(row, "uniform").statistic for row in u]),
         "Cramer-von Mises": np.array([cramervonmises(row, "uniform").statistic for row in u]),
-        "Anderson-Darling": -n - ((2 * i - 1) / n * (np.log(u) + np.log1p(-u[:, ::-1]))).sum(axis=1),
+        "Anderson-Darling": -n
+        - ((2 * i - 1) / n * (np.log(u) + np.log1p(-u[:, ::-1]))).sum(axis=1),
         **{f"ArviZ {m}": -array_stats.uniformity_test(u, method=m)[0] for m in ARVIZ},
     }
 
@@ -141,7 +157,9 @@ def power(replicates: int, level: float = 0.05) -> dict[str, dict[str, float]]:
     null = statistics(u_in_pool(*POWER_AT, 0.0, 1.0, 5 * replicates, 0))
     critical = {name: np.quantile(values, 1 - level) for name, values in null.items()}
     table: dict[str, dict[str, float]] = {name: {} for name in null}
-    for k, (label, (shift, ratio)) in enumerate({"none": (0.0, 1.0), **ALTERNATIVES}.items(), start=1):
+    for k, (label, (shift, ratio)) in enumerate(
+        {"none": (0.0, 1.0), **ALTERNATIVES}.items(), start=1
+    ):
         for name, values in statistics(u_in_pool(*POWER_AT, shift, ratio, replicates, k)).items():
             table[name][label] = float((values > critical[name]).mean())
     return table
@@ -158,9 +176,14 @@ def main() -> None:
     parser.add_argument("--replicates", type=int, default=5000)
     parser.add_argument("--pipeline", type=int, default=300)
     parser.add_argument(
-        "--parts", nargs="+", choices=("size", "pipeline", "power"), default=("size", "pipeline", "power")
+        "--parts",
+        nargs="+",
+        choices=("size", "pipeline", "power"),
+        default=("size", "pipeline", "power"),
     )
-    parser.add_argument("--out", type=Path, default=Path("validity.json"), help="other parts that it has are kept")
+    parser.add_argument(
+        "--out", type=Path, default=Path("validity.json"), help="other parts that it has are kept"
+    )
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
     result: dict[str, Any] = record.load(arguments.out, {})
@@ -179,7 +202,10 @@ def report(table: dict[str, Any], n0: int, n: Any, found: dict[str, Any]) -> Non
     """Print and keep shares of rejections by null."""
     for name, p_values in found.items():
         row = table[f"{n0}/{n}/{name}"] = shares(p_values)
-        print(f"{n0:4d} {n!s:>4s} {name:24s} " + " ".join(f"{share:6.3f}" for share in row.values()), flush=True)
+        print(
+            f"{n0:4d} {n!s:>4s} {name:24s} " + " ".join(f"{share:6.3f}" for share in row.values()),
+            flush=True,
+        )
 
 
 def run_sizes(result: dict[str, Any], arguments: argparse.Namespace) -> None:
@@ -196,7 +222,12 @@ def run_pipeline(result: dict[str, Any], arguments: argparse.Namespace) -> None:
     print(f"through prbayes, {arguments.pipeline} replicates\n{HEADER}")
     result["pipeline_replicates"], result["size_through_prbayes"] = arguments.pipeline, {}
     for n0 in FITTED[:2]:
-        report(result["size_through_prbayes"], n0, POWER_AT[1], pipeline(n0, POWER_AT[1], arguments.pipeline))
+        report(
+            result["size_through_prbayes"],
+            n0,
+            POWER_AT[1],
+            pipeline(n0, POWER_AT[1], arguments.pipeline),
+        )
 
 
 def run_power(result: dict[str, Any], arguments: argparse.Namespace) -> None:

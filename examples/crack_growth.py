@@ -1,8 +1,8 @@
 """How does the crack growth rate vary from specimen to specimen? Calibration on 21 measured cracks.
 
-The crack length of 21 specimens after 50 000 load cycles calibrates the population of the coefficient C of
-Paris' law, lognormal, with its exponent held at 2.6: by the optimiser and by ABC, with each metric. An
-independent reference fits C to every specimen's whole record by least squares.
+The crack length of 21 specimens after 50 000 load cycles calibrates the population of the
+coefficient C of Paris' law, lognormal, with its exponent held at 2.6: by the optimiser and by ABC,
+with each metric. An independent reference fits C to every specimen's whole record by least squares.
 
 Run: uv run python examples/crack_growth.py [--out FOLDER]
 """
@@ -56,44 +56,67 @@ def calibrate(metric, observed):
         C = pm.LogNormal.dist(mu, sigma)
         prb.Simulator("crack", growth, C, EXPONENT, metric=metric, observed=observed)
     optimum = prb.minimize(model)
-    posterior = prb.sample_smc(1000, chains=4, model=model, optimum=optimum, random_seed=1, progressbar=False)
+    posterior = prb.sample_smc(
+        1000, chains=4, model=model, optimum=optimum, random_seed=1, progressbar=False
+    )
     return model, optimum, posterior
 
 
 def picture(observed, log_c, results, path):
     """Save the measured and calibrated distributions, and the posteriors, as one figure."""
     colors = dict(zip(results, ["#0072B2", "#009E73", "#D55E00", "#CC79A7"], strict=True))
-    figure, axes = plt.subplot_mosaic([["left", "top"], ["left", "bottom"]], figsize=(11, 4.4), layout="constrained")
+    figure, axes = plt.subplot_mosaic(
+        [["left", "top"], ["left", "bottom"]], figsize=(11, 4.4), layout="constrained"
+    )
     left, top, bottom = axes["left"], axes["top"], axes["bottom"]
     steps = np.linspace(0, 1, observed.size + 1)
-    left.step(np.r_[observed.min(), np.sort(observed)], steps, "k", where="post", label=f"{observed.size} measured")
+    left.step(
+        np.r_[observed.min(), np.sort(observed)],
+        steps,
+        "k",
+        where="post",
+        label=f"{observed.size} measured",
+    )
     u = (np.arange(1000) + 0.5) / 1000
     z = pm.icdf(pm.Normal.dist(), u).eval(mode="FAST_COMPILE")
     grid = np.linspace(observed.min() - 0.05, observed.max() + 0.06, 200)
     optimum, posterior = results["PR"]
-    draws = posterior.posterior.to_dataset().stack(sample=("chain", "draw")).isel(sample=slice(None, None, 20))
+    draws = (
+        posterior.posterior.to_dataset()
+        .stack(sample=("chain", "draw"))
+        .isel(sample=slice(None, None, 20))
+    )
     cdfs = [
         np.searchsorted(np.sort(growth(np.exp(m + s * z), EXPONENT)), grid) / z.size
         for m, s in zip(draws.mu.values, draws.sigma.values, strict=True)
     ]
     low, high = np.quantile(cdfs, [0.055, 0.945], axis=0)
-    left.fill_between(grid, low, high, color=colors["PR"], alpha=0.25, lw=0, label="PR posterior, 89% band")
+    left.fill_between(
+        grid, low, high, color=colors["PR"], alpha=0.25, lw=0, label="PR posterior, 89% band"
+    )
     best = growth(np.exp(optimum.point["mu"] + optimum.point["sigma"] * z), EXPONENT)
-    left.plot(grid, np.searchsorted(np.sort(best), grid) / z.size, color=colors["PR"], label="PR optimum")
+    left.plot(
+        grid, np.searchsorted(np.sort(best), grid) / z.size, color=colors["PR"], label="PR optimum"
+    )
     left.set(xlabel="crack length / notch length after 50 000 cycles", ylabel="share of specimens")
     left.legend(frameon=False, loc="upper left")
     names = {"mu": (top, log_c.mean()), "sigma": (bottom, log_c.std(ddof=1))}
     for name, (axis, least_squares_value) in names.items():
         for row, (label, (optimum, posterior)) in enumerate(results.items()):
             low, high = posterior.posterior[name].quantile([0.055, 0.945])
-            axis.plot([low, high], [row, row], color=colors[label], lw=3, alpha=0.5, solid_capstyle="butt")
+            axis.plot(
+                [low, high], [row, row], color=colors[label], lw=3, alpha=0.5, solid_capstyle="butt"
+            )
             axis.plot(posterior.posterior[name].mean(), row, "|", color=colors[label], ms=14, mew=2)
             axis.plot(optimum.point[name], row, "o", color=colors[label], mec="white", ms=8)
         axis.axvline(least_squares_value, color="k", ls=":", lw=1.2)
-        axis.set(yticks=range(len(results)), yticklabels=list(results), ylim=(len(results) - 0.5, -0.5))
+        axis.set(
+            yticks=range(len(results)), yticklabels=list(results), ylim=(len(results) - 0.5, -0.5)
+        )
     top.set(xlabel="mu: mean of log C")
     top.set_title(
-        "optimum (dot); posterior mean and 89% interval (bar);\nleast squares per specimen (dotted)", fontsize=9
+        "optimum (dot); posterior mean and 89% interval (bar);\nleast squares per specimen (dotted)",
+        fontsize=9,
     )
     bottom.set(xlabel="sigma: standard deviation of log C")
     figure.savefig(path, dpi=150)
@@ -108,8 +131,12 @@ def main():
     data = prb.datasets.crack_growth()
     observed = (data.crack_length_inch.sel(million_cycles=0.05) / data.notch_inch).values
     log_c = reference(data)
-    print(f"{observed.size} specimens, relative crack length {observed.min():.3f} to {observed.max():.3f}")
-    print(f"reference, least squares per specimen: mu {log_c.mean():.3f}, sigma {log_c.std(ddof=1):.3f}\n")
+    print(
+        f"{observed.size} specimens, relative crack length {observed.min():.3f} to {observed.max():.3f}"
+    )
+    print(
+        f"reference, least squares per specimen: mu {log_c.mean():.3f}, sigma {log_c.std(ddof=1):.3f}\n"
+    )
     results = {}
     for label, metric in METRICS.items():
         model, optimum, posterior = calibrate(metric, observed)
@@ -118,7 +145,9 @@ def main():
         print(
             f"{label}: {optimum.n_responses} responses computed, epsilon {float(posterior.calibration.epsilon[0]):.3g}"
         )
-        print(table[["estimate", "sd", "lower", "upper", "shift"]].to_dataframe().round(3).to_string())
+        print(
+            table[["estimate", "sd", "lower", "upper", "shift"]].to_dataframe().round(3).to_string()
+        )
         ess = posterior.calibration.weight_ess.quantile([0.05, 0.5]).values
         print(f"weight effective sample size {ess[0]:.0f} (5%), {ess[1]:.0f} (median)")
         print(f"{prb.diagnose(posterior, model=model)}\n")

@@ -1,11 +1,13 @@
 """Does the calibrated population agree with specimens, and conditions, that it has not seen?
 
-Eleven specimens calibrate the population of Paris' coefficient C from their crack lengths after 50 000 cycles, with
-one exponent for all; the other ten are tested at 80 000 cycles, and at 50 000 to 120 000 cycles together. Then all 21
-calibrate, and are tested on themselves by the joint null; there also how much a crack grew from 50 000 to 80 000
-cycles for each inch before. The same again with exponents that vary, correlated with C.
+Eleven specimens calibrate the population of Paris' coefficient C from their crack lengths after 50
+000 cycles, with one exponent for all; the other ten are tested at 80 000 cycles, and at 50 000 to
+120 000 cycles together. Then all 21 calibrate, and are tested on themselves by the joint null;
+there also how much a crack grew from 50 000 to 80 000 cycles for each inch before. The same again
+with exponents that vary, correlated with C.
 
-A specimen that has failed and was removed is no missing value: it counts above all lengths, measured and predicted.
+A specimen that has failed and was removed is no missing value: it counts above all lengths,
+measured and predicted.
 
 Run: uv run python examples/crack_growth_validity.py [--out FOLDER] [--splits N]
 """
@@ -73,7 +75,13 @@ def one_exponent(who):
     with pm.Model() as model:
         C = pm.LogNormal.dist(pm.Normal("mu", 1.1, 0.5), pm.HalfNormal("sigma", 0.5))
         prb.Simulator(
-            "crack", length, C, EXPONENT, metric=prb.AreaMetric(), observed=measured(0.05, who), specimens=LABELS[who]
+            "crack",
+            length,
+            C,
+            EXPONENT,
+            metric=prb.AreaMetric(),
+            observed=measured(0.05, who),
+            specimens=LABELS[who],
         )
     return model, (C, EXPONENT), lambda response: response
 
@@ -101,7 +109,12 @@ def random_exponent(who):
         covariance = pt.stacklists([[sigma**2, rho * sigma * sd], [rho * sigma * sd, sd**2]])
         z = pm.MvNormal.dist(pt.stack([mu, mean]), covariance)
         prb.Simulator(
-            "crack", of_pair(length), z, metric=prb.AreaMetric(), observed=measured(0.05, who), specimens=LABELS[who]
+            "crack",
+            of_pair(length),
+            z,
+            metric=prb.AreaMetric(),
+            observed=measured(0.05, who),
+            specimens=LABELS[who],
         )
     return model, (z,), of_pair
 
@@ -110,12 +123,15 @@ def check(result, model, inputs, wrap, who, conditions, null=None):
     """Test specimens under named conditions, (values, response) each; return tests of the mean and of the spread."""
     responses = {name: wrap(response) for name, (_, response) in conditions.items()}
     observed = {name: values for name, (values, _) in conditions.items()}
-    predicted = {n: prb.predict(result, f, *inputs, model=model, random_seed=1) for n, f in responses.items()}
+    predicted = {
+        n: prb.predict(result, f, *inputs, model=model, random_seed=1) for n, f in responses.items()
+    }
     if null is not None:
         null = null(result, {n: (f, *inputs) for n, f in responses.items()}, replicates=499)
     specimens = dict.fromkeys(conditions, LABELS[who])
     return [
-        prb.area_test(observed, predicted, specimens=specimens, null=null, folded=folded) for folded in (False, True)
+        prb.area_test(observed, predicted, specimens=specimens, null=null, folded=folded)
+        for folded in (False, True)
     ]
 
 
@@ -144,10 +160,15 @@ def main():
             calibrating, others = np.sort(order[:11]), np.sort(order[11:])
             print(f"{label}, calibrated on specimens {' '.join(map(str, LABELS[calibrating]))}")
             model, inputs, wrap = build(calibrating)
-            posterior = prb.sample_smc(1000, chains=2, model=model, random_seed=1, progressbar=False)
+            posterior = prb.sample_smc(
+                1000, chains=2, model=model, random_seed=1, progressbar=False
+            )
             values = {name: (measured(t, others), f) for name, (t, f) in readings.items()}
             late = {"80 000 cycles": values["80 000 cycles"]}
-            line("  the other 10 at 80 000 cycles", check(posterior, model, inputs, wrap, others, late))
+            line(
+                "  the other 10 at 80 000 cycles",
+                check(posterior, model, inputs, wrap, others, late),
+            )
             tests = check(posterior, model, inputs, wrap, others, values)
             line("  the other 10 at 50 000 to 120 000, pooled", tests)
             kept.setdefault(f"{label}, 10 others pooled", tests[0])
@@ -162,12 +183,16 @@ def main():
             ("at 50 000 to 120 000 cycles, pooled", values),
             ("growth to 80 000 over that to 50 000", growing),
         ):
-            tests = check(optimum, model, inputs, wrap, ALL, conditions, prb.JointNull)
+            tests = check(optimum, model, inputs, wrap, ALL, conditions, prb.validation.JointNull)
             line(f"  all 21 {what}", tests)
         kept[f"{label}, growth ratio"] = tests[0]
     arguments.out.mkdir(parents=True, exist_ok=True)
-    prb.plot_validity(kept, col_wrap=2, backend="matplotlib").savefig(arguments.out / "crack_growth_validity.png")
-    print(f"figure: {arguments.out / 'crack_growth_validity.png'}; {time.perf_counter() - clock:.0f} s")
+    prb.plot_validity(kept, col_wrap=2, backend="matplotlib").savefig(
+        arguments.out / "crack_growth_validity.png"
+    )
+    print(
+        f"figure: {arguments.out / 'crack_growth_validity.png'}; {time.perf_counter() - clock:.0f} s"
+    )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """A response that runs an external program: input file, command, output file, on several threads, with a store.
 
-The deflection of beams under a given load calibrates the population of Young's modulus. The measured
-deflections are synthetic: E ~ N(210, 7^2) GPa, 24 specimens. A second run of this script runs the program not once.
+The deflection of beams under a given load calibrates the population of Young's modulus. The
+measured deflections are synthetic: E ~ N(210, 7^2) GPa, 24 specimens. A second run of this script
+runs the program not once.
 
 Run: uv run python examples/external_program.py [--store FOLDER] [--points 64]
 """
@@ -46,7 +47,7 @@ def main():
             arguments.points,
             executor=threads,  # the program runs outside Python, so threads will do
             store=arguments.store,  # nothing is computed twice, also in another run
-            on_failure=prb.Retry(2, then=prb.Replace()),
+            on_failure=prb.response.Retry(2, then=prb.response.Replace()),
         )
         E = pm.Normal.dist(mu, sigma)
         prb.Simulator(

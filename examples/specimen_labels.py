@@ -1,7 +1,7 @@
 """Two crack lengths of the same specimens are not the lengths of twice as many specimens.
 
-Lengths after 50 000 and 80 000 cycles calibrate one population, once as if all were independent and once with
-specimen labels: standard errors, posterior and bootstrap with and without them.
+Lengths after 50 000 and 80 000 cycles calibrate one population, once as if all were independent and
+once with specimen labels: standard errors, posterior and bootstrap with and without them.
 
 Run: uv run python examples/specimen_labels.py
 """
@@ -24,7 +24,9 @@ def main():
     data = prb.datasets.crack_growth()
     lengths = data.crack_length_inch / data.notch_inch
     early, late = lengths.sel(million_cycles=0.05), lengths.sel(million_cycles=0.08)
-    print(f"rank correlation of the two lengths: {spearmanr(early, late, nan_policy='omit').statistic:.2f}")
+    print(
+        f"rank correlation of the two lengths: {spearmanr(early, late, nan_policy='omit').statistic:.2f}"
+    )
     for labels in (False, True):
         with pm.Model() as model:
             mu = pm.Normal("mu", 1.1, 0.5)
@@ -37,7 +39,9 @@ def main():
                     specimens=data.specimen.values[measured] if labels else None,
                 )  # fmt: skip
         optimum = prb.minimize(model)
-        posterior = prb.sample_smc(500, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False)
+        posterior = prb.sample_smc(
+            500, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False
+        )
         resampled = prb.bootstrap(optimum, draws=400)
         print("with labels" if labels else "without labels")
         for what, sd in (

@@ -1,8 +1,9 @@
 """Case study 1 of the probability residual: four system functions, one uncertain input, four metrics.
 
-The input x is normal; its mean and standard deviation are calibrated from 1000 responses of each system (eq. 11 to 14
-of doi:10.1007/s00158-019-02288-6). Three of the four are symmetric, so that the data could come from a mirror image of
-the population as well: the optimiser starts near one of them.
+The input x is normal; its mean and standard deviation are calibrated from 1000 responses of each
+system (eq. 11 to 14 of doi:10.1007/s00158-019-02288-6). Three of the four are symmetric, so that
+the data could come from a mirror image of the population as well: the optimiser starts near one of
+them.
 
 Run: uv run python examples/system_functions.py [--out FOLDER]
 """
@@ -46,7 +47,14 @@ def calibrate(response, observed, initial, metric, coins):
         mu = pm.Normal("mu", initial[0], initial[1])
         sigma = pm.HalfNormal("sigma", initial[1])
         inputs = [pm.Normal.dist(mu, sigma), *(pm.Uniform.dist(0, 1) for _ in range(coins))]
-        prb.Simulator("y", response, *inputs, metric=metric, observed=observed, propagation=prb.Resimulated(4096))
+        prb.Simulator(
+            "y",
+            response,
+            *inputs,
+            metric=metric,
+            observed=observed,
+            propagation=prb.Resimulated(4096),
+        )
         return prb.minimize(start={"mu": initial[0], "sigma": initial[1]})
 
 
@@ -57,19 +65,26 @@ def main():
     out = parser.parse_args().out
     clock = time.perf_counter()
     figure, axes = plt.subplots(1, 4, figsize=(14, 3.2), layout="constrained")
-    print(f"{'system':12s} {'metric':15s} {'mean':>8s} {'error %':>8s} {'sd':>8s} {'error %':>8s} {'evaluations':>12s}")
+    print(
+        f"{'system':12s} {'metric':15s} {'mean':>8s} {'error %':>8s} {'sd':>8s} {'error %':>8s} {'evaluations':>12s}"
+    )
     for axis, (name, (response, truth, initial)) in zip(axes, SYSTEMS.items(), strict=True):
         rng = np.random.default_rng(5)
         coins = int(response is elliptical)
         coin = [rng.random(2000)] * coins
         observed = response(rng.normal(*truth, 2000), *coin)
-        observed = observed[np.isfinite(observed)][:1000]  # a specimen outside the ellipse cannot be measured
+        observed = observed[np.isfinite(observed)][
+            :1000
+        ]  # a specimen outside the ellipse cannot be measured
         for label, metric in METRICS.items():
             optimum = calibrate(response, observed, initial, metric, coins)
             found = np.array([optimum.point["mu"], optimum.point["sigma"]])
             error = 100 * np.abs(found / truth - 1)
             row = f"{found[0]:8.4f} {error[0]:8.2f} {found[1]:8.4f} {error[1]:8.2f} {optimum.n_evaluations:12d}"
-            print(f"{name:12s} {label:15s} {row}{'' if optimum.converged else '  ' + optimum.message}", flush=True)
+            print(
+                f"{name:12s} {label:15s} {row}{'' if optimum.converged else '  ' + optimum.message}",
+                flush=True,
+            )
             if label == "PR":
                 calibrated = response(rng.normal(*found, 20_000), *([rng.random(20_000)] * coins))
                 lost = np.isnan(calibrated).mean()
@@ -78,7 +93,10 @@ def main():
             print(f"{'':12s} share of the calibrated population without response: {lost:.2%}")
         bins = np.linspace(*np.quantile(before[np.isfinite(before)], [0.002, 0.998]), 60)
         axis.hist(observed, bins, density=True, color="0.8", label="1000 measured")
-        for values, style, text in ((before, "--", "initial"), (calibrated, "-", "calibrated by PR")):
+        for values, style, text in (
+            (before, "--", "initial"),
+            (calibrated, "-", "calibrated by PR"),
+        ):
             density, _ = np.histogram(values[np.isfinite(values)], bins, density=True)
             axis.stairs(density, bins, ls=style, color="#0072B2", label=text)
         axis.set(title=name, xlabel="response")

@@ -22,7 +22,8 @@ from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.model.identity import Level, identity_of_model, require_same
 from prbayes.model.labels import versions
 from prbayes.model.node import Node, model_on_context, nodes
-from prbayes.model.support import TOLERABLE, DesignError, shortcoming
+from prbayes.model.support import TOLERABLE, shortcoming
+from prbayes.propagation.base import DesignError
 from prbayes.propagation.points import base_points
 from prbayes.propagation.reweighted import Design
 from prbayes.response.calling import ResponseError

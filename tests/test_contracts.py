@@ -1,7 +1,8 @@
 """What the package relies on in the inner parts of PyMC, PyTensor and ArviZ, tested directly.
 
-`tests/test_house.py` holds the list of these names against the package's imports. A test that fails here after an
-upgrade says what has changed, where a failure elsewhere would only say that something has.
+`tests/test_house.py` holds the list of these names against the package's imports. A test that fails
+here after an upgrade says what has changed, where a failure elsewhere would only say that something
+has.
 """
 
 from __future__ import annotations

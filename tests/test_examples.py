@@ -15,7 +15,11 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 def test_crack_growth_validity(tmp_path: Path) -> None:
     command = [sys.executable, str(EXAMPLES / "crack_growth_validity.py"), "--out", str(tmp_path)]
     done = subprocess.run(
-        command, capture_output=True, text=True, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"}
+        command,
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
     assert (tmp_path / "crack_growth_validity.png").stat().st_size > 20_000
     rows = [line.split() for line in done.stdout.splitlines() if line[:5] in {"  the", "  all"}]

@@ -30,7 +30,8 @@ LAYERS = (
     ("_demo", "__main__"),
 )
 FLOOR = {room: floor for floor, rooms in enumerate(LAYERS) for room in rooms}
-# Rooms of one floor that may see each other: what is below everything, verbs, and the command line's two files.
+# Rooms of one floor that may see each other: what is below everything, verbs, and the command
+# line's two files.
 TOGETHER = ({"_checks", "_progress", "_weighted", "datasets"}, {"_demo", "__main__"})
 
 # Results, errors and base classes, which nobody makes; and a kernel that is passed to PyMC.
@@ -82,7 +83,9 @@ def test_imports_run_downwards(path: Path) -> None:
     for other in map(room, own(path)):
         assert other, f"{dotted(path)} imports the package itself, which is above everything"
         together = any({here, other} <= rooms for rooms in TOGETHER)
-        assert other == here or together or FLOOR[other] < FLOOR[here], f"{dotted(path)} imports {other}"
+        assert other == here or together or FLOOR[other] < FLOOR[here], (
+            f"{dotted(path)} imports {other}"
+        )
 
 
 def test_imports_form_no_circle() -> None:
@@ -95,8 +98,12 @@ def test_imports_form_no_circle() -> None:
 
 @pytest.mark.parametrize("path", FILES, ids=dotted)
 def test_files_print_nothing_and_evaluate_nothing(path: Path) -> None:
-    calls = [n for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.Call)]
-    assert not {"print", "eval", "exec", "breakpoint"} & {c.func.id for c in calls if isinstance(c.func, ast.Name)}
+    calls = [
+        n for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.Call)
+    ]
+    assert not {"print", "eval", "exec", "breakpoint"} & {
+        c.func.id for c in calls if isinstance(c.func, ast.Name)
+    }
 
 
 @pytest.mark.parametrize("name", sorted(set(prbayes.__all__) - {"datasets"}))
@@ -117,7 +124,12 @@ def test_public_names_are_documented(name: str) -> None:
 
 def test_the_package_imports_nothing_that_draws_or_renders() -> None:
     code = "import sys, prbayes; print({'arviz', 'arviz_plots', 'graphviz', 'jinja2', 'matplotlib'} & set(sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        == "set()\n"
+    )
 
 
 def test_public_names_are_in_the_reference() -> None:
@@ -146,7 +158,8 @@ def test_the_sign_of_a_discrepancy_changes_in_one_place() -> None:
     assert found == ["model.node.log_kernel"]
 
 
-# Inner names of PyMC, PyTensor and ArviZ by the files that use them: what `tests/test_contracts.py` tests directly.
+# Inner names of PyMC, PyTensor and ArviZ by the files that use them: what `tests/test_contracts.py`
+# tests directly.
 INNER = {
     "estimate.search": {"pytensor.gradient.NullTypeGradError"},
     "model.description": {
@@ -239,7 +252,11 @@ def inner(path: Path) -> set[str]:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Attribute):
             whole = ast.unparse(node).split(".")
-            if whole[0] == "pm" and len(whole) > 2 and whole[1] in ("distributions", "logprob", "model"):
+            if (
+                whole[0] == "pm"
+                and len(whole) > 2
+                and whole[1] in ("distributions", "logprob", "model")
+            ):
                 found.add(".".join(["pymc", *whole[1:]]))
     inner = {name for name in found if name.count(".") > 1}
     return {name for name in inner if not any(other.startswith(f"{name}.") for other in inner)}

@@ -48,7 +48,7 @@ def results() -> dict[str, xr.DataTree | xr.Dataset]:
         100, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False
     )
     later = prb.predict(posterior, lambda x: 2 * x, x, model=model, random_seed=1)
-    test = prb.area_test(np.array([1.0, 2.0, 3.0]), later, null=prb.PosteriorNull(199))
+    test = prb.area_test(np.array([1.0, 2.0, 3.0]), later, null=prb.validation.PosteriorNull(199))
     return {"p.nc": posterior, "o.nc": optimum.to_datatree(), "v.nc": test.to_dataset()}
 
 

@@ -13,7 +13,7 @@ from scipy.special import ndtri
 
 import prbayes as prb
 from prbayes.model.node import nodes
-from prbayes.model.support import DesignError
+from prbayes.propagation.base import DesignError
 from prbayes.response.calling import ResponseError
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)

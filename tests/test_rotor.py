@@ -57,16 +57,21 @@ def test_a_free_beam_and_a_clamped_one_have_blevins_frequencies() -> None:
     unit = np.sqrt(shaft.bending / (shaft.density * shaft.area)) / LENGTH**2
     values = eigh(stiffness, mass, eigvals_only=True)
     assert np.abs(values[:2]).max() < 1e-6 * values[2]  # two motions of a rigid body
-    np.testing.assert_allclose(np.sqrt(values[2:4]), unit * np.array([4.73004, 7.85320]) ** 2, rtol=1e-4)
     np.testing.assert_allclose(
-        frequencies(mass[2:, 2:], stiffness[2:, 2:], 2), unit * np.array([1.87510, 4.69409]) ** 2, rtol=1e-4
+        np.sqrt(values[2:4]), unit * np.array([4.73004, 7.85320]) ** 2, rtol=1e-4
+    )
+    np.testing.assert_allclose(
+        frequencies(mass[2:, 2:], stiffness[2:, 2:], 2),
+        unit * np.array([1.87510, 4.69409]) ** 2,
+        rtol=1e-4,
     )
 
 
 def test_timoshenko_beam_has_the_frequencies_of_the_closed_form() -> None:
     """A stocky shaft, simply supported: with v = V sin(wx) and rotation P cos(wx) (Timoshenko 1921),
 
-    rho A q^2 V = kGA w (w V - P) and rho I q^2 P = EI w^2 P + kGA (P - w V). The elements' error falls with h^2.
+    rho A q^2 V = kGA w (w V - P) and rho I q^2 P = EI w^2 P + kGA (P - w V). The elements' error
+    falls with h^2.
     """
     shaft = rotor.Shaft(diameter=0.05)
     mass, _, stiffness = supported(shaft)
@@ -92,7 +97,10 @@ def test_element_matrices_are_integrals_of_the_static_shape_functions() -> None:
 
     inverse = np.linalg.inv(np.array([*shapes(0.0), *shapes(length)]))
     points, weights = np.polynomial.legendre.leggauss(8)
-    v, t = (np.array(rows) @ inverse for rows in zip(*map(shapes, (points + 1) * length / 2), strict=True))
+    v, t = (
+        np.array(rows) @ inverse
+        for rows in zip(*map(shapes, (points + 1) * length / 2), strict=True)
+    )
     w = weights * length / 2
     rotary = shaft.density * shaft.inertia * t.T @ (w[:, None] * t)
     np.testing.assert_allclose(
@@ -108,13 +116,23 @@ def test_whirl_of_a_spinning_shaft_has_the_closed_form(turns: float) -> None:
     mass, gyro, stiffness = supported(shaft)
     n = len(mass)
     a = np.block(
-        [[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(mass, stiffness), 1j * speed * np.linalg.solve(mass, gyro)]]
+        [
+            [np.zeros((n, n)), np.eye(n)],
+            [-np.linalg.solve(mass, stiffness), 1j * speed * np.linalg.solve(mass, gyro)],
+        ]
     )
     whirl = np.sort(eig(a, right=False).imag)
-    total, polar = shaft.density * (shaft.area + shaft.inertia * WAVES**2), 2 * shaft.density * shaft.inertia * WAVES**2
+    total, polar = (
+        shaft.density * (shaft.area + shaft.inertia * WAVES**2),
+        2 * shaft.density * shaft.inertia * WAVES**2,
+    )
     root = np.sqrt((polar * speed) ** 2 + 4 * total * shaft.bending * WAVES**4)
-    np.testing.assert_allclose(whirl[whirl > 0][:4], (polar * speed + root) / (2 * total), rtol=2e-4)
-    np.testing.assert_allclose(-whirl[whirl < 0][::-1][:4], (root - polar * speed) / (2 * total), rtol=2e-4)
+    np.testing.assert_allclose(
+        whirl[whirl > 0][:4], (polar * speed + root) / (2 * total), rtol=2e-4
+    )
+    np.testing.assert_allclose(
+        -whirl[whirl < 0][::-1][:4], (root - polar * speed) / (2 * total), rtol=2e-4
+    )
     assert (whirl[whirl > 0][:4] > -whirl[whirl < 0][::-1][:4]).all() == (turns > 0)
 
 
@@ -131,7 +149,9 @@ def test_first_frequency_is_the_stated_one_and_its_slope_that_of_the_prototype()
     assert rotor.first_frequency(266.0, 10.55) == pytest.approx(45.69, abs=0.02)
     slope = (rotor.first_frequency(271.0, 10.55) - rotor.first_frequency(261.0, 10.55)) / 10
     assert 0.012 < slope < 0.014
-    assert abs(rotor.first_frequency(266.0, 15.9) - rotor.first_frequency(266.0, 5.0)) < 0.005  # damping is not seen
+    assert (
+        abs(rotor.first_frequency(266.0, 15.9) - rotor.first_frequency(266.0, 5.0)) < 0.005
+    )  # damping is not seen
 
 
 def test_first_frequency_agrees_with_the_whole_model() -> None:
@@ -139,7 +159,9 @@ def test_first_frequency_agrees_with_the_whole_model() -> None:
     mass, _, stiffness, pattern = rotor.ROTOR.matrices()
     undamped = replace(rotor.ROTOR, damping_ratio=0.0)
     for k in (200.0, 266.0, 340.0):
-        whole = np.sqrt(eigh(stiffness + 1e3 * k * pattern, mass, eigvals_only=True)[0]) / (2 * np.pi)
+        whole = np.sqrt(eigh(stiffness + 1e3 * k * pattern, mass, eigvals_only=True)[0]) / (
+            2 * np.pi
+        )
         assert rotor.first_frequency(k, 0.0, undamped) == pytest.approx(whole, rel=1e-6)
 
 
@@ -210,13 +232,17 @@ def test_whirl_speeds_are_those_of_ross() -> None:
     """Where it is installed: pip install ross-rotordynamics "plotly<6"."""
     ross = pytest.importorskip("ross")
     kit = rotor.ROTOR
-    steel = ross.Material("shaft", rho=kit.shaft.density, E=kit.shaft.youngs_modulus, Poisson=kit.shaft.poisson)
+    steel = ross.Material(
+        "shaft", rho=kit.shaft.density, E=kit.shaft.youngs_modulus, Poisson=kit.shaft.poisson
+    )
     lengths = np.repeat([kit.overhang / 2, kit.span / 16, kit.overhang / 2], [2, 16, 2])
     elements = [ross.ShaftElement(float(x), 0, kit.shaft.diameter, material=steel) for x in lengths]
     bearings = [ross.BearingElement(node, kxx=kit.stiffness, cxx=0) for node in kit.bearings]
     r, h = kit.disc_radius, kit.disc_thickness
     diametral, polar = kit.disc_mass * (3 * r**2 + h**2) / 12, kit.disc_mass * r**2 / 2
-    other = ross.Rotor(elements, [ross.DiskElement(kit.disc, kit.disc_mass, diametral, polar)], bearings)
+    other = ross.Rotor(
+        elements, [ross.DiskElement(kit.disc, kit.disc_mass, diametral, polar)], bearings
+    )
     mass, gyro, stiffness, pattern = kit.matrices()
     stiffness = stiffness + kit.stiffness * pattern
     zero, one = np.zeros_like(mass), np.eye(len(mass))
@@ -224,4 +250,6 @@ def test_whirl_speeds_are_those_of_ross() -> None:
         left = np.block([[zero, one], [-stiffness, 1j * speed * gyro]])
         values = eig(left, np.block([[one, zero], [zero, mass]]), right=False)
         ours = np.sort(np.abs(values.imag))[:6]
-        np.testing.assert_allclose(ours, np.sort(other.run_modal(speed, num_modes=24).wn)[:6], rtol=1e-3)
+        np.testing.assert_allclose(
+            ours, np.sort(other.run_modal(speed, num_modes=24).wn)[:6], rtol=1e-3
+        )

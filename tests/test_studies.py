@@ -16,26 +16,32 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("size", [20, 50])
-@pytest.mark.parametrize(("problem", "count"), [("linear", 60), ("quadratic", 60), ("correlated", 15)])
+@pytest.mark.parametrize(
+    ("problem", "count"), [("linear", 60), ("quadratic", 60), ("correlated", 15)]
+)
 def test_coverage(problem: str, count: int, size: int) -> None:
-    # Two hyperparameters that are nearly independent: at 60 data sets the standard error of the mean coverage is
-    # .03, and that of a standard deviation 9%.
+    # Two hyperparameters that are nearly independent: at 60 data sets the standard error of the
+    # mean coverage is .03, and that of a standard deviation 9%.
     rows = coverage.block(problem, size, 0, count, coverage.METRICS)
     error = (60 / count) ** 0.5
     for metric in coverage.METRICS:
         found = coverage.summarise(rows, metric, "affine")
-        # A few of the smallest data sets say that sigma is nearly zero, where no design of 4096 points lies.
+        # A few of the smallest data sets say that sigma is nearly zero, where no design of 4096
+        # points lies.
         assert found["failed"] <= (0.2 * count if (problem, size) == ("correlated", 20) else 0)
         assert abs(np.mean(found["coverage_89%"]) - 0.89) < 0.10 * error
         assert np.min(found["sd_over_own_sampling_sd"]) > 1 - 0.3 * error
-        # At N = 20 the full study has up to 1.44, its first 60 data sets alone 2.30: some estimates lie near an edge.
+        # At N = 20 the full study has up to 1.44, its first 60 data sets alone 2.30: some estimates
+        # lie near an edge.
         assert np.max(found["sd_over_own_sampling_sd"]) < (2.2 if size == 20 else 1.2) + 0.3 * error
 
 
 def test_a_study_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     called = []
 
-    def block(problem: str, size: int, first: int, count: int, metrics: tuple[str, ...]) -> list[dict[str, object]]:
+    def block(
+        problem: str, size: int, first: int, count: int, metrics: tuple[str, ...]
+    ) -> list[dict[str, object]]:
         called.append((problem, size, first))
         return coverage_block(problem, size, first, 2, metrics)
 

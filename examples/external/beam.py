@@ -1,6 +1,7 @@
 """A stand-in for an external solver: reads an input file, writes an output file.
 
-Deflection of a simply supported beam under a load at mid-span, w = F L^3 / (48 E I), in millimetres.
+Deflection of a simply supported beam under a load at mid-span, w = F L^3 / (48 E I), in
+millimetres.
 """
 
 import sys

@@ -1,12 +1,14 @@
 """A small rotor: beam finite elements with gyroscopic terms, springs and dampers at the bearings, disc, rub.
 
-A shaft of 10 mm carries a disc of 0.8 kg between two journal bearings and turns at 3600 rpm. Two responses:
+A shaft of 10 mm carries a disc of 0.8 kg between two journal bearings and turns at 3600 rpm. Two
+responses:
 
 - ``first_frequency(k, c)``: first natural frequency in Hz, of the shaft at rest, as an impact test finds it;
 - ``crest_factor(k, c, contact)``: peak over RMS of the vibration while a screw rubs on the shaft.
 
-Both take arrays of any shape, one entry per specimen. Deflections in the two planes are one complex number,
-``x + i y``, since shaft and bearings are the same in both. What is assumed or tuned is listed in README.md.
+Both take arrays of any shape, one entry per specimen. Deflections in the two planes are one complex
+number, ``x + i y``, since shaft and bearings are the same in both. What is assumed or tuned is
+listed in README.md.
 """
 
 from __future__ import annotations
@@ -53,23 +55,38 @@ class Shaft:
 
         Friswell, Penny, Garvey and Lees, Dynamics of Rotating Machines (2010), section 5.4.
         """
-        el, p = length, 12 * self.bending / (self.shear_stiffness * length**2) if self.shear else 0.0
+        el, p = (
+            length,
+            12 * self.bending / (self.shear_stiffness * length**2) if self.shear else 0.0,
+        )
         stiffness = np.array([
             [12, 6 * el, -12, 6 * el],
             [6 * el, (4 + p) * el**2, -6 * el, (2 - p) * el**2],
             [-12, -6 * el, 12, -6 * el],
             [6 * el, (2 - p) * el**2, -6 * el, (4 + p) * el**2],
         ]) * self.bending / ((1 + p) * el**3)  # fmt: skip
-        m1, m2, m3 = 312 + 588 * p + 280 * p**2, (44 + 77 * p + 35 * p**2) * el, 108 + 252 * p + 140 * p**2
+        m1, m2, m3 = (
+            312 + 588 * p + 280 * p**2,
+            (44 + 77 * p + 35 * p**2) * el,
+            108 + 252 * p + 140 * p**2,
+        )
         m4, m5 = -(26 + 63 * p + 35 * p**2) * el, (8 + 14 * p + 7 * p**2) * el**2
         m6 = -(6 + 14 * p + 7 * p**2) * el**2
-        translation = np.array([[m1, m2, m3, m4], [m2, m5, -m4, m6], [m3, -m4, m1, -m2], [m4, m6, -m2, m5]])
+        translation = np.array(
+            [[m1, m2, m3, m4], [m2, m5, -m4, m6], [m3, -m4, m1, -m2], [m4, m6, -m2, m5]]
+        )
         m7, m8 = 36.0, (3 - 15 * p) * el
         m9, m10 = (4 + 5 * p + 10 * p**2) * el**2, (-1 - 5 * p + 5 * p**2) * el**2
-        rotation = np.array([[m7, m8, -m7, m8], [m8, m9, -m8, m10], [-m7, -m8, m7, -m8], [m8, m10, -m8, m9]])
+        rotation = np.array(
+            [[m7, m8, -m7, m8], [m8, m9, -m8, m10], [-m7, -m8, m7, -m8], [m8, m10, -m8, m9]]
+        )
         rotary = self.density * self.inertia / (30 * (1 + p) ** 2 * el) * rotation
         mass = self.density * self.area * el / (840 * (1 + p) ** 2) * translation + rotary
-        return mass, 2 * rotary, stiffness  # the polar moment of a circle is twice the diametral one
+        return (
+            mass,
+            2 * rotary,
+            stiffness,
+        )  # the polar moment of a circle is twice the diametral one
 
 
 def assemble(shaft, lengths):
@@ -125,9 +142,9 @@ class Rotor:
     def reduced(self):
         """Return gyroscopic, damping, stiffness and bearing matrices in a basis of modes and static shapes.
 
-        The lowest modes at the nominal bearing stiffness, and the static deflections under forces at the
-        bearings and at the contact, made orthonormal in the mass matrix; and the rows of the basis at disc,
-        contact and probe.
+        The lowest modes at the nominal bearing stiffness, and the static deflections under forces
+        at the bearings and at the contact, made orthonormal in the mass matrix; and the rows of the
+        basis at disc, contact and probe.
         """
         mass, gyro, stiffness, pattern = self.matrices()
         nominal = stiffness + self.stiffness * pattern
@@ -140,7 +157,13 @@ class Rotor:
         damping = np.diag(2 * self.damping_ratio * np.sqrt(values))
         bearing = basis.T @ pattern @ basis
         rows = basis[[2 * n for n in (self.disc, self.contact, self.probe)]]
-        return basis.T @ gyro @ basis, damping, np.diag(values) - self.stiffness * bearing, bearing, rows
+        return (
+            basis.T @ gyro @ basis,
+            damping,
+            np.diag(values) - self.stiffness * bearing,
+            bearing,
+            rows,
+        )
 
     def state_matrix(self, k, c, speed):
         """Return the matrices of the state (deflection, velocity), shape (n, 2r, 2r), complex."""
@@ -160,7 +183,8 @@ ROTOR = Rotor()
 def first_frequency(k, c, rotor=ROTOR):
     """Return the first natural frequency in Hz, damped, at rest.
 
-    ``k`` in kN/m and ``c`` in N s/m, of each bearing; NaN where the stiffness or damping is not positive.
+    ``k`` in kN/m and ``c`` in N s/m, of each bearing; NaN where the stiffness or damping is not
+    positive.
     """
     k, c = np.broadcast_arrays(np.asarray(k, dtype=float), np.asarray(c, dtype=float))
     flat_k, flat_c = k.ravel(), c.ravel()
@@ -175,8 +199,8 @@ def first_frequency(k, c, rotor=ROTOR):
 def vibration(k, c, contact, unbalance=0.45, rotor=ROTOR, substeps=1):
     """Return the x-deflection at the probe in m under rub, shape (n, samples), for arrays of shape (n,).
 
-    The linear rotor is propagated exactly in the coordinates of its complex modes; the contact force is
-    linear in time over a step, and so small as to close the penalty law at its end.
+    The linear rotor is propagated exactly in the coordinates of its complex modes; the contact
+    force is linear in time over a step, and so small as to close the penalty law at its end.
     """
     a = rotor.state_matrix(1e3 * k, c, rotor.speed)
     r = a.shape[1] // 2
@@ -188,13 +212,16 @@ def vibration(k, c, contact, unbalance=0.45, rotor=ROTOR, substeps=1):
     dt = 1 / (rotor.sampling * substeps)
     z = values * dt
     step = np.exp(z)
-    # Integrals of exp(lambda (dt - s)) against a force that falls from 1 to 0, and one that rises from 0 to 1.
+    # Integrals of exp(lambda (dt - s)) against a force that falls from 1 to 0, and one that rises
+    # from 0 to 1.
     rises = (step - 1 - z) / z**2 * dt
     falls = (step - 1) / z * dt - rises
     old, new = falls * force, rises * force
     give = (see[0] * new).sum(axis=1).real  # deflection at the end of a step for a unit force there
     turning = 1e-3 * unbalance * rotor.unbalance_radius * rotor.speed**2
-    whirl = turning * (left[:, :, r:] @ disc) / (1j * rotor.speed - values)  # the stationary answer to unbalance
+    whirl = (
+        turning * (left[:, :, r:] @ disc) / (1j * rotor.speed - values)
+    )  # the stationary answer to unbalance
     orbit = (see[0] * whirl).sum(axis=1), (see[1] * whirl).sum(axis=1)
     q = np.zeros_like(values)
     f = np.zeros(len(k))
@@ -217,7 +244,8 @@ def vibration(k, c, contact, unbalance=0.45, rotor=ROTOR, substeps=1):
 def crest_factor(k, c, contact, unbalance=0.45, rotor=ROTOR, substeps=1):
     """Return peak over RMS of the vibration at the probe, about its mean.
 
-    ``k`` in kN/m, ``c`` in N s/m, ``contact`` in MN/m, ``unbalance`` in g. NaN where one is not positive.
+    ``k`` in kN/m, ``c`` in N s/m, ``contact`` in MN/m, ``unbalance`` in g. NaN where one is not
+    positive.
     """
     arrays = np.broadcast_arrays(*(np.asarray(v, dtype=float) for v in (k, c, contact)))
     k, c, contact = (v.ravel() for v in arrays)

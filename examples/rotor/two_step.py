@@ -1,10 +1,10 @@
 """A rotor is calibrated in two steps: bearings from an impact test, rub from crest factors; then it is judged.
 
 Step 1 calibrates the population of bearing stiffness and damping from 15 first natural frequencies,
-N(45.69, 0.19) Hz. Step 2 carries its posterior along, and calibrates the population of the contact stiffness from
-15 crest factors, N(1.73, 0.14), through a surrogate. Then 20 fresh crest factors with an unbalance of 0.95 g judge
-the model. ALL DATA ARE SYNTHETIC, drawn from the distributions that Oh et al. (2019) state for their rotor kit; the
-model is that of rotor.py, not theirs.
+N(45.69, 0.19) Hz. Step 2 carries its posterior along, and calibrates the population of the contact
+stiffness from 15 crest factors, N(1.73, 0.14), through a surrogate. Then 20 fresh crest factors
+with an unbalance of 0.95 g judge the model. ALL DATA ARE SYNTHETIC, drawn from the distributions
+that Oh et al. (2019) state for their rotor kit; the model is that of rotor.py, not theirs.
 
 Run: uv run python examples/rotor/two_step.py [--out FOLDER]
 """
@@ -23,7 +23,11 @@ from scipy.stats import gaussian_kde, norm
 import prbayes as prb
 
 FREQUENCY, CREST = (45.69, 0.19), (1.73, 0.14)  # stated means and standard deviations
-INITIAL = {"k": (266.0, 26.6), "c": (10.55, 1.055), "contact": (1.0, 0.1)}  # kN/m, N s/m, MN/m; as the paper, CoV 10%
+INITIAL = {
+    "k": (266.0, 26.6),
+    "c": (10.55, 1.055),
+    "contact": (1.0, 0.1),
+}  # kN/m, N s/m, MN/m; as the paper, CoV 10%
 METRICS = {
     "PR": prb.ProbabilityResidual(),
     "KLD": prb.KullbackLeibler(),
@@ -31,7 +35,11 @@ METRICS = {
     "log-likelihood": prb.LogLikelihood(),
 }
 COLORS = dict(zip(METRICS, ["#0072B2", "#009E73", "#D55E00", "#CC79A7"], strict=True))
-RANGES = {"k": (205, 325), "c": (3, 26), "contact": (0, 1.8)}  # of the surrogates: kN/m, N s/m, MN/m
+RANGES = {
+    "k": (205, 325),
+    "c": (3, 26),
+    "contact": (0, 1.8),
+}  # of the surrogates: kN/m, N s/m, MN/m
 BEARINGS = {"k": (160, 380), "c": (2, 26)}
 
 
@@ -65,7 +73,15 @@ def bearings(metric, observed, surrogate):
         mu_c = pm.Uniform("mu_c", 5, 16)  # N s/m; coefficient of variation 10%
         k = pm.Gamma.dist(mu=mu_k, sigma=sd_k)
         c = pm.Gamma.dist(mu=mu_c, sigma=0.1 * mu_c)
-        prb.Simulator("frequency", surrogate, k, c, metric=metric, observed=observed, propagation=cheap(metric))
+        prb.Simulator(
+            "frequency",
+            surrogate,
+            k,
+            c,
+            metric=metric,
+            observed=observed,
+            propagation=cheap(metric),
+        )
     return model, (k, c)
 
 
@@ -82,13 +98,23 @@ def rub(metric, observed, surrogate, first, knowledge):
         elif knowledge == "population":
             k, c = pm.Gamma.dist(mu=k0, sigma=s0), pm.Gamma.dist(mu=c0, sigma=0.1 * c0)
         else:
-            # The recipe: a normal distribution, in unconstrained space, of the draws of step 1 is the prior of step 2.
+            # The recipe: a normal distribution, in unconstrained space, of the draws of step 1 is
+            # the prior of step 2.
             free = np.array([draws.mu_k, np.log(draws.sd_k), np.log(draws.mu_c)])
             carried = pm.MvNormal("carried", free.mean(axis=1), np.cov(free))
             mu_c = pm.math.exp(carried[2])
             k = pm.Gamma.dist(mu=carried[0], sigma=pm.math.exp(carried[1]))
             c = pm.Gamma.dist(mu=mu_c, sigma=0.1 * mu_c)
-        prb.Simulator("crest", surrogate, k, c, contact, metric=metric, observed=observed, propagation=cheap(metric))
+        prb.Simulator(
+            "crest",
+            surrogate,
+            k,
+            c,
+            contact,
+            metric=metric,
+            observed=observed,
+            propagation=cheap(metric),
+        )
     return model, (k, c, contact)
 
 
@@ -98,7 +124,13 @@ def sampled(model, metric, epsilon):
     center = prb.minimize(model, prior=True, progressbar=False)
     draws = 150 if isinstance(metric, prb.LogLikelihood) else 500
     return prb.sample_smc(
-        draws, chains=2, model=model, optimum=center, adjust=prb.Affine(), random_seed=1, progressbar=False
+        draws,
+        chains=2,
+        model=model,
+        optimum=center,
+        adjust=prb.posterior.Affine(),
+        random_seed=1,
+        progressbar=False,
     )
 
 
@@ -121,12 +153,16 @@ def fit_to_stated(metric):
     """Calibrate one input for each response against the stated distributions themselves; return their moments."""
     with pm.Model() as model:
         k = pm.Gamma.dist(mu=pm.Normal("mu", 266, 40), sigma=pm.HalfNormal("sd", 30))
-        prb.Simulator("f", first_frequency, k, 10.55, metric=metric, observed=stated_values(*FREQUENCY))
+        prb.Simulator(
+            "f", first_frequency, k, 10.55, metric=metric, observed=stated_values(*FREQUENCY)
+        )
     frequency = moments(prb.minimize(model, progressbar=False), first_frequency, (k, 10.55))
     with pm.Model() as model:
         mu, sd = pm.Normal("mu", 0.5, 0.3), pm.HalfNormal("sd", 0.3)
         contact = pm.TruncatedNormal.dist(mu, sd, lower=0)
-        prb.Simulator("r", crest_factor, 266.0, 10.55, contact, metric=metric, observed=stated_values(*CREST))
+        prb.Simulator(
+            "r", crest_factor, 266.0, 10.55, contact, metric=metric, observed=stated_values(*CREST)
+        )
     optimum = prb.minimize(model, progressbar=False)
     return frequency, moments(optimum, crest_factor, (266.0, 10.55, contact)), optimum.point
 
@@ -147,7 +183,8 @@ def table(title, stated, fits, calibrated):
 def verify(title, optimum, response, surrogate, inputs):
     """Compute the response itself for 512 specimens of the calibrated population, and compare."""
     direct, through = (
-        prb.predict(optimum, f, *inputs, n_samples=512, random_seed=3).values.ravel() for f in (response, surrogate)
+        prb.predict(optimum, f, *inputs, n_samples=512, random_seed=3).values.ravel()
+        for f in (response, surrogate)
     )  # of the same specimens
     both = np.isfinite(through)
     off = through[both] - direct[both]
@@ -178,7 +215,9 @@ def picture_calibration(path, observed, stated, before, after, best, label):
     figure, axis = plt.subplots(figsize=(6.4, 4), layout="constrained")
     low, high = stated[0] - 5 * stated[1], stated[0] + 5 * stated[1]
     grid = np.linspace(low, high, 300)
-    axis.hist(observed, bins=7, density=True, color="0.85", label=f"{observed.size} tests (synthetic)")
+    axis.hist(
+        observed, bins=7, density=True, color="0.85", label=f"{observed.size} tests (synthetic)"
+    )
     axis.plot(grid, norm.pdf(grid, *stated), "k--", lw=1, label="stated distribution")
     axis.plot(grid, gaussian_kde(before)(grid), color="0.45", label="before calibration")
     density(axis, grid, after, COLORS["PR"], "PR posterior, 89% band")
@@ -192,7 +231,9 @@ def picture_validity(path, fresh, predicted, test, exact):
     """Save the validity check (the paper's figure 19): responses, u-values, critical values."""
     figure, (left, middle, right) = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
     grid = np.linspace(1.35, 2.25, 300)
-    left.hist(fresh, bins=8, density=True, color="0.85", label=f"{fresh.size} fresh values (synthetic)")
+    left.hist(
+        fresh, bins=8, density=True, color="0.85", label=f"{fresh.size} fresh values (synthetic)"
+    )
     density(left, grid, predicted, COLORS["PR"], "predicted, 89% band")
     left.set(xlabel="crest factor at 0.95 g", ylabel="density", title="(a) responses")
     left.legend(frameon=False, fontsize=9)
@@ -200,22 +241,33 @@ def picture_validity(path, fresh, predicted, test, exact):
     x, y = np.repeat(np.r_[0, u, 1], 2)[1:-1], np.repeat(np.arange(u.size + 1) / u.size, 2)
     fine = np.linspace(0, 1, 2001)
     steps = np.searchsorted(u, fine, side="right") / u.size
-    middle.fill_between(fine, fine, steps, color=COLORS["PR"], alpha=0.25, lw=0, label=f"area {test.statistic:.3f}")
+    middle.fill_between(
+        fine, fine, steps, color=COLORS["PR"], alpha=0.25, lw=0, label=f"area {test.statistic:.3f}"
+    )
     middle.plot([0, 1], [0, 1], "k--", lw=1, label="ideal")
     middle.plot(x, y, color=COLORS["area"], label="fresh values")
     middle.set(xlabel="u-value", ylabel="share of values", title="(b) u-values")
     middle.legend(frameon=False, fontsize=9)
     uniforms = np.sort(np.random.default_rng(0).random((4000, u.size)))
     under = [np.abs(np.searchsorted(row, fine) / u.size - fine).mean() for row in uniforms]
-    right.hist(under, bins=50, density=True, color="0.85", label="areas if the model were known exactly")
+    right.hist(
+        under, bins=50, density=True, color="0.85", label="areas if the model were known exactly"
+    )
     for value, color, ls, label in (
         (test.statistic, COLORS["area"], "-", f"area {test.statistic:.3f}"),
         (0.1051, "0.4", ":", "0.1051, the paper's"),
         (exact.critical_value, "k", "--", f"{exact.critical_value:.4f}, exact model known"),
-        (test.critical_value, COLORS["PR"], "--", f"{test.critical_value:.3f}, calibrated on 15 tests"),
+        (
+            test.critical_value,
+            COLORS["PR"],
+            "--",
+            f"{test.critical_value:.3f}, calibrated on 15 tests",
+        ),
     ):
         right.axvline(value, 0, 0.62, color=color, ls=ls, label=label)
-    right.set(xlabel="area metric", ylabel="density", title="(c) critical values, level 5%", ylim=(0, 32))
+    right.set(
+        xlabel="area metric", ylabel="density", title="(c) critical values, level 5%", ylim=(0, 32)
+    )
     right.legend(frameon=False, fontsize=9)
     figure.savefig(path, dpi=150)
 
@@ -231,10 +283,21 @@ def picture_parameters(path, steps):
         for row, metric in enumerate(METRICS):
             optimum, posterior = steps[metric][0 if name in ("mu_k", "sd_k", "mu_c") else 1]
             low, high = posterior.posterior[name].quantile([0.055, 0.945])
-            axis.plot([low, high], [row, row], color=COLORS[metric], lw=3, alpha=0.5, solid_capstyle="butt")
-            axis.plot(posterior.posterior[name].mean(), row, "|", color=COLORS[metric], ms=14, mew=2)
+            axis.plot(
+                [low, high],
+                [row, row],
+                color=COLORS[metric],
+                lw=3,
+                alpha=0.5,
+                solid_capstyle="butt",
+            )
+            axis.plot(
+                posterior.posterior[name].mean(), row, "|", color=COLORS[metric], ms=14, mew=2
+            )
             axis.plot(optimum.point[name], row, "o", color=COLORS[metric], mec="white", ms=8)
-        axis.set(xlabel=label, yticks=range(len(METRICS)), yticklabels=list(METRICS), ylim=(3.5, -0.5))
+        axis.set(
+            xlabel=label, yticks=range(len(METRICS)), yticklabels=list(METRICS), ylim=(3.5, -0.5)
+        )
     axes[2].set_title("not identified: its posterior is its prior", fontsize=9)
     axes[0].set_title("optimum (dot); posterior mean, 89% interval (bar)", fontsize=9)
     figure.savefig(path, dpi=150)
@@ -246,15 +309,21 @@ def main():
     parser.add_argument("--out", type=Path, default=Path("."), help="folder for the figures")
     out = parser.parse_args().out
     out.mkdir(parents=True, exist_ok=True)
-    logging.getLogger("prbayes").setLevel(logging.ERROR)  # what is said in the log is printed below, once
+    logging.getLogger("prbayes").setLevel(
+        logging.ERROR
+    )  # what is said in the log is printed below, once
     clock = time.perf_counter()
-    print("All data are synthetic, from the distributions stated in doi:10.1007/s00158-019-02288-6.")
+    print(
+        "All data are synthetic, from the distributions stated in doi:10.1007/s00158-019-02288-6."
+    )
     frequencies = synthetic_tests(*FREQUENCY, 15, seed=2019)
     crests = synthetic_tests(*CREST, 15, seed=2020)
 
     print("\nSTEP 1: bearing stiffness and damping from 15 first natural frequencies")
-    frequency = prb.Surrogate.fit(first_frequency, BEARINGS, 64, model=prb.Polynomial(5))
-    print(f"surrogate: {frequency.n_runs} model runs; cross-validated error {frequency.error}, in Hz")
+    frequency = prb.Surrogate.fit(first_frequency, BEARINGS, 64, model=prb.surrogate.Polynomial(5))
+    print(
+        f"surrogate: {frequency.n_runs} model runs; cross-validated error {frequency.error}, in Hz"
+    )
     steps, frequency_moments, first_inputs = {}, {}, {}
     for label, metric in METRICS.items():
         model, inputs = bearings(metric, frequencies, frequency)
@@ -271,9 +340,11 @@ def main():
     print(
         f"\nSTEP 2: contact stiffness from 15 crest factors, through a surrogate ({time.perf_counter() - clock:.0f} s)"
     )
-    surrogate = prb.Surrogate.fit(crest_factor, RANGES, 128, model=prb.Polynomial(4))
+    surrogate = prb.Surrogate.fit(crest_factor, RANGES, 128, model=prb.surrogate.Polynomial(4))
     print(f"surrogate: {surrogate.n_runs} model runs; cross-validated error {surrogate.error}")
-    wide = prb.Surrogate.fit(crest_factor, RANGES | {"contact": (0, 2.5)}, 128, model=prb.Polynomial(4))
+    wide = prb.Surrogate.fit(
+        crest_factor, RANGES | {"contact": (0, 2.5)}, 128, model=prb.surrogate.Polynomial(4)
+    )
     print(f"had its ranges gone up to 2.5 MN/m, where the vibration jumps: {wide.error}")
     crest_moments, known, whole = {}, {}, {}
     for label, metric in METRICS.items():
@@ -294,9 +365,14 @@ def main():
             model, inputs, posterior = whole["PR"]
         else:
             model, inputs = rub(METRICS["PR"], crests, surrogate, first, knowledge)
-            posterior = sampled(model, METRICS["PR"], prb.calibrate_epsilon(prb.minimize(model, progressbar=False)))
+            posterior = sampled(
+                model, METRICS["PR"], prb.calibrate_epsilon(prb.minimize(model, progressbar=False))
+            )
         crest = prb.predict(posterior, surrogate, *inputs, model=model, random_seed=2)
-        cells = [(float(posterior.posterior[n].mean()), float(posterior.posterior[n].std())) for n in ("mu_r", "sd_r")]
+        cells = [
+            (float(posterior.posterior[n].mean()), float(posterior.posterior[n].std()))
+            for n in ("mu_r", "sd_r")
+        ]
         cells.append(spread(crest, 0.95))
         if knowledge == "means":
             cells.append((float(first_frequency(*inputs[:2])), 0.0))
@@ -311,31 +387,54 @@ def main():
 
     print(f"\nTABLE 3 ({time.perf_counter() - clock:.0f} s)")
     fits = {label: fit_to_stated(metric) for label, metric in METRICS.items()}
-    table("first natural frequency, Hz", FREQUENCY, {m: f[0] for m, f in fits.items()}, frequency_moments)
+    table(
+        "first natural frequency, Hz",
+        FREQUENCY,
+        {m: f[0] for m, f in fits.items()},
+        frequency_moments,
+    )
     table("crest factor", CREST, {m: f[1] for m, f in fits.items()}, crest_moments)
     share = norm.cdf((np.sqrt(2) - CREST[0]) / CREST[1])
-    print(f"This rub gives no crest factor below sqrt(2), that of a sine; {share:.1%} of the stated normal is there.")
+    print(
+        f"This rub gives no crest factor below sqrt(2), that of a sine; {share:.1%} of the stated normal is there."
+    )
 
     print(f"\nDIRECT MODEL RUNS AT THE PR OPTIMUM ({time.perf_counter() - clock:.0f} s)")
-    verify("first natural frequency, Hz", steps["PR"][0][0], first_frequency, frequency, first_inputs["PR"])
+    verify(
+        "first natural frequency, Hz",
+        steps["PR"][0][0],
+        first_frequency,
+        frequency,
+        first_inputs["PR"],
+    )
     verify("crest factor", known["PR"][2], crest_factor, surrogate, known["PR"][1])
 
     print("\nVALIDITY: 20 fresh crest factors with an unbalance of 0.95 g")
-    # Synthetic: the population that fits the stated distribution, at the new unbalance, through the model itself.
+    # Synthetic: the population that fits the stated distribution, at the new unbalance, through the
+    # model itself.
     truth = fits["PR"][2]
     rng = np.random.default_rng(95)
     drawn = rng.normal(truth["mu"], truth["sd"], 100)
-    fresh = crest_factor_heavy(rng.normal(266, 15.5, 20), rng.normal(10.55, 1.055, 20), drawn[drawn > 0][:20])
-    heavy = prb.Surrogate.fit(crest_factor_heavy, RANGES, 128, model=prb.Polynomial(4))
+    fresh = crest_factor_heavy(
+        rng.normal(266, 15.5, 20), rng.normal(10.55, 1.055, 20), drawn[drawn > 0][:20]
+    )
+    heavy = prb.Surrogate.fit(crest_factor_heavy, RANGES, 128, model=prb.surrogate.Polynomial(4))
     print(f"  surrogate at 0.95 g: {heavy.n_runs} model runs; cross-validated error {heavy.error}")
     model, inputs, posterior = whole["PR"]
-    predicted = prb.predict(posterior, heavy.with_error(), *inputs, model=model, name="heavy", random_seed=4)
-    exact = prb.area_test(fresh, predicted, null=prb.ExactModel())
+    predicted = prb.predict(
+        posterior, heavy.with_error(), *inputs, model=model, name="heavy", random_seed=4
+    )
+    exact = prb.area_test(fresh, predicted, null=prb.validation.ExactModel())
     test = prb.area_test(fresh, predicted)
-    print(f"  known exactly, critical value {exact.critical_value:.4f} (the paper's 0.1051 is too small):\n{exact}")
+    print(
+        f"  known exactly, critical value {exact.critical_value:.4f} (the paper's 0.1051 is too small):\n{exact}"
+    )
     print(f"  calibrated on 15 tests:\n{test}")
     uniforms = np.random.default_rng(0).random((400, 20))
-    areas = [prb.area_test(u, np.linspace(0, 1, 2001), null=prb.ExactModel()).statistic for u in uniforms]
+    areas = [
+        prb.area_test(u, np.linspace(0, 1, 2001), null=prb.validation.ExactModel()).statistic
+        for u in uniforms
+    ]
     print(
         f"  a critical value of 0.1051 rejects an exact model in {np.mean(np.array(areas) > 0.1051):.0%} of 400 cases"
     )
@@ -347,7 +446,9 @@ def main():
     before = {name: rng.normal(*INITIAL[name], 2000) for name in INITIAL}
     model = steps["PR"][0][0].model
     after = prb.predict(first, frequency, *first_inputs["PR"], model=model, random_seed=5)
-    best = prb.predict(steps["PR"][0][0], frequency, *first_inputs["PR"], random_seed=5).values.ravel()
+    best = prb.predict(
+        steps["PR"][0][0], frequency, *first_inputs["PR"], random_seed=5
+    ).values.ravel()
     picture_calibration(out / "rotor_frequency.png", frequencies, FREQUENCY, first_frequency(before["k"], before["c"]),
                         after, best, "first natural frequency, Hz")  # fmt: skip
     model, inputs, posterior = whole["PR"]

@@ -1,4 +1,6 @@
-"""Many small minimisations at once where nothing is known of the functions: Nelder and Mead's simplex.
+"""Many small minimisations at once where nothing is known of the functions.
+
+Nelder and Mead's simplex.
 
 `batch_bfgs` needs slopes. A user's own discrepancy may have kinks, as the largest difference of two
 distribution functions, or flat pieces; a simplex only asks which of two values is the smaller.
@@ -137,7 +139,8 @@ def _step(
     points, values = points.copy(), values.copy()
     center, worst = points[:, :-1].mean(axis=1), points[:, -1]
     away = center - worst
-    # All four trials are looked at in one call, which costs less than four calls for some rows each.
+    # All four trials are looked at in one call, which costs less than four calls for some rows
+    # each.
     lengths = np.array([1.0, moves.expand, moves.contract, -moves.contract])
     trials = center[:, None] + lengths[:, None] * away[:, None]
     found = value(trials, rows)

@@ -63,7 +63,9 @@ def no_information(evaluator: Evaluator, theta: Floats) -> bool:
 def elements_at_edge(
     evaluator: Evaluator, theta: Floats, scales: Floats, *, size: float, tolerance: float, seed: int
 ) -> tuple[str, ...]:
-    """Return the elements that ran to an edge: the population goes on changing there, and its discrepancy does not.
+    """Return the elements that ran to an edge.
+
+    The population goes on changing there, and its discrepancy does not.
 
     Standard errors cannot tell: curvature and noise are both rounding errors at an edge, and their
     ratio is anything. The way back to the middle of the prior does change the discrepancy, unlike
@@ -114,7 +116,10 @@ def _apart(evaluator: Evaluator, a: Floats, b: Floats) -> float:
 
 
 def _shares_below(values: Floats, weights: Floats, at: Floats) -> Floats:
-    """Return the shares of weight of the values up to each number; those without response are above all."""
+    """Return the shares of weight of the values up to each number.
+
+    Those without response are above all.
+    """
     order = np.argsort(values)
     total = np.concatenate([[0.0], np.cumsum(weights[order])])
     return np.asarray(total[np.searchsorted(values[order], at, side="right")] / total[-1])

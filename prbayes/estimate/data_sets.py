@@ -1,7 +1,7 @@
 """Data sets that might have been observed: drawn from the model, or by resampling specimens.
 
-Observations that carry the same specimen label, within a simulator or between simulators, belong together:
-they are drawn, or get their weight, together.
+Observations that carry the same specimen label, within a simulator or between simulators, belong
+together: they are drawn, or get their weight, together.
 """
 
 from __future__ import annotations
@@ -113,15 +113,16 @@ def _same_specimens(node: Node, other: Node) -> bool:
 def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int = 0) -> DataSets:
     """Draw data sets of the observed sizes from the populations at theta (parametric bootstrap).
 
-    Only responses that are finite can be observed. Of populations of more than 2^15 points that many, the first of a
-    Sobol sequence, stand for all. Repeated observations of one specimen within a simulator
-    are equal, as the model has them.
+    Only responses that are finite can be observed. Of populations of more than 2^15 points that
+    many, the first of a Sobol sequence, stand for all. Repeated observations of one specimen within
+    a simulator are equal, as the model has them.
 
     Raises
     ------
     ValueError
-        If specimens are shared by simulators whose inputs are not the same ``.dist()`` objects, or whose
-        designs differ, so that the model does not say how their responses depend on each other.
+        If specimens are shared by simulators whose inputs are not the same ``.dist()`` objects, or
+        whose designs differ, so that the model does not say how their responses depend on each
+        other.
     """
     populations = []
     for k, node in enumerate(evaluator.nodes):
@@ -139,7 +140,9 @@ def simulated_points(
     *,
     more: int = 0,
 ) -> list[NDArray[np.intp]]:
-    """Draw the specimens of data sets: by simulator the points of its population, (n_sets, specimens + more).
+    """Draw the specimens of data sets.
+
+    By simulator the points of its population, (n_sets, specimens + more).
 
     Parameters
     ----------

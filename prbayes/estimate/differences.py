@@ -1,4 +1,7 @@
-"""Derivatives by differences: the points of a stencil, evaluated in one batch, and what they tell."""
+"""Derivatives by differences.
+
+The points of a stencil, evaluated in one batch, and what they tell.
+"""
 
 from __future__ import annotations
 

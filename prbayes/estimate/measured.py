@@ -25,7 +25,8 @@ from prbayes.model.evaluator import Evaluator
 _SETS = 200
 # First edges of the simplex, in prior standard deviations: a step that priors mean to be ordinary.
 _FIRST = 0.5
-# Largest steps, in prior standard deviations, over which it is looked whether the discrepancy rises.
+# Largest steps, in prior standard deviations, over which it is looked whether the discrepancy
+# rises.
 _WIDEST = 0.5
 # Standard errors along principal axes, as a share of the largest, that are taken apart.
 _LEAST = 1e-4
@@ -69,8 +70,8 @@ class Refits:
     ) -> Refits:
         """Draw data sets at theta and minimise the discrepancy of each; no response is computed.
 
-        What was found last is remembered: an optimum's standard errors, its epsilon and the adjustment
-        of draws rest on the same refits.
+        What was found last is remembered: an optimum's standard errors, its epsilon and the
+        adjustment of draws rest on the same refits.
         """
         chosen = tuple(range(len(evaluator.nodes)) if simulators is None else simulators)
         # Minimisers depend on the ratios of scales only; of one simulator they do not at all.
@@ -115,8 +116,8 @@ class Refits:
         A direction is identified if the minimisers scatter along it by less than ``weakest`` prior
         standard deviations, and if the discrepancy rises along it: its second derivative, averaged
         over data sets, is more than twice the mean gain of one identified direction over
-        ``weakest**2``. For a quadratic discrepancy the two say the same; where it does not change at all,
-        a minimiser stays close to where it started, and only the second one tells.
+        ``weakest**2``. For a quadratic discrepancy the two say the same; where it does not change
+        at all, a minimiser stays close to where it started, and only the second one tells.
         """
         curvatures, vectors = np.linalg.eigh(self.hessian())
         # The largest curvature first.
@@ -135,7 +136,8 @@ class Refits:
         """Return second differences of the discrepancy at theta, averaged over data sets, (d, d).
 
         In units of the prior's spread. Steps are the minimisers' own standard errors, over which
-        kinks at different places average out, and wide where the minimisers hardly know where to go.
+        kinks at different places average out, and wide where the minimisers hardly know where to
+        go.
         """
         axes, sd = principal_axes(self.shifts)
         steps = np.minimum(np.where(sd > _WIDEST / 5, _WIDEST, sd), _WIDEST)
@@ -167,8 +169,8 @@ def _refits(
 def principal_axes(points: Floats) -> tuple[Floats, Floats]:
     """Return principal axes of points, (n, d), as columns (d, d), and standard deviations along them.
 
-    Robust: points count no farther out than three standard deviations, and those are what the middle
-    89% tell, so that a few minimisers that ran away do not decide.
+    Robust: points count no farther out than three standard deviations, and those are what the
+    middle 89% tell, so that a few minimisers that ran away do not decide.
     """
     d = points.shape[1]
     if d == 0:

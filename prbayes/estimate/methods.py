@@ -91,7 +91,10 @@ class Method:
         return self.method.lower() not in {n.lower() for n in _GRADIENT_FREE}
 
     def settings(self, tolerance: float, size: int) -> dict[str, Any]:
-        """Return scipy's options for a standardised problem; the budget of evaluations alone limits iterations."""
+        """Return scipy's options for a standardised problem.
+
+        The budget of evaluations alone limits iterations.
+        """
         most = _UNLIMITED
         simplex = np.vstack([np.zeros(size), _FIRST * np.eye(size)])
         known: dict[str, dict[str, Any]] = {

@@ -1,4 +1,7 @@
-"""The deterministic route: `minimize` moves the hyperparameters until the discrepancy is smallest."""
+"""The deterministic route.
+
+`minimize` moves the hyperparameters until the discrepancy is smallest.
+"""
 
 from __future__ import annotations
 

@@ -125,7 +125,10 @@ class Optimum:
 
     @property
     def n_computed(self) -> int:
-        """Responses computed for the model so far: without those found in a store, with those computed again."""
+        """Responses computed for the model so far.
+
+        Without those found in a store, with those computed again.
+        """
         return sum(node.bound.responses.computed for node in self.evaluator.nodes)
 
     def sampling(self, *, weakest: float = 1.0) -> SamplingDistribution:

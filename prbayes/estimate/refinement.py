@@ -11,7 +11,8 @@ from prbayes._checks import Floats
 from prbayes.estimate.data_sets import siblings
 from prbayes.estimate.sandwich import Information
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.support import DesignError, Shortcoming, shortcomings
+from prbayes.model.support import Shortcoming, shortcomings
+from prbayes.propagation.base import DesignError
 
 _log = logging.getLogger("prbayes")
 # Batches added before a design is refused: by judgement.

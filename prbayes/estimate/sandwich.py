@@ -211,7 +211,8 @@ class Information:
         """J: the covariance of the gradient over data sets of the observed size, shape (d, d)."""
         if not self.node.metric.additive or dependent([self.node]):
             return np.atleast_2d(np.cov(self.gradients(*self.data_set), rowvar=False))
-        # A mean over observations: of single ones, at equal steps of probability, the covariance by N.
+        # A mean over observations: of single ones, at equal steps of probability, the covariance by
+        # N.
         slopes = self.gradients(self._quantiles(_POINTS), np.eye(_POINTS))
         return np.atleast_2d(np.cov(slopes, rowvar=False)) / self._target.n_effective
 

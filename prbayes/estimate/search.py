@@ -142,7 +142,10 @@ class Search:
         return Objective(function, center, self.units, size, gradient=gradient, most=most)
 
     def _with_gradient(self, scales: Floats) -> Function:
-        """Return theta -> value, gradient, evaluations: exact where it can be, or by differences."""
+        """Return theta -> value, gradient, evaluations.
+
+        Exact where it can be, or by differences.
+        """
         try:
             exact = self.evaluator.objective(prior=self.prior, gradient=True)
         except (NotImplementedError, NullTypeGradError):

@@ -11,7 +11,10 @@ from prbayes._checks import Floats
 
 
 def element_name(name: str, index: tuple[int, ...]) -> str:
-    """Return the name of an element, such as 'mu[1]' or 'cov[0,1]'; of a scalar, the variable's own."""
+    """Return the name of an element, such as 'mu[1]' or 'cov[0,1]'.
+
+    Of a scalar, the variable's own.
+    """
     if not index:
         return name
     places = ",".join(map(str, index))

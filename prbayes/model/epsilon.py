@@ -33,7 +33,8 @@ def checked_epsilon(
     Raises
     ------
     KeyError, TypeError, ValueError
-        If a name is unknown, a value is not a positive number, or they were calibrated for another problem.
+        If a name is unknown, a value is not a positive number, or they were calibrated for another
+        problem.
     """
     names = [node.name for node in simulators]
     unknown = sorted(set(epsilon) - set(names))
@@ -56,13 +57,13 @@ def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
     Raises
     ------
     KeyError, TypeError, ValueError
-        If a name is unknown, a value is not a positive number, or `calibrate_epsilon` found them for another
-        problem; then nothing is changed.
+        If a name is unknown, a value is not a positive number, or `calibrate_epsilon` found them
+        for another problem; then nothing is changed.
 
     Notes
     -----
-    A clone of a model (`pymc.do`, `pymc.observe`, a copy) has epsilons of its own from the first time that this
-    package is given it; what was compiled before follows the original.
+    A clone of a model (`pymc.do`, `pymc.observe`, a copy) has epsilons of its own from the first
+    time that this package is given it; what was compiled before follows the original.
 
     Examples
     --------

@@ -51,7 +51,8 @@ class Evaluation:
 class Evaluator:
     """Everything that the optimiser, the epsilon rules and the sampler ask of a model.
 
-    Names, transforms and prior draws are those of `hyperparameters`, and stand here too, since all ask for them.
+    Names, transforms and prior draws are those of `hyperparameters`, and stand here too, since all
+    ask for them.
 
     Parameters
     ----------
@@ -94,7 +95,10 @@ class Evaluator:
 
     @property
     def prior_sd(self) -> Floats:
-        """The prior's standard deviation of each element of theta, shape (d,): the unit of parameters."""
+        """The prior's standard deviation of each element of theta, shape (d,).
+
+        The unit of parameters.
+        """
         return self.hyperparameters.prior_sd
 
     @property
@@ -183,7 +187,8 @@ class Evaluator:
     def objective(self, *, prior: bool, gradient: bool) -> Any:
         """Compile (theta, scales) -> sum of d_k / scale_k [- log prior] - log of ordinary terms [, its gradient].
 
-        The prior's density is that of the user's own units, as in `pymc.find_MAP`: without Jacobian.
+        The prior's density is that of the user's own units, as in `pymc.find_MAP`: without
+        Jacobian.
 
         Raises
         ------
@@ -214,8 +219,8 @@ class Evaluator:
     def observing(self, data: dict[str, Floats], metric: Metric | None = None) -> Evaluator:
         """Return an evaluator of the same model with other observed responses, by the names of simulators.
 
-        Metrics choose bandwidths and cells anew; designs and epsilons are the same objects. With ``metric`` all
-        simulators have that one.
+        Metrics choose bandwidths and cells anew; designs and epsilons are the same objects. With
+        ``metric`` all simulators have that one.
         """
         _ = self._roots  # compiled once, for all copies
         other = copy.copy(self)
@@ -237,7 +242,10 @@ class Evaluator:
         return lambda theta, scales: (self.total(theta[None], scales)[0],)
 
     def total(self, thetas: Floats, scales: Floats) -> Floats:
-        """Return the sum of d_k / scale_k - log of ordinary terms, shape (P,); +inf outside the priors' support."""
+        """Return the sum of d_k / scale_k - log of ordinary terms, shape (P,).
+
+        +inf outside the priors' support.
+        """
         found = self(thetas)
         with np.errstate(invalid="ignore"):
             scaled = found.discrepancies / scales

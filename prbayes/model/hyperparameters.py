@@ -78,7 +78,10 @@ class Hyperparameters:
 
     @property
     def readable_names(self) -> list[str]:
-        """The same with the variables' own names, such as 'sigma'; they are transformed nevertheless."""
+        """The same with the variables' own names, such as 'sigma'.
+
+        They are transformed nevertheless.
+        """
         rvs = [self.model.values_to_rvs[v] for v in self.model.value_vars]
         return self._elements([str(rv.name) for rv in rvs])
 
@@ -128,7 +131,8 @@ class Hyperparameters:
         values = self._constrain(np.ascontiguousarray(thetas))
         found = {}
         for variable, value in zip(self.model.unobserved_RVs, values, strict=True):
-            # What does not depend on theta comes without the leading axis, or with one of length one.
+            # What does not depend on theta comes without the leading axis, or with one of length
+            # one.
             shape = (size, *np.shape(value)[1:])
             found[variable.name] = np.array(np.broadcast_to(value, shape))
         return found
@@ -202,7 +206,10 @@ class Hyperparameters:
 
     @cached_property
     def prior_sd(self) -> Floats:
-        """The prior's standard deviation of each element, robust, shape (d,): the unit of parameters."""
+        """The prior's standard deviation of each element, robust, shape (d,).
+
+        The unit of parameters.
+        """
         thetas = self.prior_thetas(_PRIOR_DRAWS, seed=0)
         upper, lower = np.quantile(thetas, _ONE_SD, axis=0)
         spread = (upper - lower) / 2

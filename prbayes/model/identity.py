@@ -1,8 +1,8 @@
 """`Identity`: what a result belongs to. One record of a problem, and one function that compares two of them.
 
-A result carries the identity of the problem that it was made from: an optimum, a posterior, a checkpoint on disk.
-Where it meets a model again, `require_same` refuses what is not the same problem. How much has to be the same
-depends on the question, see `Level`.
+A result carries the identity of the problem that it was made from: an optimum, a posterior, a
+checkpoint on disk. Where it meets a model again, `require_same` refuses what is not the same
+problem. How much has to be the same depends on the question, see `Level`.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from prbayes.model.description import describe, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node, nodes
 
-# Points of the prior at which densities and discrepancies are kept: a change that leaves the values at all of
-# them as they are is none that matters. A power of two, as Sobol points are balanced then.
+# Points of the prior at which densities and discrepancies are kept: a change that leaves the values
+# at all of them as they are is none that matters. A power of two, as Sobol points are balanced
+# then.
 _POINTS = 4
 # Responses kept of each simulator. Stored ones are appended to, so that the first stay the first.
 _RESPONSES = 8
@@ -35,13 +36,16 @@ _LONGEST = 60_000
 
 
 class Level(IntEnum):
-    """How much of two problems has to be the same; each level asks for what those before it ask for.
+    """How much of two problems has to be the same.
+
+    Each level asks for what those before it ask for.
 
     POPULATIONS
-        Hyperparameters, data, inputs and responses, so that a population of one is a population of the other.
+        Hyperparameters, data, inputs and responses, so that a population of one is a population of
+        the other.
     OPTIMUM
-        And priors, other likelihood terms, metrics and propagations: what is minimised. A design that has
-        grown since is the same problem.
+        And priors, other likelihood terms, metrics and propagations: what is minimised. A design
+        that has grown since is the same problem.
     POSTERIOR
         And epsilon.
     RUN
@@ -71,7 +75,8 @@ class SimulatorIdentity:
     ----------
     name : str
     data, weights, specimens : str
-        Digests of the observed values, their weights and the specimens' labels, in the order of the values.
+        Digests of the observed values, their weights and the specimens' labels, in the order of the
+        values.
     inputs : str
         The response's arguments, as PyMC prints them.
     metric, propagation : str
@@ -116,7 +121,8 @@ class Identity:
     prior_minimised : bool or None
         Whether minus the log prior was part of the objective; None for what was not minimised.
     thetas : tuple of tuple of float
-        Fixed points of the prior, elements in the order of the alphabet; empty if no numbers were asked for.
+        Fixed points of the prior, elements in the order of the alphabet; empty if no numbers were
+        asked for.
     log_prior, log_other : tuple of float
         Logarithms of the prior density, and of other likelihood terms, at these points.
     """
@@ -132,7 +138,10 @@ class Identity:
 
 
 def identity_of(evaluator: Evaluator, *, prior_minimised: bool | None = None) -> Identity:
-    """Return the identity of an evaluator's problem, with numbers; no response is computed for them."""
+    """Return the identity of an evaluator's problem, with numbers.
+
+    No response is computed for them.
+    """
     thetas = evaluator.hyperparameters.fixed_points(_POINTS)
     by_name = np.argsort(evaluator.names)
     simulators = []
@@ -152,7 +161,10 @@ def identity_of(evaluator: Evaluator, *, prior_minimised: bool | None = None) ->
 
 
 def identity_of_model(model: pm.Model) -> Identity:
-    """Return the identity of a model without what has to be compiled: densities and discrepancies."""
+    """Return the identity of a model without what has to be compiled.
+
+    Densities and discrepancies.
+    """
     simulators = [_simulator(node, np.empty(0)) for node in nodes(model).values()]
     shapes = {}
     for rv in model.free_RVs:
@@ -259,7 +271,10 @@ def as_attributes(identity: Identity) -> dict[str, str]:
 
 
 def from_attributes(attributes: Mapping[Any, Any]) -> Identity | None:
-    """Return the identity that a file has, or None: that of a result of other tools is not known."""
+    """Return the identity that a file has, or None.
+
+    That of a result of other tools is not known.
+    """
     try:
         return from_text(attributes["identity"])
     except (AttributeError, KeyError, TypeError, ValueError):
@@ -300,7 +315,10 @@ def require_same(
 
 
 def differences(got: Identity, expected: Identity, level: Level) -> list[str]:
-    """Return in what two problems differ, as far as a level asks for it, in words; numbers up to rounding."""
+    """Return in what two problems differ, as far as a level asks for it, in words.
+
+    Numbers up to rounding.
+    """
     if got.shapes != expected.shapes:
         return [_told("hyperparameters", _shown(got.shapes), _shown(expected.shapes))]
     names = [[s.name for s in one.simulators] for one in (got, expected)]

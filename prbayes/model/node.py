@@ -1,7 +1,10 @@
-"""What a simulator is inside a PyMC model: a `Node`, carried by the operation of an observed variable.
+"""What a simulator is inside a PyMC model.
 
-The operation is an instance of one class, `SimulatorRV`, whose log-density is registered once: a model that is
-pickled, cloned, conditioned or sent to another process needs nothing else than this module.
+A `Node`, carried by the operation of an observed variable.
+
+The operation is an instance of one class, `SimulatorRV`, whose log-density is registered once: a
+model that is pickled, cloned, conditioned or sent to another process needs nothing else than this
+module.
 """
 
 from __future__ import annotations
@@ -86,14 +89,18 @@ def shared_epsilon(name: str, value: float) -> Any:
 
 
 def log_kernel(discrepancy: Any, epsilon: Any) -> Any:
-    """Return the log-density of an observed node; the only place where the sign of a discrepancy changes."""
+    """Return the log-density of an observed node.
+
+    The only place where the sign of a discrepancy changes.
+    """
     return -discrepancy / epsilon
 
 
 class SimulatorRV(RandomVariable):
     """The operation of an observed variable: draws data sets, and carries its `Node`.
 
-    Two of them are equal if they carry the same node, so that no rewrite of a graph takes one simulator for another.
+    Two of them are equal if they carry the same node, so that no rewrite of a graph takes one
+    simulator for another.
 
     Attributes
     ----------
@@ -127,8 +134,9 @@ class SimulatorRV(RandomVariable):
     def own_node(self, apply: Apply[Any, Any]) -> Node:
         """Return the node that belongs to an application of this operation in a model.
 
-        Clones of a model share the operation with the original. Each is then given one of its own, whose design,
-        count and epsilon are copies: what is refined or set there leaves the original alone.
+        Clones of a model share the operation with the original. Each is then given one of its own,
+        whose design, count and epsilon are copies: what is refined or set there leaves the original
+        alone.
         """
         if self._owner is None:
             self._owner = weakref.ref(apply)
@@ -225,7 +233,8 @@ def _signature(ndims: Sequence[int]) -> str:
 def nodes(model: pm.Model) -> dict[Any, Node]:
     """Return the simulators of a model, keyed by their observed variables, in the model's order.
 
-    In a clone they are copies, made when they are first asked for, which its compiled functions follow from then on.
+    In a clone they are copies, made when they are first asked for, which its compiled functions
+    follow from then on.
     """
     found = {}
     for rv in model.observed_RVs:

@@ -37,19 +37,21 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     name : str
         Name of the node.
     response : callable
-        ``response(*inputs)``, a NumPy-style function: one array per input, any leading batch shape, a
-        multivariate input with its event axis last; returns an array of the batch shape, in units of the
-        observed values. NaN is a point at which it could not be computed, +inf a specimen that failed.
+        ``response(*inputs)``, a NumPy-style function: one array per input, any leading batch shape,
+        a multivariate input with its event axis last; returns an array of the batch shape, in units
+        of the observed values. NaN is a point at which it could not be computed, +inf a specimen
+        that failed.
     *inputs
-        Each is a ``.dist()`` (aleatory: varies between specimens), a model variable (epistemic: common to
-        all specimens) or a constant. The same ``.dist()`` in two simulators means the same specimens.
+        Each is a ``.dist()`` (aleatory: varies between specimens), a model variable (epistemic:
+        common to all specimens) or a constant. The same ``.dist()`` in two simulators means the
+        same specimens.
     metric : Metric
         How simulated and observed responses are compared.
     observed : array_like, shape (N,)
         Measured responses, one per specimen, at least two.
     epsilon : float, optional
-        Scale of the discrepancy. 1/N for metrics on the scale of a likelihood; unset for the others, until
-        `calibrate_epsilon` and `set_epsilon`, or `sample_smc`, set it.
+        Scale of the discrepancy. 1/N for metrics on the scale of a likelihood; unset for the
+        others, until `calibrate_epsilon` and `set_epsilon`, or `sample_smc`, set it.
     weights : array_like, shape (N,), optional
         Weights of the observed responses.
     specimens : array_like, shape (N,), optional
@@ -122,7 +124,10 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
 def _target(
     name: str, metric: Metric, observed: ArrayLike, weights: ArrayLike | None
 ) -> Discrepancy:
-    """Return the metric, prepared against the observed responses; mistakes are told with the name."""
+    """Return the metric, prepared against the observed responses.
+
+    Mistakes are told with the name.
+    """
     if not isinstance(metric, Metric):
         raise TypeError(
             f"{name}: metric: got {called(metric)}, expected a metric object such as "

@@ -30,8 +30,9 @@ class abc_distance(Op):  # noqa: N801 (reads as a function in a model)
 
     Notes
     -----
-    `pymc.Simulator` draws new responses at every evaluation, each given to all observations; numbers of
-    simulated and observed responses may differ. A simulated sample with NaN has log-density -inf.
+    `pymc.Simulator` draws new responses at every evaluation, each given to all observations;
+    numbers of simulated and observed responses may differ. A simulated sample with NaN has
+    log-density -inf.
 
     Examples
     --------

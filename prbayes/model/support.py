@@ -13,10 +13,6 @@ from prbayes.model.evaluator import Evaluator
 _LOW, _HIGH = 0.05, 0.95
 
 
-class DesignError(RuntimeError):
-    """A design that cannot support the answer, even after refinement."""
-
-
 @dataclass(frozen=True)
 class Level:
     """How well a design has to support populations.

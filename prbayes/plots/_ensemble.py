@@ -16,7 +16,7 @@ from prbayes._predict import populations_of
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import model_on_context
-from prbayes.model.support import DesignError
+from prbayes.propagation.base import DesignError
 
 # Populations in a band, whose sides are quantiles of so many curves: with 200 the standard error of
 # the share beyond one side of an 89% band is 1.6%, which a reader does not see; with 40, where each

@@ -1,1 +1,6 @@
 """Posterior uncertainty of the hyperparameters: epsilon, SMC-ABC, adjustment, bootstrap."""
+
+from prbayes.posterior.adjustment import Affine
+from prbayes.posterior.smc_kernel import BatchedKernel
+
+__all__ = ["Affine", "BatchedKernel"]

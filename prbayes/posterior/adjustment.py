@@ -26,7 +26,8 @@ _FAR = 6.0
 _REACH = 3.0
 # Standard error, in units of the prior's spread, up to which refits follow a direction.
 _WEAKEST = 2.0
-# Levels of the middle 89% of draws, and the width of a normal distribution's in standard deviations.
+# Levels of the middle 89% of draws, and the width of a normal distribution's in standard
+# deviations.
 _LEVELS = (0.055, 0.5, 0.945)
 _WIDTH = 3.2
 # Prior draws that tell its mean and precision along the axes.
@@ -38,10 +39,11 @@ _WITHOUT = "none: {}"
 class Affine:
     r"""An affine map of the draws, in unconstrained space, to the covariance and centre that the data warrant.
 
-    Data sets are drawn from the model at the optimum, and each is fitted anew. The covariance of the minimisers is the
-    inverse of A, the (Godambe) information in the data, and their median shift is the bias b of the minimiser; those
-    that run away, as where a scale may be zero, count as three standard errors off. With prior mean :math:`\theta_0`
-    and precision P the draws get covariance :math:`(A + P)^{-1}` and median
+    Data sets are drawn from the model at the optimum, and each is fitted anew. The covariance of
+    the minimisers is the inverse of A, the (Godambe) information in the data, and their median
+    shift is the bias b of the minimiser; those that run away, as where a scale may be zero, count
+    as three standard errors off. With prior mean :math:`\theta_0` and precision P the draws get
+    covariance :math:`(A + P)^{-1}` and median
     :math:`(A + P)^{-1} (A (\hat\theta - b) + P \theta_0)`, in the directions about which the data tell at least a
     quarter of what the prior does; along the others they keep their distribution given those.
 
@@ -199,7 +201,8 @@ def transported(
 def _among(sampling: SamplingDistribution, thetas: Floats) -> SamplingDistribution:
     """Return the distribution at the median of draws, (n, d), along directions not identified.
 
-    The optimum is anywhere along them, where the prior may hardly be; refits hold them at one place.
+    The optimum is anywhere along them, where the prior may hardly be; refits hold them at one
+    place.
     """
     local = sampling.local
     if not local.unidentified.size:

@@ -24,13 +24,14 @@ def bootstrap(
 ) -> xr.DataTree:
     """Minimise the discrepancy once for each of many data sets that resemble the observed one.
 
-    By default the observed specimens get Dirichlet weights: the loss-likelihood bootstrap, whose minimisers
-    are draws from a posterior without prior and without epsilon. The parametric bootstrap draws data sets
-    from the model at the optimum; its minimisers are the sampling distribution of the optimum. Observations
-    that share a specimen label are weighted, or drawn, together.
+    By default the observed specimens get Dirichlet weights: the loss-likelihood bootstrap, whose
+    minimisers are draws from a posterior without prior and without epsilon. The parametric
+    bootstrap draws data sets from the model at the optimum; its minimisers are the sampling
+    distribution of the optimum. Observations that share a specimen label are weighted, or drawn,
+    together.
 
-    With `Reweighted` each minimisation is exact and computes no response; with `Resimulated` it is of first
-    order.
+    With `Reweighted` each minimisation is exact and computes no response; with `Resimulated` it is
+    of first order.
 
     Parameters
     ----------
@@ -45,16 +46,17 @@ def bootstrap(
     Returns
     -------
     xarray.DataTree
-        Group ``posterior`` with dimensions (chain, draw), chain of length one, for ArviZ and `compare`; and
-        ``observed_data``. The attribute ``converged`` is the share of minimisations that did.
+        Group ``posterior`` with dimensions (chain, draw), chain of length one, for ArviZ and
+        `compare`; and ``observed_data``. The attribute ``converged`` is the share of minimisations
+        that did.
 
     Raises
     ------
     TypeError
         If ``optimum`` is no Optimum.
     ValueError
-        If the data tell less than the prior about a direction, along which the minimiser is anywhere; or if
-        nothing is known of a metric or propagation (`FunctionMetric`, `Fresh`).
+        If the data tell less than the prior about a direction, along which the minimiser is
+        anywhere; or if nothing is known of a metric or propagation (`FunctionMetric`, `Fresh`).
 
     References
     ----------

@@ -35,7 +35,9 @@ class Particles:
 
 
 class Chains:
-    """All chains on one design; saves its state after every stage, and takes over one that was saved.
+    """All chains on one design.
+
+    Saves its state after every stage, and takes over one that was saved.
 
     Attributes
     ----------

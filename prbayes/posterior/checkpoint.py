@@ -25,7 +25,8 @@ class Checkpoint:
     problem : Identity
         What is sampled.
     settings : dict
-        What the draws depend on besides; a file of another problem, or with other settings, is refused.
+        What the draws depend on besides; a file of another problem, or with other settings, is
+        refused.
 
     Raises
     ------
@@ -92,9 +93,7 @@ class Checkpoint:
         self.note = note
 
     def _refusal(self, what: str) -> str:
-        return (
-            f"checkpoint: {self.path} {what}; nothing was changed: move it away, or pass another path"
-        )
+        return f"checkpoint: {self.path} {what}; nothing was changed: move it away, or pass another path"
 
 
 def stored_settings(path: str | os.PathLike[str]) -> dict[str, Any]:

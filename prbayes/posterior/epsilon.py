@@ -23,7 +23,8 @@ _CLOUD = 500
 _SETS = 200
 # ArviZ's interval, for which compatibility with the rest of the package is wanted.
 _LEVEL = 0.89
-# How much wider than the sampling distribution the cloud is: it has to reach wherever posteriors do.
+# How much wider than the sampling distribution the cloud is: it has to reach wherever posteriors
+# do.
 _WIDER = 3.0
 # Times the noise floor: between these epsilon is looked for.
 _RANGE = (1e-3, 10.0)
@@ -35,14 +36,16 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
 
     - KLD and log-likelihood: 1/N, which puts them on the scale of a log-likelihood.
     - Other smooth metrics (probability residual): trace(H^-1 J) / p over the p identified directions, H the
-      Hessian of the discrepancy at the optimum and J the sampling covariance of its gradient: then the
-      posterior's covariance epsilon H^-1 matches the estimator's H^-1 J H^-1 on average.
+      Hessian of the discrepancy at the optimum and J the sampling covariance of its gradient: then
+      the posterior's covariance epsilon H^-1 matches the estimator's H^-1 J H^-1 on average.
     - Area metric: the epsilon with which 89% intervals of the posteriors of data sets simulated at the
-      optimum contain the optimum in 89% of cases, on average over the two directions that the data see best.
+      optimum contain the optimum in 89% of cases, on average over the two directions that the data
+      see best.
     - Metrics that declare nothing of their minimum, such as a `FunctionMetric` (`Reweighted` only): the mean, over
-      data sets simulated at the optimum and refitted, of delta . grad d / p at the minimiser plus delta, delta drawn
-      from the sampling distribution. For any density proportional to exp(-d / epsilon) that mean is epsilon, by
-      integration by parts; for a quadratic d it is trace(H Sigma) / p, which is the sandwich's.
+      data sets simulated at the optimum and refitted, of delta . grad d / p at the minimiser plus
+      delta, delta drawn from the sampling distribution. For any density proportional to exp(-d /
+      epsilon) that mean is epsilon, by integration by parts; for a quadratic d it is trace(H Sigma)
+      / p, which is the sandwich's.
 
     No response is computed under `Reweighted`.
 
@@ -59,10 +62,11 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
     Raises
     ------
     TypeError
-        For simulators with `Fresh`, or with `Resimulated` and a metric that declares nothing of its minimum: their
-        epsilon has to be given.
+        For simulators with `Fresh`, or with `Resimulated` and a metric that declares nothing of its
+        minimum: their epsilon has to be given.
     ValueError
-        If nothing is known around the optimum (``at_edge`` and ``at_jump`` of `Optimum`), or nothing is identified.
+        If nothing is known around the optimum (``at_edge`` and ``at_jump`` of `Optimum`), or
+        nothing is identified.
 
     References
     ----------
@@ -194,8 +198,8 @@ class _Cloud:
 def _by_coverage(information: Information) -> float:
     """Solve for the epsilon whose posteriors cover, the features taken as linear in theta."""
     area = information.area(*information.data_set)
-    # Strongest last. What a sample of one response tells beyond two directions, close to its location and its
-    # spread, is of the order of the error of derivatives of stored weights.
+    # Strongest last. What a sample of one response tells beyond two directions, close to its
+    # location and its spread, is of the order of the error of derivatives of stored weights.
     basis = seen_by_area(information)[:, -2:]
     _refuse_unidentified(information, basis.shape[1])
     shifts = first_order_shifts([information], np.ones(1), basis, information.data_sets)

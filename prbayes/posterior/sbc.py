@@ -1,4 +1,7 @@
-"""Simulation-based calibration: whether the whole procedure gives posteriors of the right width for a model."""
+"""Simulation-based calibration.
+
+Whether the whole procedure gives posteriors of the right width for a model.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,8 @@ from prbayes.posterior.smc import sample
 from prbayes.posterior.trees import calibration_tree
 
 _log = logging.getLogger("prbayes")
-# Data sets that a worker analyses before it reports: seconds of work, against milliseconds of sending the model.
+# Data sets that a worker analyses before it reports: seconds of work, against milliseconds of
+# sending the model.
 _CHUNK = 10
 
 
@@ -40,17 +44,18 @@ def simulation_based_calibration(
 ) -> xr.DataTree:
     """Calibrate many data sets with known hyperparameters, and rank these among the posterior's draws.
 
-    Each time hyperparameters are drawn from the prior, and specimens from their populations, for which the
-    response is called; then epsilon, `sample_smc` and its adjustment run as they would on measurements. If
-    posteriors have the right width and place, the ranks are uniform. A wide prior asks more than one true
-    value does: it shows what happens all over the prior.
+    Each time hyperparameters are drawn from the prior, and specimens from their populations, for
+    which the response is called; then epsilon, `sample_smc` and its adjustment run as they would on
+    measurements. If posteriors have the right width and place, the ranks are uniform. A wide prior
+    asks more than one true value does: it shows what happens all over the prior.
 
     Parameters
     ----------
     n : int
         Number of data sets.
     model : pymc.Model, optional
-        The one on the context by default. Its observed values matter only by their number, weights and labels.
+        The one on the context by default. Its observed values matter only by their number, weights
+        and labels.
     draws : int
         Draws of each posterior, in one chain.
     adjust : Affine or bool
@@ -64,17 +69,18 @@ def simulation_based_calibration(
     Returns
     -------
     xarray.DataTree
-        Group ``prior_sbc`` with dimensions (chain, draw), chain of length one and a draw per data set: ranks
-        scaled to the unit interval, for `arviz.plot_ecdf_pit`, which adds the envelope or a test of
-        uniformity. Group ``envelope``: the ECDF of the ranks of each variable, and ArviZ's simultaneous 95%
-        envelope for uniform ones; the attribute ``outside`` names the variables that leave it. Groups ``truth``
-        and ``posterior_sd`` alike. Data sets that could not be analysed are left out and counted in the
-        attribute ``failed``.
+        Group ``prior_sbc`` with dimensions (chain, draw), chain of length one and a draw per data
+        set: ranks scaled to the unit interval, for `arviz.plot_ecdf_pit`, which adds the envelope
+        or a test of uniformity. Group ``envelope``: the ECDF of the ranks of each variable, and
+        ArviZ's simultaneous 95% envelope for uniform ones; the attribute ``outside`` names the
+        variables that leave it. Groups ``truth`` and ``posterior_sd`` alike. Data sets that could
+        not be analysed are left out and counted in the attribute ``failed``.
 
     Raises
     ------
     TypeError, ValueError
-        If there is no model, or it has likelihood terms besides its simulators, whose data cannot be drawn.
+        If there is no model, or it has likelihood terms besides its simulators, whose data cannot
+        be drawn.
     RuntimeError
         If more than half of the data sets could not be analysed.
 

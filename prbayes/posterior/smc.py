@@ -66,35 +66,38 @@ def sample_smc(
     optimum : Optimum, optional
         Where to calibrate epsilon, and the centre of the adjustment; `minimize` finds it if needed.
     adjust : Affine or bool
-        Whether, and how, the draws are brought to the width that the data warrant. By default by `Affine()`,
-        unless an epsilon was given, which is then taken at its word; an `Affine` adjusts in any case.
+        Whether, and how, the draws are brought to the width that the data warrant. By default by
+        `Affine()`, unless an epsilon was given, which is then taken at its word; an `Affine`
+        adjusts in any case.
     threshold : float
         Share of the effective sample size that a stage keeps; higher means more stages.
     refine : bool
         Whether designs of `Reweighted` that do not support the posterior get more points.
     random_seed : int, optional
     checkpoint : path-like, optional
-        A file that keeps the state after every stage: a run that was killed goes on from there when it is
-        called again, and gives the same draws. Give the propagations a ``store`` as well, so that the search
-        for the optimum computes nothing again.
+        A file that keeps the state after every stage: a run that was killed goes on from there when
+        it is called again, and gives the same draws. Give the propagations a ``store`` as well, so
+        that the search for the optimum computes nothing again.
     progressbar : bool
 
     Returns
     -------
     xarray.DataTree
-        Groups ``posterior`` (chain, draw), ``unadjusted`` (the draws before the adjustment, if there was one),
-        ``sample_stats`` (chain, stage; NaN after the last stage),
-        ``calibration`` (discrepancy, epsilon, weight effective sample size, mean raw weight, lost mass,
-        ``discrepancy_error``: the Monte Carlo error of the discrepancy at the best draw; by simulator) and
-        ``observed_data``; ArviZ takes it, ``to_netcdf`` saves it. Attributes of ``posterior``:
-        ``log_marginal_likelihood``, from all chains, and ``log_marginal_likelihood_sd``, the spread of the
-        chains' own; a number to compare models by with one metric and one epsilon, and with no others.
+        Groups ``posterior`` (chain, draw), ``unadjusted`` (the draws before the adjustment, if
+        there was one), ``sample_stats`` (chain, stage; NaN after the last stage), ``calibration``
+        (discrepancy, epsilon, weight effective sample size, mean raw weight, lost mass,
+        ``discrepancy_error``: the Monte Carlo error of the discrepancy at the best draw; by
+        simulator) and ``observed_data``; ArviZ takes it, ``to_netcdf`` saves it. Attributes of
+        ``posterior``: ``log_marginal_likelihood``, from all chains, and
+        ``log_marginal_likelihood_sd``, the spread of the chains' own; a number to compare models by
+        with one metric and one epsilon, and with no others.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is not as described, no prior draw has a finite discrepancy, or nothing is known around the
-        optimum (``at_edge`` and ``at_jump`` of `Optimum`) and it is needed for epsilon or the adjustment.
+        If an argument is not as described, no prior draw has a finite discrepancy, or nothing is
+        known around the optimum (``at_edge`` and ``at_jump`` of `Optimum`) and it is needed for
+        epsilon or the adjustment.
     DesignError
         If a design does not support the posterior after refinement.
     StoreError
@@ -120,7 +123,7 @@ def sample_smc(
     model = model_on_context(model, "prb.sample_smc")
     if not isinstance(adjust, Affine | bool):
         got = f"{type(adjust).__name__} {adjust!r:.60}"
-        raise TypeError(f"adjust: got {got}, expected prb.Affine(), True or False")
+        raise TypeError(f"adjust: got {got}, expected prb.posterior.Affine(), True or False")
     if optimum is not None and not isinstance(optimum, Optimum):
         got = type(optimum).__name__
         raise TypeError(f"optimum: got {got}, expected an Optimum; call prb.minimize() first")
@@ -217,7 +220,10 @@ def sample(
 
 @dataclass(frozen=True, eq=False)
 class _Draws:
-    """The draws of one round: particles of the pseudo-posterior, and what an adjustment made of them."""
+    """The draws of one round.
+
+    Particles of the pseudo-posterior, and what an adjustment made of them.
+    """
 
     particles: Particles
     thetas: Floats
@@ -324,7 +330,10 @@ def _needs_optimum(evaluator: Evaluator, unset: list[Node], adjustment: Affine |
 
 
 def _evaluator(model: pm.Model, optimum: Optimum | None) -> Evaluator:
-    """Return the evaluator of a model; an optimum's own if it is this model's, and no optimum of another problem."""
+    """Return the evaluator of a model.
+
+    An optimum's own if it is this model's, and no optimum of another problem.
+    """
     if optimum is None:
         return Evaluator(model)
     evaluator = optimum.evaluator if optimum.model is model else Evaluator(model)
@@ -335,7 +344,8 @@ def _evaluator(model: pm.Model, optimum: Optimum | None) -> Evaluator:
 def _optima(optimum: Optimum, evaluator: Evaluator) -> tuple[Floats, ...]:
     """Return the optimum, and others that the data could as well come from.
 
-    Their elements are in the evaluator's order, which in a clone of the optimum's model may be another one.
+    Their elements are in the evaluator's order, which in a clone of the optimum's model may be
+    another one.
     """
     order = [optimum.names.index(name) for name in evaluator.names]
     rivals = [rival["theta"] for rival in optimum.rivals if rival["comparable"]]

@@ -15,14 +15,16 @@ from prbayes.model.node import model_on_context
 
 # Proposals at most in a stage: a bound on the cost where particles do not forget.
 _MAX_STEPS = 25
-# Mean absolute correlation with the particles before a stage at which they count as new draws; among 500 particles
-# that share nothing it is .036. On the way to the posterior six times as much will do: later stages forget the rest.
+# Mean absolute correlation with the particles before a stage at which they count as new draws;
+# among 500 particles that share nothing it is .036. On the way to the posterior six times as much
+# will do: later stages forget the rest.
 _UNCORRELATED = 0.05
 _ON_THE_WAY = 6
 # Gain in correlation below which more proposals are in vain.
 _NO_PROGRESS = 0.01
-# Random walks: the scale that is best for normal targets, and the acceptance rate that it is steered to
-# (Roberts, Gelman and Gilks 1997, doi:10.1214/aoap/1034625254: .234 in many dimensions, .44 in one).
+# Random walks: the scale that is best for normal targets, and the acceptance rate that it is
+# steered to (Roberts, Gelman and Gilks 1997, doi:10.1214/aoap/1034625254: .234 in many dimensions,
+# .44 in one).
 _WALK = 2.38
 _WALK_RATE = 0.3
 # Relative and absolute jitter that makes the covariance of identical particles a proper one.
@@ -33,10 +35,10 @@ _TINY = 1e-300
 class BatchedKernel(SMC_KERNEL):
     """SMC kernel that computes priors, responses and discrepancies of all particles in one call.
 
-    It mutates by independent proposals from a normal fitted to the particles, which forget the past at
-    once, in turn with random-walk proposals, which also move inside separate modes; until the particles
-    are uncorrelated with those before, or stop becoming less so. Also usable as
-    ``pymc.sample_smc(kernel=prbayes.BatchedKernel)``.
+    It mutates by independent proposals from a normal fitted to the particles, which forget the past
+    at once, in turn with random-walk proposals, which also move inside separate modes; until the
+    particles are uncorrelated with those before, or stop becoming less so. Also usable as
+    ``pymc.sample_smc(kernel=prbayes.posterior.BatchedKernel)``.
 
     Parameters
     ----------
@@ -148,7 +150,8 @@ class BatchedKernel(SMC_KERNEL):
         """Propose independent draws of the fitted normal; return the rate of acceptance."""
         proposed = fitted.mean + noise @ fitted.root.T
         here = np.linalg.solve(fitted.root, (self.tempered_posterior - fitted.mean).T)
-        # Log density of the normal, up to a constant, at the present place less that at the proposed one.
+        # Log density of the normal, up to a constant, at the present place less that at the
+        # proposed one.
         log_ratio = 0.5 * ((noise**2).sum(axis=1) - (here**2).sum(axis=0))
         return self._accept(proposed, log_ratio)
 
@@ -158,7 +161,10 @@ class BatchedKernel(SMC_KERNEL):
         return self._accept(proposed, np.zeros(len(proposed)))
 
     def _accept(self, proposed: Floats, log_ratio: Floats) -> float:
-        """Accept or reject by Metropolis and Hastings; ``log_ratio`` is that of the proposal's densities."""
+        """Accept or reject by Metropolis and Hastings.
+
+        ``log_ratio`` is that of the proposal's densities.
+        """
         prior, likelihood, discrepancies = self._evaluate(proposed)
         with np.errstate(invalid="ignore"):
             tempered = self.beta * (likelihood - self.likelihood_logp)
@@ -215,7 +221,10 @@ class BatchedKernel(SMC_KERNEL):
 
 @dataclass(frozen=True, eq=False)
 class _Normal:
-    """A normal distribution fitted to particles: mean, shape (d,), and Cholesky factor, shape (d, d)."""
+    """A normal distribution fitted to particles.
+
+    Mean, shape (d,), and Cholesky factor, shape (d, d).
+    """
 
     mean: Floats
     root: Floats

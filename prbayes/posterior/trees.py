@@ -39,7 +39,8 @@ def posterior_tree(
     evaluator : Evaluator
     thetas : ndarray, shape (chains, draws, d)
     discrepancies : ndarray, shape (chains, draws, k)
-        Before an adjustment; afterwards they are computed anew where that costs no response, and else NaN.
+        Before an adjustment; afterwards they are computed anew where that costs no response, and
+        else NaN.
     stats : list of dict
         By chain: statistics by name, one value per stage.
     unadjusted : ndarray, shape (chains, draws, d), or None

@@ -1,7 +1,7 @@
 """How a population of inputs becomes responses: `Reweighted`, `Resimulated`, `Fresh`.
 
-A propagation is configuration. ``bind`` makes the moving part for one simulator, a `Bound`, which gives
-the discrepancy as a graph of the hyperparameters and knows how many responses were computed.
+A propagation is configuration. ``bind`` makes the moving part for one simulator, a `Bound`, which
+gives the discrepancy as a graph of the hyperparameters and knows how many responses were computed.
 """
 
 from __future__ import annotations
@@ -30,9 +30,13 @@ from prbayes.response.failures import Abort, OnFailure
 from prbayes.response.inputs import Inputs
 from prbayes.response.response import Responses
 
-# Parts of a population's points whose differences tell its error: few enough that each is a design of its own, and
-# their spread is then known to about a quarter, 1 / sqrt(2 (8 - 1)).
+# Parts of a population's points whose differences tell its error: few enough that each is a design
+# of its own, and their spread is then known to about a quarter, 1 / sqrt(2 (8 - 1)).
 N_BLOCKS = 8
+
+
+class DesignError(RuntimeError):
+    """A design that cannot support the answer, even after refinement."""
 
 
 class Bound(ABC):
@@ -49,13 +53,15 @@ class Bound(ABC):
     symbolic : bool
         Whether the responses are part of the graph, so that `responses` does not count them.
     stored : bool
-        Whether the responses are stored, and theta moves their weights; then a theta costs no response.
+        Whether the responses are stored, and theta moves their weights; then a theta costs no
+        response.
     random : bool
         Whether every evaluation draws anew, so that the discrepancy is random and has no gradient.
     is_line : bool
         Whether the points are a quadrature rule of one dimension, whose error falls like 1 / n.
     draws : int
-        Number of evaluations so far that a random propagation's next draws depend on; with the seed it determines them.
+        Number of evaluations so far that a random propagation's next draws depend on; with the seed
+        it determines them.
     """
 
     n_per_theta: int = 0
@@ -100,7 +106,8 @@ class Bound(ABC):
 
     def discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy as a scalar graph of the roots' values."""
-        # Built on plain symbols: PyMC may clone parameters that are random, and a copy would be drawn, not given.
+        # Built on plain symbols: PyMC may clone parameters that are random, and a copy would be
+        # drawn, not given.
         symbols = self.inputs.placeholders()
         values = map(pt.as_tensor, params)
         swap = dict(zip(symbols, values, strict=True))
@@ -116,7 +123,10 @@ class Bound(ABC):
         """Return responses and weights of the populations at given roots, each of shape (k, n)."""
 
     def discrepancies(self, params: Sequence[Any], target: Discrepancy) -> Floats:
-        """Return the discrepancies of the populations at given roots, shape (k,); +inf where they are invalid."""
+        """Return the discrepancies of the populations at given roots, shape (k,).
+
+        +inf where they are invalid.
+        """
         size = len(params[0]) if params else 1
         result = np.full(size, np.inf)
         ok = self.valid(params)
@@ -133,7 +143,8 @@ class Bound(ABC):
     def discrepancy_error(self, params: Sequence[Any]) -> float:
         """Return the standard error of the discrepancy at given roots, shapes (1, ...), from leaving out each eighth.
 
-        Right for random draws (`Fresh`), and an upper bound for common points, which are better than random ones.
+        Right for random draws (`Fresh`), and an upper bound for common points, which are better
+        than random ones.
         """
         if self.n_points < 2 * N_BLOCKS:
             return np.nan
@@ -203,8 +214,8 @@ class Propagation(ABC):
             raise TypeError(f"store: got {type(store).__name__}, expected the path of a folder")
         if not isinstance(self.on_failure, OnFailure):
             raise TypeError(
-                f"on_failure: got {type(self.on_failure).__name__} {self.on_failure!r:.60}, expected prb.Abort(), "
-                "prb.Replace() or prb.Retry()"
+                f"on_failure: got {type(self.on_failure).__name__} {self.on_failure!r:.60}, expected prb.response.Abort(), "
+                "prb.response.Replace() or prb.response.Retry()"
             )
 
     @abstractmethod

@@ -23,7 +23,9 @@ from prbayes.response.response import Responses
 
 @dataclass(frozen=True)
 class Fresh(Propagation):
-    """New random draws at every evaluation, as in classic ABC; the discrepancy is noisy and has no gradient.
+    """New random draws at every evaluation, as in classic ABC.
+
+    The discrepancy is noisy and has no gradient.
 
     Parameters
     ----------

@@ -17,7 +17,8 @@ from prbayes.metrics.cells import Cells
 from prbayes.response.batches import batch_shape, broadcast_batch
 from prbayes.response.response import Responses
 
-# Calls of the user's functions have no compiled form; nothing is gained by saying so at every compilation.
+# Calls of the user's functions have no compiled form; nothing is gained by saying so at every
+# compilation.
 warnings.filterwarnings(
     "ignore",
     message="Numba will use object mode to run "
@@ -60,7 +61,10 @@ def float_output(ndim: int, *last: int) -> TensorVariable:
 
 
 class ResponseOp(OwnOp):
-    """The response as an operation; it has no gradient and is computed in one call for a whole batch."""
+    """The response as an operation.
+
+    It has no gradient and is computed in one call for a whole batch.
+    """
 
     def __init__(self, responses: Responses) -> None:
         self.responses = responses
@@ -81,7 +85,10 @@ class ResponseOp(OwnOp):
         return Apply(self, tensors, [float_output(ndim)])
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
-        """Call the response, but not for populations that are invalid: their quantiles are not finite."""
+        """Call the response, but not for populations that are invalid.
+
+        Their quantiles are not finite.
+        """
         k = len(self.responses.inputs.aleatory)
         batch = batch_shape(inputs, self.event_ndims)
         full = broadcast_batch(inputs, self.event_ndims, batch)
@@ -150,7 +157,10 @@ class DensityOp(OwnOp):
 
 
 class CotangentOp(OwnOp):
-    """A cotangent of a density on cells at the sample, (..., n), (..., m) -> (..., n): itself or its derivative."""
+    """A cotangent of a density on cells at the sample, (..., n), (..., m) -> (..., n).
+
+    Itself or its derivative.
+    """
 
     def __init__(self, cells: Cells, order: int) -> None:
         self.cells = cells

@@ -10,7 +10,8 @@ import numpy as np
 from prbayes._checks import Floats
 from prbayes.response.inputs import Inputs
 
-# Coordinates keep this distance from 0 and 1, where quantiles may be infinite; a point of 10^11 is ever closer.
+# Coordinates keep this distance from 0 and 1, where quantiles may be infinite; a point of 10^11 is
+# ever closer.
 _SMALLEST = 1e-12
 
 
@@ -42,7 +43,9 @@ def sobol(n: int, dimensions: int, seed: int) -> Floats:
 
 
 def monte_carlo(n: int, dimensions: int, seed: int) -> Floats:
-    """Return n independent random points in the open unit cube, shape (n, dimensions); for `Resimulated`.
+    """Return n independent random points in the open unit cube, shape (n, dimensions).
+
+    For `Resimulated`.
 
     Parameters
     ----------

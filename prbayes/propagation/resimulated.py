@@ -42,7 +42,8 @@ class Resimulated(Propagation):
         Seed of the scrambling.
     points : {"sobol", "monte_carlo"} or callable
         Scrambled Sobol points, random numbers that are the same for each theta, or a function
-        ``points(n, dimensions, seed)`` that returns points in the open unit cube, shape (n, dimensions).
+        ``points(n, dimensions, seed)`` that returns points in the open unit cube, shape (n,
+        dimensions).
     executor, store, on_failure
         As for `Reweighted`.
 
@@ -84,7 +85,8 @@ class ResimulatedBound(Bound):
         self._warn_of_few_responses()
         make_points = points_from(config.points)
         _, points = base_points(inputs, config.n, config.random_seed, make_points)
-        # What depends on constants alone, PyTensor computes once and keeps: fast, unless it is too large to keep.
+        # What depends on constants alone, PyTensor computes once and keeps: fast, unless it is too
+        # large to keep.
         keep = config.n <= _KEPT
         self._points: list[Any] = points if keep else [shared(u) for u in points]
         for dist, u in zip(inputs.aleatory, self._points, strict=True):

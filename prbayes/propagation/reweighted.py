@@ -1,4 +1,7 @@
-"""`Reweighted`, and its design: stored responses, the mixture density they were drawn from, weights."""
+"""`Reweighted`, and its design.
+
+Stored responses, the mixture density they were drawn from, weights.
+"""
 
 from __future__ import annotations
 
@@ -29,19 +32,22 @@ from prbayes.response.response import Responses
 
 _log = logging.getLogger("prbayes")
 
-# Components of a batch's mixture density: as many as there are points would be as good, and cost their square.
+# Components of a batch's mixture density: as many as there are points would be as good, and cost
+# their square.
 _COMPONENTS = 512
-# Draft points, whose response is not computed, for each point of a one-dimensional design; from 2^18 on they are a grid
-# that is fine enough for any design, so that more only cost time.
+# Draft points, whose response is not computed, for each point of a one-dimensional design; from
+# 2^18 on they are a grid that is fine enough for any design, so that more only cost time.
 _DRAFT = 16
 _LARGEST_DRAFT = 1 << 18
 # Components times points whose log-densities are held at a time: 32 MiB of floats.
 _CHUNK = 1 << 22
-# Responses under other conditions that are kept: more conditions than a study has, fewer than fill the memory.
+# Responses under other conditions that are kept: more conditions than a study has, fewer than fill
+# the memory.
 _OTHER_RESPONSES = 32
 # Batches differ in their seeds by a prime, so that seeds 0, 1, 2, ... of a user share no batch.
 _SEED_STEP = 7919
-# Inputs beyond which the weights become so uneven that another propagation is recommended (docs/choose.md).
+# Inputs beyond which the weights become so uneven that another propagation is recommended
+# (docs/choose.md).
 _MANY_INPUTS = 4
 
 
@@ -52,8 +58,8 @@ class Reweighted(Propagation):
     Parameters
     ----------
     n : int
-        Number of design points, drawn from the inputs' prior predictive distribution; the response is
-        computed n times, once. `refine` adds batches where they are needed.
+        Number of design points, drawn from the inputs' prior predictive distribution; the response
+        is computed n times, once. `refine` adds batches where they are needed.
     random_seed : int
         Seed of the design.
     max_lost : float
@@ -61,10 +67,12 @@ class Reweighted(Propagation):
     max_points : int, optional
         Largest number of design points, refinement included; 32 n by default.
     executor : Executor, optional
-        Where the response is computed: threads, processes, loky, ``dask.distributed.Client().get_executor()``,
-        ``mpi4py.futures.MPIPoolExecutor()``. In this process by default.
+        Where the response is computed: threads, processes, loky,
+        ``dask.distributed.Client().get_executor()``, ``mpi4py.futures.MPIPoolExecutor()``. In this
+        process by default.
     store : path-like, optional
-        A folder that keeps every computed response, by simulator: none is computed again, also in another run.
+        A folder that keeps every computed response, by simulator: none is computed again, also in
+        another run.
     on_failure : Abort, Replace or Retry
         What to do with a response that raises or is NaN.
 
@@ -153,8 +161,9 @@ class Batches:
 class Design(Bound):
     """Design points with their responses, and weights p(x given theta) / g(x) for every theta.
 
-    The points of a batch are stratified over a finite list of roots' values; the list is kept, and g is
-    exactly the mixture, over all batches, of the densities at the listed values (balance heuristic).
+    The points of a batch are stratified over a finite list of roots' values; the list is kept, and
+    g is exactly the mixture, over all batches, of the densities at the listed values (balance
+    heuristic).
     """
 
     stored: ClassVar[bool] = True
@@ -234,8 +243,8 @@ class Design(Bound):
     def required_ess(self) -> float:
         """The weight effective sample size that keeps design error well below sampling error.
 
-        Stratified points of one input integrate with an error that falls like 1/n, of several like n^(-3/4);
-        the size follows from asking that error to be a fraction of 1/sqrt(N).
+        Stratified points of one input integrate with an error that falls like 1/n, of several like
+        n^(-3/4); the size follows from asking that error to be a fraction of 1/sqrt(N).
         """
         root = np.sqrt(self.target.n_effective)
         if self._dimensions == 1:
@@ -253,7 +262,8 @@ class Design(Bound):
     def blocks(self) -> NDArray[np.intp]:
         """Which of eight coarser designs each point belongs to, shape (n,).
 
-        Consecutive points of a Sobol sequence, of which each stretch is a net of its own; on a line every eighth.
+        Consecutive points of a Sobol sequence, of which each stretch is a net of its own; on a line
+        every eighth.
         """
         if self.is_line:
             return np.arange(self.n_points) % N_BLOCKS
@@ -271,7 +281,10 @@ class Design(Bound):
         return [known[id(x)] for x in inputs.aleatory]
 
     def values_of(self, responses: Responses) -> Floats:
-        """Return another response of the design's specimens, shape (n,); none that is known is computed again."""
+        """Return another response of the design's specimens, shape (n,).
+
+        None that is known is computed again.
+        """
         if responses.same_as(self.responses):
             return self.values
         known = np.empty(0)
@@ -356,7 +369,8 @@ class Design(Bound):
         grid = np.unique(draft[np.isfinite(draft)])
         log_g, _ = self._log_mixture(components, counts, [grid], summed=False)
         density = np.exp(log_g)
-        # The distribution function by trapezoids, inverted at levels that are half open at a random place.
+        # The distribution function by trapezoids, inverted at levels that are half open at a random
+        # place.
         both_ends = density[1:] + density[:-1]
         trapezoids = 0.5 * both_ends * np.diff(grid)
         mass = np.concatenate([[0.0], np.cumsum(trapezoids)])
@@ -375,8 +389,8 @@ class Design(Bound):
     ) -> tuple[Floats, Floats]:
         """Return the log density of a mixture at points, (n,), and log sums of its components' weights, (2, k).
 
-        The sums over the points, if they are asked for, are of the weights, component over mixture, and of their
-        squares.
+        The sums over the points, if they are asked for, are of the weights, component over mixture,
+        and of their squares.
         """
         used = counts > 0
         log_share = np.log(counts[used, None] / counts.sum())
@@ -460,7 +474,8 @@ class Design(Bound):
         logs = self.log_weights(params)
         top = pt.max(logs)
         supported = top > -np.inf
-        # PyTensor's softmax is compiled with a backend of its own; the largest only guards against overflow.
+        # PyTensor's softmax is compiled with a backend of its own; the largest only guards against
+        # overflow.
         raw = pt.exp(pt.switch(supported, logs - disconnected_grad(top), 0.0))
         weights = raw / raw.sum()
         basis = tuple(self._shared[len(self.inputs.aleatory) + 1 :])
@@ -482,7 +497,10 @@ class Design(Bound):
         return np.broadcast_to(self.values, weights.shape), weights
 
     def discrepancies(self, params: Sequence[Any], target: Discrepancy) -> Floats:
-        """Return the discrepancies of the populations at given roots, shape (k,); +inf where none has support."""
+        """Return the discrepancies of the populations at given roots, shape (k,).
+
+        +inf where none has support.
+        """
         if self._basis[:2] != (target, self.n_points):
             self._basis = (target, self.n_points, target.basis(self.values))
         basis = self._basis[2]
@@ -498,9 +516,9 @@ class Design(Bound):
         Returns
         -------
         dict
-            ``weight_ess``, the effective sample size of the weights; ``mean_weight``, the mean raw weight
-            (1 in expectation; less when part of the population is out of the design's reach);
-            ``lost_mass``, the share of weight on points whose response is NaN.
+            ``weight_ess``, the effective sample size of the weights; ``mean_weight``, the mean raw
+            weight (1 in expectation; less when part of the population is out of the design's
+            reach); ``lost_mass``, the share of weight on points whose response is NaN.
         """
         (logs,) = self._log_weights(*params)
         total = _log_sum(logs, axis=-1)
@@ -526,7 +544,10 @@ def _end_to_end(first: Floats, second: Floats) -> Floats:
 
 
 def _log_sum(logs: Floats, axis: int) -> Floats:
-    """Return log(sum(exp(logs))), -inf where there is nothing: NumPy's logaddexp.reduce takes several times as long."""
+    """Return log(sum(exp(logs))), -inf where there is nothing.
+
+    NumPy's logaddexp.reduce takes several times as long.
+    """
     top = logs.max(axis=axis, keepdims=True, initial=-np.inf)
     top = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide="ignore"):

@@ -187,7 +187,9 @@ class Report(_Document):
         for section in made:
             if not isinstance(section, Section):
                 got = type(section).__name__
-                raise TypeError(f"Report: sections: got {got}, expected prb.Section objects")
+                raise TypeError(
+                    f"Report: sections: got {got}, expected prb.reports.Section objects"
+                )
         super().__init__(title, made, author, date)
 
 

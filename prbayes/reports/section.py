@@ -60,7 +60,7 @@ class Section(_Content):
     --------
     >>> import pandas as pd, prbayes as prb
     >>> batches = pd.DataFrame({"batch": ["A", "B"], "specimens": [11, 10]})
-    >>> prb.Section("Material", "Steel, as delivered.", batches).text
+    >>> prb.reports.Section("Material", "Steel, as delivered.", batches).text
     ('Steel, as delivered.',)
     """
 

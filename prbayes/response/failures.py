@@ -131,7 +131,9 @@ class Retry(OnFailure):
         positive_integer(self.times, "Retry: times")
         if not isinstance(self.then, OnFailure) or self.then.final is not self.then:
             got = type(self.then).__name__
-            raise TypeError(f"Retry: then: got {got}, expected prb.Abort() or prb.Replace()")
+            raise TypeError(
+                f"Retry: then: got {got}, expected prb.response.Abort() or prb.response.Replace()"
+            )
 
     @property
     def tries(self) -> int:

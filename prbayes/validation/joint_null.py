@@ -89,9 +89,7 @@ class JointNull(SimulatedNull):
     random_seed: int = 0
 
     def __post_init__(self) -> None:
-        advice = (
-            ", so that the model cannot be calibrated anew; use prb.validation.PosteriorNull()"
-        )
+        advice = ", so that the model cannot be calibrated anew; use prb.validation.PosteriorNull()"
         require_refits(self.optimum, "JointNull", advice)
         positive_integer(self.replicates, "JointNull: replicates", minimum=LEAST_REPLICATES)
         positive_integer(self.random_seed, "JointNull: random_seed", minimum=0)

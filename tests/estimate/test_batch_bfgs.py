@@ -20,13 +20,15 @@ def test_quadratics_with_their_own_data() -> None:
 
     x, values, converged = descend(value, np.zeros((30, 3)), np.eye(3), step=1e-3, tolerance=1e-10)
     assert converged.all()
-    # A promise below 2 tol leaves |x - c|^2 < tol / curvature, at least 0.3, by a Hessian that is not quite learned.
+    # A promise below 2 tol leaves |x - c|^2 < tol / curvature, at least 0.3, by a Hessian that is
+    # not quite learned.
     np.testing.assert_allclose(x, centers, atol=1e-3)
     np.testing.assert_allclose(values, np.arange(30), atol=1e-6)
 
 
 def test_a_curved_valley_and_a_wall() -> None:
-    # Rosenbrock's function, infinite on one side: steps have to be shortened, and the valley followed.
+    # Rosenbrock's function, infinite on one side: steps have to be shortened, and the valley
+    # followed.
     def value(x: Floats, rows: Any) -> Floats:
         f = 5 * (x[..., 1] - x[..., 0] ** 2) ** 2 + (1 - x[..., 0]) ** 2
         return np.where(x[..., 0] > 1.5, np.inf, f)

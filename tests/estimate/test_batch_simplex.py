@@ -30,7 +30,8 @@ def test_every_row_finds_its_own_minimum(name: str, r: int) -> None:
     value = FUNCTIONS[name]
     x, values, converged = descend_by_simplex(value, np.zeros((20, r)), sizes=SIZES)
     assert converged.all()
-    # A hundredth of the mean gain is the range over the last simplex, whose middle is not looked at.
+    # A hundredth of the mean gain is the range over the last simplex, whose middle is not looked
+    # at.
     gain = value(np.zeros((20, 1, r)), np.arange(20)).mean()
     assert values.max() < 0.06 * gain
     np.testing.assert_array_equal(values, value(x[:, None], np.arange(20))[:, 0])

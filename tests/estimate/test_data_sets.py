@@ -100,7 +100,8 @@ def means(sets: DataSets) -> list[Floats]:
     return [w @ v for v, w in zip(sets.values, sets.weights, strict=True)]
 
 
-# -- specimens -------------------------------------------------------------------------------------------
+# -- specimens
+# -------------------------------------------------------------------------------------------
 
 
 def test_numbers_and_groups_of_specimens() -> None:
@@ -148,7 +149,8 @@ def test_specimens_are_shared_through_others() -> None:
     assert siblings(nodes, {"a"}) == {"a", "b", "c"}
 
 
-# -- data sets drawn from the model ----------------------------------------------------------------------
+# -- data sets drawn from the model
+# ----------------------------------------------------------------------
 
 
 def test_simulated_sets_are_samples_of_the_population() -> None:
@@ -258,7 +260,8 @@ def test_fresh_data_of_shared_and_repeated_specimens() -> None:
     assert np.unique(repeated).size == N // 2
 
 
-# -- weights on what was observed ------------------------------------------------------------------------
+# -- weights on what was observed
+# ------------------------------------------------------------------------
 
 
 def test_dirichlet_weights() -> None:
@@ -266,7 +269,8 @@ def test_dirichlet_weights() -> None:
     (weights,) = reweighted_sets(Evaluator(build()), 4000).weights
     np.testing.assert_allclose(weights.sum(axis=1), 1)
     np.testing.assert_allclose(weights.mean(axis=0), 1 / N, rtol=4 / 4000**0.5)
-    # Var of an element of Dirichlet(1, ..., 1); the variance of 4000 squares of nearly exponential numbers: 5%.
+    # Var of an element of Dirichlet(1, ..., 1); the variance of 4000 squares of nearly exponential
+    # numbers: 5%.
     np.testing.assert_allclose(weights.var(axis=0).mean(), (N - 1) / (N**2 * (N + 1)), rtol=0.03)
     (weighted,) = reweighted_sets(Evaluator(build(weights=own)), 4000).weights
     np.testing.assert_allclose(
@@ -284,7 +288,8 @@ def test_shared_specimens_have_one_weight() -> None:
     np.testing.assert_allclose(repeated[:, ::2], repeated[:, 1::2])
 
 
-# -- refits ----------------------------------------------------------------------------------------------
+# -- refits
+# ----------------------------------------------------------------------------------------------
 
 
 @cache
@@ -341,7 +346,8 @@ def test_refits_are_minimisers(name: str) -> None:
         best = optimize.minimize(
             value, np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-12}
         )
-        # Gains of 1e-4 of a standard error's are left on the table: 0.02 standard errors, the area's kinks more.
+        # Gains of 1e-4 of a standard error's are left on the table: 0.02 standard errors, the
+        # area's kinks more.
         np.testing.assert_allclose(found, best.x, atol=0.15 if name == "area" else 0.04)
 
 
@@ -354,14 +360,16 @@ def test_the_observed_responses_are_fitted_by_the_optimum() -> None:
 
 @pytest.mark.parametrize("name", [slow("kl"), "pr", "area"])
 def test_first_order_without_a_design(name: str) -> None:
-    # The optima differ little between 512 fixed points and a design; data sets of the observed specimens are the same.
+    # The optima differ little between 512 fixed points and a design; data sets of the observed
+    # specimens are the same.
     sampling, first = neighbourhood(name), neighbourhood(name, design=False)
     sets = reweighted_sets(sampling.evaluator, 100)
     a = sampling.thetas(sampling.refit(sets)[0]) - sampling.theta
     b = first.thetas(first.refit(sets)[0]) - first.theta
     for i in range(2):
         assert np.corrcoef(a[:, i], b[:, i])[0, 1] > 0.9
-        # A linear model of distribution functions knows the spread of other data to 30%, one of densities to 10%.
+        # A linear model of distribution functions knows the spread of other data to 30%, one of
+        # densities to 10%.
         np.testing.assert_allclose(
             b[:, i].std(), a[:, i].std(), rtol=0.35 if name == "area" else 0.15
         )
@@ -374,7 +382,8 @@ def test_blocks_of_data_sets_make_no_difference(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(refit, "_BLOCK", 10 * 5 * (256 + sets.values[0].size))
     parts, converged = sampling.refit(sets)
     assert converged.size == 23
-    # Each block guesses its curvature from its own data sets, so that paths differ, but not where they lead.
+    # Each block guesses its curvature from its own data sets, so that paths differ, but not where
+    # they lead.
     np.testing.assert_allclose(parts, whole, atol=0.04)
 
 
@@ -401,7 +410,8 @@ def test_mean_hessian_of_a_parabola() -> None:
     np.testing.assert_allclose(lifted, np.diag([1.0, 0.05]), atol=1e-10)
 
 
-# -- one model, other data -------------------------------------------------------------------------------
+# -- one model, other data
+# -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["kl", slow("ll"), slow("pr"), "area"])
@@ -444,7 +454,8 @@ def test_observing_another_number_of_responses_drops_the_weights() -> None:
     np.testing.assert_allclose(other.nodes[0].target.weights, 0.1)
 
 
-# -- designs ---------------------------------------------------------------------------------------------
+# -- designs
+# ---------------------------------------------------------------------------------------------
 
 
 def test_batches_added_inside_are_undone() -> None:

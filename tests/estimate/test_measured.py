@@ -128,7 +128,8 @@ def test_data_sets_are_drawn_at_the_optimum() -> None:
     refits = Refits.at(evaluator, np.array([2.0]), np.ones(1))
     minimisers = 2.0 + refits.shifts[:, 0] * evaluator.prior_sd[0]
     assert abs(minimisers.mean() - 2.0) < 4 * 0.5 / (N * 200) ** 0.5
-    # A minimiser is nowhere worse than theta, and the mean gain is that of one squared standard error.
+    # A minimiser is nowhere worse than theta, and the mean gain is that of one squared standard
+    # error.
     np.testing.assert_allclose(refits.gain, 0.25 / N, rtol=4 * (2 / 200) ** 0.5)
 
 

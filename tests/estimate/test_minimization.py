@@ -29,7 +29,8 @@ METRICS: dict[str, prb.Metric] = {
     "pr": prb.ProbabilityResidual(),
     "area": prb.AreaMetric(),
 }
-# Largest error of 256 reweighted responses, in standard errors of the data: kinks cost the area metric some.
+# Largest error of 256 reweighted responses, in standard errors of the data: kinks cost the area
+# metric some.
 DESIGN_ERROR = {"kl": 0.03, "ll": 0.03, "pr": 0.03, "area": 0.08}
 METHODS = ("BFGS", "L-BFGS-B", "Nelder-Mead", "Powell", "CG")
 NORMAL = ("mu", "sigma")
@@ -61,7 +62,9 @@ def normal_model(
 ) -> pm.Model:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", response, x, metric=metric, observed=observed, propagation=propagation, **keywords)
+        prb.Simulator(
+            "y", response, x, metric=metric, observed=observed, propagation=propagation, **keywords
+        )
     return model
 
 
@@ -79,7 +82,9 @@ def node(model: pm.Model) -> Any:
 @cache
 def fitted(name: str) -> prb.Optimum:
     # A simplex where BFGS would walk along the kinks of the area metric: a third of the time.
-    return prb.minimize(normal_model(METRICS[name]), method="Nelder-Mead" if name == "area" else None)
+    return prb.minimize(
+        normal_model(METRICS[name]), method="Nelder-Mead" if name == "area" else None
+    )
 
 
 def pair(optimum: prb.Optimum) -> Floats:
@@ -96,23 +101,29 @@ def simplex(f: Callable[..., float], start: Floats, size: float, tolerance: floa
     return np.asarray(optimize.minimize(f, start, method="Nelder-Mead", options=options).x)
 
 
-# -- where the optimum is --------------------------------------------------------------------------------
+# -- where the optimum is
+# --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("name", "tolerance"), [("kl", 0.03), ("ll", 0.1)])
 def test_a_normal_population_gets_mean_and_sd_of_the_data(name: str, tolerance: float) -> None:
-    # Kullback-Leibler with one bandwidth for both sides matches moments; the likelihood is smoothed at one side
-    # only, with a bandwidth that costs at most a tenth of a standard error.
+    # Kullback-Leibler with one bandwidth for both sides matches moments; the likelihood is smoothed
+    # at one side only, with a bandwidth that costs at most a tenth of a standard error.
     optimum = fitted(name)
     assert optimum.converged
-    assert (np.abs(pair(optimum) - [MEAN, SD]) < tolerance * np.array([SD / N**0.5, SD / (2 * N) ** 0.5])).all()
+    assert (
+        np.abs(pair(optimum) - [MEAN, SD])
+        < tolerance * np.array([SD / N**0.5, SD / (2 * N) ** 0.5])
+    ).all()
 
 
 def residual(mu: Any, sigma: Any) -> Any:
     """The probability residual of a normal population, in closed form, without grid or design."""
     h = node(fitted("pr").model).target.cells.bandwidth
     scale = 100.0 ** -np.floor(np.log10(_kde(h).max()))
-    cross = norm.pdf(OBSERVED - mu[..., None], scale=np.sqrt(sigma**2 + 2 * h**2)[..., None]).mean(axis=-1)
+    cross = norm.pdf(OBSERVED - mu[..., None], scale=np.sqrt(sigma**2 + 2 * h**2)[..., None]).mean(
+        axis=-1
+    )
     data = norm.pdf(OBSERVED - OBSERVED[:, None], scale=np.sqrt(2) * h).mean()
     return scale * (1 / np.sqrt(4 * np.pi * (sigma**2 + h**2)) - 2 * cross + data)
 
@@ -134,7 +145,9 @@ def test_the_optimum_is_that_of_a_brute_force_grid(name: str, brute: Callable[..
     optimum = fitted(name)
     mu, sigma = np.meshgrid(np.linspace(0.5, 1.5, 41), np.linspace(0.2, 0.8, 41), indexing="ij")
     best = int(np.argmin(brute(mu.ravel(), sigma.ravel())))
-    start = np.array([mu.ravel()[best], sigma.ravel()[best]])  # refined from the best node: one basin
+    start = np.array(
+        [mu.ravel()[best], sigma.ravel()[best]]
+    )  # refined from the best node: one basin
     expected = simplex(lambda p: float(brute(np.array(p[0]), np.array(p[1]))), start, 0.02)
     assert (np.abs(pair(optimum) - start) < 0.025).all()
     assert (np.abs(pair(optimum) - expected) < DESIGN_ERROR[name] * errors(optimum)).all()
@@ -148,7 +161,9 @@ def test_reweighting_256_responses_agrees_with_resimulating_thousands(name: str)
     method, n = ("Nelder-Mead", 4096) if name == "area" else (None, 16384)
     model = normal_model(METRICS[name], prb.Resimulated(n))
     other = prb.minimize(model, method=method, start=fitted(name).point, tolerance=1e-4)
-    assert (np.abs(pair(other) - pair(fitted(name))) < DESIGN_ERROR[name] * errors(fitted(name))).all()
+    assert (
+        np.abs(pair(other) - pair(fitted(name))) < DESIGN_ERROR[name] * errors(fitted(name))
+    ).all()
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -161,8 +176,8 @@ def test_methods_agree(method: str) -> None:
 
 
 def test_a_quadratic_case_with_everything_mixed_in() -> None:
-    # With a known sd and one bandwidth for both sides the divergence is (mu - mean)^2 / (2 (sd^2 + h^2)) plus a
-    # constant; the ordinary likelihood and the potential are quadratic as well.
+    # With a known sd and one bandwidth for both sides the divergence is (mu - mean)^2 / (2 (sd^2 +
+    # h^2)) plus a constant; the ordinary likelihood and the potential are quadratic as well.
     extra = np.random.default_rng(2).normal(1.2, 0.5, 30)
     with pm.Model() as model:
         mu = pm.Normal("mu", 0, 2)
@@ -170,31 +185,43 @@ def test_a_quadratic_case_with_everything_mixed_in() -> None:
         prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
         pm.Normal("z", mu, 0.5, observed=extra)
         pm.Potential("pull", -5.0 * (mu - 3.0) ** 2)
-    precision = np.array([1 / (0.25 + node(model).target.cells.bandwidth ** 2), 30 / 0.25, 10.0, 1 / 4])
+    precision = np.array(
+        [1 / (0.25 + node(model).target.cells.bandwidth ** 2), 30 / 0.25, 10.0, 1 / 4]
+    )
     centers = np.array([MEAN, extra.mean(), 3.0, 0.0])
     plain = prb.minimize(model)
-    np.testing.assert_allclose(plain.point["mu"], precision[:3] @ centers[:3] / precision[:3].sum(), atol=1e-4)
+    np.testing.assert_allclose(
+        plain.point["mu"], precision[:3] @ centers[:3] / precision[:3].sum(), atol=1e-4
+    )
     assert plain.scales == {"y": 1.0}
-    with_prior = prb.minimize(model, prior=True)  # in units of log-densities: discrepancy / epsilon, epsilon = 1/N
+    with_prior = prb.minimize(
+        model, prior=True
+    )  # in units of log-densities: discrepancy / epsilon, epsilon = 1/N
     np.testing.assert_allclose(with_prior.scales["y"], 1 / N)
     precision[0] *= N
-    np.testing.assert_allclose(with_prior.point["mu"], precision @ centers / precision.sum(), atol=1e-4)
+    np.testing.assert_allclose(
+        with_prior.point["mu"], precision @ centers / precision.sum(), atol=1e-4
+    )
 
 
 def test_prior_true_is_find_map() -> None:
     model = fitted("kl").model
-    mode = pm.find_MAP(model=model, progressbar=False, return_inferencedata=True, jitter=False).posterior
+    mode = pm.find_MAP(
+        model=model, progressbar=False, return_inferencedata=True, jitter=False
+    ).posterior
     optimum = prb.minimize(model, prior=True)
     for name in NORMAL:
         np.testing.assert_allclose(optimum.point[name], float(mode[name].squeeze()), rtol=1e-4)
     assert abs(optimum.point["sigma"] - SD) > 1e-3  # the prior has an influence
 
 
-# -- several simulators ----------------------------------------------------------------------------------
+# -- several simulators
+# ----------------------------------------------------------------------------------
 
 
 def test_two_simulators_are_scaled_by_their_noise() -> None:
-    # The same specimens measured in metres and in millimetres: each counts the same, and the optimum is that of one.
+    # The same specimens measured in metres and in millimetres: each counts the same, and the
+    # optimum is that of one.
     with pm.Model() as model:
         x = pm.Normal.dist(1.0, pm.HalfNormal("sigma", 2))
         for name, unit in (("m", 1.0), ("mm", 1000.0)):
@@ -203,9 +230,14 @@ def test_two_simulators_are_scaled_by_their_noise() -> None:
                 propagation=R256,
             )  # fmt: skip
     optimum = prb.minimize(model)
-    # Noise floors are means over 200 simulated data sets whose discrepancies vary by 40%: standard error 3%.
-    np.testing.assert_allclose(optimum.scales["mm"] / optimum.scales["m"], 1000, rtol=5 * 0.03 * 2**0.5)
-    np.testing.assert_allclose(optimum.discrepancies["mm"] / optimum.discrepancies["m"], 1000, rtol=1e-6)
+    # Noise floors are means over 200 simulated data sets whose discrepancies vary by 40%: standard
+    # error 3%.
+    np.testing.assert_allclose(
+        optimum.scales["mm"] / optimum.scales["m"], 1000, rtol=5 * 0.03 * 2**0.5
+    )
+    np.testing.assert_allclose(
+        optimum.discrepancies["mm"] / optimum.discrepancies["m"], 1000, rtol=1e-6
+    )
     expected = sum(optimum.discrepancies[n] / optimum.scales[n] for n in ("m", "mm"))
     np.testing.assert_allclose(optimum.discrepancy, expected, rtol=1e-12)
     alone = simplex(lambda p: float(area(np.array(1.0), np.array(p[0]))), np.array([0.4]), 0.05)
@@ -218,12 +250,22 @@ def test_given_epsilons_weigh_the_simulators() -> None:
         mu = pm.Normal("mu", 0, 2)
         for name, data, epsilon in (("a", OBSERVED, 0.02), ("b", other, None)):
             x = pm.Normal.dist(mu, 0.5)
-            prb.Simulator(name, same, x, metric=METRICS["kl"], observed=data, epsilon=epsilon, propagation=R256)
+            prb.Simulator(
+                name,
+                same,
+                x,
+                metric=METRICS["kl"],
+                observed=data,
+                epsilon=epsilon,
+                propagation=R256,
+            )
     h = [n.target.cells.bandwidth for n in nodes(model).values()]
     precision = np.array([1 / 0.02, 20.0]) / (0.25 + np.square(h))  # unset: 1/N
     optimum = prb.minimize(model)
     np.testing.assert_allclose([optimum.scales["a"], optimum.scales["b"]], [0.02, 0.05])
-    np.testing.assert_allclose(optimum.point["mu"], precision @ [MEAN, other.mean()] / precision.sum(), atol=3e-4)
+    np.testing.assert_allclose(
+        optimum.point["mu"], precision @ [MEAN, other.mean()] / precision.sum(), atol=3e-4
+    )
     # Each gradient is linear in the mean of its data: the sandwich in closed form.
     noise = (precision**2 * np.array([0.25 / N, 0.25 / 20])).sum()
     np.testing.assert_allclose(optimum.stderr["mu"], noise**0.5 / precision.sum(), rtol=0.02)
@@ -244,7 +286,9 @@ def test_vector_hyperparameters_of_a_multivariate_input() -> None:
     optimum = prb.minimize(model)
     assert optimum.names == ["mean[0]", "mean[1]"]
     assert optimum.point["mean"].shape == optimum.stderr["mean"].shape == (2,)
-    expected = data.mean(axis=0)  # a quadratic in each mean; correlation does not matter to marginal conditions
+    expected = data.mean(
+        axis=0
+    )  # a quadratic in each mean; correlation does not matter to marginal conditions
     assert (np.abs(optimum.point["mean"] - expected) < 0.25 * optimum.stderr["mean"]).all()
     np.testing.assert_allclose(optimum.stderr["mean"], 1 / 30**0.5, rtol=0.1)
     np.testing.assert_allclose(optimum.point["gap"], np.diff(optimum.point["mean"])[0], rtol=1e-12)
@@ -253,7 +297,8 @@ def test_vector_hyperparameters_of_a_multivariate_input() -> None:
     assert list(tree["optimum"]["axis"].values) == ["a", "b"]
 
 
-# -- supports and starts ---------------------------------------------------------------------------------
+# -- supports and starts
+# ---------------------------------------------------------------------------------
 
 
 def priors(kind: str) -> tuple[Any, Any]:
@@ -261,7 +306,9 @@ def priors(kind: str) -> tuple[Any, Any]:
         return pm.Uniform("mu", 0, 5), pm.Uniform("sigma", 0.1, 2)
     if kind == "beta":
         return pm.Deterministic("mu", 3 * pm.Beta("share", 2, 2)), pm.Gamma("sigma", 2, 2)
-    return pm.Uniform("mu", 0, 5, default_transform=None), pm.HalfNormal("sigma", 1, default_transform=None)
+    return pm.Uniform("mu", 0, 5, default_transform=None), pm.HalfNormal(
+        "sigma", 1, default_transform=None
+    )
 
 
 @pytest.mark.parametrize("kind", ["uniform", "beta", "untransformed"])
@@ -298,7 +345,15 @@ def collapsing(spread: Callable[[], Any]) -> pm.Model:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1.5, 0.5), spread())
         coin, propagation = pm.Uniform.dist(0, 1), prb.Resimulated(512)
-        prb.Simulator("y", two_modes, x, coin, metric=METRICS["ll"], observed=observed, propagation=propagation)
+        prb.Simulator(
+            "y",
+            two_modes,
+            x,
+            coin,
+            metric=METRICS["ll"],
+            observed=observed,
+            propagation=propagation,
+        )
     return model
 
 
@@ -312,7 +367,9 @@ def collapsing(spread: Callable[[], Any]) -> pm.Model:
     ],
     ids=["wide", "inverse gamma", "coarse", "Powell"],
 )
-def test_a_collapsed_population_is_known_by_the_objective(spread: Callable[[], Any], keywords: dict[str, Any]) -> None:
+def test_a_collapsed_population_is_known_by_the_objective(
+    spread: Callable[[], Any], keywords: dict[str, Any]
+) -> None:
     """Not by standard errors: curvature and its noise are rounding errors there, and their ratio is anything."""
     optimum = prb.minimize(collapsing(spread), **keywords)
     assert optimum.point["sigma"] < 3e-3
@@ -343,12 +400,19 @@ def test_a_population_that_collapsed_within_the_bandwidth_is_no_convergence() ->
     said = prb.diagnose(optimum).messages
     assert "collapsed" in said[0]
     assert not any("did not converge" in line for line in said)
-    for call in (prb.calibrate_epsilon, prb.bootstrap, prb.cross_validate, prb.JointNull):
+    for call in (
+        prb.calibrate_epsilon,
+        prb.bootstrap,
+        prb.cross_validate,
+        prb.validation.JointNull,
+    ):
         with pytest.raises(ValueError, match=f"{call.__name__}: .*sigma ran to the edge"):
             call(optimum)
     with pytest.raises(ValueError, match=r"sample_smc: .*sigma ran to the edge .*adjust=False"):
         prb.sample_smc(50, chains=1, optimum=optimum, model=model, random_seed=1, progressbar=False)
-    tree = prb.sample_smc(50, chains=1, epsilon=1 / 20, adjust=False, optimum=optimum, model=model, random_seed=1)
+    tree = prb.sample_smc(
+        50, chains=1, epsilon=1 / 20, adjust=False, optimum=optimum, model=model, random_seed=1
+    )
     assert tree.posterior["sigma"].mean() > 10 * optimum.point["sigma"]
 
 
@@ -366,7 +430,9 @@ def lossy(name: str, seed: int, n: int) -> pm.Model:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1.65, 0.5), pm.HalfNormal("sigma", 0.3))
         coin, propagation = pm.Uniform.dist(0, 1), prb.Resimulated(n)
-        prb.Simulator("y", response, x, coin, metric=METRICS[name], observed=observed, propagation=propagation)
+        prb.Simulator(
+            "y", response, x, coin, metric=METRICS[name], observed=observed, propagation=propagation
+        )
     return model
 
 
@@ -407,13 +473,17 @@ def test_a_jump_that_hardly_matters_leaves_standard_errors_alone(name: str) -> N
     found = []
     for edge in (3.0, np.inf):
         model = normal_model(
-            METRICS[name], prb.Resimulated(100_000), lambda x, e=edge: np.where(np.abs(x - MEAN) < e * SD, x, np.nan)
+            METRICS[name],
+            prb.Resimulated(100_000),
+            lambda x, e=edge: np.where(np.abs(x - MEAN) < e * SD, x, np.nan),
         )
         found.append(prb.minimize(model))
     cut, whole = found
     assert cut.converged
     assert cut.at_jump == ()
-    np.testing.assert_allclose(errors(cut), errors(whole), rtol=0.25)  # a cut response does tell more about sigma
+    np.testing.assert_allclose(
+        errors(cut), errors(whole), rtol=0.25
+    )  # a cut response does tell more about sigma
 
 
 @pytest.mark.parametrize("name", ["ll", "pr"])
@@ -423,7 +493,9 @@ def test_an_optimum_far_outside_the_prior_is_not_taken_for_an_edge(name: str) ->
     optimum = prb.minimize(model, start={"mu": 1.0, "sigma": 0.002})
     assert optimum.converged
     assert optimum.at_edge == ()
-    np.testing.assert_allclose(optimum.point["sigma"], 0.002 * fitted(name).point["sigma"], rtol=0.1)
+    np.testing.assert_allclose(
+        optimum.point["sigma"], 0.002 * fitted(name).point["sigma"], rtol=0.1
+    )
     np.testing.assert_allclose(errors(optimum), 0.002 * errors(fitted(name)), rtol=0.5)
 
 
@@ -447,7 +519,9 @@ def test_the_start_is_honoured() -> None:
         ({"mu": [1.0, 2.0], "sigma": 1.0}, ValueError, "mu"),
     ],
 )
-def test_a_start_that_does_not_fit_is_refused(start: dict[str, Any], error: type[Exception], words: str) -> None:
+def test_a_start_that_does_not_fit_is_refused(
+    start: dict[str, Any], error: type[Exception], words: str
+) -> None:
     with pytest.raises(error, match=words):
         prb.minimize(fitted("pr").model, start=start)
 
@@ -455,7 +529,9 @@ def test_a_start_that_does_not_fit_is_refused(start: dict[str, Any], error: type
 def test_a_start_out_of_an_untransformed_support_is_refused() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Uniform("mu", 0, 5, default_transform=None), 0.5)
-        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=prb.Reweighted(64))
+        prb.Simulator(
+            "y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=prb.Reweighted(64)
+        )
     with pytest.raises(ValueError, match="inside the support"):
         prb.minimize(model, start={"mu": 6.0})
 
@@ -463,25 +539,35 @@ def test_a_start_out_of_an_untransformed_support_is_refused() -> None:
 @pytest.mark.parametrize("name", ["pr", "kl", "area"])
 def test_data_that_no_population_reaches_are_no_convergence(name: str) -> None:
     # All weight is on the outermost design point: nothing changes any more.
-    optimum = prb.minimize(normal_model(METRICS[name], observed=OBSERVED + 1000), refine=False, starts=0)
+    optimum = prb.minimize(
+        normal_model(METRICS[name], observed=OBSERVED + 1000), refine=False, starts=0
+    )
     assert not optimum.converged
     assert "try another start" in optimum.message
 
 
-@pytest.mark.parametrize("propagation", [R256, prb.Resimulated(1024)], ids=["reweighted", "resimulated"])
+@pytest.mark.parametrize(
+    "propagation", [R256, prb.Resimulated(1024)], ids=["reweighted", "resimulated"]
+)
 @pytest.mark.parametrize("name", ["pr", "kl"])
 @pytest.mark.parametrize("start", [(-3.0, 0.5), (30.0, 0.1)])  # 8 sd of the data away, and 58
 def test_far_starts_converge(name: str, propagation: Any, start: tuple[float, float]) -> None:
     model = far_model(name, propagation)
-    optimum = prb.minimize(model, start=dict(zip(NORMAL, start, strict=True)), refine=False, starts=0)
+    optimum = prb.minimize(
+        model, start=dict(zip(NORMAL, start, strict=True)), refine=False, starts=0
+    )
     assert optimum.converged
     assert "the area metric led from there" in optimum.message
     best = prb.minimize(model, start={"mu": MEAN, "sigma": SD}, refine=False, starts=0)
     assert "the area metric" not in best.message
     np.testing.assert_allclose(optimum.theta, best.theta, atol=1e-4)
     assert optimum.n_evaluations == optimum.trace["evaluations"][-1] > len(optimum.trace["theta"])
-    if propagation is not R256:  # the first point is the start itself, and not a draw of the prior that costs nothing
-        np.testing.assert_allclose(optimum.trace["theta"][0], [start[0], np.log(start[1])], rtol=1e-12)
+    if (
+        propagation is not R256
+    ):  # the first point is the start itself, and not a draw of the prior that costs nothing
+        np.testing.assert_allclose(
+            optimum.trace["theta"][0], [start[0], np.log(start[1])], rtol=1e-12
+        )
     np.testing.assert_allclose(optimum.trace["discrepancy"].min(), optimum.discrepancy, rtol=1e-9)
 
 
@@ -490,14 +576,23 @@ def far_model(name: str, propagation: Any) -> pm.Model:
     return normal_model(METRICS[name], propagation)
 
 
-@pytest.mark.parametrize("propagation", [R256, prb.Resimulated(1024)], ids=["reweighted", "resimulated"])
-def test_without_the_area_metric_a_far_start_does_not_arrive(propagation: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(minimization, "approach", lambda search, theta, *_: Approach(theta, Trace()))
-    optimum = prb.minimize(far_model("pr", propagation), start={"mu": 30.0, "sigma": 0.1}, refine=False, starts=0)
+@pytest.mark.parametrize(
+    "propagation", [R256, prb.Resimulated(1024)], ids=["reweighted", "resimulated"]
+)
+def test_without_the_area_metric_a_far_start_does_not_arrive(
+    propagation: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        minimization, "approach", lambda search, theta, *_: Approach(theta, Trace())
+    )
+    optimum = prb.minimize(
+        far_model("pr", propagation), start={"mu": 30.0, "sigma": 0.1}, refine=False, starts=0
+    )
     assert abs(optimum.point["mu"] - MEAN) > 1.0
 
 
-# -- standard errors -------------------------------------------------------------------------------------
+# -- standard errors
+# -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["kl", "ll"])
@@ -513,14 +608,20 @@ def test_standard_errors_of_the_area_metric_against_refitting_500_data_sets() ->
     fits = []
     for _ in range(500):
         data = np.sort(rng.normal(*start, N))[step]
-        fits.append(simplex(lambda p, data=data: float(np.abs(p[0] + p[1] * z - data).mean()), start, 0.04, 1e-4))
-    # The sd of 500 fits has a relative standard error of 3.2%, that of 200 linearised fits one of 5%: 6% together.
+        fits.append(
+            simplex(
+                lambda p, data=data: float(np.abs(p[0] + p[1] * z - data).mean()), start, 0.04, 1e-4
+            )
+        )
+    # The sd of 500 fits has a relative standard error of 3.2%, that of 200 linearised fits one of
+    # 5%: 6% together.
     np.testing.assert_allclose(errors(fitted("area")), np.std(fits, axis=0, ddof=1), rtol=4 * 0.06)
 
 
 @pytest.mark.slow
 def test_standard_errors_against_refitting_200_data_sets_with_minimize() -> None:
-    # Also the linearisation of the optimiser's own path: data sets from the population at the optimum.
+    # Also the linearisation of the optimiser's own path: data sets from the population at the
+    # optimum.
     for name in ("pr", "area"):
         optimum = fitted(name)
         mu, sigma = pair(optimum)
@@ -528,8 +629,11 @@ def test_standard_errors_against_refitting_200_data_sets_with_minimize() -> None
         fits = []
         for _ in range(200):
             model = normal_model(METRICS[name], observed=rng.normal(mu, sigma, N))
-            fits.append(pair(prb.minimize(model, method="Nelder-Mead", start=optimum.point, refine=False)))
-        # Both sides have a relative standard error of 5% for the area metric, one side has it for the residual.
+            fits.append(
+                pair(prb.minimize(model, method="Nelder-Mead", start=optimum.point, refine=False))
+            )
+        # Both sides have a relative standard error of 5% for the area metric, one side has it for
+        # the residual.
         np.testing.assert_allclose(errors(optimum), np.std(fits, axis=0, ddof=1), rtol=4 * 0.07)
 
 
@@ -542,7 +646,9 @@ def test_standard_errors_of_what_the_data_do_not_identify_are_infinite() -> None
             prb.Simulator("y", same, x, metric=metric, observed=OBSERVED, propagation=R256)
         optimum = prb.minimize(model)
         expected = errors(fitted("kl" if metric is METRICS["kl"] else "area"))
-        np.testing.assert_allclose(errors(optimum), expected, rtol=0.05 if metric is METRICS["kl"] else 0.25)
+        np.testing.assert_allclose(
+            errors(optimum), expected, rtol=0.05 if metric is METRICS["kl"] else 0.25
+        )
         assert np.isinf(optimum.stderr["idle"])
         assert optimum.n_responses <= 512  # an idle hyperparameter asks for no responses
 
@@ -554,12 +660,15 @@ def test_standard_errors_are_carried_to_deterministics() -> None:
         x = pm.Normal.dist(mu, sigma)
         prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
     optimum = prb.minimize(model)
-    np.testing.assert_allclose(optimum.point["both"], [2 * optimum.point["mu"], optimum.point["sigma"] ** 2])
+    np.testing.assert_allclose(
+        optimum.point["both"], [2 * optimum.point["mu"], optimum.point["sigma"] ** 2]
+    )
     slopes = [2.0, 2 * optimum.point["sigma"]]
     np.testing.assert_allclose(optimum.stderr["both"], slopes * errors(optimum), rtol=1e-3)
 
 
-# -- what it costs, and failure as a value ---------------------------------------------------------------
+# -- what it costs, and failure as a value
+# ---------------------------------------------------------------
 
 
 def test_responses_under_reweighted_are_those_of_the_design() -> None:
@@ -570,7 +679,12 @@ def test_responses_under_reweighted_are_those_of_the_design() -> None:
     assert optimum.n_responses == response.count == node(model).bound.n_points
     again = prb.minimize(model)  # the design is there already, and is part of this optimum as well
     assert again.n_responses == response.count == optimum.n_responses
-    assert optimum.n_evaluations == len(optimum.trace["discrepancy"]) == len(optimum.trace["theta"]) > 3
+    assert (
+        optimum.n_evaluations
+        == len(optimum.trace["discrepancy"])
+        == len(optimum.trace["theta"])
+        > 3
+    )
 
 
 def test_a_black_box_response_under_resimulated() -> None:
@@ -606,15 +720,20 @@ def test_fresh_draws_have_no_gradient_and_no_standard_errors() -> None:
     model = normal_model(METRICS["area"], prb.Fresh(200))
     with pytest.raises(TypeError, match=r"y: prb.Fresh .*Nelder-Mead"):
         prb.minimize(model)
-    optimum = prb.minimize(model, method="Nelder-Mead", start={"mu": 1.0, "sigma": 0.5}, max_evaluations=60)
+    optimum = prb.minimize(
+        model, method="Nelder-Mead", start={"mu": 1.0, "sigma": 0.5}, max_evaluations=60
+    )
     assert np.isnan(errors(optimum)).all()
-    assert abs(optimum.point["mu"] - MEAN) < 5 * 0.5 / 50**0.5  # the noise of 200 draws is half that of the data
+    assert (
+        abs(optimum.point["mu"] - MEAN) < 5 * 0.5 / 50**0.5
+    )  # the noise of 200 draws is half that of the data
 
 
 def test_a_users_own_metric_is_minimised_and_has_standard_errors() -> None:
     metric = prb.FunctionMetric(
         lambda z, observed, w: (
-            ((z * w).sum(axis=-1) - observed.mean()) ** 2 + ((z**2 * w).sum(axis=-1) - (observed**2).mean()) ** 2
+            ((z * w).sum(axis=-1) - observed.mean()) ** 2
+            + ((z**2 * w).sum(axis=-1) - (observed**2).mean()) ** 2
         ),
         weighted=True,
     )
@@ -634,7 +753,8 @@ def test_no_simulator_and_no_model() -> None:
         prb.minimize()
 
 
-# -- determinism and storage -----------------------------------------------------------------------------
+# -- determinism and storage
+# -----------------------------------------------------------------------------
 
 
 def test_bit_identical_twice() -> None:

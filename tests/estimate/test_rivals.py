@@ -60,7 +60,8 @@ def posterior(name: str) -> xr.DataTree:
     )
 
 
-# -- mirror solutions ------------------------------------------------------------------------------------
+# -- mirror solutions
+# ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", [slow("ll"), "pr", "area"])
@@ -169,7 +170,8 @@ def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
     assert rivals(*arguments, 1e3, starts=16, seed=0) == []
 
 
-# -- the posterior of two modes --------------------------------------------------------------------------
+# -- the posterior of two modes
+# --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", [slow("ll"), "pr", "area"])
@@ -183,7 +185,8 @@ def test_each_mode_is_adjusted_by_itself(name: str) -> None:
     np.testing.assert_array_equal(mu > 1, before > 1)
     assert 0.3 < (mu > 1).mean() < 0.7
     for side in (mu > 1, mu < 1):
-        # The sd of each mode is that of the estimator, not of the distance between modes; linear theory is 15% off.
+        # The sd of each mode is that of the estimator, not of the distance between modes; linear
+        # theory is 15% off.
         np.testing.assert_allclose(mu[side].std(), optimum.stderr["mu"], rtol=0.25)
         assert abs(abs(mu[side].mean() - 1) - 1) < 4 * optimum.stderr["mu"]
 
@@ -192,7 +195,7 @@ def test_modes_that_run_into_each_other_are_left_alone(caplog: pytest.LogCapture
     # An epsilon so large that the ridge between the modes is full of draws.
     with caplog.at_level(logging.WARNING, logger="prbayes"):
         idata = prb.sample_smc(
-            200, chains=1, model=fit("pr").model, optimum=fit("pr"), epsilon=5.0, adjust=prb.Affine(), random_seed=1,
+            200, chains=1, model=fit("pr").model, optimum=fit("pr"), epsilon=5.0, adjust=prb.posterior.Affine(), random_seed=1,
             progressbar=False,
         )  # fmt: skip
     assert (
@@ -203,7 +206,8 @@ def test_modes_that_run_into_each_other_are_left_alone(caplog: pytest.LogCapture
     assert "modes that run into each other; their width is epsilon's" in caplog.text
 
 
-# -- blind directions ------------------------------------------------------------------------------------
+# -- blind directions
+# ------------------------------------------------------------------------------------
 
 
 def local(blind: Any) -> Local:
@@ -244,7 +248,8 @@ def test_nothing_is_blind() -> None:
 
 @pytest.mark.parametrize("name", [slow("ll"), slow("kl"), "pr"])
 def test_a_sum_hides_a_difference(name: str) -> None:
-    # Both priors have the same spread, hence coefficients of one in its units; the response weighs b twice.
+    # Both priors have the same spread, hence coefficients of one in its units; the response weighs
+    # b twice.
     with pm.Model() as model:
         a, b = pm.Normal("a", 0, 1), pm.Normal("b", 0, 1, shape=1)
         x, z = pm.Normal.dist(a, 0.5), pm.Normal.dist(b[0], 0.5)
@@ -263,7 +268,8 @@ def test_a_sum_hides_a_difference(name: str) -> None:
 
 def test_rounding_errors_are_not_information() -> None:
     noise = np.diag([0.5, 1e-13])
-    # Curvature and noise of the second direction are rounding errors; their ratio looks like a standard error of 0.1.
+    # Curvature and noise of the second direction are rounding errors; their ratio looks like a
+    # standard error of 0.1.
     assert list(seen_by_curvature(np.diag([5.0, 3e-6]), noise)[2]) == [
         False,
         True,

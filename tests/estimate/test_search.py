@@ -48,7 +48,8 @@ def pair(optimum: prb.Optimum) -> Floats:
     return np.array([optimum.point["mu"], optimum.point["sigma"]])
 
 
-# -- budgets, tolerances, trace --------------------------------------------------------------------------
+# -- budgets, tolerances, trace
+# --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -110,7 +111,8 @@ def test_exact_and_differenced_gradients_agree() -> None:
     np.testing.assert_allclose(gradient, exact[1], rtol=1e-5)
 
 
-# -- starting points -------------------------------------------------------------------------------------
+# -- starting points
+# -------------------------------------------------------------------------------------
 
 
 def test_points_of_the_prior_are_spread_evenly_and_follow_hierarchies() -> None:
@@ -132,7 +134,8 @@ def test_points_of_the_prior_are_spread_evenly_and_follow_hierarchies() -> None:
     named = dict(zip(evaluator.names, thetas.T, strict=True))
     for name, frozen in (("center", stats.norm(3, 2)), ("sigma_log__", stats.gamma(2))):
         values = named[name] if name == "center" else np.exp(named[name])
-        # A net: one point in each of 256 intervals of equal probability; independent draws leave a third of them empty.
+        # A net: one point in each of 256 intervals of equal probability; independent draws leave a
+        # third of them empty.
         assert np.unique((frozen.cdf(values) * 256).astype(int)).size > 250
     for i in range(2):
         np.testing.assert_allclose(np.std(named[f"means[{i}]"] - named["center"]), 0.1, rtol=0.05)
@@ -173,7 +176,8 @@ def test_where_there_is_overlap_the_start_is_left_alone(propagation: Any) -> Non
     assert far.trace.count > 0
 
 
-# -- a million responses ---------------------------------------------------------------------------------
+# -- a million responses
+# ---------------------------------------------------------------------------------
 
 
 def test_monte_carlo_points_agree_with_sobol_points() -> None:
@@ -210,8 +214,8 @@ with pm.Model():
     optimum = prb.minimize(start={"mu": 0.8, "sigma": 0.7})
 assert optimum.converged, optimum.message
 assert abs(optimum.point["mu"] - 1) < 4 * optimum.stderr["mu"], optimum
-status = Path("/proc/self/status").read_text()  # ru_maxrss would begin with the size of the process that began this one
-print(int(status.split("VmHWM:")[1].split()[0]) / 2**20)
+status = Path("/proc/self/status").read_text()  # ru_maxrss would begin with the size of the process
+that began this one print(int(status.split("VmHWM:")[1].split()[0]) / 2**20)
 """
 
 

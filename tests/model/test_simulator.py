@@ -148,8 +148,10 @@ SAMPLERS: dict[str, Callable[[pm.Model], Any]] = {
     "NUTS": nuts,
     "stock SMC": stock_smc,
     "stock SMC, two cores": lambda model: stock_smc(model, cores=2),
-    "batched kernel": lambda model: stock_smc(model, prb.BatchedKernel),
-    "batched kernel, two cores": lambda model: stock_smc(model, prb.BatchedKernel, cores=2),
+    "batched kernel": lambda model: stock_smc(model, prb.posterior.BatchedKernel),
+    "batched kernel, two cores": lambda model: stock_smc(
+        model, prb.posterior.BatchedKernel, cores=2
+    ),
     "prbayes SMC": own_smc,
 }
 
@@ -319,7 +321,8 @@ def test_resimulated_counts_its_responses(response: Any) -> None:
         assert node.bound.responses.count == response.count
 
 
-# Samplers that compile the log-density with other backends: nutpie, and NumPyro through PyMC's JAX backend.
+# Samplers that compile the log-density with other backends: nutpie, and NumPyro through PyMC's JAX
+# backend.
 
 OF_OTHERS = [
     prb.AreaMetric(),

@@ -57,7 +57,7 @@ def test_predictions_of_unequal_size_give_u_values_that_arviz_draws(tmp_path: Pa
     """20 measured and 100 000 predicted responses: ArviZ's own test takes our u-values."""
     rng = np.random.default_rng(1)
     predicted = rng.normal(rng.normal(0, 0.25, (200, 1)), 1.0, (200, 500))
-    test = prb.area_test(rng.normal(0, 1, 20), predicted, null=prb.PosteriorNull(99))
+    test = prb.area_test(rng.normal(0, 1, 20), predicted, null=prb.validation.PosteriorNull(99))
     tree = xr.DataTree.from_dict({"posterior": xr.Dataset({"u": ("observation", test.u_values)})})
     pc = az.plot_ecdf_pit(tree, group="posterior", sample_dims="observation", backend="matplotlib")
     pc.savefig(tmp_path / "figure.png")

@@ -130,7 +130,9 @@ def test_what_the_stored_responses_do_not_reach(
     assert "stored responses do not reach there" in caplog.text
     far = posterior.copy(deep=True)
     far["posterior"]["mu"] = far["posterior"]["mu"] + 50
-    with pytest.raises(prb.DesignError, match="support 0 of 200 populations of the posterior"):
+    with pytest.raises(
+        prb.propagation.DesignError, match="support 0 of 200 populations of the posterior"
+    ):
         prb.plot_responses(far, model=optimum.model, backend="none")
 
 

@@ -14,11 +14,11 @@ import prbayes as prb
 RNG = np.random.default_rng(1)
 PREDICTED = RNG.normal(RNG.normal(0, 0.25, (200, 1)), 1.0, (200, 500))
 FRESH = RNG.normal(0, 1, 20)
-QUICK = prb.PosteriorNull(999)
+QUICK = prb.validation.PosteriorNull(999)
 
 
 @cache
-def validity(shift: float = 0.0, folded: bool = False) -> prb.ValidityTest:
+def validity(shift: float = 0.0, folded: bool = False) -> prb.validation.ValidityTest:
     return prb.area_test(FRESH + shift, PREDICTED, null=QUICK, folded=folded)
 
 

@@ -61,14 +61,17 @@ def fit(name: str, n: int = N) -> prb.Optimum:
 
 @cache
 def adjusted(name: str, n: int = N) -> xr.DataTree:
-    return sample(fit(name, n).model, optimum=fit(name, n), adjust=prb.Affine(n_sets=1000))
+    return sample(
+        fit(name, n).model, optimum=fit(name, n), adjust=prb.posterior.Affine(n_sets=1000)
+    )
 
 
 def thetas(idata: xr.DataTree) -> Floats:
     return np.asarray(idata.calibration["theta"]).reshape(-1, idata.calibration.sizes["element"])
 
 
-# -- the map ---------------------------------------------------------------------------------------------
+# -- the map
+# ---------------------------------------------------------------------------------------------
 
 
 @cache
@@ -97,7 +100,8 @@ def test_median_and_covariance_are_hit() -> None:
     np.testing.assert_allclose(np.median(new_x, axis=0), center, atol=0.1)
     np.testing.assert_allclose(np.cov(new_x, rowvar=False), covariance, rtol=1e-9)
 
-    # What the data do not see has the same distribution given the remainder: slopes and residuals of the regression.
+    # What the data do not see has the same distribution given the remainder: slopes and residuals
+    # of the regression.
     def regression(x: Floats, remainder: Floats) -> tuple[Floats, Floats]:
         design = np.column_stack([np.ones(len(x)), x])
         slopes = np.linalg.lstsq(design, remainder, rcond=None)[0]
@@ -148,7 +152,7 @@ def test_draws_get_the_moments_that_the_target_says() -> None:
     epsilon = idata.calibration["epsilon"].values
     sampling = SamplingDistribution.of(evaluator, optimum.theta, epsilon)
     prb.set_epsilon(optimum.model, {"y": epsilon[0]})
-    center, covariance = prb.Affine(n_sets=1000).target(sampling)
+    center, covariance = prb.posterior.Affine(n_sets=1000).target(sampling)
     x, _ = sampling.coordinates(thetas(idata))
     np.testing.assert_allclose(np.median(x, axis=0), center, atol=0.05)
     np.testing.assert_allclose(
@@ -157,12 +161,13 @@ def test_draws_get_the_moments_that_the_target_says() -> None:
 
 
 def test_the_target_combines_data_and_prior() -> None:
-    # Two observations and a narrow prior, both known: a normal mean, whose estimator is about the sample's.
+    # Two observations and a narrow prior, both known: a normal mean, whose estimator is about the
+    # sample's.
     data, prior_sd = np.array([2.5, 3.5]), 0.4
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 2.0, prior_sd), 0.5)
         prb.Simulator("y", same, x, metric=METRICS["ll"], observed=data, propagation=R256)
-    idata = sample(model, adjust=prb.Affine(n_sets=1000))
+    idata = sample(model, adjust=prb.posterior.Affine(n_sets=1000))
     information, precision = 2 / 0.25, 1 / prior_sd**2
     # Variances of 1000 data sets and of 1024 prior draws have relative standard errors of 4.5%.
     np.testing.assert_allclose(
@@ -172,7 +177,8 @@ def test_the_target_combines_data_and_prior() -> None:
     assert abs(float(idata.posterior["mu"].mean()) - expected) < 0.05
 
 
-# -- priors as tight as the data, and tighter ---------------------------------------------------------------
+# -- priors as tight as the data, and tighter
+# ---------------------------------------------------------------
 
 
 @cache
@@ -238,7 +244,7 @@ def test_a_standard_deviation_near_zero(name: str, sigma: float) -> None:
 
 def test_refits_that_ran_away_do_not_decide_the_width(monkeypatch: pytest.MonkeyPatch) -> None:
     sampling = idle_sampling()
-    before = prb.Affine().target(sampling)[1]
+    before = prb.posterior.Affine().target(sampling)[1]
     refit = SamplingDistribution.refit
 
     def some_lost(self: SamplingDistribution, sets: Any) -> Any:
@@ -247,17 +253,19 @@ def test_refits_that_ran_away_do_not_decide_the_width(monkeypatch: pytest.Monkey
         return x, ok
 
     monkeypatch.setattr(SamplingDistribution, "refit", some_lost)
-    after = prb.Affine().target(sampling)[1]
+    after = prb.posterior.Affine().target(sampling)[1]
     np.testing.assert_allclose(np.sqrt(np.diag(after)), np.sqrt(np.diag(before)), rtol=0.3)
 
 
-# -- widths and centres ----------------------------------------------------------------------------------
+# -- widths and centres
+# ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", [slow("ll"), "kl", slow("pr"), "area"])
 def test_widths_are_those_of_the_bootstrap_with_the_prior(name: str) -> None:
     idata = adjusted(name)
-    # Another seed: two sets of 1000 data sets, each with a standard error of 2.2%, and 600 draws matched exactly.
+    # Another seed: two sets of 1000 data sets, each with a standard error of 2.2%, and 600 draws
+    # matched exactly.
     sampling = prb.bootstrap(fit(name), 1000, parametric=True, random_seed=7).posterior
     changes = []
     for variable, log, prior in (
@@ -271,13 +279,14 @@ def test_widths_are_those_of_the_bootstrap_with_the_prior(name: str) -> None:
         np.testing.assert_allclose(float(draws.std()), expected, rtol=4 * 0.032)
         before = idata.unadjusted[variable]
         changes.append(abs(float((np.log(before) if log else before).std()) / expected - 1))
-    # The pseudo-posterior was not there before, or else this says nothing; the log-likelihood's is close.
+    # The pseudo-posterior was not there before, or else this says nothing; the log-likelihood's is
+    # close.
     assert max(changes) > 4 * 0.032 or name == "ll"
 
 
 @pytest.mark.parametrize("name", [slow("ll"), "kl"])
 def test_efficient_estimators_give_the_posterior_of_normal_data(name: str) -> None:
-    idata = sample(build(METRICS[name], sd=0.5), adjust=prb.Affine(n_sets=1000))
+    idata = sample(build(METRICS[name], sd=0.5), adjust=prb.posterior.Affine(n_sets=1000))
     precision = 1 / 4 + N / 0.25
     np.testing.assert_allclose(idata.posterior["mu"].std(), precision**-0.5, rtol=4 * 0.022 + 0.03)
     assert (
@@ -288,8 +297,9 @@ def test_efficient_estimators_give_the_posterior_of_normal_data(name: str) -> No
 
 @pytest.mark.parametrize("name", [slow("ll"), "kl", slow("pr"), "area"])
 def test_the_bias_is_taken_away(name: str) -> None:
-    # Twenty observations spread less around their own centre than around the truth: log sigma is underestimated by
-    # about (psi(19/2) - log 10) / 2 = -0.05 by all of these metrics, and the posterior has to lie above the optimum.
+    # Twenty observations spread less around their own centre than around the truth: log sigma is
+    # underestimated by about (psi(19/2) - log 10) / 2 = -0.05 by all of these metrics, and the
+    # posterior has to lie above the optimum.
     optimum, idata = fit(name, 20), adjusted(name, 20)
     sampling = np.log(
         prb.bootstrap(optimum, 1000, parametric=True, random_seed=7).posterior["sigma"]
@@ -307,13 +317,15 @@ def test_the_bias_is_taken_away(name: str) -> None:
     assert found > at + 0.02
 
 
-# -- what the response does not depend on ----------------------------------------------------------------
+# -- what the response does not depend on
+# ----------------------------------------------------------------
 
 LEVELS = [0.05, 0.25, 0.5, 0.75, 0.95]
 
 
 def assert_quantiles(draws: Any, distribution: Any, size: int) -> None:
-    # Standard errors of quantile levels sqrt(p q / n), n about half of the draws for the kernel's correlation.
+    # Standard errors of quantile levels sqrt(p q / n), n about half of the draws for the kernel's
+    # correlation.
     levels = distribution.cdf(np.quantile(draws, LEVELS))
     error = np.sqrt(np.array(LEVELS) * (1 - np.array(LEVELS)) / (size / 2))
     assert (np.abs(levels - LEVELS) < 4 * error).all()
@@ -352,12 +364,14 @@ def test_hyperparameters_that_follow_others_in_the_prior_still_do() -> None:
     assert_quantiles(residual, norm(0, 0.5), 1000)
     assert abs(np.corrcoef(residual, posterior["mu"].values.ravel())[0, 1]) < 4 / 500**0.5
     assert not np.allclose(posterior["mu"], idata.unadjusted["mu"])
-    # Its own regression: had the draws moved alone, residuals would be off by three times the motion of mu.
+    # Its own regression: had the draws moved alone, residuals would be off by three times the
+    # motion of mu.
     motion = 3 * (posterior["mu"] - idata.unadjusted["mu"]).values.ravel()
     assert motion.std() > 0.01
 
 
-# -- when there is an adjustment -------------------------------------------------------------------------
+# -- when there is an adjustment
+# -------------------------------------------------------------------------
 
 
 def adjustment(idata: xr.DataTree) -> str:
@@ -375,7 +389,7 @@ def test_a_given_epsilon_is_taken_at_its_word() -> None:
     )  # 1/N, which nobody gave
     assert adjustment(sample(optimum.model, epsilon=0.01, **short)) == "none"
     assert (
-        adjustment(sample(optimum.model, epsilon=0.01, adjust=prb.Affine(50, 3), **short))
+        adjustment(sample(optimum.model, epsilon=0.01, adjust=prb.posterior.Affine(50, 3), **short))
         == "Affine(n_sets=50, random_seed=3)"
     )
     assert adjustment(sample(optimum.model, adjust=False, **short)) == "none"
@@ -388,7 +402,7 @@ def test_an_explicit_adjustment_forgets_the_epsilon() -> None:
     # From draws far too wide and far too narrow: the same width.
     optimum = prb.minimize(build(METRICS["kl"], sd=0.5))
     runs = [
-        sample(optimum.model, optimum=optimum, epsilon=e, adjust=prb.Affine())
+        sample(optimum.model, optimum=optimum, epsilon=e, adjust=prb.posterior.Affine())
         for e in (0.2 / N, 5 / N)
     ]
     widths = [float(r.posterior["mu"].std()) for r in runs]
@@ -432,7 +446,7 @@ def test_the_unadjusted_draws_are_those_of_no_adjustment() -> None:
         idata.calibration["discrepancy"].values != plain.calibration["discrepancy"].values
     ).all()
     # Deterministic for a seed.
-    again = sample(fit("pr").model, optimum=fit("pr"), adjust=prb.Affine(n_sets=1000))
+    again = sample(fit("pr").model, optimum=fit("pr"), adjust=prb.posterior.Affine(n_sets=1000))
     xr.testing.assert_equal(again.posterior.to_dataset(), idata.posterior.to_dataset())
 
 
@@ -476,7 +490,9 @@ def test_what_cannot_be_adjusted_says_so(case: str, caplog: pytest.LogCaptureFix
     assert words in str(refit_obstacle(Evaluator(model)))
     # A FunctionMetric's epsilon has to be given: only an explicit Affine would adjust it.
     with caplog.at_level(logging.WARNING, logger="prbayes"):
-        idata = sample(model, 60, chains=1, adjust=prb.Affine() if case == "function" else True)
+        idata = sample(
+            model, 60, chains=1, adjust=prb.posterior.Affine() if case == "function" else True
+        )
     note = adjustment(idata)
     assert note.startswith("none: ")
     assert words in note
@@ -518,7 +534,8 @@ def test_data_that_tell_nothing_leave_the_prior() -> None:
     np.testing.assert_allclose(idata.posterior["mu"].std(), 0.01, rtol=4 / (2 * 200) ** 0.5)
 
 
-# -- specimens -------------------------------------------------------------------------------------------
+# -- specimens
+# -------------------------------------------------------------------------------------------
 
 
 def two_responses(metric: prb.Metric, *, labels: bool, same_input: bool = True) -> pm.Model:
@@ -567,7 +584,8 @@ def test_labels_of_different_inputs_are_refused_by_name() -> None:
             call()
 
 
-# -- saving ----------------------------------------------------------------------------------------------
+# -- saving
+# ----------------------------------------------------------------------------------------------
 
 
 def test_results_can_be_saved(tmp_path: Path) -> None:

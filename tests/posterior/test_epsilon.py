@@ -73,7 +73,8 @@ def known_sd(n: int | None = 256) -> tuple[prb.Optimum, Information]:
     return optimum, Information(evaluator, 0, optimum.theta)
 
 
-# -- likelihoods -----------------------------------------------------------------------------------------
+# -- likelihoods
+# -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -101,15 +102,17 @@ def test_calibration_of_a_likelihood_is_one_over_n_effective() -> None:
         assert node(model).epsilon_value == 7.0  # calibrating sets nothing
 
 
-# -- the sandwich of the residual ------------------------------------------------------------------------
+# -- the sandwich of the residual
+# ------------------------------------------------------------------------
 
 
 def closed_form(h: float, s: float, factor: float) -> tuple[float, float]:
     """H and J of the residual of a normal mean with known sd s, from Gaussian integrals.
 
-    d(mu) = S int (p - q)^2 with p = N(mu, v), v = s^2 + h^2, and q a mean of kernels of variance h^2. Against the
-    population itself, H = 2 S int (dp/dmu)^2. For one observation z the gradient is
-    -2 S d/dmu N(z; mu, w) plus a constant, w = v + h^2; J is its variance over N(mu, s^2), divided by N.
+    d(mu) = S int (p - q)^2 with p = N(mu, v), v = s^2 + h^2, and q a mean of kernels of variance
+    h^2. Against the population itself, H = 2 S int (dp/dmu)^2. For one observation z the gradient
+    is -2 S d/dmu N(z; mu, w) plus a constant, w = v + h^2; J is its variance over N(mu, s^2),
+    divided by N.
     """
     v, w = s**2 + h**2, s**2 + 2 * h**2
     curvature = factor / (2 * np.sqrt(np.pi) * v**1.5)
@@ -137,7 +140,8 @@ def test_sandwich_of_a_normal_mean(n: int | None) -> None:
     np.testing.assert_allclose(information.sampling_covariance, [[noise]], rtol=5e-3)
     np.testing.assert_allclose(prb.calibrate_epsilon(optimum)["y"], noise / hessian, rtol=5e-3)
     np.testing.assert_allclose(optimum.stderr["mu"], noise**0.5 / hessian, rtol=5e-3)
-    # Simulated data sets say the same: 200 of them give a variance with a relative standard error of 10%.
+    # Simulated data sets say the same: 200 of them give a variance with a relative standard error
+    # of 10%.
     np.testing.assert_allclose(
         np.var(information.gradients(*information.data_set), ddof=1), noise, rtol=0.5
     )
@@ -145,8 +149,8 @@ def test_sandwich_of_a_normal_mean(n: int | None) -> None:
 
 
 def test_the_posterior_width_that_it_gives() -> None:
-    # With one hyperparameter epsilon H^-1 is H^-1 J H^-1 exactly: the pseudo-posterior is as wide as the estimator
-    # is uncertain.
+    # With one hyperparameter epsilon H^-1 is H^-1 J H^-1 exactly: the pseudo-posterior is as wide
+    # as the estimator is uncertain.
     optimum, information = known_sd()
     epsilon = prb.calibrate_epsilon(optimum)["y"]
     thetas = np.linspace(-0.4, 0.4, 161)[:, None] + optimum.theta
@@ -160,15 +164,17 @@ def test_the_posterior_width_that_it_gives() -> None:
     assert information.noise_floor > 0
 
 
-# -- coverage for the area metric ------------------------------------------------------------------------
+# -- coverage for the area metric
+# ------------------------------------------------------------------------
 
 
 def test_area_epsilon_is_about_0_28_of_the_noise_floor() -> None:
     optimum = area_fit()
     evaluator = Evaluator(optimum.model)
     floor = Information(evaluator, 0, optimum.theta).noise_floor
-    # The floor is a mean over 200 data sets whose distances vary by 40%; the bisected coverage has a standard error
-    # of 1.6%, hence epsilon one of about 4%: 5% together. Bounds from the studies: 0.28 at N = 50, linear response.
+    # The floor is a mean over 200 data sets whose distances vary by 40%; the bisected coverage has
+    # a standard error of 1.6%, hence epsilon one of about 4%: 5% together. Bounds from the studies:
+    # 0.28 at N = 50, linear response.
     assert 0.22 < prb.calibrate_epsilon(optimum)["y"] / floor < 0.34
 
 
@@ -207,17 +213,19 @@ def test_area_posteriors_cover() -> None:
                 weights[values < truth - 1e-9].sum() + weights[np.isclose(values, truth)].sum() / 2
             )
             inside.append(abs(below - 0.5) < 0.445)
-    # 400 intervals of 200 data sets: standard error at most sqrt(.89 x .11 / 200) = 2.2%, and 1.6% of its own; 5% is
-    # left for the linearisation at N = 50.
+    # 400 intervals of 200 data sets: standard error at most sqrt(.89 x .11 / 200) = 2.2%, and 1.6%
+    # of its own; 5% is left for the linearisation at N = 50.
     assert abs(np.mean(inside) - 0.89) < 4 * 0.0275
 
 
-# -- units -----------------------------------------------------------------------------------------------
+# -- units
+# -----------------------------------------------------------------------------------------------
 
 
 def test_area_epsilon_has_the_units_of_the_response() -> None:
     one, ten = (prb.calibrate_epsilon(area_fit(unit))["y"] for unit in (1.0, 10.0))
-    # Where the optimiser stops differs in the ninth digit, and a bisected step function magnifies that.
+    # Where the optimiser stops differs in the ninth digit, and a bisected step function magnifies
+    # that.
     np.testing.assert_allclose(ten, 10 * one, rtol=0.01)
 
 
@@ -247,7 +255,8 @@ def test_a_hyperparameter_that_the_data_do_not_touch_changes_nothing() -> None:
         np.testing.assert_allclose(with_idle, alone, rtol=1e-3 if metric is PR else 0.05)
 
 
-# -- cost, and what it cannot do -------------------------------------------------------------------------
+# -- cost, and what it cannot do
+# -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("metric", [PR, AREA])
@@ -278,7 +287,8 @@ def test_what_cannot_be_refitted_is_refused_by_name() -> None:
 
 @pytest.mark.parametrize("factor", [1.0, 1e3, 1e-3])
 def test_epsilon_of_a_square_by_refits_is_twice_its_mean_gain(factor: float) -> None:
-    # The squared error of the mean: H = 2 and variance sd^2 / N, whatever factor it is multiplied by.
+    # The squared error of the mean: H = 2 and variance sd^2 / N, whatever factor it is multiplied
+    # by.
     own = prb.FunctionMetric(
         lambda z, y, w: factor * ((z * w).sum(axis=-1) - y.mean()) ** 2, weighted=True
     )
@@ -302,7 +312,8 @@ def test_something_else_than_an_optimum_is_refused() -> None:
         prb.calibrate_epsilon({"mu": 1.0})  # type: ignore[arg-type]
 
 
-# -- set_epsilon -----------------------------------------------------------------------------------------
+# -- set_epsilon
+# -----------------------------------------------------------------------------------------
 
 
 def test_set_epsilon_changes_what_is_named_and_nothing_on_error() -> None:

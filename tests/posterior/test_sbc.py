@@ -40,20 +40,33 @@ def same(x: Any) -> Any:
 
 
 def build(
-    metric: prb.Metric = METRICS["kl"], response: Callable[..., Any] = same, n: int = N, **keywords: Any
+    metric: prb.Metric = METRICS["kl"],
+    response: Callable[..., Any] = same,
+    n: int = N,
+    **keywords: Any,
 ) -> pm.Model:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
-        prb.Simulator("y", response, x, metric=metric, observed=OBSERVED[:n], **({"propagation": R256} | keywords))
+        prb.Simulator(
+            "y",
+            response,
+            x,
+            metric=metric,
+            observed=OBSERVED[:n],
+            **({"propagation": R256} | keywords),
+        )
     return model
 
 
-# -- bootstrap -------------------------------------------------------------------------------------------
+# -- bootstrap
+# -------------------------------------------------------------------------------------------
 
 
 @cache
 def fit(name: str, propagation: Any = R256) -> prb.Optimum:
-    return prb.minimize(build(METRICS[name], propagation=propagation), method="Nelder-Mead", starts=0)
+    return prb.minimize(
+        build(METRICS[name], propagation=propagation), method="Nelder-Mead", starts=0
+    )
 
 
 @pytest.mark.parametrize("name", [pytest.param("ll", marks=pytest.mark.slow), "kl"])
@@ -62,14 +75,20 @@ def test_standard_deviations_of_a_normal_mean(name: str, parametric: bool) -> No
     result = prb.bootstrap(fit(name), 1000, parametric=parametric)
     draws = result.posterior["mu"]
     assert draws.shape == (1, 1000)
-    # The minimiser is about the mean: its Dirichlet weighted variance is s^2 / (N + 1), its sampling variance 0.5^2 / N
-    # with the model's sd. 1000 draws: 2.2%; the mean is not quite the minimiser, nor these data normal: 6%.
+    # The minimiser is about the mean: its Dirichlet weighted variance is s^2 / (N + 1), its
+    # sampling variance 0.5^2 / N with the model's sd. 1000 draws: 2.2%; the mean is not quite the
+    # minimiser, nor these data normal: 6%.
     expected = 0.5 / N**0.5 if parametric else SD / (N + 1) ** 0.5
     np.testing.assert_allclose(float(draws.std()), expected, rtol=4 * 0.022 + 0.06)
     assert abs(0.5 / SD - 1) > 0.1  # the two are told apart
-    assert abs(float(draws.mean()) - fit(name).point["mu"]) < 4 * expected / 1000**0.5 + 0.05 * expected
+    assert (
+        abs(float(draws.mean()) - fit(name).point["mu"])
+        < 4 * expected / 1000**0.5 + 0.05 * expected
+    )
     assert result.posterior.attrs["converged"] == 1.0
-    assert result.posterior.attrs["sampler"].startswith("parametric" if parametric else "loss-likelihood")
+    assert result.posterior.attrs["sampler"].startswith(
+        "parametric" if parametric else "loss-likelihood"
+    )
     np.testing.assert_array_equal(result.observed_data["y"], OBSERVED)
 
 
@@ -105,14 +124,17 @@ def test_what_cannot_be_bootstrapped_is_refused() -> None:
         prb.Simulator("y", same, x, metric=METRICS["kl"], observed=OBSERVED, propagation=R256)
     optimum = prb.minimize(model, starts=0)
     for parametric in (False, True):
-        with pytest.raises(ValueError, match="bootstrap: the data tell less than the prior about idle, along which"):
+        with pytest.raises(
+            ValueError, match="bootstrap: the data tell less than the prior about idle, along which"
+        ):
             prb.bootstrap(optimum, 10, parametric=parametric)
     model = build(propagation=prb.Fresh(64))
     with pytest.raises(ValueError, match=r"bootstrap: y has prb\.Fresh"):
         prb.bootstrap(prb.minimize(model, method="Nelder-Mead", max_evaluations=5), 10)
 
 
-# -- simulation-based calibration: where it runs ---------------------------------------------------------
+# -- simulation-based calibration: where it runs
+# ---------------------------------------------------------
 
 RUN = {"n": 6, "draws": 50, "progressbar": False}  # fifty draws, or there is no adjustment
 
@@ -141,7 +163,9 @@ def executors() -> Iterator[dict[str, Executor]]:
     ("kind", "response"),
     [
         pytest.param("threads", bent, id="threads-module"),
-        pytest.param("threads", lambda x: x + 0.1 * x**2, id="threads-lambda", marks=pytest.mark.slow),
+        pytest.param(
+            "threads", lambda x: x + 0.1 * x**2, id="threads-lambda", marks=pytest.mark.slow
+        ),
         pytest.param("processes", bent, id="processes-module"),
         pytest.param("processes", lambda x: x + 0.1 * x**2, id="processes-lambda"),
     ],
@@ -193,7 +217,9 @@ def test_the_result_is_complete_and_the_model_as_before() -> None:
 def test_data_sets_do_not_depend_on_their_number() -> None:
     model, result = serial()
     few = prb.simulation_based_calibration(model=model, **(RUN | {"n": 3}))
-    np.testing.assert_array_equal(few.prior_sbc["mu"].values[0], result.prior_sbc["mu"].values[0, :3])
+    np.testing.assert_array_equal(
+        few.prior_sbc["mu"].values[0], result.prior_sbc["mu"].values[0, :3]
+    )
     other = prb.simulation_based_calibration(model=model, random_seed=1, **(RUN | {"n": 2}))
     assert not np.isin(other.truth["mu"].values, result.truth["mu"].values).any()
 
@@ -229,27 +255,37 @@ def test_it_can_be_drawn_and_saved(tmp_path: Path) -> None:
             xr.testing.assert_identical(again[group].to_dataset(), result[group].to_dataset())
 
 
-# -- failures --------------------------------------------------------------------------------------------
+# -- failures
+# --------------------------------------------------------------------------------------------
 
 
 def breaking(x: Any) -> Any:
-    return np.where(x < -1, np.inf, x)  # hardly any specimen of a population around -2 can be observed
+    return np.where(
+        x < -1, np.inf, x
+    )  # hardly any specimen of a population around -2 can be observed
 
 
 def test_failures_are_counted_and_not_lost(caplog: pytest.LogCaptureFixture) -> None:
     model = build(METRICS["area"], breaking, n=20, epsilon=0.1)
     with caplog.at_level(logging.WARNING, logger="prbayes"):
-        result = prb.simulation_based_calibration(12, model=model, draws=20, adjust=False, progressbar=False)
+        result = prb.simulation_based_calibration(
+            12, model=model, draws=20, adjust=False, progressbar=False
+        )
     failed = result.prior_sbc.attrs["failed"]
     # Specimens around mu < -1.3 fail in three cases of four: 10% of the prior.
     assert 1 <= failed <= 6
     assert result.prior_sbc.sizes["draw"] == 12 - failed
-    assert f"{failed} of 12 data sets could not be analysed; the first: ValueError: y: got" in caplog.text
+    assert (
+        f"{failed} of 12 data sets could not be analysed; the first: ValueError: y: got"
+        in caplog.text
+    )
     assert (result.truth["mu"] > -1.5).all()
 
 
 @pytest.mark.parametrize("error", [ValueError, RuntimeError, np.linalg.LinAlgError])
-def test_single_failures_leave_the_others_as_they_are(error: type[Exception], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_single_failures_leave_the_others_as_they_are(
+    error: type[Exception], monkeypatch: pytest.MonkeyPatch
+) -> None:
     original, calls = sbc._one, []
 
     def sometimes(*arguments: Any) -> Any:
@@ -264,7 +300,9 @@ def test_single_failures_leave_the_others_as_they_are(error: type[Exception], mo
     monkeypatch.setattr(sbc, "_one", sometimes)
     result = prb.simulation_based_calibration(6, **keywords)
     assert result.prior_sbc.attrs["failed"] == 2
-    np.testing.assert_array_equal(result.prior_sbc["mu"].values, whole.prior_sbc["mu"].values[:, [1, 2, 4, 5]])
+    np.testing.assert_array_equal(
+        result.prior_sbc["mu"].values, whole.prior_sbc["mu"].values[:, [1, 2, 4, 5]]
+    )
 
 
 def test_mostly_failures_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -290,20 +328,27 @@ def test_mistakes_are_not_failures(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_cannot_be_simulated_is_refused() -> None:
     with build() as model:
         pm.Normal("z", model["mu"], 1.0, observed=OBSERVED)
-    with pytest.raises(ValueError, match="likelihood terms or potentials besides its simulators, whose data cannot"):
+    with pytest.raises(
+        ValueError, match="likelihood terms or potentials besides its simulators, whose data cannot"
+    ):
         prb.simulation_based_calibration(2, model=model, progressbar=False)
     with build() as model:
         pm.Potential("z", -(model["mu"] ** 2))
     with pytest.raises(ValueError, match="likelihood terms or potentials"):
         prb.simulation_based_calibration(2, model=model, progressbar=False)
-    with pytest.raises(TypeError, match=r"prb\.simulation_based_calibration: got no model on the context"):
+    with pytest.raises(
+        TypeError, match=r"prb\.simulation_based_calibration: got no model on the context"
+    ):
         prb.simulation_based_calibration(2, progressbar=False)
     for keywords, words in (({"n": 1}, "n: "), ({"draws": 5}, "draws: ")):
         with pytest.raises(ValueError, match=words):
-            prb.simulation_based_calibration(**({"n": 2, "model": build(), "progressbar": False} | keywords))
+            prb.simulation_based_calibration(
+                **({"n": 2, "model": build(), "progressbar": False} | keywords)
+            )
 
 
-# -- what it is for --------------------------------------------------------------------------------------
+# -- what it is for
+# --------------------------------------------------------------------------------------
 
 
 def spread(result: xr.DataTree) -> Floats:
@@ -313,8 +358,9 @@ def spread(result: xr.DataTree) -> Floats:
 
 
 def test_overconfidence_shows() -> None:
-    # Ten times too small an epsilon: posteriors are too narrow by sqrt(10), and ranks Phi(sqrt(10) z) have a mean
-    # square of asin(10/11) / (2 pi) = 0.18, six standard errors of 25 uniform ones above 1/12.
+    # Ten times too small an epsilon: posteriors are too narrow by sqrt(10), and ranks Phi(sqrt(10)
+    # z) have a mean square of asin(10/11) / (2 pi) = 0.18, six standard errors of 25 uniform ones
+    # above 1/12.
     narrow = prb.simulation_based_calibration(
         25, model=build(epsilon=0.1 / N), draws=50, adjust=False, progressbar=False
     )
@@ -324,14 +370,18 @@ def test_overconfidence_shows() -> None:
 @pytest.mark.slow
 def test_underconfidence_shows() -> None:
     # Ten times too large an epsilon, ranks Phi(z / sqrt(10)): asin(1/11) / (2 pi) = 0.014.
-    wide = prb.simulation_based_calibration(25, model=build(epsilon=10 / N), draws=50, adjust=False, progressbar=False)
+    wide = prb.simulation_based_calibration(
+        25, model=build(epsilon=10 / N), draws=50, adjust=False, progressbar=False
+    )
     assert spread(wide) < -3
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(METRICS))
 def test_adjusted_posteriors_are_calibrated(name: str) -> None:
-    result = prb.simulation_based_calibration(100, model=build(METRICS[name]), draws=100, progressbar=False)
+    result = prb.simulation_based_calibration(
+        100, model=build(METRICS[name]), draws=100, progressbar=False
+    )
     assert result.prior_sbc.attrs["failed"] == 0
     assert abs(spread(result)) < 4
     ranks = result.prior_sbc["mu"].values

@@ -39,7 +39,9 @@ def known_sd(metric: prb.Metric, **keywords: Any) -> pm.Model:
 def two_hyperparameters(**keywords: Any) -> pm.Model:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-        prb.Simulator("y", same, x, metric=prb.AreaMetric(), observed=OBSERVED, propagation=R256, **keywords)
+        prb.Simulator(
+            "y", same, x, metric=prb.AreaMetric(), observed=OBSERVED, propagation=R256, **keywords
+        )
     return model
 
 
@@ -61,7 +63,9 @@ def area_grid() -> tuple[Floats, Floats, float]:
     mu, log_sigma = np.linspace(0.6, 1.4, 81), np.linspace(np.log(0.12), np.log(1.2), 81)
     thetas = np.stack(np.meshgrid(mu, log_sigma, indexing="ij"), axis=-1).reshape(-1, 2)
     sigma = np.exp(thetas[:, 1])
-    log_prior = norm.logpdf(thetas[:, 0], 0, 2) + np.log(2) + norm.logpdf(sigma, 0, 1) + thetas[:, 1]
+    log_prior = (
+        norm.logpdf(thetas[:, 0], 0, 2) + np.log(2) + norm.logpdf(sigma, 0, 1) + thetas[:, 1]
+    )
     distance = Evaluator(area_run()[0])(thetas).discrepancies[:, 0]
     logs = log_prior - distance / 0.02
     weights = np.exp(logs - logs.max())
@@ -82,19 +86,22 @@ def ess(draws: xr.DataArray) -> float:
 
 
 def assert_moments(draws: xr.DataArray, mean: float, sd: float, rtol_sd: float) -> None:
-    # Standard error of the mean sd / sqrt(ess); of the sd about sd / sqrt(2 ess), 1.6% for 2000 draws.
+    # Standard error of the mean sd / sqrt(ess); of the sd about sd / sqrt(2 ess), 1.6% for 2000
+    # draws.
     n = ess(draws)
     assert n > 0.5 * draws.size
     assert abs(float(draws.mean()) - mean) < 4 * sd / n**0.5
     np.testing.assert_allclose(float(draws.std()), sd, rtol=rtol_sd)
 
 
-# -- the posterior is the right one ----------------------------------------------------------------------
+# -- the posterior is the right one
+# ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["KullbackLeibler", "LogLikelihood"])
 def test_conjugate_posterior_of_a_normal_mean(name: str) -> None:
-    # N times these metrics is the negative log-likelihood of a normal with variance sd^2 + h^2, up to a constant.
+    # N times these metrics is the negative log-likelihood of a normal with variance sd^2 + h^2, up
+    # to a constant.
     metric = prb.KullbackLeibler() if name == "KullbackLeibler" else prb.LogLikelihood()
     model = known_sd(metric)
     h = next(iter(nodes(model).values())).target.cells.bandwidth
@@ -102,7 +109,8 @@ def test_conjugate_posterior_of_a_normal_mean(name: str) -> None:
     precision = 1 / 4 + N / (0.25 + h**2)
     mean, sd = N * MEAN / (0.25 + h**2) / precision, precision**-0.5
     assert_moments(idata.posterior["mu"], mean, sd, 0.08)  # five standard errors
-    # Against the posterior under the exact likelihood: the divergence is smoothed by two Silverman bandwidths.
+    # Against the posterior under the exact likelihood: the divergence is smoothed by two Silverman
+    # bandwidths.
     ratio = float(idata.posterior["mu"].std()) * (1 / 4 + N / 0.25) ** 0.5
     assert 0.93 < ratio < (1.3 if name == "KullbackLeibler" else 1.1)
     if name == "LogLikelihood":  # and the evidence: that of the normal data, conjugate
@@ -110,7 +118,9 @@ def test_conjugate_posterior_of_a_normal_mean(name: str) -> None:
         _, logdet = np.linalg.slogdet(2 * np.pi * covariance)
         exact = -0.5 * (logdet + OBSERVED @ np.linalg.solve(covariance, OBSERVED))
         found = idata.sample_stats["log_marginal_likelihood"].values[:, -1]
-        assert abs(found.mean() - exact) < 4 * 0.1 / 2 + 0.05  # sd of 0.1 between chains; the data are not quite normal
+        assert (
+            abs(found.mean() - exact) < 4 * 0.1 / 2 + 0.05
+        )  # sd of 0.1 between chains; the data are not quite normal
 
 
 def test_area_posterior_against_a_grid() -> None:
@@ -137,11 +147,18 @@ def test_a_reflection_keeps_both_modes() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1.5), pm.HalfNormal("sigma", 1))
         prb.Simulator(
-            "y", lambda x: x**2 - 2 * x + 1, x, metric=prb.AreaMetric(), observed=data, epsilon=0.05, propagation=R256
+            "y",
+            lambda x: x**2 - 2 * x + 1,
+            x,
+            metric=prb.AreaMetric(),
+            observed=data,
+            epsilon=0.05,
+            propagation=R256,
         )
     mu = sample(model).posterior["mu"].values
-    # Symmetric about 1; 2000 draws would give a standard error of 0.011 if chains kept the shares of the prior draws
-    # exactly, and resampling at low temperatures adds drift: 0.3 to 0.7 is more than five standard errors.
+    # Symmetric about 1; 2000 draws would give a standard error of 0.011 if chains kept the shares
+    # of the prior draws exactly, and resampling at low temperatures adds drift: 0.3 to 0.7 is more
+    # than five standard errors.
     assert 0.3 < (mu > 1).mean() < 0.7
     assert ((mu > 1).mean(axis=1) > 0.2).all()
     assert ((mu > 1).mean(axis=1) < 0.8).all()
@@ -150,14 +167,19 @@ def test_a_reflection_keeps_both_modes() -> None:
 
 
 def test_several_simulators_and_an_ordinary_likelihood() -> None:
-    # All quadratic in mu: two divergences with known bandwidths, a normal likelihood and a potential.
+    # All quadratic in mu: two divergences with known bandwidths, a normal likelihood and a
+    # potential.
     rng = np.random.default_rng(2)
     other, extra = rng.normal(1.4, 0.5, 20), rng.normal(1.2, 0.5, 30)
     with pm.Model() as model:
         mu = pm.Normal("mu", 0, 2)
         x = pm.Normal.dist(mu, 0.5)
-        prb.Simulator("a", same, x, metric=prb.KullbackLeibler(), observed=OBSERVED, propagation=R128)
-        prb.Simulator("b", lambda x: -x, x, metric=prb.KullbackLeibler(), observed=-other, propagation=R128)
+        prb.Simulator(
+            "a", same, x, metric=prb.KullbackLeibler(), observed=OBSERVED, propagation=R128
+        )
+        prb.Simulator(
+            "b", lambda x: -x, x, metric=prb.KullbackLeibler(), observed=-other, propagation=R128
+        )
         pm.Normal("z", mu, 0.5, observed=extra)
         pm.Potential("pull", -5.0 * (mu - 3.0) ** 2)
     h = np.array([n.target.cells.bandwidth for n in nodes(model).values()])
@@ -171,7 +193,8 @@ def test_several_simulators_and_an_ordinary_likelihood() -> None:
     assert list(idata.calibration["simulator"].values) == ["a", "b"]
 
 
-# -- determinism -----------------------------------------------------------------------------------------
+# -- determinism
+# -----------------------------------------------------------------------------------------
 
 
 def test_bit_identical_for_a_seed_and_different_for_others() -> None:
@@ -186,7 +209,8 @@ def test_bit_identical_for_a_seed_and_different_for_others() -> None:
     assert not np.isin(first_chain, second_chain).any()
 
 
-# -- epsilon ---------------------------------------------------------------------------------------------
+# -- epsilon
+# ---------------------------------------------------------------------------------------------
 
 
 def epsilon_of(model: pm.Model) -> list[float]:
@@ -225,7 +249,7 @@ def test_epsilon_is_restored_after_a_failure() -> None:
         raise Stop
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(prb.BatchedKernel, "mutate", fail)
+        patch.setattr(prb.posterior.BatchedKernel, "mutate", fail)
         with pytest.raises(Stop):
             sample(model, 50, chains=1, epsilon=0.7)
     assert epsilon_of(model) == [0.02]
@@ -241,7 +265,9 @@ def test_epsilon_is_restored_after_a_failure() -> None:
         ("wide", TypeError, "y: epsilon"),
     ],
 )
-def test_an_epsilon_that_is_none_is_refused(epsilon: Any, error: type[Exception], words: str) -> None:
+def test_an_epsilon_that_is_none_is_refused(
+    epsilon: Any, error: type[Exception], words: str
+) -> None:
     with pytest.raises(error, match=words):
         sample(area_run()[0], 50, chains=1, epsilon=epsilon)
     assert epsilon_of(area_run()[0]) == [0.02]
@@ -251,12 +277,22 @@ def test_one_number_for_two_simulators_is_refused() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu"), 1.0)
         for name in "ab":
-            prb.Simulator(name, same, x, metric=prb.AreaMetric(), observed=OBSERVED, propagation=prb.Reweighted(16))
-    with pytest.raises(ValueError, match=r"one number for 2 simulators, expected a dict by name: \['a', 'b'\]"):
+            prb.Simulator(
+                name,
+                same,
+                x,
+                metric=prb.AreaMetric(),
+                observed=OBSERVED,
+                propagation=prb.Reweighted(16),
+            )
+    with pytest.raises(
+        ValueError, match=r"one number for 2 simulators, expected a dict by name: \['a', 'b'\]"
+    ):
         sample(model, 50, epsilon=0.1)
 
 
-# -- other arguments -------------------------------------------------------------------------------------
+# -- other arguments
+# -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -268,7 +304,9 @@ def test_one_number_for_two_simulators_is_refused() -> None:
         ({"threshold": 1.0}, ValueError, "threshold"),
     ],
 )
-def test_arguments_are_checked(keywords: dict[str, Any], error: type[Exception], words: str) -> None:
+def test_arguments_are_checked(
+    keywords: dict[str, Any], error: type[Exception], words: str
+) -> None:
     with pytest.raises(error, match=words):
         sample(area_run()[0], **keywords)
 
@@ -277,14 +315,24 @@ def test_no_finite_discrepancy_among_the_prior_draws() -> None:
     metric = prb.FunctionMetric(lambda z, observed: np.full(np.shape(z)[:-1], np.nan))
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
-        prb.Simulator("y", same, x, metric=metric, observed=OBSERVED, epsilon=1.0, propagation=prb.Resimulated(16))
+        prb.Simulator(
+            "y",
+            same,
+            x,
+            metric=metric,
+            observed=OBSERVED,
+            epsilon=1.0,
+            propagation=prb.Resimulated(16),
+        )
     with pytest.raises(ValueError, match="no finite discrepancy among 50 draws"):
         sample(model, 50, chains=1)
 
 
 def test_a_higher_threshold_takes_more_stages() -> None:
     model = area_run()[0]
-    few, many = (sample(model, 100, chains=1, threshold=t).sample_stats.sizes["stage"] for t in (0.3, 0.9))
+    few, many = (
+        sample(model, 100, chains=1, threshold=t).sample_stats.sizes["stage"] for t in (0.3, 0.9)
+    )
     assert many > few
 
 
@@ -301,7 +349,13 @@ def test_responses_are_counted_under_other_propagations() -> None:
         with pm.Model() as model:
             x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
             prb.Simulator(
-                "y", count, x, metric=prb.AreaMetric(), observed=OBSERVED, epsilon=0.1, propagation=propagation
+                "y",
+                count,
+                x,
+                metric=prb.AreaMetric(),
+                observed=OBSERVED,
+                epsilon=0.1,
+                propagation=propagation,
             )
         counted = 0
         idata = sample(model, 60, chains=2)
@@ -309,7 +363,8 @@ def test_responses_are_counted_under_other_propagations() -> None:
         assert abs(float(idata.posterior["mu"].mean()) - MEAN) < 0.2
 
 
-# -- the result ------------------------------------------------------------------------------------------
+# -- the result
+# ------------------------------------------------------------------------------------------
 
 
 def test_the_tree_is_complete() -> None:
@@ -325,8 +380,12 @@ def test_the_tree_is_complete() -> None:
     np.testing.assert_array_equal(idata.observed_data["y"], OBSERVED)
     calibration = idata.calibration
     assert list(calibration["element"].values) == ["mu", "sigma_log__"]
-    np.testing.assert_allclose(calibration["theta"].sel(element="sigma_log__"), np.log(idata.posterior["sigma"]))
-    again = Evaluator(model)(calibration["theta"].values.reshape(-1, 2)).discrepancies.reshape(4, 500, 1)
+    np.testing.assert_allclose(
+        calibration["theta"].sel(element="sigma_log__"), np.log(idata.posterior["sigma"])
+    )
+    again = Evaluator(model)(calibration["theta"].values.reshape(-1, 2)).discrepancies.reshape(
+        4, 500, 1
+    )
     np.testing.assert_allclose(calibration["discrepancy"], again)
     for key, low, high in (("weight_ess", 10, 256), ("mean_weight", 0.8, 1.2), ("lost_mass", 0, 0)):
         assert low <= float(calibration[key].median()) <= high
@@ -342,7 +401,9 @@ def vector_model() -> pm.Model:
         pm.Deterministic("twice", 2 * mean, dims="axis")
         for i, name in enumerate(("first", "second")):
             x = pm.Normal.dist(mean[i], 1.0)
-            prb.Simulator(name, same, x, metric=prb.KullbackLeibler(), observed=data[:, i], propagation=R128)
+            prb.Simulator(
+                name, same, x, metric=prb.KullbackLeibler(), observed=data[:, i], propagation=R128
+            )
     return model
 
 
@@ -356,14 +417,18 @@ def test_named_dimensions_arrive_in_the_posterior() -> None:
     assert posterior["mean"].dims == ("chain", "draw", "axis")
     assert list(posterior["axis"].values) == ["a", "b"]
     np.testing.assert_allclose(posterior["twice"], 2 * posterior["mean"])
-    np.testing.assert_allclose(posterior["gap"], posterior["mean"].diff("axis").squeeze("axis", drop=True))
+    np.testing.assert_allclose(
+        posterior["gap"], posterior["mean"].diff("axis").squeeze("axis", drop=True)
+    )
     assert list(vector_run().calibration["element"].values) == ["mean[0]", "mean[1]"]
     for i, name in enumerate("ab"):
         data = vector_run().observed_data[("first", "second")[i]].values
         h2 = vector_run_bandwidth(i) ** 2
         precision = 1 / 4 + 30 / (1 + h2)
         draws = posterior["mean"].sel(axis=name)
-        assert_moments(draws, 30 * data.mean() / (1 + h2) / precision, precision**-0.5, 0.12)  # 800 draws: 5 x 2.5%
+        assert_moments(
+            draws, 30 * data.mean() / (1 + h2) / precision, precision**-0.5, 0.12
+        )  # 800 draws: 5 x 2.5%
 
 
 def vector_run_bandwidth(i: int) -> float:
@@ -395,7 +460,8 @@ def test_storage_in_netcdf(tmp_path: Path) -> None:
         loaded.close()
 
 
-# -- the kernel under PyMC's own sampler, and what it relies on ------------------------------------------
+# -- the kernel under PyMC's own sampler, and what it relies on
+# ------------------------------------------
 
 
 def test_the_methods_that_the_kernel_relies_on_exist() -> None:
@@ -406,14 +472,21 @@ def test_the_methods_that_the_kernel_relies_on_exist() -> None:
         assert callable(getattr(SMC_KERNEL, name)), name
     index = systematic_resampling(np.array([0.5, 0.0, 0.5]), np.random.default_rng(1))
     assert sorted(index) in ([0, 0, 2], [0, 2, 2])
-    kernel = prb.BatchedKernel(20, model=area_run()[0], random_seed=1)
-    for name in ("tempered_posterior", "prior_logp", "likelihood_logp", "beta", "iteration", "weights"):
+    kernel = prb.posterior.BatchedKernel(20, model=area_run()[0], random_seed=1)
+    for name in (
+        "tempered_posterior",
+        "prior_logp",
+        "likelihood_logp",
+        "beta",
+        "iteration",
+        "weights",
+    ):
         assert hasattr(kernel, name), name
     assert kernel.beta == 0
     assert kernel.log_marginal_likelihood == 0
 
 
-class Recording(prb.BatchedKernel):
+class Recording(prb.posterior.BatchedKernel):
     calls: list[str]
 
     def __getattribute__(self, name: str) -> Any:
@@ -431,7 +504,13 @@ RECORDED = {
 
 def test_pymc_calls_the_kernel_in_the_documented_order() -> None:
     RECORD.clear()
-    keywords = {"draws": 60, "chains": 1, "cores": 1, "progressbar": False, "compute_convergence_checks": False}
+    keywords = {
+        "draws": 60,
+        "chains": 1,
+        "cores": 1,
+        "progressbar": False,
+        "compute_convergence_checks": False,
+    }
     idata = pm.sample_smc(kernel=Recording, model=area_run()[0], random_seed=1, **keywords)
     stages = idata.sample_stats["beta"].size
     first = RECORD.index("initialize")
@@ -441,11 +520,21 @@ def test_pymc_calls_the_kernel_in_the_documented_order() -> None:
 
 
 def test_the_kernel_draws_the_same_posterior_under_pymc() -> None:
-    keywords = {"draws": 500, "chains": 2, "cores": 1, "progressbar": False, "compute_convergence_checks": False}
-    idata = pm.sample_smc(kernel=prb.BatchedKernel, model=area_run()[0], random_seed=1, **keywords)
+    keywords = {
+        "draws": 500,
+        "chains": 2,
+        "cores": 1,
+        "progressbar": False,
+        "compute_convergence_checks": False,
+    }
+    idata = pm.sample_smc(
+        kernel=prb.posterior.BatchedKernel, model=area_run()[0], random_seed=1, **keywords
+    )
     thetas, weights, evidence = area_grid()
     for name, values in (("mu", thetas[:, 0]), ("sigma", np.exp(thetas[:, 1]))):
-        assert_moments(idata.posterior[name], *moments(values, weights), 0.12)  # 1000 draws: five times 2.2%
+        assert_moments(
+            idata.posterior[name], *moments(values, weights), 0.12
+        )  # 1000 draws: five times 2.2%
     chain = idata.sample_stats["log_marginal_likelihood"].values
     last = [np.asarray(row, dtype=float)[-1] for row in chain]
     assert abs(np.mean(last) - evidence) < 4 * 0.15 / 2**0.5
@@ -454,6 +543,8 @@ def test_the_kernel_draws_the_same_posterior_under_pymc() -> None:
 def test_the_kernel_needs_an_epsilon() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu"), 1.0)
-        prb.Simulator("y", same, x, metric=prb.AreaMetric(), observed=OBSERVED, propagation=prb.Reweighted(16))
+        prb.Simulator(
+            "y", same, x, metric=prb.AreaMetric(), observed=OBSERVED, propagation=prb.Reweighted(16)
+        )
     with pytest.raises(ValueError, match=r"y: epsilon is not set; call prb\.set_epsilon"):
-        prb.BatchedKernel(50, model=model)
+        prb.posterior.BatchedKernel(50, model=model)

@@ -25,7 +25,9 @@ def same(x: Any) -> Any:
 @cache
 def model() -> pm.Model:
     """Two simulators, a vector hyperparameter with named elements, a scalar one, a deterministic, named specimens."""
-    with pm.Model(coords={"lab": ["north", "south"], "specimen": [f"s{i}" for i in range(40)]}) as m:
+    with pm.Model(
+        coords={"lab": ["north", "south"], "specimen": [f"s{i}" for i in range(40)]}
+    ) as m:
         mean = pm.Normal("mean", 0, [3.0, 3.0], dims="lab")
         sigma = pm.HalfNormal("sigma", 1)
         pm.Deterministic("variance", sigma**2)
@@ -48,25 +50,42 @@ def idata() -> xr.DataTree:
     return prb.sample_smc(200, chains=4, model=model(), random_seed=3, progressbar=False)
 
 
-# -- trees -----------------------------------------------------------------------------------------------
+# -- trees
+# -----------------------------------------------------------------------------------------------
 
 
 def test_the_tree_of_an_optimum() -> None:
     tree = optimum().to_datatree()
     assert set(tree.children) == {"optimum", "stderr", "trace", "calibration", "observed_data"}
-    assert set(tree["optimum"].data_vars) == set(tree["stderr"].data_vars) == {"mean", "sigma", "variance"}
+    assert (
+        set(tree["optimum"].data_vars)
+        == set(tree["stderr"].data_vars)
+        == {"mean", "sigma", "variance"}
+    )
     assert tree["optimum"]["mean"].dims == ("lab",)
     assert float(tree["optimum"]["mean"].sel(lab="south")) == optimum().point["mean"][1]
     assert float(tree["stderr"]["sigma"]) == optimum().stderr["sigma"]
     calibration = tree["calibration"]
     assert calibration["covariance"].dims == ("element", "other_element")
-    assert calibration["covariance"].sel(element="mean[1]", other_element="sigma_log__") == optimum().covariance[1, 2]
-    assert float(calibration["discrepancy"].sel(simulator="second")) == optimum().discrepancies["second"]
+    assert (
+        calibration["covariance"].sel(element="mean[1]", other_element="sigma_log__")
+        == optimum().covariance[1, 2]
+    )
+    assert (
+        float(calibration["discrepancy"].sel(simulator="second"))
+        == optimum().discrepancies["second"]
+    )
     assert float(calibration["scale"].sel(simulator="first")) == 0.02
     assert tree["trace"].sizes["evaluation"] == optimum().n_evaluations
-    assert {"discrepancy", "converged", "message", "n_evaluations", "n_responses", "n_screened", "seconds"} <= set(
-        tree["optimum"].attrs
-    )
+    assert {
+        "discrepancy",
+        "converged",
+        "message",
+        "n_evaluations",
+        "n_responses",
+        "n_screened",
+        "seconds",
+    } <= set(tree["optimum"].attrs)
     assert versions().items() <= tree["optimum"].attrs.items()
 
 
@@ -88,13 +107,19 @@ def test_the_tree_of_a_sampler() -> None:
     assert calibration["discrepancy"].dims == ("chain", "draw", "simulator")
     thetas = calibration["theta"].values.reshape(-1, 3)
     found = Evaluator(model())(thetas)
-    np.testing.assert_allclose(calibration["discrepancy"].values.reshape(-1, 2), found.discrepancies, rtol=1e-9)
+    np.testing.assert_allclose(
+        calibration["discrepancy"].values.reshape(-1, 2), found.discrepancies, rtol=1e-9
+    )
     support = Evaluator(model()).support(thetas)
     for name in ("first", "second"):
         one = calibration.to_dataset().sel(simulator=name)
         assert int(one["n_points"]) % 256 == 0
-        np.testing.assert_allclose(one["weight_ess"].values.ravel(), support[name]["weight_ess"], rtol=1e-9)
-        np.testing.assert_allclose(one["mean_weight"].values.ravel(), support[name]["mean_weight"], rtol=1e-9)
+        np.testing.assert_allclose(
+            one["weight_ess"].values.ravel(), support[name]["weight_ess"], rtol=1e-9
+        )
+        np.testing.assert_allclose(
+            one["mean_weight"].values.ravel(), support[name]["mean_weight"], rtol=1e-9
+        )
     np.testing.assert_allclose(calibration["epsilon"], [0.02, 1 / 40])
     assert tree["posterior"].attrs["inference_library"] == "prbayes"
     assert versions().items() <= tree["posterior"].attrs.items()
@@ -113,8 +138,13 @@ def test_metrics_are_described_the_same_in_every_session() -> None:
 def test_chains_with_different_numbers_of_stages() -> None:
     evaluator = Evaluator(model())
     thetas = np.zeros((2, 3, 3))
-    stats: list[dict[str, list[float]]] = [{"beta": [0.2, 1.0], "n_steps": [2, 4]}, {"beta": [1.0], "n_steps": [6]}]
-    tree = posterior_tree(evaluator, thetas, np.ones((2, 3, 2)), stats, seed=None, n_responses=7, seconds=1.5)
+    stats: list[dict[str, list[float]]] = [
+        {"beta": [0.2, 1.0], "n_steps": [2, 4]},
+        {"beta": [1.0], "n_steps": [6]},
+    ]
+    tree = posterior_tree(
+        evaluator, thetas, np.ones((2, 3, 2)), stats, seed=None, n_responses=7, seconds=1.5
+    )
     np.testing.assert_array_equal(tree["sample_stats"]["beta"], [[0.2, 1.0], [1.0, np.nan]])
     np.testing.assert_array_equal(tree["sample_stats"]["n_steps"], [[2, 4], [6, np.nan]])
     assert tree["posterior"].attrs["random_seed"] == "None"
@@ -140,7 +170,14 @@ def test_trees_survive_storage(make: Any, tmp_path: Path) -> None:
 def test_propagations_without_a_design_have_no_support_to_report() -> None:
     with pm.Model() as m:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
-        prb.Simulator("y", same, x, metric=prb.KullbackLeibler(), observed=DATA[:, 0], propagation=prb.Resimulated(64))
+        prb.Simulator(
+            "y",
+            same,
+            x,
+            metric=prb.KullbackLeibler(),
+            observed=DATA[:, 0],
+            propagation=prb.Resimulated(64),
+        )
     tree = prb.sample_smc(50, chains=1, model=m, random_seed=1, progressbar=False)
     for key in ("weight_ess", "mean_weight", "lost_mass"):
         assert np.isnan(tree["calibration"][key]).all()
@@ -163,7 +200,9 @@ def test_the_support_of_an_optimum_is_part_of_it() -> None:
 def test_an_optimum_shows_its_answer_in_a_few_lines() -> None:
     found = optimum()
     lines = repr(found).splitlines()
-    assert lines[0].startswith(f"Optimum: discrepancy {found.discrepancy:.4g} after {found.n_evaluations} evaluations")
+    assert lines[0].startswith(
+        f"Optimum: discrepancy {found.discrepancy:.4g} after {found.n_evaluations} evaluations"
+    )
     assert lines[0].endswith("converged")
     assert len(lines) == 1 + len(found.point) + len(found.warnings)
     for line, (name, value) in zip(lines[1:], found.point.items(), strict=False):

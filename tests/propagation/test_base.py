@@ -81,7 +81,8 @@ def test_the_error_of_random_draws_is_that_of_repetitions() -> None:
     params = at([1.5], [0.7])
     repeated = [found.discrepancies(params, found.target)[0] for _ in range(60)]
     told = np.mean([found.discrepancy_error(params) for _ in range(60)])
-    # Standard errors: of a standard deviation of 60 values 9%, of the mean of 60 jackknives about 4%.
+    # Standard errors: of a standard deviation of 60 values 9%, of the mean of 60 jackknives about
+    # 4%.
     assert told == pytest.approx(np.std(repeated), rel=0.45)
 
 

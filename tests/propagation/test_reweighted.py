@@ -67,7 +67,8 @@ def twice() -> pm.Model:
     return model
 
 
-# -- the density that the points were drawn from ---------------------------------------------------------
+# -- the density that the points were drawn from
+# ---------------------------------------------------------
 
 
 def test_points_of_one_input_have_equal_mass() -> None:
@@ -105,8 +106,9 @@ def test_weights_are_the_populations_density_over_the_mixture(model: Any) -> Non
 
 @pytest.mark.parametrize("model", [once, twice])
 def test_the_weights_integrate(model: Any) -> None:
-    # Populations inside the design: the mean raw weight estimates the integral of their density, and weighted
-    # moments are those of the population; with stratified points much better than by sampling.
+    # Populations inside the design: the mean raw weight estimates the integral of their density,
+    # and weighted moments are those of the population; with stratified points much better than by
+    # sampling.
     mu, sigma = (a.ravel() for a in np.meshgrid(np.linspace(-3, 3, 13), [0.3, 0.6, 1.2]))
     d = design(model())
     np.testing.assert_allclose(d.support([mu, sigma])["mean_weight"], 1.0, atol=0.02)
@@ -162,7 +164,8 @@ def test_two_seeds_agree_in_the_discrepancy() -> None:
     np.testing.assert_allclose(one, two, atol=0.01)  # in units of the response: 2% of the data's sd
 
 
-# -- inputs of other kinds -------------------------------------------------------------------------------
+# -- inputs of other kinds
+# -------------------------------------------------------------------------------
 
 
 def test_an_input_without_inverse_distribution_function() -> None:
@@ -201,7 +204,8 @@ def test_a_discrete_input() -> None:
     assert set(np.unique(values)) <= set(range(60))
 
 
-# -- failed responses ------------------------------------------------------------------------------------
+# -- failed responses
+# ------------------------------------------------------------------------------------
 
 
 def test_lost_mass_is_the_probability_of_failure() -> None:
@@ -219,16 +223,18 @@ def test_lost_mass_is_the_probability_of_failure() -> None:
 
 
 def test_too_much_lost_mass_at_the_answer_is_refused() -> None:
-    # Observed around 1 with an sd of 0.5: 16% of the population is below 0.5, where the response fails.
-    # Metrics count NaN responses as a misfit, so that the answer evades them in part: the limit is set low.
+    # Observed around 1 with an sd of 0.5: 16% of the population is below 0.5, where the response
+    # fails. Metrics count NaN responses as a misfit, so that the answer evades them in part: the
+    # limit is set low.
     model = line(256, metric=KL, response=lambda x: np.where(x < 0.5, np.nan, x), max_lost=0.02)
-    with pytest.raises(prb.DesignError, match=r"y: lost mass: .*raise max_lost"):
+    with pytest.raises(prb.propagation.DesignError, match=r"y: lost mass: .*raise max_lost"):
         prb.minimize(model)
-    with pytest.raises(prb.DesignError, match=r"y: lost mass: .*raise max_lost"):
+    with pytest.raises(prb.propagation.DesignError, match=r"y: lost mass: .*raise max_lost"):
         prb.sample_smc(100, model=model, random_seed=1, progressbar=False)
 
 
-# -- refinement ------------------------------------------------------------------------------------------
+# -- refinement
+# ------------------------------------------------------------------------------------------
 
 
 class Sum:
@@ -248,8 +254,8 @@ def hard(
 ) -> tuple[pm.Model, list[Sum]]:
     """Two correlated inputs under wide priors, two conditions: their sum and their difference.
 
-    The four hyperparameters are a means and an sd for either condition, so that the optimum is that of
-    two separate fits of a normal.
+    The four hyperparameters are a means and an sd for either condition, so that the optimum is that
+    of two separate fits of a normal.
     """
     responses = [Sum(1.0), Sum(-1.0)]
     with pm.Model() as model:
@@ -389,7 +395,8 @@ def test_a_wide_population_is_refused_where_a_narrow_design_may_not_grow() -> No
     assert np.abs(design(model).batches.points[0]).max() < 3
     for find in (prb.minimize, prb.refine):
         with pytest.raises(
-            prb.DesignError, match=r"y: the design does not support.* of at most 256\), or use"
+            prb.propagation.DesignError,
+            match=r"y: the design does not support.* of at most 256\), or use",
         ):
             find(model)
 
@@ -477,16 +484,19 @@ def test_refine_without_a_design_and_with_one_that_is_good() -> None:
 
 
 def test_a_design_that_can_never_do_is_refused() -> None:
-    # Populations of many widths at once, each with a few points of its own: eight batches of 16 are too few.
+    # Populations of many widths at once, each with a few points of its own: eight batches of 16 are
+    # too few.
     model = line(16)
     thetas = np.stack([np.linspace(-40, 40, 256), np.full(256, np.log(0.01))], axis=1)
     with pytest.raises(
-        prb.DesignError, match=r"y: the design does not support the answer.*now 144 points in all"
+        prb.propagation.DesignError,
+        match=r"y: the design does not support the answer.*now 144 points in all",
     ):
         prb.refine(model, thetas)
 
 
-# -- diagnose --------------------------------------------------------------------------------------------
+# -- diagnose
+# --------------------------------------------------------------------------------------------
 
 
 def posterior(**values: Floats) -> xr.DataTree:

@@ -22,7 +22,7 @@ class Calibrated(NamedTuple):
     model: pm.Model
     optimum: prb.Optimum
     posterior: xr.DataTree
-    test: prb.ValidityTest
+    test: prb.validation.ValidityTest
 
 
 @pytest.fixture(scope="session")
@@ -52,7 +52,7 @@ def calibrated() -> Calibrated:
     )
     later = prb.predict(posterior, np.positive, x, model=model, random_seed=1)
     fresh = np.random.default_rng(4).normal(2.0, 0.6, 12)
-    test = prb.area_test(fresh, later, null=prb.PosteriorNull(199))
+    test = prb.area_test(fresh, later, null=prb.validation.PosteriorNull(199))
     return Calibrated(model, optimum, posterior, test)
 
 
@@ -134,8 +134,8 @@ def row() -> Callable[[str, str, Page], dict[str, str]]:
 
 
 @pytest.fixture(scope="session")
-def section() -> Callable[[prb.Report, str], prb.Section]:
-    def find(of: prb.Report, title: str) -> prb.Section:
+def section() -> Callable[[prb.Report, str], prb.reports.Section]:
+    def find(of: prb.Report, title: str) -> prb.reports.Section:
         return next(s for s in of.sections if s.title == title)
 
     return find
@@ -145,7 +145,7 @@ def section() -> Callable[[prb.Report, str], prb.Section]:
 def picture_bytes() -> bytes:
     figure, axis = plt.subplots()
     axis.plot([1, 2, 3])
-    made = prb.Section("p", picture=figure, alt="A line.").picture
+    made = prb.reports.Section("p", picture=figure, alt="A line.").picture
     assert plt.fignum_exists(figure.number), "the user's own figure is left open"
     plt.close(figure)
     assert isinstance(made, bytes)

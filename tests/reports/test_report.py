@@ -29,7 +29,7 @@ def hostile(picture_bytes: bytes) -> prb.Report:
     return prb.Report(
         HOSTILE[0],
         sections=(
-            prb.Section(
+            prb.reports.Section(
                 HOSTILE[3],
                 tuple(HOSTILE),
                 table,
@@ -37,7 +37,7 @@ def hostile(picture_bytes: bytes) -> prb.Report:
                 alt='"><script>alert(2)',
                 caption=HOSTILE[1],
             ),
-            prb.Section(
+            prb.reports.Section(
                 "# - 1. start",
                 ["# no heading", "- no item", "1. no list", "---", "-4.5 is a number"],
                 level=3,
@@ -153,7 +153,7 @@ def test_both_writers_render_the_same_data(tmp_path: Path, report: prb.Report, p
 def test_a_section_of_the_users_own(
     tmp_path: Path, report: prb.Report, row: Any, parse: Any
 ) -> None:
-    mine = prb.Section(
+    mine = prb.reports.Section(
         "Material",
         "Al 2024-T3.",
         xr.Dataset({"E": ("batch", [70.1, 71.25])}, {"batch": ["A", "B"]}),
@@ -184,7 +184,7 @@ def test_notebooks_show_a_frame(report: prb.Report) -> None:
 
 
 def test_refusals(report: prb.Report) -> None:
-    with pytest.raises(TypeError, match=r"got str, expected prb\.Section"):
+    with pytest.raises(TypeError, match=r"got str, expected prb\.reports\.Section"):
         prb.Report("x", sections=("a",))  # type: ignore[arg-type]
     for title in ("", "  ", 3):
         with pytest.raises(TypeError, match="expected a text"):

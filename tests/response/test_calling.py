@@ -248,7 +248,7 @@ def test_points_give_keys_of_all_numbers_in_the_order_of_the_arguments() -> None
     ],
 )
 def test_what_is_no_response_is_refused(result: Any, message: str) -> None:
-    with pytest.raises(prb.ResponseError, match=f"the response returned {message}"):
+    with pytest.raises(prb.response.ResponseError, match=f"the response returned {message}"):
         checked(result, (3,), [np.zeros(3), 1.0])
     np.testing.assert_array_equal(checked([1, True, np.nan], (3,), []), [1.0, 1.0, np.nan])
 
@@ -301,7 +301,7 @@ def failing(
 
 @BATCHED
 def test_an_exception_aborts_by_default(kind: str) -> None:
-    with pytest.raises(prb.ResponseError, match=r"y: .*raised ArithmeticError: too steep"):
+    with pytest.raises(prb.response.ResponseError, match=r"y: .*raised ArithmeticError: too steep"):
         failing(kind, fails_above_two)
 
 
@@ -310,7 +310,7 @@ def test_an_exception_aborts_by_default(kind: str) -> None:
 def test_replaced(kind: str, function: Any, caplog: pytest.LogCaptureFixture) -> None:
     assert 3 < STEEP.sum() < N - 3
     with caplog.at_level(logging.WARNING, "prbayes"):
-        found = failing(kind, function, prb.Replace(np.inf))
+        found = failing(kind, function, prb.response.Replace(np.inf))
     np.testing.assert_array_equal(stored(found), np.where(STEEP, np.inf, EXPECTED))
     assert responses(found).failures == STEEP.sum()
     assert f"y: {STEEP.sum()} of {N} responses failed, replaced by inf" in caplog.text
@@ -321,8 +321,8 @@ def test_replaced(kind: str, function: Any, caplog: pytest.LogCaptureFixture) ->
 @BATCHED
 def test_nan_is_a_result_by_default_and_a_failure_if_asked_for(kind: str) -> None:
     np.testing.assert_array_equal(np.isnan(stored(failing(kind, nan_above_two))), STEEP)
-    with pytest.raises(prb.ResponseError, match="it is NaN"):
-        failing(kind, nan_above_two, prb.Abort(on_nan=True))
+    with pytest.raises(prb.response.ResponseError, match="it is NaN"):
+        failing(kind, nan_above_two, prb.response.Abort(on_nan=True))
 
 
 def test_retried_once_and_then_it_works() -> None:
@@ -334,7 +334,7 @@ def test_retried_once_and_then_it_works() -> None:
             raise OSError("license server")
         return a * x
 
-    found = failing("scalar", moody, prb.Retry(1, then=prb.Abort()))
+    found = failing("scalar", moody, prb.response.Retry(1, then=prb.response.Abort()))
     np.testing.assert_array_equal(stored(found), EXPECTED)
     # The simulator tries 16 points of the prior only where it has to; here every design point,
     # the steep ones twice.
@@ -343,16 +343,23 @@ def test_retried_once_and_then_it_works() -> None:
 
 
 def test_retried_in_vain() -> None:
-    found = failing("scalar", fails_above_two, prb.Retry(2, then=prb.Replace(-1.0)))
+    found = failing(
+        "scalar", fails_above_two, prb.response.Retry(2, then=prb.response.Replace(-1.0))
+    )
     np.testing.assert_array_equal(stored(found), np.where(STEEP, -1.0, EXPECTED))
     assert responses(found).computed == N + 2 * STEEP.sum()
-    with pytest.raises(prb.ResponseError, match="too steep"):
-        failing("scalar", fails_above_two, prb.Retry(2, then=prb.Abort()))
+    with pytest.raises(prb.response.ResponseError, match="too steep"):
+        failing("scalar", fails_above_two, prb.response.Retry(2, then=prb.response.Abort()))
 
 
 @BATCHED
 def test_the_store_knows_which_points_failed_and_why(kind: str, tmp_path: Path) -> None:
-    failing(kind, fails_above_two, prb.Retry(1, then=prb.Replace(-1.0)), store=tmp_path)
+    failing(
+        kind,
+        fails_above_two,
+        prb.response.Retry(1, then=prb.response.Replace(-1.0)),
+        store=tmp_path,
+    )
     connection = sqlite3.connect(tmp_path / "responses.sqlite")
     query = "SELECT key, reason FROM run WHERE state = 'failed'"
     found = dict(connection.execute(query).fetchall())
@@ -362,14 +369,14 @@ def test_the_store_knows_which_points_failed_and_why(kind: str, tmp_path: Path) 
 
 
 def test_a_wrong_shape_is_a_mistake_and_no_failure() -> None:
-    with pytest.raises(prb.ResponseError, match=r"y: the response returned shape \(2,\)"):
-        model(lambda x, a: (a * x)[:2], on_failure=prb.Replace())
+    with pytest.raises(prb.response.ResponseError, match=r"y: the response returned shape \(2,\)"):
+        model(lambda x, a: (a * x)[:2], on_failure=prb.response.Replace())
 
 
 def test_a_lost_worker_is_named() -> None:
     with (
         ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
-        pytest.raises(prb.ResponseError, match=r"y: a worker was lost .*store="),
+        pytest.raises(prb.response.ResponseError, match=r"y: a worker was lost .*store="),
     ):
         model(prb.scalar(lambda x, a: os._exit(3)), executor=pool)
 
@@ -415,7 +422,7 @@ def test_another_constant_is_another_input(tmp_path: Path) -> None:
 
 
 def test_what_was_computed_before_a_failure_is_kept(tmp_path: Path) -> None:
-    with pytest.raises(prb.ResponseError, match=r"\d+ responses are kept in"):
+    with pytest.raises(prb.response.ResponseError, match=r"\d+ responses are kept in"):
         model(prb.scalar(fails_above_two), store=tmp_path)
     kept = len(Store(tmp_path, "y", 2))
     found = model(prb.scalar(times), store=tmp_path)
@@ -484,7 +491,7 @@ def test_what_is_being_computed_when_one_fails_is_kept(
 
     points = Points([np.arange(12.0)], [True])
     store = Store(tmp_path, "y", 1)
-    with Pool(2) as pool, pytest.raises(prb.ResponseError, match="too steep"):
+    with Pool(2) as pool, pytest.raises(prb.response.ResponseError, match="too steep"):
         respond(Calling("y", prb.scalar(function), pool, store), points, Tally())
     values, known = store.find(points.keys())
     np.testing.assert_array_equal(np.flatnonzero(known), [1, 2, 3])
@@ -492,8 +499,10 @@ def test_what_is_being_computed_when_one_fails_is_kept(
 
 
 def test_stored_failures_are_replaced_as_the_policy_of_the_day_says(tmp_path: Path) -> None:
-    model(prb.scalar(fails_above_two), store=tmp_path, on_failure=prb.Replace(np.inf))
-    found = model(prb.scalar(fails_above_two), store=tmp_path, on_failure=prb.Replace(-1.0))
+    model(prb.scalar(fails_above_two), store=tmp_path, on_failure=prb.response.Replace(np.inf))
+    found = model(
+        prb.scalar(fails_above_two), store=tmp_path, on_failure=prb.response.Replace(-1.0)
+    )
     np.testing.assert_array_equal(stored(found), np.where(STEEP, -1.0, EXPECTED))
     assert responses(found).computed == 0
 

@@ -48,8 +48,12 @@ def test_defaults() -> None:
         (lambda: Replace("a"), TypeError, "Replace: value: got str 'a', expected a number"),  # type: ignore[arg-type]
         (lambda: Replace(True), TypeError, "Replace: value: got bool True, expected a number"),
         (lambda: Retry(0), ValueError, "Retry: times: got 0, expected an integer >= 1"),
-        (lambda: Retry(1, then=Retry()), TypeError, "Retry: then: got Retry, expected prb.Abort"),
-        (lambda: Retry(1, then=3), TypeError, "Retry: then: got int, expected prb.Abort"),  # type: ignore[arg-type]
+        (
+            lambda: Retry(1, then=Retry()),
+            TypeError,
+            "Retry: then: got Retry, expected prb.response.Abort",
+        ),
+        (lambda: Retry(1, then=3), TypeError, "Retry: then: got int, expected prb.response.Abort"),  # type: ignore[arg-type]
     ],
 )
 def test_bad_settings(make: Any, error: type[Exception], message: str) -> None:

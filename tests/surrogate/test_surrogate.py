@@ -11,7 +11,7 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
-from prbayes.model.support import DesignError
+from prbayes.propagation.base import DesignError
 from prbayes.response.calling import ResponseError
 from prbayes.response.failures import Abort, Replace, Retry
 
