@@ -1,4 +1,4 @@
-"""The package keeps to the plan of DESIGN.md: who imports whom, who touches inner names of others, what is public."""
+"""The package keeps to the plan of DESIGN.md: imports, inner names of others, what is public."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ import re
 import runpy
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
+from types import FunctionType, ModuleType
+from typing import Any
 
 import pytest
 
@@ -35,13 +38,49 @@ LAYERS = (
     ("_demo", "__main__"),
 )
 FLOOR = {room: floor for floor, rooms in enumerate(LAYERS) for room in rooms}
-# Rooms of one floor that may see each other: what is below everything, verbs, and the command
-# line's two files.
+# Rooms of one floor that may see each other: what is below everything, verbs, and the command line's two files.
 TOGETHER = ({"_checks", "_progress", "_weighted", "datasets"}, {"_demo", "__main__"})
 
 # Results, errors and base classes, which nobody makes; and a kernel that is passed to PyMC.
-WITHOUT_EXAMPLE = {"BatchedKernel", "DesignError", "Diagnosis", "Metric", "Optimum", "ResponseError", "StoreError",
-                    "SurrogateError", "ValidityTest"}  # fmt: skip
+WITHOUT_EXAMPLE = {
+    "BatchedKernel",
+    "Bound",
+    "CrossValidation",
+    "DensityDiscrepancy",
+    "DensityEstimator",
+    "DesignError",
+    "Diagnosis",
+    "Discrepancy",
+    "Metric",
+    "Minimum",
+    "Optimum",
+    "Propagation",
+    "ResponseError",
+    "Store",
+    "StoreError",
+    "Surface",
+    "ValidityTest",
+}
+
+
+def public() -> dict[str, Any]:
+    """Return what users may import, by name: that of the package, and that of its namespaces."""
+    found = {}
+    for name in prbayes.__all__:
+        value = getattr(prbayes, name)
+        if isinstance(value, ModuleType):
+            found |= {f"{name}.{inner}": getattr(value, inner) for inner in value.__all__}
+        else:
+            found[name] = value
+    return found
+
+
+PUBLIC = public()
+
+
+@cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def dotted(path: Path) -> str:
@@ -52,7 +91,7 @@ def dotted(path: Path) -> str:
 def imported(path: Path) -> list[str]:
     """Return what a file imports, anywhere in it, as dotted names: `from a import b` is a.b."""
     names: list[str] = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree(path)):
         if isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: a relative import"
             names += [f"{node.module}.{alias.name}" for alias in node.names]
@@ -61,9 +100,12 @@ def imported(path: Path) -> list[str]:
     return names
 
 
+MODULES = {dotted(path) for path in FILES}
+
+
+@cache
 def own(path: Path) -> set[str]:
     """Return the modules of the package that a file imports."""
-    modules = {dotted(p) for p in FILES}
     found: set[str] = set()
     for name in imported(path):
         parts = name.split(".")
@@ -71,7 +113,7 @@ def own(path: Path) -> set[str]:
             continue
         whole = [".".join(parts[1:end]) for end in range(len(parts), 1, -1)]
         # An import of the package itself sees all of it.
-        found.add(next((m for m in whole if m in modules), ""))
+        found.add(next((m for m in whole if m in MODULES), ""))
     return found
 
 
@@ -103,28 +145,54 @@ def test_imports_form_no_circle() -> None:
 
 @pytest.mark.parametrize("path", FILES, ids=dotted)
 def test_files_print_nothing_and_evaluate_nothing(path: Path) -> None:
-    calls = [
-        n for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.Call)
-    ]
+    calls = [n for n in ast.walk(tree(path)) if isinstance(n, ast.Call)]
     assert not {"print", "eval", "exec", "breakpoint"} & {
         c.func.id for c in calls if isinstance(c.func, ast.Name)
     }
 
 
-@pytest.mark.parametrize("name", sorted(set(prbayes.__all__) - {"datasets"}))
+@pytest.mark.parametrize("name", sorted(PUBLIC))
 def test_public_functions_and_configurations_have_an_example(name: str) -> None:
-    if name in WITHOUT_EXAMPLE:
+    if name.split(".")[-1] in WITHOUT_EXAMPLE:
         return
-    text = getattr(prbayes, name).__doc__
+    text = PUBLIC[name].__doc__
     assert "Examples\n" in text
     assert ">>> " in text
 
 
-@pytest.mark.parametrize("name", sorted(set(prbayes.__all__) - {"datasets"}))
+@pytest.mark.parametrize("name", sorted(PUBLIC))
 def test_public_names_are_documented(name: str) -> None:
-    text = getattr(prbayes, name).__doc__
+    text = PUBLIC[name].__doc__
     assert text
     assert text.strip().splitlines()[0].endswith("."), "the summary is one sentence"
+
+
+def test_the_top_has_few_names_and_no_function_is_called_like_a_module() -> None:
+    assert len(prbayes.__all__) <= 50
+    stems = {module.split(".")[-1] for module in MODULES}
+    functions = {name for name, value in PUBLIC.items() if isinstance(value, FunctionType)}
+    assert not stems & {name.split(".")[-1] for name in functions}
+
+
+def test_design_shows_the_rooms_in_their_own_words() -> None:
+    page = (ROOT / "DESIGN.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)(?:/|\.py)` \| (.*) \| (.*)\|$", page, flags=re.MULTILINE)
+    shown = {name: (words, files.strip()) for name, words, files in rows}
+    assert set(shown) == {room(module) for module in MODULES - {""}} - {"__init__"}
+    for name, (words, files) in shown.items():
+        folder = PACKAGE / name
+        path = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
+        summary = (ast.get_docstring(tree(path)) or "").split("\n\n")[0].replace("\n", " ")
+        assert words == summary, f"DESIGN.md says of {name}: {words}; the module: {summary}"
+        inside = sorted(p.stem for p in folder.glob("*.py") if p.stem != "__init__")
+        assert files == (", ".join(inside) or ("-" if folder.is_dir() else ""))
+
+
+def test_every_module_has_a_test_file_of_its_name() -> None:
+    tests = {path.stem for path in (ROOT / "tests").rglob("test_*.py")}
+    stems = {path.stem for path in FILES} - {"__init__", "__main__"}
+    missing = {stem for stem in stems if f"test_{stem.lstrip('_')}" not in tests}
+    assert not missing
 
 
 def test_the_package_imports_nothing_that_draws_or_renders() -> None:
@@ -176,7 +244,7 @@ def test_the_table_of_the_readme_is_what_its_example_prints(tmp_path: Path) -> N
 def negations_of_a_discrepancy(path: Path) -> list[str]:
     """Return the functions of a file that divide minus a discrepancy by epsilon, by their syntax trees."""
     found = []
-    for function in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for function in ast.walk(tree(path)):
         if not isinstance(function, ast.FunctionDef):
             continue
         for node in ast.walk(function):
@@ -193,8 +261,7 @@ def test_the_sign_of_a_discrepancy_changes_in_one_place() -> None:
     assert found == ["model.node.log_kernel"]
 
 
-# Inner names of PyMC, PyTensor and ArviZ by the files that use them: what `tests/test_contracts.py`
-# tests directly.
+# Inner names of PyMC, PyTensor and ArviZ by the files that use them: what `tests/test_contracts.py` tests directly.
 INNER = {
     "estimate.search": {"pytensor.gradient.NullTypeGradError"},
     "model.description": {
@@ -284,7 +351,7 @@ FOREIGN = ("pymc", "pytensor", "arviz", "arviz_base", "arviz_stats", "arviz_plot
 def inner(path: Path) -> set[str]:
     """Return names below the top of a foreign package that a file imports, or reaches as pm.distributions.x."""
     found = {name for name in imported(path) if name.split(".")[0] in FOREIGN}
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree(path)):
         if isinstance(node, ast.Attribute):
             whole = ast.unparse(node).split(".")
             if (

@@ -103,8 +103,8 @@ def test_a_copy_gives_the_same_optimum(way: str) -> None:
     model = build(prb.Reweighted(64))
     other = COPIES[way](model)
     first, second = (prb.minimize(m, starts=0, **QUIET) for m in (model, other))
-    # PyMC's clones may order variables, and so the points by which a design grows, in another way:
-    # a design is good to a tenth of a standard error.
+    # PyMC's clones may order variables, and so the points by which a design grows, in another
+    # way: a design is good to a tenth of a standard error.
     for name in ("mu", "sigma"):
         assert abs(first.point[name] - second.point[name]) < 0.1 * first.stderr[name]
         assert first.stderr[name] == pytest.approx(second.stderr[name], rel=0.05)
