@@ -1,4 +1,4 @@
-"""Configuration of the documentation: `uv run --group docs sphinx-build -W docs docs/_build/html`."""
+"""Configuration of the pages: `uv run --group docs sphinx-build -W docs docs/_build/html`."""
 
 from inspect import isclass, ismodule
 
