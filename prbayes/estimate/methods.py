@@ -40,7 +40,7 @@ class Method:
     References
     ----------
     .. [1] Nocedal, J. and S. J. Wright (2006), Numerical Optimization,
-    doi:10.1007/978-0-387-40065-5.
+           doi:10.1007/978-0-387-40065-5.
 
     Examples
     --------

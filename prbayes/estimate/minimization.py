@@ -69,7 +69,7 @@ def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[
     References
     ----------
     .. [1] Owen, A. and Y. Zhou (2000), Safe and effective importance sampling, J. Am. Stat. Assoc.
-    95, 135-143.
+           95, 135-143.
 
     Examples
     --------

@@ -65,8 +65,8 @@ def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
 
     Notes
     -----
-    A clone of a model (`pymc.do`, `pymc.observe`, a copy) has epsilons of its own from the first
-    time that this package is given it; what was compiled before follows the original.
+    A clone of a model (``pymc.do``, ``pymc.observe``, a copy) has epsilons of its own from the
+    first time that this package is given it; what was compiled before follows the original.
 
     Examples
     --------

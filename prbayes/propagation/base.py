@@ -51,7 +51,7 @@ class Bound(ABC):
     n_per_theta : int
         Number of responses that one evaluation of the discrepancy computes.
     symbolic : bool
-        Whether the responses are part of the graph, so that `responses` does not count them.
+        Whether the responses are part of the graph, so that ``responses`` does not count them.
     stored : bool
         Whether the responses are stored, and theta moves their weights; then a theta costs no
         response.

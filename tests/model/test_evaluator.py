@@ -176,6 +176,7 @@ def test_populations_of_inputs(name: str, propagation: Propagation) -> None:
     )
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize(
     "propagation", [prb.Reweighted(256), prb.Fresh(20_000)], ids=lambda p: type(p).__name__
 )

@@ -112,6 +112,7 @@ def response_op(calls: list[tuple[int, ...]]) -> ResponseOp:
     return ResponseOp(Responses("y", response, inputs))
 
 
+@pytest.mark.exact
 def test_a_batch_is_one_call_of_the_response() -> None:
     calls: list[tuple[int, ...]] = []
     op = response_op(calls)
@@ -123,6 +124,7 @@ def test_a_batch_is_one_call_of_the_response() -> None:
     assert calls == [(3, 4)]
 
 
+@pytest.mark.exact
 def test_the_response_is_not_called_for_populations_without_a_finite_specimen() -> None:
     calls: list[tuple[int, ...]] = []
     op = response_op(calls)

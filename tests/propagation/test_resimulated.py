@@ -45,6 +45,7 @@ def test_responses_are_those_of_the_quantiles_of_the_base_points() -> None:
     np.testing.assert_array_equal(weights, 1 / 64)
 
 
+@pytest.mark.exact
 def test_the_same_points_for_every_theta() -> None:
     found = bound(np.positive)
     values, _ = found.populations([np.array([0.0, 5.0]), np.array([1.0, 2.0])])

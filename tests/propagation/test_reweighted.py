@@ -83,6 +83,7 @@ def test_points_of_one_input_have_equal_mass() -> None:
     assert 0 < mass[0] < 1.5 / 256
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize("model", [once, twice])
 def test_weights_are_the_populations_density_over_the_mixture(model: Any) -> None:
     d = design(model())
@@ -187,6 +188,7 @@ def test_an_input_without_inverse_distribution_function() -> None:
     assert abs(optimum.point["mu"] - 1.0) < 4 * 1.25 * 0.58 / 40**0.5
 
 
+@pytest.mark.exact
 def test_a_discrete_input() -> None:
     data = np.random.default_rng(4).poisson(4.0, 40)
     with pm.Model() as model:
