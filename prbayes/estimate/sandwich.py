@@ -292,4 +292,4 @@ class Information:
         knots = np.unique(occurring)
         places = np.linspace(0, knots.size - 1, _KNOTS)
         some = np.unique(places.astype(int))
-        return knots[some]
+        return np.asarray(knots[some])
