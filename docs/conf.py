@@ -1,6 +1,28 @@
-"""Configuration of the documentation: `uv run --group docs sphinx-build -W docs docs/_build/html`."""
+"""Configuration of the pages: `uv run --group docs sphinx-build -W docs docs/_build/html`."""
+
+from inspect import isclass, ismodule
+
+from docutils import nodes
+from sphinx.addnodes import pending_xref
+from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
 
 import prbayes
+
+
+def public_names() -> dict[str, str]:
+    """Return where users find each public name, such as 'prbayes.response.Abort' of 'Abort'."""
+    found = {}
+    for name in prbayes.__all__:
+        value = getattr(prbayes, name)
+        if ismodule(value):
+            found |= {inner: f"prbayes.{name}.{inner}" for inner in value.__all__}
+        else:
+            found[name] = f"prbayes.{name}"
+    return found
+
+
+PUBLIC = public_names()
 
 project = "prbayes"
 author = "The prbayes developers"
@@ -23,7 +45,8 @@ html_title = "prbayes"
 html_static_path = ["_static"]
 html_css_files = ["prbayes.css"]
 
-# Pages are notebooks: a page whose code fails stops the build. Results are kept, so that only changed pages run again.
+# Pages are notebooks: a page whose code fails stops the build. Results are kept, so that only
+# changed pages run again.
 nb_execution_mode = "cache"
 nb_execution_raise_on_error = True
 nb_execution_show_tb = True
@@ -37,7 +60,7 @@ autodoc_typehints = "none"  # numpydoc's parameter sections say it
 numpydoc_show_class_members = False
 numpydoc_xref_param_type = True
 numpydoc_xref_ignore = "all"  # but these
-numpydoc_xref_aliases = {name: f"prbayes.{name}" for name in prbayes.__all__} | {
+numpydoc_xref_aliases = PUBLIC | {
     "Executor": "concurrent.futures.Executor",
     "array_like": "numpy.typing.ArrayLike",
     "bool": "bool",
@@ -47,9 +70,9 @@ numpydoc_xref_aliases = {name: f"prbayes.{name}" for name in prbayes.__all__} | 
 }
 default_role = "py:obj"
 nitpicky = True
-nitpick_ignore_regex = [("py:obj", r"prbayes\.\w+\.\w+")]  # attributes are listed with their class
 
-# Names of other projects that these pages refer to, in files kept here: the documentation builds without a network.
+# Names of other projects that these pages refer to, in files kept here: the documentation builds
+# without a network.
 intersphinx_mapping = {
     name: (address, f"inventories/{name}.inv")
     for name, address in {
@@ -61,3 +84,50 @@ intersphinx_mapping = {
         "xarray": "https://docs.xarray.dev/en/stable/",
     }.items()
 }
+
+
+def found_by_public_name(
+    app: Sphinx, env: BuildEnvironment, reference: pending_xref, content: nodes.TextElement
+) -> nodes.Node | None:
+    """Resolve what a docstring of any module calls by its public name alone.
+
+    That is a name such as `Affine`, an attribute such as `Optimum.design_error`, which is listed
+    with its class, or one of the class whose docstring it is, such as `n_computed`.
+    """
+    if reference.get("refdomain") != "py":
+        return None
+    target = reference["reftarget"].removesuffix("()").removeprefix("prbayes.")
+    parts = target.split(".")
+    owner = next((part for part in parts if part in PUBLIC), None)
+    if owner is None:
+        owner = str(reference.get("py:class") or "").split(".")[-1]
+        attributes = parts
+    else:
+        attributes = parts[parts.index(owner) + 1 :]
+    if owner not in PUBLIC or len(attributes) > 1:
+        return None
+    if attributes and not has_attribute(owner, attributes[0]):
+        return None
+    python = env.get_domain("py")
+    for full in (".".join([PUBLIC[owner], *attributes]), PUBLIC[owner]):
+        found = python.resolve_xref(
+            env, reference["refdoc"], app.builder, "obj", full, reference, content
+        )
+        if found is not None:
+            return found
+    return None
+
+
+def has_attribute(owner: str, name: str) -> bool:
+    """Whether a public class has a method, a property or a field of this name."""
+    room, _, own = PUBLIC[owner].removeprefix("prbayes.").rpartition(".")
+    value = getattr(getattr(prbayes, room) if room else prbayes, own)
+    if not isclass(value):
+        return False
+    fields = set().union(*(vars(base).get("__annotations__", {}) for base in value.__mro__))
+    return hasattr(value, name) or name in fields
+
+
+def setup(app: Sphinx) -> None:
+    """Attach what resolves bare names."""
+    app.connect("missing-reference", found_by_public_name)

@@ -115,7 +115,8 @@ def picture(observed, log_c, results, path):
         )
     top.set(xlabel="mu: mean of log C")
     top.set_title(
-        "optimum (dot); posterior mean and 89% interval (bar);\nleast squares per specimen (dotted)",
+        "optimum (dot); posterior mean and 89% interval (bar);\n"
+        "least squares per specimen (dotted)",
         fontsize=9,
     )
     bottom.set(xlabel="sigma: standard deviation of log C")
@@ -132,10 +133,12 @@ def main():
     observed = (data.crack_length_inch.sel(million_cycles=0.05) / data.notch_inch).values
     log_c = reference(data)
     print(
-        f"{observed.size} specimens, relative crack length {observed.min():.3f} to {observed.max():.3f}"
+        f"{observed.size} specimens, "
+        f"relative crack length {observed.min():.3f} to {observed.max():.3f}"
     )
     print(
-        f"reference, least squares per specimen: mu {log_c.mean():.3f}, sigma {log_c.std(ddof=1):.3f}\n"
+        "reference, least squares per specimen: "
+        f"mu {log_c.mean():.3f}, sigma {log_c.std(ddof=1):.3f}\n"
     )
     results = {}
     for label, metric in METRICS.items():
@@ -143,7 +146,8 @@ def main():
         results[label] = optimum, posterior
         table = prb.compare({"optimum": optimum, "ABC": posterior}, model=model)
         print(
-            f"{label}: {optimum.n_responses} responses computed, epsilon {float(posterior.calibration.epsilon[0]):.3g}"
+            f"{label}: {optimum.n_responses} responses computed, "
+            f"epsilon {float(posterior.calibration.epsilon[0]):.3g}"
         )
         print(
             table[["estimate", "sd", "lower", "upper", "shift"]].to_dataframe().round(3).to_string()

@@ -38,7 +38,7 @@ def length(C, m, t=0.05):
 
 
 def reading(t):
-    """Return what is read after t million cycles, to 0.01 inch: +inf where the specimen has been removed."""
+    """Return what is read after t million cycles, to 0.01 inch; +inf where it was removed."""
 
     def read(C, m):
         removed = np.round(length(C, m, t - 0.01), 2) >= REMOVED
@@ -71,7 +71,7 @@ def measured(t, who):
 
 
 def one_exponent(who):
-    """Return a model of C with one exponent, inputs of responses, and what makes a response of them."""
+    """Return a model of C with one exponent, its inputs, and what makes a response of them."""
     with pm.Model() as model:
         C = pm.LogNormal.dist(pm.Normal("mu", 1.1, 0.5), pm.HalfNormal("sigma", 0.5))
         prb.Simulator(
@@ -101,7 +101,7 @@ def fits(who):
 
 
 def random_exponent(who):
-    """Return the same with exponents that vary: their mean, spread and correlation are those of least squares."""
+    """Return the same with exponents that vary: populations of them by least squares."""
     found = fits(who)
     mean, sd, rho = found[:, 1].mean(), found[:, 1].std(ddof=1), np.corrcoef(found.T)[0, 1]
     with pm.Model() as model:
@@ -120,7 +120,7 @@ def random_exponent(who):
 
 
 def check(result, model, inputs, wrap, who, conditions, null=None):
-    """Test specimens under named conditions, (values, response) each; return tests of the mean and of the spread."""
+    """Test specimens under named conditions, (values, response) each, for mean and for spread."""
     responses = {name: wrap(response) for name, (_, response) in conditions.items()}
     observed = {name: values for name, (values, _) in conditions.items()}
     predicted = {
@@ -139,7 +139,8 @@ def line(what, tests):
     """Print one row of the table."""
     plain, folded = tests
     print(
-        f"{what:45s} {plain.statistic:6.3f} {plain.critical_value:9.3f} {plain.p_value:7.3f} {folded.p_value:9.3f}",
+        f"{what:45s} {plain.statistic:6.3f} {plain.critical_value:9.3f} "
+        f"{plain.p_value:7.3f} {folded.p_value:9.3f}",
         flush=True,
     )
 
@@ -191,7 +192,8 @@ def main():
         arguments.out / "crack_growth_validity.png"
     )
     print(
-        f"figure: {arguments.out / 'crack_growth_validity.png'}; {time.perf_counter() - clock:.0f} s"
+        f"figure: {arguments.out / 'crack_growth_validity.png'}; "
+        f"{time.perf_counter() - clock:.0f} s"
     )
 
 

@@ -1,4 +1,4 @@
-"""A response that runs an external program: input file, command, output file, on several threads, with a store.
+"""A response that runs an external program on several threads, with a store.
 
 The deflection of beams under a given load calibrates the population of Young's modulus. The
 measured deflections are synthetic: E ~ N(210, 7^2) GPa, 24 specimens. A second run of this script
@@ -56,8 +56,8 @@ def main():
         )  # fmt: skip
         optimum = prb.minimize()
         posterior = prb.sample_smc(500, chains=2, optimum=optimum, random_seed=1, progressbar=False)
-    print(f"{optimum.n_responses} runs of the program in all; sample mean {modulus.mean():.1f} GPa, "
-          f"sd {modulus.std(ddof=1):.1f} GPa")  # fmt: skip
+    print(f"{optimum.n_responses} runs of the program in all; "
+          f"sample mean {modulus.mean():.1f} GPa, sd {modulus.std(ddof=1):.1f} GPa")  # fmt: skip
     table = prb.compare({"optimum": optimum, "ABC": posterior}, model=model)
     print(table[["estimate", "sd", "lower", "upper"]].to_dataframe().round(3))
 

@@ -25,7 +25,8 @@ def main():
     lengths = data.crack_length_inch / data.notch_inch
     early, late = lengths.sel(million_cycles=0.05), lengths.sel(million_cycles=0.08)
     print(
-        f"rank correlation of the two lengths: {spearmanr(early, late, nan_policy='omit').statistic:.2f}"
+        "rank correlation of the two lengths: "
+        f"{spearmanr(early, late, nan_policy='omit').statistic:.2f}"
     )
     for labels in (False, True):
         with pm.Model() as model:
@@ -35,7 +36,8 @@ def main():
             for name, response, column in (("early", growth, early), ("late", later, late)):
                 measured = np.isfinite(column.values)
                 prb.Simulator(
-                    name, response, C, EXPONENT, metric=prb.ProbabilityResidual(), observed=column.values[measured],
+                    name, response, C, EXPONENT,
+                    metric=prb.ProbabilityResidual(), observed=column.values[measured],
                     specimens=data.specimen.values[measured] if labels else None,
                 )  # fmt: skip
         optimum = prb.minimize(model)

@@ -1,4 +1,4 @@
-"""Case study 1 of the probability residual: four system functions, one uncertain input, four metrics.
+"""Case study 1 of the probability residual: four systems, one uncertain input, four metrics.
 
 The input x is normal; its mean and standard deviation are calibrated from 1000 responses of each
 system (eq. 11 to 14 of doi:10.1007/s00158-019-02288-6). Three of the four are symmetric, so that
@@ -27,7 +27,7 @@ METRICS = {
 
 
 def elliptical(x, coin):
-    """The upper or the lower branch of an ellipse, as a coin falls; NaN where x is outside: a lost point."""
+    """The upper or the lower branch of an ellipse, as a coin falls; NaN where x is outside."""
     with np.errstate(invalid="ignore"):
         return 10 + np.where(coin < 0.5, -16, 16) * np.sqrt(1 - (x - 2) ** 2)
 
@@ -66,7 +66,8 @@ def main():
     clock = time.perf_counter()
     figure, axes = plt.subplots(1, 4, figsize=(14, 3.2), layout="constrained")
     print(
-        f"{'system':12s} {'metric':15s} {'mean':>8s} {'error %':>8s} {'sd':>8s} {'error %':>8s} {'evaluations':>12s}"
+        f"{'system':12s} {'metric':15s} {'mean':>8s} {'error %':>8s} "
+        f"{'sd':>8s} {'error %':>8s} {'evaluations':>12s}"
     )
     for axis, (name, (response, truth, initial)) in zip(axes, SYSTEMS.items(), strict=True):
         rng = np.random.default_rng(5)
@@ -80,9 +81,11 @@ def main():
             optimum = calibrate(response, observed, initial, metric, coins)
             found = np.array([optimum.point["mu"], optimum.point["sigma"]])
             error = 100 * np.abs(found / truth - 1)
-            row = f"{found[0]:8.4f} {error[0]:8.2f} {found[1]:8.4f} {error[1]:8.2f} {optimum.n_evaluations:12d}"
+            row = f"{found[0]:8.4f} {error[0]:8.2f} {found[1]:8.4f} {error[1]:8.2f}"
+            row += f" {optimum.n_evaluations:12d}"
             print(
-                f"{name:12s} {label:15s} {row}{'' if optimum.converged else '  ' + optimum.message}",
+                f"{name:12s} {label:15s} {row}"
+                f"{'' if optimum.converged else '  ' + optimum.message}",
                 flush=True,
             )
             if label == "PR":

@@ -1,9 +1,10 @@
-"""A small rotor: beam finite elements with gyroscopic terms, springs and dampers at the bearings, disc, rub.
+"""A small rotor: beam finite elements, springs and dampers at the bearings, a disc, a rub.
 
 A shaft of 10 mm carries a disc of 0.8 kg between two journal bearings and turns at 3600 rpm. Two
 responses:
 
-- ``first_frequency(k, c)``: first natural frequency in Hz, of the shaft at rest, as an impact test finds it;
+- ``first_frequency(k, c)``: first natural frequency in Hz, of the shaft at rest, as an impact test
+  finds it;
 - ``crest_factor(k, c, contact)``: peak over RMS of the vibration while a screw rubs on the shaft.
 
 Both take arrays of any shape, one entry per specimen. Deflections in the two planes are one complex
@@ -51,7 +52,7 @@ class Shaft:
         return kappa * self.youngs_modulus / (2 * (1 + self.poisson)) * self.area
 
     def element(self, length):
-        """Return mass, gyroscopic and stiffness matrix of one element, degrees of freedom (v, slope) at both ends.
+        """Return mass, gyroscopic and stiffness matrix of an element, (v, slope) at both ends.
 
         Friswell, Penny, Garvey and Lees, Dynamics of Rotating Machines (2010), section 5.4.
         """
@@ -126,7 +127,7 @@ class Rotor:
     probe = 8
 
     def matrices(self):
-        """Return mass, gyroscopic and stiffness matrices without bearings, and the bearings' pattern."""
+        """Return mass, gyroscopic and stiffness matrices, and the bearings' pattern."""
         lengths = np.repeat([self.overhang / 2, self.span / 16, self.overhang / 2], [2, 16, 2])
         mass, gyro, stiffness = assemble(self.shaft, lengths)
         r, h, at = self.disc_radius, self.disc_thickness, 2 * self.disc
@@ -140,7 +141,7 @@ class Rotor:
 
     @cache  # noqa: B019 (frozen, and few)
     def reduced(self):
-        """Return gyroscopic, damping, stiffness and bearing matrices in a basis of modes and static shapes.
+        """Return gyroscopic, damping, stiffness and bearing matrices in modes and static shapes.
 
         The lowest modes at the nominal bearing stiffness, and the static deflections under forces
         at the bearings and at the contact, made orthonormal in the mass matrix; and the rows of the
@@ -197,7 +198,7 @@ def first_frequency(k, c, rotor=ROTOR):
 
 
 def vibration(k, c, contact, unbalance=0.45, rotor=ROTOR, substeps=1):
-    """Return the x-deflection at the probe in m under rub, shape (n, samples), for arrays of shape (n,).
+    """Return the x-deflection at the probe in m under rub, shapes (n,) -> (n, samples).
 
     The linear rotor is propagated exactly in the coordinates of its complex modes; the contact
     force is linear in time over a step, and so small as to close the penalty law at its end.

@@ -121,7 +121,7 @@ class Discrepancy(ABC):
         weights : array, shape (n,) or (..., n)
             Non-negative; they sum to at most one.
         xp : module
-            `numpy`, or `pytensor.tensor` for symbolic responses.
+            ``numpy``, or ``pytensor.tensor`` for symbolic responses.
         """
 
     @abstractmethod
@@ -143,7 +143,7 @@ class Discrepancy(ABC):
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the discrepancy of the features, shape (...); smaller is better.
 
-        Written with ``xp`` (`numpy` or `pytensor.tensor`), by functions that both have.
+        Written with ``xp`` (``numpy`` or ``pytensor.tensor``), by functions that both have.
         """
 
     @property

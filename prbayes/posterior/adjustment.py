@@ -32,7 +32,30 @@ _LEVELS = (0.055, 0.5, 0.945)
 _WIDTH = 3.2
 # Prior draws that tell its mean and precision along the axes.
 _PRIOR_DRAWS = 1024
-_WITHOUT = "none: {}"
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """What an adjustment made of draws.
+
+    Attributes
+    ----------
+    thetas : ndarray, shape (..., d)
+        The draws; the given ones if nothing was done.
+    done : str
+        What was done; empty if nothing.
+    reason : str or None
+        Why nothing was done, None if something was.
+    """
+
+    thetas: Floats
+    done: str = ""
+    reason: str | None = None
+
+    @property
+    def note(self) -> str:
+        """What was done, or why nothing, as results state it."""
+        return self.done if self.reason is None else f"none: {self.reason}"
 
 
 @dataclass(frozen=True)
@@ -97,9 +120,7 @@ class Affine:
         from_prior = precision @ prior.mean(axis=0)
         return covariance @ (from_data + from_prior), covariance
 
-    def __call__(
-        self, evaluator: Evaluator, thetas: Floats, optima: Sequence[Floats]
-    ) -> tuple[Floats, str]:
+    def __call__(self, evaluator: Evaluator, thetas: Floats, optima: Sequence[Floats]) -> Adjusted:
         """Map draws of the pseudo-posterior, each mode by itself.
 
         Parameters
@@ -112,23 +133,19 @@ class Affine:
 
         Returns
         -------
-        thetas : ndarray, shape (..., d)
-        note : str
-            What was done, or why nothing.
+        Adjusted
         """
         obstacle = refit_obstacle(evaluator)
         if obstacle is not None:
-            return thetas, _WITHOUT.format(obstacle)
+            return Adjusted(thetas, reason=str(obstacle))
+        draws = thetas.reshape(-1, thetas.shape[-1])
         modes = _identified_modes(evaluator, optima)
         if not modes:
             reason = "the data tell less than the prior about every hyperparameter"
-            return thetas, _WITHOUT.format(reason)
-        draws = thetas.reshape(-1, thetas.shape[-1])
+            return Adjusted(thetas, reason=reason)
         distances = np.array([_distance(mode, draws) for mode in modes])
         if _run_together(distances):
-            reason = "the posterior has modes that run into each other"
-            return thetas, _WITHOUT.format(reason)
-        # Each mode by itself.
+            return Adjusted(thetas, reason="the posterior has modes that run into each other")
         nearest = distances.argmin(axis=0)
         out = draws.copy()
         count = 0
@@ -142,16 +159,14 @@ class Affine:
             far += int(outside.sum())
             count += 1
         if not count:
-            reason = f"there are fewer than {_FEWEST} draws of a mode"
-            return thetas, _WITHOUT.format(reason)
-        # What was done.
-        note = f"{self!r}"
+            return Adjusted(thetas, reason=f"there are fewer than {_FEWEST} draws of a mode")
+        done = f"{self!r}"
         if len(modes) > 1:
-            note += f", {count} modes each by itself"
+            done += f", {count} modes each by itself"
         if far:
             share = far / len(draws)
-            note += f", {share:.1%} of the draws drawn in to {_FAR:.0f} standard deviations"
-        return out.reshape(thetas.shape), note
+            done += f", {share:.1%} of the draws drawn in to {_FAR:.0f} standard deviations"
+        return Adjusted(out.reshape(thetas.shape), done)
 
     def _mapped(
         self, sampling: SamplingDistribution, draws: Floats
