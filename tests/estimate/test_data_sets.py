@@ -1,30 +1,25 @@
 """Many minimisations at once, data sets that might have been observed, and refits to them."""
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import pytest
-from scipy import optimize
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.estimate import refit
 from prbayes.estimate.data_sets import (
     DataSets,
     aligned,
     dependent,
     fresh_data,
     groups,
-    observed_set,
     reweighted_sets,
     siblings,
     simulated_sets,
     specimens,
 )
 from prbayes.estimate.differences import differences
-from prbayes.estimate.refit import SamplingDistribution, _mean_hessian
 from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
@@ -286,128 +281,6 @@ def test_shared_specimens_have_one_weight() -> None:
     assert (a != b).all()
     (repeated,) = reweighted_sets(Evaluator(build(specimens=labels // 2)), 5).weights
     np.testing.assert_allclose(repeated[:, ::2], repeated[:, 1::2])
-
-
-# -- refits
-# ----------------------------------------------------------------------------------------------
-
-
-@cache
-def neighbourhood(name: str, *, design: bool = True) -> SamplingDistribution:
-    model = build(METRICS[name], sd=None, propagation=R256 if design else prb.Resimulated(512))
-    optimum = prb.minimize(model, method="Nelder-Mead", starts=0)
-    evaluator = optimum.evaluator
-    return SamplingDistribution.of(
-        evaluator, optimum.theta, np.array(list(optimum.scales.values()))
-    )
-
-
-def test_coordinates_are_standard_errors_along_a_frame() -> None:
-    sampling = neighbourhood("kl")
-    thetas = sampling.theta + np.random.default_rng(6).normal(size=(7, 2))
-    x, remainder = sampling.coordinates(thetas)
-    np.testing.assert_allclose(sampling.thetas(x, remainder), thetas)
-    np.testing.assert_allclose(remainder, 0, atol=1e-12)  # two hyperparameters, both seen
-    np.testing.assert_allclose(sampling.axes.T @ sampling.axes, np.eye(2), atol=1e-12)
-    # One unit along each direction, together, make up the sampling covariance of theta.
-    steps = sampling.thetas(np.eye(2)) - sampling.theta
-    np.testing.assert_allclose(steps.T @ steps, sampling.local.in_theta)
-
-
-def test_what_is_not_seen_is_left_over() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
-        pm.Normal("idle", 0, 3)
-        prb.Simulator("y", same, x, metric=KL, observed=OBSERVED, propagation=R256)
-    evaluator = Evaluator(model)
-    sampling = SamplingDistribution.of(evaluator, np.array([1.0, 0.0]), np.ones(1))
-    x, remainder = sampling.coordinates(np.array([[1.5, 2.0]]))
-    assert x.shape == (1, 1)
-    np.testing.assert_allclose(remainder, [[0.0, 2.0]], atol=1e-9)
-    np.testing.assert_allclose(sampling.thetas(x, remainder), [[1.5, 2.0]])
-
-
-@pytest.mark.parametrize("name", ["kl", slow("ll"), slow("pr"), "area"])
-def test_refits_are_minimisers(name: str) -> None:
-    # Against a simplex on each data set by itself.
-    sampling = neighbourhood(name)
-    sets = reweighted_sets(sampling.evaluator, 6)
-    x, converged = sampling.refit(sets)
-    assert converged.all()
-    target = sampling.evaluator.nodes[0].target
-    for found, weights in zip(x, sets.weights[0], strict=True):
-        own = target.with_observed(sets.values[0], weights)
-
-        def value(point: Floats, own: Any = own) -> float:
-            return float(
-                own.of(*sampling.evaluator.populations(sampling.thetas(point)[None], 0))[0]
-            )
-
-        best = optimize.minimize(
-            value, np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-12}
-        )
-        # Gains of 1e-4 of a standard error's are left on the table: 0.02 standard errors, the
-        # area's kinks more.
-        np.testing.assert_allclose(found, best.x, atol=0.15 if name == "area" else 0.04)
-
-
-def test_the_observed_responses_are_fitted_by_the_optimum() -> None:
-    for name in ("kl", "pr"):
-        (x,), (converged,) = neighbourhood(name).refit(observed_set(neighbourhood(name).evaluator))
-        assert converged
-        np.testing.assert_allclose(x, 0, atol=0.02)
-
-
-@pytest.mark.parametrize("name", [slow("kl"), "pr", "area"])
-def test_first_order_without_a_design(name: str) -> None:
-    # The optima differ little between 512 fixed points and a design; data sets of the observed
-    # specimens are the same.
-    sampling, first = neighbourhood(name), neighbourhood(name, design=False)
-    sets = reweighted_sets(sampling.evaluator, 100)
-    a = sampling.thetas(sampling.refit(sets)[0]) - sampling.theta
-    b = first.thetas(first.refit(sets)[0]) - first.theta
-    for i in range(2):
-        assert np.corrcoef(a[:, i], b[:, i])[0, 1] > 0.9
-        # A linear model of distribution functions knows the spread of other data to 30%, one of
-        # densities to 10%.
-        np.testing.assert_allclose(
-            b[:, i].std(), a[:, i].std(), rtol=0.35 if name == "area" else 0.15
-        )
-
-
-def test_blocks_of_data_sets_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
-    sampling = neighbourhood("kl")
-    sets = simulated_sets(sampling.evaluator, sampling.theta, 23)
-    whole, _ = sampling.refit(sets)
-    monkeypatch.setattr(refit, "_BLOCK", 10 * 5 * (256 + sets.values[0].size))
-    parts, converged = sampling.refit(sets)
-    assert converged.size == 23
-    # Each block guesses its curvature from its own data sets, so that paths differ, but not where
-    # they lead.
-    np.testing.assert_allclose(parts, whole, atol=0.04)
-
-
-def test_two_simulators_are_weighed_by_their_scales() -> None:
-    # A normal mean with known sd: both minimisers are about the means of the data, weighed by N_k.
-    labels = np.arange(N)
-    evaluator = pair(labels, labels)
-    sampling = SamplingDistribution.of(evaluator, TRUTH, np.array([1 / N, 1e9, 1e9]))
-    sets = reweighted_sets(evaluator, 20)
-    only_a, _ = sampling.refit(sets)
-    alone = Evaluator(build(KL))
-    by_itself = SamplingDistribution.of(alone, TRUTH, np.array([1 / N]))
-    expected, _ = by_itself.refit(DataSets(sets.values[:1], sets.weights[:1]))
-    np.testing.assert_allclose(sampling.thetas(only_a), by_itself.thetas(expected), atol=0.003)
-
-
-def test_mean_hessian_of_a_parabola() -> None:
-    exact = np.array([[3.0, 1.0, 0.5], [1.0, 2.0, 0.0], [0.5, 0.0, 1.0]])
-    found = _mean_hessian(
-        lambda x: 0.5 * np.einsum("bsi,ij,bsj->s", x, exact, x) + x.sum(axis=(0, 2)), 3
-    )
-    np.testing.assert_allclose(found, exact, atol=1e-10)
-    lifted = _mean_hessian(lambda x: 0.5 * (x[0, :, 0] ** 2 - x[0, :, 1] ** 2), 2)
-    np.testing.assert_allclose(lifted, np.diag([1.0, 0.05]), atol=1e-10)
 
 
 # -- one model, other data

@@ -1,4 +1,4 @@
-"""Mirror solutions, blind directions, and what is said about them."""
+"""Mirror solutions, and what is said about them."""
 
 import logging
 from functools import cache
@@ -10,7 +10,6 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.estimate.identifiability import seen_by_curvature, unidentified_directions
 from prbayes.estimate.rivals import rivals
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
@@ -206,78 +205,8 @@ def test_modes_that_run_into_each_other_are_left_alone(caplog: pytest.LogCapture
     assert "modes that run into each other; their width is epsilon's" in caplog.text
 
 
-# -- blind directions
+# -- unidentified directions
 # ------------------------------------------------------------------------------------
-
-
-def local(blind: Any) -> Local:
-    basis = np.linalg.qr(np.array(blind, dtype=float).T)[0]
-    d, k = basis.shape
-    return Local(np.ones(d), np.zeros((d, d - k)), basis, np.eye(d - k))
-
-
-@pytest.mark.parametrize(
-    ("blind", "lines"),
-    [
-        ([[0, 1, 0]], ["b"]),
-        ([[1, -1, 0]], ["a - b"]),
-        ([[1, 1, 0]], ["a + b"]),
-        ([[1, -0.5, 0.05]], ["a - 0.5 b"]),  # the smallest is not mentioned
-        ([[0.2, 0, -1]], ["c - 0.2 a"]),  # the largest comes first, with a plus
-        ([[1, 1, 1], [1, 1, -1]], ["c", "a + b"]),  # rotated so that c stands alone
-        ([[1, 0, 0], [0, 1, 0], [0, 0, 1]], ["a", "b", "c"]),
-    ],
-)
-def test_directions_have_names(blind: Any, lines: list[str]) -> None:
-    assert [
-        sorted_signs(d)
-        for d in unidentified_directions(
-            np.linalg.qr(np.array(blind, dtype=float).T)[0], ["a", "b", "c"]
-        )
-    ] == lines
-
-
-def sorted_signs(line: str) -> str:
-    # Where two are equally large, rounding decides which comes first.
-    return {"b - a": "a - b", "b + a": "a + b"}.get(line, line)
-
-
-def test_nothing_is_blind() -> None:
-    assert unidentified_directions(np.zeros((2, 0)), ["a", "b"]) == []
-
-
-@pytest.mark.parametrize("name", [slow("ll"), slow("kl"), "pr"])
-def test_a_sum_hides_a_difference(name: str) -> None:
-    # Both priors have the same spread, hence coefficients of one in its units; the response weighs
-    # b twice.
-    with pm.Model() as model:
-        a, b = pm.Normal("a", 0, 1), pm.Normal("b", 0, 1, shape=1)
-        x, z = pm.Normal.dist(a, 0.5), pm.Normal.dist(b[0], 0.5)
-        prb.Simulator(
-            "y", lambda x, z: x + 2 * z, x, z, metric=METRICS[name], observed=3 * OBSERVED,
-            propagation=prb.Resimulated(256),
-        )  # fmt: skip
-    optimum = prb.minimize(model)
-    (line,) = optimum.warnings
-    assert line.startswith(
-        "the data tell less than the prior about a - 0.5 b[0] (in units of the priors'"
-    )
-    assert np.isinf(optimum.stderr["a"])
-    assert np.isinf(optimum.stderr["b"]).all()
-
-
-def test_rounding_errors_are_not_information() -> None:
-    noise = np.diag([0.5, 1e-13])
-    # Curvature and noise of the second direction are rounding errors; their ratio looks like a
-    # standard error of 0.1.
-    assert list(seen_by_curvature(np.diag([5.0, 3e-6]), noise)[2]) == [
-        False,
-        True,
-    ]  # sorted by curvature
-    # A direction that says a little more than the prior is seen beside one that says much more.
-    assert seen_by_curvature(np.diag([500.0, 0.15]), np.diag([50.0, 0.015]))[2].all()
-    # Where nothing changes, nothing is seen.
-    assert not seen_by_curvature(np.zeros((2, 2)), np.zeros((2, 2)))[2].any()
 
 
 def test_a_hyperparameter_without_effect_is_named_and_makes_no_rivals() -> None:
@@ -302,37 +231,3 @@ def test_rivals_stand_where_the_optimum_does_along_unidentified_directions() -> 
     assert len(comparable) == 1
     assert comparable[0]["point"]["idle"] == pytest.approx(optimum.point["idle"], abs=1e-6)
     assert len(optimum.warnings) == 2
-
-
-@pytest.mark.parametrize("n", [256, 1024])
-def test_a_ridge_under_the_area_metric_is_seen_through_few_points(n: int) -> None:
-    """Two sources of scatter, of which only the sum is measured: what tells them apart is the points' own error."""
-    with pm.Model() as model:
-        u = pm.Normal.dist(1, pm.HalfNormal("sigma", 1))
-        v = pm.Normal.dist(0, pm.HalfNormal("noise", 1))
-        keywords = {
-            "metric": prb.AreaMetric(),
-            "observed": OBSERVED,
-            "propagation": prb.Resimulated(n),
-        }
-        prb.Simulator("y", lambda u, v: u + v, u, v, **keywords)
-    optimum = prb.minimize(model)
-    assert all(np.isinf(optimum.stderr[name]) for name in ("sigma", "noise"))
-    (line,) = optimum.warnings
-    assert "sigma" in line
-    assert "noise" in line
-
-
-def test_what_is_seen_under_the_area_metric_is_seen_through_few_points_as_well() -> None:
-    with pm.Model() as model:
-        u = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-        v = pm.Normal.dist(0, 0.2)
-        keywords = {
-            "metric": prb.AreaMetric(),
-            "observed": OBSERVED,
-            "propagation": prb.Resimulated(256),
-        }
-        prb.Simulator("y", lambda u, v: u + v, u, v, **keywords)
-    optimum = prb.minimize(model)
-    assert all(np.isfinite(optimum.stderr[name]) for name in ("mu", "sigma"))
-    assert optimum.warnings == ()
