@@ -244,7 +244,7 @@ def analyse(
     posteriors = {
         "plain": draws,
         "sandwich": transported(sampling, x, remainder, np.zeros(r), first_order),
-        "affine": Affine(n_sets=100)(ev, draws, [optimum.theta])[0],
+        "affine": Affine(n_sets=100)(ev, draws, [optimum.theta]).thetas,
         "exact": exact,
     }
     if bootstrap:

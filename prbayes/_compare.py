@@ -191,7 +191,10 @@ def _shared(columns: list[_Column], model: pm.Model | None) -> list[str]:
 
 
 def _require_one_problem(results: Mapping[str, Any], model: pm.Model | None) -> None:
-    """Refuse results of other populations than the model's, or the first result's, as far as they tell."""
+    """Refuse results of other populations than the model's, as far as they tell.
+
+    Without a model, than the first result's.
+    """
     known = [identity_in(result) for result in results.values()]
     first = next((identity for identity in known if identity is not None), None)
     expected = identity_of_model(model) if model is not None and nodes(model) else first

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats
 
+# Halvings of a step: a 1/256 of one is no worse than none.
 _HALVINGS = 8
 # Longest element of a step, in the units of the parameters: beyond a few standard errors, or prior
 # standard deviations, a quadratic model says nothing.
@@ -37,16 +38,21 @@ class _Problem:
 
     @classmethod
     def of(cls, value: Callable[[Floats, Any], Floats], r: int, step: float) -> _Problem:
-        around = np.concatenate([np.zeros((1, r)), np.eye(r), -np.eye(r)])
+        unit = np.eye(r)
+        here = np.zeros((1, r))
+        around = np.concatenate([here, unit, -unit])
         return cls(value, step, step * around)
 
     def __call__(self, x: Floats, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
         """Return values (A,) and gradients (A, r) of some rows at one point each, (A, r)."""
         r = x.shape[-1]
-        found = self.value(x[:, None] + self.stencil, rows)
-        up, down = found[:, 1 : 1 + r], found[:, 1 + r :]
+        points = x[:, None] + self.stencil
+        found = self.value(points, rows)
+        up = found[:, 1 : 1 + r]
+        down = found[:, 1 + r :]
         with np.errstate(invalid="ignore"):
-            return found[:, 0], (up - down) / (2 * self.step)
+            gradients = (up - down) / (2 * self.step)
+        return found[:, 0], gradients
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +73,9 @@ class _Steps:
 
     def only(self, these: NDArray[np.bool_]) -> _Steps:
         """Return those of some rows."""
-        return _Steps(self.rows[these], self.steps[these], self.promise[these])
+        rows = self.rows[these]
+        steps = self.steps[these]
+        return _Steps(rows, steps, self.promise[these])
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,61 +130,86 @@ def descend(
     --------
     >>> import numpy as np
     >>> centers = np.array([[0.0], [2.0]])
-    >>> x, *_ = descend(lambda x, rows: ((x - centers[rows, None]) ** 2).sum(-1), np.zeros((2, 1)), np.eye(1),
-    ...                 step=1e-3, tolerance=1e-9)
+    >>> value = lambda x, rows: ((x - centers[rows, None]) ** 2).sum(-1)
+    >>> x, *_ = descend(value, np.zeros((2, 1)), np.eye(1), step=1e-3, tolerance=1e-9)
     >>> np.abs(x - centers).max() < 1e-4
     np.True_
     """
     size, r = start.shape
     problem = _Problem.of(value, r, step)
-    x, inverse = start.copy(), np.repeat(inverse_hessian[None], size, axis=0)
+    x = start.copy()
+    inverse = np.repeat(inverse_hessian[None], size, axis=0)
     active = np.arange(size)
     f, g = problem(x, active)
     converged = np.zeros(size, dtype=bool)
-    active = active[np.isfinite(f) & np.isfinite(g).all(axis=-1)]
+    # Where nothing is known at the start, nothing can be done.
+    sound = np.isfinite(f)
+    sound &= np.isfinite(g).all(axis=-1)
+    active = active[sound]
     for _ in range(max_iterations):
         # Rows whose step is no number stop; those that promise next to nothing have converged.
         plan = _planned(active, inverse, g)
         done = plan.promise < 2 * tolerance
         converged[plan.rows[done]] = True
         plan = plan.only(~done)
-        if not plan.rows.size:
-            break
-        accepted = _line_search(problem, plan, x, f, g)
         active = plan.rows
-        inverse[active] = _updated(inverse[active], accepted.x - x[active], accepted.g - g[active])
-        x[active], f[active], g[active] = accepted.x, accepted.f, accepted.g
+        if not active.size:
+            break
+        # Make the step, and learn from it.
+        accepted = _line_search(problem, plan, x, f, g)
+        motion = accepted.x - x[active]
+        change = accepted.g - g[active]
+        inverse[active] = _updated(inverse[active], motion, change)
+        # Book-keeping.
+        x[active] = accepted.x
+        f[active] = accepted.f
+        g[active] = accepted.g
         # Rows that no shorter step helped stay where they are.
-        converged[active[accepted.stuck]] = True
-        active = np.delete(active, accepted.stuck)
+        stuck = accepted.stuck
+        converged[active[stuck]] = True
+        active = np.delete(active, stuck)
     return x, f, converged
 
 
 def _planned(active: NDArray[np.intp], inverse: Floats, g: Floats) -> _Steps:
     """Return quasi-Newton steps of the active rows, none too long."""
+    slopes = g[active]
     with np.errstate(over="ignore", invalid="ignore"):
-        steps = -np.einsum("bij,bj->bi", inverse[active], g[active])
-        promise = -(steps * g[active]).sum(axis=-1)
+        steps = -np.einsum("bij,bj->bi", inverse[active], slopes)
+        promise = -(steps * slopes).sum(axis=-1)
         length = np.abs(steps).max(axis=-1)
-        steps = steps * (_LONGEST / np.maximum(length, _LONGEST))[:, None]
+        shorter = _LONGEST / np.maximum(length, _LONGEST)
+        steps = steps * shorter[:, None]
     sound = np.isfinite(promise) & np.isfinite(length)
-    return _Steps(active, steps, promise).only(sound)
+    plan = _Steps(active, steps, promise)
+    return plan.only(sound)
 
 
 def _line_search(problem: _Problem, plan: _Steps, x: Floats, f: Floats, g: Floats) -> _Accepted:
     """Halve the steps until they keep enough of what they promise."""
     rows = plan.rows
-    new_x, new_f, new_g = x[rows].copy(), f[rows].copy(), g[rows].copy()
-    waiting, share = np.arange(rows.size), 1.0
+    new_x = x[rows].copy()
+    new_f = f[rows].copy()
+    new_g = g[rows].copy()
+    waiting = np.arange(rows.size)
+    share = 1.0
     for _ in range(_HALVINGS):
-        trial = x[rows[waiting]] + share * plan.steps[waiting]
-        trial_f, trial_g = problem(trial, rows[waiting])
+        these = rows[waiting]
+        steps = plan.steps[waiting]
+        trial = x[these] + share * steps
+        trial_f, trial_g = problem(trial, these)
+        finite = np.isfinite(trial_g).all(-1)
         with np.errstate(invalid="ignore"):
-            enough = f[rows[waiting]] - _ARMIJO * share * plan.promise[waiting]
-            kept = (trial_f <= enough) & np.isfinite(trial_g).all(-1)
+            promised = _ARMIJO * share * plan.promise[waiting]
+            enough = trial_f <= f[these] - promised
+        # Rows that keep the step are done; the others wait for half of it.
+        kept = enough & finite
         at = waiting[kept]
-        new_x[at], new_f[at], new_g[at] = trial[kept], trial_f[kept], trial_g[kept]
-        waiting, share = waiting[~kept], share / 2
+        new_x[at] = trial[kept]
+        new_f[at] = trial_f[kept]
+        new_g[at] = trial_g[kept]
+        waiting = waiting[~kept]
+        share = share / 2
         if not waiting.size:
             break
     return _Accepted(new_x, new_f, new_g, waiting)
@@ -188,8 +221,18 @@ def _updated(inverse: Floats, s: Floats, y: Floats) -> Floats:
     Nocedal and Wright, eq. 6.17.
     """
     sy = (s * y).sum(axis=-1)
-    good = sy > _CURVED * np.linalg.norm(s, axis=-1) * np.linalg.norm(y, axis=-1)
-    rho = np.where(good, 1 / np.where(good, sy, 1.0), 0.0)[:, None, None]
-    left = np.eye(s.shape[-1]) - rho * s[:, :, None] * y[:, None, :]
+    lengths = np.linalg.norm(s, axis=-1)
+    changes = np.linalg.norm(y, axis=-1)
+    good = sy > _CURVED * lengths * changes
+    # The others have rho = 0, which leaves them as they are.
+    safe = np.where(good, sy, 1.0)
+    inverted = np.where(good, 1 / safe, 0.0)
+    rho = inverted[:, None, None]
+    # The products s y' and s s' of each row.
+    column = rho * s[:, :, None]
+    across = column * y[:, None, :]
+    along = column * s[:, None, :]
+    left = np.eye(s.shape[-1]) - across
     right = np.swapaxes(left, -1, -2)
-    return np.asarray(left @ inverse @ right + rho * s[:, :, None] * s[:, None, :])
+    turned = left @ inverse @ right
+    return np.asarray(turned + along)

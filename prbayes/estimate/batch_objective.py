@@ -54,16 +54,21 @@ class BatchObjective:
         blocks: Sequence[NDArray[np.intp]] = (),
     ) -> BatchObjective:
         """Prepare the observed sides of all data sets; of all simulators by default."""
+        every = range(len(evaluator.nodes))
+        chosen = tuple(every if simulators is None else simulators)
         # Copied row by row: sums over rows then do not depend on how the weights lie in memory.
-        every = np.arange(len(sets.weights[0]))
-        chosen = tuple(range(len(evaluator.nodes)) if simulators is None else simulators)
-        targets, bases = [], []
+        rows = np.arange(len(sets.weights[0]))
+        targets = []
+        bases = []
         for k in chosen:
             node = evaluator.nodes[k]
             design = evaluator.designs[node.name]
-            target = node.target.with_observed(sets.values[k], sets.weights[k][every, None])
+            weights = sets.weights[k][rows, None]
+            values = sets.values[k]
+            target = node.target.with_observed(values, weights)
+            basis = target.basis(design.values)
             targets.append(target)
-            bases.append(target.basis(design.values))
+            bases.append(basis)
         return cls(evaluator, scales, chosen, targets, bases, blocks)
 
     @property
@@ -80,18 +85,28 @@ class BatchObjective:
         total: Any = 0.0
         for i, k in enumerate(self.simulators):
             target = self.targets[i].rows(rows)
-            features = target.from_basis(self._weights(thetas, rows, i), self.bases[i], np)
-            total = total + target.outer(*features, xp=np) / self.scales[k]
-        return np.asarray(np.nan_to_num(total, nan=np.inf, posinf=np.inf))
+            weights = self._weights(thetas, rows, i)
+            features = target.from_basis(weights, self.bases[i], np)
+            discrepancies = target.outer(*features, xp=np)
+            total = total + discrepancies / self.scales[k]
+        values = np.nan_to_num(total, nan=np.inf, posinf=np.inf)
+        return np.asarray(values)
 
     def _weights(self, thetas: Floats, rows: Any, i: int) -> Floats:
         """Return weights of the stored responses, (A, s, n), on the whole design or on blocks."""
-        flat = thetas.reshape(-1, thetas.shape[-1])
-        _, weights = self.evaluator.populations(flat, self.simulators[i])
+        stacked = thetas.reshape(-1, thetas.shape[-1])
+        k = self.simulators[i]
+        _, weights = self.evaluator.populations(stacked, k)
         weights = weights.reshape(*thetas.shape[:-1], -1)
-        if not self.blocks or not self.blocks[i].any():
+        if not self.blocks:
             return weights
-        own = np.arange(self.n_sets)[rows, None, None]
-        weights = weights * (self.blocks[i] == own)
+        blocks = self.blocks[i]
+        if not blocks.any():
+            return weights
+        # The b-th data set sees the b-th block alone.
+        numbers = np.arange(self.n_sets)
+        own = numbers[rows, None, None]
+        weights = weights * (blocks == own)
+        total = weights.sum(axis=-1, keepdims=True)
         with np.errstate(invalid="ignore"):
-            return np.asarray(weights / weights.sum(axis=-1, keepdims=True))
+            return np.asarray(weights / total)

@@ -38,7 +38,11 @@ class Moves:
     def of(cls, r: int) -> Moves:
         """Return the moves; from two parameters on they depend on their number."""
         n = max(r, 2)
-        return cls(expand=1 + 2 / n, contract=0.75 - 1 / (2 * n), shrink=1 - 1 / n)
+        return cls(
+            expand=1 + 2 / n,
+            contract=0.75 - 1 / (2 * n),
+            shrink=1 - 1 / n,
+        )
 
 
 def descend_by_simplex(
@@ -47,8 +51,8 @@ def descend_by_simplex(
     """Minimise B functions of r parameters, each from its own start, all in step.
 
     A row has converged when the values over its simplex are about equal, or the simplex is small.
-    It may come to rest with equal values on both sides of a minimum: another one, turned round and
-    smaller, then goes on from the best point.
+    It may end with equal values on both sides of a minimum: another one, turned round and smaller,
+    then goes on from the best point.
 
     Parameters
     ----------
@@ -78,11 +82,13 @@ def descend_by_simplex(
     >>> np.abs(x - centers).max() < 0.01
     np.True_
     """
-    rows = np.arange(len(start))
+    n_rows, r = start.shape
+    rows = np.arange(n_rows)
     first = value(start[:, None], rows)[:, 0]
-    x, values = start, first
-    converged = np.ones(len(start), dtype=bool)
-    if start.shape[1] == 0:
+    x = start
+    values = first
+    converged = np.ones(n_rows, dtype=bool)
+    if r == 0:
         return x, values, converged
     for size in sizes:
         x, values, converged = _one_descent(value, x, first, size)
@@ -92,40 +98,109 @@ def descend_by_simplex(
 def _one_descent(
     value: Callable[[Floats, Any], Floats], start: Floats, first: Floats, size: float
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Let one simplex per row come to rest; ``first`` has the values before all descents."""
+    """Let one simplex per row converge; ``first`` has the values before all descents."""
     n_rows, r = start.shape
     moves = Moves.of(r)
     # Points and values of the simplices, (B, r + 1, r) and (B, r + 1), the best point first.
-    corners = np.concatenate([np.zeros((1, r)), size * np.eye(r)])
+    edges = size * np.eye(r)
+    here = np.zeros((1, r))
+    corners = np.concatenate([here, edges])
     points = start[:, None] + corners
     values = value(points, np.arange(n_rows))
     points, values = _sorted(points, values)
     converged = np.zeros(n_rows, dtype=bool)
     for _ in range(_PATIENCE * r):
-        # Rows that have come to rest are left alone from then on.
-        gains = np.where(np.isfinite(first), first, values[:, 0]) - values[:, 0]
-        gain = float(np.nan_to_num(gains).mean())
-        converged |= _at_rest(points, values, gain, abs(size))
+        # Rows that have converged are left alone from then on.
+        gain = _mean_gain(first, values[:, 0])
+        converged |= _small(points, values, gain, abs(size))
         rows = np.flatnonzero(~converged)
         if not rows.size:
             break
-        moved = _step(value, points[rows], values[rows], rows, moves)
-        points[rows], values[rows] = _sorted(*moved)
+        # Make the step.
+        stepped = _step(
+            value,
+            points[rows],
+            values[rows],
+            rows,
+            moves,
+        )
+        ordered = _sorted(*stepped)
+        points[rows], values[rows] = ordered
     return points[:, 0], values[:, 0], converged
 
 
-def _at_rest(points: Floats, values: Floats, gain: float, size: float) -> NDArray[np.bool_]:
+def _small(points: Floats, values: Floats, gain: float, size: float) -> NDArray[np.bool_]:
+    """Return which simplices, (B,), are short, or have about equal values."""
     with np.errstate(invalid="ignore"):
-        level = values[:, -1] - values[:, 0] <= _LEVEL * gain
-    length = np.abs(points - points[:, :1]).max(axis=(1, 2))
-    return np.asarray(level | (length <= _SMALL * size))
+        spread = values[:, -1] - values[:, 0]
+        level = spread <= _LEVEL * gain
+    best = points[:, :1]
+    edges = np.abs(points - best)
+    length = edges.max(axis=(1, 2))
+    short = length <= _SMALL * size
+    return np.asarray(level | short)
 
 
 def _sorted(points: Floats, values: Floats) -> tuple[Floats, Floats]:
     order = np.argsort(values, axis=1, kind="stable")
-    return np.take_along_axis(points, order[..., None], axis=1), np.take_along_axis(
-        values, order, axis=1
-    )
+    ordered = np.take_along_axis(values, order, axis=1)
+    places = order[..., None]
+    return np.take_along_axis(points, places, axis=1), ordered
+
+
+def _trials(points: Floats, moves: Moves) -> Floats:
+    """Return the four points, (A, 4, r), that may replace the worst one of each simplex.
+
+    Reflected at the centre of the others, farther than that, nearer, and nearer on its own side.
+    """
+    center = points[:, :-1].mean(axis=1)
+    worst = points[:, -1]
+    away = center - worst
+    farther = moves.expand
+    nearer = moves.contract
+    lengths = np.array([1.0, farther, nearer, -nearer])
+    steps = lengths[:, None] * away[:, None]
+    return np.asarray(center[:, None] + steps)
+
+
+def _choice(found: Floats, values: Floats) -> tuple[NDArray[np.intp], Floats, NDArray[np.bool_]]:
+    """Return which trial each simplex takes, its value, and whether it is good enough, (A,) each.
+
+    Parameters
+    ----------
+    found : ndarray, shape (A, 4)
+        Values of the trials.
+    values : ndarray, shape (A, r + 1)
+        Of the simplices, sorted.
+    """
+    reflected = found[:, 0]
+    expanded = found[:, 1]
+    best = values[:, 0]
+    second = values[:, -2]
+    last = values[:, -1]
+    # The reflected point, a farther one if that is better still, a nearer one on either side if it
+    # is not.
+    chosen = np.where(reflected < second, 0, 2)
+    farther = (reflected < best) & (expanded < reflected)
+    chosen = np.where(farther, 1, chosen)
+    chosen = np.where(reflected >= last, 3, chosen)
+    every = np.arange(len(found))
+    taken = found[every, chosen]
+    # A nearer point has to beat the reflected one, or the worst where that was not better either.
+    to_beat = np.where(chosen == 2, reflected, np.inf)
+    to_beat = np.where(chosen == 3, last, to_beat)
+    accepted = (taken <= to_beat) & (taken < last)
+    return chosen, taken, accepted
+
+
+def _mean_gain(first: Floats, values: Floats) -> float:
+    """Return by how much values are better than the first ones on average; none where not known."""
+    known = np.isfinite(first)
+    before = np.where(known, first, values)
+    # Infinite less infinite counts as nothing.
+    with np.errstate(invalid="ignore"):
+        gains = before - values
+    return float(np.nan_to_num(gains).mean())
 
 
 def _step(
@@ -136,31 +211,22 @@ def _step(
     moves: Moves,
 ) -> tuple[Floats, Floats]:
     """Replace the worst point of each simplex, or shrink it towards the best."""
-    points, values = points.copy(), values.copy()
-    center, worst = points[:, :-1].mean(axis=1), points[:, -1]
-    away = center - worst
-    # All four trials are looked at in one call, which costs less than four calls for some rows
-    # each.
-    lengths = np.array([1.0, moves.expand, moves.contract, -moves.contract])
-    trials = center[:, None] + lengths[:, None] * away[:, None]
+    points = points.copy()
+    values = values.copy()
+    # All four trials are looked at in one call, which costs less than four for some rows each.
+    trials = _trials(points, moves)
     found = value(trials, rows)
-    reflected, expanded = found[:, 0], found[:, 1]
-    best, second, last = values[:, 0], values[:, -2], values[:, -1]
-    # Which of the trials is taken, by their place above: the reflected point, a further one if that
-    # is better still, a nearer one on either side if it is not.
-    chosen = np.where(reflected < second, 0, 2)
-    chosen = np.where((reflected < best) & (expanded < reflected), 1, chosen)
-    chosen = np.where(reflected >= last, 3, chosen)
-    taken = np.take_along_axis(found, chosen[:, None], axis=1)[:, 0]
-    to_beat = np.where(chosen == 3, last, np.where(chosen == 2, reflected, np.inf))
-    accepted = (taken <= to_beat) & (taken < last)
+    chosen, taken, accepted = _choice(found, values)
     every = np.arange(len(points))
-    points[accepted, -1] = trials[every, chosen][accepted]
+    best = trials[every, chosen]
+    points[accepted, -1] = best[accepted]
     values[accepted, -1] = taken[accepted]
     # Where no trial helps, the simplex shrinks.
     stuck = ~accepted
     if stuck.any():
-        towards = points[stuck, :1] + moves.shrink * (points[stuck, 1:] - points[stuck, :1])
-        points[stuck, 1:] = towards
-        values[stuck, 1:] = value(towards, rows[stuck])
+        first = points[stuck, :1]
+        others = points[stuck, 1:]
+        nearer = first + moves.shrink * (others - first)
+        points[stuck, 1:] = nearer
+        values[stuck, 1:] = value(nearer, rows[stuck])
     return points, values

@@ -28,6 +28,8 @@ _FAR = 2.0
 # changes 2e-7 at most, and the way back to the prior's middle 7e-4 at least: any value in
 # [1e-6, 1e-4] gives the same verdicts on them, on four processors and with noise of 1e-12.
 _UNCHANGED = 1e-5
+# Draws of the prior, whose median is known from them to a twelfth of a spread.
+_PRIOR_DRAWS = 256
 # Distance between distribution functions from which two populations differ. A half of the mass
 # whose spread shrinks by a factor of 1.3 makes 0.035; where a population stands still it is a
 # point's 1/n.
@@ -38,25 +40,32 @@ def breakdown(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> list[str]:
     """Say why no sampling distribution is known: elements at an edge, simulators that jump."""
     lines = []
     if at_edge:
+        names = ", ".join(at_edge)
         lines.append(
-            f"{', '.join(at_edge)} ran to the edge of the support, where the discrepancy no longer changes; perhaps "
-            "the population has collapsed within the bandwidth of the metric: use a smaller bandwidth, or "
-            "prb.AreaMetric(), which has none"
+            f"{names} ran to the edge of the support, where the discrepancy no longer changes; "
+            "perhaps the population has collapsed within the bandwidth of the metric: use a "
+            "smaller bandwidth, or prb.AreaMetric(), which has none"
         )
     if at_jump:
+        names = ", ".join(at_jump)
         lines.append(
-            f"{', '.join(at_jump)}: points lose their response at the optimum, and the discrepancy jumps there by more "
-            "than it changes otherwise: use prb.AreaMetric(), prb.Reweighted(), or more responses"
+            f"{names}: points lose their response at the optimum, and the discrepancy jumps "
+            "there by more than it changes otherwise: use prb.AreaMetric(), prb.Reweighted(), or "
+            "more responses"
         )
     return lines
 
 
 def no_information(evaluator: Evaluator, theta: Floats) -> bool:
     """Return whether no discrepancy changes around theta, as where populations miss the data."""
-    found = evaluator(cross(theta, _NEAR * evaluator.prior_sd)).discrepancies
+    step = _NEAR * evaluator.prior_sd
+    found = evaluator(cross(theta, step)).discrepancies
+    here = found[0]
     with np.errstate(invalid="ignore"):
-        change = np.abs(found - found[0])
-        same = (found == found[0]) | (change <= _ROUNDING * np.abs(found[0]))
+        change = np.abs(found - here)
+        rounding = _ROUNDING * np.abs(here)
+        # Infinite values are equal, although their difference is not zero.
+        same = (found == here) | (change <= rounding)
     return bool(same.all())
 
 
@@ -84,34 +93,47 @@ def elements_at_edge(
         the prior.
     seed : int
     """
-    middle = np.median(evaluator.prior_thetas(256, seed), axis=0)
+    # Elements far from the middle of their prior.
+    middle = np.median(evaluator.prior_thetas(_PRIOR_DRAWS, seed), axis=0)
     away = theta - middle
-    far = np.flatnonzero(np.abs(away) > _FAR * evaluator.prior_sd)
+    distance = np.abs(away)
+    far = np.flatnonzero(distance > _FAR * evaluator.prior_sd)
     if not far.size or no_information(evaluator, theta):
         return ()
-    further = theta + np.diag(np.sign(away) * evaluator.prior_sd)[far]
+    # What changes further out, and on the way back.
+    outwards = np.sign(away) * evaluator.prior_sd
+    further = theta + np.diag(outwards)[far]
     back = theta - np.diag(away)[far]
-    # What changes further out, and on the way back
-    here, *there = evaluator.total(np.vstack([theta, further, back]), scales)
+    thetas = np.vstack([theta, further, back])
+    here, *there = evaluator.total(thetas, scales)
     with np.errstate(invalid="ignore"):
-        changes = np.abs(np.array(there) - here).reshape(2, -1)
+        changes = np.abs(np.array(there) - here)
+    beyond, returning = changes.reshape(2, -1)
     unchanged = max(_UNCHANGED, tolerance) * size
-    stands_still, comes_back = changes[0] < unchanged, changes[1] > unchanged
-    suspects = np.flatnonzero(stands_still & comes_back)
-    names = evaluator.readable_names
-    return tuple(
-        names[far[i]] for i in suspects if _apart(evaluator, theta, further[i]) > _DIFFERENT
-    )
+    stands_still = beyond < unchanged
+    comes_back = returning > unchanged
+    # Of those, the ones whose population changes all the same.
+    found = []
+    for i in np.flatnonzero(stands_still & comes_back):
+        if _apart(evaluator, theta, further[i]) > _DIFFERENT:
+            name = evaluator.readable_names[far[i]]
+            found.append(name)
+    return tuple(found)
 
 
 def _apart(evaluator: Evaluator, a: Floats, b: Floats) -> float:
-    """Return the largest distance between distribution functions of the populations at two thetas."""
+    """Return the largest distance between the populations' distribution functions at two thetas."""
     largest = 0.0
+    both = np.array([a, b])
     for k in range(len(evaluator.nodes)):
-        values, weights = evaluator.populations(np.array([a, b]), k)
-        at = np.unique(values[np.isfinite(values)])
-        below = [_shares_below(v, w, at) for v, w in zip(values, weights, strict=True)]
-        largest = max(largest, float(np.abs(below[0] - below[1]).max(initial=0.0)))
+        values, weights = evaluator.populations(both, k)
+        occurring = np.unique(values[np.isfinite(values)])
+        below = []
+        for v, w in zip(values, weights, strict=True):
+            shares = _shares_below(v, w, occurring)
+            below.append(shares)
+        gaps = np.abs(below[0] - below[1])
+        largest = max(largest, float(gaps.max(initial=0.0)))
     return largest
 
 
@@ -121,8 +143,10 @@ def _shares_below(values: Floats, weights: Floats, at: Floats) -> Floats:
     Those without response are above all.
     """
     order = np.argsort(values)
-    total = np.concatenate([[0.0], np.cumsum(weights[order])])
-    return np.asarray(total[np.searchsorted(values[order], at, side="right")] / total[-1])
+    cumulated = np.cumsum(weights[order])
+    total = np.concatenate([[0.0], cumulated])
+    places = np.searchsorted(values[order], at, side="right")
+    return np.asarray(total[places] / total[-1])
 
 
 def caveats(
@@ -132,10 +156,13 @@ def caveats(
     lines = []
     if design_error > _TOLERATED:
         lines.append(_of_design(evaluator, design_error))
-    lines += [_of_rival(evaluator, rival) for rival in others if rival.comparable]
+    for rival in others:
+        if rival.comparable:
+            lines.append(_of_rival(evaluator, rival))
     if local is not None:
-        directions = unidentified_directions(local.unidentified, evaluator.readable_names)
-        lines += map(_of_direction, directions)
+        names = evaluator.readable_names
+        directions = unidentified_directions(local.unidentified, names)
+        lines += [_of_direction(direction) for direction in directions]
     return tuple(lines)
 
 
@@ -152,10 +179,12 @@ def _of_rival(evaluator: Evaluator, rival: Rival) -> str:
     point = evaluator.constrained(rival.theta[None])
     values = []
     for rv in evaluator.model.free_RVs:
-        value = np.array2string(point[rv.name][0], precision=4)
+        own = point[rv.name][0]
+        value = np.array2string(own, precision=4)
         values.append(f"{rv.name} = {value}")
+    place = ", ".join(values)
     return (
-        f"the data could as well come from {', '.join(values)}: another optimum, or mirror "
+        f"the data could as well come from {place}: another optimum, or mirror "
         "solution, whose discrepancy differs by no more than sampling noise; state a prior that "
         "excludes one, or report both"
     )

@@ -7,9 +7,46 @@ from collections.abc import Callable
 import numpy as np
 
 from prbayes._checks import Floats
+from prbayes.estimate.differences import cross
 
 # Signs of the steps along a pair of axes; a mixed difference is the first and last less the others.
 _CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+
+
+def stencil(r: int) -> Floats:
+    """Return the cross of unit steps around zero, then the four corners of each pair of axes.
+
+    Returns
+    -------
+    ndarray, shape (1 + 2 r + 2 r (r - 1), r)
+    """
+    unit = np.eye(r)
+    rows = list(cross(np.zeros(r), np.ones(r)))
+    for i, j in _pairs(r):
+        one = unit[i]
+        other = unit[j]
+        for a, b in _CORNERS:
+            corner = a * one + b * other
+            rows.append(corner)
+    return np.array(rows)
+
+
+def hessian_of(values: Floats, r: int) -> Floats:
+    """Return the Hessian, (r, r), from values at the points of `stencil`, by unit differences."""
+    here = values[0]
+    cross_ends = [1, 1 + r, 1 + 2 * r]
+    _, up, down, corners = np.split(values, cross_ends)
+    # What is not finite gives what is not a number, and is the caller's to judge.
+    with np.errstate(invalid="ignore"):
+        along = up - 2 * here + down
+        out = np.diag(along)
+        mixed = corners.reshape(-1, len(_CORNERS))
+        for (i, j), around in zip(_pairs(r), mixed, strict=True):
+            pp, pm, mp, mm = around
+            twist = (pp - pm - mp + mm) / 4
+            out[i, j] = twist
+            out[j, i] = twist
+    return out
 
 
 def second_differences(value: Callable[[Floats], Floats], r: int) -> Floats:
@@ -25,15 +62,12 @@ def second_differences(value: Callable[[Floats], Floats], r: int) -> Floats:
     -------
     ndarray, shape (r, r)
     """
-    unit = np.eye(r)
-    pairs = [(i, j) for i in range(r) for j in range(i)]
-    rows = [np.zeros(r), *unit, *-unit]
-    for i, j in pairs:
-        rows += [a * unit[i] + b * unit[j] for a, b in _CORNERS]
-    f = value(np.array(rows)[None])
-    up, down, mixed = f[1 : 1 + r], f[1 + r : 1 + 2 * r], f[1 + 2 * r :]
-    out = np.diag(up - 2 * f[0] + down)
-    for n, (i, j) in enumerate(pairs):
-        pp, pm, mp, mm = mixed[4 * n : 4 * n + 4]
-        out[i, j] = out[j, i] = (pp - pm - mp + mm) / 4
-    return np.asarray(out)
+    points = stencil(r)
+    values = value(points[None])
+    return hessian_of(values, r)
+
+
+def _pairs(r: int) -> list[tuple[int, int]]:
+    """Return the pairs of different axes."""
+    rows, columns = np.tril_indices(r, -1)
+    return list(zip(rows.tolist(), columns.tolist(), strict=True))

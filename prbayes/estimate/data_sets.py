@@ -41,24 +41,28 @@ class DataSets:
 
 
 def specimens(nodes: list[Node]) -> tuple[list[NDArray[np.intp]], int]:
-    """Return the number of the specimen of each observation, by simulator, and how many specimens there are.
+    """Return the specimen's number of each observation, by simulator, and the number of specimens.
 
     Observations without labels are specimens of their own.
     """
     numbers: dict[object, int] = {}
     out = []
     for k, node in enumerate(nodes):
-        labels = _labels(node, k)
-        found = [numbers.setdefault(label, len(numbers)) for label in labels]
+        found = []
+        for label in _labels(node, k):
+            number = numbers.setdefault(label, len(numbers))
+            found.append(number)
         out.append(np.array(found, dtype=np.intp))
     return out, len(numbers)
 
 
 def _labels(node: Node, k: int) -> list[object]:
     """Return the labels of the k-th simulator's observations; one for each if there are none."""
-    if node.specimens is not None:
-        return list(node.specimens.tolist())
-    return [(k, i) for i in range(node.target.observed.size)]
+    labels = node.specimens
+    if labels is not None:
+        return list(labels.tolist())
+    size = node.target.observed.size
+    return [(k, i) for i in range(size)]
 
 
 def dependent(nodes: list[Node]) -> bool:
@@ -68,24 +72,28 @@ def dependent(nodes: list[Node]) -> bool:
 
 
 def groups(nodes: list[Node]) -> list[list[int]]:
-    """Return the simulators by their position, those together that share specimens, be it through others."""
+    """Return simulators by position, those together that share specimens, even through others."""
     numbers, _ = specimens(nodes)
     found: list[tuple[list[int], set[int]]] = []
     for k, number in enumerate(numbers):
-        members, shared = [k], set(number.tolist())
+        members = [k]
+        shared = set(number.tolist())
+        own = frozenset(shared)
         # Groups that have a specimen of this simulator become one with it.
         apart = []
-        for group, own in found:
-            if own.isdisjoint(number.tolist()):
-                apart.append((group, own))
+        for group, theirs in found:
+            if theirs.isdisjoint(own):
+                apart.append((group, theirs))
             else:
-                members, shared = members + group, shared | own
-        found = [*apart, (sorted(members), shared)]
+                members = members + group
+                shared = shared | theirs
+        joined = (sorted(members), shared)
+        found = [*apart, joined]
     return sorted(members for members, _ in found)
 
 
 def siblings(nodes: list[Node], names: set[str]) -> set[str]:
-    """Return names with those of simulators that share specimens with them, whose designs have to stay the same."""
+    """Return names with those of simulators that share specimens, and so a design, with them."""
     found = set(names)
     for group in groups(nodes):
         together = {nodes[k].name for k in group}
@@ -101,13 +109,17 @@ def aligned(nodes: list[Node]) -> bool:
 
 def _same_specimens(node: Node, other: Node) -> bool:
     """Return whether two simulators have the same inputs at the same points."""
-    inputs = [id(x) for x in node.bound.inputs.aleatory]
-    others = [id(x) for x in other.bound.inputs.aleatory]
+    bound = node.bound
+    theirs = other.bound
+    inputs = [id(x) for x in bound.inputs.aleatory]
+    others = [id(x) for x in theirs.inputs.aleatory]
     if inputs != others:
         return False
-    if type(node.bound) is not type(other.bound) or node.propagation != other.propagation:
+    if type(bound) is not type(theirs):
         return False
-    return node.bound.same_points(other.bound)
+    if node.propagation != other.propagation:
+        return False
+    return bound.same_points(theirs)
 
 
 def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int = 0) -> DataSets:
@@ -127,7 +139,8 @@ def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int =
     populations = []
     for k, node in enumerate(evaluator.nodes):
         values, weights = evaluator.populations(theta[None], k)
-        populations.append(thinned(values, weights, node))
+        population = thinned(values, weights, node)
+        populations.append(population)
     points = simulated_points(evaluator, populations, n_sets, seed)
     return sets_at(evaluator, populations, points)
 
@@ -156,13 +169,16 @@ def simulated_points(
     nodes = evaluator.nodes
     rng = np.random.default_rng([seed, 1])
     _, total = specimens(nodes)
+    size = (n_sets, total + more)
     draws: dict[int, NDArray[np.intp]] = {}
     for group in groups(nodes):
-        _refuse_unlike([nodes[k] for k in group])
+        members = [nodes[k] for k in group]
+        _refuse_unlike(members)
         # All that share specimens have the same points, with the same weights.
-        finite = [np.isfinite(populations[k][0][0]) for k in group]
-        weights = populations[group[0]][1][0]
-        drawn = _draw(weights, np.all(finite, axis=0), (n_sets, total + more), rng)
+        responses = [populations[k][0][0] for k in group]
+        finite = np.isfinite(responses).all(axis=0)
+        _, weights = populations[group[0]]
+        drawn = _draw(weights[0], finite, size, rng)
         draws |= dict.fromkeys(group, drawn)
     return [draws[k] for k in range(len(nodes))]
 
@@ -172,48 +188,63 @@ def sets_at(
 ) -> DataSets:
     """Return the data sets that are measured on specimens, given by `simulated_points`."""
     numbers, _ = specimens(evaluator.nodes)
-    n_sets = len(points[0])
-    values, weights = [], []
+    values = []
+    weights = []
     for k, node in enumerate(evaluator.nodes):
         responses = populations[k][0][0]
         finite = np.isfinite(responses)
+        # The place of each point among those that can be observed.
         place = np.cumsum(finite) - 1
-        size = int(finite.sum())
-        # Add up the observations' weights at the values drawn, for all data sets in one row.
-        drawn = place[points[k][:, numbers[k]]]
-        cells = drawn + size * np.arange(n_sets)[:, None]
-        own = np.tile(node.target.weights, n_sets)
-        count = np.bincount(cells.ravel(), own, n_sets * size)
+        measured = points[k][:, numbers[k]]
         values.append(responses[finite])
-        weights.append(count.reshape(n_sets, size))
+        counted = _counted(
+            place[measured],
+            node.target.weights,
+            size=int(finite.sum()),
+        )
+        weights.append(counted)
     return DataSets(values, weights)
 
 
+def _counted(places: NDArray[np.intp], own: Floats, *, size: int) -> Floats:
+    """Add up the observations' own weights at the places drawn, (n_sets, n) -> (n_sets, size)."""
+    n_sets = len(places)
+    # All data sets in one row, one after the other.
+    begin = size * np.arange(n_sets)
+    cells = places + begin[:, None]
+    repeated = np.tile(own, n_sets)
+    count = np.bincount(cells.ravel(), repeated, n_sets * size)
+    return np.asarray(count.reshape(n_sets, size))
+
+
 def thinned(values: Floats, weights: Floats, node: Node) -> tuple[Floats, Floats]:
-    """Return the first 2^15 points of resimulated populations, (k, n) each, which all have equal weights."""
+    """Return the first 2^15 points, of equal weights, of resimulated populations, (k, n) each."""
     if node.bound.stored or values.shape[-1] <= _MOST:
         return values, weights
-    return values[:, :_MOST], np.broadcast_to(1 / _MOST, (len(values), _MOST))
+    equal = np.broadcast_to(1 / _MOST, (len(values), _MOST))
+    return values[:, :_MOST], equal
 
 
 def _refuse_unlike(nodes: list[Node]) -> None:
     if not aligned(nodes):
+        names = ", ".join(n.name for n in nodes)
         raise ValueError(
-            f"specimens: got the same labels in {', '.join(n.name for n in nodes)} with different inputs or designs, "
-            "expected the same .dist() objects, n and seed in all; then the model says how responses of one specimen "
-            "depend on each other"
+            f"specimens: got the same labels in {names} with different inputs or designs, "
+            "expected the same .dist() objects, n and seed in all; then the model says how "
+            "responses of one specimen depend on each other"
         )
 
 
 def _draw(
     weights: Floats, finite: NDArray[np.bool_], size: tuple[int, int], rng: np.random.Generator
 ) -> NDArray[np.intp]:
-    p = np.where(finite, weights, 0.0)
-    return rng.choice(p.size, size=size, p=p / p.sum())
+    observable = np.where(finite, weights, 0.0)
+    probability = observable / observable.sum()
+    return rng.choice(probability.size, size=size, p=probability)
 
 
 def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) -> dict[str, Floats]:
-    """Draw one data set from the populations at theta by calling the response, not from design points.
+    """Draw one data set from the populations at theta by calling the response.
 
     Specimens whose response is not finite cannot be observed; others take their place.
 
@@ -225,15 +256,21 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
     nodes = evaluator.nodes
     numbers, total = specimens(nodes)
     together = groups(nodes)
+    generators = rng.spawn(len(together))
     data = {}
-    for group, generator in zip(together, rng.spawn(len(together)), strict=True):
-        members = [nodes[k] for k in group]
-        _refuse_unlike(members)
-        columns = [_responses(evaluator, theta, k, _SPARE * total, generator) for k in group]
+    for group, generator in zip(together, generators, strict=True):
+        _refuse_unlike([nodes[k] for k in group])
+        columns = []
+        for k in group:
+            column = _responses(evaluator, theta, k, _SPARE * total, generator)
+            columns.append(column)
+        # What one simulator of a specimen cannot measure, none of them has.
         finite = np.isfinite(columns).all(axis=0)
         for k, column in zip(group, columns, strict=True):
-            _refuse_few(nodes[k], finite, total)
-            data[nodes[k].name] = column[finite][numbers[k]]
+            node = nodes[k]
+            _refuse_few(node, finite, total)
+            observable = column[finite]
+            data[node.name] = observable[numbers[k]]
     return {node.name: data[node.name] for node in nodes}
 
 
@@ -244,32 +281,41 @@ def _responses(
     bound = evaluator.nodes[k].bound
     sampler = PopulationSampler(bound.inputs)
     roots = evaluator.roots(theta[None], k)
-    aleatory, epistemic = sampler(roots, size, copy.deepcopy(generator))
-    return np.asarray(bound.responses(aleatory, epistemic)[0])
+    again = copy.deepcopy(generator)
+    aleatory, epistemic = sampler(roots, size, again)
+    responses = bound.responses(aleatory, epistemic)
+    return np.asarray(responses[0])
 
 
 def _refuse_few(node: Node, finite: NDArray[np.bool_], expected: int) -> None:
-    if finite.sum() < expected:
+    count = finite.sum()
+    if count < expected:
         raise ValueError(
-            f"{node.name}: got {finite.sum()} finite responses of {finite.size}, expected at least "
+            f"{node.name}: got {count} finite responses of {finite.size}, expected at least "
             f"{expected}"
         )
 
 
 def observed_set(evaluator: Evaluator) -> DataSets:
     """Return the observed responses as the only data set."""
-    targets = [n.target for n in evaluator.nodes]
-    return DataSets([t.observed for t in targets], [t.weights[None] for t in targets])
+    values = []
+    weights = []
+    for node in evaluator.nodes:
+        values.append(node.target.observed)
+        weights.append(node.target.weights[None])
+    return DataSets(values, weights)
 
 
 def reweighted_sets(evaluator: Evaluator, n_sets: int, seed: int = 0) -> DataSets:
-    """Give the observed specimens Dirichlet weights (Bayesian bootstrap), on top of the observations' own."""
+    """Give the observed specimens Dirichlet weights (Bayesian bootstrap), times their own."""
     rng = np.random.default_rng([seed, 2])
     numbers, total = specimens(evaluator.nodes)
     gains = rng.standard_exponential((n_sets, total))
-    values, weights = [], []
+    values = []
+    weights = []
     for number, node in zip(numbers, evaluator.nodes, strict=True):
         w = gains[:, number] * node.target.weights
+        normalised = w / w.sum(axis=-1, keepdims=True)
         values.append(node.target.observed)
-        weights.append(w / w.sum(axis=-1, keepdims=True))
+        weights.append(normalised)
     return DataSets(values, weights)

@@ -25,7 +25,9 @@ def cross(theta: Floats, step: Floats) -> Floats:
         Theta, the neighbours up, the neighbours down.
     """
     along = np.diag(step)
-    return np.vstack([theta, theta + along, theta - along])
+    up = theta + along
+    down = theta - along
+    return np.vstack([theta, up, down])
 
 
 def slopes(values: Floats, step: Floats) -> Floats:
@@ -44,16 +46,19 @@ def slopes(values: Floats, step: Floats) -> Floats:
     ndarray, shape (..., d)
         The derivative along each element, last.
     """
-    d = step.size
-    middle = np.asarray(values[0])[..., None]
-    up = np.moveaxis(values[1 : 1 + d], 0, -1)
-    down = np.moveaxis(values[1 + d :], 0, -1)
+    # Elements last, so that steps divide them.
+    last = np.moveaxis(values, 0, -1)
+    middle, up, down = np.split(last, [1, 1 + step.size], axis=-1)
     with np.errstate(invalid="ignore"):
         forward = (up - middle) / step
         backward = (middle - down) / step
         both = (up - down) / (2 * step)
-    upwards = np.where(np.isfinite(down), both, forward)
-    return np.asarray(np.where(np.isfinite(up), upwards, backward))
+    # Both neighbours where there are both, or the one that there is.
+    above = np.isfinite(up)
+    below = np.isfinite(down)
+    upwards = np.where(below, both, forward)
+    found: Floats = np.where(above, upwards, backward)
+    return found
 
 
 def differences(
@@ -77,7 +82,9 @@ def differences(
     """
 
     def function(theta: Floats) -> tuple[float, Floats, int]:
-        found = values(cross(theta, step))
-        return found[0], slopes(found, step), len(found)
+        points = cross(theta, step)
+        found = values(points)
+        gradient = slopes(found, step)
+        return found[0], gradient, len(found)
 
     return function

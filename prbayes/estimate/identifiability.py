@@ -32,30 +32,36 @@ def unidentified_directions(unidentified: Floats, names: list[str]) -> list[str]
         Such as 'mu[0] - 0.8 mu[1]'; rotated so that elements stand alone where they can.
     """
     found = []
-    basis = unidentified
-    while basis.shape[1]:
+    left = unidentified
+    while left.shape[1]:
         # The element that lies closest to the space that is left, projected on it.
-        projector = basis @ basis.T
-        i = int(np.argmax(np.diag(projector)))
-        direction = projector[i] / np.sqrt(projector[i, i])
+        projector = left @ left.T
+        within = np.diag(projector)
+        i = int(np.argmax(within))
+        length = np.sqrt(within[i])
+        direction = projector[i] / length
         found.append(_named(direction, names))
         # What is left is orthogonal to it.
-        without = basis - np.outer(direction, direction @ basis)
-        left, strength, _ = np.linalg.svd(without, full_matrices=False)
-        basis = left[:, strength > _NOTHING]
+        along = np.outer(direction, direction @ left)
+        without = left - along
+        axes, strength, _ = np.linalg.svd(without, full_matrices=False)
+        left = axes[:, strength > _NOTHING]
     return found
 
 
 def _named(direction: Floats, names: list[str]) -> str:
-    largest = direction[np.argmax(np.abs(direction))]
-    shares = zip(direction / largest, names, strict=True)
+    largest = np.argmax(np.abs(direction))
+    shares = direction / direction[largest]
+    order = np.argsort(-np.abs(shares), kind="stable")
     terms = []
-    for share, name in sorted(shares, key=lambda term: -abs(term[0])):
-        if abs(share) <= _SHARE:
+    for i in order:
+        share = shares[i]
+        size = abs(share)
+        if size <= _SHARE:
             continue
         sign = "-" if share < 0 else "+"
-        size = "" if abs(share) > _EQUAL else f"{abs(share):.1f} "
-        terms.append(f"{sign} {size}{name}")
+        factor = "" if size > _EQUAL else f"{size:.1f} "
+        terms.append(f"{sign} {factor}{names[i]}")
     return " ".join(terms).removeprefix("+ ")
 
 
@@ -78,10 +84,14 @@ def seen_by_area(information: Information) -> Floats:
     """
     area = information.area(*information.data_set)
     slopes = _in_prior_sd(area, information)
-    _, vectors = np.linalg.eigh((slopes * area.lengths) @ slopes.T)
+    gram = (slopes * area.lengths) @ slopes.T
+    _, vectors = np.linalg.eigh(gram)
+    # The change of the area over one prior standard deviation along each direction.
     changes = np.abs(vectors.T @ slopes)
-    seen = (changes * area.lengths).sum(axis=-1) > _CHANGE * information.noise_floor
-    if information.node.bound.blocks.size >= _HALVED:
+    change = (changes * area.lengths).sum(axis=-1)
+    seen = change > _CHANGE * information.noise_floor
+    points = information.node.bound.blocks
+    if points.size >= _HALVED:
         seen &= _halves_agree(information, vectors)
     return np.asarray(vectors[:, seen])
 
@@ -91,18 +101,23 @@ def _halves_agree(information: Information, vectors: Floats) -> NDArray[np.bool_
     blocks = information.node.bound.blocks
     changes = []
     for half in (0, 1):
-        area = information.area(*information.data_set, blocks % 2 == half)
-        changes.append(vectors.T @ _in_prior_sd(area, information))
+        own = blocks % 2 == half
+        area = information.area(*information.data_set, own)
+        slopes = _in_prior_sd(area, information)
+        changes.append(vectors.T @ slopes)
     first, second = changes
     # The knots are the same: they are values that occur, and both halves know all of them.
-    both = (first * second * area.lengths).sum(axis=-1)
-    one = (first**2 * area.lengths).sum(axis=-1)
-    other = (second**2 * area.lengths).sum(axis=-1)
-    return np.asarray(both > _AGREEMENT * np.sqrt(one * other))
+    lengths = area.lengths
+    both = (first * second * lengths).sum(axis=-1)
+    one = (first**2 * lengths).sum(axis=-1)
+    other = (second**2 * lengths).sum(axis=-1)
+    least = _AGREEMENT * np.sqrt(one * other)
+    return np.asarray(both > least)
 
 
 def _in_prior_sd(area: LinearArea, information: Information) -> Floats:
-    return np.asarray(area.slopes * information.prior_sd[:, None])
+    spread = information.prior_sd[:, None]
+    return np.asarray(area.slopes * spread)
 
 
 def seen_by_curvature(
@@ -117,10 +132,14 @@ def seen_by_curvature(
     weakest : float
         Below which the standard error has to be, in prior standard deviations.
     """
-    values, vectors = np.linalg.eigh((hessian + hessian.T) / 2)
-    along = np.einsum("ik,ij,jk->k", vectors, noise, vectors)
+    symmetric = (hessian + hessian.T) / 2
+    values, vectors = np.linalg.eigh(symmetric)
+    noise_along = np.einsum("ik,ij,jk->k", vectors, noise, vectors)
     # Where the data see nothing both are rounding errors, and small against their ratio elsewhere.
+    floor = 0.0
     total = float(np.trace(hessian))
-    floor = _ROUNDING * float(np.trace(noise)) / total if total > 0 else 0.0
-    precise = along < (weakest * values) ** 2
+    if total > 0:
+        variance = float(np.trace(noise))
+        floor = _ROUNDING * variance / total
+    precise = noise_along < (weakest * values) ** 2
     return values, vectors, (values > floor) & precise

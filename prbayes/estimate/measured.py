@@ -30,9 +30,50 @@ _FIRST = 0.5
 _WIDEST = 0.5
 # Standard errors along principal axes, as a share of the largest, that are taken apart.
 _LEAST = 1e-4
-_REMEMBERED = 4  # refits: the optimum's, and for epsilon one for each of a few simulators
+# Refits held: the optimum's, and for epsilon one for each of a few simulators.
+_REMEMBERED = 4
+# The middle 89%, ArviZ's interval, with the median; and the width of a normal distribution's in
+# standard deviations.
 _LEVELS = (0.055, 0.5, 0.945)
-_WIDTH = 3.2  # of the middle 89% of a normal distribution, in standard deviations
+_WIDTH = 3.2
+
+
+@dataclass(frozen=True, eq=False)
+class _Along:
+    """An objective in coordinates x along axes, in steps, around theta.
+
+    Attributes
+    ----------
+    objective : BatchObjective
+    theta : ndarray, shape (d,)
+    prior_sd : ndarray, shape (d,)
+    axes : ndarray, shape (d, d)
+        As columns, in units of the prior's spread.
+    steps : ndarray, shape (d,)
+        Length of one unit of x along each.
+    """
+
+    objective: BatchObjective
+    theta: Floats
+    prior_sd: Floats
+    axes: Floats
+    steps: Floats
+
+    def shifts(self, x: Floats) -> Floats:
+        """Return coordinates (..., d) in units of the prior's spread."""
+        stepped = x * self.steps
+        return np.asarray(stepped @ self.axes.T)
+
+    def __call__(self, x: Floats, rows: Any) -> Floats:
+        """Return the values of data sets ``rows``, shapes (A, s, d), (A,) -> (A, s)."""
+        shifts = self.shifts(x)
+        thetas = self.theta + shifts * self.prior_sd
+        return self.objective(thetas, rows)
+
+    def mean(self, x: Floats) -> Floats:
+        """Return the mean over all data sets at the same points, (1, s, d) -> (s,)."""
+        values = self(x, slice(None))
+        return np.asarray(values.mean(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,11 +114,23 @@ class Refits:
         What was found last is remembered: an optimum's standard errors, its epsilon and the
         adjustment of draws rest on the same refits.
         """
-        chosen = tuple(range(len(evaluator.nodes)) if simulators is None else simulators)
+        every = range(len(evaluator.nodes))
+        chosen = tuple(every if simulators is None else simulators)
         # Minimisers depend on the ratios of scales only; of one simulator they do not at all.
         ratios = scales / scales[chosen[0]]
-        designs = tuple(hash(design.values.tobytes()) for design in evaluator.designs.values())
-        return _refits(evaluator, tuple(theta), tuple(ratios), chosen, n_sets, seed, designs)
+        fingerprints = []
+        for design in evaluator.designs.values():
+            content = design.values.tobytes()
+            fingerprints.append(hash(content))
+        return _refits(
+            evaluator,
+            tuple(theta),
+            tuple(ratios),
+            chosen,
+            n_sets,
+            seed,
+            tuple(fingerprints),
+        )
 
     @classmethod
     def made(
@@ -93,22 +146,34 @@ class Refits:
         sets = simulated_sets(evaluator, theta, n_sets, seed)
         objective = BatchObjective.of(evaluator, scales, sets, simulators=simulators)
         prior_sd = evaluator.prior_sd
-
-        def value(shifts: Floats, rows: Any) -> Floats:
-            return objective(theta + shifts * prior_sd, rows)
-
-        start = np.zeros((n_sets, theta.size))
-        before = value(start[:, None], np.arange(n_sets))[:, 0]
-        # The first simplices know no more than the prior, the second ones know the principal axes.
+        d = theta.size
+        start = np.zeros((n_sets, d))
+        # The first simplices know no more than the prior.
+        value = _Along(
+            objective,
+            theta,
+            prior_sd,
+            axes=np.eye(d),
+            steps=np.ones(d),
+        )
+        rows = np.arange(n_sets)
+        first = value(start[:, None], rows)
+        before = first[:, 0]
         shifts, _, _ = descend_by_simplex(value, start, sizes=[_FIRST])
+        # The second ones know the principal axes.
         axes, sd = principal_axes(shifts)
-
-        def along(x: Floats, rows: Any) -> Floats:
-            return value((x * sd) @ axes.T, rows)
-
-        x, after, _ = descend_by_simplex(along, shifts @ axes / sd, sizes=[1.0])
-        gain = float((before - after)[np.isfinite(before)].mean())
-        return cls(objective, theta, prior_sd, (x * sd) @ axes.T, gain)
+        along = _Along(objective, theta, prior_sd, axes, sd)
+        begin = shifts @ axes / sd
+        x, after, _ = descend_by_simplex(along, begin, sizes=[1.0])
+        known = np.isfinite(before)
+        gain = before[known] - after[known]
+        return cls(
+            objective,
+            theta,
+            prior_sd,
+            along.shifts(x),
+            float(gain.mean()),
+        )
 
     def local(self, weakest: float = 1.0) -> Local:
         """Return the minimisers' covariance, along the directions that the data identify.
@@ -121,16 +186,22 @@ class Refits:
         """
         curvatures, vectors = np.linalg.eigh(self.hessian())
         # The largest curvature first.
-        curvatures, vectors = curvatures[::-1], vectors[:, ::-1]
+        curvatures = curvatures[::-1]
+        vectors = vectors[:, ::-1]
         number = np.arange(1, curvatures.size + 1)
-        rises = curvatures * weakest**2 > 2 * self.gain / number
+        least = 2 * self.gain / number
+        rises = curvatures * weakest**2 > least
         rank = int(number[rises].max(initial=0))
-        axes, sd = principal_axes(self.shifts @ vectors[:, :rank])
+        rising = vectors[:, :rank]
+        level = vectors[:, rank:]
+        # Among those that rise, the ones along which the minimisers scatter little enough.
+        axes, sd = principal_axes(self.shifts @ rising)
         narrow = sd < weakest
-        identified = vectors[:, :rank] @ axes[:, narrow]
-        wide = vectors[:, :rank] @ axes[:, ~narrow]
-        unidentified = np.concatenate([vectors[:, rank:], wide], axis=1)
-        return Local(self.prior_sd, identified, unidentified, np.diag(sd[narrow] ** 2))
+        identified = rising @ axes[:, narrow]
+        wide = rising @ axes[:, ~narrow]
+        unidentified = np.concatenate([level, wide], axis=1)
+        covariance = np.diag(sd[narrow] ** 2)
+        return Local(self.prior_sd, identified, unidentified, covariance)
 
     def hessian(self) -> Floats:
         """Return second differences of the discrepancy at theta, averaged over data sets, (d, d).
@@ -140,16 +211,15 @@ class Refits:
         go.
         """
         axes, sd = principal_axes(self.shifts)
-        steps = np.minimum(np.where(sd > _WIDEST / 5, _WIDEST, sd), _WIDEST)
-
-        def mean(x: Floats) -> Floats:
-            thetas = self.theta + (x * steps) @ axes.T * self.prior_sd
-            values = self.objective(thetas, slice(None))
-            return np.asarray(values.mean(axis=0))
-
-        differences = second_differences(mean, steps.size)
-        along = axes / steps
-        return np.asarray(along @ np.nan_to_num(differences) @ along.T)
+        wide = sd > _WIDEST / 5
+        steps = np.where(wide, _WIDEST, sd)
+        steps = np.minimum(steps, _WIDEST)
+        along = _Along(self.objective, self.theta, self.prior_sd, axes, steps)
+        differences = second_differences(along.mean, steps.size)
+        known = np.nan_to_num(differences)
+        # From differences along the axes to derivatives in units of the prior's spread.
+        back = axes / steps
+        return np.asarray(back @ known @ back.T)
 
 
 @lru_cache(maxsize=_REMEMBERED)
@@ -163,11 +233,13 @@ def _refits(
     designs: tuple[int, ...],
 ) -> Refits:
     """Return refits on designs as they are now, of which ``designs`` has fingerprints."""
-    return Refits.made(evaluator, np.array(theta), np.array(scales), simulators, n_sets, seed)
+    at = np.array(theta)
+    weights = np.array(scales)
+    return Refits.made(evaluator, at, weights, simulators, n_sets, seed)
 
 
 def principal_axes(points: Floats) -> tuple[Floats, Floats]:
-    """Return principal axes of points, (n, d), as columns (d, d), and standard deviations along them.
+    """Return principal axes of points, (n, d), as columns (d, d), and their spreads along them.
 
     Robust: points count no farther out than three standard deviations, and those are what the
     middle 89% tell, so that a few minimisers that ran away do not decide.
@@ -175,11 +247,16 @@ def principal_axes(points: Floats) -> tuple[Floats, Floats]:
     d = points.shape[1]
     if d == 0:
         return np.empty((0, 0)), np.empty(0)
+    # Runaways are drawn in before they count in the covariance.
     low, middle, high = np.quantile(points, _LEVELS, axis=0)
     reach = 3 * (high - low) / _WIDTH
     counted = np.clip(points, middle - reach, middle + reach)
-    _, axes = np.linalg.eigh(np.cov(counted, rowvar=False).reshape(d, d))
-    low, _, high = np.quantile(points @ axes, _LEVELS, axis=0)
+    covariance = np.cov(counted, rowvar=False).reshape(d, d)
+    _, axes = np.linalg.eigh(covariance)
+    # Spreads along the axes, none so small that a division by it fails.
+    turned = points @ axes
+    low, _, high = np.quantile(turned, _LEVELS, axis=0)
     sd = (high - low) / _WIDTH
-    least = _LEAST * sd.max() if sd.max() > 0 else 1.0
+    largest = sd.max()
+    least = _LEAST * largest if largest > 0 else 1.0
     return axes, np.maximum(sd, least)

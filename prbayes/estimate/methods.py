@@ -56,13 +56,13 @@ class Method:
         if isinstance(self.method, str):
             if self.method.lower() not in {name.lower() for name in known}:
                 raise ValueError(
-                    f"method: got {self.method!r}, expected one of {', '.join(known)}, or a function that "
-                    "scipy.optimize.minimize takes as its method"
+                    f"method: got {self.method!r}, expected one of {', '.join(known)}, or a "
+                    "function that scipy.optimize.minimize takes as its method"
                 )
         elif not callable(self.method) or isinstance(self.method, type):
             raise TypeError(
-                f"method: got {self.method!r:.60}, expected the name of a scipy method, or a function that "
-                "scipy.optimize.minimize takes as its method"
+                f"method: got {self.method!r:.60}, expected the name of a scipy method, or a "
+                "function that scipy.optimize.minimize takes as its method"
             )
         if not isinstance(self.options, Mapping):
             raise TypeError(

@@ -445,7 +445,10 @@ def _against_rivals(plan: _Plan, state: _State) -> tuple[_State, list[Rival]]:
 
 
 def _rivals(plan: _Plan, state: _State) -> list[Rival]:
-    """Return other optima; where a design is too thin for one that matters, refine and look again."""
+    """Return other optima.
+
+    Where a design is too thin for one that matters, refine and look again.
+    """
     evaluator = plan.evaluator
     assert state.local is not None
     floors = noise_floors(evaluator, state.theta, n_sets=_FLOOR_SETS)

@@ -35,7 +35,7 @@ class Objective:
         Theta -> value, gradient or None, number of evaluations.
     center : ndarray, shape (d,)
         Theta where the standardised parameters are zero.
-    units : ndarray, shape (d,)
+    prior_sd : ndarray, shape (d,)
     size : float
         Typical size of the values.
     gradient : bool
@@ -48,7 +48,7 @@ class Objective:
         self,
         function: Callable[[Floats], Any],
         center: Floats,
-        units: Floats,
+        prior_sd: Floats,
         size: float,
         *,
         gradient: bool,
@@ -56,7 +56,7 @@ class Objective:
     ) -> None:
         self.function = function
         self.center = center
-        self.units = units
+        self.prior_sd = prior_sd
         self.size = size
         self.gradient = gradient
         self.most = most
@@ -73,14 +73,14 @@ class Objective:
         """Return the value, and the gradient where there is one, at standardised parameters."""
         if self.count >= self.most:
             raise SpentError
-        theta = self.center + np.asarray(t) * self.units
+        theta = self.center + np.asarray(t) * self.prior_sd
         value, gradient, cost = self.function(theta)
         self._record(theta, float(value), cost)
         value = float(value) / self.size
         self._look_for_progress(value, cost)
         if not self.gradient:
             return value if np.isfinite(value) else _HUGE
-        slope = np.asarray(gradient) * self.units / self.size
+        slope = np.asarray(gradient) * self.prior_sd / self.size
         if not np.isfinite(value) or not np.isfinite(slope).all():
             # Back towards the start, without breaking a line search.
             return _STEEP + float(t @ t), 2 * t

@@ -49,9 +49,11 @@ class Obstacle:
 def simulator_obstacle(evaluator: Evaluator, k: int) -> Obstacle | None:
     """Return why nothing is known of the minimiser of one simulator's discrepancy, or None."""
     node = evaluator.nodes[k]
-    if node.bound.random:
-        return Obstacle(Cause.RANDOM, f"{node.name} has prb.Fresh, whose discrepancy is random")
-    if node.metric.minimum is Minimum.UNKNOWN and not node.bound.stored:
+    bound = node.bound
+    if bound.random:
+        reason = f"{node.name} has prb.Fresh, whose discrepancy is random"
+        return Obstacle(Cause.RANDOM, reason)
+    if node.metric.minimum is Minimum.UNKNOWN and not bound.stored:
         metric = type(node.metric).__name__
         reason = (
             f"{node.name} has a {metric}, of which nothing is known without refits, and these need "
@@ -63,13 +65,18 @@ def simulator_obstacle(evaluator: Evaluator, k: int) -> Obstacle | None:
 
 def sampling_obstacle(evaluator: Evaluator) -> Obstacle | None:
     """Return why there is no sampling distribution of the minimiser, or None."""
-    found = [simulator_obstacle(evaluator, k) for k in range(len(evaluator.nodes))]
-    several = measured_by_refits(evaluator) and not all(n.bound.stored for n in evaluator.nodes)
-    if several and not any(found):
-        names = ", ".join(n.name for n in evaluator.nodes if not n.bound.stored)
+    nodes = evaluator.nodes
+    for k in range(len(nodes)):
+        obstacle = simulator_obstacle(evaluator, k)
+        if obstacle is not None:
+            return obstacle
+    # Where one simulator needs refits, all of them have to be refitted.
+    computed = [node.name for node in nodes if not node.bound.stored]
+    if computed and measured_by_refits(evaluator):
+        names = ", ".join(computed)
         reason = f"another metric needs refits, and the responses of {names} are not stored"
-        found.append(Obstacle(Cause.COSTLY, reason))
-    return next((obstacle for obstacle in found if obstacle is not None), None)
+        return Obstacle(Cause.COSTLY, reason)
+    return None
 
 
 def refit_obstacle(evaluator: Evaluator) -> Obstacle | None:
@@ -77,8 +84,9 @@ def refit_obstacle(evaluator: Evaluator) -> Obstacle | None:
     obstacle = sampling_obstacle(evaluator)
     if obstacle is not None:
         return obstacle
-    ordinary = len(evaluator.model.observed_RVs) > len(evaluator.nodes)
-    if ordinary or evaluator.model.potentials:
+    model = evaluator.model
+    ordinary = len(model.observed_RVs) > len(evaluator.nodes)
+    if ordinary or model.potentials:
         reason = "the model has likelihood terms or potentials besides its simulators"
         return Obstacle(Cause.OTHER_TERMS, reason)
     return None
@@ -86,4 +94,5 @@ def refit_obstacle(evaluator: Evaluator) -> Obstacle | None:
 
 def measured_by_refits(evaluator: Evaluator) -> bool:
     """Return whether a metric declares nothing of its minimum, so that refits have to tell."""
-    return any(node.metric.minimum is Minimum.UNKNOWN for node in evaluator.nodes)
+    minima = [node.metric.minimum for node in evaluator.nodes]
+    return Minimum.UNKNOWN in minima

@@ -155,7 +155,10 @@ class Optimum:
         return SamplingDistribution.of(self.evaluator, self.theta, scales, weakest)
 
     def to_datatree(self) -> xr.DataTree:
-        """Return the optimum as a DataTree with groups ``optimum``, ``stderr``, ``trace`` and ``calibration``."""
+        """Return the optimum as a DataTree.
+
+        Groups ``optimum``, ``stderr``, ``trace`` and ``calibration``.
+        """
         return optimum_tree(self)
 
 

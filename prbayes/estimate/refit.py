@@ -23,17 +23,22 @@ from prbayes.estimate.sandwich import Information
 from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.base import N_BLOCKS
 
-_STEP = 0.02  # of differences, in standard errors
-_TOLERANCE = (
-    1e-4  # gain, in units of the curvature along a standard error, that is left on the table
-)
-_TYPICAL = 50  # data sets from which the curvature is guessed
-_BLOCK = 1 << 23  # weights held at a time
-_SETTLED = 1.5  # ratio of standard errors from one step of the differences and from its double
-_LOWEST = (
-    0.05  # curvature along an axis, as a share of the largest, that a first guess has at least
-)
-# First edges of simplices, in standard errors: the second one starts where the first came to rest.
+# Step of differences, in standard errors.
+_STEP = 0.02
+# Gain, in units of the curvature along a standard error, that is left on the table: the minimiser
+# is then known to about a hundredth of a standard error.
+_TOLERANCE = 1e-4
+# Data sets from which the curvature is guessed; the minimiser does not depend on the guess.
+_TYPICAL = 50
+# Weights held at a time: 64 MiB.
+_BLOCK = 1 << 23
+# Ratio of standard errors from one step of the differences and from its double.
+_SETTLED = 1.5
+# Curvature along an axis, as a share of the largest, that a first guess has at least.
+_LOWEST = 0.05
+# Smallest variance and curvature, where rounding leaves none.
+_TINY = 1e-300
+# First edges of simplices, in standard errors: the second one starts where the first has ended.
 _SIMPLICES = (1.0, -0.5)
 
 
@@ -75,15 +80,25 @@ class SamplingDistribution:
         Directions with a standard error above ``weakest`` prior standard deviations are not
         identified.
         """
-        information = [Information(evaluator, k, theta) for k in range(len(evaluator.nodes))]
+        number = len(evaluator.nodes)
+        information = [Information(evaluator, k, theta) for k in range(number)]
         if measured_by_refits(evaluator):
             local = Refits.at(evaluator, theta, scales).local(weakest)
         else:
             local = local_sampling(information, scales, weakest)
         variances, vectors = np.linalg.eigh(local.covariance)
         axes = local.identified @ vectors
-        stderr = np.sqrt(np.maximum(variances, 1e-300))
-        return cls(evaluator, theta, scales, information, local, axes, stderr)
+        # Rounding may leave a variance of zero or less.
+        positive = np.maximum(variances, _TINY)
+        return cls(
+            evaluator,
+            theta,
+            scales,
+            information,
+            local,
+            axes,
+            stderr=np.sqrt(positive),
+        )
 
     def unsettled(self) -> list[int]:
         """Return the simulators whose discrepancy jumps here, if that matters.
@@ -91,12 +106,14 @@ class SamplingDistribution:
         It does if twice the step of the differences gives other errors: second differences over a
         jump are the smaller the wider the step, those of a smooth function are not.
         """
-        jumping = [i.k for i in self.information if i.jumps]
+        jumping = [one.k for one in self.information if one.jumps]
         if not jumping:
             return []
-        wider = [replace(i, wide=2 * i.wide) for i in self.information]
-        variances = np.diag(local_sampling(self.information, self.scales).in_theta)
-        others = np.diag(local_sampling(wider, self.scales).in_theta)
+        wider = [replace(one, wide=2 * one.wide) for one in self.information]
+        local = local_sampling(self.information, self.scales)
+        other = local_sampling(wider, self.scales)
+        variances = np.diag(local.in_theta)
+        others = np.diag(other.in_theta)
         ratio = np.sqrt(variances / others)
         settled = (ratio > 1 / _SETTLED) & (ratio < _SETTLED)
         return [] if settled.all() else jumping
@@ -111,15 +128,18 @@ class SamplingDistribution:
         remainder : ndarray, shape (..., d)
             In theta.
         """
-        shifts = (thetas - self.theta) / self.local.prior_sd
+        prior_sd = self.local.prior_sd
+        shifts = (thetas - self.theta) / prior_sd
         x = shifts @ self.axes
-        remainder = (shifts - x @ self.axes.T) * self.local.prior_sd
+        along = x @ self.axes.T
+        remainder = (shifts - along) * prior_sd
         return x / self.stderr, remainder
 
     def thetas(self, x: Floats, remainder: Floats | float = 0.0) -> Floats:
         """Return thetas, (..., d), of coordinates (..., r) and what remains."""
         shifts = (x * self.stderr) @ self.axes.T
-        return np.asarray(self.theta + shifts * self.local.prior_sd + remainder)
+        shifted = self.theta + shifts * self.local.prior_sd
+        return np.asarray(shifted + remainder)
 
     def refit(self, sets: DataSets) -> tuple[Floats, NDArray[np.bool_]]:
         """Return the minimiser of each data set, (n_sets, r) in coordinates, and which converged.
@@ -127,26 +147,34 @@ class SamplingDistribution:
         With designs the minimisation is exact, and else of first order; no response is computed
         with designs.
         """
-        if not all(n.bound.stored for n in self.evaluator.nodes):
+        if not self._stored:
             shifts = first_order_shifts(self.information, self.scales, self.axes, sets)
-            return shifts / self.stderr, np.ones(len(shifts), dtype=bool)
+            converged = np.ones(len(shifts), dtype=bool)
+            return shifts / self.stderr, converged
         n_sets = len(sets.weights[0])
         at_once = self._at_once(sets)
-        minimisers, converged = [], []
+        minimisers = []
+        arrived = []
         with progress("refits", n_sets) as report:
             for i in range(0, n_sets, at_once):
-                some = DataSets(sets.values, [w[i : i + at_once] for w in sets.weights])
-                x, ok = self._minimise(BatchObjective.of(self.evaluator, self.scales, some))
+                weights = [w[i : i + at_once] for w in sets.weights]
+                some = DataSets(sets.values, weights)
+                objective = BatchObjective.of(self.evaluator, self.scales, some)
+                x, converged = self._minimise(objective)
                 minimisers.append(x)
-                converged.append(ok)
-                report(len(ok), "")
-        return np.concatenate(minimisers), np.concatenate(converged)
+                arrived.append(converged)
+                report(len(converged), "")
+        return np.concatenate(minimisers), np.concatenate(arrived)
 
     def _at_once(self, sets: DataSets) -> int:
         """Return how many data sets fit into memory."""
-        pairs = zip(self.evaluator.nodes, sets.values, strict=True)
-        points = max(node.bound.n_points + values.size for node, values in pairs)
-        return max(1, _BLOCK // (points * (2 * self.stderr.size + 1)))
+        points = 0
+        for node, values in zip(self.evaluator.nodes, sets.values, strict=True):
+            here = node.bound.n_points + values.size
+            points = max(points, here)
+        # Gradients by differences take theta and two neighbours along each axis.
+        stencil = 2 * self.stderr.size + 1
+        return max(1, _BLOCK // (points * stencil))
 
     def design_error(self) -> float:
         """Return how far the optimum of an independent design would be; NaN if not known.
@@ -156,21 +184,38 @@ class SamplingDistribution:
         were independent, bounds the error of the whole. Points on a line, which cut it into parts
         of equal mass, are far better together than their parts tell: they count as exact.
         """
-        bounds = [n.bound for n in self.evaluator.nodes]
-        blocks = [b.blocks * (not b.is_line) for b in bounds if b.stored]
-        if len(blocks) < len(bounds) or all((b == 0).all() for b in blocks):
+        blocks = self._blocks()
+        if not any(block.any() for block in blocks):
             return np.nan
         # The observed responses against each block.
         observed = observed_set(self.evaluator)
-        repeated = [w[np.zeros(N_BLOCKS, dtype=int)] for w in observed.weights]
+        every = np.zeros(N_BLOCKS, dtype=int)
+        repeated = [w[every] for w in observed.weights]
         sets = DataSets(observed.values, repeated)
         objective = BatchObjective.of(self.evaluator, self.scales, sets, blocks=blocks)
         x, converged = self._minimise(objective)
         if converged.sum() < N_BLOCKS / 2:
             return np.inf
         # Two designs differ by the root of two of one's error.
-        error = x[converged].std(axis=0, ddof=1) / np.sqrt(N_BLOCKS)
+        spread = x[converged].std(axis=0, ddof=1)
+        error = spread / np.sqrt(N_BLOCKS)
         return float(np.sqrt(2) * error.max(initial=0.0))
+
+    @property
+    def _stored(self) -> bool:
+        """Whether no simulator's responses are computed anew."""
+        return all(node.bound.stored for node in self.evaluator.nodes)
+
+    def _blocks(self) -> list[NDArray[np.intp]]:
+        """Return by simulator the block of each point of its design; none if not all have one."""
+        if not self._stored:
+            return []
+        blocks = []
+        for node in self.evaluator.nodes:
+            own = node.bound.blocks
+            # Points on a line are one block.
+            blocks.append(np.zeros_like(own) if node.bound.is_line else own)
+        return blocks
 
     def _minimise(self, objective: BatchObjective) -> tuple[Floats, NDArray[np.bool_]]:
         """Return the minimisers of data sets from the optimum on, along the axes."""
@@ -178,14 +223,18 @@ class SamplingDistribution:
         def value(x: Floats, rows: Any) -> Floats:
             return objective(self.thetas(x), rows)
 
-        r, n_sets = self.stderr.size, objective.n_sets
-        start = np.zeros((n_sets, r))
+        def typical(x: Floats) -> Floats:
+            values = value(x, slice(_TYPICAL))
+            return np.asarray(values.mean(axis=0))
+
+        r = self.stderr.size
+        start = np.zeros((objective.n_sets, r))
         if measured_by_refits(self.evaluator):
             x, _, converged = descend_by_simplex(value, start, sizes=_SIMPLICES)
             return x, converged
-        curvature = _mean_hessian(lambda x: value(x, slice(_TYPICAL)).mean(axis=0), r)
-        tolerance = _TOLERANCE * np.trace(curvature) / r
+        curvature = _mean_hessian(typical, r)
         inverse = np.linalg.inv(curvature)
+        tolerance = _TOLERANCE * np.trace(curvature) / r
         x, _, converged = descend(value, start, inverse, step=_STEP, tolerance=tolerance)
         return x, converged
 
@@ -193,7 +242,9 @@ class SamplingDistribution:
 def _mean_hessian(value: Callable[[Floats], Floats], r: int) -> Floats:
     """Return the Hessian at zero by differences of one unit, made positive definite."""
     differences = second_differences(value, r)
-    values, vectors = np.linalg.eigh(differences)
-    lowest = _LOWEST * max(np.nanmax(values), 1e-300)
-    values = np.maximum(np.nan_to_num(values), lowest)
-    return np.asarray((vectors * values) @ vectors.T)
+    curvatures, vectors = np.linalg.eigh(differences)
+    largest = max(np.nanmax(curvatures), _TINY)
+    lowest = _LOWEST * largest
+    known = np.nan_to_num(curvatures)
+    positive = np.maximum(known, lowest)
+    return np.asarray((vectors * positive) @ vectors.T)

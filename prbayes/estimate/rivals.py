@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -52,6 +52,48 @@ class Rival:
     better: bool
 
 
+@dataclass(frozen=True, eq=False)
+class _Objective:
+    """The objective in theta, and in units of the prior's spread around the best one."""
+
+    evaluator: Evaluator
+    scales: Floats
+    best: Floats
+    prior_sd: Floats
+
+    def __call__(self, thetas: Floats) -> Floats:
+        """Return values of thetas, (..., d) -> (...)."""
+        stacked = thetas.reshape(-1, thetas.shape[-1])
+        values = self.evaluator.total(stacked, self.scales)
+        return values.reshape(thetas.shape[:-1])
+
+    def theta(self, x: Floats) -> Floats:
+        """Return thetas, (..., d), of shifts in units of the prior's spread."""
+        return np.asarray(self.best + x * self.prior_sd)
+
+    def along(self, x: Floats, rows: Any) -> Floats:
+        """Return values of shifts; the same function for all rows."""
+        return self(self.theta(x))
+
+
+def _starts(objective: _Objective, n: int, noise: float, seed: int) -> tuple[Floats, float]:
+    """Return shifts to begin at, (n, d), and the typical size of the objective among the priors'.
+
+    They are the better half of points of the prior, without crowding.
+    """
+    points = objective.evaluator.prior_points(_CANDIDATES * n, seed)
+    values = objective(points)
+    ranked = np.argsort(values, kind="stable")
+    some = ranked[::_EVERY]
+    chosen = points[some[:n]]
+    finite = values[np.isfinite(values)]
+    quantiles = np.quantile(finite, [0.0, 0.5])
+    half = float(np.ptp(quantiles))
+    size = max(half, noise)
+    shifts = (chosen - objective.best) / objective.prior_sd
+    return shifts, size
+
+
 def rivals(
     evaluator: Evaluator,
     best: Floats,
@@ -62,7 +104,7 @@ def rivals(
     starts: int,
     seed: int,
 ) -> list[Rival]:
-    """Descend from points of the prior, all at once, and return the optima that a barrier separates from each other.
+    """Descend from points of the prior, and return the optima that barriers separate.
 
     Parameters
     ----------
@@ -70,8 +112,8 @@ def rivals(
     best : ndarray, shape (d,)
     scales : ndarray, shape (k,)
     local : Local
-        What the data see at ``best``; where they are blind, rivals are reported at the same place
-        as ``best``.
+        What the data identify at ``best``; along the other directions, rivals are reported at the
+        same place as ``best``.
     noise : float
         A difference of the objective that sampling explains.
     starts : int
@@ -82,58 +124,50 @@ def rivals(
     list of Rival
         Sorted by value; without ``best``.
     """
-
-    def objective(thetas: Floats) -> Floats:
-        flat = thetas.reshape(-1, thetas.shape[-1])
-        return evaluator.total(flat, scales).reshape(thetas.shape[:-1])
-
-    # Starts: the better half of points of the prior, without crowding.
-    units = local.prior_sd
-    points = evaluator.prior_points(_CANDIDATES * starts, seed)
-    first = objective(points)
-    ranked = np.argsort(first, kind="stable")
-    chosen = points[ranked[::_EVERY][:starts]]
-    quantiles = np.quantile(first[np.isfinite(first)], [0.0, 0.5])
-    size = max(float(np.ptp(quantiles)), noise)
+    objective = _Objective(evaluator, scales, best, local.prior_sd)
+    starts_at, size = _starts(objective, starts, noise, seed)
     if not size > 0:
         return []
 
     # Descend, all at once.
     ends, values, _ = descend(
-        lambda x, rows: objective(best + x * units),
-        (chosen - best) / units,
+        objective.along,
+        starts_at,
         np.eye(best.size) / size,
         step=_STEP,
         tolerance=_TOLERANCE * noise,
     )
     lowest = float(objective(best[None])[0])
-    ends, values = _in_line(objective, best, units, local.unidentified, ends, values, noise)
+    ends, values = _in_line(objective, local.unidentified, ends, values, noise)
 
     # Keep those that a barrier separates from all that are kept already.
     kept = [(best, lowest)]
     for i in np.argsort(values):
-        end, value = best + ends[i] * units, float(values[i])
+        value = float(values[i])
         if not np.isfinite(value):
             continue
-        if all(_separate(objective, end, value, *other, noise) for other in kept):
+        end = objective.theta(ends[i])
+        separate = (_separate(objective, end, value, *other, noise) for other in kept)
+        if all(separate):
             kept.append((end, value))
-    return [_rival(theta, value, lowest, noise) for theta, value in kept[1:]]
+    found = kept[1:]
+    return [_rival(theta, value, lowest, noise) for theta, value in found]
 
 
 def _in_line(
-    objective: Callable[[Floats], Floats],
-    best: Floats,
-    units: Floats,
+    objective: _Objective,
     unidentified: Floats,
     ends: Floats,
     values: Floats,
     noise: float,
 ) -> tuple[Floats, Floats]:
-    """Move ends to where the best is along directions that are not identified, if that is as good."""
-    in_line = ends - ends @ unidentified @ unidentified.T
-    also = objective(best + in_line * units)
+    """Move ends to where the best is along what is not identified, if that is as good."""
+    hidden = ends @ unidentified @ unidentified.T
+    in_line = ends - hidden
+    also = objective.along(in_line, None)
     as_good = also < values + _TOLERANCE * noise
-    return np.where(as_good[:, None], in_line, ends), np.minimum(also, values)
+    aligned = np.where(as_good[:, None], in_line, ends)
+    return aligned, np.minimum(also, values)
 
 
 def _rival(theta: Floats, value: float, lowest: float, noise: float) -> Rival:
@@ -143,7 +177,7 @@ def _rival(theta: Floats, value: float, lowest: float, noise: float) -> Rival:
 
 
 def _separate(
-    objective: Callable[[Floats], Floats],
+    objective: _Objective,
     a: Floats,
     value_a: float,
     b: Floats,
@@ -151,7 +185,8 @@ def _separate(
     noise: float,
 ) -> bool:
     """Return whether the objective between two optima is above both by more than the noise."""
-    share = np.linspace(0, 1, _BETWEEN + 2)[1:-1, None]
-    between = objective(a + share * (b - a))
+    share = np.linspace(0, 1, _BETWEEN + 2)
+    inside = share[1:-1, None]
+    between = objective(a + inside * (b - a))
     barrier = np.max(between) - max(value_a, value_b)
     return bool(barrier > _BARRIER * noise)

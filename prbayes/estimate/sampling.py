@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from prbayes.estimate.identifiability import seen_by_area, seen_by_curvature
 from prbayes.estimate.sandwich import Information, LinearArea
 from prbayes.metrics.base import Minimum
 
+# Iterations of reweighting.
 _IRLS = 30
 # Squared gap of distribution functions below which an absolute value counts as a parabola.
 _KINK = 1e-8
@@ -65,7 +67,9 @@ def first_order_shifts(
     """
     expansion = _expanded(information, scales, basis, sets)
     shifts = np.zeros_like(expansion.force)
-    for _ in range(_IRLS if expansion.areas else 1):
+    # Without an area one solution is exact.
+    iterations = _IRLS if expansion.areas else 1
+    for _ in range(iterations):
         shifts = _solved(expansion, shifts)
     return shifts
 
@@ -73,35 +77,49 @@ def first_order_shifts(
 def _expanded(
     information: list[Information], scales: Floats, basis: Floats, sets: DataSets
 ) -> _Expansion:
-    n_sets, r = len(sets.weights[0]), basis.shape[1]
-    directions = basis * information[0].prior_sd[:, None]
-    force, curvature = np.zeros((n_sets, r)), np.zeros((r, r))
+    prior_sd = information[0].prior_sd
+    directions = basis * prior_sd[:, None]
+    r = basis.shape[1]
+    n_sets = len(sets.weights[0])
+    force = np.zeros((n_sets, r))
+    curvature = np.zeros((r, r))
     areas = []
-    for i, scale in zip(information, scales, strict=True):
-        data = sets.values[i.k], sets.weights[i.k]
-        if i.node.metric.minimum is Minimum.QUADRATIC:
-            force -= i.gradients(*data) @ directions / scale
-            curvature += directions.T @ i.hessian @ directions / scale
+    for one, scale in zip(information, scales, strict=True):
+        observed = sets.values[one.k]
+        weights = sets.weights[one.k]
+        if one.node.metric.minimum is Minimum.QUADRATIC:
+            gradients = one.gradients(observed, weights)
+            force -= gradients @ directions / scale
+            hessian = directions.T @ one.hessian
+            curvature += hessian @ directions / scale
         else:
-            area = i.area(*data)
+            area = one.area(observed, weights)
             slopes = directions.T @ area.slopes
-            areas.append(LinearArea(area.gaps, slopes, area.lengths / scale))
+            lengths = area.lengths / scale
+            areas.append(LinearArea(area.gaps, slopes, lengths))
     return _Expansion(force, curvature, areas)
 
 
 def _solved(expansion: _Expansion, shifts: Floats) -> Floats:
     """Return the minimisers with each |gap| as a parabola through its value at ``shifts``."""
     n_sets, r = shifts.shape
-    left = np.broadcast_to(expansion.curvature, (n_sets, r, r)).copy()
+    curvature = np.broadcast_to(expansion.curvature, (n_sets, r, r))
+    left = curvature.copy()
     right = expansion.force.copy()
     for area in expansion.areas:
-        gaps, slopes = area.gaps, area.slopes
-        weight = area.lengths / np.sqrt((gaps + shifts @ slopes) ** 2 + _KINK)
+        slopes = area.slopes
+        gaps = area.gaps + shifts @ slopes
+        sizes = np.sqrt(gaps**2 + _KINK)
+        weight = area.lengths / sizes
+        pull = weight * area.gaps
         left += np.einsum("bm,im,jm->bij", weight, slopes, slopes, optimize=True)
-        right -= np.einsum("bm,im->bi", weight * gaps, slopes, optimize=True)
-    size = np.trace(left, axis1=1, axis2=2)[:, None, None]
-    solved = np.linalg.solve(left + _RIDGE * size * np.eye(r), right[..., None])
-    return np.asarray(solved[..., 0])
+        right -= np.einsum("bm,im->bi", pull, slopes, optimize=True)
+    # A ridge, small against the system's size, keeps it regular.
+    size = np.trace(left, axis1=1, axis2=2)
+    ridge = _RIDGE * size[:, None, None]
+    regular = left + ridge * np.eye(r)
+    solution = np.linalg.solve(regular, right[..., None])
+    return np.asarray(solution[..., 0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,9 +147,12 @@ class Local:
     def in_theta(self) -> Floats:
         """The covariance in theta, (d, d), infinite for elements with a share not identified."""
         unit = np.outer(self.prior_sd, self.prior_sd)
-        covariance = self.identified @ self.covariance @ self.identified.T * unit
-        hidden = (self.unidentified**2).sum(axis=1) > _LOADING
-        covariance[hidden] = covariance[:, hidden] = np.inf
+        along = self.identified @ self.covariance
+        covariance = along @ self.identified.T * unit
+        loading = (self.unidentified**2).sum(axis=1)
+        hidden = loading > _LOADING
+        covariance[hidden] = np.inf
+        covariance[:, hidden] = np.inf
         return np.asarray(covariance)
 
 
@@ -141,8 +162,8 @@ def local_sampling(information: list[Information], scales: Floats, weakest: floa
     Directions along which its standard error is above ``weakest``, in units of the prior's spread,
     are not identified.
     """
-    metrics = [i.node.metric for i in information]
-    if all(m.minimum is Minimum.QUADRATIC for m in metrics):
+    minima = {one.node.metric.minimum for one in information}
+    if minima == {Minimum.QUADRATIC}:
         return _sandwich(information, scales, weakest)
     return _by_data_sets(information, scales, weakest)
 
@@ -151,32 +172,51 @@ def _sandwich(information: list[Information], scales: Floats, weakest: float) ->
     """Return H^-1 J H^-1 along the directions that the data identify."""
     prior_sd = information[0].prior_sd
     unit = np.outer(prior_sd, prior_sd)
-    pairs = list(zip(information, scales, strict=True))
-    hessian = unit * sum(i.hessian / s for i, s in pairs)
-    if dependent(information[0].evaluator.nodes):
-        # Gradients of the simulators depend on each other where they share specimens.
-        together = sum(i.gradients(*i.data_set) / s for i, s in pairs)
-        noise = unit * np.atleast_2d(np.cov(together, rowvar=False))
-    else:
-        noise = unit * sum(i.sampling_covariance / s**2 for i, s in pairs)
+    total: Any = 0
+    for one, scale in zip(information, scales, strict=True):
+        total = total + one.hessian / scale
+    hessian = unit * total
+    noise = unit * _gradient_covariance(information, scales)
     values, vectors, seen = seen_by_curvature(hessian, noise, weakest)
-    inverse = vectors[:, seen] / values[seen]
+    identified = vectors[:, seen]
+    unidentified = vectors[:, ~seen]
+    inverse = identified / values[seen]
     covariance = inverse.T @ noise @ inverse
-    return Local(prior_sd, vectors[:, seen], vectors[:, ~seen], covariance)
+    return Local(prior_sd, identified, unidentified, covariance)
+
+
+def _gradient_covariance(information: list[Information], scales: Floats) -> Floats:
+    """Return J of the sum of d_k / scale_k in theta, shape (d, d)."""
+    total: Any = 0
+    weighed = zip(information, scales, strict=True)
+    if not dependent(information[0].evaluator.nodes):
+        for one, scale in weighed:
+            total = total + one.sampling_covariance / scale**2
+        return np.asarray(total)
+    # Gradients of the simulators depend on each other where they share specimens.
+    for one, scale in weighed:
+        gradients = one.gradients(*one.data_set)
+        total = total + gradients / scale
+    covariance = np.cov(total, rowvar=False)
+    return np.atleast_2d(covariance)
 
 
 def _by_data_sets(information: list[Information], scales: Floats, weakest: float) -> Local:
     """Return the covariance of the shifts over simulated data sets, where there are areas."""
     prior_sd = information[0].prior_sd
-    seen = [_seen(i, weakest) for i in information]
+    seen = [_seen(one, weakest) for one in information]
     # The space spanned by what each simulator identifies; an empty column, should none do.
     nothing = np.zeros((prior_sd.size, 1))
-    left, strength, _ = np.linalg.svd(np.concatenate([nothing, *seen], axis=1))
-    rank = int((strength > _SPANNED).sum())
-    identified, unidentified = left[:, :rank], left[:, rank:]
+    columns = np.concatenate([nothing, *seen], axis=1)
+    axes, strength, _ = np.linalg.svd(columns)
+    spanned = strength > _SPANNED
+    rank = int(spanned.sum())
+    identified = axes[:, :rank]
+    unidentified = axes[:, rank:]
     covariance = np.zeros((rank, rank))
     if rank:
-        shifts = first_order_shifts(information, scales, identified, information[0].data_sets)
+        sets = information[0].data_sets
+        shifts = first_order_shifts(information, scales, identified, sets)
         covariance = np.cov(shifts, rowvar=False).reshape(rank, rank)
     return Local(prior_sd, identified, unidentified, covariance)
 
@@ -185,7 +225,9 @@ def _seen(information: Information, weakest: float) -> Floats:
     """Return the directions that one simulator identifies, shape (d, r)."""
     if information.node.metric.minimum is not Minimum.QUADRATIC:
         return seen_by_area(information)
-    unit = np.outer(information.prior_sd, information.prior_sd)
-    hessian, noise = information.hessian * unit, information.sampling_covariance * unit
+    prior_sd = information.prior_sd
+    unit = np.outer(prior_sd, prior_sd)
+    hessian = information.hessian * unit
+    noise = information.sampling_covariance * unit
     _, vectors, seen = seen_by_curvature(hessian, noise, weakest)
     return np.asarray(vectors[:, seen])

@@ -15,16 +15,19 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats
 from prbayes._weighted import distribution_function, reached
+from prbayes.estimate.curvature import hessian_of, stencil
 from prbayes.estimate.data_sets import DataSets, dependent, simulated_sets, thinned
+from prbayes.estimate.differences import slopes
 from prbayes.metrics.base import Discrepancy
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node
 
-# Of the prior's standard deviation; densities are twice differentiable.
+# Step of differences of densities, which are twice differentiable, in prior standard deviations.
 _STEP = 1e-3
-# Where a distribution function of simulated values, a step function, or a jump is differenced.
+# The same where a distribution function of simulated values, a step function, or a jump is
+# differenced.
 _WIDE_STEP = 0.05
-# On which distribution functions are linearised.
+# Knots on which distribution functions are linearised.
 _KNOTS = 400
 # Numbers held at a time where data sets meet the features of a stencil: 8 MiB.
 _BLOCK = 1 << 20
@@ -55,7 +58,7 @@ class LinearArea:
 
 @dataclass(frozen=True, eq=False)
 class Stencil:
-    """Populations around theta: at it, a step to either side along each element, and at corners.
+    """Populations around theta, in the order of `curvature.stencil`.
 
     Attributes
     ----------
@@ -121,38 +124,36 @@ class Information:
         if self._target.differentiable:
             narrow = self._around(_STEP)
             finite = np.isfinite(narrow.values)
-            if (finite == finite[0]).all():
+            # Unless a point gains or loses its response within the step.
+            unchanged = finite == finite[0]
+            if unchanged.all():
                 return narrow
         return self._around(self.wide)
 
     def _around(self, share: float) -> Stencil:
-        steps = self._displacements(share)
-        values, weights = self.evaluator.populations(self.theta + steps, self.k)
+        """Return the populations within steps of a share of the prior's spread."""
+        step = share * self.prior_sd
+        thetas = self.theta + stencil(step.size) * step
+        values, weights = self.evaluator.populations(thetas, self.k)
         return Stencil(share, values, weights)
-
-    def _displacements(self, share: float) -> Floats:
-        """Return displacements: none, +- each, and the four corners of each pair."""
-        d = self.theta.size
-        unit = share * np.diag(self.prior_sd)
-        rows = [np.zeros(d)]
-        for u in unit:
-            rows += [u, -u]
-        for i in range(d):
-            for j in range(i):
-                rows += [a * unit[i] + b * unit[j] for a in (1, -1) for b in (1, -1)]
-        return np.array(rows)
 
     @property
     def _step(self) -> Floats:
         return self._stencil.share * self.prior_sd
 
+    @property
+    def _n_cross(self) -> int:
+        """How many points of the stencil are theta and its neighbours along each element."""
+        return 1 + 2 * self.theta.size
+
     @cached_property
     def _center(self) -> tuple[Floats, Floats]:
         """The population at theta that could be observed: finite, with weights that sum to one."""
-        values, weights = self._stencil.values[0], self._stencil.weights[0]
+        values = self._stencil.values[0]
         finite = np.isfinite(values)
-        w = weights[finite]
-        return values[finite], w / w.sum()
+        weights = self._stencil.weights[0]
+        observable = weights[finite]
+        return values[finite], observable / observable.sum()
 
     @cached_property
     def data_sets(self) -> DataSets:
@@ -162,35 +163,49 @@ class Information:
     @property
     def data_set(self) -> tuple[Floats, Floats]:
         """Values and weights of this simulator's data sets, shapes (n,), (n_sets, n)."""
-        return self.data_sets.values[self.k], self.data_sets.weights[self.k]
+        sets = self.data_sets
+        return sets.values[self.k], sets.weights[self.k]
 
     @cached_property
     def _features(self) -> Any:
-        """Features at the stencil, of a metric whose features do not depend on the observed side."""
-        return self._target.features(self._stencil.values, self._stencil.weights, np)
+        """Features at the stencil; they do not depend on the observed side."""
+        around = self._stencil
+        return self._target.features(around.values, around.weights, np)
 
     def _along_stencil(self, observed: Floats, weights: Floats) -> Floats:
-        """Return the discrepancies at the stencil, (s,) or (n_sets, s), some data sets at a time."""
+        """Return discrepancies at the stencil, (s,) or (n_sets, s), some data sets at a time."""
+        features = self._features
         at_once = len(weights)
         if weights.ndim > 1:
-            at_once = max(1, _BLOCK // sum(f.size for f in self._features))
+            size = sum(f.size for f in features)
+            at_once = max(1, _BLOCK // size)
         found = []
         for i in range(0, len(weights), at_once):
-            target = self._target.with_observed(observed, weights[i : i + at_once])
-            found.append(np.atleast_1d(target.outer(*self._features, xp=np)))
+            some = weights[i : i + at_once]
+            target = self._target.with_observed(observed, some)
+            values = target.outer(*features, xp=np)
+            found.append(np.atleast_1d(values))
         return np.concatenate(found)
 
     @cached_property
     def noise_floor(self) -> float:
         """The mean discrepancy between the population at theta and data sets drawn from it."""
-        first = self._stencil.values[:1], self._stencil.weights[:1]
-        values, weights = thinned(*first, self.node)
+        around = self._stencil
+        values, weights = thinned(
+            around.values[:1],
+            around.weights[:1],
+            self.node,
+        )
         observed, data_sets = self.data_set
         found = []
-        for w in data_sets:
-            drawn = w > 0
-            target = self._target.with_observed(observed[drawn], w[drawn])
-            found.append(target.of(values, weights))
+        for own in data_sets:
+            drawn = own > 0
+            target = self._target.with_observed(
+                observed[drawn],
+                own[drawn],
+            )
+            distance = target.of(values, weights)
+            found.append(distance)
         return float(np.mean(found))
 
     def gradients(self, observed: Floats, weights: Floats) -> Floats:
@@ -202,41 +217,39 @@ class Information:
         weights : ndarray, shape (n_sets, n)
         """
         values = self._along_stencil(observed, weights[:, None])
-        beside = values[:, 1 : 1 + 2 * self.theta.size]
-        up, down = beside[:, 0::2], beside[:, 1::2]
-        return np.asarray((up - down) / (2 * self._step))
+        across = values.T[: self._n_cross]
+        return slopes(across, self._step)
 
     @cached_property
     def sampling_covariance(self) -> Floats:
         """J: the covariance of the gradient over data sets of the observed size, shape (d, d)."""
         if not self.node.metric.additive or dependent([self.node]):
-            return np.atleast_2d(np.cov(self.gradients(*self.data_set), rowvar=False))
-        # A mean over observations: of single ones, at equal steps of probability, the covariance by
-        # N.
-        slopes = self.gradients(self._quantiles(_POINTS), np.eye(_POINTS))
-        return np.atleast_2d(np.cov(slopes, rowvar=False)) / self._target.n_effective
+            gradients = self.gradients(*self.data_set)
+            covariance = np.cov(gradients, rowvar=False)
+            return np.atleast_2d(covariance)
+        # A mean over observations: the covariance of single ones, at equal steps of probability,
+        # by N.
+        single = self._quantiles(_POINTS)
+        gradients = self.gradients(single, np.eye(_POINTS))
+        covariance = np.cov(gradients, rowvar=False)
+        return np.atleast_2d(covariance) / self._target.n_effective
 
     def _quantiles(self, n: int) -> Floats:
         """Return values of the population at theta at n equal steps of probability."""
         values, weights = self._center
         order = np.argsort(values)
         levels = (np.arange(n) + 0.5) / n
-        return np.asarray(values[order][reached(weights[order], levels)])
+        places = reached(weights[order], levels)
+        ordered = values[order]
+        return np.asarray(ordered[places])
 
     @cached_property
     def hessian(self) -> Floats:
         """H: the Hessian of the discrepancy against the population at theta, shape (d, d)."""
-        f = self._along_stencil(*self._center)
-        d, h = self.theta.size, self._step
-        up, down = f[1 : 1 + 2 * d : 2], f[2 : 2 + 2 * d : 2]
-        out = np.diag((up - 2 * f[0] + down) / h**2)
-        row = 1 + 2 * d
-        for i in range(d):
-            for j in range(i):
-                pp, pm, mp, mm = f[row : row + 4]
-                out[i, j] = out[j, i] = (pp - pm - mp + mm) / (4 * h[i] * h[j])
-                row += 4
-        return np.asarray(out)
+        values = self._along_stencil(*self._center)
+        step = self._step
+        differences = hessian_of(values, step.size)
+        return differences / np.outer(step, step)
 
     def area(
         self, observed: Floats, weights: Floats, among: NDArray[np.bool_] | None = None
@@ -250,20 +263,33 @@ class Information:
         among : ndarray of bool, optional
             The points of the population that count; all by default.
         """
-        values, w = self._stencil.values, self._stencil.weights
+        values = self._stencil.values
+        own = self._stencil.weights
         if among is not None:
-            w = w * among / (w * among).sum(axis=-1, keepdims=True)
-        # Knots are values that occur, so that the functions are exact there.
-        finite = values[0][np.isfinite(values[0])]
-        knots = np.unique(np.concatenate([finite, observed]))
-        some = np.linspace(0, knots.size - 1, _KNOTS).astype(int)
-        knots = knots[np.unique(some)]
+            counted = own * among
+            own = counted / counted.sum(axis=-1, keepdims=True)
+        knots = self._knots(observed)
+        # Stored responses are the same at all points of the stencil: they are sorted once.
         if np.array_equal(values[0], values[-1], equal_nan=True):
             values = values[0]
-        cdf = distribution_function(values, w, knots, kind="quicksort")
+        simulated = distribution_function(values, own, knots, kind="quicksort")
         measured = distribution_function(observed, weights, knots, kind="quicksort")
-        gaps = cdf[0] - measured
-        d = self.theta.size
-        up, down = cdf[1 : 1 + 2 * d : 2], cdf[2 : 2 + 2 * d : 2]
-        slopes = (up - down) / (2 * self._step[:, None])
-        return LinearArea(gaps[:, :-1], slopes[:, :-1], np.diff(knots))
+        gaps = simulated[0] - measured
+        across = simulated[: self._n_cross]
+        derivatives = slopes(across, self._step).T
+        # On the intervals between knots: what holds at their left ends.
+        return LinearArea(
+            gaps=gaps[:, :-1],
+            slopes=derivatives[:, :-1],
+            lengths=np.diff(knots),
+        )
+
+    def _knots(self, observed: Floats) -> Floats:
+        """Return values that occur, where distribution functions are exact, some hundred of all."""
+        values = self._stencil.values[0]
+        finite = values[np.isfinite(values)]
+        occurring = np.concatenate([finite, observed])
+        knots = np.unique(occurring)
+        places = np.linspace(0, knots.size - 1, _KNOTS)
+        some = np.unique(places.astype(int))
+        return np.asarray(knots[some])

@@ -96,7 +96,7 @@ class Search:
     Parameters
     ----------
     evaluator : Evaluator
-    units : ndarray, shape (d,)
+    prior_sd : ndarray, shape (d,)
         Typical size of each parameter: the prior's spread.
     method : Method
     prior : bool
@@ -108,7 +108,7 @@ class Search:
     """
 
     evaluator: Evaluator
-    units: Floats
+    prior_sd: Floats
     method: Method
     prior: bool
     tolerance: float
@@ -139,7 +139,7 @@ class Search:
         """Return the standardised objective around a center."""
         function = self._with_gradient(scales) if gradient else self._without_gradient(scales)
         most = self.most - spent
-        return Objective(function, center, self.units, size, gradient=gradient, most=most)
+        return Objective(function, center, self.prior_sd, size, gradient=gradient, most=most)
 
     def _with_gradient(self, scales: Floats) -> Function:
         """Return theta -> value, gradient, evaluations.
@@ -150,7 +150,7 @@ class Search:
             exact = self.evaluator.objective(prior=self.prior, gradient=True)
         except (NotImplementedError, NullTypeGradError):
             # Of the response, or of an inverse distribution function, there is none.
-            return differences(self._values(scales), _STEP * self.units)
+            return differences(self._values(scales), _STEP * self.prior_sd)
         return lambda theta: (*exact(theta, scales), 1)
 
     def _without_gradient(self, scales: Floats) -> Function:
@@ -247,7 +247,7 @@ def settle(search: Search, run: Run) -> Run:
         return run
     spent = run.trace.count
     again = search.objective(run.center, run.scales, run.size, gradient=False, spent=spent)
-    begin = (run.best - run.center) / search.units
+    begin = (run.best - run.center) / search.prior_sd
     edge = _OVER if jumps(search, run.best) else _NEAR
     simplex = np.vstack([begin, begin + edge * np.eye(begin.size)])
     options = {
@@ -270,7 +270,7 @@ def jumps(search: Search, theta: Floats) -> bool:
     """Return whether a smooth discrepancy loses or wins simulated responses close to theta."""
     if not all(n.metric.minimum is Minimum.QUADRATIC for n in search.evaluator.nodes):
         return False
-    near = cross(theta, _STEP * search.units)
+    near = cross(theta, _STEP * search.prior_sd)
     values, _ = _populations(search.evaluator, near)
     lost = [~np.isfinite(v) for v in values]
     return any((rows != rows[0]).any() for rows in lost)
@@ -327,12 +327,12 @@ def approach(search: Search, theta: Floats, scales: Floats, seed: int) -> Approa
         points = evaluator.prior_points(_SCREENED, seed)
         candidates = np.vstack([theta, points])
         theta = candidates[np.argmin(guide(candidates))]
-    function = differences(guide, _STEP * search.units)
+    function = differences(guide, _STEP * search.prior_sd)
     size = len(evaluator.nodes)
-    objective = Objective(function, theta, search.units, size, gradient=True, most=search.most)
+    objective = Objective(function, theta, search.prior_sd, size, gradient=True, most=search.most)
 
     def stop_where_near(t: Floats) -> None:
-        if guide.overlap_at(theta + t * search.units) > _ENOUGH:
+        if guide.overlap_at(theta + t * search.prior_sd) > _ENOUGH:
             raise StopIteration
 
     _scipy(
@@ -365,7 +365,7 @@ def _astray(evaluator: Evaluator, theta: Floats) -> bool:
 
 
 class _Guide:
-    """The area between populations and data, with what else is known of the thetas it was asked for."""
+    """The area between populations and data, with what else is known of each theta."""
 
     def __init__(self, evaluator: Evaluator, scales: Floats) -> None:
         nodes = evaluator.nodes

@@ -124,10 +124,13 @@ def _above(variable: Any, known: Set[Any]) -> str:
 
     def inputs_of(v: Any) -> Any:
         # Not beyond a variable of the model
-        return None if v in known or v.owner is None else v.owner.inputs
+        if v in known or v.owner is None:
+            return None
+        return v.owner.inputs
 
     start = [] if variable.owner is None else variable.owner.inputs
-    names = [str(v.name) for v in walk(start, inputs_of) if v in known]
+    above = walk(start, inputs_of)
+    names = [str(v.name) for v in above if v in known]
     return ", ".join(names) or "constants"
 
 

@@ -27,7 +27,7 @@ def element_names(name: str, shape: Sequence[int]) -> list[str]:
 
 
 def split_elements(values: Mapping[Any, Any]) -> dict[str, Floats]:
-    """Return arrays of shape (n,) by the names of elements, of arrays of shape (n, *shape) by variable."""
+    """Return arrays (n,) by the names of elements, of arrays (n, *shape) by variable."""
     found: dict[str, Floats] = {}
     for name, value in values.items():
         array = np.asarray(value)

@@ -42,7 +42,10 @@ def checked_epsilon(
         raise KeyError(f"epsilon: got {unknown}, expected names of simulators: {sorted(names)}")
     if isinstance(epsilon, Epsilon):
         require_same(epsilon.identity, identity_of_model(model), caller)
-    return {name: positive_number(value, f"{name}: epsilon") for name, value in epsilon.items()}
+    found = {}
+    for name, value in epsilon.items():
+        found[name] = positive_number(value, f"{name}: epsilon")
+    return found
 
 
 def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:

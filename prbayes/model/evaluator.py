@@ -1,4 +1,7 @@
-"""Reads a PyMC model: theta[P, d] -> log prior[P], discrepancies[P, k], gradients. One evaluator for all routes."""
+"""Reads a PyMC model: theta[P, d] -> log prior[P], discrepancies[P, k], gradients.
+
+One evaluator serves all routes.
+"""
 
 from __future__ import annotations
 
@@ -153,7 +156,7 @@ class Evaluator:
         return np.array(np.broadcast_to(found, len(thetas)))
 
     def discrepancies(self, thetas: Floats, k: int, target: Discrepancy | None = None) -> Floats:
-        """Return the discrepancies of the k-th simulator, shape (P,), or those from another target."""
+        """Return the k-th simulator's discrepancies, shape (P,), or those from another target."""
         node = self.nodes[k]
         return node.bound.discrepancies(self.roots(thetas, k), target or node.target)
 
@@ -185,7 +188,9 @@ class Evaluator:
 
     @cache  # noqa: B019 (lives as long as the evaluator)
     def objective(self, *, prior: bool, gradient: bool) -> Any:
-        """Compile (theta, scales) -> sum of d_k / scale_k [- log prior] - log of ordinary terms [, its gradient].
+        """Compile the objective as a function of theta and scales.
+
+        (theta, scales) -> sum of d_k / scale_k [- log prior] - log of ordinary terms [, gradient].
 
         The prior's density is that of the user's own units, as in `pymc.find_MAP`: without
         Jacobian.
@@ -200,9 +205,8 @@ class Evaluator:
         total = scaled - self._log_other()
         log_prior = self.model.logp(vars=self.model.free_RVs, jacobian=False)
         objective = total - log_prior if prior else total
-        (value,), theta = self.hyperparameters.joined(
-            [pt.switch(log_prior > -np.inf, objective, np.inf)]
-        )
+        within = pt.switch(log_prior > -np.inf, objective, np.inf)
+        (value,), theta = self.hyperparameters.joined([within])
         graphs = [value]
         if gradient:
             graphs.append(pt.grad(value, theta))
@@ -217,8 +221,9 @@ class Evaluator:
         return counted
 
     def observing(self, data: dict[str, Floats], metric: Metric | None = None) -> Evaluator:
-        """Return an evaluator of the same model with other observed responses, by the names of simulators.
+        """Return an evaluator of the same model with other observed responses.
 
+        They come by the names of simulators.
         Metrics choose bandwidths and cells anew; designs and epsilons are the same objects. With
         ``metric`` all simulators have that one.
         """

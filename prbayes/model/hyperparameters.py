@@ -180,14 +180,18 @@ class Hyperparameters:
             columns.append(pt.atleast_1d(value).ravel())
         swap = dict(zip(free, symbols, strict=True))
         theta = graph_replace(pt.concatenate(columns), swap, strict=False)
-        batched = [pt.tensor(dtype=s.dtype, shape=(None, *s.type.shape)) for s in symbols]
-        thetas = vectorize_graph(theta, dict(zip(symbols, batched, strict=True)))
+        batched = []
+        for symbol in symbols:
+            shape = (None, *symbol.type.shape)
+            batched.append(pt.tensor(dtype=symbol.dtype, shape=shape))
+        in_batches = dict(zip(symbols, batched, strict=True))
+        thetas = vectorize_graph(theta, in_batches)
         return pytensor.function(
             batched, thetas, mode=PLAIN, on_unused_input="ignore", allow_input_downcast=True
         )
 
     def thetas_of(self, draws: Sequence[Floats]) -> Floats:
-        """Return thetas, shape (P, d), of values of the free variables, (P, *shape), in their order."""
+        """Return thetas, (P, d), of values of the free variables, (P, *shape), in their order."""
         return np.asarray(self._transform(*draws))
 
     # The prior.
@@ -241,7 +245,10 @@ class Hyperparameters:
         return np.where(np.isfinite(thetas), thetas, self.initial)
 
     def fixed_points(self, size: int) -> Floats:
-        """Return thetas, shape (size, d), that are the same for clones, which may order variables in other ways."""
+        """Return thetas, shape (size, d), that are the same for clones.
+
+        Clones may order variables in other ways.
+        """
         if self._points is None:
             offsets = sobol(size, self.size, seed=0) - 0.5
             return self.initial + _by_name(offsets, self.names)

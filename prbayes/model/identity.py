@@ -1,4 +1,6 @@
-"""`Identity`: what a result belongs to. One record of a problem, and one function that compares two of them.
+"""`Identity`: what a result belongs to.
+
+One record of a problem, and one function that compares two of them.
 
 A result carries the identity of the problem that it was made from: an optimum, a posterior, a
 checkpoint on disk. Where it meets a model again, `require_same` refuses what is not the same
@@ -165,7 +167,8 @@ def identity_of_model(model: pm.Model) -> Identity:
 
     Densities and discrepancies.
     """
-    simulators = [_simulator(node, np.empty(0)) for node in nodes(model).values()]
+    found = nodes(model).values()
+    simulators = [_simulator(node, np.empty(0)) for node in found]
     shapes = {}
     for rv in model.free_RVs:
         value = model.rvs_to_values[rv]
@@ -223,7 +226,8 @@ def _inputs(node: Node) -> str:
             texts.append(str(argument.name or "an expression"))
         else:
             values = np.asarray(argument, dtype=np.float64)
-            texts.append(f"{values}" if values.ndim == 0 else _digest(values.tobytes()))
+            content = values.tobytes()
+            texts.append(f"{values}" if values.ndim == 0 else _digest(content))
     return ", ".join(texts)
 
 
@@ -257,7 +261,8 @@ def from_text(text: str) -> Identity:
         for key in ("responses", "discrepancies"):
             fields[key] = tuple(fields[key])
         simulators.append(SimulatorIdentity(**fields))
-    shapes = {name: tuple(shape) for name, shape in found.pop("shapes").items()}
+    shapes = found.pop("shapes")
+    shapes = {name: tuple(shape) for name, shape in shapes.items()}
     thetas = tuple(tuple(theta) for theta in found.pop("thetas"))
     for key in ("terms", "log_prior", "log_other"):
         found[key] = tuple(found[key])
@@ -379,7 +384,8 @@ def _prior_differences(got: Identity, expected: Identity) -> list[str]:
         found.append(_told("other likelihood terms", got.terms or "none", expected.terms or "none"))
     if found or not got.thetas or not expected.thetas:
         return found
-    if not _close(got.thetas, expected.thetas) or not _close(got.log_prior, expected.log_prior):
+    same_prior = _close(got.thetas, expected.thetas) and _close(got.log_prior, expected.log_prior)
+    if not same_prior:
         found.append("the priors have other densities")
     elif not _close(got.log_other, expected.log_other):
         found.append("other likelihood terms, or potentials, have other values")
@@ -405,12 +411,16 @@ def _told(what: str, got: object, expected: object) -> str:
 
 
 def _shown(shapes: Mapping[str, tuple[int, ...]]) -> str:
-    return ", ".join(f"{name} {shape}" if shape else name for name, shape in shapes.items())
+    texts = []
+    for name, shape in shapes.items():
+        texts.append(f"{name} {shape}" if shape else name)
+    return ", ".join(texts)
 
 
 def _close(got: Any, expected: Any) -> bool:
     """Return whether numbers are the same up to rounding, relative to the largest of them."""
-    a, b = np.asarray(got, dtype=np.float64), np.asarray(expected, dtype=np.float64)
+    a = np.asarray(got, dtype=np.float64)
+    b = np.asarray(expected, dtype=np.float64)
     if a.shape != b.shape:
         return False
     finite = a[np.isfinite(a)]

@@ -21,12 +21,16 @@ def versions() -> dict[str, str]:
 
 def labelled(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, int]) -> xr.Dataset:
     """Label values, shapes (*leading, *shape), with the model's own dimensions and coordinates."""
-    dims, known = evaluator.model.named_vars_to_dims, evaluator.model.coords
-    coords: dict[str, Any] = {name: np.arange(size) for name, size in leading.items()}
+    dims = evaluator.model.named_vars_to_dims
+    known = evaluator.model.coords
+    coords: dict[str, Any] = {}
+    for name, size in leading.items():
+        coords[name] = np.arange(size)
     variables = {}
     for name, value in values.items():
         array = np.asarray(value)
-        given = dims.get(name) or [None] * (array.ndim - len(leading))
+        unnamed = [None] * (array.ndim - len(leading))
+        given = dims.get(name) or unnamed
         own = []
         for i, dim in enumerate(given):
             own.append(dim or f"{name}_dim_{i}")

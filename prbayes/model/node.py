@@ -74,11 +74,11 @@ class Node:
 
     @property
     def epsilon_is_default(self) -> bool:
-        """Whether epsilon is the 1/N of a metric on the scale of a likelihood, which nobody gave."""
+        """Whether nobody gave epsilon: it is the 1/N of a metric on a likelihood's scale."""
         return self.metric.likelihood and self.epsilon_value == 1 / self.target.n_effective
 
     def copied(self) -> Node:
-        """Return the same simulator with a design, a count of responses and an epsilon of its own."""
+        """Return the same simulator with its own design, count of responses and epsilon."""
         epsilon = shared_epsilon(self.name, self.epsilon_value)
         return replace(self, bound=self.bound.copied(), epsilon=epsilon)
 
@@ -148,7 +148,7 @@ class SimulatorRV(RandomVariable):
         return own.own_node(apply)
 
     def rng_fn(self, rng: np.random.Generator, *arguments: Any) -> Floats:
-        """Draw responses of different specimens, of the shape that comes last among the arguments."""
+        """Draw responses of different specimens; their shape is the last of the arguments."""
         *params, size = arguments
         bound = self.node.bound
         batches = []
@@ -169,7 +169,7 @@ class SimulatorRV(RandomVariable):
 
 
 def _own_index(index: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return where an array of this leading shape is read for an index of the shape it broadcasts to."""
+    """Return where an array of this leading shape is read, for an index after broadcasting."""
     last = index[len(index) - len(shape) :]
     pairs = zip(last, shape, strict=True)
     return tuple(0 if n == 1 else i for i, n in pairs)
@@ -189,8 +189,8 @@ def _log_density(
     node = op.node
     check = CheckParameterValue(
         f"{node.name}: epsilon is not set; call prb.set_epsilon(model, "
-        "prb.calibrate_epsilon(prb.minimize(model))), pass epsilon= to prb.Simulator, or use prb.sample_smc, "
-        "which calibrates it"
+        "prb.calibrate_epsilon(prb.minimize(model))), pass epsilon= to prb.Simulator, or use "
+        "prb.sample_smc, which calibrates it"
     )
     epsilon = check(node.epsilon, pt.gt(node.epsilon, 0.0))
     inputs = node.bound.inputs
@@ -249,7 +249,8 @@ def required_nodes(model: pm.Model) -> dict[Any, Node]:
     if not found:
         raise ValueError(
             "model: got one without a prb.Simulator, expected at least one; add "
-            "prb.Simulator(name, response, *inputs, metric=..., observed=...) inside the `with pm.Model()`"
+            "prb.Simulator(name, response, *inputs, metric=..., observed=...) inside the "
+            "`with pm.Model()`"
         )
     return found
 
@@ -260,6 +261,7 @@ def model_on_context(model: pm.Model | None, caller: str) -> pm.Model:
     if not isinstance(found, pm.Model):
         got = "no model on the context" if found is None else type(found).__name__
         raise TypeError(
-            f"{caller}: got {got}, expected a pm.Model; call it inside `with pm.Model():` or pass model="
+            f"{caller}: got {got}, expected a pm.Model; "
+            "call it inside `with pm.Model():` or pass model="
         )
     return found

@@ -1,4 +1,4 @@
-"""`Simulator`: adds an observed node whose log-density is -discrepancy / epsilon to a PyMC model."""
+"""`Simulator`: an observed node of a PyMC model with log-density -discrepancy / epsilon."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     References
     ----------
     .. [1] Oh et al. (2019), doi:10.1007/s00158-019-02288-6.
-    .. [2] Bissiri, P. G., C. C. Holmes and S. G. Walker (2016), A general framework for updating belief
-       distributions, J. R. Stat. Soc. B 78, 1103-1130, doi:10.1111/rssb.12158.
+    .. [2] Bissiri, P. G., C. C. Holmes and S. G. Walker (2016), A general framework for updating
+       belief distributions, J. R. Stat. Soc. B 78, 1103-1130, doi:10.1111/rssb.12158.
 
     Examples
     --------
@@ -152,6 +152,7 @@ def _labels(name: str, specimens: ArrayLike, n: int) -> NDArray[Any]:
     labels = np.asarray(specimens)
     if labels.shape != (n,):
         raise ValueError(
-            f"{name}: specimens: got shape {labels.shape}, expected ({n},), one label per observation"
+            f"{name}: specimens: got shape {labels.shape}, expected ({n},), "
+            "one label per observation"
         )
     return labels

@@ -40,7 +40,8 @@ class abc_distance(Op):  # noqa: N801 (reads as a function in a model)
     >>> def simulate(rng, mu, size):
     ...     return rng.normal(mu, 1.0, size=500)
     >>> with pm.Model() as model:
-    ...     y = pm.Simulator("y", simulate, pm.Normal("mu"), distance=prb.abc_distance(prb.AreaMetric()),
+    ...     distance = prb.abc_distance(prb.AreaMetric())
+    ...     y = pm.Simulator("y", simulate, pm.Normal("mu"), distance=distance,
     ...                      epsilon=0.02, observed=np.array([0.5, 1.0, 4.0]))
     """
 
@@ -50,16 +51,16 @@ class abc_distance(Op):  # noqa: N801 (reads as a function in a model)
     def __init__(self, metric: Metric) -> None:
         if not isinstance(metric, Metric):
             raise TypeError(
-                f"abc_distance: got {called(metric)}, expected a metric object such as prb.AreaMetric()"
+                f"abc_distance: got {called(metric)}, expected a metric object "
+                "such as prb.AreaMetric()"
             )
         self.metric = metric
         self._prepared: tuple[Floats, Discrepancy] | None = None
 
     def make_node(self, epsilon: Any, observed: Any, simulated: Any) -> Apply[Any, Any]:
         """Apply to epsilon and the two samples."""
-        return Apply(
-            self, [pt.as_tensor(v) for v in (epsilon, observed, simulated)], [pt.dscalar()]
-        )
+        tensors = [pt.as_tensor(v) for v in (epsilon, observed, simulated)]
+        return Apply(self, tensors, [pt.dscalar()])
 
     def perform(self, node: Any, inputs: Sequence[Any], outputs: Any) -> None:
         """Return the log-density; the observed side is prepared once."""

@@ -1,4 +1,4 @@
-"""Whether a design supports the populations at given hyperparameters, and in what it falls short."""
+"""Whether a design supports the populations at given hyperparameters, and where it falls short."""
 
 from __future__ import annotations
 
@@ -74,7 +74,8 @@ class Shortcoming:
 
     def __bool__(self) -> bool:
         """Whether the design falls short at all."""
-        return any(found is not None for found in (self.lost, self.ess, self.mass))
+        shortcomings = (self.lost, self.ess, self.mass)
+        return any(found is not None for found in shortcomings)
 
     def __str__(self) -> str:
         """Return what is wrong, and what was expected, as the end of a sentence."""
@@ -135,11 +136,14 @@ def shortcoming(
     """
     ess, mass, lost = (support[key] for key in ("weight_ess", "mean_weight", "lost_mass"))
     low, middle = np.quantile(ess, [_LOW, 0.5])
-    mass_low, mass_high = np.quantile(mass, [_LOW, _HIGH] if level.tails else [0.5, 0.5])
+    at = [_LOW, _HIGH] if level.tails else [0.5, 0.5]
+    mass_low, mass_high = np.quantile(mass, at)
     most_lost = float(np.quantile(lost, _HIGH))
     least, most = level.mass
     # A comparison with NaN is false, and falls short.
-    many = middle >= level.ess * required_ess and low >= level.lowest_ess * required_ess
+    many_in_the_middle = middle >= level.ess * required_ess
+    many_at_the_low_end = low >= level.lowest_ess * required_ess
+    many = many_in_the_middle and many_at_the_low_end
     covered = mass_low >= least and mass_high <= most
     return Shortcoming(
         lost=most_lost if most_lost > max_lost else None,

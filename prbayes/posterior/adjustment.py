@@ -1,4 +1,4 @@
-"""Adjustment of a pseudo-posterior's draws, so that their width is that of the metric's own estimate."""
+"""Adjustment of a pseudo-posterior's draws to the width of the metric's own estimate."""
 
 from __future__ import annotations
 
@@ -32,20 +32,44 @@ _LEVELS = (0.055, 0.5, 0.945)
 _WIDTH = 3.2
 # Prior draws that tell its mean and precision along the axes.
 _PRIOR_DRAWS = 1024
-_WITHOUT = "none: {}"
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """What an adjustment made of draws.
+
+    Attributes
+    ----------
+    thetas : ndarray, shape (..., d)
+        The draws; the given ones if nothing was done.
+    done : str
+        What was done; empty if nothing.
+    reason : str or None
+        Why nothing was done, None if something was.
+    """
+
+    thetas: Floats
+    done: str = ""
+    reason: str | None = None
+
+    @property
+    def note(self) -> str:
+        """What was done, or why nothing, as results state it."""
+        return self.done if self.reason is None else f"none: {self.reason}"
 
 
 @dataclass(frozen=True)
 class Affine:
-    r"""An affine map of the draws, in unconstrained space, to the covariance and centre that the data warrant.
+    r"""An affine map of the draws of theta to the covariance and centre that the data warrant.
 
     Data sets are drawn from the model at the optimum, and each is fitted anew. The covariance of
     the minimisers is the inverse of A, the (Godambe) information in the data, and their median
     shift is the bias b of the minimiser; those that run away, as where a scale may be zero, count
     as three standard errors off. With prior mean :math:`\theta_0` and precision P the draws get
     covariance :math:`(A + P)^{-1}` and median
-    :math:`(A + P)^{-1} (A (\hat\theta - b) + P \theta_0)`, in the directions about which the data tell at least a
-    quarter of what the prior does; along the others they keep their distribution given those.
+    :math:`(A + P)^{-1} (A (\hat\theta - b) + P \theta_0)`, in the directions about which the data
+    tell at least a quarter of what the prior does; along the others they keep their distribution
+    given those.
 
     Parameters
     ----------
@@ -55,8 +79,8 @@ class Affine:
 
     References
     ----------
-    .. [1] Shaby, B. A. (2014), The open-faced sandwich adjustment for MCMC using estimating functions,
-       J. Comput. Graph. Stat. 23, 853-876, doi:10.1080/10618600.2013.842174.
+    .. [1] Shaby, B. A. (2014), The open-faced sandwich adjustment for MCMC using estimating
+       functions, J. Comput. Graph. Stat. 23, 853-876, doi:10.1080/10618600.2013.842174.
 
     Examples
     --------
@@ -73,27 +97,30 @@ class Affine:
 
     def target(self, sampling: SamplingDistribution) -> tuple[Floats, Floats]:
         """Return the centre (r,) and covariance (r, r) that draws should have, in coordinates."""
-        evaluator, r = sampling.evaluator, sampling.stderr.size
-        # What the data tell: the minimiser, its information and its bias.
+        evaluator = sampling.evaluator
+        r = sampling.stderr.size
+        # Where the minimiser is, and data sets drawn from the model there.
         (center,), _ = sampling.refit(observed_set(evaluator))
         at = sampling.thetas(center)
-        x, converged = sampling.refit(simulated_sets(evaluator, at, self.n_sets, self.random_seed))
-        shifts = np.clip(x[converged] - center, -_REACH, _REACH)
-        information = np.linalg.inv(np.cov(shifts, rowvar=False).reshape(r, r))
-        bias = np.median(
-            shifts, axis=0
-        )  # the same in every parametrisation, as where a scale comes near zero
+        sets = simulated_sets(evaluator, at, self.n_sets, self.random_seed)
+        # What the data tell: the minimiser's information and its bias, which as a median is the
+        # same in every parametrisation, as where a scale comes near zero.
+        x, converged = sampling.refit(sets)
+        away = x[converged] - center
+        shifts = np.clip(away, -_REACH, _REACH)
+        information = _precision(shifts, r)
+        bias = np.median(shifts, axis=0)
         # What the prior tells.
-        prior, _ = sampling.coordinates(evaluator.prior_thetas(_PRIOR_DRAWS, self.random_seed))
-        precision = np.linalg.inv(np.cov(prior, rowvar=False).reshape(r, r))
+        draws = evaluator.prior_thetas(_PRIOR_DRAWS, self.random_seed)
+        prior, _ = sampling.coordinates(draws)
+        precision = _precision(prior, r)
         # Both together.
         covariance = np.linalg.inv(information + precision)
-        force = information @ (center - bias) + precision @ prior.mean(axis=0)
-        return covariance @ force, covariance
+        from_data = information @ (center - bias)
+        from_prior = precision @ prior.mean(axis=0)
+        return covariance @ (from_data + from_prior), covariance
 
-    def __call__(
-        self, evaluator: Evaluator, thetas: Floats, optima: Sequence[Floats]
-    ) -> tuple[Floats, str]:
+    def __call__(self, evaluator: Evaluator, thetas: Floats, optima: Sequence[Floats]) -> Adjusted:
         """Map draws of the pseudo-posterior, each mode by itself.
 
         Parameters
@@ -106,40 +133,40 @@ class Affine:
 
         Returns
         -------
-        thetas : ndarray, shape (..., d)
-        note : str
-            What was done, or why nothing.
+        Adjusted
         """
         obstacle = refit_obstacle(evaluator)
         if obstacle is not None:
-            return thetas, _WITHOUT.format(obstacle)
+            return Adjusted(thetas, reason=str(obstacle))
         draws = thetas.reshape(-1, thetas.shape[-1])
         modes = _identified_modes(evaluator, optima)
         if not modes:
             reason = "the data tell less than the prior about every hyperparameter"
-            return thetas, _WITHOUT.format(reason)
+            return Adjusted(thetas, reason=reason)
         distances = np.array([_distance(mode, draws) for mode in modes])
         if _run_together(distances):
-            return thetas, _WITHOUT.format("the posterior has modes that run into each other")
+            return Adjusted(thetas, reason="the posterior has modes that run into each other")
         nearest = distances.argmin(axis=0)
         out = draws.copy()
-        count, far = 0, 0
+        count = 0
+        far = 0
         for m, mode in enumerate(modes):
             own = nearest == m
             if own.sum() < _FEWEST:
                 continue
-            out[own], outside = self._mapped(mode, draws[own])
+            mapped, outside = self._mapped(mode, draws[own])
+            out[own] = mapped
             far += int(outside.sum())
             count += 1
         if not count:
-            return thetas, _WITHOUT.format(f"there are fewer than {_FEWEST} draws of a mode")
-        note = f"{self!r}"
+            return Adjusted(thetas, reason=f"there are fewer than {_FEWEST} draws of a mode")
+        done = f"{self!r}"
         if len(modes) > 1:
-            note += f", {count} modes each by itself"
+            done += f", {count} modes each by itself"
         if far:
             share = far / len(draws)
-            note += f", {share:.1%} of the draws drawn in to {_FAR:.0f} standard deviations"
-        return out.reshape(thetas.shape), note
+            done += f", {share:.1%} of the draws drawn in to {_FAR:.0f} standard deviations"
+        return Adjusted(out.reshape(thetas.shape), done)
 
     def _mapped(
         self, sampling: SamplingDistribution, draws: Floats
@@ -149,20 +176,26 @@ class Affine:
         x, remainder = sampling.coordinates(draws)
         center, covariance = self.target(sampling)
         out = transported(sampling, x, remainder, center, covariance)
-        return out, (_drawn_in(x, _FAR) != x).any(axis=1)
+        outside = _drawn_in(x, _FAR) != x
+        return out, outside.any(axis=1)
 
 
 def _identified_modes(evaluator: Evaluator, optima: Sequence[Floats]) -> list[SamplingDistribution]:
     """Return the sampling distributions at optima about which the data tell something."""
     scales = evaluator.epsilon
-    found = [SamplingDistribution.of(evaluator, theta, scales, _WEAKEST) for theta in optima]
-    return [sampling for sampling in found if sampling.stderr.size]
+    found = []
+    for theta in optima:
+        sampling = SamplingDistribution.of(evaluator, theta, scales, _WEAKEST)
+        if sampling.stderr.size:
+            found.append(sampling)
+    return found
 
 
 def _distance(sampling: SamplingDistribution, draws: Floats) -> Floats:
     """Return how far draws, (n, d), are from an optimum, in its standard errors, shape (n,)."""
     x, _ = sampling.coordinates(draws)
-    return np.asarray(np.linalg.norm(x, axis=-1) / np.sqrt(sampling.stderr.size))
+    length = np.linalg.norm(x, axis=-1)
+    return np.asarray(length / np.sqrt(sampling.stderr.size))
 
 
 def _run_together(distances: Floats) -> bool:
@@ -170,7 +203,8 @@ def _run_together(distances: Floats) -> bool:
     if len(distances) < 2:
         return False
     first, second = np.sort(distances, axis=0)[:2]
-    return bool(np.mean(second < _APART * first) > _BETWEEN)
+    between = second < _APART * first
+    return bool(np.mean(between) > _BETWEEN)
 
 
 def transported(
@@ -180,7 +214,7 @@ def transported(
     center: Floats,
     covariance: Floats,
 ) -> Floats:
-    """Map draws to a median and covariance along the axes, as normal distributions are, with the least motion.
+    """Map draws to a median and covariance along the axes as one normal distribution to another.
 
     What remains follows as its regression on them says. Draws count as refits do: their median, and
     no farther from it than three standard deviations.
@@ -188,14 +222,20 @@ def transported(
     r = sampling.stderr.size
     x = _drawn_in(x, _FAR)
     # The symmetric map between two normal distributions.
-    root = _root(np.cov(_drawn_in(x, _REACH), rowvar=False).reshape(r, r))
+    counted = _drawn_in(x, _REACH)
+    before = np.cov(counted, rowvar=False).reshape(r, r)
+    root = _root(before)
     inverse = np.linalg.inv(root)
-    matrix = inverse @ _root(root @ covariance @ root) @ inverse
-    to = center + (x - np.median(x, axis=0)) @ matrix.T
+    between = _root(root @ covariance @ root)
+    matrix = inverse @ between @ inverse
+    shifts = x - np.median(x, axis=0)
+    to = center + shifts @ matrix.T
     # The regression of the remainder on the coordinates.
     apart = x - x.mean(axis=0)
-    slopes = np.linalg.solve(apart.T @ apart, apart.T @ (remainder - remainder.mean(axis=0)))
-    return sampling.thetas(to, remainder + (to - x) @ slopes)
+    response = remainder - remainder.mean(axis=0)
+    slopes = np.linalg.solve(apart.T @ apart, apart.T @ response)
+    follows = (to - x) @ slopes
+    return sampling.thetas(to, remainder + follows)
 
 
 def _among(sampling: SamplingDistribution, thetas: Floats) -> SamplingDistribution:
@@ -207,11 +247,19 @@ def _among(sampling: SamplingDistribution, thetas: Floats) -> SamplingDistributi
     local = sampling.local
     if not local.unidentified.size:
         return sampling
-    shift = (np.median(thetas, axis=0) - sampling.theta) / local.prior_sd
+    middle = np.median(thetas, axis=0)
+    shift = (middle - sampling.theta) / local.prior_sd
     along = local.identified @ (local.identified.T @ shift)
     place = sampling.theta + (shift - along) * local.prior_sd
-    found = SamplingDistribution.of(sampling.evaluator, place, sampling.scales, _WEAKEST)
-    return found if found.stderr.size == sampling.stderr.size else sampling
+    found = SamplingDistribution.of(
+        sampling.evaluator,
+        place,
+        sampling.scales,
+        _WEAKEST,
+    )
+    # Where more or fewer directions are identified there, the coordinates would not be the same.
+    same = found.stderr.size == sampling.stderr.size
+    return found if same else sampling
 
 
 def _drawn_in(x: Floats, most: float) -> Floats:
@@ -225,7 +273,14 @@ def _drawn_in(x: Floats, most: float) -> Floats:
     return np.clip(x, middle - far, middle + far)
 
 
+def _precision(points: Floats, r: int) -> Floats:
+    """Return the inverse of the covariance of points, (n, r), as (r, r) for r = 1 as well."""
+    covariance = np.cov(points, rowvar=False).reshape(r, r)
+    return np.linalg.inv(covariance)
+
+
 def _root(matrix: Floats) -> Floats:
     """Return the symmetric square root."""
     values, vectors = np.linalg.eigh(matrix)
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T)
+    roots = np.sqrt(np.maximum(values, 0))
+    return np.asarray((vectors * roots) @ vectors.T)

@@ -68,7 +68,8 @@ def bootstrap(
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     data = [0.0, 2.0, 4.0]
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=data)
     >>> prb.bootstrap(prb.minimize(model), draws=50).posterior["mu"].shape
     (1, 50)
     """
@@ -76,11 +77,12 @@ def bootstrap(
     evaluator = require_refits(optimum, "bootstrap", "; use prb.sample_smc").evaluator
     positive_integer(draws, "draws", minimum=2)
     sampling = optimum.sampling()
-    blind = unidentified_directions(sampling.local.unidentified, evaluator.readable_names)
-    if blind:
+    unseen = unidentified_directions(sampling.local.unidentified, evaluator.readable_names)
+    if unseen:
         raise ValueError(
-            f"bootstrap: the data tell less than the prior about {', '.join(blind)}, along which the minimiser is "
-            "anywhere; use prb.sample_smc, whose posterior falls back on the prior there, or fix a hyperparameter"
+            f"bootstrap: the data tell less than the prior about {', '.join(unseen)}, "
+            "along which the minimiser is anywhere; use prb.sample_smc, whose posterior "
+            "falls back on the prior there, or fix a hyperparameter"
         )
     if parametric:
         data = simulated_sets(evaluator, optimum.theta, draws, random_seed)

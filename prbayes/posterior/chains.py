@@ -97,15 +97,18 @@ class Chains:
         return note if note.get("round") == len(self.refined) else {}
 
     def saved_refinement(self, round_: int) -> Floats | None:
-        """Return the thetas at which a round that is over refined the designs, None where it is not over."""
+        """Return the thetas at which a finished round refined the designs, else None."""
         if self.checkpoint is None or round_ >= self.checkpoint.note.get("round", 0):
             return None
         return self.checkpoint.arrays[f"refined{round_}_thetas"]
 
     def _arrays(self, prefix: str) -> dict[str, Floats]:
         assert self.checkpoint is not None
-        arrays = self.checkpoint.arrays.items()
-        return {key.removeprefix(prefix): a for key, a in arrays if key.startswith(prefix)}
+        found = {}
+        for key, array in self.checkpoint.arrays.items():
+            if key.startswith(prefix):
+                found[key.removeprefix(prefix)] = array
+        return found
 
     def _finished(self, chain: int) -> tuple[Floats, Floats] | None:
         """Return thetas and discrepancies of a chain that was at its end."""
@@ -115,7 +118,7 @@ class Chains:
         return arrays["thetas"], arrays["discrepancies"]
 
     def _begun(self, chain: int, seed: np.random.SeedSequence) -> tuple[BatchedKernel, Stages]:
-        """Return a kernel at the stage that its chain had reached, and the statistics until then."""
+        """Return a kernel at the stage its chain had reached, and the statistics until then."""
         evaluator = self.evaluator
         kernel = BatchedKernel(
             self.draws, model=evaluator.model, threshold=self.threshold, evaluator=evaluator

@@ -1,4 +1,7 @@
-"""The state of a sampler on disk after every stage, so that a run that was killed goes on where it stopped."""
+"""The state of a sampler on disk after every stage.
+
+A run that was killed goes on where it stopped.
+"""
 
 from __future__ import annotations
 
@@ -93,7 +96,10 @@ class Checkpoint:
         self.note = note
 
     def _refusal(self, what: str) -> str:
-        return f"checkpoint: {self.path} {what}; nothing was changed: move it away, or pass another path"
+        return (
+            f"checkpoint: {self.path} {what}; nothing was changed: move it away, "
+            "or pass another path"
+        )
 
 
 def stored_settings(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -28,24 +28,26 @@ _LEVEL = 0.89
 _WIDER = 3.0
 # Times the noise floor: between these epsilon is looked for.
 _RANGE = (1e-3, 10.0)
-_BISECTIONS = 40  # of a range of 10^4 on a logarithmic scale: to rounding
+# Halvings of a range of 10^4 on a logarithmic scale: to rounding.
+_BISECTIONS = 40
 
 
 def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
-    """Return an epsilon for each simulator, such that the posterior is about as wide as the data warrant.
+    """Return an epsilon for each simulator, so that the posterior is as wide as the data warrant.
 
     - KLD and log-likelihood: 1/N, which puts them on the scale of a log-likelihood.
-    - Other smooth metrics (probability residual): trace(H^-1 J) / p over the p identified directions, H the
-      Hessian of the discrepancy at the optimum and J the sampling covariance of its gradient: then
-      the posterior's covariance epsilon H^-1 matches the estimator's H^-1 J H^-1 on average.
-    - Area metric: the epsilon with which 89% intervals of the posteriors of data sets simulated at the
-      optimum contain the optimum in 89% of cases, on average over the two directions that the data
-      see best.
-    - Metrics that declare nothing of their minimum, such as a `FunctionMetric` (`Reweighted` only): the mean, over
-      data sets simulated at the optimum and refitted, of delta . grad d / p at the minimiser plus
-      delta, delta drawn from the sampling distribution. For any density proportional to exp(-d /
-      epsilon) that mean is epsilon, by integration by parts; for a quadratic d it is trace(H Sigma)
-      / p, which is the sandwich's.
+    - Other smooth metrics (probability residual): trace(H^-1 J) / p over the p identified
+      directions, H the Hessian of the discrepancy at the optimum and J the sampling covariance of
+      its gradient: then the posterior's covariance epsilon H^-1 matches the estimator's
+      H^-1 J H^-1 on average.
+    - Area metric: the epsilon with which 89% intervals of the posteriors of data sets simulated at
+      the optimum contain the optimum in 89% of cases, on average over the two directions that the
+      data identify best.
+    - Metrics that declare nothing of their minimum, such as a `FunctionMetric` (`Reweighted` only):
+      the mean, over data sets simulated at the optimum and refitted, of delta . grad d / p at the
+      minimiser plus delta, delta drawn from the sampling distribution. For any density proportional
+      to exp(-d / epsilon) that mean is epsilon, by integration by parts; for a quadratic d it is
+      trace(H Sigma) / p, which is the sandwich's.
 
     No response is computed under `Reweighted`.
 
@@ -70,17 +72,19 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
 
     References
     ----------
-    .. [1] Shaby, B. A. (2014), The open-faced sandwich adjustment for MCMC using estimating functions,
-       J. Comput. Graph. Stat. 23, 853-876.
-    .. [2] Syring, N. and R. Martin (2019), Calibrating general posterior credible regions, Biometrika 106,
-       479-486, doi:10.1093/biomet/asy054.
+    .. [1] Shaby, B. A. (2014), The open-faced sandwich adjustment for MCMC using estimating
+       functions, J. Comput. Graph. Stat. 23, 853-876.
+    .. [2] Syring, N. and R. Martin (2019), Calibrating general posterior credible regions,
+       Biometrika 106, 479-486, doi:10.1093/biomet/asy054.
 
     Examples
     --------
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.KullbackLeibler(), observed=[0.0, 2.0, 4.0])
+    ...     y = prb.Simulator(
+    ...         "y", lambda x: 2 * x, x, metric=prb.KullbackLeibler(), observed=[0.0, 2.0, 4.0]
+    ...     )
     >>> prb.calibrate_epsilon(prb.minimize(model))
     {'y': 0.3333333333333333}
     """
@@ -105,8 +109,8 @@ def _epsilon(information: Information) -> float:
     obstacle = simulator_obstacle(information.evaluator, information.k)
     if obstacle is not None:
         raise TypeError(
-            f"epsilon cannot be calibrated: {obstacle}; pass epsilon= to prb.Simulator (the standard deviation of the "
-            "discrepancy at a good theta is a start)"
+            f"epsilon cannot be calibrated: {obstacle}; pass epsilon= to prb.Simulator (the "
+            "standard deviation of the discrepancy at a good theta is a start)"
         )
     match node.metric.minimum:
         case Minimum.QUADRATIC:
@@ -125,15 +129,19 @@ def _sandwich(information: Information) -> float:
     values, vectors, seen = seen_by_curvature(hessian, noise)
     _refuse_unidentified(information, int(seen.sum()))
     along = np.einsum("ik,ij,jk->k", vectors, noise, vectors)
-    return float(np.mean(along[seen] / values[seen]))
+    shares = along[seen] / values[seen]
+    return float(np.mean(shares))
 
 
 def _refuse_unidentified(information: Information, identified: int) -> None:
-    if not identified:
-        raise ValueError(
-            f"{information.node.name}: the data tell less than the prior about every hyperparameter, so epsilon "
-            "cannot be calibrated; look at the optimum, widen the priors, or pass epsilon="
-        )
+    """Raise where no direction is identified."""
+    if identified:
+        return
+    name = information.node.name
+    raise ValueError(
+        f"{name}: the data tell less than the prior about every hyperparameter, so epsilon cannot "
+        "be calibrated; look at the optimum, widen the priors, or pass epsilon="
+    )
 
 
 def _by_refits(information: Information) -> float:
@@ -144,7 +152,11 @@ def _by_refits(information: Information) -> float:
     """
     scales = np.ones(len(information.evaluator.nodes))
     refits = Refits.at(
-        information.evaluator, information.theta, scales, simulators=[information.k], n_sets=_SETS
+        information.evaluator,
+        information.theta,
+        scales,
+        simulators=[information.k],
+        n_sets=_SETS,
     )
     local = refits.local()
     p = local.identified.shape[1]
@@ -152,13 +164,18 @@ def _by_refits(information: Information) -> float:
     # One delta for each data set, and its opposite; steps in units of the prior's spread.
     rng = np.random.default_rng(information.seed)
     z = rng.standard_normal((len(refits.shifts), p))
-    delta = z @ np.linalg.cholesky(local.covariance).T @ local.identified.T
+    root = np.linalg.cholesky(local.covariance)
+    delta = z @ root.T @ local.identified.T
     shares = np.array([1.5, 0.5, -0.5, -1.5])
-    steps = refits.shifts[:, None] + shares[:, None] * delta[:, None]
-    d = refits.objective(refits.theta + steps * refits.prior_sd, slice(None))
-    slopes = ((d[:, 0] - d[:, 1]) + (d[:, 3] - d[:, 2])) / 2
+    away = shares[:, None] * delta[:, None]
+    steps = refits.shifts[:, None] + away
+    thetas = refits.theta + steps * refits.prior_sd
+    values = refits.objective(thetas, slice(None))
+    far, near, opposite, far_opposite = values.T
+    slopes = ((far - near) + (far_opposite - opposite)) / 2
     # Where a population leaves the design's reach nothing is known.
-    return float(slopes[np.isfinite(slopes)].mean() / p)
+    known = slopes[np.isfinite(slopes)]
+    return float(known.mean() / p)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,20 +195,31 @@ class _Cloud:
     @classmethod
     def around(cls, area: LinearArea, directions: Floats, seed: int) -> _Cloud:
         """Draw the thetas; directions, (d, r), are one standard error long."""
-        z = np.random.default_rng(seed).standard_normal((_CLOUD, directions.shape[1]))
-        change = _WIDER * (z @ directions.T) @ area.slopes
-        distances = [(np.abs(gap + change) * area.lengths).sum(axis=-1) for gap in area.gaps]
+        rng = np.random.default_rng(seed)
+        z = rng.standard_normal((_CLOUD, directions.shape[1]))
+        shifts = _WIDER * (z @ directions.T)
+        change = shifts @ area.slopes
+        distances = []
+        for gap in area.gaps:
+            gaps = np.abs(gap + change)
+            distance = (gaps * area.lengths).sum(axis=-1)
+            distances.append(distance)
         return cls(z, np.array(distances))
 
     def coverage(self, epsilon: float) -> float:
         """Return how often the data sets' posterior intervals contain the optimum, on average."""
         log_proposal = -0.5 * (self.z**2).sum(axis=-1)
         logs = -self.distances / epsilon - log_proposal
-        weights = np.exp(logs - logs.max(axis=1, keepdims=True))
+        highest = logs.max(axis=1, keepdims=True)
+        weights = np.exp(logs - highest)
         weights /= weights.sum(axis=1, keepdims=True)
         # The optimum is at zero: the posterior probability below it, by data set and axis.
-        below = [(weights * (z < 0)).sum(axis=1) for z in self.z.T]
-        inside = np.abs(np.stack(below) - 0.5) < _LEVEL / 2
+        below = []
+        for z in self.z.T:
+            share = (weights * (z < 0)).sum(axis=1)
+            below.append(share)
+        off_center = np.abs(np.stack(below) - 0.5)
+        inside = off_center < _LEVEL / 2
         return float(np.mean(inside))
 
 
@@ -202,11 +230,15 @@ def _by_coverage(information: Information) -> float:
     # location and its spread, is of the order of the error of derivatives of stored weights.
     basis = seen_by_area(information)[:, -2:]
     _refuse_unidentified(information, basis.shape[1])
-    shifts = first_order_shifts([information], np.ones(1), basis, information.data_sets)
+    sets = information.data_sets
+    shifts = first_order_shifts([information], np.ones(1), basis, sets)
     # The cloud spans the directions seen, wider than the estimator's sampling distribution.
-    values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(shifts, rowvar=False)))
-    axes = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
-    cloud = _Cloud.around(area, axes * information.prior_sd[:, None], information.seed)
+    covariance = np.atleast_2d(np.cov(shifts, rowvar=False))
+    variances, vectors = np.linalg.eigh(covariance)
+    errors = np.sqrt(np.maximum(variances, 0))
+    axes = basis @ (vectors * errors)
+    directions = axes * information.prior_sd[:, None]
+    cloud = _Cloud.around(area, directions, information.seed)
     # Coverage grows with epsilon.
     low, high = (information.noise_floor * factor for factor in _RANGE)
     for _ in range(_BISECTIONS):

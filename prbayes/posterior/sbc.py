@@ -42,7 +42,7 @@ def simulation_based_calibration(
     random_seed: int = 0,
     progressbar: bool = True,
 ) -> xr.DataTree:
-    """Calibrate many data sets with known hyperparameters, and rank these among the posterior's draws.
+    """Calibrate many data sets with known hyperparameters, and rank these among the draws.
 
     Each time hyperparameters are drawn from the prior, and specimens from their populations, for
     which the response is called; then epsilon, `sample_smc` and its adjustment run as they would on
@@ -86,17 +86,19 @@ def simulation_based_calibration(
 
     References
     ----------
-    .. [1] Talts, S. et al. (2018), Validating Bayesian inference algorithms with simulation-based calibration,
-       arXiv:1804.06788.
-    .. [2] Säilynoja, T., P.-C. Bürkner and A. Vehtari (2022), Graphical test for discrete uniformity and its
-       applications in goodness-of-fit evaluation, Stat. Comput. 32, doi:10.1007/s11222-022-10090-6.
+    .. [1] Talts, S. et al. (2018), Validating Bayesian inference algorithms with
+       simulation-based calibration, arXiv:1804.06788.
+    .. [2] Säilynoja, T., P.-C. Bürkner and A. Vehtari (2022), Graphical test for discrete
+       uniformity and its applications in goodness-of-fit evaluation, Stat. Comput. 32,
+       doi:10.1007/s11222-022-10090-6.
 
     Examples
     --------
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.KullbackLeibler(), observed=np.arange(9.0))
+    ...     data = np.arange(9.0)
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.KullbackLeibler(), observed=data)
     >>> ranks = prb.simulation_based_calibration(2, model=model, draws=50, progressbar=False)
     >>> ranks.prior_sbc["mu"].shape
     (1, 2)
@@ -107,13 +109,14 @@ def simulation_based_calibration(
     evaluator = Evaluator(model)
     if model.potentials or len(model.observed_RVs) > len(evaluator.nodes):
         raise ValueError(
-            "simulation_based_calibration: got a model with likelihood terms or potentials besides its simulators, "
-            "whose data cannot be drawn; expected prb.Simulator nodes only"
+            "simulation_based_calibration: got a model with likelihood terms or potentials "
+            "besides its simulators, whose data cannot be drawn; expected prb.Simulator nodes only"
         )
     starts = range(0, n, _CHUNK)
-    jobs = [
-        _Job(range(start, min(start + _CHUNK, n)), draws, adjust, random_seed) for start in starts
-    ]
+    jobs = []
+    for start in starts:
+        numbers = range(start, min(start + _CHUNK, n))
+        jobs.append(_Job(numbers, draws, adjust, random_seed))
     with shown(progressbar), progress("data sets", n) as report:
         if executor is None:
             parts = [_analyse(evaluator, job, lambda: report(1, "")) for job in jobs]
@@ -128,7 +131,8 @@ def simulation_based_calibration(
         )
     if len(failed) > n / 2:
         raise RuntimeError(
-            f"simulation_based_calibration: {len(failed)} of {n} data sets failed; first: {failed[0]}"
+            f"simulation_based_calibration: {len(failed)} of {n} data sets failed; "
+            f"first: {failed[0]}"
         )
     return calibration_tree(
         evaluator, good, failed=len(failed), draws=draws, adjust=adjust, seed=random_seed
@@ -188,7 +192,7 @@ def _analyse(
 
 
 def _one(evaluator: Evaluator, job: _Job, rng: np.random.Generator) -> dict[str, Floats]:
-    """Draw hyperparameters, and data from their population, and rank them among the posterior's draws."""
+    """Draw hyperparameters, and data from their population, and rank them among the draws."""
     theta = evaluator.prior_thetas(1, int(rng.integers(2**31)))[0]
     data = fresh_data(evaluator, theta, rng)
     tree = sample(

@@ -25,7 +25,7 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import identity_of, require_same
 from prbayes.model.node import Node, model_on_context
 from prbayes.model.support import shortcomings
-from prbayes.posterior.adjustment import Affine
+from prbayes.posterior.adjustment import Adjusted, Affine
 from prbayes.posterior.chains import Chains, Particles
 from prbayes.posterior.checkpoint import Checkpoint, stored_settings
 from prbayes.posterior.epsilon import calibrate_epsilon
@@ -51,7 +51,9 @@ def sample_smc(
     checkpoint: str | PathLike[str] | None = None,
     progressbar: bool = True,
 ) -> xr.DataTree:
-    """Draw from the pseudo-posterior prior x exp(-sum of d_k / epsilon_k) by sequential Monte Carlo.
+    """Draw from the pseudo-posterior by sequential Monte Carlo.
+
+    Its density is proportional to the prior times exp(-sum of d_k / epsilon_k).
 
     Parameters
     ----------
@@ -105,15 +107,16 @@ def sample_smc(
 
     References
     ----------
-    .. [1] Del Moral, P., A. Doucet and A. Jasra (2006), Sequential Monte Carlo samplers, J. R. Stat. Soc. B
-       68, 411-436, doi:10.1111/j.1467-9868.2006.00553.x.
+    .. [1] Del Moral, P., A. Doucet and A. Jasra (2006), Sequential Monte Carlo samplers, J. R.
+       Stat. Soc. B 68, 411-436, doi:10.1111/j.1467-9868.2006.00553.x.
 
     Examples
     --------
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
+    ...     data = [0.0, 2.0, 4.0]
+    ...     y = prb.Simulator("y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=data)
     >>> idata = prb.sample_smc(100, chains=2, model=model, random_seed=1, progressbar=False)
     >>> idata.posterior["mu"].shape
     (2, 100)
@@ -197,10 +200,8 @@ def sample(
             refine=refine and bool(evaluator.designs),
         )
         found = rounds.until_supported(progressbar)
-        if found.unadjusted_because:
-            _log.warning(
-                "the draws are not adjusted: %s; their width is epsilon's", found.unadjusted_because
-            )
+        if found.reason is not None:
+            _log.warning("the draws are not adjusted: %s; their width is epsilon's", found.reason)
 
         # The record
         return posterior_tree(
@@ -226,18 +227,27 @@ class _Draws:
     """
 
     particles: Particles
-    thetas: Floats
-    note: str
+    adjusted: Adjusted | None
 
     @property
-    def unadjusted_because(self) -> str:
-        """Why an adjustment that was asked for left the draws as they are; empty if it did not."""
-        return self.note.removeprefix("none: ") if self.note.startswith("none: ") else ""
+    def thetas(self) -> Floats:
+        """The draws after the adjustment, if there was one."""
+        return self.particles.thetas if self.adjusted is None else self.adjusted.thetas
+
+    @property
+    def note(self) -> str:
+        """What the adjustment did, or why nothing."""
+        return "none" if self.adjusted is None else self.adjusted.note
+
+    @property
+    def reason(self) -> str | None:
+        """Why an adjustment that was asked for left the draws as they are; None if it did not."""
+        return None if self.adjusted is None else self.adjusted.reason
 
 
 @dataclass(frozen=True, eq=False)
 class _Rounds:
-    """Sampling, adjustment and refinement of the designs, again until the designs support the draws."""
+    """Sampling, adjustment and refinement, again until the designs support the draws."""
 
     run: Chains
     chains: int
@@ -278,9 +288,9 @@ class _Rounds:
     def _draws(self, children: list[np.random.SeedSequence], progressbar: bool) -> _Draws:
         particles = self.run(children, progressbar)
         if self.adjustment is None:
-            return _Draws(particles, particles.thetas, "none")
-        thetas, note = self.adjustment(self.run.evaluator, particles.thetas, self.optima)
-        return _Draws(particles, thetas, note)
+            return _Draws(particles, None)
+        adjusted = self.adjustment(self.run.evaluator, particles.thetas, self.optima)
+        return _Draws(particles, adjusted)
 
     def _some_of(self, found: _Draws) -> Floats:
         """Return some draws, before and after the adjustment: the design has to support both."""
@@ -308,7 +318,8 @@ def _set_epsilons(evaluator: Evaluator, epsilon: float | dict[str, float] | None
     if not isinstance(epsilon, dict):
         if len(names) > 1:
             raise ValueError(
-                f"epsilon: got one number for {len(names)} simulators, expected a dict by name: {names}"
+                f"epsilon: got one number for {len(names)} simulators, "
+                f"expected a dict by name: {names}"
             )
         epsilon = {names[0]: epsilon}
     values = checked_epsilon(epsilon, evaluator.nodes, evaluator.model, "sample_smc: epsilon")

@@ -84,11 +84,14 @@ class BatchedKernel(SMC_KERNEL):
         if unset:
             raise ValueError(
                 f"{unset[0]}: epsilon is not set; call prb.set_epsilon(model, "
-                "prb.calibrate_epsilon(prb.minimize(model))) or use prb.sample_smc, which calibrates it"
+                "prb.calibrate_epsilon(prb.minimize(model))) or use prb.sample_smc, "
+                "which calibrates it"
             )
         self.variables = model.value_vars
-        shapes = self.evaluator.shapes.items()
-        self.var_info = {name: (shape, int(np.prod(shape, dtype=int))) for name, shape in shapes}
+        self.var_info = {}
+        for name, shape in self.evaluator.shapes.items():
+            size = int(np.prod(shape, dtype=int))
+            self.var_info[name] = (shape, size)
         self.rng = np.random.default_rng(random_seed)
         self._reset_state()
 
@@ -107,8 +110,9 @@ class BatchedKernel(SMC_KERNEL):
         self.prior_logp, self.likelihood_logp, self.discrepancies = found
         if not np.isfinite(self.likelihood_logp).any():
             raise ValueError(
-                f"model: got no finite discrepancy among {self.draws} draws from the prior, expected some; the "
-                "populations of the prior are invalid or far from the design: look at the priors"
+                f"model: got no finite discrepancy among {self.draws} draws from the prior, "
+                "expected some; the populations of the prior are invalid or far from the design: "
+                "look at the priors"
             )
 
     def resample(self) -> None:
@@ -121,7 +125,7 @@ class BatchedKernel(SMC_KERNEL):
         self.discrepancies = self.discrepancies[index]
 
     def mutate(self) -> None:
-        """Move all particles by Metropolis-Hastings steps that leave the tempered posterior as it is."""
+        """Move all particles by Metropolis-Hastings steps that keep the tempered posterior."""
         before = self.tempered_posterior.copy()
         fitted = _Normal.of(before)
         enough = _UNCORRELATED if self.beta == 1 else _UNCORRELATED * _ON_THE_WAY
@@ -149,10 +153,13 @@ class BatchedKernel(SMC_KERNEL):
     def _jump(self, fitted: _Normal, noise: Floats) -> float:
         """Propose independent draws of the fitted normal; return the rate of acceptance."""
         proposed = fitted.mean + noise @ fitted.root.T
-        here = np.linalg.solve(fitted.root, (self.tempered_posterior - fitted.mean).T)
+        from_mean = self.tempered_posterior - fitted.mean
+        here = np.linalg.solve(fitted.root, from_mean.T)
         # Log density of the normal, up to a constant, at the present place less that at the
         # proposed one.
-        log_ratio = 0.5 * ((noise**2).sum(axis=1) - (here**2).sum(axis=0))
+        squared_there = (noise**2).sum(axis=1)
+        squared_here = (here**2).sum(axis=0)
+        log_ratio = 0.5 * (squared_there - squared_here)
         return self._accept(proposed, log_ratio)
 
     def _walk(self, fitted: _Normal, noise: Floats) -> float:
@@ -240,7 +247,10 @@ def _correlation(before: Floats, after: Floats) -> float:
     """Return the mean absolute correlation of the particles' coordinates with those before."""
     a = before - before.mean(axis=0)
     b = after - after.mean(axis=0)
-    size = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
+    in_a = (a**2).sum(axis=0)
+    in_b = (b**2).sum(axis=0)
+    size = np.sqrt(in_a * in_b)
     size = np.where(size > 0, size, 1.0)
-    each = np.abs((a * b).sum(axis=0)) / size
+    product = (a * b).sum(axis=0)
+    each = np.abs(product) / size
     return float(np.mean(each))

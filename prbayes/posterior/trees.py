@@ -77,7 +77,8 @@ def posterior_tree(
             **as_attributes(identity_of(evaluator)),
         }
     )
-    errors = np.full(len(evaluator.nodes), np.nan) if errors is None else errors
+    if errors is None:
+        errors = np.full(len(evaluator.nodes), np.nan)
     calibration = xr.Dataset(
         {
             "discrepancy": (_EACH_DRAW, discrepancies),
@@ -109,7 +110,7 @@ _EACH_DRAW = ["chain", "draw", "simulator"]
 
 
 def _discrepancies_again(evaluator: Evaluator, thetas: Floats, before: Floats) -> Floats:
-    """Return the discrepancies of draws that were moved, where that costs no response, and else NaN."""
+    """Return the discrepancies of adjusted draws, NaN where that would cost responses."""
     if evaluator.responses_per_theta:
         return np.full(before.shape, np.nan)
     return evaluator(thetas).discrepancies.reshape(before.shape)
@@ -159,16 +160,16 @@ def _by_simulator(evaluator: Evaluator) -> dict[str, Any]:
 
 
 def _evidence(stats: list[dict[str, list[float]]]) -> dict[str, float]:
-    """Return the logarithm of the mean marginal likelihood of the chains, and their standard deviation in logs."""
-    logs = np.array(
-        [s["log_marginal_likelihood"][-1] for s in stats if "log_marginal_likelihood" in s]
-    )
+    """Return the log of the chains' mean marginal likelihood, and the spread of their logs."""
+    key = "log_marginal_likelihood"
+    logs = np.array([stages[key][-1] for stages in stats if key in stages])
     if not logs.size:
         return {}
     spread = float(logs.std(ddof=1)) if logs.size > 1 else np.nan
     top = logs.max()
+    mean = np.exp(logs - top).mean()
     return {
-        "log_marginal_likelihood": float(top + np.log(np.exp(logs - top).mean())),
+        "log_marginal_likelihood": float(top + np.log(mean)),
         "log_marginal_likelihood_sd": spread,
     }
 
@@ -212,13 +213,19 @@ def calibration_tree(
     adjust: object,
     seed: int,
 ) -> xr.DataTree:
-    """Return the DataTree of a simulation-based calibration, from rank, truth and sd by variable and data set."""
-    stacked = {name: np.stack([row[name] for row in rows])[None] for name in rows[0]}
+    """Return the DataTree of a simulation-based calibration.
+
+    ``rows`` has rank, truth and sd by variable, one of them for each data set.
+    """
+    stacked = {}
+    for name in rows[0]:
+        column = np.stack([row[name] for row in rows])
+        stacked[name] = column[None]
     leading = {"chain": 1, "draw": len(rows)}
-    groups = {
-        group: labelled(evaluator, {name: v[:, :, i] for name, v in stacked.items()}, leading)
-        for i, group in enumerate(("prior_sbc", "truth", "posterior_sd"))
-    }
+    groups = {}
+    for i, group in enumerate(("prior_sbc", "truth", "posterior_sd")):
+        own = {name: values[:, :, i] for name, values in stacked.items()}
+        groups[group] = labelled(evaluator, own, leading)
     groups["envelope"], outside = _envelopes(groups["prior_sbc"])
     groups["prior_sbc"].attrs.update(
         {
@@ -234,7 +241,7 @@ def calibration_tree(
 
 
 def _envelopes(ranks: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
-    """Return ECDFs of ranks with ArviZ's envelope for uniform ones, and the names of those that leave it."""
+    """Return ECDFs of ranks with ArviZ's envelope for uniform ones, and who leaves it."""
     from arviz_stats.ecdf_utils import ecdf_pit
 
     rows, names = {}, []
@@ -262,8 +269,8 @@ def _draws(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
     """Return draws, shape (chains, draws, d), as labelled variables."""
     chains, draws, d = thetas.shape
     values = evaluator.constrained(thetas.reshape(-1, d)).items()
-    return labelled(
-        evaluator,
-        {n: v.reshape(chains, draws, *v.shape[1:]) for n, v in values},
-        {"chain": chains, "draw": draws},
-    )
+    by_chain = {}
+    for name, value in values:
+        shape = value.shape[1:]
+        by_chain[name] = value.reshape(chains, draws, *shape)
+    return labelled(evaluator, by_chain, {"chain": chains, "draw": draws})

@@ -73,7 +73,7 @@ class Bound(ABC):
 
     @property
     def known_responses(self) -> Floats:
-        """Responses that were computed when the simulator was made, of which the first stay the first."""
+        """Responses computed when the simulator was made; the first of them stay the first."""
         return self._probed
 
     @property
@@ -82,7 +82,7 @@ class Bound(ABC):
         return False
 
     def same_points(self, other: Bound) -> bool:
-        """Return whether the i-th points of another bound of the same configuration and inputs are the same."""
+        """Return whether another bound of the same settings and inputs has the same points."""
         return True
 
     def __init__(
@@ -94,7 +94,7 @@ class Bound(ABC):
         self.responses = responses
 
     def copied(self) -> Self:
-        """Return the same propagation with a count of responses of its own, for a clone of the model."""
+        """Return the same propagation with its own count of responses, for a clone of the model."""
         other = copy.copy(self)
         other.responses = self.responses.copied()
         return other
@@ -141,10 +141,10 @@ class Bound(ABC):
         return np.arange(self.n_points) * N_BLOCKS // self.n_points
 
     def discrepancy_error(self, params: Sequence[Any]) -> float:
-        """Return the standard error of the discrepancy at given roots, shapes (1, ...), from leaving out each eighth.
+        """Return the standard error of the discrepancy at given roots, shapes (1, ...).
 
-        Right for random draws (`Fresh`), and an upper bound for common points, which are better
-        than random ones.
+        From leaving out each eighth of the responses. Right for random draws (`Fresh`), and an
+        upper bound for common points, which are better than random ones.
         """
         if self.n_points < 2 * N_BLOCKS:
             return np.nan
@@ -153,7 +153,8 @@ class Bound(ABC):
         for block in range(N_BLOCKS):
             left = self.blocks != block
             kept = weights[:, left]
-            found = self.target.of(values[:, left], kept / kept.sum())
+            kept = kept / kept.sum()
+            found = self.target.of(values[:, left], kept)
             without_block.append(found[0])
         # The jackknife of grouped points.
         return float(np.sqrt((N_BLOCKS - 1) * np.var(without_block)))
@@ -165,7 +166,7 @@ class Bound(ABC):
         return compile_batched(symbols, [valid(self.inputs, dists)])
 
     def valid(self, params: Sequence[Any]) -> Any:
-        """Return which of a batch of roots give valid distributions (sigma > 0 and such), shape (k,)."""
+        """Return which of a batch of roots give valid distributions (sigma > 0), shape (k,)."""
         (found,) = self._valid(*params)
         batch = np.shape(params[0])[:1]
         return np.broadcast_to(found, batch).astype(bool)
@@ -176,13 +177,14 @@ class Bound(ABC):
         if not ok.any():
             names = ", ".join(str(r.name) for r in self.inputs.roots)
             raise ValueError(
-                f"{self.name}: priors: got invalid parameters of the inputs at all {len(ok)} draws of {names}, "
-                "expected valid ones; give scales a prior on positive numbers, such as pm.HalfNormal"
+                f"{self.name}: priors: got invalid parameters of the inputs at all {len(ok)} draws "
+                f"of {names}, expected valid ones; give scales a prior on positive numbers, "
+                "such as pm.HalfNormal"
             )
         return [p[ok] for p in params]
 
     def draw(self, rng: np.random.Generator, size: int, params: Sequence[Any]) -> Floats:
-        """Draw responses of ``size`` different specimens from the population at one value of the roots."""
+        """Draw responses of ``size`` different specimens at one value of the roots."""
         at = [np.asarray(p)[None] for p in params]
         if not self.valid(at).all():
             return np.full(size, np.nan)
@@ -214,8 +216,8 @@ class Propagation(ABC):
             raise TypeError(f"store: got {type(store).__name__}, expected the path of a folder")
         if not isinstance(self.on_failure, OnFailure):
             raise TypeError(
-                f"on_failure: got {type(self.on_failure).__name__} {self.on_failure!r:.60}, expected prb.response.Abort(), "
-                "prb.response.Replace() or prb.response.Retry()"
+                f"on_failure: got {type(self.on_failure).__name__} {self.on_failure!r:.60}, "
+                "expected prb.response.Abort(), prb.response.Replace() or prb.response.Retry()"
             )
 
     @abstractmethod
@@ -227,8 +229,9 @@ def refuse_nested(name: str, inputs: Inputs) -> None:
     """Refuse a `.dist()` that depends on another one."""
     if inputs.nested:
         raise TypeError(
-            f"{name}: an input is a `.dist()` that depends on another `.dist()`; its density is not that of "
-            "independent inputs; use one multivariate distribution, or propagation=prb.Fresh()"
+            f"{name}: an input is a `.dist()` that depends on another `.dist()`; its density "
+            "is not that of independent inputs; use one multivariate distribution, "
+            "or propagation=prb.Fresh()"
         )
 
 
@@ -253,6 +256,7 @@ def refuse_all_nan(name: str, values: Floats) -> None:
     """Raise if no response is a number."""
     if np.isnan(values).all():
         raise ResponseError(
-            f"{name}: the response is NaN at all {values.size} points drawn from the prior, expected numbers; look at "
-            "the priors and at the response's domain; a specimen that fails is +inf"
+            f"{name}: the response is NaN at all {values.size} points drawn from the prior, "
+            "expected numbers; "
+            "look at the priors and at the response's domain; a specimen that fails is +inf"
         )

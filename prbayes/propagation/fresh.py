@@ -85,7 +85,8 @@ class FreshBound(Bound):
         rng = np.random.default_rng([self._seed, self.draws])
         aleatory, epistemic = self._sampler(params, self.n_per_theta, rng)
         values = self.responses(aleatory, epistemic)
-        return values, np.broadcast_to(1 / self.n_per_theta, values.shape)
+        equal = np.broadcast_to(1 / self.n_per_theta, values.shape)
+        return values, equal
 
 
 class FreshOp(OwnOp):
@@ -107,21 +108,30 @@ class FreshOp(OwnOp):
         """Apply to the roots' values."""
         tensors = [pt.as_tensor(p) for p in params]
         pairs = zip(tensors, self._event_ndims, strict=True)
-        ndim = max(t.type.ndim - event for t, event in pairs)
+        leading = [t.type.ndim - event for t, event in pairs]
+        ndim = max(leading)
         return Apply(self, tensors, [float_output(ndim)])
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Draw, call the response, compare."""
         batch = batch_shape(inputs, self._event_ndims)
         full = broadcast_batch(inputs, self._event_ndims, batch)
-        params = [p.reshape(-1, *p.shape[len(batch) :]) for p in full]
+        leading = len(batch)
+        params = []
+        for values in full:
+            event_shape = values.shape[leading:]
+            params.append(values.reshape(-1, *event_shape))
         found = self.bound.discrepancies(params, self.bound.target)
         outputs[0][0] = found.reshape(batch)
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
-        """Refuse by name; not as NotImplementedError, which PyMC takes as leave to use a slice sampler."""
+        """Refuse by name.
+
+        Not as NotImplementedError, which PyMC takes as leave to use a slice sampler.
+        """
         raise TypeError(
-            f"{self.bound.name}: prb.Fresh draws new responses at every evaluation, so its log-density is random and "
-            "has no gradient: pm.sample, pm.find_MAP and gradient methods of prb.minimize would be wrong; use "
-            "propagation=prb.Reweighted() or prb.Resimulated(), or prb.sample_smc"
+            f"{self.bound.name}: prb.Fresh draws new responses at every evaluation, so its "
+            "log-density is random and has no gradient: pm.sample, pm.find_MAP and gradient "
+            "methods of prb.minimize would be wrong; use propagation=prb.Reweighted() or "
+            "prb.Resimulated(), or prb.sample_smc"
         )

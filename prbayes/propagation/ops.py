@@ -1,4 +1,4 @@
-"""PyTensor operations: a response, a density of simulated values, a user's metric as nodes of a graph."""
+"""PyTensor operations: a response, a density of simulated values and a metric in a graph."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ warnings.filterwarnings(
 
 
 class OwnOp(Op):
-    """An operation that takes leading axes itself, and equals those of its class that hold the very same objects."""
+    """An operation that takes leading axes itself.
+
+    It equals those of its class that hold the very same objects.
+    """
 
     __props__ = ()
 
@@ -81,7 +84,8 @@ class ResponseOp(OwnOp):
         """Apply to values of shape (..., *event); the result has the leading axes."""
         tensors = [pt.as_tensor(x) for x in inputs]
         pairs = zip(tensors, self.event_ndims, strict=True)
-        ndim = max(t.type.ndim - event for t, event in pairs)
+        leading = [t.type.ndim - event for t, event in pairs]
+        ndim = max(leading)
         return Apply(self, tensors, [float_output(ndim)])
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
@@ -106,10 +110,9 @@ class ResponseOp(OwnOp):
             return
         values = np.full(batch, np.nan)
         if valid.any():
-            values[valid] = self.responses(
-                [x[valid] for x in aleatory],
-                [x[valid] for x in epistemic],
-            )
+            valid_aleatory = [x[valid] for x in aleatory]
+            valid_epistemic = [x[valid] for x in epistemic]
+            values[valid] = self.responses(valid_aleatory, valid_epistemic)
         outputs[0][0] = values
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
@@ -147,7 +150,8 @@ class DensityOp(OwnOp):
         """Return the derivatives by another operation."""
         if not self.cells.smooth:
             raise NotImplementedError(
-                "a Histogram has no gradient under prb.Resimulated: use GaussianKDE, or prb.Reweighted"
+                "a Histogram has no gradient under prb.Resimulated: "
+                "use GaussianKDE, or prb.Reweighted"
             )
         sample, weights = inputs
         (cotangent,) = cotangents
@@ -220,7 +224,7 @@ class OpaqueOp(OwnOp):
 
 
 def symbolic_discrepancy(target: Discrepancy, sample: Any, weights: Any) -> Any:
-    """Return the graph of a discrepancy for a sample that depends on theta, shapes (n,), (n,) -> ()."""
+    """Return the graph of a discrepancy for a sample that depends on theta: (n,), (n,) -> ()."""
     if not target.symbolic:
         return OpaqueOp(target)(sample, weights)
     if target.density_cells is not None:

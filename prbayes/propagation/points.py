@@ -24,7 +24,8 @@ def sobol(n: int, dimensions: int, seed: int) -> Floats:
 
     References
     ----------
-    .. [1] Owen, A. B. (1998), Scrambling Sobol and Niederreiter-Xing points, doi:10.1006/jcom.1998.0487.
+    .. [1] Owen, A. B. (1998), Scrambling Sobol and Niederreiter-Xing points,
+       doi:10.1006/jcom.1998.0487.
 
     Examples
     --------
@@ -91,13 +92,15 @@ def points_from(points: object) -> Callable[[int, int, int], Floats]:
 def base_points(
     inputs: Inputs, n: int, seed: int, points: Callable[[int, int, int], Floats] = sobol
 ) -> tuple[Floats, list[Floats]]:
-    """Return one spare coordinate, shape (n,), and one array of points, (n, *event), per aleatory input."""
+    """Return a spare coordinate, (n,), and an array of points, (n, *event), per aleatory input."""
     shapes = inputs.event_shapes
     sizes = [int(np.prod(s, dtype=int)) for s in shapes]
     u = points(n, 1 + sum(sizes), seed)
     edges = np.cumsum([1, *sizes])
-    parts = []
+    by_input = []
     for (start, end), shape in zip(pairwise(edges), shapes, strict=True):
-        part = u[:, start:end].reshape(n, *shape)
-        parts.append(part.copy())
-    return u[:, 0].copy(), parts
+        own = u[:, start:end]
+        own = own.reshape(n, *shape)
+        by_input.append(own.copy())
+    spare = u[:, 0]
+    return spare.copy(), by_input

@@ -32,7 +32,7 @@ _KEPT = 1 << 21
 
 @dataclass(frozen=True)
 class Resimulated(Propagation):
-    """Fixed scrambled Sobol points through the inputs' inverse distribution functions, for each theta anew.
+    """Fixed Sobol points through the inputs' inverse distribution functions, for each theta anew.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class ResimulatedBound(Bound):
         self.symbolic = self._accepts_tensors(*tried)
 
     def copied(self) -> Self:
-        """Return the same propagation with a count of its own, which its compiled function has to know."""
+        """Return the same propagation with its own count, which its compiled function knows."""
         other = super().copied()
         other.__dict__.pop("_values", None)
         return other
@@ -105,9 +105,10 @@ class ResimulatedBound(Bound):
         enough = per_observation * self.target.n_effective
         if self.n_per_theta < enough:
             _log.warning(
-                "%s: the log-likelihood of %d resimulated responses sees too little of the tails: its "
-                "standard errors and posterior come out too narrow, expected at least %.0f responses, "
-                "%d for each observation; use prb.Reweighted(n), prb.KullbackLeibler() or a larger n",
+                "%s: the log-likelihood of %d resimulated responses sees too little of the tails: "
+                "its standard errors and posterior come out too narrow, expected at least "
+                "%.0f responses, %d for each observation; use prb.Reweighted(n), "
+                "prb.KullbackLeibler() or a larger n",
                 self.name,
                 self.n_per_theta,
                 enough,
@@ -137,7 +138,7 @@ class ResimulatedBound(Bound):
         return same_shape and np.allclose(values, expected, rtol=1e-9, equal_nan=True)
 
     def _response(self, params: Sequence[Any]) -> tuple[TensorVariable, TensorVariable]:
-        """Return the responses at the base points as a graph, and whether the parameters are valid."""
+        """Return the graph of responses at the base points, and whether parameters are valid."""
         dists, epistemic = self.inputs.rebuilt(params)
         pairs = zip(dists, self._points, strict=True)
         aleatory = ninf_for_invalid([quantiles(self.name, d, u) for d, u in pairs])
@@ -149,7 +150,7 @@ class ResimulatedBound(Bound):
         return values, valid(self.inputs, dists)
 
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
-        """Return the discrepancy of the responses at the base points, +inf where parameters are invalid."""
+        """Return the discrepancy of the responses, +inf where parameters are invalid."""
         values, parameters_valid = self._response(params)
         weights = np.full(self.n_per_theta, 1 / self.n_per_theta)
         found = symbolic_discrepancy(self.target, values, weights)

@@ -53,7 +53,7 @@ _MANY_INPUTS = 4
 
 @dataclass(frozen=True)
 class Reweighted(Propagation):
-    """Simulate once: stored responses at design points get weights p(x given theta) / g(x) for each theta.
+    """Simulate once: stored responses get weights p(x given theta) / g(x) for each theta.
 
     Parameters
     ----------
@@ -78,7 +78,8 @@ class Reweighted(Propagation):
 
     References
     ----------
-    .. [1] Owen, A. B., Monte Carlo theory, methods and examples, chapter 9 (mixture importance sampling).
+    .. [1] Owen, A. B., Monte Carlo theory, methods and examples, chapter 9 (mixture importance
+       sampling).
 
     Examples
     --------
@@ -108,17 +109,18 @@ class Reweighted(Propagation):
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Compute the responses at the first design points."""
         if inputs.epistemic:
-            names = ", ".join(str(e.name or e) for e in inputs.epistemic)
+            each = [str(e.name or e) for e in inputs.epistemic]
+            names = ", ".join(each)
             raise TypeError(
-                f"{name}: {names} goes into the response as a model variable (epistemic), so stored "
-                "responses cannot be reweighted; use propagation=prb.Resimulated()"
+                f"{name}: {names} goes into the response as a model variable (epistemic), so "
+                "stored responses cannot be reweighted; use propagation=prb.Resimulated()"
             )
         refuse_nested(name, inputs)
         if not target.metric.takes_weights:
             raise TypeError(
-                f"{name}: a metric that takes no weights cannot be used with prb.Reweighted; in a "
-                "FunctionMetric write function(simulated, observed, weights) with weighted=True, or use "
-                "propagation=prb.Resimulated()"
+                f"{name}: a metric that takes no weights cannot be used with prb.Reweighted; "
+                "in a FunctionMetric write function(simulated, observed, weights) with "
+                "weighted=True, or use propagation=prb.Resimulated()"
             )
         return Design(name, inputs, target, responses, self)
 
@@ -185,14 +187,15 @@ class Design(Bound):
 
     def _warn_of_thin_support(self, size: float) -> None:
         advice = (
-            "prb.minimize and prb.sample_smc refine it themselves, before pm.sample call prb.refine(model)"
+            "prb.minimize and prb.sample_smc refine it themselves, "
+            "before pm.sample call prb.refine(model)"
             if self._dimensions <= _MANY_INPUTS
             else f"{self._dimensions} inputs are many for stored responses: rather use "
             "propagation=prb.Resimulated(n), which has no design"
         )
         _log.warning(
-            "%s: the design of %d responses supports a typical population of the prior with a weight "
-            "effective sample size of %.0f, expected %.0f; %s",
+            "%s: the design of %d responses supports a typical population of the prior with a "
+            "weight effective sample size of %.0f, expected %.0f; %s",
             self.name,
             self.config.n,
             size,
@@ -254,9 +257,10 @@ class Design(Bound):
     @property
     def is_line(self) -> bool:
         """Whether there is one continuous aleatory input of one dimension."""
-        x = self.inputs.aleatory[0]
+        x, *others = self.inputs.aleatory
         continuous = x.dtype.startswith("float")
-        return len(self.inputs.aleatory) == 1 and x.type.ndim == 0 and continuous
+        scalar = x.type.ndim == 0
+        return not others and scalar and continuous
 
     @property
     def blocks(self) -> NDArray[np.intp]:
@@ -277,7 +281,8 @@ class Design(Bound):
 
     def points_of(self, inputs: Inputs) -> list[Floats]:
         """Return the points of some of the design's aleatory inputs, shapes (n, *event)."""
-        known = dict(zip(map(id, self.inputs.aleatory), self.batches.points, strict=True))
+        own = [id(x) for x in self.inputs.aleatory]
+        known = dict(zip(own, self.batches.points, strict=True))
         return [known[id(x)] for x in inputs.aleatory]
 
     def values_of(self, responses: Responses) -> Floats:
@@ -299,7 +304,7 @@ class Design(Bound):
         return known
 
     def same_points(self, other: Bound) -> bool:
-        """Return whether another design has the same points, so that their responses belong together."""
+        """Return whether another design has the same points, whose responses belong together."""
         if not isinstance(other, Design):
             return False
         pairs = zip(self.batches.points, other.batches.points, strict=True)
@@ -335,7 +340,8 @@ class Design(Bound):
         log_g, sums = self._log_mixture(
             self.batches.components, self.batches.counts, self.batches.points
         )
-        self._share([*self.batches.points, log_g, *self.target.basis(self.values)])
+        basis = self.target.basis(self.values)
+        self._share([*self.batches.points, log_g, *basis])
         log_ess = 2 * sums[0] - sums[1]
         of_these = np.exp(log_ess)[-len(counts) :]
         return float(np.median(of_these))
@@ -343,8 +349,9 @@ class Design(Bound):
     def _place(
         self, components: Sequence[Floats], n: int, seed: int
     ) -> tuple[list[Floats], Floats]:
-        """Return n points, one from each population of a stratified list, and how often each component was used.
+        """Return n points, and how often each component of the mixture was used.
 
+        One point comes from each population of a stratified list.
         Scrambled Sobol points go through the inverse distribution functions where they exist.
         """
         k = len(components[0])
@@ -363,7 +370,7 @@ class Design(Bound):
     def _equal_mass(
         self, components: Sequence[Floats], n: int, seed: int
     ) -> tuple[list[Floats], Floats]:
-        """Return n points of one input that cut the mixture over all components into parts of equal mass."""
+        """Return n points of one input that cut the whole mixture into parts of equal mass."""
         n_draft = min(_DRAFT * n, _LARGEST_DRAFT)
         (draft,), counts = self._place(components, n_draft, seed)
         grid = np.unique(draft[np.isfinite(draft)])
@@ -387,20 +394,22 @@ class Design(Bound):
         *,
         summed: bool = True,
     ) -> tuple[Floats, Floats]:
-        """Return the log density of a mixture at points, (n,), and log sums of its components' weights, (2, k).
+        """Return log density of a mixture at points, (n,), and log sums of weights, (2, k).
 
         The sums over the points, if they are asked for, are of the weights, component over mixture,
         and of their squares.
         """
         used = counts > 0
-        log_share = np.log(counts[used, None] / counts.sum())
+        share = counts[used, None] / counts.sum()
+        log_share = np.log(share)
         n = len(points[0])
         log_g = np.empty(n)
         sums = np.full((2, counts.size), -np.inf)
         step = max(1, _CHUNK // counts.size)
         for start in range(0, n, step):
             chunk = slice(start, start + step)
-            (logs,) = self._log_density(*components, *(p[chunk] for p in points))
+            here = [p[chunk] for p in points]
+            (logs,) = self._log_density(*components, *here)
             log_g[chunk] = _log_sum(logs[used] + log_share, axis=0)
             if summed:
                 log_weights = logs - log_g[chunk]
@@ -432,7 +441,9 @@ class Design(Bound):
     def _share(self, arrays: Sequence[Any]) -> None:
         """Hand arrays to the compiled graphs, which read shared variables of any length."""
         if not self._shared:
-            self._shared = [pytensor.shared(a, shape=(None,) * a.ndim) for a in arrays]
+            for array in arrays:
+                of_any_length = (None,) * array.ndim
+                self._shared.append(pytensor.shared(array, shape=of_any_length))
         for shared, array in zip(self._shared, arrays, strict=True):
             shared.set_value(array)
 
@@ -441,28 +452,34 @@ class Design(Bound):
     @cached_property
     def _log_density(self) -> Any:
         symbols = self.inputs.placeholders()
-        points = [
-            pt.tensor(dtype=x.dtype, shape=(None,) * (x.type.ndim + 1))
-            for x in self.inputs.aleatory
-        ]
+        points = []
+        for x in self.inputs.aleatory:
+            shape = (None,) * (x.type.ndim + 1)
+            points.append(pt.tensor(dtype=x.dtype, shape=shape))
         dists, _ = self.inputs.rebuilt(symbols)
-        return compile_batched(symbols, [log_density(self.inputs, dists, points)], points)
+        density = log_density(self.inputs, dists, points)
+        return compile_batched(symbols, [density], points)
 
     @cached_property
     def _quantiles(self) -> Any:
         symbols = self.inputs.placeholders()
-        uniforms = [pt.tensor(dtype="float64", shape=x.type.shape) for x in self.inputs.aleatory]
+        shapes = [x.type.shape for x in self.inputs.aleatory]
+        uniforms = [pt.tensor(dtype="float64", shape=shape) for shape in shapes]
         dists, _ = self.inputs.rebuilt(symbols)
-        pairs = zip(dists, uniforms, strict=True)
-        placed = [quantiles(self.name, d, u[None])[0] for d, u in pairs]
+        placed = []
+        for dist, uniform in zip(dists, uniforms, strict=True):
+            points = quantiles(self.name, dist, uniform[None])
+            placed.append(points[0])
         return compile_batched([*symbols, *uniforms], placed)
 
     def log_weights(self, params: Sequence[Any]) -> TensorVariable:
         """Return log p(x given theta) - log g(x) at the design points, shape (n,)."""
         k = len(self.inputs.aleatory)
-        points, log_g = self._shared[:k], self._shared[k]
+        points = self._shared[:k]
+        log_g = self._shared[k]
         dists, _ = self.inputs.rebuilt(params)
-        return log_density(self.inputs, dists, points) - log_g
+        log_p = log_density(self.inputs, dists, points)
+        return log_p - log_g
 
     @cached_property
     def _log_weights(self) -> Any:
@@ -476,9 +493,11 @@ class Design(Bound):
         supported = top > -np.inf
         # PyTensor's softmax is compiled with a backend of its own; the largest only guards against
         # overflow.
-        raw = pt.exp(pt.switch(supported, logs - disconnected_grad(top), 0.0))
+        centred = logs - disconnected_grad(top)
+        raw = pt.exp(pt.switch(supported, centred, 0.0))
         weights = raw / raw.sum()
-        basis = tuple(self._shared[len(self.inputs.aleatory) + 1 :])
+        after_points_and_log_g = len(self.inputs.aleatory) + 1
+        basis = tuple(self._shared[after_points_and_log_g:])
         if self.target.symbolic:
             features = self.target.from_basis(weights, basis, pt)
             value = self.target.outer(*features, xp=pt)
@@ -490,7 +509,8 @@ class Design(Bound):
         """Return the stored responses and their weights at given roots."""
         (logs,) = self._log_weights(*params)
         top = logs.max(axis=-1, keepdims=True)
-        weights = np.exp(logs - np.where(np.isfinite(top), top, 0.0))
+        top = np.where(np.isfinite(top), top, 0.0)
+        weights = np.exp(logs - top)
         total = weights.sum(axis=-1, keepdims=True)
         with np.errstate(invalid="ignore"):
             weights = weights / total
@@ -507,7 +527,8 @@ class Design(Bound):
         _, weights = self.populations(params)
         supported = np.isfinite(weights).all(axis=-1)
         weights = np.where(supported[:, None], weights, 1 / self.n_points)
-        found = target.outer(*target.from_basis(weights, basis, np), xp=np)
+        features = target.from_basis(weights, basis, np)
+        found = target.outer(*features, xp=np)
         return np.where(supported, found, np.inf)
 
     def support(self, params: Sequence[Any]) -> dict[str, Floats]:
@@ -523,7 +544,8 @@ class Design(Bound):
         (logs,) = self._log_weights(*params)
         total = _log_sum(logs, axis=-1)
         squares = _log_sum(2 * logs, axis=-1)
-        without_response = _log_sum(logs[..., np.isnan(self.values)], axis=-1)
+        failed = np.isnan(self.values)
+        without_response = _log_sum(logs[..., failed], axis=-1)
         with np.errstate(invalid="ignore"):
             ess = np.exp(2 * total - squares)
             lost = np.exp(without_response - total)
@@ -551,5 +573,6 @@ def _log_sum(logs: Floats, axis: int) -> Floats:
     top = logs.max(axis=axis, keepdims=True, initial=-np.inf)
     top = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide="ignore"):
-        total = np.log(np.exp(logs - top).sum(axis=axis))
+        relative = np.exp(logs - top)
+        total = np.log(relative.sum(axis=axis))
     return np.asarray(total + top.squeeze(axis))

@@ -268,7 +268,8 @@ def _failed(calling: Calling, raised: dict[int, str]) -> ResponseError:
         kept = f"; {len(calling.store)} responses are kept in {calling.store.folder}"
     return ResponseError(
         f"{calling.name}: the response failed at {len(raised)} point(s): {first}{kept}; "
-        "repair it, or pass on_failure=prb.response.Replace() or prb.response.Retry() to the propagation or surrogate"
+        "repair it, or pass on_failure=prb.response.Replace() or prb.response.Retry() "
+        "to the propagation or surrogate"
     )
 
 

@@ -214,8 +214,9 @@ with pm.Model():
     optimum = prb.minimize(start={"mu": 0.8, "sigma": 0.7})
 assert optimum.converged, optimum.message
 assert abs(optimum.point["mu"] - 1) < 4 * optimum.stderr["mu"], optimum
-status = Path("/proc/self/status").read_text()  # ru_maxrss would begin with the size of the process
-that began this one print(int(status.split("VmHWM:")[1].split()[0]) / 2**20)
+# ru_maxrss would begin with the size of the process that began this one.
+status = Path("/proc/self/status").read_text()
+print(int(status.split("VmHWM:")[1].split()[0]) / 2**20)
 """
 
 

@@ -14,7 +14,6 @@ import prbayes as prb
 from prbayes.model.description import (
     as_attribute,
     describe,
-    element_name,
     from_attributes,
     without_addresses,
 )
@@ -124,12 +123,6 @@ def test_configurations_read_the_same_in_every_session() -> None:
     metric = prb.FunctionMetric(lambda simulated, observed: 0.0)
     assert "0x" not in without_addresses(metric)
     assert "<lambda>" in without_addresses(metric)
-
-
-def test_names_of_elements() -> None:
-    assert element_name("mu", ()) == "mu"
-    assert element_name("mu", (1,)) == "mu[1]"
-    assert element_name("C", (0, 2)) == "C[0,2]"
 
 
 def test_a_variable_is_computed_from_those_next_above_it() -> None:
