@@ -120,7 +120,7 @@ def rub(metric, observed, surrogate, first, knowledge):
 
 
 def sampled(model, metric, epsilon):
-    """Return the posterior, around an optimum that the prior holds where the data are blind."""
+    """Return the posterior, around an optimum that the prior holds where the data see nothing."""
     prb.set_epsilon(model, epsilon)
     center = prb.minimize(model, prior=True, progressbar=False)
     draws = 150 if isinstance(metric, prb.LogLikelihood) else 500
