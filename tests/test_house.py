@@ -309,6 +309,7 @@ INNER = {
         "pytensor.compile.function",
         "pytensor.tensor.variable.TensorVariable",
     },
+    "propagation.edges": {"pytensor.tensor.variable.TensorVariable"},
     "propagation.reweighted": {
         "pytensor.gradient.disconnected_grad",
         "pytensor.tensor.variable.TensorVariable",

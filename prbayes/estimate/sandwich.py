@@ -24,8 +24,8 @@ from prbayes.model.node import Node
 
 # Step of differences of densities, which are twice differentiable, in prior standard deviations.
 _STEP = 1e-3
-# The same where a distribution function of simulated values, a step function, or a jump is
-# differenced.
+# The same where a distribution function of simulated values, a step function, a jump or an edge of
+# the support is differenced.
 _WIDE_STEP = 0.05
 # Knots on which distribution functions are linearised.
 _KNOTS = 400
@@ -114,13 +114,15 @@ class Information:
     @property
     def jumps(self) -> bool:
         """Whether points lose their response close to theta, where a smooth discrepancy jumps."""
-        return self._target.differentiable and self._stencil.share > _STEP
+        smooth = self._target.differentiable and not self.node.bound.stored
+        return smooth and self._stencil.share > _STEP
 
     @cached_property
     def _stencil(self) -> Stencil:
         """The populations around theta, as close as the discrepancy can be differenced."""
         if self.node.bound.stored:
-            return self._around(_STEP)
+            # Over several points of those that an edge passes one after the other.
+            return self._around(self.wide if self.node.bound.support_moves else _STEP)
         if self._target.differentiable:
             narrow = self._around(_STEP)
             finite = np.isfinite(narrow.values)

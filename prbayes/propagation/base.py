@@ -57,6 +57,9 @@ class Bound(ABC):
         response.
     random : bool
         Whether every evaluation draws anew, so that the discrepancy is random and has no gradient.
+    support_moves : bool
+        Whether points are inside the population's support at some thetas and outside at others, so
+        that their weights change along an edge only.
     is_line : bool
         Whether the points are a quadrature rule of one dimension, whose error falls like 1 / n.
     draws : int
@@ -68,6 +71,7 @@ class Bound(ABC):
     symbolic: bool = False
     stored: ClassVar[bool] = False
     random: ClassVar[bool] = False
+    support_moves: bool = False
     draws: int = 0
     _probed: Floats = np.empty(0)
 

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -23,6 +23,7 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes.metrics.base import Discrepancy
 from prbayes.propagation.base import N_BLOCKS, Bound, Propagation, refuse_all_nan, refuse_nested
+from prbayes.propagation.edges import averaged_log_density, cells_around, moving_inputs
 from prbayes.propagation.ops import OpaqueOp
 from prbayes.propagation.points import base_points
 from prbayes.response.compilation import compile_batched
@@ -46,6 +47,9 @@ _CHUNK = 1 << 22
 _OTHER_RESPONSES = 32
 # Batches differ in their seeds by a prime, so that seeds 0, 1, 2, ... of a user share no batch.
 _SEED_STEP = 7919
+# Neighbours on either side in the cells of an input whose support moves, beside other inputs: its
+# points then pass an edge some at a time, as their weights differ. On a line the cells meet.
+_NEIGHBOURS = 8
 # Inputs beyond which the weights become so uneven that another propagation is recommended
 # (docs/choose.md).
 _MANY_INPUTS = 4
@@ -179,6 +183,7 @@ class Design(Bound):
         self._shared: list[Any] = []
         self._basis: tuple[Any, int, Any] = (None, 0, None)
         self._others: deque[tuple[Responses, Floats]] = deque(maxlen=_OTHER_RESPONSES)
+        self._moving: tuple[int, ...] | None = None
         components = prior_draws(inputs.roots, min(config.n, _COMPONENTS), config.random_seed)
         size = self.add(components)
         refuse_all_nan(name, self.values)
@@ -332,6 +337,7 @@ class Design(Bound):
         components = self.valid_only(components)
         place = self._equal_mass if self.is_line else self._place
         points, counts = place(components, n, seed)
+        points = self._off_the_edges(points, components, counts)
         values = self.responses(points, [])
         batch = Batches(tuple(points), values, tuple(components), counts, (n,))
         self._stored = batch if self._stored is None else self._stored.followed_by(batch)
@@ -340,11 +346,23 @@ class Design(Bound):
         log_g, sums = self._log_mixture(
             self.batches.components, self.batches.counts, self.batches.points
         )
+        if self._moving is None:
+            self._moving = moving_inputs(self.name, self.inputs, components, points)
+            self.support_moves = bool(self._moving)
         basis = self.target.basis(self.values)
-        self._share([*self.batches.points, log_g, *basis])
+        self._share([*self.batches.points, log_g, *self._cell_ends(), *basis])
         log_ess = 2 * sums[0] - sums[1]
         of_these = np.exp(log_ess)[-len(counts) :]
         return float(np.median(of_these))
+
+    def _cell_ends(self) -> list[Floats]:
+        """Return lower and upper ends of the points' cells, of each input whose support moves."""
+        reach = 1 if self.is_line else _NEIGHBOURS
+        found = []
+        for i in self._moving or ():
+            cells = cells_around(self.batches.points[i], reach)
+            found += [cells.lower, cells.upper]
+        return found
 
     def _place(
         self, components: Sequence[Floats], n: int, seed: int
@@ -375,16 +393,30 @@ class Design(Bound):
         (draft,), counts = self._place(components, n_draft, seed)
         grid = np.unique(draft[np.isfinite(draft)])
         log_g, _ = self._log_mixture(components, counts, [grid], summed=False)
-        density = np.exp(log_g)
-        # The distribution function by trapezoids, inverted at levels that are half open at a random
-        # place.
-        both_ends = density[1:] + density[:-1]
-        trapezoids = 0.5 * both_ends * np.diff(grid)
-        mass = np.concatenate([[0.0], np.cumsum(trapezoids)])
         shift = np.random.default_rng(seed).uniform()
         levels = (np.arange(n) + shift) / n
-        points = np.interp(levels * mass[-1], mass, grid)
+        points = _inverted(levels, grid, np.exp(log_g))
         return [points], counts * (n / counts.sum())
+
+    def _off_the_edges(
+        self, points: Sequence[Floats], components: Sequence[Floats], counts: Floats
+    ) -> list[Floats]:
+        """Return points, moved by a rounding where the density is infinite.
+
+        Quantiles may be rounded to the edge of a support, where densities such as that of
+        ``Beta.dist(1, 0.5)`` have no finite value.
+        """
+        log_g, _ = self._log_mixture(components, counts, points, summed=False)
+        infinite = np.isposinf(log_g)
+        moved = list(points)
+        if infinite.any():
+            for i, x in enumerate(moved):
+                if x.dtype.kind == "f":
+                    inside = np.nextafter(x, np.median(x, axis=0))
+                    x = x.copy()
+                    x[infinite] = inside[infinite]
+                    moved[i] = x
+        return moved
 
     def _log_mixture(
         self,
@@ -478,7 +510,11 @@ class Design(Bound):
         points = self._shared[:k]
         log_g = self._shared[k]
         dists, _ = self.inputs.rebuilt(params)
-        log_p = log_density(self.inputs, dists, points)
+        averaged = {}
+        for place, i in enumerate(self._moving or ()):
+            lower, upper = self._shared[k + 1 + 2 * place :][:2]
+            averaged[i] = partial(averaged_log_density, lower=lower, upper=upper)
+        log_p = log_density(self.inputs, dists, points, averaged)
         return log_p - log_g
 
     @cached_property
@@ -496,8 +532,8 @@ class Design(Bound):
         centred = logs - disconnected_grad(top)
         raw = pt.exp(pt.switch(supported, centred, 0.0))
         weights = raw / raw.sum()
-        after_points_and_log_g = len(self.inputs.aleatory) + 1
-        basis = tuple(self._shared[after_points_and_log_g:])
+        before_the_basis = len(self.inputs.aleatory) + 1 + 2 * len(self._moving or ())
+        basis = tuple(self._shared[before_the_basis:])
         if self.target.symbolic:
             features = self.target.from_basis(weights, basis, pt)
             value = self.target.outer(*features, xp=pt)
@@ -559,6 +595,30 @@ class Design(Bound):
 def design_of(bound: Bound) -> Design | None:
     """Return a bound as a design if its responses are stored, and else None."""
     return bound if isinstance(bound, Design) else None
+
+
+def _inverted(levels: Floats, grid: Floats, density: Floats) -> Floats:
+    """Return where a distribution function reaches some levels.
+
+    Parameters
+    ----------
+    levels : ndarray, shape (n,)
+    grid : ndarray, shape (m,)
+        Points of the distribution, in order and all different.
+    density : ndarray, shape (m,)
+        At the grid.
+    """
+    share = (np.arange(grid.size) + 0.5) / grid.size
+    both_ends = density[1:] + density[:-1]
+    with np.errstate(invalid="ignore", over="ignore"):
+        trapezoids = 0.5 * both_ends * np.diff(grid)
+        mass = np.concatenate([[0.0], np.cumsum(trapezoids)])
+        off = np.abs(mass / mass[-1] - share).max()
+    # Trapezoids are finer than the share of points below, but where the density is infinite at an
+    # edge, or its peaks lie between points: then the two differ by more than random points would.
+    if off < 1 / np.sqrt(grid.size):
+        return np.interp(levels * mass[-1], mass, grid)
+    return np.interp(levels, share, grid)
 
 
 def _end_to_end(first: Floats, second: Floats) -> Floats:

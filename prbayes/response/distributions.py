@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -24,12 +24,21 @@ from prbayes.response.inputs import Inputs, event_shape, is_random
 
 
 def log_density(
-    inputs: Inputs, aleatory: Sequence[TensorVariable], values: Sequence[Any]
+    inputs: Inputs,
+    aleatory: Sequence[TensorVariable],
+    values: Sequence[Any],
+    instead: Mapping[int, Callable[[TensorVariable, Any], TensorVariable]] | None = None,
 ) -> TensorVariable:
-    """Return log p(x), shape (n,), of values (n, *event), summed over the aleatory inputs."""
+    """Return log p(x), shape (n,), of values (n, *event), summed over the aleatory inputs.
+
+    ``instead`` has, for some of the inputs by their positions, what is taken for their log-density.
+    """
     total: Any = 0.0
-    for dist, x, shape in zip(aleatory, values, inputs.event_shapes, strict=True):
-        if is_mvnormal(dist):
+    triples = zip(aleatory, values, inputs.event_shapes, strict=True)
+    for i, (dist, x, shape) in enumerate(triples):
+        if instead and i in instead:
+            logp = instead[i](dist, x)
+        elif is_mvnormal(dist):
             logp = _mvnormal_logp(dist, x, shape[0])
         else:
             logp = pm.logp(dist, x, warn_rvs=False)

@@ -18,6 +18,7 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import nodes
 from prbayes.model.support import shortcomings
 from prbayes.propagation.reweighted import Design
+from prbayes.response.distributions import PopulationSampler
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 KL, PR, AREA = prb.KullbackLeibler(), prb.ProbabilityResidual(), prb.AreaMetric()
@@ -81,6 +82,43 @@ def test_points_of_one_input_have_equal_mass() -> None:
     # Gaps of 4096 draft points in the outermost parts are bridged by straight lines.
     assert (np.abs(gaps[5:-5] - 1) < 0.1).all()
     assert 0 < mass[0] < 1.5 / 256
+
+
+SINGULAR = {
+    "gamma": lambda: pm.Gamma.dist(mu=10, sigma=pm.HalfNormal("b", 10)),
+    "weibull": lambda: pm.Weibull.dist(pm.HalfNormal("a", 2), pm.HalfNormal("b", 1)),
+    "beta": lambda: pm.Beta.dist(pm.HalfNormal("a", 2), pm.HalfNormal("b", 1)),
+    "pareto": lambda: pm.Pareto.dist(pm.Gamma("a", 2, 0.5), pm.HalfNormal("b", 1)),
+    "far and narrow": lambda: pm.Normal.dist(pm.Normal("a", 1, 50), pm.HalfNormal("b", 1)),
+}
+
+
+@pytest.mark.parametrize("n", [256, 1024])
+@pytest.mark.parametrize("kind", sorted(SINGULAR))
+def test_points_have_equal_mass_where_the_density_is_infinite_or_has_narrow_peaks(
+    kind: str, n: int
+) -> None:
+    with pm.Model() as model:
+        x = SINGULAR[kind]()
+        propagation = prb.Reweighted(n)
+        prb.Simulator("y", same, x, metric=AREA, observed=OBSERVED, propagation=propagation)
+    d = design(model)
+    drawn = PopulationSampler(d.inputs)(d.batches.components, 64, np.random.default_rng(0))
+    population = drawn[0][0].ravel()
+    levels = np.arange(1, 10) / 10
+    share = [np.mean(population <= q) for q in np.quantile(d.values, levels)]
+    np.testing.assert_allclose(share, levels, atol=0.03)
+
+
+def test_a_density_that_is_infinite_at_its_edge_leaves_weights_that_are_numbers() -> None:
+    with pm.Model() as model:
+        x = pm.Beta.dist(1.0, pm.HalfNormal("b", 0.3))
+        y = pm.Normal.dist(0.0, 1.0)
+        prb.Simulator("y", np.add, x, y, metric=AREA, observed=OBSERVED)
+    evaluator = Evaluator(model)
+    mass = evaluator.support(evaluator.prior_thetas(50, 1))["y"]["mean_weight"]
+    assert np.isfinite(mass).all()
+    assert 0.9 < np.median(mass) < 1.1
 
 
 @pytest.mark.exact

@@ -1,0 +1,141 @@
+"""Densities whose support moves with the hyperparameters, averaged over cells around points.
+
+At a stored point the density of ``Uniform.dist(a, a + b)`` does not depend on a until an edge
+passes it, and then it jumps: weights have no derivative where it matters. Its average over a cell
+around the point, a difference of the distribution function, changes while the edge is in the cell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+from pytensor.tensor.variable import TensorVariable
+
+from prbayes._checks import Floats
+from prbayes.response.compilation import compile_batched
+from prbayes.response.distributions import is_mvnormal
+from prbayes.response.inputs import Inputs
+
+# Probability of a cell below which it is the density at the point times the width: the difference
+# of two distribution functions, each rounded to 1e-16, has lost half of its digits there.
+_RESOLVED = 1e-8
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Cells around points of an input, one for each point.
+
+    Attributes
+    ----------
+    lower, upper : ndarray, shapes (n, *event)
+    """
+
+    lower: Floats
+    upper: Floats
+
+
+def moving_inputs(
+    name: str, inputs: Inputs, components: Sequence[Floats], points: Sequence[Floats]
+) -> tuple[int, ...]:
+    """Return which aleatory inputs have a support that moves, by their positions.
+
+    That is, those whose density is zero at some point for some hyperparameters, and is not for
+    others.
+
+    Parameters
+    ----------
+    name : str
+        The simulator's, for messages.
+    inputs : Inputs
+    components : sequence of ndarray, shapes (k, *shape)
+        Values of the roots.
+    points : sequence of ndarray, shapes (n, *event)
+        Of each aleatory input.
+
+    Raises
+    ------
+    TypeError
+        If one is discrete, or PyMC does not know its distribution function.
+    """
+    symbols = inputs.placeholders()
+    dists, _ = inputs.rebuilt(symbols)
+    given = [pt.tensor(dtype=x.dtype, shape=(None, *x.type.shape)) for x in inputs.aleatory]
+    logs = [pm.logp(dist, x, warn_rvs=False) for dist, x in zip(dists, given, strict=True)]
+    outside = [pt.isneginf(log) for log in logs]
+    found = compile_batched(symbols, outside, given)(*components, *points)
+    moving = []
+    k = len(components[0])
+    for i, (x, of_input) in enumerate(zip(points, found, strict=True)):
+        elements = x.shape[: 1 if is_mvnormal(dists[i]) else None]
+        at_each = np.broadcast_to(of_input, (k, *elements))
+        if np.any(at_each.any(axis=0) & ~at_each.all(axis=0)) and not is_mvnormal(dists[i]):
+            _require_distribution_function(name, dists[i])
+            moving.append(i)
+    return tuple(moving)
+
+
+def _require_distribution_function(name: str, dist: TensorVariable) -> None:
+    kind = dist.owner.op
+    refused = (
+        f"{name}: got {kind} with a support that moves with its hyperparameters, expected one that "
+        "stays, or "
+    )
+    if not dist.dtype.startswith("float"):
+        raise TypeError(f"{refused}a continuous distribution; use propagation=prb.Fresh()")
+    try:
+        pm.logcdf(dist, pt.zeros_like(dist), warn_rvs=False)
+    except (NotImplementedError, TypeError, ValueError):
+        raise TypeError(
+            f"{refused}one whose distribution function PyMC knows, since the weights of stored "
+            "responses jump where an edge passes them; use propagation=prb.Resimulated() or "
+            "prb.Fresh()"
+        ) from None
+
+
+def cells_around(points: Floats, reach: int) -> Cells:
+    """Return a cell around each point, of each element by itself.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, *event)
+    reach : int
+        How many neighbours a cell reaches on either side: with one it ends half way to the next.
+
+    Returns
+    -------
+    Cells
+    """
+    flat = points.reshape(len(points), -1)
+    lower, upper = np.empty_like(flat), np.empty_like(flat)
+    for k, column in enumerate(flat.T):
+        order = np.argsort(column, kind="stable")
+        ordered = column[order]
+        half_way = 0.5 * (ordered[1:] + ordered[:-1])
+        rank = np.arange(column.size)
+        below, above = rank - reach, rank + reach - 1
+        low = half_way[np.maximum(below, 0)]
+        high = half_way[np.minimum(above, half_way.size - 1)]
+        # The outermost points are in the middle of theirs.
+        low = np.where(below < 0, 2 * ordered - high, low)
+        high = np.where(above > half_way.size - 1, 2 * ordered - low, high)
+        lower[order, k], upper[order, k] = low, high
+    return Cells(lower.reshape(points.shape), upper.reshape(points.shape))
+
+
+def averaged_log_density(dist: TensorVariable, x: Any, lower: Any, upper: Any) -> TensorVariable:
+    """Return the logarithm of the mean density between two ends, elementwise.
+
+    The density at the point itself where the probability between them is too small for a
+    difference.
+    """
+    at_upper = pt.exp(pm.logcdf(dist, upper, warn_rvs=False))
+    at_lower = pt.exp(pm.logcdf(dist, lower, warn_rvs=False))
+    probability = at_upper - at_lower
+    resolved = (probability > _RESOLVED) & (upper > lower)
+    mean = pt.switch(resolved, probability / (upper - lower), 1.0)
+    return pt.switch(resolved, pt.log(mean), pm.logp(dist, x, warn_rvs=False))
