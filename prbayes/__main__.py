@@ -13,6 +13,7 @@ from typing import Any
 import xarray as xr
 
 from prbayes._demo import run_demo
+from prbayes.model.identity import from_attributes
 from prbayes.reports.report import Report
 from prbayes.validation.validity import ValidityTest
 
@@ -216,6 +217,7 @@ def _test_of(path: Path, dataset: xr.Dataset) -> ValidityTest:
             envelope=dataset[["lower", "upper"]].to_array().values,
             conditions=dataset["condition"].values.astype(str),
             specimens=dataset["specimen"].values.astype(str),
+            identity=from_attributes(dataset.attrs),
         )
     except KeyError as error:
         raise UserError(

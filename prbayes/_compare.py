@@ -20,7 +20,7 @@ from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual
 from prbayes.model.elements import element_name
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.identity import Level, identity_of_model, require_same
+from prbayes.model.identity import as_attributes, require_together
 from prbayes.model.node import nodes
 from prbayes.model.support import shortcomings
 
@@ -64,7 +64,8 @@ def compare(
     Raises
     ------
     TypeError, ValueError
-        If there is no result, one is of another type, or they share no hyperparameter.
+        If there is no result, one is of another type, they share no hyperparameter, or they are of
+        other populations or data than the model or the first of them.
 
     Examples
     --------
@@ -80,7 +81,8 @@ def compare(
         raise ValueError(
             "compare: got no results, expected a dict such as {'optimum': optimum, 'ABC': idata}"
         )
-    _require_one_problem(results, model)
+    identities = {label: identity_in(result) for label, result in results.items()}
+    identity = require_together(identities, "compare", model=model)
     columns = {label: _column(label, result) for label, result in results.items()}
     names = _shared(list(columns.values()), model)
     if not names:
@@ -106,7 +108,8 @@ def compare(
         for key, scores in _scores(model, names, estimates, metrics).items():
             data[key] = ("result", scores)
     coords = {"result": list(columns), "hyperparameter": names}
-    return xr.Dataset(data, coords=coords, attrs={"interval": INTERVAL})
+    attrs = {"interval": INTERVAL, **as_attributes(identity)}
+    return xr.Dataset(data, coords=coords, attrs=attrs)
 
 
 class _Estimate(NamedTuple):
@@ -188,18 +191,6 @@ def _shared(columns: list[_Column], model: pm.Model | None) -> list[str]:
         return names
     free = {rv.name for rv in model.free_RVs}
     return [name for name in names if name.partition("[")[0] in free]
-
-
-def _require_one_problem(results: Mapping[str, Any], model: pm.Model | None) -> None:
-    """Refuse results of other populations than the model's, as far as they tell.
-
-    Without a model, than the first result's.
-    """
-    known = [identity_in(result) for result in results.values()]
-    first = next((identity for identity in known if identity is not None), None)
-    expected = identity_of_model(model) if model is not None and nodes(model) else first
-    for label, identity in zip(results, known, strict=True):
-        require_same(identity, expected, f"compare: {label}", Level.POPULATIONS)
 
 
 def _scores(

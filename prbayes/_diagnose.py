@@ -12,9 +12,10 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._checks import Floats
-from prbayes.estimate.optimum import Optimum
+from prbayes.estimate.optimum import Optimum, require_of_model
 from prbayes.model.elements import element_name
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.identity import Level
 from prbayes.model.node import model_on_context
 from prbayes.model.support import shortcoming
 
@@ -82,6 +83,8 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     ------
     TypeError, KeyError
         If there is no model where one is needed, or the posterior lacks a free variable of it.
+    ValueError
+        If the result is of another problem than the model's.
 
     References
     ----------
@@ -98,6 +101,8 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     >>> print(prb.diagnose(prb.minimize(model)))
     No problem was found.
     """
+    if model is not None:
+        require_of_model(result, model, "diagnose", Level.OPTIMUM)
     if isinstance(result, Optimum):
         return _of_optimum(result)
     if "optimum" in result and "posterior" not in result:
@@ -137,6 +142,7 @@ def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
         designs = _stored(result["calibration"].to_dataset())
     else:
         model = model_on_context(model, "prb.diagnose")
+        require_of_model(result, model, "diagnose", Level.OPTIMUM)
         designs = _computed(Evaluator(model), _thetas(posterior, model))
         variables = variables[[str(rv.name) for rv in model.free_RVs]]
     messages = [

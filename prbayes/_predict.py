@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats, positive_integer
 from prbayes._weighted import reached
-from prbayes.estimate.optimum import Optimum, identity_in
-from prbayes.model.identity import Level, identity_of_model, require_same
+from prbayes.estimate.optimum import Optimum, identity_in, require_of_model
+from prbayes.model.identity import Level, as_attributes, identity_of_model
 from prbayes.model.labels import versions
 from prbayes.model.node import Node, model_on_context, nodes
 from prbayes.model.support import TOLERABLE, shortcoming
@@ -30,7 +30,7 @@ from prbayes.response.calling import ResponseError
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, quantiles
 from prbayes.response.inputs import Inputs, read_inputs
-from prbayes.response.response import Responses, refuse_uncallable
+from prbayes.response.response import Responses, refuse_uncallable, refuse_version
 
 _log = logging.getLogger("prbayes")
 
@@ -50,6 +50,7 @@ def predict(
     name: str | None = None,
     executor: Executor | None = None,
     store: str | PathLike[str] | None = None,
+    version: str | None = None,
     random_seed: int | None = 0,
 ) -> xr.DataArray:
     """Draw responses of the calibrated population.
@@ -89,6 +90,8 @@ def predict(
         Where the response is computed.
     store : path-like, optional
         A folder that keeps every computed response, by ``name``.
+    version : str, optional
+        Of the response, for the store; as for `Reweighted`.
     random_seed : int, optional
 
     Returns
@@ -98,12 +101,13 @@ def predict(
         (how many were computed), ``nan`` (how many values are NaN), ``specimens_id`` (equal for
         predictions with the same specimens), ``calibration_data`` and ``calibration_specimens``
         (digests of the data, and specimen labels, of the calibration, by which `area_test` knows
-        them).
+        them), ``identity`` (of the problem that was calibrated).
 
     Raises
     ------
     TypeError, KeyError, ValueError
-        If an argument is not as described, or the result lacks a free variable.
+        If an argument is not as described, or the result lacks a free variable, or is of other
+        populations or data than the model.
     DesignError
         If the design points do not support the populations.
     ResponseError
@@ -135,11 +139,13 @@ def predict(
     model = model_on_context(model, "prb.predict")
     label = _label(response, name, store)
     if not (isinstance(result, Optimum) and model is result.model):
-        identity = identity_of_model(model)
-        require_same(identity_in(result), identity, "prb.predict", Level.POPULATIONS)
+        require_of_model(result, model, "prb.predict", Level.POPULATIONS)
     points, coords = populations_of(result, model, draws, "prb.predict")
     sorted_inputs = read_inputs(label, inputs, model)
-    responses = Responses(label, response, sorted_inputs, executor=executor, store=store)
+    refuse_version(version)
+    responses = Responses(
+        label, response, sorted_inputs, executor=executor, store=store, version=version
+    )
     rng = np.random.default_rng(random_seed)
     node = serving(list(nodes(model).values()), responses) if stored else None
     if node is None:
@@ -159,6 +165,7 @@ def predict(
             "specimens_id": _digest(*drawn.specimens),
             "random_seed": str(random_seed),
             **_calibration(result, model),
+            **as_attributes(identity_in(result) or identity_of_model(model)),
             **versions(),
         },
     )

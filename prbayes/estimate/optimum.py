@@ -15,7 +15,15 @@ from prbayes.estimate.obstacles import refit_obstacle, sampling_obstacle
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.identity import Identity, as_attributes, from_attributes
+from prbayes.model.identity import (
+    Identity,
+    Level,
+    as_attributes,
+    from_attributes,
+    identity_of,
+    identity_of_model,
+    require_same,
+)
 from prbayes.model.labels import labelled, observed_dataset, versions
 
 
@@ -78,6 +86,8 @@ class Optimum:
     at_jump : tuple of str
         Simulators whose discrepancy jumps at the optimum, since points lose their response there:
         nothing is known of standard errors.
+    prior : bool
+        Whether minus the log prior was part of the objective.
     identity : Identity or None
         Of the problem that was solved, by which it is known again.
     """
@@ -104,6 +114,7 @@ class Optimum:
     warnings: tuple[str, ...] = ()
     at_edge: tuple[str, ...] = ()
     at_jump: tuple[str, ...] = ()
+    prior: bool = False
     identity: Identity | None = None
 
     def __repr__(self) -> str:
@@ -113,10 +124,10 @@ class Optimum:
             for name, value in self.point.items()
         ]
         state = "converged" if self.converged else "NOT converged"
+        what = "Optimum with the prior" if self.prior else "Optimum"
+        head = f"{what}: discrepancy {self.discrepancy:.4g} after"
         cost = f"{self.n_evaluations} evaluations, {self.n_responses} responses, {state}"
-        return "\n  ".join(
-            [f"Optimum: discrepancy {self.discrepancy:.4g} after {cost}", *found, *self.warnings]
-        )
+        return "\n  ".join([f"{head} {cost}", *found, *self.warnings])
 
     @property
     def model(self) -> pm.Model:
@@ -143,7 +154,8 @@ class Optimum:
         Raises
         ------
         ValueError
-            If nothing is known around the optimum: it is at the edge of a support, or at a jump.
+            If nothing is known around the optimum: it is at the edge of a support, or at a jump; or
+            if the prior was part of it, or the model has changed since.
         TypeError
             If a metric declares nothing of its minimum, or a discrepancy is random.
         """
@@ -151,6 +163,7 @@ class Optimum:
         obstacle = sampling_obstacle(self.evaluator)
         if obstacle is not None:
             raise TypeError(f"sampling: {obstacle}")
+        require_minimiser(self, "sampling")
         scales = np.array(list(self.scales.values()))
         return SamplingDistribution.of(self.evaluator, self.theta, scales, weakest)
 
@@ -186,9 +199,11 @@ def require_sampling(optimum: Optimum, caller: str) -> Optimum:
 
 
 def identity_in(result: Any) -> Identity | None:
-    """Return the identity that an optimum or a DataTree carries, or None."""
+    """Return the identity that a result carries, an Optimum, a DataTree or a Dataset; or None."""
     if isinstance(result, Optimum):
         return result.identity
+    if isinstance(result, xr.Dataset):
+        return from_attributes(result.attrs)
     if not isinstance(result, xr.DataTree):
         return None
     group = "posterior" if "posterior" in result.children else "optimum"
@@ -203,7 +218,8 @@ def require_refits(optimum: object, caller: str, advice: str) -> Optimum:
     TypeError
         If it is no Optimum.
     ValueError
-        If nothing is known around it, or the model cannot be calibrated anew; then with ``advice``.
+        If nothing is known around it, or the prior was part of it, or the model has changed since,
+        or cannot be calibrated anew; then with ``advice``.
     """
     if not isinstance(optimum, Optimum):
         got = type(optimum).__name__
@@ -211,7 +227,31 @@ def require_refits(optimum: object, caller: str, advice: str) -> Optimum:
     obstacle = refit_obstacle(require_sampling(optimum, caller).evaluator)
     if obstacle is not None:
         raise ValueError(f"{caller}: {obstacle}{advice}")
+    return require_minimiser(optimum, caller)
+
+
+def require_minimiser(optimum: Optimum, caller: str) -> Optimum:
+    """Return an optimum of the discrepancy alone, whose model is the one that was minimised.
+
+    Raises
+    ------
+    ValueError
+        If the prior was part of the objective, or the model has changed since.
+    """
+    expected = identity_of(optimum.evaluator, prior_minimised=False)
+    require_same(optimum.identity, expected, caller)
     return optimum
+
+
+def require_of_model(result: Any, model: pm.Model, caller: str, level: Level) -> None:
+    """Raise if a result is of another problem than a model's.
+
+    Raises
+    ------
+    ValueError
+        With all that differs.
+    """
+    require_same(identity_in(result), identity_of_model(model), caller, level)
 
 
 def plain(value: Any) -> Any:
@@ -225,6 +265,7 @@ def optimum_tree(optimum: Optimum) -> xr.DataTree:
     attrs = {
         "discrepancy": optimum.discrepancy,
         "converged": int(optimum.converged),
+        "prior": int(optimum.prior),
         "message": optimum.message,
         "n_evaluations": optimum.n_evaluations,
         "n_screened": optimum.n_screened,
@@ -233,7 +274,7 @@ def optimum_tree(optimum: Optimum) -> xr.DataTree:
         "warnings": "\n".join(optimum.warnings),
         **versions(),
         **as_attribute(optimum.model),
-        **({} if optimum.identity is None else as_attributes(optimum.identity)),
+        **as_attributes(optimum.identity),
     }
     groups = {
         "optimum": labelled(evaluator, optimum.point, {}).assign_attrs(attrs),

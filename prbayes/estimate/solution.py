@@ -80,6 +80,7 @@ def assemble(
             "discrepancy": np.array(run.trace.values),
             "evaluations": np.array(run.trace.counts, dtype=np.int64),
         },
+        prior=search.prior,
         identity=identity_of(evaluator, prior_minimised=search.prior),
     )
 

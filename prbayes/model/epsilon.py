@@ -8,7 +8,8 @@ import numpy as np
 import pymc as pm
 
 from prbayes._checks import positive_number
-from prbayes.model.identity import Identity, identity_of_model, require_same
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.identity import Identity, identity_of, require_same
 from prbayes.model.node import Node, required_nodes
 
 
@@ -41,7 +42,7 @@ def checked_epsilon(
     if unknown:
         raise KeyError(f"epsilon: got {unknown}, expected names of simulators: {sorted(names)}")
     if isinstance(epsilon, Epsilon):
-        require_same(epsilon.identity, identity_of_model(model), caller)
+        require_same(epsilon.identity, identity_of(Evaluator(model)), caller)
     found = {}
     for name, value in epsilon.items():
         found[name] = positive_number(value, f"{name}: epsilon")

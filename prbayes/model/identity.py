@@ -45,9 +45,11 @@ class Level(IntEnum):
     POPULATIONS
         Hyperparameters, data, inputs and responses, so that a population of one is a population of
         the other.
+    PRIORS
+        And priors and other likelihood terms.
     OPTIMUM
-        And priors, other likelihood terms, metrics and propagations: what is minimised. A design
-        that has grown since is the same problem.
+        And metrics and propagations, and whether the prior was part of it: what is minimised. A
+        design that has grown since is the same problem.
     POSTERIOR
         And epsilon.
     RUN
@@ -55,14 +57,16 @@ class Level(IntEnum):
     """
 
     POPULATIONS = 1
-    OPTIMUM = 2
-    POSTERIOR = 3
-    RUN = 4
+    PRIORS = 2
+    OPTIMUM = 3
+    POSTERIOR = 4
+    RUN = 5
 
 
 # What to do about a difference.
 _REMEDIES = {
     Level.POPULATIONS: "pass the model that the result was made from, or make the result anew",
+    Level.PRIORS: "pass the model that the result was made from, or make the result anew",
     Level.OPTIMUM: "call prb.minimize on this model, and use that optimum",
     Level.POSTERIOR: "sample this model anew",
     Level.RUN: "start a new run",
@@ -269,8 +273,10 @@ def from_text(text: str) -> Identity:
     return Identity(shapes=shapes, simulators=tuple(simulators), thetas=thetas, **found)
 
 
-def as_attributes(identity: Identity) -> dict[str, str]:
-    """Return an identity as an attribute of a file; none where it is too long for one."""
+def as_attributes(identity: Identity | None) -> dict[str, str]:
+    """Return an identity as an attribute of a file; none where it is unknown or too long."""
+    if identity is None:
+        return {}
     text = as_text(identity)
     return {"identity": text} if len(text) <= _LONGEST else {}
 
@@ -319,6 +325,39 @@ def require_same(
         )
 
 
+def require_together(
+    identities: Mapping[str, Identity | None],
+    caller: str,
+    *,
+    model: pm.Model | None = None,
+    level: Level = Level.POPULATIONS,
+) -> Identity | None:
+    """Return the identity of a model, or else of the first result that has one.
+
+    Parameters
+    ----------
+    identities : mapping
+        Of results, by their labels.
+    caller : str
+        For the message.
+    model : pymc.Model, optional
+        Nothing is asked of one without a simulator.
+    level : Level
+
+    Raises
+    ------
+    ValueError
+        If one of the results is of another problem.
+    """
+    known = [identity for identity in identities.values() if identity is not None]
+    expected = known[0] if known else None
+    if model is not None and nodes(model):
+        expected = identity_of_model(model)
+    for label, identity in identities.items():
+        require_same(identity, expected, f"{caller}: {label}", level)
+    return expected
+
+
 def differences(got: Identity, expected: Identity, level: Level) -> list[str]:
     """Return in what two problems differ, as far as a level asks for it, in words.
 
@@ -336,8 +375,10 @@ def differences(got: Identity, expected: Identity, level: Level) -> list[str]:
         # Design points are drawn through the priors: with others, other responses are known.
         comparable = not priors and a.propagation == b.propagation
         found += _population_differences(a, b, comparable=comparable)
-    if level >= Level.OPTIMUM:
+    if level >= Level.PRIORS:
         found += priors
+    if level >= Level.OPTIMUM:
+        found += _minimised_differences(got.prior_minimised, expected.prior_minimised)
         for a, b in pairs:
             found += _discrepancy_differences(a, b)
     if level >= Level.POSTERIOR:
@@ -390,6 +431,15 @@ def _prior_differences(got: Identity, expected: Identity) -> list[str]:
     elif not _close(got.log_other, expected.log_other):
         found.append("other likelihood terms, or potentials, have other values")
     return found
+
+
+def _minimised_differences(got: bool | None, expected: bool | None) -> list[str]:
+    if None in (got, expected) or got == expected:
+        return []
+    with_prior = "an optimum of discrepancy and prior together (prior=True)"
+    without = "one of the discrepancy alone"
+    told = (with_prior, without) if got else (without, with_prior)
+    return [f"got {told[0]}, expected {told[1]}"]
 
 
 def _discrepancy_differences(a: SimulatorIdentity, b: SimulatorIdentity) -> list[str]:

@@ -108,6 +108,7 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         sorted_inputs,
         executor=propagation.executor,
         store=propagation.store,
+        version=propagation.version,
         on_failure=propagation.on_failure,
     )
     bound = propagation.bind(name, sorted_inputs, target, responses)

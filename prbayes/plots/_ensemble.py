@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats
 from prbayes._predict import populations_of
-from prbayes.estimate.optimum import Optimum
+from prbayes.estimate.optimum import Optimum, require_of_model
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.identity import Level
 from prbayes.model.node import model_on_context
 from prbayes.propagation.base import DesignError
 
@@ -107,6 +108,8 @@ def read_result(
     ------
     TypeError, KeyError
         If the result is of another type, or lacks a free variable of the model.
+    ValueError
+        If it is of other populations or data than the model.
     DesignError
         If stored responses do not support most of the populations.
     """
@@ -128,7 +131,9 @@ def _evaluator_of(result: Optimum | xr.DataTree, model: pm.Model | None, caller:
     """Return the optimum's own evaluator, or one of the model given or on the context."""
     if isinstance(result, Optimum) and (model is None or model is result.model):
         return result.evaluator
-    return Evaluator(model_on_context(model, caller))
+    found = model_on_context(model, caller)
+    require_of_model(result, found, caller, Level.POPULATIONS)
+    return Evaluator(found)
 
 
 def _affordable(cost: int) -> int:

@@ -9,8 +9,9 @@ import numpy as np
 import pymc as pm
 
 from prbayes._checks import Floats, positive_integer
-from prbayes.estimate.optimum import Optimum
+from prbayes.estimate.optimum import Optimum, require_of_model
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.identity import Level
 from prbayes.plots._canvas import BLUE, CROSS, DIAMOND, INK, VERMILION, Canvas, Panel
 from prbayes.plots._grid import Landscape, landscape, rooted
 from prbayes.plots._names import named
@@ -74,7 +75,8 @@ def plot_landscape(
     Raises
     ------
     TypeError, KeyError, ValueError
-        If an argument is not as described, or it would compute more responses than allowed.
+        If an argument is not as described, it would compute more responses than allowed, or the
+        optimum is of other populations or data than the model.
 
     Examples
     --------
@@ -131,6 +133,7 @@ def _evaluator_of(optimum: Optimum, model: pm.Model | None) -> Evaluator:
     """Return the optimum's own evaluator, or one of another model with the same hyperparameters."""
     if model is None or model is optimum.model:
         return optimum.evaluator
+    require_of_model(optimum, model, "plot_landscape", Level.POPULATIONS)
     evaluator = Evaluator(model)
     simulators = [node.name for node in evaluator.nodes]
     expected = list(optimum.scales)

@@ -62,7 +62,7 @@ def plot_population(
     ------
     TypeError, KeyError, ValueError
         If an argument is not as described, there is no such input, or the result lacks a free
-        variable.
+        variable, or is of other populations or data than the model.
 
     Examples
     --------

@@ -11,9 +11,10 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._checks import Floats
-from prbayes.estimate.optimum import Optimum
+from prbayes.estimate.optimum import Optimum, identity_in, require_of_model
 from prbayes.model.elements import split_elements
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.identity import Level, require_together
 from prbayes.plots._canvas import BLUE, DASHED, DIAMOND, DOTTED, GREY, VERMILION, Canvas, Panel
 from prbayes.plots._curves import bounded_density, central_levels, normal_density
 from prbayes.plots._names import named, point_elements
@@ -73,7 +74,8 @@ def plot_posterior(
     Raises
     ------
     TypeError, KeyError, ValueError
-        If an argument is not as described, or nothing is left to draw.
+        If an argument is not as described, or nothing is left to draw; if the optimum is of other
+        populations or data than the posterior, or the model has other priors.
 
     Examples
     --------
@@ -90,7 +92,7 @@ def plot_posterior(
     >>> list(prb.plot_posterior(posterior, optimum, model=model, backend="none").viz["posterior"])
     ['mu']
     """
-    _check_results(posterior, optimum)
+    _check_results(posterior, optimum, model)
     check_level(level)
     found = _read_hyperparameters(posterior, optimum, model)
     canvas = Canvas(list(found), size=(4.6, 3.6), backend=backend, pc_kwargs=pc_kwargs)
@@ -102,7 +104,8 @@ def plot_posterior(
     return canvas.finish()
 
 
-def _check_results(posterior: Any, optimum: Any) -> None:
+def _check_results(posterior: Any, optimum: Any, model: pm.Model | None) -> None:
+    """Refuse what is of another kind, an optimum of other populations, and other priors."""
     if not isinstance(posterior, xr.DataTree) or "posterior" not in posterior:
         raise TypeError(
             f"plot_posterior: got {type(posterior).__name__}, expected a DataTree with a "
@@ -113,6 +116,10 @@ def _check_results(posterior: Any, optimum: Any) -> None:
             f"plot_posterior: optimum: got {type(optimum).__name__}, expected an Optimum from "
             "prb.minimize"
         )
+    identities = {"posterior": identity_in(posterior), "optimum": identity_in(optimum)}
+    require_together(identities, "plot_posterior")
+    if model is not None:
+        require_of_model(posterior, model, "plot_posterior", Level.PRIORS)
 
 
 @dataclass(frozen=True, eq=False)

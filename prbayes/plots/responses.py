@@ -90,7 +90,8 @@ def plot_responses(
     Raises
     ------
     TypeError, KeyError, ValueError
-        If an argument is not as described, or the result lacks a free variable of the model.
+        If an argument is not as described, or the result lacks a free variable of the model, or is
+        of other populations or data.
     DesignError
         If stored responses do not support the populations.
 

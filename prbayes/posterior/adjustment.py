@@ -14,6 +14,12 @@ from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 
+# Standard errors from which on a minimiser is elsewhere than where its sampling distribution was
+# taken: an optimum by itself is within a hundredth of one, one that the prior held may be far off.
+# By judgement.
+_ELSEWHERE = 1.0
+# Times that it is followed; one or two arrive.
+_STEPS = 5
 # Draws of a mode below which it is left as it is: a covariance needs some.
 _FEWEST = 50
 # Ratio of distances to two modes below which a draw is between them.
@@ -185,10 +191,26 @@ def _identified_modes(evaluator: Evaluator, optima: Sequence[Floats]) -> list[Sa
     scales = evaluator.epsilon
     found = []
     for theta in optima:
-        sampling = SamplingDistribution.of(evaluator, theta, scales, _WEAKEST)
+        sampling = _at_minimiser(SamplingDistribution.of(evaluator, theta, scales, _WEAKEST))
         if sampling.stderr.size:
             found.append(sampling)
     return found
+
+
+def _at_minimiser(sampling: SamplingDistribution) -> SamplingDistribution:
+    """Return the distribution at the metric's own minimiser, along what the data identify.
+
+    An optimum that the prior held is elsewhere.
+    """
+    for _ in range(_STEPS):
+        if not sampling.stderr.size:
+            break
+        (center,), _ = sampling.refit(observed_set(sampling.evaluator))
+        if not np.abs(center).max() > _ELSEWHERE:
+            break
+        place = sampling.thetas(center)
+        sampling = SamplingDistribution.of(sampling.evaluator, place, sampling.scales, _WEAKEST)
+    return sampling
 
 
 def _distance(sampling: SamplingDistribution, draws: Floats) -> Floats:

@@ -56,7 +56,8 @@ def bootstrap(
         If ``optimum`` is no Optimum.
     ValueError
         If the data tell less than the prior about a direction, along which the minimiser is
-        anywhere; or if nothing is known of a metric or propagation (`FunctionMetric`, `Fresh`).
+        anywhere; or if nothing is known of a metric or propagation (`FunctionMetric`, `Fresh`); if
+        the prior was part of the optimum, or its model has changed since.
 
     References
     ----------

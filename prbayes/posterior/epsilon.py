@@ -10,12 +10,11 @@ from prbayes._checks import Floats
 from prbayes.estimate.identifiability import seen_by_area, seen_by_curvature
 from prbayes.estimate.measured import Refits
 from prbayes.estimate.obstacles import simulator_obstacle
-from prbayes.estimate.optimum import Optimum, require_sampling
+from prbayes.estimate.optimum import Optimum, require_minimiser, require_sampling
 from prbayes.estimate.sampling import first_order_shifts
 from prbayes.estimate.sandwich import Information, LinearArea
 from prbayes.metrics.base import Minimum
 from prbayes.model.epsilon import Epsilon
-from prbayes.model.identity import identity_of, require_same
 
 # Thetas that carry each simulated data set's posterior.
 _CLOUD = 500
@@ -68,7 +67,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
         minimum: their epsilon has to be given.
     ValueError
         If nothing is known around the optimum (``at_edge`` and ``at_jump`` of `Optimum`), or
-        nothing is identified.
+        nothing is identified; if the prior was part of it, or its model has changed since.
 
     References
     ----------
@@ -94,7 +93,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
             "prb.calibrate_epsilon(prb.minimize(model))"
         )
     evaluator = require_sampling(optimum, "calibrate_epsilon").evaluator
-    require_same(optimum.identity, identity_of(evaluator), "calibrate_epsilon")
+    require_minimiser(optimum, "calibrate_epsilon")
     found = {}
     for k, node in enumerate(evaluator.nodes):
         information = Information(evaluator, k, optimum.theta, n_sets=_SETS)

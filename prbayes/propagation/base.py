@@ -28,7 +28,7 @@ from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, prior_draws, valid
 from prbayes.response.failures import Abort, OnFailure
 from prbayes.response.inputs import Inputs
-from prbayes.response.response import Responses
+from prbayes.response.response import Responses, refuse_version
 
 # Parts of a population's points whose differences tell its error: few enough that each is a design
 # of its own, and their spread is then known to about a quarter, 1 / sqrt(2 (8 - 1)).
@@ -207,6 +207,7 @@ class Propagation(ABC):
 
     executor: Executor | None = field(default=None, repr=False)
     store: str | PathLike[str] | None = field(default=None, repr=False)
+    version: str | None = field(default=None, repr=False)
     on_failure: OnFailure = field(default_factory=Abort, repr=False)
 
     def check(self) -> None:
@@ -218,6 +219,7 @@ class Propagation(ABC):
             raise TypeError(f"executor: got {got}, expected a concurrent.futures.Executor")
         if store is not None and not isinstance(store, str | PathLike):
             raise TypeError(f"store: got {type(store).__name__}, expected the path of a folder")
+        refuse_version(self.version)
         if not isinstance(self.on_failure, OnFailure):
             raise TypeError(
                 f"on_failure: got {type(self.on_failure).__name__} {self.on_failure!r:.60}, "

@@ -33,7 +33,7 @@ class Fresh(Propagation):
         Number of draws for each theta.
     random_seed : int
         Seed of the generator that belongs to the simulator.
-    executor, store, on_failure
+    executor, store, version, on_failure
         As for `Reweighted`.
 
     Examples

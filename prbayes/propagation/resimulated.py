@@ -44,7 +44,7 @@ class Resimulated(Propagation):
         Scrambled Sobol points, random numbers that are the same for each theta, or a function
         ``points(n, dimensions, seed)`` that returns points in the open unit cube, shape (n,
         dimensions).
-    executor, store, on_failure
+    executor, store, version, on_failure
         As for `Reweighted`.
 
     Examples

@@ -76,7 +76,12 @@ class Reweighted(Propagation):
         process by default.
     store : path-like, optional
         A folder that keeps every computed response, by simulator: none is computed again, also in
-        another run.
+        another run; but one, each time that a simulator is made, to see that the response is still
+        the same one: code, or variables of a closure, may have changed, which is refused.
+    version : str, optional
+        Names the response as it is, such as ``"2"`` or ``"mesh 3"``: runs of different versions are
+        kept apart in the store, and none is computed again. You then answer for a new name whenever
+        the response changes; needed for one that is random, or minutes long.
     on_failure : Abort, Replace or Retry
         What to do with a response that raises or is NaN.
 

@@ -46,7 +46,13 @@ def _how_it_ended(attrs: Mapping[Any, Any]) -> str:
     ended = "converged" if attrs.get("converged") else "did not converge"
     evaluations = counted(int(attrs.get("n_evaluations", 0)), "evaluation")
     message = str(attrs.get("message", "")).rstrip(".")
-    return f"The optimiser {ended} after {evaluations} of the objective: {message}."
+    told = f"The optimiser {ended} after {evaluations} of the objective: {message}."
+    if not attrs.get("prior"):
+        return told
+    return (
+        f"{told} Minus the log prior was part of the objective: "
+        "the discrepancy alone is smallest elsewhere."
+    )
 
 
 def _other_optimum(rival: Mapping[str, Any]) -> str:

@@ -13,9 +13,10 @@ import xarray as xr
 from prbayes._checks import Floats
 from prbayes._compare import compare
 from prbayes._diagnose import Diagnosis, diagnose
-from prbayes.estimate.optimum import Optimum
+from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.model.description import describe, from_attributes
 from prbayes.model.elements import element_name
+from prbayes.model.identity import Level, differences, identity_of_model, require_together
 from prbayes.model.node import nodes
 from prbayes.validation.validity import ValidityTest
 
@@ -90,7 +91,8 @@ def gather(model: Any, optimum: Any, posterior: Any, validity: Any, comparison: 
     Raises
     ------
     TypeError, ValueError
-        If a result is not what it is given as.
+        If a result is not what it is given as, or of other populations or data than the model or
+        the first of them.
     """
     given = _labelled(optimum, "optimum")
     posteriors = _labelled(posterior, "posterior")
@@ -109,8 +111,14 @@ def gather(model: Any, optimum: Any, posterior: Any, validity: Any, comparison: 
     for label, tree in optima.items():
         _require_optimum(label, tree)
 
-    # Find out what was not given
+    # Refuse what is of different problems
     results = optima | posteriors
+    identities = {label: identity_in(result) for label, result in (results | found).items()}
+    identities |= {label: test.identity for label, test in tests.items()}
+    identities["comparison"] = identity_in(comparison)
+    require_together(identities, "Report", model=model)
+
+    # Find out what was not given
     description = _stored_description(results) if model is None else describe(model)
     if comparison is None and len(results) > 1:
         comparison = _free_only(compare(results | found, model=model), description)
@@ -258,6 +266,17 @@ def _diagnosis(result: Optimum | xr.DataTree, model: pm.Model | None) -> Diagnos
     if isinstance(result, Optimum):
         return diagnose(result)
     stored = "optimum" in result or "calibration" in result
+    # By a metric or prior other than the model's, say: the result then tells by itself.
+    if model is not None and not _is_of(result, model):
+        model = None
     if model is None and not stored:
         return None
     return diagnose(result, model=model)
+
+
+def _is_of(result: xr.DataTree, model: pm.Model) -> bool:
+    """Return whether a result is of a model's very problem, as far as is known."""
+    identity = identity_in(result)
+    if identity is None:
+        return True
+    return not differences(identity, identity_of_model(model), Level.OPTIMUM)

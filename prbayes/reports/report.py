@@ -152,7 +152,8 @@ class Report(_Document):
     Raises
     ------
     TypeError, ValueError
-        If an argument is not as described.
+        If an argument is not as described, or results are of other populations or data than the
+        model or each other.
 
     Examples
     --------

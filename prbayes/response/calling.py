@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 from prbayes._progress import progress
 from prbayes.response.failures import Abort, OnFailure
-from prbayes.response.store import Store
+from prbayes.response.store import Store, StoreError
 
 _log = logging.getLogger("prbayes")
 
@@ -41,6 +41,9 @@ _FIRST = 16
 # Share of earlier chunks in the measured cost of a response; it only sizes the next chunks. By
 # judgement.
 _MEMORY = 0.7
+# Relative difference of a response that another machine, or another version of a library, may make;
+# any value from 1e-9 to 1e-3 tells another response from rounding, but for chaotic ones.
+_ROUNDING = 1e-6
 # Chunks sent out at a time to an executor that does not tell how many workers it has: as many as
 # workers that are known of in practice; what one costs in memory is measured by `python -m
 # benchmarks.scale`. By judgement.
@@ -112,6 +115,28 @@ class Points:
         """Return some of the points; with a number that one, without the leading axis."""
         pairs = zip(self.arguments, self.varying, strict=True)
         return Points([a[rows] if varies else a for a, varies in pairs], self.varying)
+
+    def read(self, keys: Floats) -> Points:
+        """Return the points of keys that were made with the same constants."""
+        arguments, first = [], 0
+        for a, varies in zip(self.arguments, self.varying, strict=True):
+            event = np.shape(a)[1:] if varies else np.shape(a)
+            last = first + int(np.prod(event, dtype=int))
+            arguments.append(keys[:, first:last].reshape(len(keys), *event) if varies else a)
+            first = last
+        return Points(arguments, self.varying)
+
+    def with_same_constants(self, keys: Floats) -> NDArray[np.bool_]:
+        """Return which keys were made with the same constants, shape (n,)."""
+        same = np.ones(len(keys), dtype=bool)
+        first = 0
+        for a, varies in zip(self.arguments, self.varying, strict=True):
+            event = np.shape(a)[1:] if varies else np.shape(a)
+            last = first + int(np.prod(event, dtype=int))
+            if not varies:
+                same &= (keys[:, first:last] == np.ravel(a)).all(axis=1)
+            first = last
+        return same
 
     def keys(self) -> Floats:
         """Return all numbers that a response depends on, constants included, shape (n, columns)."""
@@ -199,8 +224,11 @@ def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
     ------
     ResponseError
         If a response fails and the policy says so, or if it is no response.
+    StoreError
+        If the store holds other values than the response gives.
     """
     policy = calling.on_failure
+    _verify(calling, points, tally)
     keys = points.keys() if calling.store is not None else np.empty((len(points), 0))
     values, missing = _stored(calling.store, keys)
     raised: dict[int, str] = {}
@@ -222,6 +250,43 @@ def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
         if not missing.size:
             break
     return _settled(calling, values, raised, tally)
+
+
+def _verify(calling: Calling, points: Points, tally: Tally) -> None:
+    """Compute one stored response again, once for a store that says nothing of its version.
+
+    What is stored may be of a function that has changed since, or whose variables have.
+    """
+    store = calling.store
+    if store is None or store.verified:
+        return
+    keys, values = store.known()
+    usable = np.flatnonzero(np.isfinite(values) & points.with_same_constants(keys))
+    if usable.size:
+        first = usable[:1]
+        expected = float(values[first[0]])
+        size = max(abs(expected), float(np.median(np.abs(values[usable]))))
+        got, told = _again(calling, points.read(keys[first]), tally)
+        if not abs(got - expected) <= _ROUNDING * size:
+            at = ", ".join(f"{x:.6g}" for x in keys[first[0]])
+            raise StoreError(
+                f"{calling.name}: store: got a response that gives {told} at ({at}), expected "
+                f"{expected:.10g}, which is stored in {store.path}: it is of another function, or "
+                "its variables have changed; nothing was changed: pass another folder, or version= "
+                "with a name for the response as it is now, whose runs are then kept apart"
+            )
+    store.verified = True
+
+
+def _again(calling: Calling, point: Points, tally: Tally) -> tuple[float, str]:
+    """Return the response at one point, and what came of it in words."""
+    chunk = Chunk(np.array([np.nan]), {}, 0.0)
+    for _ in range(calling.on_failure.tries):
+        for _, chunk in chunks(calling, point, np.arange(1), True, tally):
+            if not chunk.raised:
+                value = float(chunk.values[0])
+                return value, f"{value:.10g}"
+    return np.nan, f"nothing ({next(iter(chunk.raised.values()), 'it was lost')})"
 
 
 def _stored(store: Store | None, keys: Floats) -> tuple[Floats, Rows]:

@@ -15,27 +15,25 @@ from typing import Any
 # Tells our files from other databases (https://www.sqlite.org/pragma.html#pragma_application_id).
 APPLICATION = int.from_bytes(b"prby")
 # Counts the changes of the tables below: a file of another layout is refused, and not misread.
-LAYOUT = 1
+LAYOUT = 2
 # Seconds to wait for other writers. By judgement: a chunk is written in some 10 ms, so that a
 # thousand writers wait less, and one that hangs is told of within a minute.
 PATIENCE = 60.0
 
-# `constants`, `version` and `fingerprint` can tell responses of one name apart; nothing fills them
-# yet. Key and value of a run are float64, little-endian: every bit survives, those of NaN too. Runs
-# are numbered without a gap, so that one that is lost is missed.
+# Responses are told apart by name and version. Key and value of a run are float64, little-endian:
+# every bit survives, those of NaN too; a key holds the constants as well. Runs are numbered without
+# a gap, so that one that is lost is missed.
 TABLES = (
     "CREATE TABLE response (id INTEGER PRIMARY KEY, name TEXT NOT NULL, columns INTEGER NOT NULL, "
-    "constants BLOB, version TEXT, fingerprint BLOB, checksum INTEGER NOT NULL)",
+    "version TEXT, checksum INTEGER NOT NULL)",
     "CREATE TABLE run (id INTEGER PRIMARY KEY, response INTEGER NOT NULL, key BLOB NOT NULL, "
     "state TEXT NOT NULL, reason TEXT, value BLOB NOT NULL, checksum INTEGER NOT NULL)",
 )
 INSERT_RESPONSE = (
-    "INSERT INTO response (name, columns, constants, version, fingerprint, checksum) "
-    "SELECT ?, ?, ?, ?, ?, ? WHERE NOT EXISTS (SELECT 1 FROM response WHERE name = ?)"
+    "INSERT INTO response (name, columns, version, checksum) SELECT ?, ?, ?, ? "
+    "WHERE NOT EXISTS (SELECT 1 FROM response WHERE name = ? AND version IS ?)"
 )
-SELECT_RESPONSES = (
-    "SELECT id, name, columns, constants, version, fingerprint, checksum FROM response ORDER BY id"
-)
+SELECT_RESPONSES = "SELECT id, name, columns, version, checksum FROM response ORDER BY id"
 INSERT_RUN = (
     "INSERT INTO run (response, key, state, reason, value, checksum) VALUES (?, ?, ?, ?, ?, ?)"
 )

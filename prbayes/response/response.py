@@ -38,6 +38,15 @@ def refuse_uncallable(name: str, function: object) -> None:
         )
 
 
+def refuse_version(version: object) -> None:
+    """Raise if a version is no text."""
+    if version is not None and not isinstance(version, str):
+        raise TypeError(
+            f"version: got {type(version).__name__} {version!r:.60}, expected a text that names "
+            "the response as it is, such as '2' or 'mesh 3, solver 1.4'"
+        )
+
+
 class Responses:
     """The user's response: a function of inputs, and how it is called.
 
@@ -55,6 +64,8 @@ class Responses:
     executor : concurrent.futures.Executor, optional
     store : path-like, optional
         A folder.
+    version : str, optional
+        Of the function, for the store.
     on_failure : OnFailure, optional
 
     Attributes
@@ -71,11 +82,12 @@ class Responses:
         *,
         executor: Executor | None = None,
         store: Any = None,
+        version: str | None = None,
         on_failure: OnFailure | None = None,
     ) -> None:
         refuse_uncallable(name, function)
         policy = on_failure or Abort()
-        kept = None if store is None else Store(store, name, _columns(inputs))
+        kept = None if store is None else Store(store, name, _columns(inputs), version=version)
         self.name = name
         self.function = function
         self.inputs = inputs

@@ -1,4 +1,4 @@
-"""Computed responses on disk, keyed by their inputs: none is computed twice, none is lost.
+"""Computed responses on disk, keyed by their inputs: none is lost.
 
 A store is a folder with one SQLite file for all simulators that were given it. Runs are only ever
 appended, a transaction for each chunk of them: whatever moment a process is killed at, what was
@@ -98,6 +98,14 @@ class Store:
     columns : int, optional
         Number of values that the inputs of one point are made of. By default that of the stored
         responses; there must be some, then.
+    version : str, optional
+        Of the response; those of each version are kept apart, as are those without one.
+
+    Attributes
+    ----------
+    verified : bool
+        Whether the stored responses are known to be those of the response at hand: a version says
+        so, or one of them was computed again.
 
     Raises
     ------
@@ -117,19 +125,28 @@ class Store:
     """
 
     def __init__(
-        self, folder: str | os.PathLike[str], name: str, columns: int | None = None
+        self,
+        folder: str | os.PathLike[str],
+        name: str,
+        columns: int | None = None,
+        *,
+        version: str | None = None,
     ) -> None:
         self.folder = Path(folder)
         self.name = name
         self.columns = columns
+        self.version = version
+        self.verified = version is not None
         self._local = threading.local()
         self._read()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"folder": self.folder, "name": self.name, "columns": self.columns}
+        keys = ("folder", "name", "columns", "version")
+        return {key: vars(self)[key] for key in keys}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
+        self.verified = self.version is not None
         self._local = threading.local()
 
     @property
@@ -146,6 +163,12 @@ class Store:
         found = [known.get(key) for key in _keys(inputs)]
         present = np.array([value is not None for value in found], dtype=bool)
         return _numbers(_NAN if value is None else value for value in found), present
+
+    def known(self) -> tuple[Floats, Floats]:
+        """Return the inputs, (n, columns), and values, (n,), in the order in which they came."""
+        session = self._read()
+        inputs = _numbers(session.known).reshape(-1, session.entry.columns)
+        return inputs, _numbers(session.known.values())
 
     def add(self, inputs: Floats, values: Floats, reasons: Mapping[int, str] | None = None) -> None:
         """Append responses, safe on disk when this returns.
@@ -171,13 +194,9 @@ class Store:
             ``inputs``, dims (point, column), and ``response``, dim (point), in the order in which
             they came.
         """
-        session = self._read()
-        inputs = _numbers(session.known).reshape(-1, session.entry.columns)
+        inputs, values = self.known()
         return xr.Dataset(
-            {
-                "inputs": (["point", "column"], inputs),
-                "response": ("point", _numbers(session.known.values())),
-            },
+            {"inputs": (["point", "column"], inputs), "response": ("point", values)},
             attrs={"simulator": self.name},
         )
 
@@ -231,14 +250,16 @@ class Store:
 
     def _entry(self, connection: sqlite3.Connection) -> _Entry:
         """Return the store's response in the file, where it is entered if it is new."""
-        if self.name not in self._entries(connection):
+        own = self.name, self.version
+        if own not in self._entries(connection):
             self._enter(connection)
         entries = self._entries(connection)
-        if self.name not in entries:
-            got = f"which holds no responses of simulator {self.name!r}"
-            todo = "look at name and folder"
-            raise self._refusal(Complaint(got, f"one of {list(entries)}", todo))
-        entry = entries[self.name]
+        if own not in entries:
+            got = f"which holds no responses of simulator {_called(*own)}"
+            todo = "look at name, version and folder"
+            known = ", ".join(_called(*each) for each in entries)
+            raise self._refusal(Complaint(got, f"one of [{known}]", todo))
+        entry = entries[own]
         if self.columns not in (None, entry.columns):
             got = f"which holds inputs of {entry.columns} values for simulator {self.name!r}"
             todo = "nothing was changed: give the simulator another name, or pass another folder"
@@ -247,13 +268,15 @@ class Store:
 
     def _enter(self, connection: sqlite3.Connection) -> None:
         """Enter the response, unless another process has, with what an old store knows of it."""
-        old = self._old()
+        old = None if self.version is not None else self._old()
         columns = self.columns if old is None else old.shape[1] - 1
         if columns is None:
             return
-        row = (self.name, columns, None, None, None)
+        row = (self.name, columns, self.version)
         with transaction(connection):
-            made = connection.execute(INSERT_RESPONSE, (*row, checksum(*row), self.name))
+            made = connection.execute(
+                INSERT_RESPONSE, (*row, checksum(*row), self.name, self.version)
+            )
             if made.rowcount == 1 and old is not None:
                 runs = _rows(int(made.lastrowid or 0), old[:, :-1], old[:, -1], {})
                 connection.executemany(INSERT_RUN, runs)
@@ -266,14 +289,14 @@ class Store:
             todo = "nothing was changed: move them away, or pass another folder"
             raise self._refusal(Complaint(got, "sound ones", todo)) from error
 
-    def _entries(self, connection: sqlite3.Connection) -> dict[str, _Entry]:
-        """Return the responses in the file, by name."""
+    def _entries(self, connection: sqlite3.Connection) -> dict[tuple[str, str | None], _Entry]:
+        """Return the responses in the file, by name and version."""
         entries = {}
         for number, *row, written in connection.execute(SELECT_RESPONSES).fetchall():
             if written != checksum(*row):
                 raise self._refusal(damaged(f"response {number} does not match its checksum"))
-            name, columns, *_ = row
-            entries[name] = _Entry(number, columns)
+            name, columns, version = row
+            entries[name, version] = _Entry(number, columns)
         return entries
 
     def _read_on(self, session: _Session) -> None:
@@ -302,6 +325,11 @@ class Store:
             f"{self.name}: store: got {self.path}, {complaint.got}, expected {complaint.expected}; "
             f"{complaint.todo}"
         )
+
+
+def _called(name: str, version: str | None) -> str:
+    """Return what a response is called, for messages."""
+    return repr(name) if version is None else f"{name!r}, version {version!r}"
 
 
 def _keys(inputs: Floats) -> list[bytes]:

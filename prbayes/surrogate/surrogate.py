@@ -16,6 +16,7 @@ from prbayes._checks import Floats, positive_integer
 from prbayes.propagation.points import sobol
 from prbayes.response.calling import Calling, Points, ResponseError, Tally, respond
 from prbayes.response.failures import Abort, OnFailure, Replace
+from prbayes.response.response import refuse_version
 from prbayes.response.store import Store
 from prbayes.surrogate.error import CrossValidation, cross_validated, points_needed
 from prbayes.surrogate.files import Kept, read, write
@@ -108,6 +109,7 @@ class Surrogate:
         coverage: float = 0.999,
         executor: Executor | None = None,
         store: str | PathLike[str] | None = None,
+        version: str | None = None,
         on_failure: OnFailure | None = None,
         name: str = "surrogate",
         random_seed: int = 0,
@@ -134,7 +136,7 @@ class Surrogate:
             the log. A simulator with `Reweighted` reports them as lost mass, and refuses an answer
             that rests on them. `Abort`: they raise; take that with `Resimulated`.
         coverage : float
-        executor, store, on_failure
+        executor, store, version, on_failure
             As for `Reweighted`. A point that fails in the end is left out of the fit; the surrogate
             then fails where that is the nearest point.
         name : str
@@ -163,13 +165,14 @@ class Surrogate:
         _refuse_wrong(name, response, model, outside, store)
         _refuse_share(name, coverage)
         positive_integer(random_seed, f"{name}: random_seed", minimum=0)
+        refuse_version(version)
         domain, predictive = read_ranges(name, inputs, coverage, random_seed)
         needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=needed)
 
         # Compute the responses.
         points = domain.at(sobol(n, domain.dimensions, random_seed))
-        kept = None if store is None else Store(store, name, points.shape[1])
+        kept = None if store is None else Store(store, name, points.shape[1], version=version)
         calling = Calling(name, response, executor, kept, on_failure or Abort())
         varying = [not one.constant for one in domain.inputs]
         tally = Tally()

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer, real_array
 from prbayes._predict import specimen_names
+from prbayes.model.identity import Identity, Level, from_attributes, require_together
 from prbayes.validation.predictive import Predictive
 
 Predicted = xr.DataArray | NDArray[Any]
@@ -43,6 +44,11 @@ class Condition:
     attributes: Mapping[Any, Any] = field(default_factory=dict)
 
     @property
+    def identity(self) -> Identity | None:
+        """Of the problem that was calibrated, where the prediction tells."""
+        return from_attributes(self.attributes)
+
+    @property
     def specimens(self) -> tuple[str, ...]:
         """Names of the specimens: labels, or else the condition and a number."""
         if self.labels is not None:
@@ -64,6 +70,8 @@ class Case:
         With a seed u-values are randomised within ties.
     folded : bool
         Whether the statistic is the area of abs(2u - 1).
+    identity : Identity or None
+        Of the problem whose calibration predicted all conditions, where predictions tell.
     """
 
     conditions: tuple[Condition, ...]
@@ -71,6 +79,7 @@ class Case:
     shared: bool
     random_seed: int | None
     folded: bool = False
+    identity: Identity | None = None
 
     @property
     def size(self) -> int:
@@ -141,6 +150,8 @@ def read_case(
         )
         conditions.append(condition)
     _refuse_other_draws(conditions)
+    identities = {f"{c.name}: predicted": c.identity for c in conditions}
+    identity = require_together(identities, "area_test", level=Level.OPTIMUM)
     distinct = sum(np.unique(c.numbers).size for c in conditions)
     return Case(
         conditions=tuple(conditions),
@@ -148,6 +159,7 @@ def read_case(
         shared=distinct > len(numbers),
         random_seed=random_seed,
         folded=folded,
+        identity=identity,
     )
 
 

@@ -49,7 +49,8 @@ def cross_validate(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) ->
     ------
     TypeError, ValueError
         If an argument is not as described, there are fewer specimens than two per fold, or nothing
-        is known of a metric or propagation (`FunctionMetric`, `Fresh`).
+        is known of a metric or propagation (`FunctionMetric`, `Fresh`); if the prior was part of
+        the optimum, or its model has changed since.
 
     References
     ----------

@@ -13,6 +13,7 @@ from prbayes._checks import Floats, positive_integer
 from prbayes._predict import data_digest, serving, specimen_names
 from prbayes.estimate.data_sets import groups, sets_at, simulated_points, specimens
 from prbayes.estimate.optimum import Optimum, require_refits
+from prbayes.model.identity import Level, require_same
 from prbayes.model.node import Node
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
@@ -63,7 +64,8 @@ class JointNull(SimulatedNull):
     TypeError
         If ``optimum`` is no Optimum, or a response cannot be called.
     ValueError
-        If nothing is known of a metric or propagation (`FunctionMetric`, `Fresh`).
+        If nothing is known of a metric or propagation (`FunctionMetric`, `Fresh`); if the prior was
+        part of the optimum, or its model has changed since.
 
     Examples
     --------
@@ -99,6 +101,7 @@ class JointNull(SimulatedNull):
         evaluator = self.optimum.evaluator
         theta = self.optimum.theta
         ties = case.rng(1)
+        require_same(case.identity, self.optimum.identity, "JointNull: predicted", Level.OPTIMUM)
         served = [self._served(case, condition) for condition in case.conditions]
         numbers, more = _specimen_numbers(evaluator.nodes, served)
         simulators = range(len(evaluator.nodes))

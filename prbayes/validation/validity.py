@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats
 from prbayes._predict import data_digest
+from prbayes.model.identity import Identity, as_attributes
 from prbayes.model.labels import versions
 from prbayes.validation.conditions import Case, Condition, Predicted, read_case
 from prbayes.validation.exact_model import ExactModel
@@ -42,6 +43,8 @@ class ValidityTest:
         probability 1 - ``level``.
     conditions, specimens : ndarray of str, shape (n,)
         Where each u-value comes from.
+    identity : Identity or None
+        Of the problem whose calibration is tested, where the predictions tell.
     """
 
     statistic: float
@@ -54,6 +57,7 @@ class ValidityTest:
     envelope: Floats
     conditions: NDArray[np.str_]
     specimens: NDArray[np.str_]
+    identity: Identity | None = None
 
     @property
     def rejected(self) -> bool:
@@ -95,7 +99,7 @@ class ValidityTest:
                 "condition": ("observation", self.conditions),
                 "specimen": ("observation", self.specimens),
             },
-            attrs={"null": self.null, **versions()},
+            attrs={"null": self.null, **as_attributes(self.identity), **versions()},
         )
 
 
@@ -154,7 +158,8 @@ def area_test(
     TypeError, ValueError
         If an argument is not as described; if the data, or labels, are those of the calibration and
         the null does not allow for it; if specimens are shared by conditions that were not
-        predicted for the same specimens.
+        predicted for the same specimens; if conditions were predicted by calibrations of different
+        problems.
 
     References
     ----------
@@ -205,6 +210,7 @@ def area_test(
         envelope=np.array([judged.lower, judged.upper]),
         conditions=conditions,
         specimens=np.array(labels),
+        identity=case.identity,
     )
 
 

@@ -108,9 +108,9 @@ CHANGES: dict[str, tuple[Problem, Level, str]] = {
     "inputs": (Problem(inputs=pm.Gumbel), Level.POPULATIONS, "inputs of y: got"),
     "hyperparameter": (Problem(hyperparameter="nu"), Level.POPULATIONS, "hyperparameters: got nu"),
     "simulator": (Problem(name="z"), Level.POPULATIONS, r"simulators: got \['z'\]"),
-    "prior": (Problem(prior=(-3.0, 0.1)), Level.OPTIMUM, "prior of mu: got"),
-    "family": (Problem(family=pm.Laplace), Level.OPTIMUM, "prior of mu: got Laplace"),
-    "potential": (Problem(potential=True), Level.OPTIMUM, "other likelihood terms: got"),
+    "prior": (Problem(prior=(-3.0, 0.1)), Level.PRIORS, "prior of mu: got"),
+    "family": (Problem(family=pm.Laplace), Level.PRIORS, "prior of mu: got Laplace"),
+    "potential": (Problem(potential=True), Level.PRIORS, "other likelihood terms: got"),
     "metric": (Problem(metric=prb.KullbackLeibler()), Level.OPTIMUM, "metric of y: got"),
     "size of the design": (
         Problem(propagation=prb.Reweighted(128, max_lost=0.9)),

@@ -103,7 +103,7 @@ def test_the_landscape_of_another_metric(
     thetas = np.column_stack([x, np.full(x.size, optimum.theta[1])])
     np.testing.assert_allclose(y, Evaluator(other)(thetas).discrepancies[:, 0])
     with pytest.raises(
-        ValueError, match=r"got hyperparameters and simulators .* expected \['mu', 'sigma_log__'\]"
+        ValueError, match=r"plot_landscape: .*hyperparameters: got mu, sigma_log__, expected mu"
     ):
         prb.plot_landscape(optimum, model=_one())
 

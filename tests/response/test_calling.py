@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -384,14 +384,19 @@ def test_a_lost_worker_is_named() -> None:
 # -- what is stored --------------------------------------------------------------------------------
 
 
-def test_nothing_is_computed_twice(tmp_path: Path) -> None:
-    first = model(prb.scalar(times), store=tmp_path)
-    second = model(prb.scalar(times), store=tmp_path)
+@pytest.mark.parametrize("version", [None, "1"])
+def test_nothing_is_computed_twice_but_one_response_without_a_version(
+    version: str | None, tmp_path: Path
+) -> None:
+    again = int(version is None)
+    kept: dict[str, Any] = {"store": tmp_path, "version": version}
+    first = model(prb.scalar(times), **kept)
+    second = model(prb.scalar(times), **kept)
     np.testing.assert_array_equal(stored(second), EXPECTED)
-    assert (responses(first).computed, responses(second).computed) == (N, 0)
-    more = model(prb.scalar(times), propagation=prb.Reweighted(N, random_seed=1, store=tmp_path))
-    assert responses(more).computed == N  # other points
-    data = Store(tmp_path, "y").to_dataset()
+    assert (responses(first).computed, responses(second).computed) == (N, again)
+    more = model(prb.scalar(times), propagation=prb.Reweighted(N, random_seed=1, **kept))
+    assert responses(more).computed == N + again  # other points
+    data = Store(tmp_path, "y", version=version).to_dataset()
     assert data["response"].size == 2 * N
     np.testing.assert_allclose(data["response"], 2 * data["inputs"][:, 0])
     np.testing.assert_array_equal(data["inputs"][:, 1], 2.0)  # the constant
@@ -401,7 +406,69 @@ def test_an_optimum_tells_what_was_computed_and_what_it_rests_on(tmp_path: Path)
     first = prb.minimize(model(prb.scalar(times), store=tmp_path))
     again = prb.minimize(model(prb.scalar(times), store=tmp_path))
     assert first.n_computed == first.n_responses == again.n_responses >= N
-    assert (again.n_computed, again.point) == (0, first.point)
+    assert (again.n_computed, again.point) == (1, first.point)
+
+
+def by_factor(factor: float, calls: list[Any] | None = None) -> Any:
+    """Return a response whose variable is not among its inputs."""
+
+    def response(x: Any, a: Any) -> Any:
+        if calls is not None:
+            calls.append(x)
+        return factor * a * x
+
+    return response
+
+
+@pytest.mark.parametrize("wrapped", [prb.scalar, lambda f: f], ids=["scalar", "batch"])
+def test_a_store_refuses_a_response_whose_variables_have_changed(
+    wrapped: Callable[[Any], Any], tmp_path: Path
+) -> None:
+    model(wrapped(by_factor(1.0)), store=tmp_path)
+    before = Store(tmp_path, "y").to_dataset()
+    for changed, calls in ((1.001, []), (-1.0, [])):
+        with pytest.raises(
+            prb.response.StoreError,
+            match=r"y: store: got a response that gives .* expected .* stored in .*have changed",
+        ):
+            model(wrapped(by_factor(changed, calls)), store=tmp_path)
+        assert np.size(calls[0]) == len(calls) == 1
+    # Also at points of which none is stored; and rounding is tolerated.
+    with pytest.raises(prb.response.StoreError, match="have changed"):
+        model(
+            wrapped(by_factor(2.0)),
+            propagation=prb.Reweighted(N, random_seed=1, store=tmp_path),
+        )
+    assert Store(tmp_path, "y").to_dataset().identical(before)
+    model(wrapped(by_factor(1 + 1e-12)), store=tmp_path)
+
+
+def test_a_response_that_raises_where_a_number_is_stored_is_another_one(tmp_path: Path) -> None:
+    model(prb.scalar(times), store=tmp_path)
+
+    def broken(x: Any, a: Any) -> Any:
+        raise ArithmeticError("no license")
+
+    with pytest.raises(prb.response.StoreError, match=r"gives nothing .*no license"):
+        model(prb.scalar(broken), store=tmp_path)
+
+
+def test_responses_of_each_version_are_kept_apart(tmp_path: Path) -> None:
+    for version, factor in (("1", 1.0), ("2", 3.0), (None, 5.0), ("1", 1.0)):
+        found = model(prb.scalar(by_factor(factor)), store=tmp_path, version=version)
+        np.testing.assert_array_equal(stored(found), factor * EXPECTED)
+    assert responses(found).computed == 0
+    with pytest.raises(TypeError, match="version: got int 2, expected a text"):
+        model(times, store=tmp_path, version=2)
+    with pytest.raises(prb.response.StoreError, match=r"version '3', expected one of \['y', ver"):
+        Store(tmp_path, "y", version="3")
+
+
+def test_a_clone_does_not_compute_a_stored_response_once_more(tmp_path: Path) -> None:
+    model(prb.scalar(times), store=tmp_path)
+    found = model(prb.scalar(times), store=tmp_path)
+    prb.minimize(pm.do(found, {}), progressbar=False)
+    assert responses(found).computed == 1
 
 
 def test_another_constant_is_another_input(tmp_path: Path) -> None:
@@ -427,7 +494,7 @@ def test_what_was_computed_before_a_failure_is_kept(tmp_path: Path) -> None:
     kept = len(Store(tmp_path, "y", 2))
     found = model(prb.scalar(times), store=tmp_path)
     np.testing.assert_array_equal(stored(found), EXPECTED)
-    assert responses(found).computed == N - kept
+    assert responses(found).computed == N - kept + 1  # one of those that are kept
     assert kept == int(np.argmax(STEEP))  # all that came before the first steep point
 
 
@@ -504,7 +571,7 @@ def test_stored_failures_are_replaced_as_the_policy_of_the_day_says(tmp_path: Pa
         prb.scalar(fails_above_two), store=tmp_path, on_failure=prb.response.Replace(-1.0)
     )
     np.testing.assert_array_equal(stored(found), np.where(STEEP, -1.0, EXPECTED))
-    assert responses(found).computed == 0
+    assert responses(found).computed == 1
 
 
 # -- killed ----------------------------------------------------------------------------------------

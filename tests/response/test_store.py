@@ -456,10 +456,10 @@ def test_what_is_no_store_is_refused(folder: Path, tmp_path: Path) -> None:
 
 def test_another_layout_is_refused(folder: Path) -> None:
     connection = sqlite3.connect(file_of(folder))
-    connection.execute("PRAGMA user_version = 2")
+    connection.execute("PRAGMA user_version = 3")
     connection.close()
     refused(
-        folder, "which has layout 2, expected layout 1; use the version of prbayes that wrote it"
+        folder, "which has layout 3, expected layout 2; use the version of prbayes that wrote it"
     )
 
 

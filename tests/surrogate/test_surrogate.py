@@ -72,9 +72,14 @@ def test_executors_give_the_same_and_a_store_computes_nothing_twice(tmp_path: Pa
             np.testing.assert_array_equal(other.responses, plain.responses)
     folder = tmp_path / "runs"
     assert prb.Surrogate.fit(bent, BOX, 32, store=folder).n_runs == 32
-    assert prb.Surrogate.fit(bent, BOX, 48, store=folder).n_runs == 16
+    assert prb.Surrogate.fit(bent, BOX, 48, store=folder).n_runs == 16 + 1
     again = prb.Surrogate.fit(bent, BOX, 48, store=folder, model=prb.surrogate.Polynomial(3))
-    assert again.n_runs == 0
+    assert again.n_runs == 1
+    with pytest.raises(prb.response.StoreError, match="its variables have changed"):
+        prb.Surrogate.fit(lambda x, y: 2 * bent(x, y), BOX, 48, store=folder)
+    for runs in (32, 0):
+        versioned = prb.Surrogate.fit(bent, BOX, 32, store=folder, version="1")
+        assert versioned.n_runs == runs
     assert again.error.rms > 0
     assert (folder / "responses.sqlite").exists()
 
