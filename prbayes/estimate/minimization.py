@@ -97,6 +97,9 @@ _LOOKS = 3
 # Points of the prior from which other optima are searched for where a theta costs no response; the
 # better half of four times as many. By judgement: more take time, fewer may leave out a basin.
 _STARTS = 32
+# Points of the prior that tell whether other terms weigh, or only exclude some of them. By
+# judgement; a power of two, as Sobol points are balanced then.
+_TERMS = 64
 # Spreads of the prior from which what is known of an optimum is looked up again: a simplex that
 # settles a line search moves it by less, and standard errors change by less.
 _MOVED = 0.01
@@ -126,7 +129,8 @@ def minimize(
     The parameters are unconstrained through PyMC's transforms and standardised by the prior's
     spread. With several simulators the sum of d_k / s_k is minimised: s_k is epsilon where it was
     given, and else the sampling noise of d_k, the mean discrepancy of data sets drawn from the
-    model, at a pilot optimum.
+    model, at a pilot optimum. Beside other likelihood terms, potentials or the prior, s_k is
+    epsilon: what is minimised is then minus a log-density.
 
     Parameters
     ----------
@@ -148,7 +152,7 @@ def minimize(
         For scipy's ``options=``, in units of the standardised problem; they replace those that are
         set otherwise.
     prior : bool
-        Add minus the log prior (then discrepancies should be divided by calibrated epsilons).
+        Add minus the log prior; every simulator needs an epsilon, then.
     tolerance : float
         Of the standardised problem: the gradient's largest element, or the smallest step of methods
         without gradient, with parameters in units of the prior's spread and the objective in units
@@ -175,7 +179,8 @@ def minimize(
     TypeError
         If there is no model, or a gradient method is used on `Fresh`.
     KeyError, ValueError
-        If ``start`` does not fit the model, or there is no such method.
+        If ``start`` does not fit the model, or there is no such method; or if the prior, other
+        likelihood terms or potentials are to be weighed against a discrepancy without epsilon.
     DesignError
         If a design does not support the optimum after refinement.
 
@@ -237,7 +242,8 @@ def find_optimum(
     plan = _Plan(search, _several(evaluator), refine, starts, random_seed)
 
     # Initialise: a start, and the way to where simulated responses meet the data
-    scales = _initial_scales(evaluator, prior=prior)
+    weighed = _require_weights(evaluator, prior=prior)
+    scales = _initial_scales(evaluator, weighed=weighed)
     theta, screened = begin(search, start, scales, random_seed)
     led = approach(search, theta, scales, random_seed)
 
@@ -371,9 +377,45 @@ def _several(evaluator: Evaluator) -> bool:
     return len(evaluator.nodes) > 1
 
 
-def _initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
+def _require_weights(evaluator: Evaluator, *, prior: bool) -> bool:
+    """Return whether log-densities are added to the discrepancies.
+
+    Raises
+    ------
+    ValueError
+        If there are some, and an epsilon is not set: their weights would mean nothing.
+    """
+    if prior:
+        others = "minus the log prior (prior=True)"
+    elif _other_terms_weigh(evaluator):
+        others = "other likelihood terms or potentials"
+    else:
+        return False
+    unset = [node.name for node in evaluator.nodes if np.isnan(node.epsilon_value)]
+    if unset:
+        raise ValueError(
+            f"prb.minimize: got {others} beside simulators without epsilon, {unset}, expected an "
+            "epsilon of each, without which a discrepancy has no weight against a log-density; "
+            "pass epsilon= to prb.Simulator, or calibrate one on the simulators alone, in a model "
+            "without other terms and with prior=False: "
+            "prb.set_epsilon(model, dict(prb.calibrate_epsilon(prb.minimize(alone))))"
+        )
+    return True
+
+
+def _other_terms_weigh(evaluator: Evaluator) -> bool:
+    """Return whether other terms do more than to exclude hyperparameters."""
+    if not evaluator.has_other_terms:
+        return False
+    thetas = evaluator.prior_points(_TERMS, 0)
+    values = evaluator.log_other(thetas)
+    finite = values[np.isfinite(values)]
+    return finite.size > 0 and bool(np.ptp(finite) > 0)
+
+
+def _initial_scales(evaluator: Evaluator, *, weighed: bool) -> Floats:
     """Return epsilons where they are given and matter, else typical sizes of discrepancies."""
-    if not (_several(evaluator) or prior):
+    if not (_several(evaluator) or weighed):
         return np.ones(1)
     natural = np.array([n.target.scale for n in evaluator.nodes])
     epsilon = evaluator.epsilon

@@ -84,9 +84,7 @@ def refit_obstacle(evaluator: Evaluator) -> Obstacle | None:
     obstacle = sampling_obstacle(evaluator)
     if obstacle is not None:
         return obstacle
-    model = evaluator.model
-    ordinary = len(model.observed_RVs) > len(evaluator.nodes)
-    if ordinary or model.potentials:
+    if evaluator.has_other_terms:
         reason = "the model has likelihood terms or potentials besides its simulators"
         return Obstacle(Cause.OTHER_TERMS, reason)
     return None

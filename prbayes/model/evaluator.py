@@ -143,14 +143,19 @@ class Evaluator:
         likelihood = self.model.logp(vars=ordinary) if ordinary else pt.constant(0.0)
         return likelihood + self.model.potentiallogp
 
+    @property
+    def has_other_terms(self) -> bool:
+        """Whether there are ordinary observed variables or potentials."""
+        ordinary = len(self.model.observed_RVs) > len(self.nodes)
+        return ordinary or bool(self.model.potentials)
+
     @cached_property
     def _evaluate_other(self) -> Any:
         return self.hyperparameters.compile([self._log_other()])
 
     def log_other(self, thetas: Floats) -> Floats:
         """Return the log-likelihood of ordinary observed variables, and potentials, shape (P,)."""
-        ordinary = len(self.model.observed_RVs) > len(self.nodes)
-        if not ordinary and not self.model.potentials:
+        if not self.has_other_terms:
             return np.zeros(len(thetas))
         (found,) = self._evaluate_other(np.ascontiguousarray(thetas))
         return np.array(np.broadcast_to(found, len(thetas)))

@@ -107,7 +107,7 @@ def simulation_based_calibration(
     positive_integer(n, "n", minimum=2)
     positive_integer(draws, "draws", minimum=10)
     evaluator = Evaluator(model)
-    if model.potentials or len(model.observed_RVs) > len(evaluator.nodes):
+    if evaluator.has_other_terms:
         raise ValueError(
             "simulation_based_calibration: got a model with likelihood terms or potentials "
             "besides its simulators, whose data cannot be drawn; expected prb.Simulator nodes only"

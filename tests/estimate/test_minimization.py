@@ -189,19 +189,68 @@ def test_a_quadratic_case_with_everything_mixed_in() -> None:
         [1 / (0.25 + node(model).target.cells.bandwidth ** 2), 30 / 0.25, 10.0, 1 / 4]
     )
     centers = np.array([MEAN, extra.mean(), 3.0, 0.0])
-    plain = prb.minimize(model)
-    np.testing.assert_allclose(
-        plain.point["mu"], precision[:3] @ centers[:3] / precision[:3].sum(), atol=1e-4
-    )
-    assert plain.scales == {"y": 1.0}
-    with_prior = prb.minimize(
-        model, prior=True
-    )  # in units of log-densities: discrepancy / epsilon, epsilon = 1/N
-    np.testing.assert_allclose(with_prior.scales["y"], 1 / N)
+    # In units of log-densities: discrepancy / epsilon, epsilon = 1/N
     precision[0] *= N
-    np.testing.assert_allclose(
-        with_prior.point["mu"], precision @ centers / precision.sum(), atol=1e-4
-    )
+    for prior, terms in ((False, slice(3)), (True, slice(4))):
+        optimum = prb.minimize(model, prior=prior)
+        assert optimum.scales == {"y": pytest.approx(1 / N)}
+        expected = precision[terms] @ centers[terms] / precision[terms].sum()
+        np.testing.assert_allclose(optimum.point["mu"], expected, atol=1e-4)
+        assert (optimum.prior, "with the prior" in repr(optimum)) == (prior, prior)
+        assert optimum.to_datatree()["optimum"].attrs["prior"] == int(prior)
+
+
+def with_term(term: Callable[[Any], Any], epsilon: float | None = None) -> pm.Model:
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, 2)
+        x = pm.Normal.dist(mu, 0.5)
+        prb.Simulator(
+            "y",
+            same,
+            x,
+            metric=METRICS["area"],
+            observed=OBSERVED,
+            epsilon=epsilon,
+            propagation=R256,
+        )
+        term(mu)
+    return model
+
+
+WEIGHING: dict[str, Callable[[Any], Any]] = {
+    "potential": lambda mu: pm.Potential("pull", -50.0 * (mu - 3.0) ** 2),
+    "likelihood": lambda mu: pm.Normal("z", mu, 0.1, observed=[3.0]),
+}
+
+
+@pytest.mark.parametrize("term", WEIGHING)
+def test_other_terms_are_weighed_by_epsilon_or_refused(term: str) -> None:
+    with pytest.raises(
+        ValueError, match=r"minimize: got other likelihood terms or potentials beside .*\['y'\]"
+    ):
+        prb.minimize(with_term(WEIGHING[term]))
+    for epsilon in (0.02, 0.2):
+        model = with_term(WEIGHING[term], epsilon)
+        optimum = prb.minimize(model, starts=0)
+        density = model.compile_logp(vars=model.observed_RVs + model.potentials)
+        grid = np.linspace(MEAN - 1, 4, 401)
+        best = grid[np.argmax([density({"mu": mu}) for mu in grid])]
+        assert abs(optimum.point["mu"] - best) < 0.02
+
+
+def test_a_potential_that_only_excludes_needs_no_epsilon() -> None:
+    model = with_term(lambda mu: pm.Potential("positive", pm.math.switch(mu > 0, 0.0, -np.inf)))
+    plain = prb.minimize(with_term(lambda mu: None))
+    found = prb.minimize(model)
+    assert found.scales == plain.scales == {"y": 1.0}
+    assert abs(found.point["mu"] - plain.point["mu"]) < 0.1 * plain.stderr["mu"]
+
+
+def test_a_prior_without_epsilon_to_weigh_it_against_is_refused() -> None:
+    with pytest.raises(
+        ValueError, match=r"minimize: got minus the log prior .* without epsilon, \['y'\]"
+    ):
+        prb.minimize(with_term(lambda mu: None), prior=True)
 
 
 def test_prior_true_is_find_map() -> None:
