@@ -8,6 +8,7 @@ has.
 from __future__ import annotations
 
 import inspect
+import pickle
 import re
 from typing import Any
 
@@ -300,3 +301,19 @@ def test_the_envelope_of_ranks_is_around_the_diagonal() -> None:
 
 def test_numbers_are_of_double_precision() -> None:
     assert pytensor.config.floatX == "float64"
+
+
+def test_pymc_models_have_no_plain_pickle() -> None:
+    # PyMC binds a `functools.partial` to models and variables as a method, of which there is none
+    # in the class, and which has no name. Should it ever cease to, the Optimum can travel without
+    # cloudpickle. Without these two, nothing else stands in the way.
+    with pytest.raises(AttributeError, match=r"partial.* has no attribute '__name__'"):
+        pickle.dumps(pm.Model())
+    with pm.Model() as model:
+        a = pm.Normal("a")
+        pm.Normal("b", a, observed=[1.0])
+    for thing in (model, *model.basic_RVs):
+        for name in ("str_repr", "_repr_latex_"):
+            vars(thing).pop(name, None)
+    back = pickle.loads(pickle.dumps(model))
+    assert back.compile_logp()({"a": 0.5}) == model.compile_logp()({"a": 0.5})

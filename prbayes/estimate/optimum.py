@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -129,6 +129,14 @@ class Optimum:
         cost = f"{self.n_evaluations} evaluations, {self.n_responses} responses, {state}"
         return "\n  ".join([f"{head} {cost}", *found, *self.warnings])
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel with the model packed by cloudpickle: those of PyMC have no plain pickle."""
+        import cloudpickle
+
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        values["evaluator"] = self.model
+        return _unpacked, (cloudpickle.dumps(values),)
+
     @property
     def model(self) -> pm.Model:
         """The model."""
@@ -173,6 +181,14 @@ class Optimum:
         Groups ``optimum``, ``stderr``, ``trace`` and ``calibration``.
         """
         return optimum_tree(self)
+
+
+def _unpacked(payload: bytes) -> Optimum:
+    """Return an optimum that was pickled."""
+    import cloudpickle
+
+    values = cloudpickle.loads(payload)
+    return Optimum(**{**values, "evaluator": Evaluator(values["evaluator"])})
 
 
 def _short(value: Any) -> str:

@@ -21,7 +21,7 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pymc.logprob.abstract import _logprob
 from pymc.logprob.utils import CheckParameterValue
-from pytensor.graph.basic import Apply
+from pytensor.graph.basic import Apply, Constant
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
@@ -194,7 +194,36 @@ def _log_density(
     )
     epsilon = check(node.epsilon, pt.gt(node.epsilon, 0.0))
     inputs = node.bound.inputs
-    return log_kernel(node.bound.discrepancy(inputs.core(params)), epsilon)
+    density = log_kernel(node.bound.discrepancy(inputs.core(params)), epsilon)
+    (value,) = values
+    if isinstance(value, Constant):
+        _require_own_data(node, value.data)
+        return density
+    observed = node.target.observed.astype(value.dtype)
+    same = pt.eq(value.shape[0], observed.size) & pt.all(pt.eq(value[: observed.size], observed))
+    return CheckParameterValue(_other_data(node))(density, same)
+
+
+def _require_own_data(node: Node, value: Any) -> None:
+    """Raise if values are others than those that a simulator's metric was prepared against.
+
+    Raises
+    ------
+    ValueError
+        With what to do.
+    """
+    given = np.asarray(value)
+    own = node.target.observed.astype(given.dtype)
+    if given.shape != own.shape or not np.array_equal(given, own):
+        raise ValueError(_other_data(node))
+
+
+def _other_data(node: Node) -> str:
+    return (
+        f"{node.name}: got other observed values than the simulator was made with, expected the "
+        "same ones, against which its metric is prepared; build the model again, with "
+        "observed= the new ones"
+    )
 
 
 class SimulatorDistribution(pm.Distribution):
@@ -235,11 +264,19 @@ def nodes(model: pm.Model) -> dict[Any, Node]:
 
     In a clone they are copies, made when they are first asked for, which its compiled functions
     follow from then on.
+
+    Raises
+    ------
+    ValueError
+        If `pymc.observe` gave one other data than it was made with.
     """
     found = {}
     for rv in model.observed_RVs:
         if isinstance(rv.owner.op, SimulatorRV):
-            found[rv] = rv.owner.op.own_node(rv.owner)
+            node = rv.owner.op.own_node(rv.owner)
+            value = model.rvs_to_values[rv]
+            _require_own_data(node, value.data if isinstance(value, Constant) else value.eval())
+            found[rv] = node
     return found
 
 

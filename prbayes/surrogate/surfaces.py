@@ -170,10 +170,10 @@ class Polynomial(Surface):
 
     def through(self, x: Floats, y: Floats) -> Predict:
         """Return the polynomial of least squares."""
-        coefficients = np.linalg.lstsq(self._basis(x), y, rcond=None)[0]
-        return lambda at: np.asarray(self._basis(at) @ coefficients)
+        coefficients = np.linalg.lstsq(self.basis(x), y, rcond=None)[0]
+        return _LeastSquares(self, coefficients)
 
-    def _basis(self, x: Floats) -> Floats:
+    def basis(self, x: Floats) -> Floats:
         """Return products of Legendre polynomials at points of the unit cube, shape (n, terms)."""
         dimensions = x.shape[1]
         # One input at a time, shape (n, d, degree + 1).
@@ -185,6 +185,17 @@ class Polynomial(Surface):
             factors = [single[:, i, k] for i, k in enumerate(degrees)]
             columns.append(np.prod(factors, axis=0))
         return np.stack(columns, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _LeastSquares:
+    """A polynomial with its coefficients; a class, so that it can be pickled."""
+
+    polynomial: Polynomial
+    coefficients: Floats
+
+    def __call__(self, at: Floats) -> Floats:
+        return np.asarray(self.polynomial.basis(at) @ self.coefficients)
 
 
 # Those that a file can name, so that it is read without being handed the surface.
@@ -236,9 +247,18 @@ def fitted(model: Any, x: Floats, y: Floats) -> Predict:
         regressor.fit(x, z)
         predict = regressor.predict
 
-    def in_units(at: Floats) -> Floats:
-        values = np.asarray(predict(at), dtype=np.float64)
-        # Some regressors give a column.
-        return np.asarray(center + spread * values.reshape(len(at)))
+    return _InUnits(predict, center, spread)
 
-    return in_units
+
+@dataclass(frozen=True, eq=False)
+class _InUnits:
+    """A surface through responses of unit spread, in the response's own units."""
+
+    predict: Predict
+    center: float
+    spread: float
+
+    def __call__(self, at: Floats) -> Floats:
+        values = np.asarray(self.predict(at), dtype=np.float64)
+        # Some regressors give a column.
+        return np.asarray(self.center + self.spread * values.reshape(len(at)))

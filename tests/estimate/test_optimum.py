@@ -1,10 +1,17 @@
 """What is asked of an optimum before it is used."""
 
+import pickle
+import subprocess
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+import pymc as pm
 import pytest
 
+import prbayes as prb
 from prbayes.estimate.optimum import plain, require_refits, require_sampling
 
 
@@ -23,3 +30,39 @@ def test_something_else_than_an_optimum_is_refused() -> None:
 def test_one_number_is_a_float() -> None:
     assert type(plain(1)) is float
     assert plain([1, 2]).shape == (2,)
+
+
+SCRIPT = """
+import pickle, sys
+import prbayes as prb
+optimum = pickle.loads(open(sys.argv[1], "rb").read())
+print(repr(optimum.discrepancy), repr(optimum.point["mu"]), repr(optimum.stderr["mu"]))
+print(repr(prb.calibrate_epsilon(optimum)["y"]), optimum.model is optimum.evaluator.model)
+tree = prb.sample_smc(50, chains=1, model=optimum.model, optimum=optimum, progressbar=False)
+print(repr(float(tree["posterior"]["mu"].mean())))
+"""
+
+
+def test_an_optimum_survives_plain_pickle_into_a_fresh_process(tmp_path: Path) -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
+        data = np.random.default_rng(1).normal(1.0, 1.0, 20)
+        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=data)
+    optimum = prb.minimize(model, starts=0, progressbar=False)
+    file = tmp_path / "optimum.pkl"
+    file.write_bytes(pickle.dumps(optimum))
+    run = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", SCRIPT, str(file)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    discrepancy, mu, stderr, epsilon, same, mean = run.stdout.split()
+    assert (float(discrepancy), float(mu)) == (optimum.discrepancy, optimum.point["mu"])
+    assert float(stderr) == optimum.stderr["mu"]
+    assert float(epsilon) == pytest.approx(prb.calibrate_epsilon(optimum)["y"], rel=1e-9)
+    assert same == "True"
+    tree = prb.sample_smc(50, chains=1, model=model, optimum=optimum, progressbar=False)
+    assert float(mean) == pytest.approx(float(tree["posterior"]["mu"].mean()), rel=1e-6)
+    assert pickle.loads(pickle.dumps(tree)).identical(tree)

@@ -371,3 +371,234 @@ def test_an_epsilon_calibrated_for_another_problem_is_refused() -> None:
     prb.set_epsilon(clone, calibrated)
     (node,) = nodes(clone).values()
     assert node.epsilon_value == calibrated["y"]
+
+
+# Every public function that is given two things of a problem: how much of them has to be the same.
+
+
+@cache
+def other_model(change: str) -> pm.Model:
+    """Return a model that differs from the base, or is a clone of it."""
+    if change == "nothing":
+        return clone_model(base())
+    return {"prior": Problem(prior=(1.5, 1.0))}.get(change, CHANGES[change][0]).model()
+
+
+@cache
+def other_optimum(change: str) -> Optimum:
+    return prb.minimize(other_model(change), starts=0, **QUIET)
+
+
+@cache
+def predicted(change: str) -> xr.DataArray:
+    model = other_model(change)
+    x = pm.Normal.dist(model["mu"], 1.0)
+    return prb.predict(other_optimum(change), lambda x: 2 * x, x, model=model, stored=False)
+
+
+@cache
+def validity() -> prb.validation.ValidityTest:
+    return prb.area_test(OBSERVED + 0.1, predicted("nothing"))
+
+
+@cache
+def calibrated() -> dict[str, float]:
+    return prb.calibrate_epsilon(optimum())
+
+
+def sampled(change: str, **given: Any) -> Any:
+    settings: dict[str, Any] = {"chains": 1, "adjust": False, "refine": False, **QUIET}
+    return prb.sample_smc(20, model=other_model(change), **settings, **given)
+
+
+def report(**results: Any) -> Any:
+    return prb.Report("A report", pictures=False, **results)
+
+
+def new_input(change: str) -> Any:
+    return pm.Normal.dist(other_model(change)["mu"], 1.0)
+
+
+PICTURE: dict[str, Any] = {"backend": "none"}
+PAIRS: dict[str, tuple[Level, Callable[[str], Any]]] = {
+    "predict: optimum, model": (
+        Level.POPULATIONS,
+        lambda change: prb.predict(
+            optimum(), np.positive, new_input(change), model=other_model(change), stored=False
+        ),
+    ),
+    "predict: posterior, model": (
+        Level.POPULATIONS,
+        lambda change: prb.predict(
+            posterior(), np.positive, new_input(change), model=other_model(change), stored=False
+        ),
+    ),
+    "compare: result, model": (
+        Level.POPULATIONS,
+        lambda change: prb.compare({"a": optimum()}, model=other_model(change)),
+    ),
+    "compare: two results": (
+        Level.POPULATIONS,
+        lambda change: prb.compare({"a": posterior(), "b": other_optimum(change)}),
+    ),
+    "Report: posterior, model": (
+        Level.POPULATIONS,
+        lambda change: report(posterior=posterior(), model=other_model(change)),
+    ),
+    "Report: optimum, model": (
+        Level.POPULATIONS,
+        lambda change: report(optimum=optimum(), model=other_model(change)),
+    ),
+    "Report: optimum, posterior": (
+        Level.POPULATIONS,
+        lambda change: report(optimum=other_optimum(change), posterior=posterior()),
+    ),
+    "Report: comparison, model": (
+        Level.POPULATIONS,
+        lambda change: report(comparison=prb.compare({"a": optimum()}), model=other_model(change)),
+    ),
+    "Report: validity, optimum": (
+        Level.POPULATIONS,
+        lambda change: report(validity=validity(), optimum=other_optimum(change)),
+    ),
+    "plot_landscape: optimum, model": (
+        Level.POPULATIONS,
+        lambda change: prb.plot_landscape(
+            optimum(), model=other_model(change), points=5, **PICTURE
+        ),
+    ),
+    "plot_population: posterior, model": (
+        Level.POPULATIONS,
+        lambda change: prb.plot_population(posterior(), model=other_model(change), **PICTURE),
+    ),
+    "plot_responses: optimum, model": (
+        Level.POPULATIONS,
+        lambda change: prb.plot_responses(optimum(), model=other_model(change), **PICTURE),
+    ),
+    "plot_posterior: posterior, optimum": (
+        Level.POPULATIONS,
+        lambda change: prb.plot_posterior(posterior(), other_optimum(change), **PICTURE),
+    ),
+    "plot_posterior: posterior, model": (
+        Level.PRIORS,
+        lambda change: prb.plot_posterior(posterior(), model=other_model(change), **PICTURE),
+    ),
+    "diagnose: posterior, model": (
+        Level.OPTIMUM,
+        lambda change: prb.diagnose(posterior(), model=other_model(change)),
+    ),
+    "diagnose: optimum, model": (
+        Level.OPTIMUM,
+        lambda change: prb.diagnose(optimum(), model=other_model(change)),
+    ),
+    "sample_smc: optimum, model": (
+        Level.OPTIMUM,
+        lambda change: sampled(change, optimum=optimum()),
+    ),
+    "sample_smc: epsilon, model": (
+        Level.OPTIMUM,
+        lambda change: sampled(change, epsilon=calibrated()),
+    ),
+    "set_epsilon: model, epsilon": (
+        Level.OPTIMUM,
+        lambda change: prb.set_epsilon(clone_model(other_model(change)), calibrated()),
+    ),
+    "area_test: two conditions": (
+        Level.OPTIMUM,
+        lambda change: prb.area_test(
+            {"a": OBSERVED + 0.1, "b": OBSERVED + 0.2},
+            {"a": predicted("nothing"), "b": predicted(change)},
+        ),
+    ),
+    "JointNull: optimum, prediction": (
+        Level.OPTIMUM,
+        lambda change: prb.area_test(
+            OBSERVED,
+            predicted(change),
+            null=prb.validation.JointNull(optimum(), replicates=19),
+        ),
+    ),
+}
+FROM = {
+    "nothing": None,
+    "data": Level.POPULATIONS,
+    "prior": Level.PRIORS,
+    "metric": Level.OPTIMUM,
+}
+
+
+@pytest.mark.parametrize("change", FROM)
+@pytest.mark.parametrize("pair", PAIRS)
+def test_two_things_of_different_problems_are_refused_where_it_matters(
+    pair: str, change: str
+) -> None:
+    level, use = PAIRS[pair]
+    caller = pair.partition(":")[0]
+    differs_from = FROM[change]
+    if differs_from is not None and differs_from <= level:
+        with pytest.raises(ValueError, match=rf"{caller}.*got a result of another problem: "):
+            use(change)
+    else:
+        use(change)
+
+
+def test_other_responses_are_refused_like_other_data() -> None:
+    for pair in ("Report: posterior, model", "plot_responses: optimum, model"):
+        with pytest.raises(ValueError, match="response of y has other values at the same points"):
+            PAIRS[pair][1]("response")
+
+
+# An optimum alone, whose model may have changed, or whose objective had the prior in it.
+
+ALONE: dict[str, Callable[[Optimum], Any]] = {
+    "calibrate_epsilon": prb.calibrate_epsilon,
+    "bootstrap": lambda found: prb.bootstrap(found, 20, **QUIET),
+    "cross_validate": lambda found: prb.cross_validate(found, folds=2),
+    "JointNull": prb.validation.JointNull,
+    "sampling": lambda found: found.sampling(),
+}
+
+
+@cache
+def with_prior() -> Optimum:
+    return prb.minimize(base(), prior=True, starts=0, **QUIET)
+
+
+@pytest.mark.parametrize("use", ALONE)
+def test_an_optimum_with_the_prior_is_refused_where_the_minimiser_is_meant(use: str) -> None:
+    ALONE[use](optimum())
+    with pytest.raises(
+        ValueError, match=rf"{use}: .*got an optimum of discrepancy and prior together"
+    ):
+        ALONE[use](with_prior())
+
+
+def test_an_optimum_with_the_prior_serves_elsewhere_and_says_so() -> None:
+    assert with_prior().prior
+    assert with_prior().identity is not None
+    assert with_prior().identity.prior_minimised
+    prb.compare({"without": optimum(), "with": with_prior()}, model=base())
+    prb.diagnose(with_prior(), model=base())
+    sections = prb.Report("A report", optimum=with_prior(), pictures=False).sections
+    told = [str(section.text) for section in sections if section.title == "Optimum"]
+    assert "Minus the log prior was part of the objective" in told[0]
+
+
+@pytest.mark.parametrize("use", ALONE)
+def test_an_optimum_whose_model_has_changed_since_is_refused(use: str) -> None:
+    found, model = that_may_change()
+    model.set_data("centre", 1.5)
+    try:
+        with pytest.raises(ValueError, match=rf"{use}: .*prior of mu: got"):
+            ALONE[use](found)
+    finally:
+        model.set_data("centre", 1.0)
+
+
+@cache
+def that_may_change() -> tuple[Optimum, pm.Model]:
+    with pm.Model() as model:
+        mu = pm.Normal("mu", pm.Data("centre", 1.0), 1.0)
+        x = pm.Normal.dist(mu, 1.0)
+        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=OBSERVED)
+    return prb.minimize(model, starts=0, **QUIET), model

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import pickle
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,6 +15,7 @@ import numpy as np
 import pymc as pm
 import pytensor
 import pytest
+from pymc.logprob.utils import ParameterValueError
 from pymc.model.fgraph import clone_model
 from pymc.model.transform.optimization import freeze_dims_and_data
 from pytensor.graph.replace import vectorize_graph
@@ -274,3 +276,52 @@ def test_a_batch_of_parameters_is_a_batch_of_populations() -> None:
 def test_a_picture_of_the_model_names_the_simulator() -> None:
     graph = pm.model_graph.ModelGraph(build(prb.Reweighted(64)))
     assert graph.model["y"].owner.op._print_name[0] == "prbayes_Simulator"
+
+
+def test_nothing_of_a_simulator_stands_in_the_way_of_plain_pickle() -> None:
+    model = build(prb.Reweighted(64))
+    x = node_of(model).bound.inputs.aleatory
+    before = log_density(model)(AT)
+    # What PyMC binds to models and variables has no plain pickle (tests/test_contracts.py).
+    for thing in (model, *model.basic_RVs, *x):
+        for name in ("str_repr", "_repr_latex_"):
+            vars(thing).pop(name, None)
+    assert log_density(pickle.loads(pickle.dumps(model)))(AT) == before
+
+
+# Other data.
+
+
+OTHER = r"y: got other observed values than the simulator was made with, .*observed= the new ones"
+
+
+def test_pymc_observe_with_other_data_is_refused_and_with_the_same_it_is_not() -> None:
+    model = build(prb.Reweighted(64))
+    same = pm.observe(model, {"y": OBSERVED})
+    assert log_density(same)(AT) == log_density(model)(AT)
+    assert prb.minimize(same, starts=0, **QUIET).converged
+    other = pm.observe(model, {"y": OBSERVED + 1})
+    for use in (
+        log_density,
+        prb.minimize,
+        lambda model: prb.sample_smc(20, model=model, **QUIET),
+        lambda model: prb.set_epsilon(model, {"y": 0.2}),
+        lambda model: pm.sample(2, tune=2, chains=1, model=model, **QUIET),
+    ):
+        with pytest.raises(ValueError, match=OTHER):
+            use(other)
+
+
+def test_the_value_that_a_log_density_is_asked_at_has_to_be_the_data() -> None:
+    model = build(prb.Reweighted(64))
+    at = {model["mu"]: AT["mu"], model["sigma"]: float(np.exp(AT["sigma_log__"]))}
+    expected = log_density(model)(AT)
+    assert float(pm.logp(model["y"], OBSERVED).eval(at)) == pytest.approx(expected, rel=1e-9)
+    with pytest.raises(ValueError, match=OTHER):
+        pm.logp(model["y"], OBSERVED + 1)
+    value = pytensor.tensor.vector("value", dtype="float64")
+    symbolic = pm.logp(model["y"], value)
+    assert float(symbolic.eval({**at, value: OBSERVED})) == pytest.approx(expected, rel=1e-9)
+    for other in (OBSERVED[::-1], np.append(OBSERVED, 1.0)):
+        with pytest.raises(ParameterValueError, match=OTHER):
+            symbolic.eval({**at, value: other})

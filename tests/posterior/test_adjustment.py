@@ -602,3 +602,32 @@ def test_results_can_be_saved(tmp_path: Path) -> None:
                 xr.testing.assert_equal(again[group].to_dataset(), tree[group].to_dataset())
                 assert again[group].attrs.keys() == tree[group].attrs.keys()
     assert "unadjusted" in results["smc"].children
+
+
+def test_an_optimum_that_the_prior_held_gives_the_same_draws() -> None:
+    # The prior is in conflict with the data: its optimum is several standard errors away from the
+    # metric's own, around which draws are adjusted.
+    data = np.random.default_rng(1).normal(2.0, 1.0, 20)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0.5, 0.2), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=data)
+    alone = prb.minimize(model, progressbar=False)
+    prb.set_epsilon(model, prb.calibrate_epsilon(alone))
+    held = prb.minimize(model, prior=True, progressbar=False)
+    assert alone.point["mu"] - held.point["mu"] > 3 * alone.stderr["mu"]
+    first, second = (
+        prb.sample_smc(
+            500,
+            chains=1,
+            model=model,
+            optimum=optimum,
+            adjust=prb.posterior.Affine(),
+            progressbar=False,
+        )["posterior"]
+        for optimum in (alone, held)
+    )
+    # The same particles, mapped around the same place.
+    for name in ("mu", "sigma"):
+        sd = float(first[name].std())
+        assert abs(float(first[name].mean() - second[name].mean())) < 0.1 * sd
+        assert float(second[name].std()) == pytest.approx(sd, rel=0.1)

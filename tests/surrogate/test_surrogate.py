@@ -1,6 +1,7 @@
 """Surrogates: refusing outside, called like the response, honest in a model."""
 
 import logging
+import pickle
 import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
@@ -182,3 +183,12 @@ def test_resimulated_stops_at_the_range_when_asked_to() -> None:
     assert prb.minimize(
         model_with(lambda x: wide, prb.Resimulated(64)), method="Nelder-Mead"
     ).converged
+
+
+@pytest.mark.parametrize("surface", [None, prb.surrogate.Polynomial(3)])
+def test_a_surrogate_survives_plain_pickle(surface: Any) -> None:
+    fitted = prb.Surrogate.fit(bent, BOX, 32, model=surface).with_error()
+    back = pickle.loads(pickle.dumps(fitted))
+    x, y = np.random.default_rng(1).uniform((0, 1), (3, 2), (20, 2)).T
+    np.testing.assert_array_equal(back(x, y), fitted(x, y))
+    np.testing.assert_array_equal(back.local_error(x, y), fitted.local_error(x, y))
