@@ -31,7 +31,7 @@ from pytensor import shared
 from pytensor.compile import function
 from pytensor.compile.mode import Mode
 from pytensor.gradient import NullTypeGradError, disconnected_grad, grad_undefined
-from pytensor.graph.basic import Apply, Variable
+from pytensor.graph.basic import Apply, Constant, Variable
 from pytensor.graph.op import Op
 from pytensor.graph.replace import _vectorize_node, graph_replace, vectorize_graph
 from pytensor.graph.traversal import ancestors, walk
@@ -317,3 +317,13 @@ def test_pymc_models_have_no_plain_pickle() -> None:
             vars(thing).pop(name, None)
     back = pickle.loads(pickle.dumps(model))
     assert back.compile_logp()({"a": 0.5}) == model.compile_logp()({"a": 0.5})
+
+
+def test_observed_values_are_constants_with_their_data() -> None:
+    with pm.Model() as model:
+        y = pm.Normal("y", pm.Normal("a"), observed=[1.0, 2.0])
+    for one in (model, clone_model(model), pm.observe(model, {"y": [1.0, 2.0]})):
+        value = one.rvs_to_values[one["y"]]
+        assert isinstance(value, Constant)
+        np.testing.assert_array_equal(value.data, [1.0, 2.0])
+    assert isinstance(model.rvs_to_values[y], Constant)

@@ -279,6 +279,7 @@ INNER = {
         "pymc.logprob.abstract._logprob",
         "pymc.logprob.utils.CheckParameterValue",
         "pytensor.graph.basic.Apply",
+        "pytensor.graph.basic.Constant",
         "pytensor.tensor.random.op.RandomVariable",
         "pytensor.tensor.variable.TensorVariable",
     },
