@@ -263,18 +263,10 @@ class _Needs:
 
 @dataclass(frozen=True, eq=False)
 class _Designs:
-    """How designs support the populations of a result, and what they are asked for.
+    """How designs support the populations of a result, and what they are asked for."""
 
-    Attributes
-    ----------
-    support : xarray.Dataset
-        With the dimensions simulator and sample.
-    needs : dict
-        By simulator.
-    """
-
-    support: xr.Dataset
-    needs: dict[str, _Needs]
+    support: xr.Dataset  # with the dimensions simulator and sample
+    needs: dict[str, _Needs]  # by simulator
 
 
 def _computed(evaluator: Evaluator, thetas: Floats) -> _Designs:

@@ -166,21 +166,11 @@ def predict(
 
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """Responses of specimens.
+    """Responses of specimens."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (k, n)
-        By population.
-    specimens : list of ndarray, shapes (k, n, *event)
-        Aleatory inputs.
-    source : str
-        How specimens were made.
-    """
-
-    values: Floats
-    specimens: list[Floats]
-    source: str
+    values: Floats  # (k, n): by population
+    specimens: list[Floats]  # (k, n, *event): aleatory inputs
+    source: str  # how specimens were made
 
 
 def _label(response: Callable[..., Any], name: str | None, store: object) -> str:

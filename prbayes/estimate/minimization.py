@@ -292,20 +292,10 @@ def find_optimum(
 
 @dataclass(frozen=True)
 class _Plan:
-    """What is to be done: the search, and what goes on around it.
-
-    Attributes
-    ----------
-    search : Search
-    several : bool
-        Whether there are several simulators, so that their scales matter.
-    refine : bool
-    starts : int
-    seed : int
-    """
+    """What is to be done: the search, and what goes on around it."""
 
     search: Search
-    several: bool
+    several: bool  # whether there are several simulators, so that their scales matter
     refine: bool
     starts: int
     seed: int
@@ -318,32 +308,17 @@ class _Plan:
 
 @dataclass(frozen=True)
 class _State:
-    """Where the minimisation stands.
+    """Where the minimisation stands."""
 
-    Attributes
-    ----------
-    theta : ndarray, shape (d,)
-        The best so far.
-    scales : ndarray, shape (k,)
-        By which the simulators' discrepancies are divided.
-    run : Run
-        The last one, with the trace of all.
-    sampling : SamplingDistribution or None
-        The sampling distribution of the minimiser around theta; None where nothing is known of it.
-    design_error : float
-        Of the design, in standard errors; NaN where it is not known.
-    cloud : ndarray, shape (m, d), or None
-        Thetas to which a pilot led, around which the design grows.
-    restart : ndarray, shape (d,), or None
-        Where to minimise again, on a design that has grown.
-    """
-
-    theta: Floats
-    scales: Floats
-    run: Run
+    theta: Floats  # (d,): the best so far
+    scales: Floats  # (k,): by which the simulators' discrepancies are divided
+    run: Run  # the last one, with the trace of all
+    # The sampling distribution of the minimiser around theta; None where nothing is known of it.
     sampling: SamplingDistribution | None
-    design_error: float = np.nan
+    design_error: float = np.nan  # of the design, in standard errors; NaN where it is not known
+    # (m, d), or None: thetas to which a pilot led, around which the design grows.
     cloud: Floats | None = None
+    # (d,), or None: where to minimise again, on a design that has grown.
     restart: Floats | None = None
 
     @property

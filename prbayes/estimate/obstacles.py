@@ -29,17 +29,10 @@ class Cause(Enum):
 
 @dataclass(frozen=True)
 class Obstacle:
-    """Why something cannot be done.
-
-    Attributes
-    ----------
-    cause : Cause
-    reason : str
-        In words, as the end of a sentence.
-    """
+    """Why something cannot be done."""
 
     cause: Cause
-    reason: str
+    reason: str  # in words, as the end of a sentence
 
     def __str__(self) -> str:
         """Return the reason."""

@@ -33,23 +33,12 @@ _EVERY = 4
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """An optimum of the discrepancy other than the best.
+    """An optimum of the discrepancy other than the best."""
 
-    Attributes
-    ----------
-    theta : ndarray, shape (d,)
-    value : float
-        The objective there.
-    comparable : bool
-        Whether it is as good as the best one up to sampling noise.
-    better : bool
-        Whether it is better than what was thought the best.
-    """
-
-    theta: Floats
-    value: float
-    comparable: bool
-    better: bool
+    theta: Floats  # (d,)
+    value: float  # the objective there
+    comparable: bool  # whether it is as good as the best one up to sampling noise
+    better: bool  # whether it is better than what was thought the best
 
 
 @dataclass(frozen=True, eq=False)

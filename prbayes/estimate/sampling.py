@@ -27,20 +27,11 @@ _SPANNED = 0.1
 
 @dataclass(frozen=True, eq=False)
 class _Expansion:
-    """The objective of data sets around theta, along r directions.
+    """The objective of data sets around theta, along r directions."""
 
-    Attributes
-    ----------
-    force : ndarray, shape (n_sets, r)
-        Minus the gradients of quadratic discrepancies.
-    curvature : ndarray, shape (r, r)
-        Their Hessian.
-    areas : list of LinearArea
-        With slopes along the directions, (r, m), and lengths divided by the scale.
-    """
-
-    force: Floats
-    curvature: Floats
+    force: Floats  # (n_sets, r): minus the gradients of quadratic discrepancies
+    curvature: Floats  # (r, r): their Hessian
+    # With slopes along the directions, (r, m), and lengths divided by the scale.
     areas: list[LinearArea]
 
 
@@ -124,24 +115,14 @@ def _solved(expansion: _Expansion, shifts: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Local:
-    """Covariance of the minimiser at one theta, in units of the prior's spread.
+    """Covariance of the minimiser at one theta, in units of the prior's spread."""
 
-    Attributes
-    ----------
-    prior_sd : ndarray, shape (d,)
-        The prior's spread.
-    identified : ndarray, shape (d, r)
-        Orthonormal directions about which the data tell enough, by default more than the prior.
-    unidentified : ndarray, shape (d, d - r)
-        The other directions.
-    covariance : ndarray, shape (r, r)
-        Of the minimiser, along the directions identified.
-    """
-
-    prior_sd: Floats
+    prior_sd: Floats  # (d,): the prior's spread
+    # (d, r): orthonormal directions about which the data tell enough, by default more than the
+    # prior.
     identified: Floats
-    unidentified: Floats
-    covariance: Floats
+    unidentified: Floats  # (d, d - r): the other directions
+    covariance: Floats  # (r, r): of the minimiser, along the directions identified
 
     @property
     def in_theta(self) -> Floats:

@@ -117,20 +117,11 @@ def _check_results(posterior: Any, optimum: Any) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Hyperparameter:
-    """What is known of one hyperparameter.
+    """What is known of one hyperparameter."""
 
-    Attributes
-    ----------
-    draws : ndarray, shape (n,)
-        Of the posterior.
-    prior : ndarray, shape (m,), or None
-        Draws of the prior.
-    best, error : float or None
-        The optimum, and its standard error where it is known.
-    """
-
-    draws: Floats
-    prior: Floats | None
+    draws: Floats  # (n,): of the posterior
+    prior: Floats | None  # (m,), or None: draws of the prior
+    # The optimum, and its standard error where it is known.
     best: float | None
     error: float | None
 

@@ -180,17 +180,11 @@ def _by_refits(information: Information) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Cloud:
-    """Thetas around the optimum with the distances of data sets from their populations.
+    """Thetas around the optimum with the distances of data sets from their populations."""
 
-    Attributes
-    ----------
-    z : ndarray, shape (M, r)
-        Standard normal coordinates along the principal axes of the sampling distribution.
-    distances : ndarray, shape (n_sets, M)
-    """
-
+    # (M, r): standard normal coordinates along the principal axes of the sampling distribution.
     z: Floats
-    distances: Floats
+    distances: Floats  # (n_sets, M)
 
     @classmethod
     def around(cls, area: LinearArea, directions: Floats, seed: int) -> _Cloud:

@@ -131,27 +131,14 @@ class Reweighted(Propagation):
 
 @dataclass(frozen=True)
 class Batches:
-    """The points of a design, batch after batch, and the mixture that they were drawn from.
+    """The points of a design, batch after batch, and the mixture that they were drawn from."""
 
-    Attributes
-    ----------
-    points : tuple of ndarray, shapes (n, *event)
-        One for each aleatory input.
-    values : ndarray, shape (n,)
-        Their responses; NaN where there is none.
-    components : tuple of ndarray, shapes (k, *shape)
-        The roots' values of the mixture's components, one array for each root.
-    counts : ndarray, shape (k,)
-        How many points came from each component.
-    sizes : tuple of int
-        Number of points of each batch.
-    """
-
-    points: tuple[Floats, ...]
-    values: Floats
+    points: tuple[Floats, ...]  # (n, *event): one for each aleatory input
+    values: Floats  # (n,): their responses; NaN where there is none
+    # (k, *shape): the roots' values of the mixture's components, one array for each root.
     components: tuple[Floats, ...]
-    counts: Floats
-    sizes: tuple[int, ...]
+    counts: Floats  # (k,): how many points came from each component
+    sizes: tuple[int, ...]  # number of points of each batch
 
     def followed_by(self, other: Batches) -> Batches:
         """Return these batches with others after them."""

@@ -22,32 +22,16 @@ from prbayes.validation.validity import ValidityTest
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Results by label; a single one has its kind as label.
-
-    Attributes
-    ----------
-    model : pymc.Model or None
-    description : dict or None
-        Of the model; from a file where there is no model.
-    optima : dict of DataTree
-    found : dict of Optimum
-        Those of the optima that are not from a file.
-    posteriors : dict of DataTree
-    tests : dict of ValidityTest
-    comparison : Dataset or None
-    observed : dict of ndarray
-        Measured responses by simulator.
-    diagnoses : dict of Diagnosis, or None where the model is needed
-    """
+    """Results by label; a single one has its kind as label."""
 
     model: pm.Model | None
-    description: dict[str, Any] | None
+    description: dict[str, Any] | None  # of the model; from a file where there is no model
     optima: dict[str, xr.DataTree]
-    found: dict[str, Optimum]
+    found: dict[str, Optimum]  # those of the optima that are not from a file
     posteriors: dict[str, xr.DataTree]
     tests: dict[str, ValidityTest]
     comparison: xr.Dataset | None
-    observed: dict[str, Floats]
+    observed: dict[str, Floats]  # measured responses by simulator
     diagnoses: dict[str, Diagnosis | None]
 
     @property

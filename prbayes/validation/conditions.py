@@ -19,27 +19,14 @@ Predicted = xr.DataArray | NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """What was measured and predicted under one condition.
-
-    Attributes
-    ----------
-    name : str
-    observed : ndarray, shape (n,)
-    predicted : ndarray, shape (D, S)
-        One row per draw.
-    labels : tuple of str, or None
-        Of the specimens.
-    numbers : ndarray of int, shape (n,)
-        The specimens, over all conditions.
-    attributes : dict
-        Of the prediction, as `predict` notes them.
-    """
+    """What was measured and predicted under one condition."""
 
     name: str
-    observed: Floats
-    predicted: Floats
-    labels: tuple[str, ...] | None
-    numbers: NDArray[np.intp]
+    observed: Floats  # (n,)
+    predicted: Floats  # (D, S): one row per draw
+    labels: tuple[str, ...] | None  # of the specimens
+    numbers: NDArray[np.intp]  # (n,): the specimens, over all conditions
+    # Of the prediction, as `predict` notes them.
     attributes: Mapping[Any, Any] = field(default_factory=dict)
 
     @property
@@ -52,25 +39,13 @@ class Condition:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """All conditions of one test.
-
-    Attributes
-    ----------
-    conditions : tuple of Condition
-    n_specimens : int
-    shared : bool
-        Whether a specimen occurs in several conditions.
-    random_seed : int or None
-        With a seed u-values are randomised within ties.
-    folded : bool
-        Whether the statistic is the area of abs(2u - 1).
-    """
+    """All conditions of one test."""
 
     conditions: tuple[Condition, ...]
     n_specimens: int
-    shared: bool
-    random_seed: int | None
-    folded: bool = False
+    shared: bool  # whether a specimen occurs in several conditions
+    random_seed: int | None  # with a seed u-values are randomised within ties
+    folded: bool = False  # whether the statistic is the area of abs(2u - 1)
 
     @property
     def size(self) -> int:

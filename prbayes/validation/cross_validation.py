@@ -100,20 +100,13 @@ def cross_validate(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) ->
 
 @dataclass(frozen=True, eq=False)
 class _Folds:
-    """The parts of the specimens, as weights of the observations.
+    """The parts of the specimens, as weights of the observations."""
 
-    Attributes
-    ----------
-    left_out, kept : list of ndarray, shapes (folds, n_k)
-        By simulator: weights of the observations of a fold, and of the others; those kept sum to
-        one.
-    sizes : ndarray of int, shape (folds, simulators)
-        Observations left out.
-    """
-
+    # (folds, n_k): by simulator: weights of the observations of a fold, and of the others; those
+    # kept sum to one.
     left_out: list[Floats]
     kept: list[Floats]
-    sizes: NDArray[np.intp]
+    sizes: NDArray[np.intp]  # (folds, simulators): observations left out
 
     @classmethod
     def dealt(cls, nodes: list[Node], folds: int, random_seed: int) -> _Folds:
