@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from prbayes._checks import Floats, positive_integer
 from prbayes._weighted import reached
 from prbayes.estimate.optimum import Optimum, identity_in
+from prbayes.model.elements import stacked_draws
 from prbayes.model.identity import Level, identity_of_model, require_same
 from prbayes.model.labels import versions
 from prbayes.model.node import Node, model_on_context, nodes
@@ -235,11 +236,8 @@ def populations_of(
         )
     thinned = _thinned(result["posterior"].to_dataset(), draws)
     _refuse_incomplete(thinned, names, caller)
-    points = {}
-    for name in names:
-        values = thinned[name].transpose("chain", "draw", ...).values
-        points[name] = values.reshape(-1, *values.shape[2:])
-    return points, {dim: np.asarray(thinned[dim]) for dim in ("chain", "draw")}
+    coords = {dim: np.asarray(thinned[dim]) for dim in ("chain", "draw")}
+    return stacked_draws(thinned, names), coords
 
 
 def _thinned(posterior: xr.Dataset, draws: int) -> xr.Dataset:

@@ -8,9 +8,10 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
+from prbayes.model.elements import single_elements
 from prbayes.model.evaluator import Evaluator
 from prbayes.plots._ensemble import supported
-from prbayes.plots._names import point_elements, variable_of
+from prbayes.plots._names import variable_of
 from prbayes.plots._objective import free_elements, objective
 
 # How far an axis goes from the optimum, in standard errors: the discrepancy is far above its lowest
@@ -135,7 +136,7 @@ def _plane(optimum: Optimum, evaluator: Evaluator, names: list[str]) -> _Plane:
 
 def _standard_error(optimum: Optimum, name: str, bulk: Floats) -> float:
     """Return the standard error, or if it is unknown what makes the axis as wide as the prior."""
-    error = point_elements(optimum.stderr)[name]
+    error = single_elements(optimum.stderr)[name]
     if np.isfinite(error) and error > 0:
         return error
     low, high = bulk

@@ -12,11 +12,11 @@ import xarray as xr
 
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
-from prbayes.model.elements import split_elements
+from prbayes.model.elements import single_elements, split_elements, stacked_draws
 from prbayes.model.evaluator import Evaluator
 from prbayes.plots._canvas import BLUE, DASHED, DIAMOND, DOTTED, GREY, VERMILION, Canvas, Panel
 from prbayes.plots._curves import bounded_density, central_levels, normal_density
-from prbayes.plots._names import named, point_elements
+from prbayes.plots._names import named
 from prbayes.plots._objective import free_elements
 from prbayes.plots._populations import check_level
 from prbayes.plots._ticks import round_ticks
@@ -141,18 +141,13 @@ def _read_hyperparameters(
     posterior: xr.DataTree, optimum: Optimum | None, model: pm.Model | None
 ) -> dict[str, _Hyperparameter]:
     """Return by element what posterior, optimum and model share."""
-    group = posterior["posterior"].to_dataset()
-    samples = {}
-    for name, values in group.items():
-        stacked = values.stack(s=("chain", "draw"))
-        samples[str(name)] = stacked.transpose("s", ...).values
-    draws = split_elements(samples)
+    draws = split_elements(stacked_draws(posterior["posterior"]))
     shared = {name for name, x in draws.items() if np.ptp(x) > 0}
 
     best, errors = {}, {}
     if optimum is not None:
-        best = point_elements(optimum.point)
-        errors = point_elements(optimum.stderr)
+        best = single_elements(optimum.point)
+        errors = single_elements(optimum.stderr)
         shared &= set(best)
     prior: dict[str, Floats] = {}
     if model is not None:

@@ -127,7 +127,7 @@ class Affine:
         """
         obstacle = refit_obstacle(evaluator)
         if obstacle is not None:
-            return Adjusted(thetas, reason=str(obstacle))
+            return Adjusted(thetas, reason=obstacle)
         draws = thetas.reshape(-1, thetas.shape[-1])
         modes = _identified_modes(evaluator, optima)
         if not modes:

@@ -15,7 +15,6 @@ from prbayes._compare import compare
 from prbayes._diagnose import Diagnosis, diagnose
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.description import describe, from_attributes
-from prbayes.model.elements import element_name
 from prbayes.model.node import nodes
 from prbayes.validation.validity import ValidityTest
 
@@ -112,26 +111,6 @@ def gather(model: Any, optimum: Any, posterior: Any, validity: Any, comparison: 
         observed=_observed(model, results),
         diagnoses=diagnoses,
     )
-
-
-def draws_by_element(group: xr.Dataset) -> dict[str, Floats]:
-    """Return the draws of each element, such as 'mu[1]', of a group with dimensions chain, draw."""
-    found: dict[str, Floats] = {}
-    for name, variable in group.data_vars.items():
-        values = variable.transpose("chain", "draw", ...).values
-        draws = values.reshape(-1, *values.shape[2:])
-        for index in np.ndindex(draws.shape[1:]):
-            found[element_name(str(name), index)] = draws[(slice(None), *index)]
-    return found
-
-
-def single_values(group: xr.Dataset) -> dict[str, float]:
-    """Return the value of each element, such as 'mu[1]', of a group of an optimum."""
-    found: dict[str, float] = {}
-    for name, variable in group.data_vars.items():
-        for index in np.ndindex(variable.shape):
-            found[element_name(str(name), index)] = float(variable.values[index])
-    return found
 
 
 # -- checks ----------------------------------------------------------------------------------
