@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,7 @@ from prbayes.estimate.refinement import (
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.estimate.rivals import Rival, rivals
 from prbayes.estimate.sampling import Local
-from prbayes.estimate.search import Run, Search, Trace, approach, minimise, settle
+from prbayes.estimate.search import Approach, Run, Search, Trace, approach, minimise, settle
 from prbayes.estimate.search import start as begin
 from prbayes.estimate.solution import assemble, rival_record
 from prbayes.model.evaluator import Evaluator
@@ -195,96 +195,48 @@ def minimize(
     True
     """
     evaluator = Evaluator(model_on_context(model, "prb.minimize"))
+    asked = Minimisation(
+        start=start,
+        method=Method.of(method, options),
+        prior=prior,
+        tolerance=positive_number(tolerance, "tolerance"),
+        max_evaluations=positive_integer(max_evaluations, "max_evaluations"),
+        refine=refine,
+        starts=starts,
+        random_seed=random_seed,
+    )
     with shown(progressbar):
-        return find_optimum(
-            evaluator,
-            start=start,
-            method=method,
-            options=options,
-            prior=prior,
-            tolerance=tolerance,
-            max_evaluations=max_evaluations,
-            refine=refine,
-            starts=starts,
-            random_seed=random_seed,
-        )
+        return find_optimum(evaluator, asked)
 
 
-def find_optimum(
-    evaluator: Evaluator,
-    *,
-    start: dict[str, Any] | None = None,
-    method: str | Callable[..., Any] | None = None,
-    options: Mapping[str, Any] | None = None,
-    prior: bool = False,
-    tolerance: float = 1e-6,
-    max_evaluations: int = 5000,
-    refine: bool = True,
-    starts: int | None = None,
-    random_seed: int = 0,
-) -> Optimum:
+@dataclass(frozen=True)
+class Minimisation:
+    """What `minimize` is asked for."""
+
+    start: dict[str, Any] | None = None
+    method: Method = field(default_factory=Method)
+    prior: bool = False
+    tolerance: float = 1e-6
+    max_evaluations: int = 5000
+    refine: bool = True
+    starts: int | None = None
+    random_seed: int = 0
+
+
+def find_optimum(evaluator: Evaluator, asked: Minimisation) -> Optimum:
     """Do what `minimize` does, for an evaluator."""
-    clock = time.perf_counter()
-    minimiser = Method.of(method, options)
-    positive_number(tolerance, "tolerance")
-    positive_integer(max_evaluations, "max_evaluations")
-    _refuse_random(evaluator, minimiser)
-    search = Search(evaluator, evaluator.prior_sd, minimiser, prior, tolerance, max_evaluations)
-    stored = sum(d.n_points for d in evaluator.designs.values())
-    responses_before = evaluator.n_responses - stored
-    if starts is None:
-        starts = 0 if evaluator.responses_per_theta else _STARTS
-    plan = _Plan(search, _several(evaluator), refine, starts, random_seed)
-
-    # Initialise: a start, and the way to where simulated responses meet the data
-    scales = _initial_scales(evaluator, prior=prior)
-    theta, screened = begin(search, start, scales, random_seed)
-    led = approach(search, theta, scales, random_seed)
-
+    plan = _planned(evaluator, asked)
+    begun = _begun(plan, asked)
     # Step: minimise, look at the design, until it is enough
-    state = _minimised(plan, led.theta, scales, led.trace)
+    state = _minimised(plan, begun.led.theta, begun.scales, begun.led.trace)
     rounds = 0
-    while True:
-        state = _judged(plan, state, rounds)
-        if state.restart is None:
-            break
+    while (state := _judged(plan, state, rounds)).restart is not None:
         rounds += 1
         state = _minimised(plan, state.restart, state.scales, state.run.trace, state.cloud)
-
     # Terminate: other optima, stalled line searches, the error of the design where it ended
     state, others = _against_rivals(plan, state)
     state = _settled(plan, state)
-
-    # Postprocess: where nothing is known of the sampling distribution, none is reported
-    edge, jump = _breakdown(plan, state)
-    if edge or jump:
-        state, others = replace(state, sampling=None), []
-    found = assemble(
-        search,
-        state.run,
-        covariance=_covariance(state),
-        remark=led.remark,
-        screened=screened,
-        responses_before=responses_before,
-    )
-    warnings = (
-        *breakdown(edge, jump),
-        *caveats(evaluator, state.local, others, state.design_error),
-    )
-    for line in warnings:
-        _log.warning("%s", line)
-    ran_out = f" {', '.join(edge)} ran to the edge of the support." if edge else ""
-    return replace(
-        found,
-        converged=found.converged and not edge,
-        message=found.message + ran_out,
-        seconds=time.perf_counter() - clock,
-        design_error=state.design_error,
-        rivals=tuple(rival_record(evaluator, o) for o in others),
-        warnings=warnings,
-        at_edge=edge,
-        at_jump=jump,
-    )
+    return _reported(plan, begun, state, others)
 
 
 # -- what a minimisation is, and where it stands ---------------------------------------------------
@@ -299,11 +251,22 @@ class _Plan:
     refine: bool
     starts: int
     seed: int
+    clock: float  # when it began
+    responses_before: int  # computed before it began, without those of designs
 
     @property
     def evaluator(self) -> Evaluator:
         """The model's evaluator."""
         return self.search.evaluator
+
+
+@dataclass(frozen=True)
+class _Beginning:
+    """Where a minimisation begins."""
+
+    scales: Floats  # (k,): by which the simulators' discrepancies are divided at first
+    led: Approach
+    screened: int  # points that were screened for it
 
 
 @dataclass(frozen=True)
@@ -342,13 +305,42 @@ def _refuse_random(evaluator: Evaluator, method: Method) -> None:
         )
 
 
-def _several(evaluator: Evaluator) -> bool:
-    return len(evaluator.nodes) > 1
+def _planned(evaluator: Evaluator, asked: Minimisation) -> _Plan:
+    """Return what is to be done."""
+    clock = time.perf_counter()
+    _refuse_random(evaluator, asked.method)
+    stored = sum(d.n_points for d in evaluator.designs.values())
+    free = not evaluator.responses_per_theta
+    return _Plan(
+        search=Search(
+            evaluator,
+            evaluator.prior_sd,
+            asked.method,
+            asked.prior,
+            asked.tolerance,
+            asked.max_evaluations,
+        ),
+        several=len(evaluator.nodes) > 1,
+        refine=asked.refine,
+        starts=(_STARTS if free else 0) if asked.starts is None else asked.starts,
+        seed=asked.random_seed,
+        clock=clock,
+        responses_before=evaluator.n_responses - stored,
+    )
 
 
-def _initial_scales(evaluator: Evaluator, *, prior: bool) -> Floats:
+def _begun(plan: _Plan, asked: Minimisation) -> _Beginning:
+    """Return a start, and the way from there to where simulated responses meet the data."""
+    scales = _initial_scales(plan)
+    theta, screened = begin(plan.search, asked.start, scales, plan.seed)
+    led = approach(plan.search, theta, scales, plan.seed)
+    return _Beginning(scales, led, screened)
+
+
+def _initial_scales(plan: _Plan) -> Floats:
     """Return epsilons where they are given and matter, else typical sizes of discrepancies."""
-    if not (_several(evaluator) or prior):
+    evaluator = plan.evaluator
+    if not (plan.several or plan.search.prior):
         return np.ones(1)
     natural = np.array([n.target.scale for n in evaluator.nodes])
     epsilon = evaluator.epsilon
@@ -464,6 +456,40 @@ def _settled(plan: _Plan, state: _State) -> _State:
 
 
 # -- after -----------------------------------------------------------------------------------------
+
+
+def _reported(plan: _Plan, begun: _Beginning, state: _State, others: list[Rival]) -> Optimum:
+    """Return the record; where nothing is known of the sampling distribution, it has none."""
+    evaluator = plan.evaluator
+    edge, jump = _breakdown(plan, state)
+    if edge or jump:
+        state, others = replace(state, sampling=None), []
+    found = assemble(
+        plan.search,
+        state.run,
+        covariance=_covariance(state),
+        remark=begun.led.remark,
+        screened=begun.screened,
+        responses_before=plan.responses_before,
+    )
+    warnings = (
+        *breakdown(edge, jump),
+        *caveats(evaluator, state.local, others, state.design_error),
+    )
+    for line in warnings:
+        _log.warning("%s", line)
+    ran_out = f" {', '.join(edge)} ran to the edge of the support." if edge else ""
+    return replace(
+        found,
+        converged=found.converged and not edge,
+        message=found.message + ran_out,
+        seconds=time.perf_counter() - plan.clock,
+        design_error=state.design_error,
+        rivals=tuple(rival_record(evaluator, o) for o in others),
+        warnings=warnings,
+        at_edge=edge,
+        at_jump=jump,
+    )
 
 
 def _breakdown(plan: _Plan, state: _State) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -5,19 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from prbayes.model.elements import single_elements, split_elements, stacked_draws
+from prbayes.plots._objective import METRIC_LABELS
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import counted, number, percentage, plus_minus
 from prbayes.validation.validity import ValidityTest
 
 _MOST = 6  # by judgement: more hyperparameters than this make a list, which a table shows better
-
-# How the metrics that ship are called in a sentence; one of the user's own has its class's name.
-_IN_WORDS = {
-    "ProbabilityResidual": "probability residual",
-    "KullbackLeibler": "Kullback-Leibler divergence",
-    "AreaMetric": "area metric",
-    "LogLikelihood": "log-likelihood",
-}
 
 
 def summary(m: Material) -> list[str]:
@@ -70,7 +63,7 @@ def _metrics(m: Material) -> list[str]:
         first = next(iter(m.calibrations.values()))
         described = list(map(str, first["metric"].values.tolist()))
     classes = [description.partition("(")[0] for description in described]
-    in_words = [_IN_WORDS.get(name, name) for name in classes]
+    in_words = [METRIC_LABELS.get(name, name) for name in classes]
     return list(dict.fromkeys(in_words))
 
 
