@@ -294,16 +294,12 @@ INNER = {
         "pytensor.graph.replace.graph_replace",
         "pytensor.tensor.variable.TensorVariable",
     },
-    "propagation.fresh": {
-        "pytensor.graph.basic.Apply",
-        "pytensor.tensor.variable.TensorVariable",
-    },
+    "propagation.fresh": {"pytensor.tensor.variable.TensorVariable"},
     "propagation.ops": {
         "pytensor.graph.basic.Apply",
         "pytensor.graph.basic.Variable",
         "pytensor.graph.op.Op",
         "pytensor.graph.replace._vectorize_node",
-        "pytensor.tensor.variable.TensorVariable",
     },
     "propagation.resimulated": {
         "pytensor.compile.function",

@@ -273,9 +273,11 @@ class Design(Bound):
 
     def points_of(self, inputs: Inputs) -> list[Floats]:
         """Return the points of some of the design's aleatory inputs, shapes (n, *event)."""
-        own = [id(x) for x in self.inputs.aleatory]
-        known = dict(zip(own, self.batches.points, strict=True))
-        return [known[id(x)] for x in inputs.aleatory]
+        points = self.batches.points
+        own = list(map(id, self.inputs.aleatory))
+        wanted = map(id, inputs.aleatory)
+        places = map(own.index, wanted)
+        return [points[i] for i in places]
 
     def values_of(self, responses: Responses) -> Floats:
         """Return another response of the design's specimens, shape (n,).
@@ -544,9 +546,11 @@ class Design(Bound):
 
         +inf where none has support.
         """
-        if self._basis[:2] != (target, self.n_points):
-            self._basis = (target, self.n_points, target.basis(self.values))
-        basis = self._basis[2]
+        wanted = (target, self.n_points)
+        if self._basis[:2] != wanted:
+            made = target.basis(self.values)
+            self._basis = (*wanted, made)
+        *_, basis = self._basis
         _, weights = self.populations(params)
         supported = np.isfinite(weights).all(axis=-1)
         weights = np.where(supported[:, None], weights, 1 / self.n_points)
