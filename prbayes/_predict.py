@@ -17,6 +17,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats, positive_integer
+from prbayes._progress import shown
 from prbayes._weighted import reached
 from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.model.elements import stacked_draws
@@ -52,6 +53,7 @@ def predict(
     executor: Executor | None = None,
     store: str | PathLike[str] | None = None,
     random_seed: int | None = 0,
+    progressbar: bool = True,
 ) -> xr.DataArray:
     """Draw responses of the calibrated population.
 
@@ -91,6 +93,8 @@ def predict(
     store : path-like, optional
         A folder that keeps every computed response, by ``name``.
     random_seed : int, optional
+    progressbar : bool
+        Whether work of more than two seconds shows a bar on stderr.
 
     Returns
     -------
@@ -143,10 +147,11 @@ def predict(
     responses = Responses(label, response, sorted_inputs, executor=executor, store=store)
     rng = np.random.default_rng(random_seed)
     node = serving(list(nodes(model).values()), responses) if stored else None
-    if node is None:
-        drawn = _new_responses(label, responses, points, n_samples, rng)
-    else:
-        drawn = _resampled_responses(node, responses, points, n_samples, rng)
+    with shown(progressbar):
+        if node is None:
+            drawn = _new_responses(label, responses, points, n_samples, rng)
+        else:
+            drawn = _resampled_responses(node, responses, points, n_samples, rng)
     missing = _count_missing(label, drawn.values)
     return xr.DataArray(
         drawn.values.reshape(len(coords["chain"]), len(coords["draw"]), n_samples),

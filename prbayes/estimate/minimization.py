@@ -43,7 +43,9 @@ from prbayes.model.support import shortcomings
 _log = logging.getLogger("prbayes")
 
 
-def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[str, int]:
+def refine(
+    model: pm.Model | None = None, thetas: Floats | None = None, *, progressbar: bool = True
+) -> dict[str, int]:
     """Add design points where the posterior's populations live, until the designs support them.
 
     `minimize` and `sample_smc` call it; call it yourself before `pymc.sample` on models with
@@ -55,6 +57,8 @@ def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[
         The one on the context by default.
     thetas : ndarray, shape (P, d), optional
         Unconstrained hyperparameters whose populations matter; by default those around the optimum.
+    progressbar : bool
+        Whether work of more than two seconds shows a bar on stderr.
 
     Returns
     -------
@@ -82,13 +86,14 @@ def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[
     """
     model = model_on_context(model, "prb.refine")
     evaluator = Evaluator(model)
-    if thetas is None:
-        minimize(model)
-    else:
-        for _ in range(MAX_ROUNDS):
-            if not refine_at(evaluator, np.asarray(thetas, dtype=np.float64)):
-                break
-        refuse(shortcomings(evaluator, thetas), evaluator)
+    with shown(progressbar):
+        if thetas is None:
+            find_optimum(evaluator, Minimisation())
+        else:
+            for _ in range(MAX_ROUNDS):
+                if not refine_at(evaluator, np.asarray(thetas, dtype=np.float64)):
+                    break
+            refuse(shortcomings(evaluator, thetas), evaluator)
     return {name: design.n_points for name, design in evaluator.designs.items()}
 
 

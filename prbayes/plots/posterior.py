@@ -10,7 +10,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, share
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.elements import single_elements, split_elements, stacked_draws
 from prbayes.model.evaluator import Evaluator
@@ -18,7 +18,6 @@ from prbayes.plots._canvas import BLUE, DASHED, DIAMOND, DOTTED, GREY, VERMILION
 from prbayes.plots._curves import bounded_density, central_levels, normal_density
 from prbayes.plots._names import named
 from prbayes.plots._objective import free_elements
-from prbayes.plots._populations import check_level
 from prbayes.plots._ticks import round_ticks
 
 # Draws of the prior, whose density they show: at a normal's peak within 2%, by the sum of kernels.
@@ -91,7 +90,7 @@ def plot_posterior(
     ['mu']
     """
     _check_results(posterior, optimum)
-    check_level(level)
+    share(level, "level")
     found = _read_hyperparameters(posterior, optimum, model)
     canvas = Canvas(list(found), size=(4.6, 3.6), backend=backend, pc_kwargs=pc_kwargs)
     for name, hyperparameter in found.items():

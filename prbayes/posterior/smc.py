@@ -47,8 +47,8 @@ def sample_smc(
     adjust: Affine | bool = True,
     threshold: float = 0.5,
     refine: bool = True,
-    random_seed: int | None = 0,
     checkpoint: str | PathLike[str] | None = None,
+    random_seed: int | None = 0,
     progressbar: bool = True,
 ) -> xr.DataTree:
     """Draw from the pseudo-posterior by sequential Monte Carlo.
@@ -75,11 +75,11 @@ def sample_smc(
         Share of the effective sample size that a stage keeps; higher means more stages.
     refine : bool
         Whether designs of `Reweighted` that do not support the posterior get more points.
-    random_seed : int, optional
     checkpoint : path-like, optional
         A file that keeps the state after every stage: a run that was killed goes on from there when
         it is called again, and gives the same draws. Give the propagations a ``store`` as well, so
         that the search for the optimum computes nothing again.
+    random_seed : int, optional
     progressbar : bool
 
     Returns

@@ -44,7 +44,7 @@ class Case:
     conditions: tuple[Condition, ...]
     n_specimens: int
     shared: bool  # whether a specimen occurs in several conditions
-    random_seed: int | None  # with a seed u-values are randomised within ties
+    random_seed: int | None  # of the choice within ties
     folded: bool = False  # whether the statistic is the area of abs(2u - 1)
 
     @property
@@ -62,11 +62,10 @@ class Case:
         """Whether a specimen was measured several times."""
         return self.n_specimens < self.size
 
-    def rng(self, stream: int) -> np.random.Generator | None:
-        """Return a generator for the choice within ties, or None for the mid-transform."""
-        if self.random_seed is None:
-            return None
-        return np.random.default_rng([self.random_seed, stream])
+    def rng(self, stream: int) -> np.random.Generator:
+        """Return a generator for the choice within ties."""
+        seed = self.random_seed
+        return np.random.default_rng(None if seed is None else [seed, stream])
 
     def tested(self, u: Floats) -> Floats:
         """Return the values that are tested for uniformity."""
@@ -86,7 +85,7 @@ def read_case(
     observed: Any,
     predicted: Any,
     specimens: Any = None,
-    random_seed: int | None = None,
+    random_seed: int | None = 0,
     folded: bool = False,
 ) -> Case:
     """Return the conditions, checked; arguments are those of `area_test`.

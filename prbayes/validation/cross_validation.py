@@ -9,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
+from prbayes._progress import shown
 from prbayes.estimate.data_sets import DataSets, specimens
 from prbayes.estimate.optimum import Optimum, require_refits
 from prbayes.metrics.base import Discrepancy
@@ -20,7 +21,9 @@ from prbayes.model.node import Node
 _STREAM = 3
 
 
-def cross_validate(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) -> xr.Dataset:
+def cross_validate(
+    optimum: Optimum, *, folds: int = 5, random_seed: int = 0, progressbar: bool = True
+) -> xr.Dataset:
     """Calibrate on parts of the specimens, and return the discrepancy of those left out.
 
     In place of LOO and WAIC, which do not apply to a discrepancy: it is one value for all specimens
@@ -37,6 +40,8 @@ def cross_validate(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) ->
         Number of parts; specimens are dealt out at random, those with the same label together.
     random_seed : int
         Models with as many specimens have the same folds with the same seed.
+    progressbar : bool
+        Whether work of more than two seconds shows a bar on stderr.
 
     Returns
     -------
@@ -75,7 +80,8 @@ def cross_validate(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) ->
     # Calibrate on the others of each fold.
     observed = [node.target.observed for node in evaluator.nodes]
     sampling = optimum.sampling()
-    x, converged = sampling.refit(DataSets(observed, parts.kept))
+    with shown(progressbar):
+        x, converged = sampling.refit(DataSets(observed, parts.kept))
     thetas = sampling.thetas(x)
 
     # Compare what was found with both parts.

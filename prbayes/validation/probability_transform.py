@@ -14,15 +14,17 @@ def u_values(
     observed: ArrayLike | Mapping[str, ArrayLike] | Sequence[ArrayLike],
     predicted: Predicted | Mapping[str, Predicted] | Sequence[Predicted],
     *,
-    random_seed: int | None = None,
+    random_seed: int | None = 0,
 ) -> Floats:
     r"""Return where measured responses stand in the pooled predictive distribution.
 
     This is the probability integral transform:
 
-    .. math:: u_i = \tfrac12 \{ P(Y < y_i) + P(Y \le y_i) \}
+    .. math:: u_i \sim U \{ P(Y < y_i), P(Y \le y_i) \}
 
-    over all draws and samples of the prediction together. Several conditions pool their u-values.
+    over all draws and samples of the prediction together. Between the two lie only values that are
+    tied with predicted ones, such as failed specimens or discrete responses: at random, so that
+    they are uniform too if the model is right. Several conditions pool their u-values.
 
     Parameters
     ----------
@@ -31,9 +33,7 @@ def u_values(
     predicted : DataArray from `predict`, or ndarray of shape (..., S); or a mapping or list of such
         +inf counts as larger than every number; NaN are left out.
     random_seed : int, optional
-        With a seed u is uniform between P(Y < y) and P(Y <= y), and not the middle: then u-values
-        of ties, such as failed specimens or discrete responses, are uniform too if the model is
-        right.
+        Of the choice within ties; with None another one each time.
 
     Returns
     -------
