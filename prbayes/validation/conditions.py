@@ -44,7 +44,8 @@ class Case:
     conditions: tuple[Condition, ...]
     n_specimens: int
     shared: bool  # whether a specimen occurs in several conditions
-    random_seed: int | None  # of the choice within ties
+    randomize: bool  # whether u-values of ties are random within their step
+    random_seed: int | None
     folded: bool = False  # whether the statistic is the area of abs(2u - 1)
 
     @property
@@ -62,8 +63,10 @@ class Case:
         """Whether a specimen was measured several times."""
         return self.n_specimens < self.size
 
-    def rng(self, stream: int) -> np.random.Generator:
-        """Return a generator for the choice within ties."""
+    def rng(self, stream: int) -> np.random.Generator | None:
+        """Return a generator for the choice within ties, or None for the mid-transform."""
+        if not self.randomize:
+            return None
         seed = self.random_seed
         return np.random.default_rng(None if seed is None else [seed, stream])
 
@@ -85,8 +88,10 @@ def read_case(
     observed: Any,
     predicted: Any,
     specimens: Any = None,
-    random_seed: int | None = 0,
+    *,
     folded: bool = False,
+    randomize: bool = False,
+    random_seed: int | None = 0,
 ) -> Case:
     """Return the conditions, checked; arguments are those of `area_test`.
 
@@ -120,6 +125,7 @@ def read_case(
         conditions=tuple(conditions),
         n_specimens=len(numbers),
         shared=distinct > len(numbers),
+        randomize=randomize,
         random_seed=random_seed,
         folded=folded,
     )

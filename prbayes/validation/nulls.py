@@ -188,7 +188,9 @@ class _Pool:
             count=np.count_nonzero(usable, axis=1),
         )
 
-    def u_values(self, draw: NDArray[np.intp], place: Floats, ties: np.random.Generator) -> Floats:
+    def u_values(
+        self, draw: NDArray[np.intp], place: Floats, ties: np.random.Generator | None
+    ) -> Floats:
         """Return u-values of replicates, shape (r, n).
 
         Parameters

@@ -110,6 +110,7 @@ def area_test(
     | Sequence[ArrayLike | None]
     | None = None,
     folded: bool = False,
+    randomize: bool = False,
     random_seed: int | None = 0,
     progressbar: bool = True,
 ) -> ValidityTest:
@@ -143,7 +144,7 @@ def area_test(
     folded : bool
         Whether to test ``|2u - 1|``, which a right model makes uniform as well: responses too far
         out, or too close to the middle. Two tests at ``level`` / 2 look at both mean and spread.
-    random_seed : int, optional
+    randomize, random_seed
         As in `u_values`.
     progressbar : bool
         Whether work of more than two seconds shows a bar on stderr.
@@ -177,7 +178,14 @@ def area_test(
     """
     _refuse_null(null)
     level = share(level, "level")
-    case = read_case(observed, predicted, specimens, random_seed, folded)
+    case = read_case(
+        observed,
+        predicted,
+        specimens,
+        folded=folded,
+        randomize=randomize,
+        random_seed=random_seed,
+    )
     if null is None:
         one_each = case.draws == 1 and not case.dependent
         null = ExactModel() if one_each else PosteriorNull()
