@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import xarray as xr
+from scipy.stats import norm
 
 from prbayes._checks import Floats, share
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.elements import single_elements, split_elements, stacked_draws
 from prbayes.model.evaluator import Evaluator
 from prbayes.plots._canvas import BLUE, DASHED, DIAMOND, DOTTED, GREY, VERMILION, Canvas, Panel
-from prbayes.plots._curves import bounded_density, central_levels, normal_density
+from prbayes.plots._curves import bounded_density, central_levels
 from prbayes.plots._names import named
 from prbayes.plots._objective import free_elements
 from prbayes.plots._ticks import round_ticks
@@ -213,12 +214,8 @@ def _draw_normal(
     panel: Panel, grid: Floats, best: float, error: float, level: float, row: float
 ) -> None:
     """Draw the normal distribution of the optimum's standard error, and its interval."""
-    from scipy.special import ndtri  # takes longer to import than the whole package
-
-    y = normal_density(grid, best, error)
+    normal = norm(best, error)
     text = "normal with the optimum's standard error"
-    panel.line("normal", grid, y, VERMILION, style=DASHED, legend=text)
-    tail = (1 - level) / 2
-    z = -float(ndtri(tail))
-    ends = best + z * error * np.array([-1, 1])
+    panel.line("normal", grid, normal.pdf(grid), VERMILION, style=DASHED, legend=text)
+    ends = normal.ppf(central_levels(level))
     panel.line("stderr", ends, np.repeat(row, 2), VERMILION, width=3)

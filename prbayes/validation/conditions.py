@@ -44,8 +44,8 @@ class Case:
     conditions: tuple[Condition, ...]
     n_specimens: int
     shared: bool  # whether a specimen occurs in several conditions
-    randomize: bool  # whether u-values of ties are random within their step
-    random_seed: int | None
+    randomize: bool = False  # whether u-values of ties are random within their step
+    random_seed: int | None = 0
     folded: bool = False  # whether the statistic is the area of abs(2u - 1)
 
     @property

@@ -47,7 +47,6 @@ def test_p_values_of_replicates_count_the_observed_data_in() -> None:
         (Condition("a", np.zeros(1), np.zeros((1, 1)), None, np.zeros(1, dtype=int)),),
         1,
         False,
-        None,
     )
 
     def judged(statistic: float, level: float) -> tuple[float, float]:
