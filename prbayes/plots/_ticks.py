@@ -23,7 +23,8 @@ def round_ticks(low: float, high: float) -> Ticks:
     """Return a few round numbers within a range, and their labels."""
     from matplotlib.ticker import MaxNLocator  # heavy, and only needed for pictures
 
-    found = MaxNLocator(_MOST_ROUND, steps=list(_ROUND_STEPS)).tick_values(low, high)
+    locator = MaxNLocator(_MOST_ROUND, steps=list(_ROUND_STEPS))
+    found = np.asarray(locator.tick_values(low, high))
     step = found[1] - found[0]
     slack = _ROUNDING * step
     at = found[(found >= low - slack) & (found <= high + slack)]
