@@ -122,7 +122,7 @@ def test_terms_of_two_inputs(kernel: str, degree: int | None, terms: int) -> Non
 
 
 def test_settings_make_the_same_surface_again() -> None:
-    for model in (prb.surrogate.RadialBasis("quintic", 2, 0.1, 9), prb.surrogate.Polynomial(4)):
+    for model in (prb.surrogate.RadialBasis("quintic", 2, 0.1), prb.surrogate.Polynomial(4)):
         assert shipped(type(model).__name__, settings_of(model)) == model
     assert settings_of(Plane()) == {}
     assert shipped("Plane", {}) is None
