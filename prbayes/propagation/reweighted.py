@@ -332,16 +332,17 @@ class Design(Bound):
         self._stored = batch if self._stored is None else self._stored.followed_by(batch)
 
         # The mixture is that of all batches, so its density changes at the old points too.
-        log_g, sums = self._log_mixture(
-            self.batches.components, self.batches.counts, self.batches.points
-        )
+        stored = self.batches
+        log_g, sums = self._log_mixture(stored.components, stored.counts, stored.points)
         if self._moving is None:
             self._moving = moving_inputs(self.name, self.inputs, components, points)
             self.support_moves = bool(self._moving)
         basis = self.target.basis(self.values)
-        self._share([*self.batches.points, log_g, *self._cell_ends(), *basis])
+        ends = self._cell_ends()
+        self._share([*stored.points, log_g, *ends, *basis])
         log_ess = 2 * sums[0] - sums[1]
-        of_these = np.exp(log_ess)[-len(counts) :]
+        ess = np.exp(log_ess)
+        of_these = ess[-len(counts) :]
         return float(np.median(of_these))
 
     def _cell_ends(self) -> list[Floats]:
@@ -603,13 +604,17 @@ def _inverted(levels: Floats, grid: Floats, density: Floats) -> Floats:
     both_ends = density[1:] + density[:-1]
     with np.errstate(invalid="ignore", over="ignore"):
         trapezoids = 0.5 * both_ends * np.diff(grid)
-        mass = np.concatenate([[0.0], np.cumsum(trapezoids)])
-        off = np.abs(mass / mass[-1] - share).max()
+        cumulated = np.cumsum(trapezoids)
+        mass = np.concatenate([[0.0], cumulated])
+        apart = mass / mass[-1] - share
+        off = np.abs(apart).max()
     # Trapezoids are finer than the share of points below, but where the density is infinite at an
     # edge, or its peaks lie between points: then the two differ by more than random points would.
     if off < 1 / np.sqrt(grid.size):
-        return np.interp(levels * mass[-1], mass, grid)
-    return np.interp(levels, share, grid)
+        found = np.interp(levels * mass[-1], mass, grid)
+    else:
+        found = np.interp(levels, share, grid)
+    return np.asarray(found)
 
 
 def _end_to_end(first: Floats, second: Floats) -> Floats:
