@@ -158,3 +158,14 @@ def positive_integer(value: object, name: str, *, minimum: int = 1) -> int:
     if value < minimum:
         raise ValueError(f"{name}: got {value}, expected an integer >= {minimum}")
     return int(value)
+
+
+def share(value: object, name: str) -> float:
+    """Return ``value`` as a float, or raise if it is no number between 0 and 1, ends excluded."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise TypeError(
+            f"{name}: got {type(value).__name__} {value!r:.60}, expected a number between 0 and 1"
+        )
+    if not 0 < value < 1:
+        raise ValueError(f"{name}: got {value!r}, expected a number between 0 and 1")
+    return float(value)

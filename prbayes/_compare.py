@@ -18,7 +18,12 @@ from prbayes.metrics.base import Metric
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual
-from prbayes.model.elements import element_name
+from prbayes.model.elements import (
+    element_names,
+    single_elements,
+    split_elements,
+    stacked_draws,
+)
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import as_attributes, require_together
 from prbayes.model.node import nodes
@@ -137,7 +142,7 @@ def _column(label: str, result: Any) -> _Column:
         return _Column(elements, float(result.n_responses), result.seconds)
     if isinstance(result, xr.DataTree) and "posterior" in result.children:
         posterior = result["posterior"]
-        return _Column(_of_draws(posterior.to_dataset()), *_cost(posterior.attrs))
+        return _Column(_of_draws(posterior), *_cost(posterior.attrs))
     if isinstance(result, xr.DataTree) and "optimum" in result.children:
         optimum = result["optimum"]
         elements = _normal(optimum.data_vars, result["stderr"].data_vars)
@@ -148,32 +153,24 @@ def _column(label: str, result: Any) -> _Column:
     )
 
 
-def _of_draws(posterior: xr.Dataset) -> dict[str, _Estimate]:
+def _of_draws(posterior: Any) -> dict[str, _Estimate]:
     """Return mean, standard deviation and equal-tailed interval by element."""
     tails = [(1 - INTERVAL) / 2, (1 + INTERVAL) / 2]
     found = {}
-    for name, variable in posterior.data_vars.items():
-        stacked = variable.stack(sample=("chain", "draw"))
-        draws = stacked.transpose("sample", ...).values
-        for index in np.ndindex(draws.shape[1:]):
-            x = draws[(slice(None), *index)]
-            lower, upper = np.quantile(x, tails)
-            element = element_name(str(name), index)
-            found[element] = _Estimate(float(x.mean()), float(x.std(ddof=1)), lower, upper)
+    for element, x in split_elements(stacked_draws(posterior)).items():
+        lower, upper = np.quantile(x, tails)
+        found[element] = _Estimate(float(x.mean()), float(x.std(ddof=1)), lower, upper)
     return found
 
 
 def _normal(point: Mapping[Any, Any], stderr: Mapping[Any, Any]) -> dict[str, _Estimate]:
     """Return estimate, standard error and normal interval by element of an optimum."""
     z = norm.ppf((1 + INTERVAL) / 2)
+    errors = single_elements(stderr)
     found = {}
-    for name, value in point.items():
-        values = np.asarray(value)
-        errors = np.asarray(stderr[name])
-        for index in np.ndindex(values.shape):
-            estimate, sd = float(values[index]), float(errors[index])
-            element = element_name(str(name), index)
-            found[element] = _Estimate(estimate, sd, estimate - z * sd, estimate + z * sd)
+    for element, estimate in single_elements(point).items():
+        sd = errors[element]
+        found[element] = _Estimate(estimate, sd, estimate - z * sd, estimate + z * sd)
     return found
 
 
@@ -223,7 +220,7 @@ def _thetas(evaluator: Evaluator, names: list[str], estimates: Floats) -> Floats
     values = []
     for rv in evaluator.model.free_RVs:
         shape = tuple(map(int, rv.shape.eval()))
-        elements = [element_name(str(rv.name), index) for index in np.ndindex(shape)]
+        elements = element_names(str(rv.name), shape)
         if not set(elements) <= set(names):
             return None
         places = [names.index(element) for element in elements]

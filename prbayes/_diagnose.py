@@ -13,7 +13,7 @@ import xarray as xr
 
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum, require_of_model
-from prbayes.model.elements import element_name
+from prbayes.model.elements import single_elements, stacked_draws
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level
 from prbayes.model.node import model_on_context
@@ -205,11 +205,7 @@ def _by_element(statistic: str, posterior: xr.Dataset) -> dict[str, float]:
     stats: Any = import_module("arviz_stats")  # heavy, and partly annotated
     with np.errstate(all="ignore"):  # a variable that never moves
         found = getattr(stats, statistic)(posterior)
-    by_element = {}
-    for name, values in found.items():
-        for index in np.ndindex(values.shape):
-            by_element[element_name(str(name), index)] = float(values.values[index])
-    return by_element
+    return single_elements(found.data_vars)
 
 
 def _listed(values: Mapping[str, float], form: str) -> str:
@@ -248,11 +244,8 @@ def _thetas(posterior: Any, model: pm.Model) -> Floats:
     missing = [name for name in names if name not in posterior]
     if missing:
         raise KeyError(f"posterior: got no {missing}, expected the model's free variables {names}")
-    draws = []
-    for name in names:
-        values = posterior[name].transpose("chain", "draw", ...).values
-        draws.append(values.reshape(-1, *values.shape[2:]))
-    return Evaluator(model).thetas_of(draws)
+    draws = stacked_draws(posterior, names)
+    return Evaluator(model).thetas_of(list(draws.values()))
 
 
 # -- designs ---------------------------------------------------------------------------------
@@ -269,18 +262,10 @@ class _Needs:
 
 @dataclass(frozen=True, eq=False)
 class _Designs:
-    """How designs support the populations of a result, and what they are asked for.
+    """How designs support the populations of a result, and what they are asked for."""
 
-    Attributes
-    ----------
-    support : xarray.Dataset
-        With the dimensions simulator and sample.
-    needs : dict
-        By simulator.
-    """
-
-    support: xr.Dataset
-    needs: dict[str, _Needs]
+    support: xr.Dataset  # with the dimensions simulator and sample
+    needs: dict[str, _Needs]  # by simulator
 
 
 def _computed(evaluator: Evaluator, thetas: Floats) -> _Designs:

@@ -17,8 +17,10 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats, positive_integer
+from prbayes._progress import shown
 from prbayes._weighted import reached
 from prbayes.estimate.optimum import Optimum, identity_in, require_of_model
+from prbayes.model.elements import stacked_draws
 from prbayes.model.identity import Level, as_attributes, identity_of_model
 from prbayes.model.labels import versions
 from prbayes.model.node import Node, model_on_context, nodes
@@ -52,6 +54,7 @@ def predict(
     store: str | PathLike[str] | None = None,
     version: str | None = None,
     random_seed: int | None = 0,
+    progressbar: bool = True,
 ) -> xr.DataArray:
     """Draw responses of the calibrated population.
 
@@ -93,6 +96,8 @@ def predict(
     version : str, optional
         Of the response, for the store; as for `Reweighted`.
     random_seed : int, optional
+    progressbar : bool
+        Whether work of more than two seconds shows a bar on stderr.
 
     Returns
     -------
@@ -148,10 +153,11 @@ def predict(
     )
     rng = np.random.default_rng(random_seed)
     node = serving(list(nodes(model).values()), responses) if stored else None
-    if node is None:
-        drawn = _new_responses(label, responses, points, n_samples, rng)
-    else:
-        drawn = _resampled_responses(node, responses, points, n_samples, rng)
+    with shown(progressbar):
+        if node is None:
+            drawn = _new_responses(label, responses, points, n_samples, rng)
+        else:
+            drawn = _resampled_responses(node, responses, points, n_samples, rng)
     missing = _count_missing(label, drawn.values)
     return xr.DataArray(
         drawn.values.reshape(len(coords["chain"]), len(coords["draw"]), n_samples),
@@ -173,21 +179,11 @@ def predict(
 
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """Responses of specimens.
+    """Responses of specimens."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (k, n)
-        By population.
-    specimens : list of ndarray, shapes (k, n, *event)
-        Aleatory inputs.
-    source : str
-        How specimens were made.
-    """
-
-    values: Floats
-    specimens: list[Floats]
-    source: str
+    values: Floats  # (k, n): by population
+    specimens: list[Floats]  # (k, n, *event): aleatory inputs
+    source: str  # how specimens were made
 
 
 def _label(response: Callable[..., Any], name: str | None, store: object) -> str:
@@ -252,11 +248,8 @@ def populations_of(
         )
     thinned = _thinned(result["posterior"].to_dataset(), draws)
     _refuse_incomplete(thinned, names, caller)
-    points = {}
-    for name in names:
-        values = thinned[name].transpose("chain", "draw", ...).values
-        points[name] = values.reshape(-1, *values.shape[2:])
-    return points, {dim: np.asarray(thinned[dim]) for dim in ("chain", "draw")}
+    coords = {dim: np.asarray(thinned[dim]) for dim in ("chain", "draw")}
+    return stacked_draws(thinned, names), coords
 
 
 def _thinned(posterior: xr.Dataset, draws: int) -> xr.Dataset:

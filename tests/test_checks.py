@@ -13,6 +13,7 @@ from prbayes._checks import (
     positive_number,
     real_array,
     sample_weights,
+    share,
     simulated_sample,
 )
 
@@ -211,3 +212,13 @@ def test_positive_integer_refuses_other_types(value: Any) -> None:
         TypeError, match=f"^bins: got {type(value).__name__} .*expected an integer >= 1"
     ):
         positive_integer(value, "bins")
+
+
+def test_a_share_is_between_zero_and_one() -> None:
+    assert share(np.float32(0.5), "level") == 0.5
+    for value in (0.0, 1, 1.5, -0.2, np.nan, np.inf):
+        with pytest.raises(ValueError, match=r"level: got .*, expected a number between 0 and 1"):
+            share(value, "level")
+    for other in (True, "0.5", None, [0.5]):
+        with pytest.raises(TypeError, match=r"level: got .*, expected a number between 0 and 1"):
+            share(other, "level")

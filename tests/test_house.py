@@ -174,6 +174,66 @@ def test_the_top_has_few_names_and_no_function_is_called_like_a_module() -> None
     assert not stems & {name.split(".")[-1] for name in functions}
 
 
+# How work is done, by keyword, after what is done; in this order.
+TAIL = (
+    "labels",
+    "backend",
+    "executor",
+    "store",
+    "version",
+    "on_failure",
+    "checkpoint",
+    "random_seed",
+    "progressbar",
+)
+# What computes responses, refits or replicates, and may so take long.
+SLOW = (
+    "Simulator",
+    "Surrogate.fit",
+    "area_test",
+    "bootstrap",
+    "cross_validate",
+    "minimize",
+    "predict",
+    "refine",
+    "sample_smc",
+    "simulation_based_calibration",
+)
+SIGNATURES = {
+    name: inspect.signature(value)
+    for name, value in (PUBLIC | {"Surrogate.fit": prbayes.Surrogate.fit}).items()
+    if inspect.isroutine(value)
+}
+
+
+@pytest.mark.parametrize("name", sorted(SIGNATURES))
+def test_public_functions_have_their_arguments_in_one_order(name: str) -> None:
+    parameters = SIGNATURES[name].parameters
+    given = [key for key, p in parameters.items() if p.kind is not inspect.Parameter.VAR_KEYWORD]
+    common = [key for key in given if key in TAIL]
+    assert common == sorted(common, key=TAIL.index)
+    assert given[len(given) - len(common) :] == common
+    assert all(parameters[key].kind is inspect.Parameter.KEYWORD_ONLY for key in common)
+
+
+def test_what_is_slow_has_a_progress_bar_that_can_be_left_out() -> None:
+    with_bar = [name for name, s in SIGNATURES.items() if "progressbar" in s.parameters]
+    assert sorted(with_bar) == list(SLOW)
+    assert all(SIGNATURES[name].parameters["progressbar"].default is True for name in SLOW)
+
+
+def test_seeds_are_zero_by_default() -> None:
+    for name, value in PUBLIC.items():
+        if name == "posterior.BatchedKernel":
+            continue  # made by PyMC, which hands it a generator
+        if isinstance(value, type) and issubclass(value, Exception):
+            continue
+        parameters = inspect.signature(value).parameters
+        assert "seed" not in parameters
+        if "random_seed" in parameters:
+            assert parameters["random_seed"].default == 0, name
+
+
 def test_design_shows_the_rooms_in_their_own_words() -> None:
     page = (ROOT / "DESIGN.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(\w+)(?:/|\.py)` \| (.*) \| (.*)\|$", page, flags=re.MULTILINE)
@@ -295,16 +355,12 @@ INNER = {
         "pytensor.graph.replace.graph_replace",
         "pytensor.tensor.variable.TensorVariable",
     },
-    "propagation.fresh": {
-        "pytensor.graph.basic.Apply",
-        "pytensor.tensor.variable.TensorVariable",
-    },
+    "propagation.fresh": {"pytensor.tensor.variable.TensorVariable"},
     "propagation.ops": {
         "pytensor.graph.basic.Apply",
         "pytensor.graph.basic.Variable",
         "pytensor.graph.op.Op",
         "pytensor.graph.replace._vectorize_node",
-        "pytensor.tensor.variable.TensorVariable",
     },
     "propagation.resimulated": {
         "pytensor.compile.function",

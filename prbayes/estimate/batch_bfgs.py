@@ -57,19 +57,11 @@ class _Problem:
 
 @dataclass(frozen=True, eq=False)
 class _Steps:
-    """What some of the rows are to do next.
+    """What some of the rows are to do next."""
 
-    Attributes
-    ----------
-    rows : ndarray of int, shape (A,)
-    steps : ndarray, shape (A, r)
-    promise : ndarray, shape (A,)
-        Twice the gain that a quadratic model promises.
-    """
-
-    rows: NDArray[np.intp]
-    steps: Floats
-    promise: Floats
+    rows: NDArray[np.intp]  # (A,)
+    steps: Floats  # (A, r)
+    promise: Floats  # (A,): twice the gain that a quadratic model promises
 
     def only(self, these: NDArray[np.bool_]) -> _Steps:
         """Return those of some rows."""

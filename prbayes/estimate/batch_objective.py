@@ -17,30 +17,15 @@ from prbayes.model.evaluator import Evaluator
 
 @dataclass(frozen=True, eq=False)
 class BatchObjective:
-    """The sum of d_k / scale_k against each of B data sets; no response is computed.
+    """The sum of d_k / scale_k against each of B data sets; no response is computed."""
 
-    Attributes
-    ----------
-    evaluator : Evaluator
-        All its responses are stored.
-    scales : ndarray, shape (K,)
-        By simulator of the model.
-    simulators : tuple of int
-        Which of them count.
-    targets : list of Discrepancy
-        Of those, each against all B data sets.
-    bases : list
-        What turns weights of stored responses into features.
-    blocks : sequence of ndarray, shapes (n_k,)
-        Of those that count: the block that each point of the design belongs to. Where there are
-        several, the b-th data set is compared with the b-th block alone.
-    """
-
-    evaluator: Evaluator
-    scales: Floats
-    simulators: tuple[int, ...]
-    targets: list[Discrepancy]
-    bases: list[tuple[NDArray[Any], ...]]
+    evaluator: Evaluator  # all its responses are stored
+    scales: Floats  # (K,): by simulator of the model
+    simulators: tuple[int, ...]  # which of them count
+    targets: list[Discrepancy]  # of those, each against all B data sets
+    bases: list[tuple[NDArray[Any], ...]]  # what turns weights of stored responses into features
+    # (n_k,): of those that count: the block that each point of the design belongs to. Where there
+    # are several, the b-th data set is compared with the b-th block alone.
     blocks: Sequence[NDArray[np.intp]] = ()
 
     @classmethod

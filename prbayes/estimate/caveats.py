@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from prbayes._checks import Floats
+from prbayes._weighted import distribution_function
 from prbayes.estimate.differences import cross
 from prbayes.estimate.identifiability import unidentified_directions
 from prbayes.estimate.refinement import AGREE
@@ -128,25 +129,10 @@ def _apart(evaluator: Evaluator, a: Floats, b: Floats) -> float:
     for k in range(len(evaluator.nodes)):
         values, weights = evaluator.populations(both, k)
         occurring = np.unique(values[np.isfinite(values)])
-        below = []
-        for v, w in zip(values, weights, strict=True):
-            shares = _shares_below(v, w, occurring)
-            below.append(shares)
+        below = distribution_function(values, weights, occurring)
         gaps = np.abs(below[0] - below[1])
         largest = max(largest, float(gaps.max(initial=0.0)))
     return largest
-
-
-def _shares_below(values: Floats, weights: Floats, at: Floats) -> Floats:
-    """Return the shares of weight of the values up to each number.
-
-    Those without response are above all.
-    """
-    order = np.argsort(values)
-    cumulated = np.cumsum(weights[order])
-    total = np.concatenate([[0.0], cumulated])
-    places = np.searchsorted(values[order], at, side="right")
-    return np.asarray(total[places] / total[-1])
 
 
 def caveats(

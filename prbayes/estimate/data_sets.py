@@ -26,17 +26,10 @@ _SPARE = 4
 
 @dataclass(frozen=True, eq=False)
 class DataSets:
-    """Data sets for all simulators of a model, as weights on fixed values.
+    """Data sets for all simulators of a model, as weights on fixed values."""
 
-    Attributes
-    ----------
-    values : list of ndarray, shapes (n_k,)
-        By simulator: all values that occur.
-    weights : list of ndarray, shapes (n_sets, n_k)
-        By simulator: the weight of each value in each data set; they sum to one.
-    """
-
-    values: list[Floats]
+    values: list[Floats]  # (n_k,): by simulator: all values that occur
+    # (n_sets, n_k): by simulator: the weight of each value in each data set; they sum to one.
     weights: list[Floats]
 
 

@@ -69,16 +69,16 @@ def _named(direction: Floats, names: list[str]) -> str:
 _HALVED = 256
 # Correlation of the changes of two halves of the points from which a change is taken as real.
 _AGREEMENT = 0.35
-# Change of the area over one prior standard deviation, in units of the noise floor, that is seen.
+# Change of the area over one prior standard deviation, in noise floors, that counts.
 _CHANGE = 0.5
 # Curvature, in units of the gradient's variance over the curvature, that is a rounding error.
 _ROUNDING = 0.01
 
 
-def seen_by_area(information: Information) -> Floats:
+def identified_by_area(information: Information) -> Floats:
     """Return the directions that an area metric identifies, the strongest last, shape (d, r).
 
-    Orthonormal in units of the prior's spread. A direction is not seen if one prior standard
+    Orthonormal in units of the prior's spread. A direction is not identified if one prior standard
     deviation along it changes the area by less than half the noise floor, or if two halves of the
     points do not agree on the change: then it is the points' own error.
     """
@@ -89,11 +89,11 @@ def seen_by_area(information: Information) -> Floats:
     # The change of the area over one prior standard deviation along each direction.
     changes = np.abs(vectors.T @ slopes)
     change = (changes * area.lengths).sum(axis=-1)
-    seen = change > _CHANGE * information.noise_floor
+    found = change > _CHANGE * information.noise_floor
     points = information.node.bound.blocks
     if points.size >= _HALVED:
-        seen &= _halves_agree(information, vectors)
-    return np.asarray(vectors[:, seen])
+        found &= _halves_agree(information, vectors)
+    return np.asarray(vectors[:, found])
 
 
 def _halves_agree(information: Information, vectors: Floats) -> NDArray[np.bool_]:
@@ -120,7 +120,7 @@ def _in_prior_sd(area: LinearArea, information: Information) -> Floats:
     return np.asarray(area.slopes * spread)
 
 
-def seen_by_curvature(
+def identified_by_curvature(
     hessian: Floats, noise: Floats, weakest: float = 1.0
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Return eigenvalues and eigenvectors of the Hessian, and along which the data tell enough.

@@ -40,24 +40,13 @@ _WIDTH = 3.2
 
 @dataclass(frozen=True, eq=False)
 class _Along:
-    """An objective in coordinates x along axes, in steps, around theta.
-
-    Attributes
-    ----------
-    objective : BatchObjective
-    theta : ndarray, shape (d,)
-    prior_sd : ndarray, shape (d,)
-    axes : ndarray, shape (d, d)
-        As columns, in units of the prior's spread.
-    steps : ndarray, shape (d,)
-        Length of one unit of x along each.
-    """
+    """An objective in coordinates x along axes, in steps, around theta."""
 
     objective: BatchObjective
-    theta: Floats
-    prior_sd: Floats
-    axes: Floats
-    steps: Floats
+    theta: Floats  # (d,)
+    prior_sd: Floats  # (d,)
+    axes: Floats  # (d, d): as columns, in units of the prior's spread
+    steps: Floats  # (d,): length of one unit of x along each
 
     def shifts(self, x: Floats) -> Floats:
         """Return coordinates (..., d) in units of the prior's spread."""
@@ -78,25 +67,13 @@ class _Along:
 
 @dataclass(frozen=True, eq=False)
 class Refits:
-    """Data sets drawn from the model at one theta, and the minimiser of each.
+    """Data sets drawn from the model at one theta, and the minimiser of each."""
 
-    Attributes
-    ----------
-    objective : BatchObjective
-        Of the data sets.
-    theta : ndarray, shape (d,)
-    prior_sd : ndarray, shape (d,)
-    shifts : ndarray, shape (n_sets, d)
-        Minimisers less theta, in units of the prior's spread.
-    gain : float
-        By how much the minimisers are better than theta, on average.
-    """
-
-    objective: BatchObjective
-    theta: Floats
-    prior_sd: Floats
-    shifts: Floats
-    gain: float
+    objective: BatchObjective  # of the data sets
+    theta: Floats  # (d,)
+    prior_sd: Floats  # (d,)
+    shifts: Floats  # (n_sets, d): minimisers less theta, in units of the prior's spread
+    gain: float  # by how much the minimisers are better than theta, on average
 
     @classmethod
     def at(

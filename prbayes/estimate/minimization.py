@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,7 @@ from prbayes.estimate.refinement import (
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.estimate.rivals import Rival, rivals
 from prbayes.estimate.sampling import Local
-from prbayes.estimate.search import Run, Search, Trace, approach, minimise, settle
+from prbayes.estimate.search import Approach, Run, Search, Trace, approach, minimise, settle
 from prbayes.estimate.search import start as begin
 from prbayes.estimate.solution import assemble, rival_record
 from prbayes.model.evaluator import Evaluator
@@ -43,7 +43,9 @@ from prbayes.model.support import shortcomings
 _log = logging.getLogger("prbayes")
 
 
-def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[str, int]:
+def refine(
+    model: pm.Model | None = None, thetas: Floats | None = None, *, progressbar: bool = True
+) -> dict[str, int]:
     """Add design points where the posterior's populations live, until the designs support them.
 
     `minimize` and `sample_smc` call it; call it yourself before `pymc.sample` on models with
@@ -55,6 +57,8 @@ def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[
         The one on the context by default.
     thetas : ndarray, shape (P, d), optional
         Unconstrained hyperparameters whose populations matter; by default those around the optimum.
+    progressbar : bool
+        Whether work of more than two seconds shows a bar on stderr.
 
     Returns
     -------
@@ -82,13 +86,14 @@ def refine(model: pm.Model | None = None, thetas: Floats | None = None) -> dict[
     """
     model = model_on_context(model, "prb.refine")
     evaluator = Evaluator(model)
-    if thetas is None:
-        minimize(model)
-    else:
-        for _ in range(MAX_ROUNDS):
-            if not refine_at(evaluator, np.asarray(thetas, dtype=np.float64)):
-                break
-        refuse(shortcomings(evaluator, thetas), evaluator)
+    with shown(progressbar):
+        if thetas is None:
+            find_optimum(evaluator, Minimisation())
+        else:
+            for _ in range(MAX_ROUNDS):
+                if not refine_at(evaluator, np.asarray(thetas, dtype=np.float64)):
+                    break
+            refuse(shortcomings(evaluator, thetas), evaluator)
     return {name: design.n_points for name, design in evaluator.designs.items()}
 
 
@@ -200,97 +205,48 @@ def minimize(
     True
     """
     evaluator = Evaluator(model_on_context(model, "prb.minimize"))
+    asked = Minimisation(
+        start=start,
+        method=Method.of(method, options),
+        prior=prior,
+        tolerance=positive_number(tolerance, "tolerance"),
+        max_evaluations=positive_integer(max_evaluations, "max_evaluations"),
+        refine=refine,
+        starts=starts,
+        random_seed=random_seed,
+    )
     with shown(progressbar):
-        return find_optimum(
-            evaluator,
-            start=start,
-            method=method,
-            options=options,
-            prior=prior,
-            tolerance=tolerance,
-            max_evaluations=max_evaluations,
-            refine=refine,
-            starts=starts,
-            random_seed=random_seed,
-        )
+        return find_optimum(evaluator, asked)
 
 
-def find_optimum(
-    evaluator: Evaluator,
-    *,
-    start: dict[str, Any] | None = None,
-    method: str | Callable[..., Any] | None = None,
-    options: Mapping[str, Any] | None = None,
-    prior: bool = False,
-    tolerance: float = 1e-6,
-    max_evaluations: int = 5000,
-    refine: bool = True,
-    starts: int | None = None,
-    random_seed: int = 0,
-) -> Optimum:
+@dataclass(frozen=True)
+class Minimisation:
+    """What `minimize` is asked for."""
+
+    start: dict[str, Any] | None = None
+    method: Method = field(default_factory=Method)
+    prior: bool = False
+    tolerance: float = 1e-6
+    max_evaluations: int = 5000
+    refine: bool = True
+    starts: int | None = None
+    random_seed: int = 0
+
+
+def find_optimum(evaluator: Evaluator, asked: Minimisation) -> Optimum:
     """Do what `minimize` does, for an evaluator."""
-    clock = time.perf_counter()
-    minimiser = Method.of(method, options)
-    positive_number(tolerance, "tolerance")
-    positive_integer(max_evaluations, "max_evaluations")
-    _refuse_random(evaluator, minimiser)
-    search = Search(evaluator, evaluator.prior_sd, minimiser, prior, tolerance, max_evaluations)
-    stored = sum(d.n_points for d in evaluator.designs.values())
-    responses_before = evaluator.n_responses - stored
-    if starts is None:
-        starts = 0 if evaluator.responses_per_theta else _STARTS
-    plan = _Plan(search, _several(evaluator), refine, starts, random_seed)
-
-    # Initialise: a start, and the way to where simulated responses meet the data
-    weighed = _require_weights(evaluator, prior=prior)
-    scales = _initial_scales(evaluator, weighed=weighed)
-    theta, screened = begin(search, start, scales, random_seed)
-    led = approach(search, theta, scales, random_seed)
-
+    plan = _planned(evaluator, asked)
+    begun = _begun(plan, asked)
     # Step: minimise, look at the design, until it is enough
-    state = _minimised(plan, led.theta, scales, led.trace)
+    state = _minimised(plan, begun.led.theta, begun.scales, begun.led.trace)
     rounds = 0
-    while True:
-        state = _judged(plan, state, rounds)
-        if state.restart is None:
-            break
+    while (state := _judged(plan, state, rounds)).restart is not None:
         rounds += 1
         state = _minimised(plan, state.restart, state.scales, state.run.trace, state.cloud)
-
     # Terminate: other optima, stalled line searches, the error of the design where it ended
     state, others = _against_rivals(plan, state)
     state = _settled(plan, state)
-
-    # Postprocess: where nothing is known of the sampling distribution, none is reported
-    edge, jump = _breakdown(plan, state)
-    if edge or jump:
-        state, others = replace(state, sampling=None), []
-    found = assemble(
-        search,
-        state.run,
-        covariance=_covariance(state),
-        remark=led.remark,
-        screened=screened,
-        responses_before=responses_before,
-    )
-    warnings = (
-        *breakdown(edge, jump),
-        *caveats(evaluator, state.local, others, state.design_error),
-    )
-    for line in warnings:
-        _log.warning("%s", line)
-    ran_out = f" {', '.join(edge)} ran to the edge of the support." if edge else ""
-    return replace(
-        found,
-        converged=found.converged and not edge,
-        message=found.message + ran_out,
-        seconds=time.perf_counter() - clock,
-        design_error=state.design_error,
-        rivals=tuple(rival_record(evaluator, o) for o in others),
-        warnings=warnings,
-        at_edge=edge,
-        at_jump=jump,
-    )
+    return _reported(plan, begun, state, others)
 
 
 # -- what a minimisation is, and where it stands ---------------------------------------------------
@@ -298,23 +254,15 @@ def find_optimum(
 
 @dataclass(frozen=True)
 class _Plan:
-    """What is to be done: the search, and what goes on around it.
-
-    Attributes
-    ----------
-    search : Search
-    several : bool
-        Whether there are several simulators, so that their scales matter.
-    refine : bool
-    starts : int
-    seed : int
-    """
+    """What is to be done: the search, and what goes on around it."""
 
     search: Search
-    several: bool
+    several: bool  # whether there are several simulators, so that their scales matter
     refine: bool
     starts: int
     seed: int
+    clock: float  # when it began
+    responses_before: int  # computed before it began, without those of designs
 
     @property
     def evaluator(self) -> Evaluator:
@@ -323,33 +271,27 @@ class _Plan:
 
 
 @dataclass(frozen=True)
+class _Beginning:
+    """Where a minimisation begins."""
+
+    scales: Floats  # (k,): by which the simulators' discrepancies are divided at first
+    led: Approach
+    screened: int  # points that were screened for it
+
+
+@dataclass(frozen=True)
 class _State:
-    """Where the minimisation stands.
+    """Where the minimisation stands."""
 
-    Attributes
-    ----------
-    theta : ndarray, shape (d,)
-        The best so far.
-    scales : ndarray, shape (k,)
-        By which the simulators' discrepancies are divided.
-    run : Run
-        The last one, with the trace of all.
-    sampling : SamplingDistribution or None
-        The sampling distribution of the minimiser around theta; None where nothing is known of it.
-    design_error : float
-        Of the design, in standard errors; NaN where it is not known.
-    cloud : ndarray, shape (m, d), or None
-        Thetas to which a pilot led, around which the design grows.
-    restart : ndarray, shape (d,), or None
-        Where to minimise again, on a design that has grown.
-    """
-
-    theta: Floats
-    scales: Floats
-    run: Run
+    theta: Floats  # (d,): the best so far
+    scales: Floats  # (k,): by which the simulators' discrepancies are divided
+    run: Run  # the last one, with the trace of all
+    # The sampling distribution of the minimiser around theta; None where nothing is known of it.
     sampling: SamplingDistribution | None
-    design_error: float = np.nan
+    design_error: float = np.nan  # of the design, in standard errors; NaN where it is not known
+    # (m, d), or None: thetas to which a pilot led, around which the design grows.
     cloud: Floats | None = None
+    # (d,), or None: where to minimise again, on a design that has grown.
     restart: Floats | None = None
 
     @property
@@ -373,8 +315,37 @@ def _refuse_random(evaluator: Evaluator, method: Method) -> None:
         )
 
 
-def _several(evaluator: Evaluator) -> bool:
-    return len(evaluator.nodes) > 1
+def _planned(evaluator: Evaluator, asked: Minimisation) -> _Plan:
+    """Return what is to be done."""
+    clock = time.perf_counter()
+    _refuse_random(evaluator, asked.method)
+    stored = sum(d.n_points for d in evaluator.designs.values())
+    free = not evaluator.responses_per_theta
+    return _Plan(
+        search=Search(
+            evaluator,
+            evaluator.prior_sd,
+            asked.method,
+            asked.prior,
+            asked.tolerance,
+            asked.max_evaluations,
+        ),
+        several=len(evaluator.nodes) > 1,
+        refine=asked.refine,
+        starts=(_STARTS if free else 0) if asked.starts is None else asked.starts,
+        seed=asked.random_seed,
+        clock=clock,
+        responses_before=evaluator.n_responses - stored,
+    )
+
+
+def _begun(plan: _Plan, asked: Minimisation) -> _Beginning:
+    """Return a start, and the way from there to where simulated responses meet the data."""
+    weighed = _require_weights(plan.evaluator, prior=asked.prior)
+    scales = _initial_scales(plan, weighed=weighed)
+    theta, screened = begin(plan.search, asked.start, scales, plan.seed)
+    led = approach(plan.search, theta, scales, plan.seed)
+    return _Beginning(scales, led, screened)
 
 
 def _require_weights(evaluator: Evaluator, *, prior: bool) -> bool:
@@ -413,9 +384,10 @@ def _other_terms_weigh(evaluator: Evaluator) -> bool:
     return finite.size > 0 and bool(np.ptp(finite) > 0)
 
 
-def _initial_scales(evaluator: Evaluator, *, weighed: bool) -> Floats:
+def _initial_scales(plan: _Plan, *, weighed: bool) -> Floats:
     """Return epsilons where they are given and matter, else typical sizes of discrepancies."""
-    if not (_several(evaluator) or weighed):
+    evaluator = plan.evaluator
+    if not (plan.several or weighed):
         return np.ones(1)
     natural = np.array([n.target.scale for n in evaluator.nodes])
     epsilon = evaluator.epsilon
@@ -531,6 +503,40 @@ def _settled(plan: _Plan, state: _State) -> _State:
 
 
 # -- after -----------------------------------------------------------------------------------------
+
+
+def _reported(plan: _Plan, begun: _Beginning, state: _State, others: list[Rival]) -> Optimum:
+    """Return the record; where nothing is known of the sampling distribution, it has none."""
+    evaluator = plan.evaluator
+    edge, jump = _breakdown(plan, state)
+    if edge or jump:
+        state, others = replace(state, sampling=None), []
+    found = assemble(
+        plan.search,
+        state.run,
+        covariance=_covariance(state),
+        remark=begun.led.remark,
+        screened=begun.screened,
+        responses_before=plan.responses_before,
+    )
+    warnings = (
+        *breakdown(edge, jump),
+        *caveats(evaluator, state.local, others, state.design_error),
+    )
+    for line in warnings:
+        _log.warning("%s", line)
+    ran_out = f" {', '.join(edge)} ran to the edge of the support." if edge else ""
+    return replace(
+        found,
+        converged=found.converged and not edge,
+        message=found.message + ran_out,
+        seconds=time.perf_counter() - plan.clock,
+        design_error=state.design_error,
+        rivals=tuple(rival_record(evaluator, o) for o in others),
+        warnings=warnings,
+        at_edge=edge,
+        at_jump=jump,
+    )
 
 
 def _breakdown(plan: _Plan, state: _State) -> tuple[tuple[str, ...], tuple[str, ...]]:

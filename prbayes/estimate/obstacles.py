@@ -1,69 +1,30 @@
-"""What a model's metrics and propagations do not allow: sampling distributions, refits."""
+"""What a model's metrics and propagations do not allow: sampling distributions, refits.
+
+An obstacle is a reason in words, as the end of a sentence.
+"""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
-from enum import Enum
 
 from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
 
 
-class Cause(Enum):
-    """Why a model cannot be calibrated to other data sets.
-
-    Attributes
-    ----------
-    RANDOM
-        A simulator's discrepancy is drawn anew at every evaluation.
-    COSTLY
-        A metric declares nothing of its minimum, and its refits would compute responses.
-    OTHER_TERMS
-        There are likelihood terms or potentials besides the simulators.
-    """
-
-    RANDOM = "random"
-    COSTLY = "costly"
-    OTHER_TERMS = "other terms"
-
-
-@dataclass(frozen=True)
-class Obstacle:
-    """Why something cannot be done.
-
-    Attributes
-    ----------
-    cause : Cause
-    reason : str
-        In words, as the end of a sentence.
-    """
-
-    cause: Cause
-    reason: str
-
-    def __str__(self) -> str:
-        """Return the reason."""
-        return self.reason
-
-
-def simulator_obstacle(evaluator: Evaluator, k: int) -> Obstacle | None:
+def simulator_obstacle(evaluator: Evaluator, k: int) -> str | None:
     """Return why nothing is known of the minimiser of one simulator's discrepancy, or None."""
     node = evaluator.nodes[k]
     bound = node.bound
     if bound.random:
-        reason = f"{node.name} has prb.Fresh, whose discrepancy is random"
-        return Obstacle(Cause.RANDOM, reason)
+        return f"{node.name} has prb.Fresh, whose discrepancy is random"
     if node.metric.minimum is Minimum.UNKNOWN and not bound.stored:
         metric = type(node.metric).__name__
-        reason = (
+        return (
             f"{node.name} has a {metric}, of which nothing is known without refits, and these need "
             "stored responses: use propagation=prb.Reweighted()"
         )
-        return Obstacle(Cause.COSTLY, reason)
     return None
 
 
-def sampling_obstacle(evaluator: Evaluator) -> Obstacle | None:
+def sampling_obstacle(evaluator: Evaluator) -> str | None:
     """Return why there is no sampling distribution of the minimiser, or None."""
     nodes = evaluator.nodes
     for k in range(len(nodes)):
@@ -74,19 +35,17 @@ def sampling_obstacle(evaluator: Evaluator) -> Obstacle | None:
     computed = [node.name for node in nodes if not node.bound.stored]
     if computed and measured_by_refits(evaluator):
         names = ", ".join(computed)
-        reason = f"another metric needs refits, and the responses of {names} are not stored"
-        return Obstacle(Cause.COSTLY, reason)
+        return f"another metric needs refits, and the responses of {names} are not stored"
     return None
 
 
-def refit_obstacle(evaluator: Evaluator) -> Obstacle | None:
+def refit_obstacle(evaluator: Evaluator) -> str | None:
     """Return why the model cannot be calibrated to other data sets, or None."""
     obstacle = sampling_obstacle(evaluator)
     if obstacle is not None:
         return obstacle
     if evaluator.has_other_terms:
-        reason = "the model has likelihood terms or potentials besides its simulators"
-        return Obstacle(Cause.OTHER_TERMS, reason)
+        return "the model has likelihood terms or potentials besides its simulators"
     return None
 
 

@@ -44,31 +44,17 @@ _SIMPLICES = (1.0, -0.5)
 
 @dataclass(frozen=True, eq=False)
 class SamplingDistribution:
-    """How the minimiser scatters around an optimum, over data sets that might have been observed.
-
-    Attributes
-    ----------
-    evaluator : Evaluator
-    theta : ndarray, shape (d,)
-    scales : ndarray, shape (k,)
-        By which the simulators' discrepancies are divided before they are added.
-    information : list of Information
-        By simulator.
-    local : Local
-    axes : ndarray, shape (d, r)
-        Principal axes of the sampling distribution along the directions that the data identify,
-        orthonormal in units of the prior's spread.
-    stderr : ndarray, shape (r,)
-        Standard errors along them.
-    """
+    """How the minimiser scatters around an optimum, over data sets that could be observed."""
 
     evaluator: Evaluator
-    theta: Floats
-    scales: Floats
-    information: list[Information]
+    theta: Floats  # (d,)
+    scales: Floats  # (k,): by which the simulators' discrepancies are divided before they are added
+    information: list[Information]  # by simulator
     local: Local
+    # (d, r): principal axes of the sampling distribution along the directions that the data
+    # identify, orthonormal in units of the prior's spread.
     axes: Floats
-    stderr: Floats
+    stderr: Floats  # (r,): standard errors along them
 
     @classmethod
     def of(

@@ -15,14 +15,14 @@ from prbayes.model.evaluator import Evaluator
 # Points looked at between two optima; a barrier narrower than a tenth of the way is missed. By
 # judgement.
 _BETWEEN = 9
-# Height of the barrier, in units of the noise, that separates two optima.
+# Height of the barrier, in multiples of the noise, that separates two optima.
 _BARRIER = 1.0
-# Difference, in units of the noise, up to which data could come from either optimum; three of them
-# are about the noise floor, since the noise is a third of it.
+# Difference, in multiples of the noise, up to which data could come from either optimum; three of
+# them are about the noise floor, since the noise is a third of it.
 _COMPARABLE = 3.0
-# Difference, in units of the noise, from which one is better than what was thought the best.
+# Difference, in multiples of the noise, from which one is better than what was thought the best.
 _BETTER = 0.1
-# What the descents leave on the table, in units of the noise: far below both.
+# What the descents leave on the table, in multiples of the noise: far below both.
 _TOLERANCE = 0.01
 # Step of their differences, in spreads of the prior.
 _STEP = 1e-3
@@ -33,23 +33,12 @@ _EVERY = 4
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """An optimum of the discrepancy other than the best.
+    """An optimum of the discrepancy other than the best."""
 
-    Attributes
-    ----------
-    theta : ndarray, shape (d,)
-    value : float
-        The objective there.
-    comparable : bool
-        Whether it is as good as the best one up to sampling noise.
-    better : bool
-        Whether it is better than what was thought the best.
-    """
-
-    theta: Floats
-    value: float
-    comparable: bool
-    better: bool
+    theta: Floats  # (d,)
+    value: float  # the objective there
+    comparable: bool  # whether it is as good as the best one up to sampling noise
+    better: bool  # whether it is better than what was thought the best
 
 
 @dataclass(frozen=True, eq=False)

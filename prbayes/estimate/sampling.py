@@ -9,7 +9,7 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.estimate.data_sets import DataSets, dependent
-from prbayes.estimate.identifiability import seen_by_area, seen_by_curvature
+from prbayes.estimate.identifiability import identified_by_area, identified_by_curvature
 from prbayes.estimate.sandwich import Information, LinearArea
 from prbayes.metrics.base import Minimum
 
@@ -27,20 +27,11 @@ _SPANNED = 0.1
 
 @dataclass(frozen=True, eq=False)
 class _Expansion:
-    """The objective of data sets around theta, along r directions.
+    """The objective of data sets around theta, along r directions."""
 
-    Attributes
-    ----------
-    force : ndarray, shape (n_sets, r)
-        Minus the gradients of quadratic discrepancies.
-    curvature : ndarray, shape (r, r)
-        Their Hessian.
-    areas : list of LinearArea
-        With slopes along the directions, (r, m), and lengths divided by the scale.
-    """
-
-    force: Floats
-    curvature: Floats
+    force: Floats  # (n_sets, r): minus the gradients of quadratic discrepancies
+    curvature: Floats  # (r, r): their Hessian
+    # With slopes along the directions, (r, m), and lengths divided by the scale.
     areas: list[LinearArea]
 
 
@@ -124,24 +115,14 @@ def _solved(expansion: _Expansion, shifts: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Local:
-    """Covariance of the minimiser at one theta, in units of the prior's spread.
+    """Covariance of the minimiser at one theta, in units of the prior's spread."""
 
-    Attributes
-    ----------
-    prior_sd : ndarray, shape (d,)
-        The prior's spread.
-    identified : ndarray, shape (d, r)
-        Orthonormal directions about which the data tell enough, by default more than the prior.
-    unidentified : ndarray, shape (d, d - r)
-        The other directions.
-    covariance : ndarray, shape (r, r)
-        Of the minimiser, along the directions identified.
-    """
-
-    prior_sd: Floats
+    prior_sd: Floats  # (d,): the prior's spread
+    # (d, r): orthonormal directions about which the data tell enough, by default more than the
+    # prior.
     identified: Floats
-    unidentified: Floats
-    covariance: Floats
+    unidentified: Floats  # (d, d - r): the other directions
+    covariance: Floats  # (r, r): of the minimiser, along the directions identified
 
     @property
     def in_theta(self) -> Floats:
@@ -177,10 +158,10 @@ def _sandwich(information: list[Information], scales: Floats, weakest: float) ->
         total = total + one.hessian / scale
     hessian = unit * total
     noise = unit * _gradient_covariance(information, scales)
-    values, vectors, seen = seen_by_curvature(hessian, noise, weakest)
-    identified = vectors[:, seen]
-    unidentified = vectors[:, ~seen]
-    inverse = identified / values[seen]
+    values, vectors, found = identified_by_curvature(hessian, noise, weakest)
+    identified = vectors[:, found]
+    unidentified = vectors[:, ~found]
+    inverse = identified / values[found]
     covariance = inverse.T @ noise @ inverse
     return Local(prior_sd, identified, unidentified, covariance)
 
@@ -204,10 +185,10 @@ def _gradient_covariance(information: list[Information], scales: Floats) -> Floa
 def _by_data_sets(information: list[Information], scales: Floats, weakest: float) -> Local:
     """Return the covariance of the shifts over simulated data sets, where there are areas."""
     prior_sd = information[0].prior_sd
-    seen = [_seen(one, weakest) for one in information]
+    spans = [_identified(one, weakest) for one in information]
     # The space spanned by what each simulator identifies; an empty column, should none do.
     nothing = np.zeros((prior_sd.size, 1))
-    columns = np.concatenate([nothing, *seen], axis=1)
+    columns = np.concatenate([nothing, *spans], axis=1)
     axes, strength, _ = np.linalg.svd(columns)
     spanned = strength > _SPANNED
     rank = int(spanned.sum())
@@ -221,13 +202,13 @@ def _by_data_sets(information: list[Information], scales: Floats, weakest: float
     return Local(prior_sd, identified, unidentified, covariance)
 
 
-def _seen(information: Information, weakest: float) -> Floats:
+def _identified(information: Information, weakest: float) -> Floats:
     """Return the directions that one simulator identifies, shape (d, r)."""
     if information.node.metric.minimum is not Minimum.QUADRATIC:
-        return seen_by_area(information)
+        return identified_by_area(information)
     prior_sd = information.prior_sd
     unit = np.outer(prior_sd, prior_sd)
     hessian = information.hessian * unit
     noise = information.sampling_covariance * unit
-    _, vectors, seen = seen_by_curvature(hessian, noise, weakest)
-    return np.asarray(vectors[:, seen])
+    _, vectors, found = identified_by_curvature(hessian, noise, weakest)
+    return np.asarray(vectors[:, found])

@@ -40,61 +40,33 @@ class LinearArea:
     """The area metric of data sets, with distribution functions that are linear in theta.
 
     At theta + delta it is the sum over intervals of |gaps + delta @ slopes| lengths.
-
-    Attributes
-    ----------
-    gaps : ndarray, shape (n_sets, m)
-        Simulated less observed distribution function on each interval between knots.
-    slopes : ndarray, shape (d, m)
-        Derivatives of the simulated one.
-    lengths : ndarray, shape (m,)
-        Of the intervals.
     """
 
+    # (n_sets, m): simulated less observed distribution function on each interval between knots.
     gaps: Floats
-    slopes: Floats
-    lengths: Floats
+    slopes: Floats  # (d, m): derivatives of the simulated one
+    lengths: Floats  # (m,): of the intervals
 
 
 @dataclass(frozen=True, eq=False)
 class Stencil:
-    """Populations around theta, in the order of `curvature.stencil`.
+    """Populations around theta, in the order of `curvature.stencil`."""
 
-    Attributes
-    ----------
-    share : float
-        The step, in prior standard deviations.
-    values, weights : ndarray, shape (s, n)
-    """
-
-    share: float
-    values: Floats
-    weights: Floats
+    share: float  # the step, in prior standard deviations
+    values: Floats  # (s, n)
+    weights: Floats  # (s, n)
 
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Information about theta in the data of one simulator, were they drawn from the model there.
-
-    Parameters
-    ----------
-    evaluator : Evaluator
-    k : int
-        Which simulator.
-    theta : ndarray, shape (d,)
-    n_sets : int
-        Number of simulated data sets, each of the observed size.
-    seed : int
-    wide : float
-        Step in prior standard deviations where the discrepancy is a step function of theta, or
-        jumps.
-    """
+    """Information about theta in one simulator's data, were they drawn from the model there."""
 
     evaluator: Evaluator
-    k: int
-    theta: Floats
-    n_sets: int = 200
+    k: int  # which simulator
+    theta: Floats  # (d,)
+    n_sets: int = 200  # number of simulated data sets, each of the observed size
     seed: int = 0
+    # Step in prior standard deviations where the discrepancy is a step function of theta, or jumps.
     wide: float = _WIDE_STEP
 
     @property

@@ -60,23 +60,12 @@ Function = Callable[[Floats], tuple[float, Floats | None, int]]
 
 @dataclass(frozen=True)
 class Trace:
-    """The points that minimisers have asked for.
+    """The points that minimisers have asked for."""
 
-    Attributes
-    ----------
-    thetas : tuple of ndarray, shapes (d,)
-    values : tuple of float
-        The objective there.
-    counts : tuple of int
-        Evaluations until then.
-    count : int
-        Evaluations in all.
-    """
-
-    thetas: tuple[Floats, ...] = ()
-    values: tuple[float, ...] = ()
-    counts: tuple[int, ...] = ()
-    count: int = 0
+    thetas: tuple[Floats, ...] = ()  # (d,)
+    values: tuple[float, ...] = ()  # the objective there
+    counts: tuple[int, ...] = ()  # evaluations until then
+    count: int = 0  # evaluations in all
 
     def then(self, objective: Objective) -> Trace:
         """Return the trace with the points of one more minimisation."""
@@ -91,28 +80,14 @@ class Trace:
 
 @dataclass(frozen=True)
 class Search:
-    """What is minimised, and how.
-
-    Parameters
-    ----------
-    evaluator : Evaluator
-    prior_sd : ndarray, shape (d,)
-        Typical size of each parameter: the prior's spread.
-    method : Method
-    prior : bool
-        Whether minus the log prior is added.
-    tolerance : float
-        Of the standardised problem.
-    most : int
-        Largest number of evaluations in all.
-    """
+    """What is minimised, and how."""
 
     evaluator: Evaluator
-    prior_sd: Floats
+    prior_sd: Floats  # (d,): typical size of each parameter: the prior's spread
     method: Method
-    prior: bool
-    tolerance: float
-    most: int
+    prior: bool  # whether minus the log prior is added
+    tolerance: float  # of the standardised problem
+    most: int  # largest number of evaluations in all
 
     @property
     def gradient(self) -> bool:
@@ -168,33 +143,16 @@ class Search:
 
 @dataclass(frozen=True)
 class Run:
-    """Where a minimisation ended.
+    """Where a minimisation ended."""
 
-    Attributes
-    ----------
-    best : ndarray, shape (d,)
-    success : bool
-    message : str
-        What the method said.
-    trace : Trace
-        With the points of those before it.
-    center : ndarray, shape (d,)
-        Where it began.
-    scales : ndarray, shape (k,)
-    lowest : float
-        The objective at ``best``.
-    size : float
-        Its typical size.
-    """
-
-    best: Floats
+    best: Floats  # (d,)
     success: bool
-    message: str
-    trace: Trace
-    center: Floats
-    scales: Floats
-    lowest: float
-    size: float
+    message: str  # what the method said
+    trace: Trace  # with the points of those before it
+    center: Floats  # (d,): where it began
+    scales: Floats  # (k,)
+    lowest: float  # the objective at ``best``
+    size: float  # its typical size
 
 
 def start(
@@ -297,19 +255,11 @@ def _scipy(
 
 @dataclass(frozen=True)
 class Approach:
-    """Where the area metric led.
+    """Where the area metric led."""
 
-    Attributes
-    ----------
-    theta : ndarray, shape (d,)
-    trace : Trace
-    remark : str
-        That it did; empty if there was no need.
-    """
-
-    theta: Floats
+    theta: Floats  # (d,)
     trace: Trace
-    remark: str = ""
+    remark: str = ""  # that it did; empty if there was no need
 
 
 def approach(search: Search, theta: Floats, scales: Floats, seed: int) -> Approach:

@@ -35,21 +35,13 @@ def product(weights: Floats, matrix: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Cells(ABC):
-    """Cells on which densities are compared, the last two for the mass below and above all others.
+    """Cells on which densities are compared, the last two for the mass below and above all else."""
 
-    Attributes
-    ----------
-    widths : ndarray, shape (m,)
-        Length that each cell stands for; the outer two are as long as documented by the estimator.
-    centers : ndarray, shape (m - 2,)
-        Positions of the inner cells, in units of the response.
-    smooth : bool
-        Whether the density has derivatives with respect to the sample's values.
-    """
-
+    # (m,): length that each cell stands for; the outer two are as long as documented by the
+    # estimator.
     widths: Floats
-    centers: Floats
-    smooth: bool
+    centers: Floats  # (m - 2,): positions of the inner cells, in units of the response
+    smooth: bool  # whether the density has derivatives with respect to the sample's values
 
     @abstractmethod
     def density(self, sample: Floats, weights: Floats) -> Floats:
@@ -84,20 +76,11 @@ class KernelCells(Cells):
     """Nodes of a regular grid; mass outside counts as one tight cluster on either side.
 
     The cluster is a single kernel, which is where that mass is most conspicuous.
-
-    Attributes
-    ----------
-    bandwidth : float
-        Standard deviation of the kernel, in units of the response.
-    step : float
-        Distance of two nodes.
-    kernel : ndarray, shape (2 k + 1,)
-        The kernel that smooths counts at nodes into densities.
     """
 
-    bandwidth: float
-    step: float
-    kernel: Floats
+    bandwidth: float  # standard deviation of the kernel, in units of the response
+    step: float  # distance of two nodes
+    kernel: Floats  # (2 k + 1,): the kernel that smooths counts at nodes into densities
 
     @property
     def _low(self) -> float:

@@ -72,15 +72,10 @@ class FunctionDiscrepancy(Discrepancy):
 
     The function takes observed values without weights: a data set that is given by weights of
     values is handed to it as a sample, in which each value is repeated by its count.
-
-    Attributes
-    ----------
-    size : int
-        Number of values in such a sample.
     """
 
     metric: FunctionMetric
-    size: int
+    size: int  # number of values in such a sample
 
     @property
     def symbolic(self) -> bool:

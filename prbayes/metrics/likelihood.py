@@ -62,14 +62,10 @@ class LogLikelihood(Metric):
 
 @dataclass(frozen=True, eq=False)
 class LikelihoodDiscrepancy(DensityDiscrepancy):
-    """The mean log-likelihood of fixed observed values.
+    """The mean log-likelihood of fixed observed values."""
 
-    Attributes
-    ----------
-    reading : ndarray, shape (m,) or (..., m)
-        ``reading @ g`` is the weighted mean of g, given on the cells, at the observed values.
-    """
-
+    # (m,) or (..., m): ``reading @ g`` is the weighted mean of g, given on the cells, at the
+    # observed values.
     reading: Floats
     _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "density", "reading")
 

@@ -1,8 +1,8 @@
-"""Names of the elements of variables, such as 'mu[1]': the one place where they are made."""
+"""Elements of variables, such as 'mu[1]': their names, and values by name."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,4 +34,19 @@ def split_elements(values: Mapping[Any, Any]) -> dict[str, Floats]:
         names = element_names(str(name), array.shape[1:])
         columns = array.reshape(len(array), len(names))
         found |= dict(zip(names, columns.T, strict=True))
+    return found
+
+
+def single_elements(values: Mapping[Any, Any]) -> dict[str, float]:
+    """Return numbers by the names of elements, of one value of each variable."""
+    rows = {name: np.asarray(value)[None] for name, value in values.items()}
+    return {name: float(row[0]) for name, row in split_elements(rows).items()}
+
+
+def stacked_draws(posterior: Any, names: Iterable[str] | None = None) -> dict[str, Floats]:
+    """Return the draws of variables, (chains x draws, *shape), of a group with these dimensions."""
+    found = {}
+    for name in posterior.data_vars if names is None else names:
+        values = posterior[name].transpose("chain", "draw", ...).values
+        found[str(name)] = values.reshape(-1, *values.shape[2:])
     return found

@@ -28,20 +28,11 @@ _CHUNK = 1 << 22
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What is known of a batch of thetas.
+    """What is known of a batch of thetas."""
 
-    Attributes
-    ----------
-    log_prior : ndarray, shape (P,)
-        With the Jacobian of the transforms.
-    log_other : ndarray, shape (P,)
-        Log-likelihood of ordinary observed variables, and potentials.
-    discrepancies : ndarray, shape (P, k)
-        One column per simulator; +inf where a population is invalid or has no support.
-    """
-
-    log_prior: Floats
-    log_other: Floats
+    log_prior: Floats  # (P,): with the Jacobian of the transforms
+    log_other: Floats  # (P,): log-likelihood of ordinary observed variables, and potentials
+    # (P, k): one column per simulator; +inf where a population is invalid or has no support.
     discrepancies: Floats
 
     def log_likelihood(self, epsilon: Floats) -> Floats:

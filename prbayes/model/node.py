@@ -33,28 +33,14 @@ from prbayes.propagation.reweighted import Design, design_of
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """One simulator of a model.
-
-    Attributes
-    ----------
-    name : str
-    target : Discrepancy
-        The metric, prepared against the observed responses.
-    bound : Bound
-        The propagation at work.
-    propagation : Propagation
-        Its configuration.
-    epsilon : shared variable
-        Scalar; NaN while it is not set.
-    specimens : ndarray, shape (N,), or None
-        Labels of the specimens that the observed responses were measured on.
-    """
+    """One simulator of a model."""
 
     name: str
-    target: Discrepancy
-    bound: Bound
-    propagation: Propagation
-    epsilon: Any
+    target: Discrepancy  # the metric, prepared against the observed responses
+    bound: Bound  # the propagation at work
+    propagation: Propagation  # its configuration
+    epsilon: Any  # scalar; NaN while it is not set
+    # (N,), or None: labels of the specimens that the observed responses were measured on.
     specimens: NDArray[Any] | None
 
     @property

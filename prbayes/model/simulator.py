@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import observed_sample, positive_number
+from prbayes._progress import shown
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.node import Node, SimulatorDistribution, model_on_context, shared_epsilon
 from prbayes.propagation.base import Propagation
@@ -29,6 +30,7 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     specimens: ArrayLike | None = None,
     dims: str | None = None,
     propagation: Propagation | None = None,
+    progressbar: bool = True,
 ) -> TensorVariable:
     r"""Add an observed node whose log-density is -discrepancy / epsilon to the current model.
 
@@ -60,6 +62,8 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         Name of the observed dimension.
     propagation : Propagation, optional
         How populations become responses; ``Reweighted(1024)`` by default.
+    progressbar : bool
+        Whether work of more than two seconds shows a bar on stderr.
 
     Returns
     -------
@@ -111,7 +115,8 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         version=propagation.version,
         on_failure=propagation.on_failure,
     )
-    bound = propagation.bind(name, sorted_inputs, target, responses)
+    with shown(progressbar):
+        bound = propagation.bind(name, sorted_inputs, target, responses)
     if epsilon is None:
         epsilon = 1 / target.n_effective if metric.likelihood else np.nan
     node = Node(name, target, bound, propagation, shared_epsilon(name, epsilon), labels)

@@ -15,24 +15,13 @@ _LOW, _HIGH = 0.05, 0.95
 
 @dataclass(frozen=True)
 class Level:
-    """How well a design has to support populations.
+    """How well a design has to support populations."""
 
-    Attributes
-    ----------
-    ess : float
-        Weight effective sample size at the median, as a share of what the design asks for.
-    lowest_ess : float
-        The same at the 5% quantile.
-    mass : tuple of float
-        Bounds of the mean raw weight, which is one if the design covers the population.
-    tails : bool
-        Whether 5% and 95% quantiles of the mean raw weight are bounded, or the median.
-    """
-
-    ess: float
-    lowest_ess: float
+    ess: float  # weight effective sample size at the median, as a share of what the design asks for
+    lowest_ess: float  # the same at the 5% quantile
+    # Bounds of the mean raw weight, which is one if the design covers the population.
     mass: tuple[float, float]
-    tails: bool
+    tails: bool  # whether 5% and 95% quantiles of the mean raw weight are bounded, or the median
 
 
 # Where an answer is made: the optimiser and the samplers, whose designs grow until it holds. A mean
@@ -46,29 +35,16 @@ TOLERABLE = Level(ess=0.5, lowest_ess=0.0, mass=(0.7, 1.4), tails=False)
 
 @dataclass(frozen=True)
 class Shortcoming:
-    """In what a design does not support populations; it can be said as text.
+    """In what a design does not support populations; it can be said as text."""
 
-    Attributes
-    ----------
-    lost : float or None
-        Share of a population's weight on points without response, at the 95% quantile, if too much.
-    ess : tuple of float or None
-        Weight effective sample size, 5% quantile and median, if too small.
-    mass : tuple of float or None
-        Mean raw weight, lowest and highest that count, if one of them is out of bounds.
-    max_lost : float
-        The share that may be lost.
-    required_ess : float
-        What the design asks for.
-    n_points : int
-    level : Level
-    """
-
+    # Share of a population's weight on points without response, at the 95% quantile, if too much.
     lost: float | None
+    # Weight effective sample size, 5% quantile and median, if too small.
     ess: tuple[float, float] | None
+    # Mean raw weight, lowest and highest that count, if one of them is out of bounds.
     mass: tuple[float, float] | None
-    max_lost: float
-    required_ess: float
+    max_lost: float  # the share that may be lost
+    required_ess: float  # what the design asks for
     n_points: int
     level: Level
 

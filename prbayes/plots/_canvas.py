@@ -169,13 +169,7 @@ class Canvas:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One panel of a canvas; each visual is drawn once on it.
-
-    Attributes
-    ----------
-    canvas : Canvas
-    name : str
-    """
+    """One panel of a canvas; each visual is drawn once on it."""
 
     canvas: Canvas
     name: str

@@ -175,10 +175,3 @@ def steps(values: Floats, heights: Floats, low: float, high: float) -> tuple[Flo
     twice = np.repeat(values, 2)
     x = np.concatenate([[low], twice, [high]])
     return x, np.repeat(heights, 2)
-
-
-def normal_density(x: Floats, mean: float, sd: float) -> Floats:
-    """Return the density of a normal distribution."""
-    exponent = -0.5 * ((x - mean) / sd) ** 2
-    area = sd * np.sqrt(2 * np.pi)
-    return np.asarray(np.exp(exponent) / area)

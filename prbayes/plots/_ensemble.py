@@ -34,27 +34,15 @@ _ROUNDING = 1e-12  # of a sum of weights that is zero
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
-    """Populations of a result.
-
-    Attributes
-    ----------
-    evaluator : Evaluator
-    center : ndarray, shape (0 or 1, d)
-        The optimum; a posterior has none.
-    thetas : ndarray, shape (P, d)
-        Draws of the posterior, or from the optimum's sampling distribution; none where nothing is
-        known of it.
-    label : str
-        What the curve in the middle is called.
-    spread : str
-        What the band is of.
-    """
+    """Populations of a result."""
 
     evaluator: Evaluator
-    center: Floats
+    center: Floats  # (0 or 1, d): the optimum; a posterior has none
+    # (P, d): draws of the posterior, or from the optimum's sampling distribution; none where
+    # nothing is known of it.
     thetas: Floats
-    label: str
-    spread: str
+    label: str  # what the curve in the middle is called
+    spread: str  # what the band is of
 
     @property
     def every(self) -> Floats:

@@ -8,9 +8,10 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
+from prbayes.model.elements import single_elements
 from prbayes.model.evaluator import Evaluator
 from prbayes.plots._ensemble import supported
-from prbayes.plots._names import point_elements, variable_of
+from prbayes.plots._names import variable_of
 from prbayes.plots._objective import free_elements, objective
 
 # How far an axis goes from the optimum, in standard errors: the discrepancy is far above its lowest
@@ -27,46 +28,26 @@ _MARGIN = 0.04  # of an axis, beyond what is marked on it; about the size of a m
 
 @dataclass(frozen=True, eq=False)
 class Landscape:
-    """Heights over a grid in the user's own units.
+    """Heights over a grid in the user's own units."""
 
-    Attributes
-    ----------
-    axes : list of ndarray, shape (n,)
-        One for each hyperparameter.
-    heights : ndarray, shape (n,) or (n, n)
-        The sum of d_k / s_k, the first hyperparameter along the first axis; NaN where stored
-        responses do not support a population or the priors exclude it.
-    path, rivals : ndarray, shape (m, 1 or 2)
-        Where the optimiser went, and other optima.
-    optimum : ndarray, shape (1, 1 or 2)
-    """
-
-    axes: list[Floats]
+    axes: list[Floats]  # (n,): one for each hyperparameter
+    # (n,) or (n, n): the sum of d_k / s_k, the first hyperparameter along the first axis; NaN where
+    # stored responses do not support a population or the priors exclude it.
     heights: Floats
+    # (m, 1 or 2): where the optimiser went, and other optima.
     path: Floats
     rivals: Floats
-    optimum: Floats
+    optimum: Floats  # (1, 1 or 2)
 
 
 @dataclass(frozen=True, eq=False)
 class _Plane:
-    """The plane along one or two hyperparameters through an optimum, where all others stand.
-
-    Attributes
-    ----------
-    evaluator : Evaluator
-    names : list of str
-        Of the hyperparameters along the axes.
-    center : dict of ndarray, shape (1,)
-        The optimum, by element name.
-    shapes : dict of tuple
-        Of the free variables.
-    """
+    """The plane along one or two hyperparameters through an optimum, where all others stand."""
 
     evaluator: Evaluator
-    names: list[str]
-    center: dict[str, Floats]
-    shapes: dict[str, tuple[int, ...]]
+    names: list[str]  # of the hyperparameters along the axes
+    center: dict[str, Floats]  # (1,): the optimum, by element name
+    shapes: dict[str, tuple[int, ...]]  # of the free variables
 
     def thetas(self, places: Floats) -> Floats:
         """Return thetas of places, shape (P, 1 or 2); NaN outside the priors' support."""
@@ -155,7 +136,7 @@ def _plane(optimum: Optimum, evaluator: Evaluator, names: list[str]) -> _Plane:
 
 def _standard_error(optimum: Optimum, name: str, bulk: Floats) -> float:
     """Return the standard error, or if it is unknown what makes the axis as wide as the prior."""
-    error = point_elements(optimum.stderr)[name]
+    error = single_elements(optimum.stderr)[name]
     if np.isfinite(error) and error > 0:
         return error
     low, high = bulk

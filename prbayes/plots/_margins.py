@@ -34,26 +34,16 @@ _TAIL = 0.002
 
 @dataclass(frozen=True, eq=False)
 class Margin:
-    """One number that varies from specimen to specimen.
+    """One number that varies from specimen to specimen."""
 
-    Attributes
-    ----------
-    name : str
-        That of the distribution if it has one, or of the response's argument; with an element's
-        index.
-    dist : variable
-        The ``.dist()``.
-    node, position : int
-        Which simulator has it, and which of its aleatory inputs it is.
-    index : tuple of int
-        Element of a multivariate input.
-    """
-
+    # That of the distribution if it has one, or of the response's argument; with an element's
+    # index.
     name: str
-    dist: TensorVariable
+    dist: TensorVariable  # the ``.dist()``
+    # Which simulator has it, and which of its aleatory inputs it is.
     node: int
     position: int
-    index: tuple[int, ...]
+    index: tuple[int, ...]  # element of a multivariate input
 
     @property
     def discrete(self) -> bool:

@@ -3,23 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
-
-import numpy as np
-
-from prbayes.model.elements import split_elements
 
 
 def variable_of(element: str) -> str:
     """Return the name of the variable that an element belongs to."""
     return element.partition("[")[0]
-
-
-def point_elements(point: Mapping[str, Any]) -> dict[str, float]:
-    """Return numbers by element name, of one value of each variable."""
-    rows = {name: np.asarray(value)[None] for name, value in point.items()}
-    elements = split_elements(rows)
-    return {name: float(row[0]) for name, row in elements.items()}
 
 
 def named(name: str, labels: Mapping[str, str] | None) -> str:

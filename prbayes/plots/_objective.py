@@ -12,9 +12,9 @@ from prbayes.model.elements import split_elements
 from prbayes.model.evaluator import Evaluator
 
 # What a reader calls a metric of the package; any other one goes by the name of its class.
-_METRIC_LABELS = {
+METRIC_LABELS = {
     "AreaMetric": "area metric",
-    "KullbackLeibler": "Kullback-Leibler",
+    "KullbackLeibler": "Kullback-Leibler divergence",
     "LogLikelihood": "log-likelihood",
     "ProbabilityResidual": "probability residual",
 }
@@ -36,7 +36,7 @@ def objective_label(optimum: Optimum) -> str:
     if len(optimum.scales) > 1:
         return "sum of d / s"
     name = type(optimum.evaluator.nodes[0].metric).__name__
-    label = _METRIC_LABELS.get(name, name)
+    label = METRIC_LABELS.get(name, name)
     return f"discrepancy ({label})"
 
 

@@ -1,19 +1,13 @@
-"""What pictures of populations share: the level of a band, and the calibrated curve in its band."""
+"""What pictures of populations share: the calibrated curve in its band."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from prbayes._checks import Floats, positive_number
+from prbayes._checks import Floats
 from prbayes.plots._canvas import BLUE, Panel
 from prbayes.plots._curves import pointwise_band
 from prbayes.plots._ensemble import Ensemble
-
-
-def check_level(level: float) -> None:
-    """Refuse what is no probability strictly between 0 and 1."""
-    if positive_number(level, "level") >= 1:
-        raise ValueError(f"level: got {level}, expected a number between 0 and 1")
 
 
 @dataclass(frozen=True, eq=False)

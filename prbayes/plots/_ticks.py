@@ -21,15 +21,13 @@ Ticks = tuple[list[float], list[str]]  # positions and labels
 
 def round_ticks(low: float, high: float) -> Ticks:
     """Return a few round numbers within a range, and their labels."""
-    # The smallest round step that is not too many
-    smallest = max(high - low, 1e-300) / _MOST_ROUND
-    power = 10.0 ** np.floor(np.log10(smallest))
-    steps = power * np.array(_ROUND_STEPS)
-    step = steps[steps >= smallest][0]
+    from matplotlib.ticker import MaxNLocator  # heavy, and only needed for pictures
 
-    first = np.ceil(low / step - _ROUNDING)
-    last = np.floor(high / step + _ROUNDING)
-    at = step * np.arange(first, last + 1)
+    locator = MaxNLocator(_MOST_ROUND, steps=list(_ROUND_STEPS))
+    found = np.asarray(locator.tick_values(low, high))
+    step = found[1] - found[0]
+    slack = _ROUNDING * step
+    at = found[(found >= low - slack) & (found <= high + slack)]
     labels = []
     for x in at:
         zero = abs(x) < step / 2  # not 1e-17

@@ -8,12 +8,13 @@ from typing import Any
 import pymc as pm
 import xarray as xr
 
+from prbayes._checks import share
 from prbayes.estimate.optimum import Optimum
 from prbayes.plots._canvas import Canvas
 from prbayes.plots._ensemble import read_result
 from prbayes.plots._margins import chosen, margin_densities, margins
 from prbayes.plots._names import named
-from prbayes.plots._populations import calibrated, check_level, draw_calibrated
+from prbayes.plots._populations import calibrated, draw_calibrated
 
 
 def plot_population(
@@ -75,7 +76,7 @@ def plot_population(
     >>> list(prb.plot_population(prb.minimize(model), backend="none").viz["after"])
     ['load']
     """
-    check_level(level)
+    share(level, "level")
     shown = read_result(result, model, "prb.plot_population", draws, free=True)
     wanted = chosen(margins(shown.evaluator), inputs)
     found = margin_densities(shown.evaluator, wanted, shown.every)

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import xarray as xr
+from scipy.stats import norm
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, share
 from prbayes.estimate.optimum import Optimum, identity_in, require_of_model
-from prbayes.model.elements import split_elements
+from prbayes.model.elements import single_elements, split_elements, stacked_draws
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level, require_together
 from prbayes.plots._canvas import BLUE, DASHED, DIAMOND, DOTTED, GREY, VERMILION, Canvas, Panel
-from prbayes.plots._curves import bounded_density, central_levels, normal_density
-from prbayes.plots._names import named, point_elements
+from prbayes.plots._curves import bounded_density, central_levels
+from prbayes.plots._names import named
 from prbayes.plots._objective import free_elements
-from prbayes.plots._populations import check_level
 from prbayes.plots._ticks import round_ticks
 
 # Draws of the prior, whose density they show: at a normal's peak within 2%, by the sum of kernels.
@@ -93,7 +93,7 @@ def plot_posterior(
     ['mu']
     """
     _check_results(posterior, optimum, model)
-    check_level(level)
+    share(level, "level")
     found = _read_hyperparameters(posterior, optimum, model)
     canvas = Canvas(list(found), size=(4.6, 3.6), backend=backend, pc_kwargs=pc_kwargs)
     for name, hyperparameter in found.items():
@@ -124,20 +124,11 @@ def _check_results(posterior: Any, optimum: Any, model: pm.Model | None) -> None
 
 @dataclass(frozen=True, eq=False)
 class _Hyperparameter:
-    """What is known of one hyperparameter.
+    """What is known of one hyperparameter."""
 
-    Attributes
-    ----------
-    draws : ndarray, shape (n,)
-        Of the posterior.
-    prior : ndarray, shape (m,), or None
-        Draws of the prior.
-    best, error : float or None
-        The optimum, and its standard error where it is known.
-    """
-
-    draws: Floats
-    prior: Floats | None
+    draws: Floats  # (n,): of the posterior
+    prior: Floats | None  # (m,), or None: draws of the prior
+    # The optimum, and its standard error where it is known.
     best: float | None
     error: float | None
 
@@ -157,18 +148,13 @@ def _read_hyperparameters(
     posterior: xr.DataTree, optimum: Optimum | None, model: pm.Model | None
 ) -> dict[str, _Hyperparameter]:
     """Return by element what posterior, optimum and model share."""
-    group = posterior["posterior"].to_dataset()
-    samples = {}
-    for name, values in group.items():
-        stacked = values.stack(s=("chain", "draw"))
-        samples[str(name)] = stacked.transpose("s", ...).values
-    draws = split_elements(samples)
+    draws = split_elements(stacked_draws(posterior["posterior"]))
     shared = {name for name, x in draws.items() if np.ptp(x) > 0}
 
     best, errors = {}, {}
     if optimum is not None:
-        best = point_elements(optimum.point)
-        errors = point_elements(optimum.stderr)
+        best = single_elements(optimum.point)
+        errors = single_elements(optimum.stderr)
         shared &= set(best)
     prior: dict[str, Floats] = {}
     if model is not None:
@@ -235,12 +221,8 @@ def _draw_normal(
     panel: Panel, grid: Floats, best: float, error: float, level: float, row: float
 ) -> None:
     """Draw the normal distribution of the optimum's standard error, and its interval."""
-    from scipy.special import ndtri  # takes longer to import than the whole package
-
-    y = normal_density(grid, best, error)
+    normal = norm(best, error)
     text = "normal with the optimum's standard error"
-    panel.line("normal", grid, y, VERMILION, style=DASHED, legend=text)
-    tail = (1 - level) / 2
-    z = -float(ndtri(tail))
-    ends = best + z * error * np.array([-1, 1])
+    panel.line("normal", grid, normal.pdf(grid), VERMILION, style=DASHED, legend=text)
+    ends = normal.ppf(central_levels(level))
     panel.line("stderr", ends, np.repeat(row, 2), VERMILION, width=3)

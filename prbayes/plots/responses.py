@@ -11,7 +11,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, share
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node
@@ -26,7 +26,7 @@ from prbayes.plots._curves import (
 )
 from prbayes.plots._ensemble import read_before, read_result, supported
 from prbayes.plots._names import named
-from prbayes.plots._populations import calibrated, check_level, draw_calibrated
+from prbayes.plots._populations import calibrated, draw_calibrated
 
 _log = logging.getLogger("prbayes")
 # Shares of a population beyond each end of the axis, by judgement: hardly any of the calibrated;
@@ -111,7 +111,7 @@ def plot_responses(
     >>> prb.plot_responses(prb.minimize(model), backend="none").viz["after"].name
     'after'
     """
-    check_level(level)
+    share(level, "level")
     shown = read_result(result, model, "prb.plot_responses", draws)
     start, what = read_before(result, shown.evaluator, before)
     if len(start) and not supported(shown.evaluator, start)[0]:

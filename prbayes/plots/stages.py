@@ -88,20 +88,11 @@ def plot_stages(
 
 @dataclass(frozen=True, eq=False)
 class _Statistic:
-    """A statistic by chain and stage.
-
-    Attributes
-    ----------
-    name : str
-    chains : list
-        Names of the chains.
-    rows : ndarray, shape (chains, stages)
-        NaN where it is not known, or after the last stage of a chain.
-    """
+    """A statistic by chain and stage."""
 
     name: str
-    chains: list[Any]
-    rows: Floats
+    chains: list[Any]  # names of the chains
+    rows: Floats  # (chains, stages): NaN where it is not known, or after the last stage of a chain
 
     @property
     def once(self) -> bool:

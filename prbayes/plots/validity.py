@@ -16,7 +16,6 @@ from prbayes.validation.validity import ValidityTest
 def plot_validity(
     tests: ValidityTest | Mapping[str, ValidityTest],
     *,
-    envelope: bool = True,
     backend: str | None = None,
     **pc_kwargs: Any,
 ) -> Any:
@@ -30,8 +29,6 @@ def plot_validity(
     ----------
     tests : ValidityTest or mapping
         From `area_test`; several by name, one panel each.
-    envelope : bool
-        Whether the band is drawn.
     backend : {"matplotlib", "bokeh", "plotly"}, optional
         That of ArviZ's settings by default.
     **pc_kwargs
@@ -63,7 +60,7 @@ def plot_validity(
     canvas = Canvas(panels, size=(4.6, 4.8), backend=backend, pc_kwargs=pc_kwargs)
     for name, test in by_name.items():
         panel = canvas.panel(name or "u")
-        _draw(panel, test, _title(name, test), envelope=envelope)
+        _draw(panel, test, _title(name, test))
     return canvas.finish()
 
 
@@ -81,15 +78,14 @@ def _by_name(tests: ValidityTest | Mapping[str, ValidityTest]) -> dict[str, Vali
     return by_name
 
 
-def _draw(panel: Panel, test: ValidityTest, title: str, *, envelope: bool) -> None:
+def _draw(panel: Panel, test: ValidityTest, title: str) -> None:
     """Draw the ECDF of a test's values, and its distance from the identity."""
     values, name = test.u_values, "u-value"
     if test.folded:
         values, name = np.abs(2 * values - 1), "|2u - 1|"
     color = VERMILION if test.rejected else BLUE
-    if envelope:
-        at, sides = _envelope(test)
-        panel.band("envelope", at, sides, PALE, alpha=0.4)
+    at, sides = _envelope(test)
+    panel.band("envelope", at, sides, PALE, alpha=0.4)
     x, y = _ecdf(np.sort(values))
     at, sides = _between(x, y)
     panel.band("area", at, sides, color, alpha=0.4)

@@ -42,21 +42,11 @@ _PRIOR_DRAWS = 1024
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """What an adjustment made of draws.
+    """What an adjustment made of draws."""
 
-    Attributes
-    ----------
-    thetas : ndarray, shape (..., d)
-        The draws; the given ones if nothing was done.
-    done : str
-        What was done; empty if nothing.
-    reason : str or None
-        Why nothing was done, None if something was.
-    """
-
-    thetas: Floats
-    done: str = ""
-    reason: str | None = None
+    thetas: Floats  # (..., d): the draws; the given ones if nothing was done
+    done: str = ""  # what was done; empty if nothing
+    reason: str | None = None  # why nothing was done, None if something was
 
     @property
     def note(self) -> str:
@@ -143,7 +133,7 @@ class Affine:
         """
         obstacle = refit_obstacle(evaluator)
         if obstacle is not None:
-            return Adjusted(thetas, reason=str(obstacle))
+            return Adjusted(thetas, reason=obstacle)
         draws = thetas.reshape(-1, thetas.shape[-1])
         modes = _identified_modes(evaluator, optima)
         if not modes:

@@ -78,10 +78,10 @@ def bootstrap(
     evaluator = require_refits(optimum, "bootstrap", "; use prb.sample_smc").evaluator
     positive_integer(draws, "draws", minimum=2)
     sampling = optimum.sampling()
-    unseen = unidentified_directions(sampling.local.unidentified, evaluator.readable_names)
-    if unseen:
+    unidentified = unidentified_directions(sampling.local.unidentified, evaluator.readable_names)
+    if unidentified:
         raise ValueError(
-            f"bootstrap: the data tell less than the prior about {', '.join(unseen)}, "
+            f"bootstrap: the data tell less than the prior about {', '.join(unidentified)}, "
             "along which the minimiser is anywhere; use prb.sample_smc, whose posterior "
             "falls back on the prior there, or fix a hyperparameter"
         )

@@ -19,19 +19,11 @@ Stages = dict[str, list[float]]
 
 @dataclass(frozen=True, eq=False)
 class Particles:
-    """Draws of the pseudo-posterior.
+    """Draws of the pseudo-posterior."""
 
-    Attributes
-    ----------
-    thetas : ndarray, shape (chains, draws, d)
-    discrepancies : ndarray, shape (chains, draws, k)
-    stats : list of dict
-        By chain: statistics by name, one value per stage.
-    """
-
-    thetas: Floats
-    discrepancies: Floats
-    stats: list[Stages]
+    thetas: Floats  # (chains, draws, d)
+    discrepancies: Floats  # (chains, draws, k)
+    stats: list[Stages]  # by chain: statistics by name, one value per stage
 
 
 class Chains:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes.estimate.identifiability import seen_by_area, seen_by_curvature
+from prbayes.estimate.identifiability import identified_by_area, identified_by_curvature
 from prbayes.estimate.measured import Refits
 from prbayes.estimate.obstacles import simulator_obstacle
 from prbayes.estimate.optimum import Optimum, require_minimiser, require_sampling
@@ -125,10 +125,10 @@ def _sandwich(information: Information) -> float:
     unit = np.outer(information.prior_sd, information.prior_sd)
     hessian = information.hessian * unit
     noise = information.sampling_covariance * unit
-    values, vectors, seen = seen_by_curvature(hessian, noise)
-    _refuse_unidentified(information, int(seen.sum()))
+    values, vectors, found = identified_by_curvature(hessian, noise)
+    _refuse_unidentified(information, int(found.sum()))
     along = np.einsum("ik,ij,jk->k", vectors, noise, vectors)
-    shares = along[seen] / values[seen]
+    shares = along[found] / values[found]
     return float(np.mean(shares))
 
 
@@ -179,17 +179,11 @@ def _by_refits(information: Information) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Cloud:
-    """Thetas around the optimum with the distances of data sets from their populations.
+    """Thetas around the optimum with the distances of data sets from their populations."""
 
-    Attributes
-    ----------
-    z : ndarray, shape (M, r)
-        Standard normal coordinates along the principal axes of the sampling distribution.
-    distances : ndarray, shape (n_sets, M)
-    """
-
+    # (M, r): standard normal coordinates along the principal axes of the sampling distribution.
     z: Floats
-    distances: Floats
+    distances: Floats  # (n_sets, M)
 
     @classmethod
     def around(cls, area: LinearArea, directions: Floats, seed: int) -> _Cloud:
@@ -227,11 +221,11 @@ def _by_coverage(information: Information) -> float:
     area = information.area(*information.data_set)
     # Strongest last. What a sample of one response tells beyond two directions, close to its
     # location and its spread, is of the order of the error of derivatives of stored weights.
-    basis = seen_by_area(information)[:, -2:]
+    basis = identified_by_area(information)[:, -2:]
     _refuse_unidentified(information, basis.shape[1])
     sets = information.data_sets
     shifts = first_order_shifts([information], np.ones(1), basis, sets)
-    # The cloud spans the directions seen, wider than the estimator's sampling distribution.
+    # The cloud spans the directions identified, wider than the estimator's sampling distribution.
     covariance = np.atleast_2d(np.cov(shifts, rowvar=False))
     variances, vectors = np.linalg.eigh(covariance)
     errors = np.sqrt(np.maximum(variances, 0))

@@ -23,7 +23,7 @@ from prbayes.estimate.data_sets import fresh_data
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import model_on_context
 from prbayes.posterior.adjustment import Affine
-from prbayes.posterior.smc import sample
+from prbayes.posterior.smc import Sampling, sample
 from prbayes.posterior.trees import calibration_tree
 
 _log = logging.getLogger("prbayes")
@@ -195,12 +195,8 @@ def _one(evaluator: Evaluator, job: _Job, rng: np.random.Generator) -> dict[str,
     """Draw hyperparameters, and data from their population, and rank them among the draws."""
     theta = evaluator.prior_thetas(1, int(rng.integers(2**31)))[0]
     data = fresh_data(evaluator, theta, rng)
-    tree = sample(
-        evaluator.observing(data),
-        draws=job.draws,
-        adjust=job.adjust,
-        random_seed=int(rng.integers(2**31)),
-    )
+    asked = Sampling(draws=job.draws, adjust=job.adjust, random_seed=int(rng.integers(2**31)))
+    tree = sample(evaluator.observing(data), asked)
     row = {}
     for name, (truth,) in evaluator.constrained(theta[None]).items():
         found = np.asarray(tree["posterior"][name])[0]

@@ -16,7 +16,7 @@ import xarray as xr
 
 from prbayes._checks import Floats, positive_integer
 from prbayes._progress import shown
-from prbayes.estimate.minimization import find_optimum
+from prbayes.estimate.minimization import Minimisation, find_optimum
 from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, require_sampling
 from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse
@@ -47,8 +47,8 @@ def sample_smc(
     adjust: Affine | bool = True,
     threshold: float = 0.5,
     refine: bool = True,
-    random_seed: int | None = 0,
     checkpoint: str | PathLike[str] | None = None,
+    random_seed: int | None = 0,
     progressbar: bool = True,
 ) -> xr.DataTree:
     """Draw from the pseudo-posterior by sequential Monte Carlo.
@@ -75,11 +75,11 @@ def sample_smc(
         Share of the effective sample size that a stage keeps; higher means more stages.
     refine : bool
         Whether designs of `Reweighted` that do not support the posterior get more points.
-    random_seed : int, optional
     checkpoint : path-like, optional
         A file that keeps the state after every stage: a run that was killed goes on from there when
         it is called again, and gives the same draws. Give the propagations a ``store`` as well, so
         that the search for the optimum computes nothing again.
+    random_seed : int, optional
     progressbar : bool
 
     Returns
@@ -130,93 +130,106 @@ def sample_smc(
     if optimum is not None and not isinstance(optimum, Optimum):
         got = type(optimum).__name__
         raise TypeError(f"optimum: got {got}, expected an Optimum; call prb.minimize() first")
+    asked = Sampling(
+        draws=draws,
+        chains=chains,
+        epsilon=epsilon,
+        optimum=optimum,
+        adjust=adjust,
+        threshold=threshold,
+        refine=refine,
+        checkpoint=checkpoint,
+        random_seed=random_seed,
+        progressbar=progressbar,
+    )
     evaluator = _evaluator(model, optimum)
     with shown(progressbar):
-        return sample(
-            evaluator,
-            draws=draws,
-            chains=chains,
-            epsilon=epsilon,
-            optimum=optimum,
-            adjust=adjust,
-            threshold=threshold,
-            refine=refine,
-            random_seed=random_seed,
-            checkpoint=checkpoint,
-            progressbar=progressbar,
-        )
+        return sample(evaluator, asked)
 
 
-def sample(
-    evaluator: Evaluator,
-    *,
-    draws: int = 1000,
-    chains: int = 1,
-    epsilon: float | dict[str, float] | None = None,
-    optimum: Optimum | None = None,
-    adjust: Affine | bool = True,
-    threshold: float = 0.5,
-    refine: bool = True,
-    random_seed: int | None = 0,
-    progressbar: bool = False,
-    checkpoint: str | PathLike[str] | None = None,
-) -> xr.DataTree:
+@dataclass(frozen=True, eq=False)
+class Sampling:
+    """What `sample_smc` is asked for."""
+
+    draws: int = 1000
+    chains: int = 1
+    epsilon: float | dict[str, float] | None = None
+    optimum: Optimum | None = None
+    adjust: Affine | bool = True
+    threshold: float = 0.5
+    refine: bool = True
+    checkpoint: str | PathLike[str] | None = None
+    random_seed: int | None = 0
+    progressbar: bool = False
+
+
+def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     """Do what `sample_smc` does, for an evaluator."""
     clock = time.perf_counter()
     in_designs = sum(design.n_points for design in evaluator.designs.values())
     before = evaluator.n_responses - in_designs
     with _epsilons_restored(evaluator):
-        # Epsilon, the adjustment, and the optimum that they need
-        _set_epsilons(evaluator, epsilon)
-        unset = [node for node in evaluator.nodes if np.isnan(node.epsilon_value)]
-        adjustment = _adjustment(adjust, evaluator, unset)
-        if optimum is None and _needs_optimum(evaluator, unset, adjustment):
-            optimum = find_optimum(evaluator, refine=refine)
-        if optimum is not None and adjustment is not None:
-            require_sampling(optimum, "sample_smc")
-        if optimum is not None and unset:
-            calibrated = calibrate_epsilon(optimum)
-            for node in unset:
-                node.epsilon.set_value(np.asarray(calibrated[node.name]))
-
-        # The draws, on designs that support them
-        saved = _checkpoint(
-            checkpoint,
-            evaluator,
-            random_seed,
-            draws=draws,
-            chains=chains,
-            threshold=threshold,
-            adjust=repr(adjustment),
-            refine=refine,
-        )
-        entropy = random_seed if saved is None else int(saved.settings["entropy"])
-        rounds = _Rounds(
-            run=Chains(evaluator, draws, threshold, saved),
-            chains=chains,
-            seeds=np.random.SeedSequence(entropy),
-            adjustment=adjustment,
-            optima=() if optimum is None else _optima(optimum, evaluator),
-            refine=refine and bool(evaluator.designs),
-        )
-        found = rounds.until_supported(progressbar)
+        adjustment, optimum = _prepared(evaluator, asked)
+        rounds = _rounds(evaluator, asked, adjustment, optimum)
+        found = rounds.until_supported(asked.progressbar)
         if found.reason is not None:
             _log.warning("the draws are not adjusted: %s; their width is epsilon's", found.reason)
-
-        # The record
+        particles = found.particles
         return posterior_tree(
             evaluator,
             found.thetas,
-            found.particles.discrepancies,
-            found.particles.stats,
-            unadjusted=None if found.thetas is found.particles.thetas else found.particles.thetas,
+            particles.discrepancies,
+            particles.stats,
+            unadjusted=None if found.thetas is particles.thetas else particles.thetas,
             adjustment=found.note,
             warnings=() if optimum is None else optimum.warnings,
-            errors=_discrepancy_errors(evaluator, found.particles),
-            seed=random_seed,
+            errors=_discrepancy_errors(evaluator, particles),
+            seed=asked.random_seed,
             n_responses=evaluator.n_responses - before,
             seconds=time.perf_counter() - clock,
         )
+
+
+def _prepared(evaluator: Evaluator, asked: Sampling) -> tuple[Affine | None, Optimum | None]:
+    """Set the epsilons; return the adjustment, and the optimum that it or they need."""
+    _set_epsilons(evaluator, asked.epsilon)
+    unset = [node for node in evaluator.nodes if np.isnan(node.epsilon_value)]
+    adjustment = _adjustment(asked.adjust, evaluator, unset)
+    optimum = asked.optimum
+    if optimum is None and _needs_optimum(evaluator, unset, adjustment):
+        optimum = find_optimum(evaluator, Minimisation(refine=asked.refine))
+    if optimum is not None and adjustment is not None:
+        require_sampling(optimum, "sample_smc")
+    if optimum is not None and unset:
+        calibrated = calibrate_epsilon(optimum)
+        for node in unset:
+            node.epsilon.set_value(np.asarray(calibrated[node.name]))
+    return adjustment, optimum
+
+
+def _rounds(
+    evaluator: Evaluator, asked: Sampling, adjustment: Affine | None, optimum: Optimum | None
+) -> _Rounds:
+    """Return the rounds of sampling, perhaps with what a run before has saved."""
+    saved = _checkpoint(
+        asked.checkpoint,
+        evaluator,
+        asked.random_seed,
+        draws=asked.draws,
+        chains=asked.chains,
+        threshold=asked.threshold,
+        adjust=repr(adjustment),
+        refine=asked.refine,
+    )
+    entropy = asked.random_seed if saved is None else int(saved.settings["entropy"])
+    return _Rounds(
+        run=Chains(evaluator, asked.draws, asked.threshold, saved),
+        chains=asked.chains,
+        seeds=np.random.SeedSequence(entropy),
+        adjustment=adjustment,
+        optima=() if optimum is None else _optima(optimum, evaluator),
+        refine=asked.refine and bool(evaluator.designs),
+    )
 
 
 @dataclass(frozen=True, eq=False)

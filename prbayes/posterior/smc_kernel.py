@@ -9,7 +9,7 @@ import numpy as np
 import pymc as pm
 from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, share
 from prbayes.model.evaluator import Evaluation, Evaluator
 from prbayes.model.node import model_on_context
 
@@ -73,11 +73,9 @@ class BatchedKernel(SMC_KERNEL):
         evaluator: Evaluator | None = None,
     ) -> None:
         # PyMC's constructor compiles functions of single particles, which this kernel never calls.
-        if not 0 < threshold < 1:
-            raise ValueError(f"threshold: got {threshold}, expected a number between 0 and 1")
         self.draws = draws
         self.start = start
-        self.threshold = threshold
+        self.threshold = share(threshold, "threshold")
         model = model_on_context(model, "BatchedKernel")
         self.evaluator = evaluator or Evaluator(model)
         unset = [n.name for n in self.evaluator.nodes if np.isnan(n.epsilon_value)]

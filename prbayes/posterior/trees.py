@@ -55,9 +55,8 @@ def posterior_tree(
         Scalar responses computed, the designs' included.
     seconds : float
     """
-    chains, draws, d = thetas.shape
     if unadjusted is not None:
-        discrepancies = _discrepancies_again(evaluator, thetas.reshape(-1, d), discrepancies)
+        discrepancies = _discrepancies_again(evaluator, thetas, discrepancies)
     attrs = {
         "sampler": "SMC-ABC",
         "n_responses": n_responses,
@@ -67,19 +66,37 @@ def posterior_tree(
         "warnings": "\n".join(warnings),
         **versions(),
     }
-    posterior = _draws(evaluator, thetas)
-    posterior.attrs.update(
+    if errors is None:
+        errors = np.full(len(evaluator.nodes), np.nan)
+    groups = {
+        "posterior": _posterior(evaluator, thetas, attrs | _evidence(stats)),
+        "sample_stats": _sample_stats(stats),
+        "calibration": _calibration(evaluator, thetas, discrepancies, errors).assign_attrs(attrs),
+        "observed_data": observed_dataset(evaluator),
+    }
+    if unadjusted is not None:
+        groups["unadjusted"] = _draws(evaluator, unadjusted)
+    return xr.DataTree.from_dict(groups)
+
+
+def _posterior(evaluator: Evaluator, thetas: Floats, attrs: dict[str, Any]) -> xr.Dataset:
+    """Return the draws, with what is told of them and of the model."""
+    return _draws(evaluator, thetas).assign_attrs(
         {
             "inference_library": "prbayes",
             **attrs,
-            **_evidence(stats),
             **as_attribute(evaluator.model),
             **as_attributes(identity_of(evaluator)),
         }
     )
-    if errors is None:
-        errors = np.full(len(evaluator.nodes), np.nan)
-    calibration = xr.Dataset(
+
+
+def _calibration(
+    evaluator: Evaluator, thetas: Floats, discrepancies: Floats, errors: Floats
+) -> xr.Dataset:
+    """Return what is known of the simulators, by draw and over all."""
+    chains, draws, _ = thetas.shape
+    return xr.Dataset(
         {
             "discrepancy": (_EACH_DRAW, discrepancies),
             **_support(evaluator, thetas),
@@ -93,17 +110,7 @@ def posterior_tree(
             "chain": np.arange(chains),
             "draw": np.arange(draws),
         },
-        attrs=attrs,
     )
-    groups = {
-        "posterior": posterior,
-        "sample_stats": _sample_stats(stats),
-        "calibration": calibration,
-        "observed_data": observed_dataset(evaluator),
-    }
-    if unadjusted is not None:
-        groups["unadjusted"] = _draws(evaluator, unadjusted)
-    return xr.DataTree.from_dict(groups)
 
 
 _EACH_DRAW = ["chain", "draw", "simulator"]
@@ -113,7 +120,8 @@ def _discrepancies_again(evaluator: Evaluator, thetas: Floats, before: Floats) -
     """Return the discrepancies of adjusted draws, NaN where that would cost responses."""
     if evaluator.responses_per_theta:
         return np.full(before.shape, np.nan)
-    return evaluator(thetas).discrepancies.reshape(before.shape)
+    rows = thetas.reshape(-1, thetas.shape[-1])
+    return evaluator(rows).discrepancies.reshape(before.shape)
 
 
 def _sample_stats(stats: list[dict[str, list[float]]]) -> xr.Dataset:
@@ -185,20 +193,15 @@ def bootstrap_tree(
     seconds: float,
 ) -> xr.DataTree:
     """Return the DataTree of minimisers, shape (1, draws, d)."""
-    posterior = _draws(evaluator, thetas)
-    posterior.attrs.update(
-        {
-            "inference_library": "prbayes",
-            "sampler": sampler,
-            "converged": converged,
-            "n_responses": n_responses,
-            "seconds": seconds,
-            "random_seed": str(seed),
-            **versions(),
-            **as_attribute(evaluator.model),
-            **as_attributes(identity_of(evaluator)),
-        }
-    )
+    attrs = {
+        "sampler": sampler,
+        "converged": converged,
+        "n_responses": n_responses,
+        "seconds": seconds,
+        "random_seed": str(seed),
+        **versions(),
+    }
+    posterior = _posterior(evaluator, thetas, attrs)
     return xr.DataTree.from_dict(
         {"posterior": posterior, "observed_data": observed_dataset(evaluator)}
     )

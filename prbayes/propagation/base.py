@@ -172,8 +172,9 @@ class Bound(ABC):
     def valid(self, params: Sequence[Any]) -> Any:
         """Return which of a batch of roots give valid distributions (sigma > 0), shape (k,)."""
         (found,) = self._valid(*params)
-        batch = np.shape(params[0])[:1]
-        return np.broadcast_to(found, batch).astype(bool)
+        size = len(params[0])
+        of_each = np.broadcast_to(found, size)
+        return of_each.astype(bool)
 
     def valid_only(self, params: Sequence[Floats]) -> list[Floats]:
         """Leave out the roots that give no valid distributions, or raise if none does."""

@@ -17,7 +17,7 @@ import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats
-from prbayes.response.compilation import compile_batched
+from prbayes.response.compilation import compile_batched, with_leading_axis
 from prbayes.response.distributions import is_mvnormal
 from prbayes.response.inputs import Inputs
 
@@ -28,15 +28,10 @@ _RESOLVED = 1e-8
 
 @dataclass(frozen=True)
 class Cells:
-    """Cells around points of an input, one for each point.
+    """Cells around points of an input, one for each point."""
 
-    Attributes
-    ----------
-    lower, upper : ndarray, shapes (n, *event)
-    """
-
-    lower: Floats
-    upper: Floats
+    lower: Floats  # (n, *event)
+    upper: Floats  # (n, *event)
 
 
 def moving_inputs(
@@ -64,17 +59,23 @@ def moving_inputs(
     """
     symbols = inputs.placeholders()
     dists, _ = inputs.rebuilt(symbols)
-    given = [pt.tensor(dtype=x.dtype, shape=(None, *x.type.shape)) for x in inputs.aleatory]
-    logs = [pm.logp(dist, x, warn_rvs=False) for dist, x in zip(dists, given, strict=True)]
-    outside = [pt.isneginf(log) for log in logs]
-    found = compile_batched(symbols, outside, given)(*components, *points)
+    given = with_leading_axis(inputs.aleatory)
+    outside = []
+    for dist, x in zip(dists, given, strict=True):
+        log = pm.logp(dist, x, warn_rvs=False)
+        outside.append(pt.isneginf(log))
+    compiled = compile_batched(symbols, outside, given)
+    found = compiled(*components, *points)
     moving = []
     k = len(components[0])
-    for i, (x, of_input) in enumerate(zip(points, found, strict=True)):
-        elements = x.shape[: 1 if is_mvnormal(dists[i]) else None]
-        at_each = np.broadcast_to(of_input, (k, *elements))
-        if np.any(at_each.any(axis=0) & ~at_each.all(axis=0)) and not is_mvnormal(dists[i]):
-            _require_distribution_function(name, dists[i])
+    for i, dist in enumerate(dists):
+        if is_mvnormal(dist):
+            continue  # everywhere positive
+        at_each = np.broadcast_to(found[i], (k, *points[i].shape))
+        sometimes = at_each.any(axis=0)
+        always = at_each.all(axis=0)
+        if np.any(sometimes & ~always):
+            _require_distribution_function(name, dist)
             moving.append(i)
     return tuple(moving)
 
@@ -111,20 +112,28 @@ def cells_around(points: Floats, reach: int) -> Cells:
     Cells
     """
     flat = points.reshape(len(points), -1)
-    lower, upper = np.empty_like(flat), np.empty_like(flat)
+    lower = np.empty_like(flat)
+    upper = np.empty_like(flat)
     for k, column in enumerate(flat.T):
         order = np.argsort(column, kind="stable")
         ordered = column[order]
-        half_way = 0.5 * (ordered[1:] + ordered[:-1])
+        both = ordered[1:] + ordered[:-1]
+        half_way = 0.5 * both
+        last = half_way.size - 1
         rank = np.arange(column.size)
-        below, above = rank - reach, rank + reach - 1
+        below = rank - reach
+        above = rank + reach - 1
         low = half_way[np.maximum(below, 0)]
-        high = half_way[np.minimum(above, half_way.size - 1)]
+        high = half_way[np.minimum(above, last)]
         # The outermost points are in the middle of theirs.
-        low = np.where(below < 0, 2 * ordered - high, low)
-        high = np.where(above > half_way.size - 1, 2 * ordered - low, high)
-        lower[order, k], upper[order, k] = low, high
-    return Cells(lower.reshape(points.shape), upper.reshape(points.shape))
+        mirrored = 2 * ordered - high
+        low = np.where(below < 0, mirrored, low)
+        mirrored = 2 * ordered - low
+        high = np.where(above > last, mirrored, high)
+        lower[order, k] = low
+        upper[order, k] = high
+    shape = points.shape
+    return Cells(lower.reshape(shape), upper.reshape(shape))
 
 
 def averaged_log_density(dist: TensorVariable, x: Any, lower: Any, upper: Any) -> TensorVariable:
@@ -133,9 +142,11 @@ def averaged_log_density(dist: TensorVariable, x: Any, lower: Any, upper: Any) -
     The density at the point itself where the probability between them is too small for a
     difference.
     """
-    at_upper = pt.exp(pm.logcdf(dist, upper, warn_rvs=False))
-    at_lower = pt.exp(pm.logcdf(dist, lower, warn_rvs=False))
-    probability = at_upper - at_lower
+    at_upper = pm.logcdf(dist, upper, warn_rvs=False)
+    at_lower = pm.logcdf(dist, lower, warn_rvs=False)
+    probability = pt.exp(at_upper) - pt.exp(at_lower)
     resolved = (probability > _RESOLVED) & (upper > lower)
-    mean = pt.switch(resolved, probability / (upper - lower), 1.0)
-    return pt.switch(resolved, pt.log(mean), pm.logp(dist, x, warn_rvs=False))
+    width = upper - lower
+    mean = pt.switch(resolved, probability / width, 1.0)
+    at_point = pm.logp(dist, x, warn_rvs=False)
+    return pt.switch(resolved, pt.log(mean), at_point)

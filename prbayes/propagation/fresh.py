@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-import pytensor.tensor as pt
-from pytensor.graph.basic import Apply
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
 from prbayes.propagation.base import Bound, Propagation, probe
-from prbayes.propagation.ops import OwnOp, float_output
+from prbayes.propagation.ops import OwnOp
 from prbayes.response.batches import batch_shape, broadcast_batch
 from prbayes.response.distributions import PopulationSampler
 from prbayes.response.inputs import Inputs
@@ -92,30 +90,16 @@ class FreshBound(Bound):
 class FreshOp(OwnOp):
     """Draws a population and returns its discrepancy, () ... -> ()."""
 
+    __props__ = ("bound",)
+
     def __init__(self, bound: FreshBound) -> None:
         self.bound = bound
-
-    @property
-    def held(self) -> tuple[object, ...]:
-        """The generator of draws."""
-        return (self.bound,)
-
-    @property
-    def _event_ndims(self) -> list[int]:
-        return [r.type.ndim for r in self.bound.inputs.roots]
-
-    def make_node(self, *params: Any) -> Apply[Any, Any]:
-        """Apply to the roots' values."""
-        tensors = [pt.as_tensor(p) for p in params]
-        pairs = zip(tensors, self._event_ndims, strict=True)
-        leading = [t.type.ndim - event for t, event in pairs]
-        ndim = max(leading)
-        return Apply(self, tensors, [float_output(ndim)])
+        self.event_ndims = [r.type.ndim for r in bound.inputs.roots]
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Draw, call the response, compare."""
-        batch = batch_shape(inputs, self._event_ndims)
-        full = broadcast_batch(inputs, self._event_ndims, batch)
+        batch = batch_shape(inputs, self.event_ndims)
+        full = broadcast_batch(inputs, self.event_ndims, batch)
         leading = len(batch)
         params = []
         for values in full:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,6 @@ import pytensor.tensor as pt
 from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.op import Op
 from pytensor.graph.replace import _vectorize_node
-from pytensor.tensor.variable import TensorVariable
 
 from prbayes.metrics.base import Discrepancy
 from prbayes.metrics.cells import Cells
@@ -27,26 +27,24 @@ warnings.filterwarnings(
 
 
 class OwnOp(Op):
-    """An operation that takes leading axes itself.
+    """An operation on arrays (..., *event), which takes leading axes itself.
 
-    It equals those of its class that hold the very same objects.
+    What ``__props__`` names has no equal but itself: two operations that hold it are the same.
     """
 
-    __props__ = ()
+    __props__: tuple[str, ...] = ()
+    event_ndims: Sequence[int] = (1, 1)  # of each input: a sample, and what goes with it
+    event_shape: tuple[int | None, ...] = ()  # of the result
 
-    @property
-    def held(self) -> tuple[object, ...]:
-        """The objects that make the operation what it is."""
-        raise TypeError(f"{type(self).__name__}: got no list of what it holds")
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, OwnOp) or type(self) is not type(other):
-            return False
-        pairs = zip(self.held, other.held, strict=True)
-        return all(mine is theirs for mine, theirs in pairs)
-
-    def __hash__(self) -> int:
-        return hash((type(self), *map(id, self.held)))
+    def make_node(self, *inputs: Any) -> Apply[Any, Any]:
+        """Apply to arrays; the result has their leading axes, and its own event behind them."""
+        tensors = [pt.as_tensor(x) for x in inputs]
+        pairs = zip(tensors, self.event_ndims, strict=True)
+        leading = max(t.type.ndim - event for t, event in pairs)
+        batch = (None,) * leading
+        shape = batch + self.event_shape
+        result = pt.tensor(dtype="float64", shape=shape)
+        return Apply(self, tensors, [result])
 
 
 def _on_batches(op: Any, node: Apply[Any, Any], *batched: Variable) -> Any:
@@ -57,36 +55,19 @@ def _on_batches(op: Any, node: Apply[Any, Any], *batched: Variable) -> Any:
 _vectorize_node.register(OwnOp, _on_batches)
 
 
-def float_output(ndim: int, *last: int) -> TensorVariable:
-    """Return an output of so many axes, of which the last ones have known lengths."""
-    shape = (None,) * (ndim - len(last)) + last
-    return pt.tensor(dtype="float64", shape=shape)
-
-
 class ResponseOp(OwnOp):
     """The response as an operation.
 
     It has no gradient and is computed in one call for a whole batch.
     """
 
+    __props__ = ("responses",)
+
     def __init__(self, responses: Responses) -> None:
         self.responses = responses
         inputs = responses.inputs
         common = [e.type.ndim for e in inputs.epistemic]
         self.event_ndims = [*inputs.event_ndims, *common]
-
-    @property
-    def held(self) -> tuple[object, ...]:
-        """The user's response."""
-        return (self.responses,)
-
-    def make_node(self, *inputs: Any) -> Apply[Any, Any]:
-        """Apply to values of shape (..., *event); the result has the leading axes."""
-        tensors = [pt.as_tensor(x) for x in inputs]
-        pairs = zip(tensors, self.event_ndims, strict=True)
-        leading = [t.type.ndim - event for t, event in pairs]
-        ndim = max(leading)
-        return Apply(self, tensors, [float_output(ndim)])
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Call the response, but not for populations that are invalid.
@@ -127,19 +108,11 @@ class ResponseOp(OwnOp):
 class DensityOp(OwnOp):
     """The density of a weighted sample on cells, (..., n), (..., n) -> (..., m)."""
 
+    __props__ = ("cells",)
+
     def __init__(self, cells: Cells) -> None:
         self.cells = cells
-
-    @property
-    def held(self) -> tuple[object, ...]:
-        """The cells."""
-        return (self.cells,)
-
-    def make_node(self, sample: Any, weights: Any) -> Apply[Any, Any]:
-        """Apply to a sample and its weights."""
-        tensors = [pt.as_tensor(sample), pt.as_tensor(weights)]
-        ndim = max(t.type.ndim for t in tensors)
-        return Apply(self, tensors, [float_output(ndim, self.cells.widths.size)])
+        self.event_shape = cells.widths.shape
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Bin and smooth."""
@@ -166,20 +139,12 @@ class CotangentOp(OwnOp):
     Itself or its derivative.
     """
 
+    __props__ = ("cells", "order")
+    event_shape = (None,)
+
     def __init__(self, cells: Cells, order: int) -> None:
         self.cells = cells
         self.order = order
-
-    @property
-    def held(self) -> tuple[object, ...]:
-        """The cells, and which derivative."""
-        return (self.cells, self.order)
-
-    def make_node(self, sample: Any, cotangent: Any) -> Apply[Any, Any]:
-        """Apply to a sample and the cotangent of the density."""
-        tensors = [pt.as_tensor(sample), pt.as_tensor(cotangent)]
-        ndim = max(t.type.ndim for t in tensors)
-        return Apply(self, tensors, [float_output(ndim)])
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Gather."""
@@ -196,19 +161,10 @@ class CotangentOp(OwnOp):
 class OpaqueOp(OwnOp):
     """A user's metric on weighted responses, (..., n), (..., n) -> (...); it has no gradient."""
 
+    __props__ = ("target",)
+
     def __init__(self, target: Discrepancy) -> None:
         self.target = target
-
-    @property
-    def held(self) -> tuple[object, ...]:
-        """The metric with its observed side."""
-        return (self.target,)
-
-    def make_node(self, sample: Any, weights: Any) -> Apply[Any, Any]:
-        """Apply to a sample and its weights."""
-        tensors = [pt.as_tensor(sample), pt.as_tensor(weights)]
-        ndim = max(t.type.ndim for t in tensors)
-        return Apply(self, tensors, [float_output(ndim - 1)])
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Call the user's function."""

@@ -140,14 +140,18 @@ class ResimulatedBound(Bound):
     def _response(self, params: Sequence[Any]) -> tuple[TensorVariable, TensorVariable]:
         """Return the graph of responses at the base points, and whether parameters are valid."""
         dists, epistemic = self.inputs.rebuilt(params)
-        pairs = zip(dists, self._points, strict=True)
-        aleatory = ninf_for_invalid([quantiles(self.name, d, u) for d, u in pairs])
+        placed = []
+        for dist, u in zip(dists, self._points, strict=True):
+            points = quantiles(self.name, dist, u)
+            placed.append(points)
+        aleatory = ninf_for_invalid(placed)
         common = [e[None] for e in epistemic]
-        if self.symbolic:
-            values = self.responses.function(*self.inputs.fill(aleatory, common))
-        else:
-            values = ResponseOp(self.responses)(*aleatory, *common)
-        return values, valid(self.inputs, dists)
+        parameters_valid = valid(self.inputs, dists)
+        if not self.symbolic:
+            respond = ResponseOp(self.responses)
+            return respond(*aleatory, *common), parameters_valid
+        arguments = self.inputs.fill(aleatory, common)
+        return self.responses.function(*arguments), parameters_valid
 
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy of the responses, +inf where parameters are invalid."""

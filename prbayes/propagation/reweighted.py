@@ -136,27 +136,14 @@ class Reweighted(Propagation):
 
 @dataclass(frozen=True)
 class Batches:
-    """The points of a design, batch after batch, and the mixture that they were drawn from.
+    """The points of a design, batch after batch, and the mixture that they were drawn from."""
 
-    Attributes
-    ----------
-    points : tuple of ndarray, shapes (n, *event)
-        One for each aleatory input.
-    values : ndarray, shape (n,)
-        Their responses; NaN where there is none.
-    components : tuple of ndarray, shapes (k, *shape)
-        The roots' values of the mixture's components, one array for each root.
-    counts : ndarray, shape (k,)
-        How many points came from each component.
-    sizes : tuple of int
-        Number of points of each batch.
-    """
-
-    points: tuple[Floats, ...]
-    values: Floats
+    points: tuple[Floats, ...]  # (n, *event): one for each aleatory input
+    values: Floats  # (n,): their responses; NaN where there is none
+    # (k, *shape): the roots' values of the mixture's components, one array for each root.
     components: tuple[Floats, ...]
-    counts: Floats
-    sizes: tuple[int, ...]
+    counts: Floats  # (k,): how many points came from each component
+    sizes: tuple[int, ...]  # number of points of each batch
 
     def followed_by(self, other: Batches) -> Batches:
         """Return these batches with others after them."""
@@ -291,9 +278,11 @@ class Design(Bound):
 
     def points_of(self, inputs: Inputs) -> list[Floats]:
         """Return the points of some of the design's aleatory inputs, shapes (n, *event)."""
-        own = [id(x) for x in self.inputs.aleatory]
-        known = dict(zip(own, self.batches.points, strict=True))
-        return [known[id(x)] for x in inputs.aleatory]
+        points = self.batches.points
+        own = list(map(id, self.inputs.aleatory))
+        wanted = map(id, inputs.aleatory)
+        places = map(own.index, wanted)
+        return [points[i] for i in places]
 
     def values_of(self, responses: Responses) -> Floats:
         """Return another response of the design's specimens, shape (n,).
@@ -348,16 +337,17 @@ class Design(Bound):
         self._stored = batch if self._stored is None else self._stored.followed_by(batch)
 
         # The mixture is that of all batches, so its density changes at the old points too.
-        log_g, sums = self._log_mixture(
-            self.batches.components, self.batches.counts, self.batches.points
-        )
+        stored = self.batches
+        log_g, sums = self._log_mixture(stored.components, stored.counts, stored.points)
         if self._moving is None:
             self._moving = moving_inputs(self.name, self.inputs, components, points)
             self.support_moves = bool(self._moving)
         basis = self.target.basis(self.values)
-        self._share([*self.batches.points, log_g, *self._cell_ends(), *basis])
+        ends = self._cell_ends()
+        self._share([*stored.points, log_g, *ends, *basis])
         log_ess = 2 * sums[0] - sums[1]
-        of_these = np.exp(log_ess)[-len(counts) :]
+        ess = np.exp(log_ess)
+        of_these = ess[-len(counts) :]
         return float(np.median(of_these))
 
     def _cell_ends(self) -> list[Floats]:
@@ -562,9 +552,11 @@ class Design(Bound):
 
         +inf where none has support.
         """
-        if self._basis[:2] != (target, self.n_points):
-            self._basis = (target, self.n_points, target.basis(self.values))
-        basis = self._basis[2]
+        wanted = (target, self.n_points)
+        if self._basis[:2] != wanted:
+            made = target.basis(self.values)
+            self._basis = (*wanted, made)
+        *_, basis = self._basis
         _, weights = self.populations(params)
         supported = np.isfinite(weights).all(axis=-1)
         weights = np.where(supported[:, None], weights, 1 / self.n_points)
@@ -617,13 +609,17 @@ def _inverted(levels: Floats, grid: Floats, density: Floats) -> Floats:
     both_ends = density[1:] + density[:-1]
     with np.errstate(invalid="ignore", over="ignore"):
         trapezoids = 0.5 * both_ends * np.diff(grid)
-        mass = np.concatenate([[0.0], np.cumsum(trapezoids)])
-        off = np.abs(mass / mass[-1] - share).max()
+        cumulated = np.cumsum(trapezoids)
+        mass = np.concatenate([[0.0], cumulated])
+        apart = mass / mass[-1] - share
+        off = np.abs(apart).max()
     # Trapezoids are finer than the share of points below, but where the density is infinite at an
     # edge, or its peaks lie between points: then the two differ by more than random points would.
     if off < 1 / np.sqrt(grid.size):
-        return np.interp(levels * mass[-1], mass, grid)
-    return np.interp(levels, share, grid)
+        found = np.interp(levels * mass[-1], mass, grid)
+    else:
+        found = np.interp(levels, share, grid)
+    return np.asarray(found)
 
 
 def _end_to_end(first: Floats, second: Floats) -> Floats:

@@ -11,7 +11,8 @@ import numpy as np
 import xarray as xr
 
 from prbayes._compare import INTERVAL
-from prbayes.reports.material import Material, draws_by_element, single_values
+from prbayes.model.elements import single_elements, split_elements, stacked_draws
+from prbayes.reports.material import Material
 from prbayes.reports.numbers import NOTHING, alike, counted, number, places
 from prbayes.reports.section import Section
 from prbayes.reports.tables import rows_table
@@ -33,8 +34,8 @@ def optima(m: Material) -> list[Section]:
 
 
 def _optimum_rows(tree: xr.DataTree) -> list[dict[str, Any]]:
-    point = single_values(tree["optimum"].to_dataset())
-    stderr = single_values(tree["stderr"].to_dataset())
+    point = single_elements(tree["optimum"].data_vars)
+    stderr = single_elements(tree["stderr"].data_vars)
     rows = []
     for name, value in point.items():
         estimate, error = alike((value, stderr[name]), stderr[name])
@@ -85,7 +86,7 @@ def _posterior_rows(tree: xr.DataTree) -> list[dict[str, Any]]:
     with np.errstate(all="ignore"):  # a variable that never moves
         table = arviz.summary(tree, kind="all", ci_prob=INTERVAL, ci_kind="eti", round_to="none")
     # ArviZ names elements by their coordinates; all else in a report does by their place.
-    names = list(draws_by_element(tree["posterior"].to_dataset()))
+    names = list(split_elements(stacked_draws(tree["posterior"])))
     percent = f"{100 * INTERVAL:.0f}"
     rows = []
     for name, (_, found) in zip(names, table.iterrows(), strict=True):

@@ -48,22 +48,11 @@ Request = Call | NotDrawn | None
 
 @dataclass(frozen=True)
 class Illustration:
-    """A picture that a report shows where it has what the picture needs.
+    """A picture that a report shows where it has what the picture needs."""
 
-    Attributes
-    ----------
-    after : str
-        Title of the section that it belongs to.
-    function : callable
-        Returns an ArviZ `PlotCollection`.
-    request : callable
-        From the material to a `Request`.
-    title, alt, caption : str
-    """
-
-    after: str
-    function: Callable[..., Any]
-    request: Callable[[Material], Request]
+    after: str  # title of the section that it belongs to
+    function: Callable[..., Any]  # returns an ArviZ `PlotCollection`
+    request: Callable[[Material], Request]  # from the material to a `Request`
     title: str
     alt: str
     caption: str

@@ -15,7 +15,6 @@ from prbayes._compare import compare
 from prbayes._diagnose import Diagnosis, diagnose
 from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.model.description import describe, from_attributes
-from prbayes.model.elements import element_name
 from prbayes.model.identity import Level, differences, identity_of_model, require_together
 from prbayes.model.node import nodes
 from prbayes.validation.validity import ValidityTest
@@ -23,32 +22,16 @@ from prbayes.validation.validity import ValidityTest
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Results by label; a single one has its kind as label.
-
-    Attributes
-    ----------
-    model : pymc.Model or None
-    description : dict or None
-        Of the model; from a file where there is no model.
-    optima : dict of DataTree
-    found : dict of Optimum
-        Those of the optima that are not from a file.
-    posteriors : dict of DataTree
-    tests : dict of ValidityTest
-    comparison : Dataset or None
-    observed : dict of ndarray
-        Measured responses by simulator.
-    diagnoses : dict of Diagnosis, or None where the model is needed
-    """
+    """Results by label; a single one has its kind as label."""
 
     model: pm.Model | None
-    description: dict[str, Any] | None
+    description: dict[str, Any] | None  # of the model; from a file where there is no model
     optima: dict[str, xr.DataTree]
-    found: dict[str, Optimum]
+    found: dict[str, Optimum]  # those of the optima that are not from a file
     posteriors: dict[str, xr.DataTree]
     tests: dict[str, ValidityTest]
     comparison: xr.Dataset | None
-    observed: dict[str, Floats]
+    observed: dict[str, Floats]  # measured responses by simulator
     diagnoses: dict[str, Diagnosis | None]
 
     @property
@@ -136,26 +119,6 @@ def gather(model: Any, optimum: Any, posterior: Any, validity: Any, comparison: 
         observed=_observed(model, results),
         diagnoses=diagnoses,
     )
-
-
-def draws_by_element(group: xr.Dataset) -> dict[str, Floats]:
-    """Return the draws of each element, such as 'mu[1]', of a group with dimensions chain, draw."""
-    found: dict[str, Floats] = {}
-    for name, variable in group.data_vars.items():
-        values = variable.transpose("chain", "draw", ...).values
-        draws = values.reshape(-1, *values.shape[2:])
-        for index in np.ndindex(draws.shape[1:]):
-            found[element_name(str(name), index)] = draws[(slice(None), *index)]
-    return found
-
-
-def single_values(group: xr.Dataset) -> dict[str, float]:
-    """Return the value of each element, such as 'mu[1]', of a group of an optimum."""
-    found: dict[str, float] = {}
-    for name, variable in group.data_vars.items():
-        for index in np.ndindex(variable.shape):
-            found[element_name(str(name), index)] = float(variable.values[index])
-    return found
 
 
 # -- checks ----------------------------------------------------------------------------------

@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from prbayes.reports.material import Material, draws_by_element, single_values
+from prbayes.model.elements import single_elements, split_elements, stacked_draws
+from prbayes.plots._objective import METRIC_LABELS
+from prbayes.reports.material import Material
 from prbayes.reports.numbers import counted, number, percentage, plus_minus
 from prbayes.validation.validity import ValidityTest
 
 _MOST = 6  # by judgement: more hyperparameters than this make a list, which a table shows better
-
-# How the metrics that ship are called in a sentence; one of the user's own has its class's name.
-_IN_WORDS = {
-    "ProbabilityResidual": "probability residual",
-    "KullbackLeibler": "Kullback-Leibler divergence",
-    "AreaMetric": "area metric",
-    "LogLikelihood": "log-likelihood",
-}
 
 
 def summary(m: Material) -> list[str]:
@@ -69,7 +63,7 @@ def _metrics(m: Material) -> list[str]:
         first = next(iter(m.calibrations.values()))
         described = list(map(str, first["metric"].values.tolist()))
     classes = [description.partition("(")[0] for description in described]
-    in_words = [_IN_WORDS.get(name, name) for name in classes]
+    in_words = [METRIC_LABELS.get(name, name) for name in classes]
     return list(dict.fromkeys(in_words))
 
 
@@ -101,15 +95,14 @@ def _estimates(m: Material, label: str) -> dict[str, tuple[float, float]]:
     """Return estimate and spread of each element of the hyperparameters, by a result."""
     found: dict[str, tuple[float, float]] = {}
     if label in m.posteriors:
-        posterior = m.posteriors[label]["posterior"]
-        draws = draws_by_element(posterior.to_dataset())
+        draws = split_elements(stacked_draws(m.posteriors[label]["posterior"]))
         for name, values in draws.items():
             mean, sd = values.mean(), values.std(ddof=1)
             found[name] = (float(mean), float(sd))
     else:
         tree = m.optima[label]
-        point = single_values(tree["optimum"].to_dataset())
-        stderr = single_values(tree["stderr"].to_dataset())
+        point = single_elements(tree["optimum"].data_vars)
+        stderr = single_elements(tree["stderr"].data_vars)
         for name, value in point.items():
             found[name] = (value, stderr[name])
     known = m.hyperparameters

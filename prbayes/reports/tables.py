@@ -19,19 +19,11 @@ _DIGIT_WIDE, _POINT_WIDE = "\u2007", "\u2008"
 
 @dataclass(frozen=True)
 class Cells:
-    """A table as text.
-
-    Attributes
-    ----------
-    header : tuple of str
-    rows : tuple of tuple of str
-    numeric : tuple of bool
-        Which columns hold numbers.
-    """
+    """A table as text."""
 
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    numeric: tuple[bool, ...]
+    numeric: tuple[bool, ...]  # which columns hold numbers
 
     def aligned(self) -> tuple[tuple[str, ...], ...]:
         """Return the rows with spaces after numbers, so that decimal points stand in line."""

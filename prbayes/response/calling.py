@@ -96,15 +96,9 @@ class scalar:  # noqa: N801 (reads as a function in a model)
 
 @dataclass(frozen=True)
 class Points:
-    """Points at which a response is wanted.
+    """Points at which a response is wanted."""
 
-    Attributes
-    ----------
-    arguments : sequence
-        Of the response: arrays (n, *event) where ``varying``, and else constants.
-    varying : sequence of bool
-    """
-
+    # Of the response: arrays (n, *event) where ``varying``, and else constants.
     arguments: Sequence[Any]
     varying: Sequence[bool]
 
@@ -150,64 +144,33 @@ class Points:
 
 @dataclass(frozen=True)
 class Chunk:
-    """What a worker gives back for the points of a chunk.
+    """What a worker gives back for the points of a chunk."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (m,)
-        NaN where the response raised, or was not called since an earlier point raised.
-    raised : dict
-        What was raised, in words, by position.
-    seconds : float
-        How long it took.
-    """
-
+    # (m,): NaN where the response raised, or was not called since an earlier point raised.
     values: Floats
-    raised: dict[int, str]
-    seconds: float
+    raised: dict[int, str]  # what was raised, in words, by position
+    seconds: float  # how long it took
 
 
 @dataclass(frozen=True)
 class Calling:
-    """How a response is called.
+    """How a response is called."""
 
-    Attributes
-    ----------
-    name : str
-        Of the simulator, for messages.
-    function : callable or scalar
-        ``function(*arguments)``.
-    executor : concurrent.futures.Executor or None
-        Where; None is here.
-    store : Store or None
-        Where responses are kept.
-    on_failure : OnFailure
-    """
-
-    name: str
-    function: Callable[..., Any]
-    executor: Executor | None = None
-    store: Store | None = None
+    name: str  # of the simulator, for messages
+    function: Callable[..., Any]  # ``function(*arguments)``
+    executor: Executor | None = None  # where; None is here
+    store: Store | None = None  # where responses are kept
     on_failure: OnFailure = field(default_factory=Abort)
 
 
 @dataclass
 class Tally:
-    """What calling a response has come to so far.
+    """What calling a response has come to so far."""
 
-    Attributes
-    ----------
-    computed : int
-        Responses computed, those that were tried again included; not those found in a store.
-    failures : int
-        Points whose response failed in the end and was replaced.
-    seconds : float
-        That one response takes, measured; 0 as long as nothing is known.
-    """
-
+    # Responses computed, those that were tried again included; not those found in a store.
     computed: int = 0
-    failures: int = 0
-    seconds: float = 0.0
+    failures: int = 0  # points whose response failed in the end and was replaced
+    seconds: float = 0.0  # that one response takes, measured; 0 as long as nothing is known
 
     def take(self, size: int, seconds: float) -> None:
         """Take note of a chunk of so many responses."""

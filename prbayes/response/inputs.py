@@ -22,25 +22,15 @@ from prbayes.response.compilation import PLAIN
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """The inputs of one response, in the order of its arguments.
+    """The inputs of one response, in the order of its arguments."""
 
-    Attributes
-    ----------
-    arguments : tuple
-        One entry per argument: an int (position in ``aleatory``), a variable (epistemic), or an
-        array.
-    aleatory : tuple of random variables
-        The distinct ``.dist()`` objects.
-    roots : tuple of variables
-        The model's random variables above the aleatory and epistemic inputs.
-    nested : bool
-        Whether a ``.dist()`` depends on another one.
-    """
-
+    # One entry per argument: an int (position in ``aleatory``), a variable (epistemic), or an
+    # array.
     arguments: tuple[Any, ...]
-    aleatory: tuple[TensorVariable, ...]
+    aleatory: tuple[TensorVariable, ...]  # the distinct ``.dist()`` objects
+    # The model's random variables above the aleatory and epistemic inputs.
     roots: tuple[TensorVariable, ...]
-    nested: bool
+    nested: bool  # whether a ``.dist()`` depends on another one
 
     @property
     def epistemic(self) -> tuple[TensorVariable, ...]:

@@ -39,7 +39,6 @@ from prbayes.response.database import (
     damaged,
     transaction,
 )
-from prbayes.response.old_store import old_responses
 
 _FILE = "responses.sqlite"  # what users see in their folder
 _NAN = np.array(np.nan, dtype="<f8").tobytes()
@@ -267,27 +266,18 @@ class Store:
         return entry
 
     def _enter(self, connection: sqlite3.Connection) -> None:
-        """Enter the response, unless another process has, with what an old store knows of it."""
-        old = None if self.version is not None else self._old()
-        columns = self.columns if old is None else old.shape[1] - 1
-        if columns is None:
+        """Enter the response, unless another process has, or stores of before SQLite have it."""
+        if self.columns is None:
             return
-        row = (self.name, columns, self.version)
+        safe = "".join(c if c.isalnum() or c in "-_." else f"%{ord(c):x}" for c in self.name)
+        older = [end for end in (".nc", ".journal") if (self.folder / f"{safe}{end}").exists()]
+        if older:
+            got = f"beside {safe}{older[0]}, which an older version wrote"
+            todo = "this version does not read it: move it away, or pass another folder"
+            raise self._refusal(Complaint(got, "no such file", todo))
+        row = (self.name, self.columns, self.version)
         with transaction(connection):
-            made = connection.execute(
-                INSERT_RESPONSE, (*row, checksum(*row), self.name, self.version)
-            )
-            if made.rowcount == 1 and old is not None:
-                runs = _rows(int(made.lastrowid or 0), old[:, :-1], old[:, -1], {})
-                connection.executemany(INSERT_RUN, runs)
-
-    def _old(self) -> Floats | None:
-        try:
-            return old_responses(self.folder, self.name)
-        except Exception as error:  # of what reads netCDF
-            got = f"beside files of an older version that cannot be read ({error})"
-            todo = "nothing was changed: move them away, or pass another folder"
-            raise self._refusal(Complaint(got, "sound ones", todo)) from error
+            connection.execute(INSERT_RESPONSE, (*row, checksum(*row), self.name, self.version))
 
     def _entries(self, connection: sqlite3.Connection) -> dict[tuple[str, str | None], _Entry]:
         """Return the responses in the file, by name and version."""

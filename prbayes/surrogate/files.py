@@ -22,35 +22,18 @@ _VERSION = 1
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """What a file keeps of a surrogate.
-
-    Attributes
-    ----------
-    ranges : Ranges
-    points : ndarray, shape (n, columns)
-    responses : ndarray, shape (n,)
-    error : CrossValidation
-    kind : str
-        Of the surface: the name of its class.
-    settings : dict
-        Of the surface, if it ships with prbayes.
-    outside : OnFailure
-    noise : int or None
-    n_runs : int
-    probes : ndarray, shape (k,)
-        Values of the surface at fixed points, by which another surface is known.
-    """
+    """What a file keeps of a surrogate."""
 
     ranges: Ranges
-    points: Floats
-    responses: Floats
+    points: Floats  # (n, columns)
+    responses: Floats  # (n,)
     error: CrossValidation
-    kind: str
-    settings: dict[str, Any]
+    kind: str  # of the surface: the name of its class
+    settings: dict[str, Any]  # of the surface, if it ships with prbayes
     outside: OnFailure
     noise: int | None
     n_runs: int
-    probes: Floats
+    probes: Floats  # (k,): values of the surface at fixed points, by which another surface is known
 
 
 def write(path: str | PathLike[str], kept: Kept) -> None:

@@ -23,21 +23,13 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Range:
-    """The range of one input.
-
-    Attributes
-    ----------
-    name : str
-    low, high : ndarray, shape (*event)
-        Lowest and highest value, in the input's own units.
-    constant : bool
-        Whether it is one value only.
-    """
+    """The range of one input."""
 
     name: str
+    # (*event): lowest and highest value, in the input's own units.
     low: Floats
     high: Floats
-    constant: bool = False
+    constant: bool = False  # whether it is one value only
 
     @property
     def proper(self) -> bool:
@@ -59,12 +51,7 @@ class Range:
 
 @dataclass(frozen=True, eq=False)
 class Ranges:
-    """The ranges of all inputs; specimens are rows with one column for each number.
-
-    Attributes
-    ----------
-    inputs : tuple of Range
-    """
+    """The ranges of all inputs; specimens are rows with one column for each number."""
 
     inputs: tuple[Range, ...]
 

@@ -77,9 +77,6 @@ class RadialBasis(Surface):
         Of the polynomial; by default the lowest that the kernel needs.
     smoothing : float
         0 passes through the points; more smooths a response that is noisy.
-    neighbors : int, optional
-        How many of the nearest points are used; all by default. Some 50, where there are thousands
-        of points.
 
     Raises
     ------
@@ -89,13 +86,12 @@ class RadialBasis(Surface):
     Examples
     --------
     >>> RadialBasis(kernel="thin_plate_spline")
-    RadialBasis(kernel='thin_plate_spline', degree=None, smoothing=0.0, neighbors=None)
+    RadialBasis(kernel='thin_plate_spline', degree=None, smoothing=0.0)
     """
 
     kernel: str = "cubic"
     degree: int | None = None
     smoothing: float = 0.0
-    neighbors: int | None = None
 
     def __post_init__(self) -> None:
         if self.kernel not in _LOWEST_DEGREE:
@@ -109,8 +105,6 @@ class RadialBasis(Surface):
             raise ValueError(
                 f"RadialBasis: smoothing: got {self.smoothing!r}, expected a number >= 0"
             )
-        if self.neighbors is not None:
-            positive_integer(self.neighbors, "RadialBasis: neighbors", minimum=2)
 
     def terms(self, dimensions: int) -> int:
         """Return the number of terms of the polynomial."""
@@ -119,17 +113,10 @@ class RadialBasis(Surface):
 
     def through(self, x: Floats, y: Floats) -> Predict:
         """Return the interpolant."""
-        from scipy.interpolate import (
-            RBFInterpolator,
-        )  # takes as long to import as the whole package
+        from scipy.interpolate import RBFInterpolator as Interpolator  # takes long to import
 
-        surface: Predict = RBFInterpolator(
-            x,
-            y,
-            neighbors=self.neighbors,
-            smoothing=self.smoothing,
-            kernel=self.kernel,
-            degree=self._degree(),
+        surface: Predict = Interpolator(
+            x, y, smoothing=self.smoothing, kernel=self.kernel, degree=self._degree()
         )
         return surface
 

@@ -12,7 +12,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from prbayes._checks import Floats, positive_integer
+from prbayes._checks import Floats, positive_integer, share
+from prbayes._progress import shown
 from prbayes.propagation.points import sobol
 from prbayes.response.calling import Calling, Points, ResponseError, Tally, respond
 from prbayes.response.failures import Abort, OnFailure, Replace
@@ -107,12 +108,13 @@ class Surrogate:
         model: Any = None,
         outside: OnFailure | None = None,
         coverage: float = 0.999,
+        name: str = "surrogate",
         executor: Executor | None = None,
         store: str | PathLike[str] | None = None,
         version: str | None = None,
         on_failure: OnFailure | None = None,
-        name: str = "surrogate",
         random_seed: int = 0,
+        progressbar: bool = True,
     ) -> Surrogate:
         """Compute the response on a scrambled Sobol design, and fit a surface.
 
@@ -136,12 +138,14 @@ class Surrogate:
             the log. A simulator with `Reweighted` reports them as lost mass, and refuses an answer
             that rests on them. `Abort`: they raise; take that with `Resimulated`.
         coverage : float
+        name : str
+            For messages, and of the store.
         executor, store, version, on_failure
             As for `Reweighted`. A point that fails in the end is left out of the fit; the surrogate
             then fails where that is the nearest point.
-        name : str
-            For messages, and of the store.
         random_seed : int
+        progressbar : bool
+            Whether work of more than two seconds shows a bar on stderr.
 
         Raises
         ------
@@ -163,7 +167,7 @@ class Surrogate:
         model = model or RadialBasis()
         outside = outside or Replace()
         _refuse_wrong(name, response, model, outside, store)
-        _refuse_share(name, coverage)
+        share(coverage, f"{name}: coverage")
         positive_integer(random_seed, f"{name}: random_seed", minimum=0)
         refuse_version(version)
         domain, predictive = read_ranges(name, inputs, coverage, random_seed)
@@ -176,7 +180,8 @@ class Surrogate:
         calling = Calling(name, response, executor, kept, on_failure or Abort())
         varying = [not one.constant for one in domain.inputs]
         tally = Tally()
-        responses = respond(calling, Points(domain.arguments(points), varying), tally)
+        with shown(progressbar):
+            responses = respond(calling, Points(domain.arguments(points), varying), tally)
         good = np.isfinite(responses)
         if good.sum() < needed:
             raise ResponseError(
@@ -426,9 +431,3 @@ def _refuse_wrong(name: str, response: object, model: Any, outside: object, stor
         )
     if store is not None and not isinstance(store, str | PathLike):
         raise TypeError(f"{name}: store: got {type(store).__name__}, expected the path of a folder")
-
-
-def _refuse_share(name: str, coverage: object) -> None:
-    """Raise if the coverage is not between 0 and 1."""
-    if not isinstance(coverage, float) or not 0 < coverage < 1:
-        raise ValueError(f"{name}: coverage: got {coverage!r}, expected a share between 0 and 1")

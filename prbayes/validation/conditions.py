@@ -20,27 +20,14 @@ Predicted = xr.DataArray | NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """What was measured and predicted under one condition.
-
-    Attributes
-    ----------
-    name : str
-    observed : ndarray, shape (n,)
-    predicted : ndarray, shape (D, S)
-        One row per draw.
-    labels : tuple of str, or None
-        Of the specimens.
-    numbers : ndarray of int, shape (n,)
-        The specimens, over all conditions.
-    attributes : dict
-        Of the prediction, as `predict` notes them.
-    """
+    """What was measured and predicted under one condition."""
 
     name: str
-    observed: Floats
-    predicted: Floats
-    labels: tuple[str, ...] | None
-    numbers: NDArray[np.intp]
+    observed: Floats  # (n,)
+    predicted: Floats  # (D, S): one row per draw
+    labels: tuple[str, ...] | None  # of the specimens
+    numbers: NDArray[np.intp]  # (n,): the specimens, over all conditions
+    # Of the prediction, as `predict` notes them.
     attributes: Mapping[Any, Any] = field(default_factory=dict)
 
     @property
@@ -58,27 +45,15 @@ class Condition:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """All conditions of one test.
-
-    Attributes
-    ----------
-    conditions : tuple of Condition
-    n_specimens : int
-    shared : bool
-        Whether a specimen occurs in several conditions.
-    random_seed : int or None
-        With a seed u-values are randomised within ties.
-    folded : bool
-        Whether the statistic is the area of abs(2u - 1).
-    identity : Identity or None
-        Of the problem whose calibration predicted all conditions, where predictions tell.
-    """
+    """All conditions of one test."""
 
     conditions: tuple[Condition, ...]
     n_specimens: int
-    shared: bool
-    random_seed: int | None
-    folded: bool = False
+    shared: bool  # whether a specimen occurs in several conditions
+    randomize: bool = False  # whether u-values of ties are random within their step
+    random_seed: int | None = 0
+    folded: bool = False  # whether the statistic is the area of abs(2u - 1)
+    # Of the problem whose calibration predicted all conditions, where predictions tell.
     identity: Identity | None = None
 
     @property
@@ -98,9 +73,10 @@ class Case:
 
     def rng(self, stream: int) -> np.random.Generator | None:
         """Return a generator for the choice within ties, or None for the mid-transform."""
-        if self.random_seed is None:
+        if not self.randomize:
             return None
-        return np.random.default_rng([self.random_seed, stream])
+        seed = self.random_seed
+        return np.random.default_rng(None if seed is None else [seed, stream])
 
     def tested(self, u: Floats) -> Floats:
         """Return the values that are tested for uniformity."""
@@ -120,8 +96,10 @@ def read_case(
     observed: Any,
     predicted: Any,
     specimens: Any = None,
-    random_seed: int | None = None,
+    *,
     folded: bool = False,
+    randomize: bool = False,
+    random_seed: int | None = 0,
 ) -> Case:
     """Return the conditions, checked; arguments are those of `area_test`.
 
@@ -157,6 +135,7 @@ def read_case(
         conditions=tuple(conditions),
         n_specimens=len(numbers),
         shared=distinct > len(numbers),
+        randomize=randomize,
         random_seed=random_seed,
         folded=folded,
         identity=identity,

@@ -9,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
+from prbayes._progress import shown
 from prbayes.estimate.data_sets import DataSets, specimens
 from prbayes.estimate.optimum import Optimum, require_refits
 from prbayes.metrics.base import Discrepancy
@@ -20,7 +21,9 @@ from prbayes.model.node import Node
 _STREAM = 3
 
 
-def cross_validate(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) -> xr.Dataset:
+def cross_validate(
+    optimum: Optimum, *, folds: int = 5, random_seed: int = 0, progressbar: bool = True
+) -> xr.Dataset:
     """Calibrate on parts of the specimens, and return the discrepancy of those left out.
 
     In place of LOO and WAIC, which do not apply to a discrepancy: it is one value for all specimens
@@ -37,6 +40,8 @@ def cross_validate(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) ->
         Number of parts; specimens are dealt out at random, those with the same label together.
     random_seed : int
         Models with as many specimens have the same folds with the same seed.
+    progressbar : bool
+        Whether work of more than two seconds shows a bar on stderr.
 
     Returns
     -------
@@ -76,7 +81,8 @@ def cross_validate(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) ->
     # Calibrate on the others of each fold.
     observed = [node.target.observed for node in evaluator.nodes]
     sampling = optimum.sampling()
-    x, converged = sampling.refit(DataSets(observed, parts.kept))
+    with shown(progressbar):
+        x, converged = sampling.refit(DataSets(observed, parts.kept))
     thetas = sampling.thetas(x)
 
     # Compare what was found with both parts.
@@ -101,20 +107,13 @@ def cross_validate(optimum: Optimum, *, folds: int = 5, random_seed: int = 0) ->
 
 @dataclass(frozen=True, eq=False)
 class _Folds:
-    """The parts of the specimens, as weights of the observations.
+    """The parts of the specimens, as weights of the observations."""
 
-    Attributes
-    ----------
-    left_out, kept : list of ndarray, shapes (folds, n_k)
-        By simulator: weights of the observations of a fold, and of the others; those kept sum to
-        one.
-    sizes : ndarray of int, shape (folds, simulators)
-        Observations left out.
-    """
-
+    # (folds, n_k): by simulator: weights of the observations of a fold, and of the others; those
+    # kept sum to one.
     left_out: list[Floats]
     kept: list[Floats]
-    sizes: NDArray[np.intp]
+    sizes: NDArray[np.intp]  # (folds, simulators): observations left out
 
     @classmethod
     def dealt(cls, nodes: list[Node], folds: int, random_seed: int) -> _Folds:

@@ -25,20 +25,11 @@ _BACK = 7
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """Quantiles of sqrt(n) A.
+    """Quantiles of sqrt(n) A."""
 
-    Attributes
-    ----------
-    sizes : ndarray, shape (k,)
-        Of samples, n.
-    logs : ndarray, shape (m,)
-        Minus the logarithms of tail probabilities, increasing.
-    quantiles : ndarray, shape (k, m)
-    """
-
-    sizes: Floats
-    logs: Floats
-    quantiles: Floats
+    sizes: Floats  # (k,): of samples, n
+    logs: Floats  # (m,): minus the logarithms of tail probabilities, increasing
+    quantiles: Floats  # (k, m)
 
     def at(self, n: int) -> Floats:
         """Return the quantiles for n values, shape (m,), interpolated in 1 / sqrt(n)."""

@@ -197,18 +197,11 @@ class JointNull(SimulatedNull):
 
 @dataclass(frozen=True, eq=False)
 class _Served:
-    """A condition, and the simulator whose points are its specimens.
-
-    Attributes
-    ----------
-    condition : Condition
-    simulator : int
-    values : ndarray, shape (points,), or None
-        Responses at the simulator's points, unless they are its own.
-    """
+    """A condition, and the simulator whose points are its specimens."""
 
     condition: Condition
     simulator: int
+    # (points,), or None: responses at the simulator's points, unless they are its own.
     values: Floats | None
 
     def values_or(self, own: Floats) -> Floats:

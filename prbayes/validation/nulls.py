@@ -36,17 +36,11 @@ _COUNT_ROUNDING, _TIE_ROUNDING = 1e-9, 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What a null says of a case.
-
-    Attributes
-    ----------
-    p_value, critical_value : float
-    lower, upper : ndarray, shape (n,)
-        The envelope: bounds of the sorted values that are tested.
-    """
+    """What a null says of a case."""
 
     p_value: float
     critical_value: float
+    # (n,): the envelope: bounds of the sorted values that are tested.
     lower: Floats
     upper: Floats
 
@@ -173,25 +167,14 @@ class PosteriorNull(SimulatedNull):
 
 @dataclass(frozen=True, eq=False)
 class _Pool:
-    """The predicted samples of one condition, from which replicates are taken.
+    """The predicted samples of one condition, from which replicates are taken."""
 
-    Attributes
-    ----------
-    numbers : ndarray of int, shape (n,)
-        The specimen of each observation.
-    left, right : ndarray, shape (D, S)
-        P(Y < y) and P(Y <= y) of each sample in the pool of all.
-    order : ndarray of int, shape (D, S)
-        Samples of each draw, those that can be used first.
-    count : ndarray of int, shape (D,)
-        How many those are.
-    """
-
-    numbers: NDArray[np.intp]
+    numbers: NDArray[np.intp]  # (n,): the specimen of each observation
+    # (D, S): P(Y < y) and P(Y <= y) of each sample in the pool of all.
     left: Floats
     right: Floats
-    order: NDArray[np.intp]
-    count: NDArray[np.intp]
+    order: NDArray[np.intp]  # (D, S): samples of each draw, those that can be used first
+    count: NDArray[np.intp]  # (D,): how many those are
 
     @classmethod
     def of(cls, condition: Condition, usable: NDArray[np.bool_]) -> _Pool:

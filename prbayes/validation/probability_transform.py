@@ -14,7 +14,8 @@ def u_values(
     observed: ArrayLike | Mapping[str, ArrayLike] | Sequence[ArrayLike],
     predicted: Predicted | Mapping[str, Predicted] | Sequence[Predicted],
     *,
-    random_seed: int | None = None,
+    randomize: bool = False,
+    random_seed: int | None = 0,
 ) -> Floats:
     r"""Return where measured responses stand in the pooled predictive distribution.
 
@@ -30,10 +31,11 @@ def u_values(
         +inf is a specimen that had failed.
     predicted : DataArray from `predict`, or ndarray of shape (..., S); or a mapping or list of such
         +inf counts as larger than every number; NaN are left out.
+    randomize : bool
+        Whether u is uniform between P(Y < y) and P(Y <= y), and not the middle: then u-values of
+        ties, such as failed specimens or discrete responses, are uniform too if the model is right.
     random_seed : int, optional
-        With a seed u is uniform between P(Y < y) and P(Y <= y), and not the middle: then u-values
-        of ties, such as failed specimens or discrete responses, are uniform too if the model is
-        right.
+        Of that choice.
 
     Returns
     -------
@@ -61,4 +63,5 @@ def u_values(
     >>> prb.validation.u_values([0.3, 1.5, 9.0], np.array([0.0, 1.0, 2.0, 3.0]))
     array([0.25, 0.5 , 1.  ])
     """
-    return read_case(observed, predicted, random_seed=random_seed).u_values()
+    case = read_case(observed, predicted, randomize=randomize, random_seed=random_seed)
+    return case.u_values()

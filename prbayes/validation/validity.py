@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, share
 from prbayes._predict import data_digest
+from prbayes._progress import shown
 from prbayes.model.identity import Identity, as_attributes
 from prbayes.model.labels import versions
 from prbayes.validation.conditions import Case, Condition, Predicted, read_case
@@ -114,7 +114,9 @@ def area_test(
     | Sequence[ArrayLike | None]
     | None = None,
     folded: bool = False,
-    random_seed: int | None = None,
+    randomize: bool = False,
+    random_seed: int | None = 0,
+    progressbar: bool = True,
 ) -> ValidityTest:
     r"""Test whether measured responses may come from the calibrated population.
 
@@ -146,8 +148,10 @@ def area_test(
     folded : bool
         Whether to test ``|2u - 1|``, which a right model makes uniform as well: responses too far
         out, or too close to the middle. Two tests at ``level`` / 2 look at both mean and spread.
-    random_seed : int, optional
+    randomize, random_seed
         As in `u_values`.
+    progressbar : bool
+        Whether work of more than two seconds shows a bar on stderr.
 
     Returns
     -------
@@ -178,8 +182,15 @@ def area_test(
     True
     """
     _refuse_null(null)
-    _refuse_level(level)
-    case = read_case(observed, predicted, specimens, random_seed, folded)
+    level = share(level, "level")
+    case = read_case(
+        observed,
+        predicted,
+        specimens,
+        folded=folded,
+        randomize=randomize,
+        random_seed=random_seed,
+    )
     if null is None:
         one_each = case.draws == 1 and not case.dependent
         null = ExactModel() if one_each else PosteriorNull()
@@ -191,7 +202,8 @@ def area_test(
 
     u = case.u_values()
     statistic = float(area(case.tested(u)))
-    judged = null.judge(case, statistic, float(level))
+    with shown(progressbar):
+        judged = null.judge(case, statistic, level)
 
     # Where each value comes from.
     conditions = np.repeat(
@@ -203,7 +215,7 @@ def area_test(
         statistic=statistic,
         critical_value=judged.critical_value,
         p_value=judged.p_value,
-        level=float(level),
+        level=level,
         null=null.describe(case),
         u_values=u,
         folded=folded,
@@ -221,15 +233,6 @@ def _refuse_null(null: object) -> None:
             f"null: got {type(null).__name__} {null!r:.60}, expected "
             "prb.validation.PosteriorNull(), prb.validation.ExactModel() or "
             "prb.validation.JointNull(optimum)"
-        )
-
-
-def _refuse_level(level: Any) -> None:
-    """Raise if it is no probability."""
-    is_number = isinstance(level, int | float | np.floating) and not isinstance(level, bool)
-    if not is_number or not 0 < level < 1:
-        raise ValueError(
-            f"level: got {level!r:.60}, expected a probability between 0 and 1, such as 0.05"
         )
 
 

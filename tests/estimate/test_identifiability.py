@@ -8,8 +8,8 @@ import pytest
 
 import prbayes as prb
 from prbayes.estimate.identifiability import (
-    seen_by_area,
-    seen_by_curvature,
+    identified_by_area,
+    identified_by_curvature,
     unidentified_directions,
 )
 from prbayes.estimate.sandwich import Information
@@ -62,14 +62,14 @@ def test_rounding_errors_are_not_information() -> None:
     noise = np.diag([0.5, 1e-13])
     # Curvature and noise of the second direction are rounding errors; their ratio looks like a
     # standard error of 0.1.
-    assert list(seen_by_curvature(np.diag([5.0, 3e-6]), noise)[2]) == [
+    assert list(identified_by_curvature(np.diag([5.0, 3e-6]), noise)[2]) == [
         False,
         True,
     ]  # sorted by curvature
     # A direction that says a little more than the prior is seen beside one that says much more.
-    assert seen_by_curvature(np.diag([500.0, 0.15]), np.diag([50.0, 0.015]))[2].all()
+    assert identified_by_curvature(np.diag([500.0, 0.15]), np.diag([50.0, 0.015]))[2].all()
     # Where nothing changes, nothing is seen.
-    assert not seen_by_curvature(np.zeros((2, 2)), np.zeros((2, 2)))[2].any()
+    assert not identified_by_curvature(np.zeros((2, 2)), np.zeros((2, 2)))[2].any()
 
 
 @pytest.mark.parametrize("name", [slow("ll"), slow("kl"), "pr"])
@@ -130,23 +130,23 @@ def test_a_standard_error_of_the_priors_spread_is_the_limit() -> None:
     # H = 1: the standard error is the root of J.
     hessian = np.eye(2)
     noise = np.diag([0.9, 1.1])
-    assert sorted(seen_by_curvature(hessian, noise)[2]) == [False, True]
-    assert seen_by_curvature(hessian, noise, weakest=1.1)[2].all()
-    assert not seen_by_curvature(hessian, noise, weakest=0.9)[2].any()
+    assert sorted(identified_by_curvature(hessian, noise)[2]) == [False, True]
+    assert identified_by_curvature(hessian, noise, weakest=1.1)[2].all()
+    assert not identified_by_curvature(hessian, noise, weakest=0.9)[2].any()
 
 
 def test_turned_matrices_have_turned_directions() -> None:
     turn = np.array([[0.6, -0.8], [0.8, 0.6]])
     hessian = turn @ np.diag([1.0, 9.0]) @ turn.T
     noise = turn @ np.diag([4.0, 4.0]) @ turn.T
-    values, vectors, seen = seen_by_curvature(hessian, noise)
+    values, vectors, seen = identified_by_curvature(hessian, noise)
     np.testing.assert_allclose(values, [1.0, 9.0])
     np.testing.assert_allclose(np.abs(vectors.T @ turn), np.eye(2), atol=1e-12)
     assert list(seen) == [False, True]
 
 
 def test_a_maximum_identifies_nothing() -> None:
-    assert not seen_by_curvature(-np.eye(2), np.diag([0.01, 0.01]))[2].any()
+    assert not identified_by_curvature(-np.eye(2), np.diag([0.01, 0.01]))[2].any()
 
 
 def test_of_a_sum_of_two_means_an_area_identifies_only_the_sum() -> None:
@@ -157,7 +157,7 @@ def test_of_a_sum_of_two_means_an_area_identifies_only_the_sum() -> None:
             "y", np.positive, x, metric=prb.AreaMetric(), observed=OBSERVED, propagation=R256
         )
     information = Information(Evaluator(model), 0, np.array([0.5, 0.5]), n_sets=50)
-    seen = seen_by_area(information)
+    seen = identified_by_area(information)
     assert seen.shape == (2, 1)
     # In units of the priors' spreads, which are known from draws to some per cent.
     assert abs(seen[:, 0] @ np.sqrt([0.5, 0.5])) > 0.99

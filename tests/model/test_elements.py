@@ -1,8 +1,15 @@
 """Names of elements."""
 
 import numpy as np
+import xarray as xr
 
-from prbayes.model.elements import element_name, element_names, split_elements
+from prbayes.model.elements import (
+    element_name,
+    element_names,
+    single_elements,
+    split_elements,
+    stacked_draws,
+)
 
 
 def test_names() -> None:
@@ -22,3 +29,21 @@ def test_values_by_element() -> None:
     assert list(found) == ["s", "c[0,0]", "c[0,1]", "c[1,0]", "c[1,1]"]
     np.testing.assert_array_equal(found["s"], [0, 1, 2])
     np.testing.assert_array_equal(found["c[1,0]"], [2, 6, 10])
+
+
+def test_draws_by_element() -> None:
+    w = np.arange(24.0).reshape(2, 3, 4)
+    group = xr.Dataset({"mu": (["chain", "draw"], w[..., 0]), "w": (["chain", "draw", "i"], w)})
+    found = split_elements(stacked_draws(group))
+    assert list(found) == ["mu", "w[0]", "w[1]", "w[2]", "w[3]"]
+    np.testing.assert_array_equal(found["w[2]"], w[..., 2].ravel())
+    turned = split_elements(stacked_draws(group.transpose("i", "draw", "chain"), ["w"]))
+    assert "mu" not in turned
+    np.testing.assert_array_equal(turned["w[2]"], found["w[2]"])
+
+
+def test_a_point_is_one_number_for_each_element() -> None:
+    assert single_elements({"mu": [1.0, 2.0], "s": 3}) == {"mu[0]": 1.0, "mu[1]": 2.0, "s": 3.0}
+    point = xr.Dataset({"w": (["i", "j"], [[1.0, 2.0], [3.0, 4.0]]), "mu": 5.0})
+    values = {"w[0,0]": 1.0, "w[0,1]": 2.0, "w[1,0]": 3.0, "w[1,1]": 4.0, "mu": 5.0}
+    assert single_elements(point.data_vars) == values

@@ -119,8 +119,3 @@ def test_steps_go_from_low_to_high_with_a_height_before_the_first() -> None:
     x, y = curves.steps(np.array([1.0, 3.0]), np.array([5.0, 6.0, 7.0]), 0.0, 4.0)
     np.testing.assert_array_equal(x, [0, 1, 1, 3, 3, 4])
     np.testing.assert_array_equal(y, [5, 5, 6, 6, 7, 7])
-
-
-def test_the_normal_density_is_that_of_scipy() -> None:
-    expected = stats.norm.pdf(GRID, 1.5, 0.7)
-    np.testing.assert_allclose(curves.normal_density(GRID, 1.5, 0.7), expected, rtol=1e-12)

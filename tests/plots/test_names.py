@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from prbayes.model.elements import element_name, split_elements
-from prbayes.plots._names import named, point_elements, variable_of
+from prbayes.plots._names import named, variable_of
 
 
 @pytest.mark.parametrize(("index", "expected"), [((), "mu"), ((1,), "mu[1]"), ((0, 2), "mu[0,2]")])
@@ -27,7 +27,3 @@ def test_values_are_split_along_all_axes_but_the_first() -> None:
     found = split_elements({"mu": np.arange(3.0), "cov": cov})
     assert list(found) == ["mu", "cov[0,0]", "cov[0,1]", "cov[1,0]", "cov[1,1]"]
     np.testing.assert_array_equal(found["cov[0,1]"], cov[:, 0, 1])
-
-
-def test_a_point_is_one_number_for_each_element() -> None:
-    assert point_elements({"mu": [1.0, 2.0], "s": 3}) == {"mu[0]": 1.0, "mu[1]": 2.0, "s": 3.0}

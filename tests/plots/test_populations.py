@@ -1,11 +1,10 @@
 """The calibrated curve and its band."""
 
 import numpy as np
-import pytest
 
 import prbayes as prb
 from prbayes.plots._ensemble import Ensemble
-from prbayes.plots._populations import calibrated, check_level
+from prbayes.plots._populations import calibrated
 
 CURVES = np.arange(11.0)[:, None] * np.array([1.0, -1.0])
 
@@ -29,9 +28,3 @@ def test_the_curve_of_an_optimum_is_its_own_and_no_part_of_the_band(optimum: prb
     alone = calibrated(CURVES[:1], shown(optimum, 1), 0.8)
     assert alone.band is None
     assert alone.top == 0
-
-
-@pytest.mark.parametrize("level", [0.0, 1.0, 1.5, -0.2, np.nan])
-def test_a_level_is_between_zero_and_one(level: float) -> None:
-    with pytest.raises(ValueError, match="level: got"):
-        check_level(level)

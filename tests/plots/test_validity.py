@@ -80,7 +80,6 @@ def test_the_envelope_holds_the_ecdf_of_a_right_model() -> None:
         middle = path.contains_points(np.column_stack([v, (low + high) / 2 + 1e-9]))
         assert middle[high > low].all()
         assert not path.contains_points(np.column_stack([v, high + 0.03]))[high < 0.96].any()
-    assert "envelope" not in prb.plot_validity(validity(), backend="matplotlib", envelope=False).viz
 
 
 def test_several_tests_of_different_sizes_get_a_panel_each(tmp_path: Path) -> None:

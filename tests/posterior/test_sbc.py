@@ -151,7 +151,7 @@ def test_data_sets_do_not_depend_on_their_number() -> None:
 
 def test_ranks_count_the_draws_below_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
     # A posterior that is always the same: 0, 1, ..., 9.
-    def fixed(evaluator: Evaluator, **keywords: Any) -> xr.DataTree:
+    def fixed(evaluator: Evaluator, asked: object) -> xr.DataTree:
         draws = xr.Dataset({"mu": (["chain", "draw"], np.arange(10.0)[None] / 5 - 1)})
         return xr.DataTree.from_dict({"posterior": draws})
 

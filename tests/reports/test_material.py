@@ -4,12 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.reports.material import draws_by_element, gather, single_values
+from prbayes.reports.material import gather
 from prbayes.reports.tables import cells
 
 
@@ -97,19 +96,6 @@ def test_a_saved_optimum_is_diagnosed_as_in_memory(calibrated: Any) -> None:
     assert memory.messages == saved.messages
     assert saved.messages[0] == "The data do not see mu."
     assert "did not converge (stopped)" in saved.messages[1]
-
-
-def test_values_by_element() -> None:
-    w = np.arange(24.0).reshape(2, 3, 4)
-    group = xr.Dataset({"mu": (["chain", "draw"], w[..., 0]), "w": (["chain", "draw", "i"], w)})
-    found = draws_by_element(group)
-    assert list(found) == ["mu", "w[0]", "w[1]", "w[2]", "w[3]"]
-    np.testing.assert_array_equal(found["w[2]"], w[..., 2].ravel())
-    turned = draws_by_element(group.transpose("i", "draw", "chain"))
-    np.testing.assert_array_equal(turned["w[2]"], found["w[2]"])
-    point = xr.Dataset({"w": (["i", "j"], [[1.0, 2.0], [3.0, 4.0]]), "mu": 5.0})
-    values = {"w[0,0]": 1.0, "w[0,1]": 2.0, "w[1,0]": 3.0, "w[1,1]": 4.0, "mu": 5.0}
-    assert single_values(point) == values
 
 
 def test_deterministics_of_a_file_are_not_compared(calibrated: Any) -> None:

@@ -129,6 +129,17 @@ def test_names_of_any_kind_have_their_own_responses(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["s"]
 
 
+@pytest.mark.parametrize("name", ["y%2f1.nc", "y%2f1.journal"])
+def test_files_of_an_older_version_are_refused_and_not_ignored(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"prbayes1")
+    with pytest.raises(StoreError, match=rf"y/1: store: .*beside {name}.*older version.*move it"):
+        Store(tmp_path, "y/1", 2)
+    assert (tmp_path / name).read_bytes() == b"prbayes1"
+    assert len(Store(tmp_path, "z", 2)) == 0
+    (tmp_path / name).unlink()
+    assert len(Store(tmp_path, "y/1", 2)) == 0
+
+
 def test_responses_go_to_other_programs_as_a_data_set(folder: Path, tmp_path: Path) -> None:
     Store(folder, "y").to_dataset().to_netcdf(tmp_path / "y.nc", engine="h5netcdf")
     with xr.open_dataset(tmp_path / "y.nc", engine="h5netcdf") as data:

@@ -58,13 +58,6 @@ def test_smoothing_recovers_a_response_below_its_noise() -> None:
     assert noisy.error.rms == pytest.approx(0.05, rel=0.2)  # se of an rms of 256 is 4%
 
 
-def test_neighbors_are_near_the_whole_surface() -> None:
-    whole = prb.Surrogate.fit(bent, BOX, 64)
-    local = prb.Surrogate.fit(bent, BOX, 64, model=prb.surrogate.RadialBasis(neighbors=30))
-    x, y = fresh_points()
-    assert 0 < np.abs(local(x, y) - whole(x, y)).max() < 0.05
-
-
 def test_a_regressor_of_scikit_learn_serves_and_is_left_unfitted() -> None:
     # The length of greatest likelihood is .60; it is not searched for. Responses without noise
     # leave a matrix of condition 4e9, hence a likelihood that is rounded at 2e-7: whether the
@@ -129,7 +122,7 @@ def test_terms_of_two_inputs(kernel: str, degree: int | None, terms: int) -> Non
 
 
 def test_settings_make_the_same_surface_again() -> None:
-    for model in (prb.surrogate.RadialBasis("quintic", 2, 0.1, 9), prb.surrogate.Polynomial(4)):
+    for model in (prb.surrogate.RadialBasis("quintic", 2, 0.1), prb.surrogate.Polynomial(4)):
         assert shipped(type(model).__name__, settings_of(model)) == model
     assert settings_of(Plane()) == {}
     assert shipped("Plane", {}) is None

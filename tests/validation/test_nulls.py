@@ -47,7 +47,6 @@ def test_p_values_of_replicates_count_the_observed_data_in() -> None:
         (Condition("a", np.zeros(1), np.zeros((1, 1)), None, np.zeros(1, dtype=int)),),
         1,
         False,
-        None,
     )
 
     def judged(statistic: float, level: float) -> tuple[float, float]:
@@ -77,7 +76,7 @@ def test_nan_is_left_out_of_populations(posterior: Posterior) -> None:
 def test_ties_in_populations_are_randomised_alike() -> None:
     """Discrete responses: with a seed the size stays nominal, as if they were continuous."""
     test = prb.area_test(
-        np.zeros(5), np.round(GRID), null=prb.validation.PosteriorNull(9999), random_seed=1
+        np.zeros(5), np.round(GRID), null=prb.validation.PosteriorNull(9999), randomize=True
     )
     assert test.critical_value == pytest.approx(EXACT.critical_value(5), abs=0.01)
 

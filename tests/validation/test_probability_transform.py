@@ -49,8 +49,8 @@ def test_u_values_of_a_decreasing_transformation_are_reflected(posterior: Poster
 def test_randomised_u_values_of_ties_are_uniform() -> None:
     rng = np.random.default_rng(3)
     counts, predicted = rng.poisson(2, 4000), np.random.default_rng(4).poisson(2, 200_000)
-    u = prb.validation.u_values(counts, predicted, random_seed=1)
-    np.testing.assert_array_equal(u, prb.validation.u_values(counts, predicted, random_seed=1))
+    u = prb.validation.u_values(counts, predicted, randomize=True)
+    np.testing.assert_array_equal(u, prb.validation.u_values(counts, predicted, randomize=True))
     assert EXACT.p_value(float(area(u)), u.size) > 0.01
     middle = prb.validation.u_values(counts, predicted)
     assert np.unique(middle).size == np.unique(counts).size
@@ -67,7 +67,7 @@ def test_failed_specimens_are_the_largest_and_nan_is_left_out() -> None:
 def test_rounded_measurements_have_ties_with_predictions_rounded_alike() -> None:
     rng = np.random.default_rng(5)
     predicted = as_array(rng.normal(0, 1, (1, 50_000)), nan=0)
-    u = prb.validation.u_values(rng.normal(0, 1, 2000).round(0), predicted.round(0), random_seed=1)
+    u = prb.validation.u_values(rng.normal(0, 1, 2000).round(0), predicted.round(0), randomize=True)
     assert EXACT.p_value(float(area(u)), 2000) > 0.01
 
 

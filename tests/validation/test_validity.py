@@ -143,7 +143,7 @@ def test_the_result_is_readable_and_saved(tmp_path: Path, posterior: Posterior) 
         ([1.0], np.array(1.0), {}, r"predicted: got shape \(\)"),
         ([1.0], xr.DataArray(GRID, dims="x"), {}, r"got a DataArray with dims \('x',\)"),
         ([1.0] * 10, GRID[::20], {}, "predicted: got 50 values for 10 observed ones"),
-        ([1.0], GRID, {"level": 1.0}, "level: got 1.0, expected a probability"),
+        ([1.0], GRID, {"level": 1.0}, "level: got 1.0, expected a number between"),
         ([1.0], GRID, {"specimens": [1, 2]}, r"specimens: got shape \(2,\), expected \(1,\)"),
         ([1.0, 2.0], GRID, {"specimens": [1, 1], "null": EXACT}, "2 values of 1 specimens"),
         (
