@@ -9,6 +9,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from four_metrics import METRICS, R256, same
 from scipy import optimize
 from scipy.stats import norm
 
@@ -23,22 +24,11 @@ from prbayes.model.node import nodes
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N, MEAN, SD = OBSERVED.size, float(OBSERVED.mean()), float(OBSERVED.std())
-METRICS: dict[str, prb.Metric] = {
-    "kl": prb.KullbackLeibler(),
-    "ll": prb.LogLikelihood(),
-    "pr": prb.ProbabilityResidual(),
-    "area": prb.AreaMetric(),
-}
 # Largest error of 256 reweighted responses, in standard errors of the data: kinks cost the area
 # metric some.
 DESIGN_ERROR = {"kl": 0.03, "ll": 0.03, "pr": 0.03, "area": 0.08}
 METHODS = ("BFGS", "L-BFGS-B", "Nelder-Mead", "Powell", "CG")
 NORMAL = ("mu", "sigma")
-R256 = prb.Reweighted(256)
-
-
-def same(x: Any) -> Any:
-    return x
 
 
 class Counting:
