@@ -53,14 +53,15 @@ def compiled(
     except _NotKeptError:
         return _function(inputs, outputs, allow_input_downcast)
     with _lock:
-        found = _known.get(key)
-        if found is None:
-            found = _function(inputs, outputs, allow_input_downcast)
-            _known[key] = found
-            while len(_known) > _KEPT:
-                _known.popitem(last=False)
-        _known.move_to_end(key)
-        return found.copy()
+        if key in _known:
+            _known.move_to_end(key)
+            return _known[key].copy()
+    function = _function(inputs, outputs, allow_input_downcast)
+    with _lock:
+        _known[key] = function
+        while len(_known) > _KEPT:
+            _known.popitem(last=False)
+        return function.copy()
 
 
 def _function(
