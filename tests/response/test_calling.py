@@ -342,6 +342,7 @@ def test_retried_once_and_then_it_works() -> None:
     assert responses(found).computed == N + STEEP.sum()
 
 
+@pytest.mark.exact
 def test_retried_in_vain() -> None:
     found = failing(
         "scalar", fails_above_two, prb.response.Retry(2, then=prb.response.Replace(-1.0))
@@ -352,6 +353,7 @@ def test_retried_in_vain() -> None:
         failing("scalar", fails_above_two, prb.response.Retry(2, then=prb.response.Abort()))
 
 
+@pytest.mark.exact
 @BATCHED
 def test_the_store_knows_which_points_failed_and_why(kind: str, tmp_path: Path) -> None:
     failing(
@@ -404,6 +406,7 @@ def test_an_optimum_tells_what_was_computed_and_what_it_rests_on(tmp_path: Path)
     assert (again.n_computed, again.point) == (0, first.point)
 
 
+@pytest.mark.exact
 def test_another_constant_is_another_input(tmp_path: Path) -> None:
     model(times, store=tmp_path)
     with pm.Model() as other:
@@ -498,6 +501,7 @@ def test_what_is_being_computed_when_one_fails_is_kept(
     np.testing.assert_array_equal(values[known], [2.0, 4.0, 6.0])
 
 
+@pytest.mark.exact
 def test_stored_failures_are_replaced_as_the_policy_of_the_day_says(tmp_path: Path) -> None:
     model(prb.scalar(fails_above_two), store=tmp_path, on_failure=prb.response.Replace(np.inf))
     found = model(
