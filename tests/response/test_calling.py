@@ -568,7 +568,9 @@ def killed(folder: Path, kind: str, at: int) -> str:
     return out
 
 
-@pytest.mark.parametrize(("kind", "at"), [("reweighted", 40), ("resimulated", 200)])
+@pytest.mark.parametrize(
+    ("kind", "at"), [("reweighted", 40), pytest.param("resimulated", 200, marks=pytest.mark.slow)]
+)
 def test_a_killed_run_computes_nothing_again_and_gives_the_same(
     kind: str,
     at: int,
