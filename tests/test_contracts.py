@@ -34,7 +34,7 @@ from pytensor.gradient import NullTypeGradError, disconnected_grad, grad_undefin
 from pytensor.graph.basic import Apply, Constant, Variable
 from pytensor.graph.op import Op
 from pytensor.graph.replace import _vectorize_node, graph_replace, vectorize_graph
-from pytensor.graph.traversal import ancestors, walk
+from pytensor.graph.traversal import ancestors, toposort, walk
 from pytensor.graph.utils import MissingInputError
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.random.type import RandomGeneratorType
@@ -85,6 +85,28 @@ def test_walk_and_ancestors_go_upwards_once() -> None:
     seen = list(walk([bottom], lambda v: None if v is top or v.owner is None else v.owner.inputs))
     assert top in seen
     assert x not in seen, "nothing is above where None is returned"
+
+
+def test_applications_come_in_the_same_order_and_constants_carry_their_numbers() -> None:
+    def graph() -> tuple[TensorVariable, TensorVariable]:
+        x = pt.dscalar("x")
+        return x, pt.exp(x) * 2.0 + pt.log(x)
+
+    found = [[node.op for node in toposort([y], blockers=[x])] for x, y in (graph(), graph())]
+    assert found[0] == found[1]
+    assert len(found[0]) == 4
+    assert found[0][-1] == graph()[1].owner.op, "what is needed comes first"
+    (number,) = (v for v in graph()[1].owner.inputs[0].owner.inputs if isinstance(v, Constant))
+    assert number.data == 2.0
+
+
+def test_a_copy_of_a_function_has_a_memory_of_its_own() -> None:
+    x = pt.dvector("x")
+    first = function([x], [pt.cumsum(x)], mode=PLAIN)
+    second = first.copy()
+    (kept,) = first(np.ones(2))
+    np.testing.assert_array_equal(second(np.zeros(2))[0], [0, 0])
+    np.testing.assert_array_equal(kept, [1, 2])
 
 
 def test_replacement_without_strictness_ignores_what_is_not_there() -> None:

@@ -116,6 +116,18 @@ def test_few_independent_draws() -> None:
     )
 
 
+@pytest.mark.parametrize(("every", "enough"), [(3, True), (6, False)])
+def test_of_few_draws_a_quarter_need_be_independent(every: int, enough: bool) -> None:
+    """Draws that come three times in a row are a third as many, and six times, a sixth."""
+    model, _ = sampled()
+    tree = normal_tree([0, 0, 0, 0], 240)
+    for name in ("mu", "sigma"):
+        values = tree["posterior"][name].values
+        values[:] = np.repeat(values[:, ::every], every, axis=1)
+    said = "too few for means and intervals" in str(prb.diagnose(tree, model=model))
+    assert said != enough
+
+
 def test_particles_that_stick() -> None:
     text = str(prb.diagnose(stuck()))
     assert "Particles hardly moved in the last stage of chains 0, 1 (0.0" in text

@@ -374,10 +374,13 @@ INNER = {
     "response.compilation": {
         "pymc.logprob.utils.CheckParameterValue",
         "pytensor.compile.mode.Mode",
+        "pytensor.graph.basic.Constant",
         "pytensor.graph.basic.Variable",
+        "pytensor.graph.op.Op",
         "pytensor.graph.replace.graph_replace",
         "pytensor.graph.replace.vectorize_graph",
         "pytensor.graph.traversal.ancestors",
+        "pytensor.graph.traversal.toposort",
         "pytensor.tensor.variable.TensorVariable",
     },
     "response.distributions": {

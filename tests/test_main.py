@@ -60,11 +60,20 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_report_of_saved_results(folder: Path) -> None:
-    files = ("p.nc", "o.nc", "v.nc")
-    options = ("--title", "A < B", "--date", "2 May", "--out", "r.html", "--no-pictures")
-    done = run("report", *files, *options, cwd=folder)
+REPORT = ("report", "p.nc", "o.nc", "v.nc", "--title", "A < B", "--date", "2 May")
+WRITTEN = ("--out", "r.html", "--no-pictures")
+
+
+@pytest.mark.slow
+def test_the_command_is_a_program(folder: Path) -> None:
+    done = run(*REPORT, *WRITTEN, cwd=folder)
     assert (done.returncode, done.stdout, done.stderr) == (0, "r.html\n", "")
+    assert (folder / "r.html").stat().st_size > 5000
+
+
+def test_report_of_saved_results(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*REPORT, *WRITTEN]) == 0
+    assert capsys.readouterr() == ("r.html\n", "")
     text = (folder / "r.html").read_text(encoding="utf-8")
     assert "<h1>A &lt; B</h1>" in text
     for title in (

@@ -12,7 +12,7 @@ from rich.console import Console
 
 import prbayes as prb
 import prbayes._progress
-from prbayes._progress import progress, shown
+from prbayes._progress import _expected, progress, shown
 
 
 @pytest.fixture
@@ -58,6 +58,13 @@ def test_short_work_shows_nothing(
             for _ in range(100):
                 report(1, "")
     assert screen.getvalue() == ""
+
+
+def test_the_seconds_left_are_those_at_the_pace_so_far() -> None:
+    assert _expected(3.0, 1, 4) == 9.0
+    assert _expected(3.0, 4, 4) == 0.0
+    assert _expected(3.0, 0, 4) == 9.0, "what is under way counts as done"
+    assert _expected(3.0, 7, None) == 3.0
 
 
 def test_what_is_hidden_outside_stays_hidden_inside(screen: io.StringIO) -> None:

@@ -35,6 +35,9 @@ _PRIOR_DRAWS = 256
 # whose spread shrinks by a factor of 1.3 makes 0.035; where a population stands still it is a
 # point's 1/n.
 _DIFFERENT = 0.02
+# Halvings of the way back to the middle of the prior: a thousandth of it is a tenth of a spread
+# where an optimum is a hundred spreads out.
+_HALVINGS = 10
 
 
 def breakdown(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> list[str]:
@@ -75,7 +78,9 @@ def elements_at_edge(
 ) -> tuple[str, ...]:
     """Return the elements that ran to an edge.
 
-    The population goes on changing there, and its discrepancy does not.
+    The population goes on changing there, and its discrepancy does not. So far out that the
+    population is one number, to the last digit, it no longer changes either: there the last place
+    on the way back counts where the discrepancy is the same.
 
     Standard errors cannot tell: curvature and noise are both rounding errors at an edge, and their
     ratio is anything. The way back to the middle of the prior does change the discrepancy, unlike
@@ -113,13 +118,34 @@ def elements_at_edge(
     unchanged = max(_UNCHANGED, tolerance) * size
     stands_still = beyond < unchanged
     comes_back = returning > unchanged
-    # Of those, the ones whose population changes all the same.
+    # Of those, the ones whose population changes all the same, there or on the way back.
     found = []
     for i in np.flatnonzero(stands_still & comes_back):
-        if _apart(evaluator, theta, further[i]) > _DIFFERENT:
+        changes_here = _apart(evaluator, theta, further[i]) > _DIFFERENT
+        if not changes_here:
+            last = _last_unchanged(evaluator, theta, back[i], scales, unchanged)
+            outwards_from_there = last + further[i] - theta
+            changes_here = _apart(evaluator, last, outwards_from_there) > _DIFFERENT
+        if changes_here:
             name = evaluator.readable_names[far[i]]
             found.append(name)
     return tuple(found)
+
+
+def _last_unchanged(
+    evaluator: Evaluator, theta: Floats, back: Floats, scales: Floats, unchanged: float
+) -> Floats:
+    """Return the last place on a straight way where the objective is that at its beginning."""
+    (here,) = evaluator.total(theta[None], scales)
+    same, other = 0.0, 1.0
+    for _ in range(_HALVINGS):
+        half = (same + other) / 2
+        (there,) = evaluator.total((theta + half * (back - theta))[None], scales)
+        if abs(there - here) < unchanged:
+            same = half
+        else:
+            other = half
+    return theta + same * (back - theta)
 
 
 def _apart(evaluator: Evaluator, a: Floats, b: Floats) -> float:

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
-import pytensor
 import pytensor.tensor as pt
 
 from prbayes._checks import Floats
@@ -20,7 +19,7 @@ from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.hyperparameters import Hyperparameters
 from prbayes.model.node import Node, log_kernel, required_nodes
 from prbayes.propagation.reweighted import Design
-from prbayes.response.compilation import PLAIN, ninf_for_invalid
+from prbayes.response.compilation import compiled, ninf_for_invalid
 
 # Design points times thetas evaluated at a time: arrays of 32 MB; it bounds memory, not the answer.
 _CHUNK = 1 << 22
@@ -206,13 +205,11 @@ class Evaluator:
         graphs = [value]
         if gradient:
             graphs.append(pt.grad(value, theta))
-        compiled = pytensor.function(
-            [theta, scales], ninf_for_invalid(graphs), mode=PLAIN, on_unused_input="ignore"
-        )
+        function = compiled([theta, scales], ninf_for_invalid(graphs))
 
         def counted(theta: Floats, scales: Floats) -> Any:
             self._count(1)
-            return compiled(theta, scales)
+            return function(theta, scales)
 
         return counted
 
@@ -259,13 +256,13 @@ class Evaluator:
         """The compiled roots of all simulators, and where those of each begin and end."""
         params = self._params()
         every = [p for own in params for p in own]
-        compiled = self.hyperparameters.compile(self.model.replace_rvs_by_values(every))
-        return compiled, np.cumsum([0, *map(len, params)])
+        function = self.hyperparameters.compile(self.model.replace_rvs_by_values(every))
+        return function, np.cumsum([0, *map(len, params)])
 
     def roots(self, thetas: Floats, k: int) -> list[Floats]:
         """Return the values of the k-th simulator's roots, shapes (P, *shape)."""
-        compiled, ends = self._roots
-        values = compiled(np.ascontiguousarray(thetas))
+        function, ends = self._roots
+        values = function(np.ascontiguousarray(thetas))
         size = len(thetas)
         found = []
         for value in values[ends[k] : ends[k + 1]]:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
-import pytensor
 import pytensor.tensor as pt
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.replace import graph_replace, vectorize_graph
@@ -19,7 +18,7 @@ from pytensor.graph.replace import graph_replace, vectorize_graph
 from prbayes._checks import Floats, real_array
 from prbayes.model.elements import element_names
 from prbayes.propagation.points import sobol
-from prbayes.response.compilation import PLAIN, ninf_for_invalid
+from prbayes.response.compilation import compiled, ninf_for_invalid
 from prbayes.response.distributions import PriorPoints, PriorSampler
 from prbayes.response.inputs import event_shape
 
@@ -106,7 +105,7 @@ class Hyperparameters:
         outputs, theta = self.joined(graphs)
         batch = pt.dmatrix("thetas")
         batched = vectorize_graph(ninf_for_invalid(outputs), {theta: batch})
-        return pytensor.function([batch], batched, mode=PLAIN, on_unused_input="ignore")
+        return compiled([batch], batched)
 
     @cached_property
     def _log_prior(self) -> Any:
@@ -186,13 +185,12 @@ class Hyperparameters:
             batched.append(pt.tensor(dtype=symbol.dtype, shape=shape))
         in_batches = dict(zip(symbols, batched, strict=True))
         thetas = vectorize_graph(theta, in_batches)
-        return pytensor.function(
-            batched, thetas, mode=PLAIN, on_unused_input="ignore", allow_input_downcast=True
-        )
+        return compiled(batched, [thetas], allow_input_downcast=True)
 
     def thetas_of(self, draws: Sequence[Floats]) -> Floats:
         """Return thetas, (P, d), of values of the free variables, (P, *shape), in their order."""
-        return np.asarray(self._transform(*draws))
+        (found,) = self._transform(*draws)
+        return np.asarray(found)
 
     # The prior.
 

@@ -1,17 +1,20 @@
-"""Batched compilation of graphs, so that one invalid row leaves the others alone."""
+"""Compilation of graphs: in batches, where one invalid row leaves the others alone, and once."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import OrderedDict
+from collections.abc import Hashable, Sequence
+from threading import Lock
 from typing import Any
 
 import numpy as np
 import pytensor
 import pytensor.tensor as pt
 from pytensor.compile.mode import Mode
-from pytensor.graph.basic import Variable
+from pytensor.graph.basic import Constant, Variable
+from pytensor.graph.op import Op
 from pytensor.graph.replace import graph_replace, vectorize_graph
-from pytensor.graph.traversal import ancestors
+from pytensor.graph.traversal import ancestors, toposort
 from pytensor.tensor.variable import TensorVariable
 
 # Batched NumPy calls: nothing here runs often enough to repay a heavy compilation. Without fusion
@@ -20,6 +23,115 @@ from pytensor.tensor.variable import TensorVariable
 PLAIN = Mode(linker="py", optimizer="fast_run").excluding(
     "fusion", "inplace", "BlasOpt", "c_blas", "symbolic_op_recognition"
 )
+
+# Functions that are kept, the oldest of which goes: a model has about ten. What they hold beside
+# their code are constants, 4 MB of them at the most.
+_KEPT = 64
+_LARGEST = 1 << 16  # bytes of constants
+
+_known: OrderedDict[Hashable, Any] = OrderedDict()
+_lock = Lock()
+
+
+class _NotKeptError(Exception):
+    """A graph holds something of a user's, which is not to be kept alive."""
+
+
+def compiled(
+    inputs: Sequence[TensorVariable],
+    outputs: Sequence[TensorVariable],
+    *,
+    allow_input_downcast: bool | None = None,
+) -> Any:
+    """Compile a graph, unless the same graph was compiled before in this process.
+
+    The second evaluator of a model, and of a model that was built again, asks for what the first
+    one did. It gets a copy of that function, with a memory of its own: two threads may call both.
+    """
+    try:
+        key = (allow_input_downcast, _structure(inputs, outputs))
+    except _NotKeptError:
+        return _function(inputs, outputs, allow_input_downcast)
+    with _lock:
+        if key in _known:
+            _known.move_to_end(key)
+            return _known[key].copy()
+    function = _function(inputs, outputs, allow_input_downcast)
+    with _lock:
+        _known[key] = function
+        while len(_known) > _KEPT:
+            _known.popitem(last=False)
+        return function.copy()
+
+
+def _function(
+    inputs: Sequence[TensorVariable],
+    outputs: Sequence[TensorVariable],
+    allow_input_downcast: bool | None,
+) -> Any:
+    return pytensor.function(
+        list(inputs),
+        list(outputs),
+        mode=PLAIN,
+        on_unused_input="ignore",
+        allow_input_downcast=allow_input_downcast,
+    )
+
+
+def _structure(
+    inputs: Sequence[TensorVariable], outputs: Sequence[TensorVariable]
+) -> tuple[Hashable, ...]:
+    """Return what makes a graph that graph: its operations, constants and how they hang together.
+
+    Names do not.
+
+    Raises
+    ------
+    _NotKeptError
+        If the graph has shared variables, operations of a user's or of ours, or many constants.
+    """
+    number: dict[Variable, int] = {}
+    said: list[Hashable] = []
+    size = 0
+    for variable in inputs:
+        number.setdefault(variable, len(number))
+        said.append(variable.type)
+
+    def numbered(variable: Variable) -> int:
+        nonlocal size
+        if variable in number:
+            return number[variable]
+        if not isinstance(variable, Constant):
+            raise _NotKeptError
+        if isinstance(variable.data, np.ndarray | np.generic):
+            size += variable.data.nbytes
+            data: Hashable = (variable.data.shape, variable.data.tobytes())
+        elif isinstance(variable.data, slice | int | float | None):
+            data = repr(variable.data)
+        else:
+            raise _NotKeptError
+        if size > _LARGEST:
+            raise _NotKeptError
+        number[variable] = len(number)
+        said.append((variable.type, data))
+        return number[variable]
+
+    for node in toposort(list(outputs), blockers=list(inputs)):
+        if not _foreign(node.op):
+            raise _NotKeptError
+        said.append((node.op, *map(numbered, node.inputs)))
+        for variable in node.outputs:
+            number[variable] = len(number)
+    said.append(tuple(map(numbered, outputs)))
+    return tuple(said)
+
+
+def _foreign(op: Op) -> bool:
+    """Return whether an operation, with those inside it, is PyTensor's own, and without state."""
+    names = getattr(op, "__props__", None) or ()
+    within = [getattr(op, name, None) for name in names]
+    own = type(op).__module__.startswith("pytensor.")
+    return own and all(_foreign(inner) for inner in within if isinstance(inner, Op))
 
 
 def ninf_for_invalid(graphs: Sequence[TensorVariable]) -> list[TensorVariable]:
@@ -51,10 +163,4 @@ def compile_batched(
     outputs = ninf_for_invalid(core_outputs)
     batched = with_leading_axis(core_inputs)
     vectorized = vectorize_graph(outputs, dict(zip(core_inputs, batched, strict=True)))
-    return pytensor.function(
-        [*batched, *extra],
-        vectorized,
-        mode=PLAIN,
-        on_unused_input="ignore",
-        allow_input_downcast=True,
-    )
+    return compiled([*batched, *extra], vectorized, allow_input_downcast=True)

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from four_metrics import METRICS, R256, same, slow
 
 import prbayes as prb
 from prbayes._checks import Floats
@@ -24,23 +25,8 @@ from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 N = OBSERVED.size
-KL, LL, PR, AREA = (
-    prb.KullbackLeibler(),
-    prb.LogLikelihood(),
-    prb.ProbabilityResidual(),
-    prb.AreaMetric(),
-)
-METRICS = {"kl": KL, "ll": LL, "pr": PR, "area": AREA}
-R256 = prb.Reweighted(256)
+KL, LL, PR, AREA = (METRICS[name] for name in ("kl", "ll", "pr", "area"))
 TRUTH = np.array([1.0])
-
-
-def slow(name: str) -> Any:
-    return pytest.param(name, marks=pytest.mark.slow)
-
-
-def same(x: Any) -> Any:
-    return x
 
 
 def double(x: Any) -> Any:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from four_metrics import METRICS, R256, same, slow
 from scipy import optimize
 
 import prbayes as prb
@@ -17,22 +18,7 @@ from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 N = OBSERVED.size
-METRICS: dict[str, prb.Metric] = {
-    "kl": prb.KullbackLeibler(),
-    "ll": prb.LogLikelihood(),
-    "pr": prb.ProbabilityResidual(),
-    "area": prb.AreaMetric(),
-}
-R256 = prb.Reweighted(256)
 TRUTH = np.array([1.0])
-
-
-def slow(name: str) -> Any:
-    return pytest.param(name, marks=pytest.mark.slow)
-
-
-def same(x: Any) -> Any:
-    return x
 
 
 def double(x: Any) -> Any:

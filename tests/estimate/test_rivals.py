@@ -8,6 +8,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from four_metrics import METRICS, R256, same, slow
 
 import prbayes as prb
 from prbayes.estimate.rivals import rivals
@@ -16,25 +17,10 @@ from prbayes.model.evaluator import Evaluator
 
 DATA = (np.random.default_rng(3).normal(2.0, 0.3, 40) - 1) ** 2
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
-METRICS = {
-    "ll": prb.LogLikelihood(),
-    "kl": prb.KullbackLeibler(),
-    "pr": prb.ProbabilityResidual(),
-    "area": prb.AreaMetric(),
-}
-R256 = prb.Reweighted(256)
-
-
-def slow(name: str) -> Any:
-    return pytest.param(name, marks=pytest.mark.slow)
 
 
 def parabola(x: Any) -> Any:
     return x**2 - 2 * x + 1
-
-
-def same(x: Any) -> Any:
-    return x
 
 
 def mirrored(metric: prb.Metric, **keywords: Any) -> pm.Model:

@@ -9,6 +9,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from four_metrics import METRICS, R256, same, slow
 from scipy.special import digamma
 from scipy.stats import gamma, norm
 
@@ -21,21 +22,6 @@ from prbayes.posterior.adjustment import _drawn_in, transported
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N = OBSERVED.size
-METRICS = {
-    "ll": prb.LogLikelihood(),
-    "kl": prb.KullbackLeibler(),
-    "pr": prb.ProbabilityResidual(),
-    "area": prb.AreaMetric(),
-}
-R256 = prb.Reweighted(256)
-
-
-def slow(name: str) -> Any:
-    return pytest.param(name, marks=pytest.mark.slow)
-
-
-def same(x: Any) -> Any:
-    return x
 
 
 def build(

@@ -7,22 +7,12 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from four_metrics import METRICS, R256, same
 
 import prbayes as prb
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N, SD = OBSERVED.size, float(OBSERVED.std())
-METRICS = {
-    "ll": prb.LogLikelihood(),
-    "kl": prb.KullbackLeibler(),
-    "pr": prb.ProbabilityResidual(),
-    "area": prb.AreaMetric(),
-}
-R256 = prb.Reweighted(256)
-
-
-def same(x: Any) -> Any:
-    return x
 
 
 def build(metric: prb.Metric, propagation: Any = R256) -> pm.Model:

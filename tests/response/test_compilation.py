@@ -1,12 +1,28 @@
-"""Batched compilation: one invalid row leaves the others alone."""
+"""Compilation: one invalid row leaves the others alone, and what is known is not done again."""
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
 import numpy as np
 import pymc as pm
+import pytensor
 import pytensor.tensor as pt
+import pytest
+from pytensor.graph.basic import Apply
+from pytensor.graph.op import Op
 
-from prbayes.response.compilation import compile_batched, ninf_for_invalid, with_leading_axis
+import prbayes as prb
+from prbayes.model.evaluator import Evaluator
+from prbayes.response import compilation
+from prbayes.response.compilation import (
+    compile_batched,
+    compiled,
+    ninf_for_invalid,
+    with_leading_axis,
+)
 
 
 def test_a_batch_gives_what_single_calls_do() -> None:
@@ -41,3 +57,129 @@ def test_a_leading_axis_keeps_name_type_and_shape() -> None:
     assert [b.name for b in batched] == ["a", "b"]
     assert [b.dtype for b in batched] == ["float64", "int64"]
     assert [b.type.shape for b in batched] == [(None,), (None, 3)]
+
+
+# -- once ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def compilations(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Begin with nothing known, and count what is compiled."""
+    counted: list[Any] = []
+    function = pytensor.function
+
+    def counting(*given: Any, **keywords: Any) -> Any:
+        counted.append(given)
+        return function(*given, **keywords)
+
+    monkeypatch.setattr(compilation, "_known", OrderedDict())
+    monkeypatch.setattr(pytensor, "function", counting)
+    return counted
+
+
+def line(slope: float, *, vector: bool = False, power: int = 2, swap: bool = False) -> Any:
+    """Compile slope x^power - y."""
+    x, y = (pt.dvector(), pt.dvector()) if vector else (pt.dscalar("x"), pt.dscalar("y"))
+    return compiled([y, x] if swap else [x, y], [slope * x**power - y])
+
+
+def test_the_same_graph_is_compiled_once(compilations: list[Any]) -> None:
+    first, second = line(3.0), line(3.0)
+    assert len(compilations) == 1
+    assert first(2.0, 1.0) == second(2.0, 1.0) == [11.0]
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [({"slope": 4.0}, 15.0), ({"vector": True}, 11.0), ({"power": 3}, 23.0), ({"swap": True}, 1.0)],
+    ids=["a constant", "a type", "an operation", "an order"],
+)
+def test_another_graph_is_compiled_for_itself(
+    change: dict[str, Any], found: float, compilations: list[Any]
+) -> None:
+    line(3.0)
+    other = line(**{"slope": 3.0, **change})
+    assert len(compilations) == 2
+    given = ([2.0], [1.0]) if "vector" in change else (2.0, 1.0)
+    np.testing.assert_array_equal(np.ravel(other(*given)), [found])
+
+
+def test_which_variable_goes_where_is_told_apart(compilations: list[Any]) -> None:
+    for pick in ((0, 1), (1, 0), (0, 0)):
+        x, y = pt.dscalar(), pt.dscalar()
+        a, b = pt.exp(x), pt.exp(y)
+        (found,) = compiled([x, y], [(a, b)[pick[0]] / (1 + (a, b)[pick[1]])])(0.0, 1.0)
+        numbers = np.exp([0.0, 1.0])
+        assert found == pytest.approx(numbers[pick[0]] / (1 + numbers[pick[1]]))
+    assert len(compilations) == 3
+
+
+def test_functions_of_one_graph_share_no_memory(compilations: list[Any]) -> None:
+    x = pt.dvector()
+    first, second = (compiled([x], [pt.cumsum(pt.exp(x)), x + 1]) for _ in range(2))
+    (kept, _) = first(np.zeros(3))
+    second(np.ones(3))
+    np.testing.assert_array_equal(kept, [1, 2, 3])
+    with ThreadPoolExecutor(2) as threads:
+        given = [np.full(2000, float(i)) for i in range(2)]
+        jobs = [
+            threads.submit(lambda f, v: [f(v)[1][0] for _ in range(300)], f, v)
+            for f, v in zip((first, second), given, strict=True)
+        ]
+        assert [set(job.result()) for job in jobs] == [{1.0}, {2.0}]
+    assert len(compilations) == 1
+
+
+class Theirs(Op):
+    """An operation of a user's, which may hold anything."""
+
+    __props__ = ()
+
+    def make_node(self, x: Any) -> Apply:
+        return Apply(self, [x], [x.type()])
+
+    def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
+        outputs[0][0] = 2 * inputs[0]
+
+
+@pytest.mark.parametrize("what", ["shared", "operation", "inside", "large"])
+def test_what_may_be_a_users_is_not_kept(what: str, compilations: list[Any]) -> None:
+    x = pt.dvector()
+    graph = {
+        "shared": lambda: x + pytensor.shared(np.ones(2)),
+        "operation": lambda: Theirs()(x),
+        "inside": lambda: pt.vectorize(Theirs(), signature="(n)->(n)")(pt.stack([x, x])),
+        "large": lambda: x.sum() + np.arange(1e4),
+    }[what]()
+    for _ in range(2):
+        compiled([x], [graph])
+    assert len(compilations) == 2
+    assert not compilation._known
+
+
+def test_a_number_of_functions_is_kept_the_latest_used(compilations: list[Any]) -> None:
+    for slope in range(1, compilation._KEPT + 1):
+        line(float(slope))
+    line(1.0)
+    line(-1.0)  # one too many: the second goes, for the first was just used
+    assert len(compilation._known) == compilation._KEPT
+    before = len(compilations)
+    line(1.0)
+    assert len(compilations) == before
+    line(2.0)
+    assert len(compilations) == before + 1
+
+
+def test_a_model_that_is_built_again_has_its_functions(compilations: list[Any]) -> None:
+    def log_prior(mean: float) -> Any:
+        with pm.Model() as model:
+            x = pm.Normal.dist(pm.Normal("mu", mean, 1), 0.5)
+            y = [1.0, 2.0]
+            prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=y)
+        return Evaluator(model).hyperparameters.log_prior(np.zeros((1, 1)))[0]
+
+    first = log_prior(0.0)
+    before = len(compilations)
+    assert log_prior(0.0) == first == pytest.approx(-0.5 * np.log(2 * np.pi))
+    assert len(compilations) - before < before / 2
+    assert log_prior(1.0) == pytest.approx(first - 0.5)

@@ -1,4 +1,4 @@
-"""A real Dask cluster on the loopback interface; one worker is killed while it computes."""
+"""A real Dask cluster: in threads, and on the loopback interface, where a worker is killed while it computes."""
 
 from __future__ import annotations
 
@@ -40,6 +40,34 @@ def build(**keywords: object) -> pm.Model:
     return model
 
 
+def all_there(model: pm.Model, store: Path) -> None:
+    """The responses are those of this process, and all of them are stored."""
+    responses = next(iter(nodes(model).values())).bound
+    np.testing.assert_array_equal(
+        responses.values, next(iter(nodes(build()).values())).bound.values
+    )
+    again = next(iter(nodes(build(store=store)).values())).bound.responses
+    assert again.computed == 1  # whether the response is still the same
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
+def test_a_worker_that_leaves_while_it_computes_loses_nothing(tmp_path: Path) -> None:
+    cluster = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
+    )
+    with cluster, distributed.Client(cluster) as client:
+        executor = client.get_executor(pure=False)
+        assert capacity(executor) == Capacity(2, 4)
+        leaving = threading.Timer(0.6, cluster.scale, (1,))
+        leaving.start()
+        begun = time.perf_counter()
+        model = build(executor=executor, store=tmp_path)
+        assert time.perf_counter() - begun > 0.6, "the worker was to leave while it computes"
+        leaving.join()
+    all_there(model, tmp_path)
+
+
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
 def test_a_worker_is_killed_and_nothing_is_lost(tmp_path: Path) -> None:
     cluster = distributed.LocalCluster(
@@ -56,9 +84,4 @@ def test_a_worker_is_killed_and_nothing_is_lost(tmp_path: Path) -> None:
         assert time.perf_counter() - begun > 0.6, "the worker was to be killed while it computes"
         killer.join()
         assert pids[0] not in client.run(os.getpid).values()
-    responses = next(iter(nodes(model).values())).bound
-    np.testing.assert_array_equal(
-        responses.values, next(iter(nodes(build()).values())).bound.values
-    )
-    again = next(iter(nodes(build(store=tmp_path)).values())).bound.responses
-    assert again.computed == 1
+    all_there(model, tmp_path)

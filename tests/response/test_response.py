@@ -41,6 +41,7 @@ def by_rows(pair: Any, a: Any, x: Any, slope: Any) -> Any:
     return weighted(pair, a, x, slope)
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize("way", ["plain", "scalar", "stored", "tolerant"])
 def test_every_way_of_calling_gives_the_same_in_the_shape_of_the_batch(
     way: str, tmp_path: Path
@@ -72,6 +73,7 @@ def test_a_point_of_a_store_is_all_that_goes_into_the_response(tmp_path: Path) -
     assert count(PAIR, 3.0, X, MU) == 12  # another constant is another input
 
 
+@pytest.mark.exact
 def test_failures_are_counted(tmp_path: Path) -> None:
     def steep(x: Any) -> Any:
         return np.where(x > 0, np.nan, x)
