@@ -17,7 +17,7 @@ from prbayes.model.elements import element_name
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level
 from prbayes.model.node import model_on_context
-from prbayes.model.support import shortcoming
+from prbayes.model.support import ENOUGH, shortcoming
 
 _RHAT = 1.01  # recommended by Vehtari et al. (2021)
 # R-hat of independent draws exceeds 1 + _NOISE / (chains x draws) about once in a thousand cases:
@@ -327,7 +327,7 @@ def _unsupported(designs: _Designs) -> list[str]:
     messages = []
     for name, needs in designs.needs.items():
         own = {key: designs.support[key].sel(simulator=name).values for key in _SUPPORT}
-        lacking = shortcoming(own, needs.weight_ess, needs.max_lost, needs.n_points)
+        lacking = shortcoming(own, needs.weight_ess, needs.max_lost, needs.n_points, ENOUGH)
         if lacking:
             messages.append(
                 f"{name}: the design does not support the answer: {lacking}. "

@@ -106,8 +106,6 @@ class Refits:
         scales: Floats,
         *,
         simulators: Sequence[int] | None = None,
-        n_sets: int = _SETS,
-        seed: int = 0,
     ) -> Refits:
         """Draw data sets at theta and minimise the discrepancy of each; no response is computed.
 
@@ -127,8 +125,6 @@ class Refits:
             tuple(theta),
             tuple(ratios),
             chosen,
-            n_sets,
-            seed,
             tuple(fingerprints),
         )
 
@@ -139,15 +135,13 @@ class Refits:
         theta: Floats,
         scales: Floats,
         simulators: tuple[int, ...],
-        n_sets: int,
-        seed: int,
     ) -> Refits:
         """Draw and minimise."""
-        sets = simulated_sets(evaluator, theta, n_sets, seed)
+        sets = simulated_sets(evaluator, theta, _SETS, seed=0)
         objective = BatchObjective.of(evaluator, scales, sets, simulators=simulators)
         prior_sd = evaluator.prior_sd
         d = theta.size
-        start = np.zeros((n_sets, d))
+        start = np.zeros((_SETS, d))
         # The first simplices know no more than the prior.
         value = _Along(
             objective,
@@ -156,7 +150,7 @@ class Refits:
             axes=np.eye(d),
             steps=np.ones(d),
         )
-        rows = np.arange(n_sets)
+        rows = np.arange(_SETS)
         first = value(start[:, None], rows)
         before = first[:, 0]
         shifts, _, _ = descend_by_simplex(value, start, sizes=[_FIRST])
@@ -228,14 +222,12 @@ def _refits(
     theta: tuple[float, ...],
     scales: tuple[float, ...],
     simulators: tuple[int, ...],
-    n_sets: int,
-    seed: int,
     designs: tuple[int, ...],
 ) -> Refits:
     """Return refits on designs as they are now, of which ``designs`` has fingerprints."""
     at = np.array(theta)
     weights = np.array(scales)
-    return Refits.made(evaluator, at, weights, simulators, n_sets, seed)
+    return Refits.made(evaluator, at, weights, simulators)
 
 
 def principal_axes(points: Floats) -> tuple[Floats, Floats]:

@@ -109,7 +109,7 @@ class SamplingDistribution:
         jumping = [one.k for one in self.information if one.jumps]
         if not jumping:
             return []
-        wider = [replace(one, wide=2 * one.wide) for one in self.information]
+        wider = [replace(one, widened=2.0) for one in self.information]
         local = local_sampling(self.information, self.scales)
         other = local_sampling(wider, self.scales)
         variances = np.diag(local.in_theta)

@@ -85,9 +85,8 @@ class Information:
     n_sets : int
         Number of simulated data sets, each of the observed size.
     seed : int
-    wide : float
-        Step in prior standard deviations where the discrepancy is a step function of theta, or
-        jumps.
+    widened : float
+        Factor of the step where the discrepancy is a step function of theta, or jumps.
     """
 
     evaluator: Evaluator
@@ -95,7 +94,7 @@ class Information:
     theta: Floats
     n_sets: int = 200
     seed: int = 0
-    wide: float = _WIDE_STEP
+    widened: float = 1.0
 
     @property
     def node(self) -> Node:
@@ -130,7 +129,7 @@ class Information:
             unchanged = finite == finite[0]
             if unchanged.all():
                 return narrow
-        return self._around(self.wide)
+        return self._around(self.widened * _WIDE_STEP)
 
     def _around(self, share: float) -> Stencil:
         """Return the populations within steps of a share of the prior's spread."""

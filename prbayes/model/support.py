@@ -107,7 +107,9 @@ def shortcomings(evaluator: Evaluator, thetas: Floats) -> dict[str, Shortcoming]
     found = {}
     for name, support in evaluator.support(thetas).items():
         design = evaluator.designs[name]
-        short = shortcoming(support, design.required_ess, design.config.max_lost, design.n_points)
+        short = shortcoming(
+            support, design.required_ess, design.config.max_lost, design.n_points, ENOUGH
+        )
         if short:
             found[name] = short
     return found
@@ -118,7 +120,7 @@ def shortcoming(
     required_ess: float,
     max_lost: float,
     n_points: int,
-    level: Level = ENOUGH,
+    level: Level,
 ) -> Shortcoming:
     """Return in what a design falls short; it is false where it does not.
 

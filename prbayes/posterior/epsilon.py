@@ -155,7 +155,6 @@ def _by_refits(information: Information) -> float:
         information.theta,
         scales,
         simulators=[information.k],
-        n_sets=_SETS,
     )
     local = refits.local()
     p = local.identified.shape[1]
