@@ -26,6 +26,7 @@ from __future__ import annotations
 import argparse
 import ast
 import dataclasses
+import gc
 import importlib
 import logging
 import os
@@ -46,13 +47,13 @@ from benchmarks import record
 
 PACKAGE = Path(prb.__file__).parent
 ROOMS = (
-    "estimate",
     "posterior",
-    "model",
-    "propagation",
-    "metrics",
     "validation",
     "surrogate",
+    "model",
+    "estimate",
+    "propagation",
+    "metrics",
     "_predict",
     "_diagnose",
 )
@@ -159,6 +160,12 @@ class Variation:
     value: Any
     old: float
 
+    def read_by(self, names: set[tuple[str, str]]) -> bool:
+        """Return whether code read it, whose files and names these are."""
+        private = self.constant.startswith("_")
+        own = sys.modules[self.module].__file__
+        return any(n == self.constant and (f == own or not private) for f, n in names)
+
     def make(self) -> None:
         """Set it, wherever it was imported, or is a default."""
         here = sys.modules[self.module]
@@ -185,7 +192,7 @@ def variations() -> list[Variation]:
                     if other != number:
                         label = f"{short}{inner} = {number:g} {sign}"
                         found.append(Variation(module, name, label, whole(other), number))
-    # Roundings last.
+    # Roundings last: what they change, if anything, is least likely to matter.
     return sorted(found, key=lambda one: abs(one.old) < 1e-5)
 
 
@@ -235,12 +242,16 @@ def kolmogorov(simulated: Any, observed: Any, weights: Any) -> Any:
     return np.abs(gaps).max(axis=-1)
 
 
-def calibrated(model: pm.Model, random_seed: int, **options: Any) -> dict[str, Any]:
-    """Minimise and sample."""
-    optimum = prb.minimize(model, progressbar=False, **options)
+def minimised(build: Callable[[], pm.Model], **options: Any) -> prb.Optimum:
+    """Build a model and minimise."""
+    return prb.minimize(build(), progressbar=False, **options)
+
+
+def sampled(optimum: prb.Optimum, random_seed: int) -> dict[str, Any]:
+    """Sample, and return all answers."""
     posterior = prb.sample_smc(
-        400, chains=1, model=model, optimum=optimum, random_seed=random_seed, progressbar=False
-    )
+        400, chains=1, model=optimum.model, optimum=optimum, random_seed=random_seed, progressbar=False
+    )  # fmt: skip
     draws = posterior["calibration"]["theta"].values[0]
     return {
         "theta": optimum.theta,
@@ -254,8 +265,8 @@ def calibrated(model: pm.Model, random_seed: int, **options: Any) -> dict[str, A
     }
 
 
-def validity(rng: np.random.Generator, random_seed: int) -> dict[str, Any]:
-    """Test a calibration on a surrogate, against fresh data and its own."""
+def on_surrogate(rng: np.random.Generator) -> tuple[Any, ...]:
+    """Return an optimum on a surrogate, with what was made for it."""
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1.2, 1.0), pm.HalfNormal("sigma", 1.0))
         surface = prb.Surrogate.fit(lambda x: np.sinh(x) + 0.2 * np.sin(9 * x), [(-6, 8)], 48)
@@ -265,7 +276,13 @@ def validity(rng: np.random.Generator, random_seed: int) -> dict[str, Any]:
             "y", surface.with_error(1), x, metric=metric, observed=observed,
             propagation=prb.Reweighted(256),
         )  # fmt: skip
-    optimum = prb.minimize(model, progressbar=False)
+    return prb.minimize(model, progressbar=False), surface, x, rng
+
+
+def validity(case: tuple[Any, ...], random_seed: int) -> dict[str, Any]:
+    """Test a calibration on a surrogate, against fresh data and its own."""
+    optimum, surface, x, rng = case
+    model = optimum.model
     posterior = prb.sample_smc(
         200, chains=2, model=model, optimum=optimum, random_seed=random_seed, progressbar=False
     )
@@ -291,11 +308,31 @@ def validity(rng: np.random.Generator, random_seed: int) -> dict[str, Any]:
     }
 
 
-Problem = Callable[[int], dict[str, Any]]
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """A calibration in two parts, so that what only the second reads is varied there alone.
+
+    Attributes
+    ----------
+    first : callable
+        Minimises.
+    second : callable
+        Of what the first returned and a seed: the answers.
+    everywhere : bool
+        Whether it is solved for each constant that it reads, or for those alone that no problem
+        before it reads.
+    """
+
+    first: Callable[[], Any]
+    second: Callable[[Any, int], dict[str, Any]]
+    everywhere: bool
+
+    def __call__(self, random_seed: int = 1) -> dict[str, Any]:
+        return self.second(self.first(), random_seed)
 
 
 def problems() -> dict[str, Problem]:
-    """Return what to calibrate, given a seed of the sampler.
+    """Return what to calibrate.
 
     None of them is among those of the studies of coverage.
     """
@@ -309,20 +346,19 @@ def problems() -> dict[str, Problem]:
         other.bit_generator.state = state
         return other
 
-    def solved(build: Callable[[], pm.Model], random_seed: int, **options: Any) -> dict[str, Any]:
-        return calibrated(build(), random_seed, **options)
-
-    def of_one(*model: Any, **options: Any) -> Problem:
-        return partial(solved, lambda: one_input(*model), **options)
+    def of_one(*model: Any, everywhere: bool = False, **options: Any) -> Problem:
+        return Problem(
+            partial(minimised, lambda: one_input(*model), **options), sampled, everywhere
+        )
 
     bins = prb.KullbackLeibler(prb.Histogram())
     own = prb.FunctionMetric(kolmogorov, weighted=True)
-    return {
-        "PR, N = 20": of_one(np.sinh, np.sinh(small), prb.ProbabilityResidual()),
+    found = {
+        "PR, N = 20": of_one(np.sinh, np.sinh(small), prb.ProbabilityResidual(), everywhere=True),
         "area, N = 20": of_one(np.sinh, np.sinh(small), prb.AreaMetric()),
-        "area, squared, N = 60": of_one(np.square, np.square(larger), prb.AreaMetric()),
-        "log-likelihood, N = 60": of_one(np.exp, np.exp(larger), prb.LogLikelihood()),
-        "two inputs, PR, N = 30": partial(solved, lambda: two_inputs(again())),
+        "area, squared, N = 60": of_one(np.square, np.square(larger), prb.AreaMetric(), everywhere=True),
+        "log-likelihood, N = 60": of_one(np.exp, np.exp(larger), prb.LogLikelihood(), everywhere=True),
+        "two inputs, PR, N = 30": Problem(partial(minimised, lambda: two_inputs(again())), sampled, True),
         "KLD, histogram, N = 60": of_one(np.tanh, np.tanh(larger), bins),
         "Kolmogorov, N = 30": of_one(np.sinh, np.sinh(some), own),
         "Nelder-Mead, PR, N = 20": of_one(
@@ -331,14 +367,15 @@ def problems() -> dict[str, Problem]:
         "Resimulated, PR, N = 20": of_one(
             np.sinh, np.sinh(small), prb.ProbabilityResidual(), prb.Resimulated(128)
         ),
-        "surrogate and validity": lambda random_seed: validity(again(), random_seed),
+        "surrogate and validity": Problem(lambda: on_surrogate(again()), validity, True),
     }
+    return dict(sorted(found.items(), key=lambda item: not item[1].everywhere))
 
 
-def answer(problem: Problem, random_seed: int = 1) -> dict[str, Any] | str:
+def answer(solve: Callable[[], dict[str, Any]]) -> dict[str, Any] | str:
     """Return a problem's answers, or the error that ended it."""
     try:
-        return problem(random_seed)
+        return solve()
     except Exception as error:
         return f"{type(error).__name__}: {error}"[:200]
 
@@ -359,9 +396,14 @@ class Reading:
             self.codes.add(code)
         return sys.monitoring.DISABLE
 
-    def look(self) -> set[str]:
-        """Return the names, and begin anew."""
-        found = {name for code in self.codes for name in code.co_names if name.isupper()}
+    def look(self) -> set[tuple[str, str]]:
+        """Return files and names, and begin anew."""
+        found = {
+            (code.co_filename, name)
+            for code in self.codes
+            for name in code.co_names
+            if name.isupper()
+        }
         self.codes = set()
         sys.monitoring.restart_events()
         return found
@@ -448,16 +490,25 @@ def main() -> None:
     # All problems once, to compile and to know who reads what; then twice, which must be the same.
     everything = problems()
     reading = Reading()
-    read = {}
+    read: dict[str, tuple[set[str], set[str]]] = {}
+    half: dict[str, Any] = {}
     before = {}
     for name, problem in everything.items():
-        before[name] = answer(problem)
-        read[name] = reading.look()
+        half[name] = problem.first()
+        first = reading.look()
+        in_two = problem.second(problem.first(), 1)
+        # The second part with the first one's own: what that reads is known already.
+        read[name] = first, reading.look()
+        before[name] = in_two
     reading.end()
+    # Garbage is not looked for in what stays for good, nor in what ends soon.
+    gc.collect()
+    gc.freeze()
+    gc.disable()
     for name, problem in everything.items():
-        again = change(in_a_fork(partial(answer, problem)), before[name])
-        print(f"{name}: {before[name] if isinstance(before[name], str) else 'solved'}", again)
-        assert not again, f"{name}: a second run differs by {again}"
+        for solve in (problem, partial(problem.second, half[name], 1)):
+            again = change(in_a_fork(partial(answer, solve)), before[name])
+            assert not again, f"{name}: a second run differs by {again}"
 
     whole = record.load(arguments.out, {})
     table: dict[str, Any] = {} if arguments.anew else whole
@@ -465,17 +516,25 @@ def main() -> None:
     labels = {"another seed of the sampler", *(one.label for one in wanted)}
     table = {label: found for label, found in table.items() if label in labels}
     if "another seed of the sampler" not in table:
-        changes = {name: change(answer(p, 2), before[name]) for name, p in everything.items()}
+        changes = {
+            name: change(in_a_fork(partial(answer, partial(p.second, half[name], 2))), before[name])
+            for name, p in everything.items()
+        }
         table["another seed of the sampler"] = {k: v for k, v in changes.items() if v}
     print(f"{'':58s}", " ".join(f"{key:>9s}" for key in COLUMNS), flush=True)
     for one in wanted:
         if arguments.only not in one.label or one.label in table:
             continue
-        readers = [name for name in everything if one.constant in read[name]]
+        readers: dict[str, Callable[[], dict[str, Any]]] = {}
+        for name, problem in everything.items():
+            early, late = (one.read_by(names) for names in read[name])
+            if (early or late) and (problem.everywhere or not readers):
+                second = partial(problem.second, half[name], 1)
+                readers[name] = problem if early else second
 
-        def varied_answers(one: Variation = one, readers: list[str] = readers) -> dict[str, Any]:
+        def varied_answers(one: Variation = one, readers: Any = readers) -> dict[str, Any]:
             one.make()
-            return {name: answer(everything[name]) for name in readers}
+            return {name: answer(solve) for name, solve in readers.items()}
 
         answers = in_a_fork(varied_answers) if readers else {}
         if isinstance(answers, str):
