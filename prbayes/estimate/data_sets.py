@@ -20,8 +20,6 @@ from prbayes.response.distributions import PopulationSampler
 # Points of a resimulated population from which data sets are drawn: hundreds of data sets are then
 # weights of some ten million numbers at most.
 _MOST = 1 << 15
-# Draws for each specimen that is needed, in case three of four responses are not finite.
-_SPARE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +260,8 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
         _refuse_unlike([nodes[k] for k in group])
         columns = []
         for k in group:
-            column = _responses(evaluator, theta, k, _SPARE * total, generator)
+            # Four for each that is needed, in case three of four responses are not finite.
+            column = _responses(evaluator, theta, k, 4 * total, generator)
             columns.append(column)
         # What one simulator of a specimen cannot measure, none of them has.
         finite = np.isfinite(columns).all(axis=0)

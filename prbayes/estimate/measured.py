@@ -30,8 +30,6 @@ _FIRST = 0.5
 _WIDEST = 0.5
 # Standard errors along principal axes, as a share of the largest, that are taken apart.
 _LEAST = 1e-4
-# Refits held: the optimum's, and for epsilon one for each of a few simulators.
-_REMEMBERED = 4
 # The middle 89%, ArviZ's interval, with the median; and the width of a normal distribution's in
 # standard deviations.
 _LEVELS = (0.055, 0.5, 0.945)
@@ -216,7 +214,7 @@ class Refits:
         return np.asarray(back @ known @ back.T)
 
 
-@lru_cache(maxsize=_REMEMBERED)
+@lru_cache(maxsize=4)  # the optimum's, and for epsilon one for each of a few simulators
 def _refits(
     evaluator: Evaluator,
     theta: tuple[float, ...],
@@ -240,9 +238,7 @@ def principal_axes(points: Floats) -> tuple[Floats, Floats]:
     if d == 0:
         return np.empty((0, 0)), np.empty(0)
     # Runaways are drawn in before they count in the covariance.
-    low, middle, high = np.quantile(points, _LEVELS, axis=0)
-    reach = 3 * (high - low) / _WIDTH
-    counted = np.clip(points, middle - reach, middle + reach)
+    counted = drawn_in(points, 3.0)
     covariance = np.cov(counted, rowvar=False).reshape(d, d)
     _, axes = np.linalg.eigh(covariance)
     # Spreads along the axes, none so small that a division by it fails.
@@ -252,3 +248,14 @@ def principal_axes(points: Floats) -> tuple[Floats, Floats]:
     largest = sd.max()
     least = _LEAST * largest if largest > 0 else 1.0
     return axes, np.maximum(sd, least)
+
+
+def drawn_in(points: Floats, most: float) -> Floats:
+    """Return points, (n, d), at most so many standard deviations from the median.
+
+    The middle 89% tell the standard deviation. A few in a thousand far out, as where a bounded
+    parameter comes near its bound, would otherwise decide about all others.
+    """
+    low, middle, high = np.quantile(points, _LEVELS, axis=0)
+    far = most * (high - low) / _WIDTH
+    return np.clip(points, middle - far, middle + far)

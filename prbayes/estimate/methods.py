@@ -11,8 +11,6 @@ import numpy as np
 # Names of scipy's minimisers that need no Hessian.
 _GRADIENT_FREE = ("Nelder-Mead", "Powell", "COBYLA", "COBYQA")
 _WITH_GRADIENT = ("BFGS", "CG", "L-BFGS-B", "Newton-CG", "SLSQP", "TNC", "trust-constr")
-# Where the budget of evaluations alone is to limit a method.
-_UNLIMITED = 10**9
 # First step of methods without gradient, in spreads of the prior. By judgement: larger than the
 # standard errors of most problems, and within the prior.
 _FIRST = 0.2
@@ -95,7 +93,7 @@ class Method:
 
         The budget of evaluations alone limits iterations.
         """
-        most = _UNLIMITED
+        most = 10**9  # never reached
         simplex = np.vstack([np.zeros(size), _FIRST * np.eye(size)])
         known: dict[str, dict[str, Any]] = {
             "bfgs": {"gtol": tolerance, "maxiter": most},

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
+from prbayes._checks import AT_ONCE, Floats
 from prbayes._progress import progress
 from prbayes.estimate.batch_bfgs import descend
 from prbayes.estimate.batch_objective import BatchObjective
@@ -30,16 +30,10 @@ _STEP = 0.02
 _TOLERANCE = 1e-4
 # Data sets from which the curvature is guessed; the minimiser does not depend on the guess.
 _TYPICAL = 50
-# Weights held at a time: 64 MiB.
-_BLOCK = 1 << 23
 # Ratio of standard errors from one step of the differences and from its double.
 _SETTLED = 1.5
 # Curvature along an axis, as a share of the largest, that a first guess has at least.
 _LOWEST = 0.05
-# Smallest variance and curvature, where rounding leaves none.
-_TINY = 1e-300
-# First edges of simplices, in standard errors: the second one starts where the first has ended.
-_SIMPLICES = (1.0, -0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +83,7 @@ class SamplingDistribution:
         variances, vectors = np.linalg.eigh(local.covariance)
         axes = local.identified @ vectors
         # Rounding may leave a variance of zero or less.
-        positive = np.maximum(variances, _TINY)
+        positive = np.maximum(variances, 1e-300)
         return cls(
             evaluator,
             theta,
@@ -174,7 +168,7 @@ class SamplingDistribution:
             points = max(points, here)
         # Gradients by differences take theta and two neighbours along each axis.
         stencil = 2 * self.stderr.size + 1
-        return max(1, _BLOCK // (points * stencil))
+        return max(1, AT_ONCE // (points * stencil))
 
     def design_error(self) -> float:
         """Return how far the optimum of an independent design would be; NaN if not known.
@@ -230,7 +224,8 @@ class SamplingDistribution:
         r = self.stderr.size
         start = np.zeros((objective.n_sets, r))
         if measured_by_refits(self.evaluator):
-            x, _, converged = descend_by_simplex(value, start, sizes=_SIMPLICES)
+            # In standard errors; the second one starts where the first has ended.
+            x, _, converged = descend_by_simplex(value, start, sizes=(1.0, -0.5))
             return x, converged
         curvature = _mean_hessian(typical, r)
         inverse = np.linalg.inv(curvature)
@@ -243,7 +238,7 @@ def _mean_hessian(value: Callable[[Floats], Floats], r: int) -> Floats:
     """Return the Hessian at zero by differences of one unit, made positive definite."""
     differences = second_differences(value, r)
     curvatures, vectors = np.linalg.eigh(differences)
-    largest = max(np.nanmax(curvatures), _TINY)
+    largest = max(np.nanmax(curvatures), 1e-300)
     lowest = _LOWEST * largest
     known = np.nan_to_num(curvatures)
     positive = np.maximum(known, lowest)

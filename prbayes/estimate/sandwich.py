@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
+from prbayes._checks import AT_ONCE, Floats
 from prbayes._weighted import distribution_function, reached
 from prbayes.estimate.curvature import hessian_of, stencil
 from prbayes.estimate.data_sets import DataSets, dependent, simulated_sets, thinned
@@ -29,8 +29,6 @@ _STEP = 1e-3
 _WIDE_STEP = 0.05
 # Knots on which distribution functions are linearised.
 _KNOTS = 400
-# Numbers held at a time where data sets meet the features of a stencil: 8 MiB.
-_BLOCK = 1 << 20
 # Single observations over which the covariance of an additive gradient is taken.
 _POINTS = 1000
 
@@ -179,7 +177,7 @@ class Information:
         at_once = len(weights)
         if weights.ndim > 1:
             size = sum(f.size for f in features)
-            at_once = max(1, _BLOCK // size)
+            at_once = max(1, AT_ONCE // size)
         found = []
         for i in range(0, len(weights), at_once):
             some = weights[i : i + at_once]

@@ -6,29 +6,20 @@ import numpy as np
 
 from prbayes._checks import Floats
 
-# Most ticks of an axis whose labels stand side by side, by judgement.
-_MOST_ROUND, _MOST_POWERS = 5, 6
-# Steps of round numbers, over a power of ten: those that people count by.
-_ROUND_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
-# Ratio of the largest to the smallest value above which a logarithm shows them better: on an even
-# axis the smallest would be within a twentieth of the bottom. By judgement.
-_DECADES_RATIO = 20
-# Of a step: what rounding may put on the wrong side of an end.
-_ROUNDING = 1e-9
-
 Ticks = tuple[list[float], list[str]]  # positions and labels
 
 
 def round_ticks(low: float, high: float) -> Ticks:
     """Return a few round numbers within a range, and their labels."""
-    # The smallest round step that is not too many
-    smallest = max(high - low, 1e-300) / _MOST_ROUND
+    # The smallest round step that makes five of them at most
+    smallest = max(high - low, 1e-300) / 5
     power = 10.0 ** np.floor(np.log10(smallest))
-    steps = power * np.array(_ROUND_STEPS)
+    steps = power * np.array([1.0, 2.0, 2.5, 5.0, 10.0])
     step = steps[steps >= smallest][0]
 
-    first = np.ceil(low / step - _ROUNDING)
-    last = np.floor(high / step + _ROUNDING)
+    # An end that is a tick is one in spite of rounding
+    first = np.ceil(low / step - 1e-9)
+    last = np.floor(high / step + 1e-9)
     at = step * np.arange(first, last + 1)
     labels = []
     for x in at:
@@ -42,7 +33,8 @@ def spans_decades(values: Floats) -> bool:
     finite = values[np.isfinite(values)]
     if not finite.size or finite.min() <= 0:
         return False
-    threshold = _DECADES_RATIO * finite.min()
+    # On an even axis the smallest would be within a twentieth of the bottom
+    threshold = 20 * finite.min()
     return bool(finite.max() > threshold)
 
 
@@ -52,14 +44,14 @@ def log_ticks(values: Floats) -> Ticks:
     shown = np.log10(finite[finite > 0])
     low, high = shown.min(), shown.max()
 
-    # Powers of ten, every second or third where there are many; 1, 2, 5 where there are few
+    # Powers of ten, some of them where there are more than six; 1, 2, 5 where there are few
     first, last = np.floor(low), np.ceil(high)
     powers = np.arange(first, last + 1)
-    every = -(-powers.size // _MOST_POWERS)
+    every = -(-powers.size // 6)
     factors = (1, 2, 5) if high - low < 2 else (1,)
 
     # Ticks a little outside the values are still on the axis, which has a margin of a twentieth
-    slack = 0.05 * (high - low) + _ROUNDING
+    slack = 0.05 * (high - low) + 1e-9
     at: list[float] = []
     labels: list[str] = []
     for power in powers[::every]:

@@ -27,9 +27,6 @@ _NO_PROGRESS = 0.01
 # .44 in one).
 _WALK = 2.38
 _WALK_RATE = 0.3
-# Relative and absolute jitter that makes the covariance of identical particles a proper one.
-_JITTER = 1e-12
-_TINY = 1e-300
 
 
 class BatchedKernel(SMC_KERNEL):
@@ -239,7 +236,8 @@ class _Normal:
     @classmethod
     def of(cls, particles: Floats) -> _Normal:
         covariance = np.atleast_2d(np.cov(particles, rowvar=False))
-        jitter = _JITTER * np.diag(np.diag(covariance) + _TINY)
+        # Makes the covariance of identical particles a proper one.
+        jitter = 1e-12 * np.diag(np.diag(covariance) + 1e-300)
         return cls(particles.mean(axis=0), np.linalg.cholesky(covariance + jitter))
 
 

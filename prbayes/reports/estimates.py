@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._compare import INTERVAL
+from prbayes._weighted import INTERVAL
 from prbayes.reports.material import Material, draws_by_element, single_values
 from prbayes.reports.numbers import NOTHING, alike, counted, number, places
 from prbayes.reports.section import Section
