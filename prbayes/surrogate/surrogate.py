@@ -26,6 +26,12 @@ from prbayes.surrogate.surfaces import Predict, RadialBasis, Surface, fitted, se
 
 _log = logging.getLogger("prbayes")
 
+# Times d + 1 is how many residuals are nearby: 8 or more of them tell an rms to a quarter or better,
+# 1 / sqrt(2 k), and more of them are less near. Half or twice moves an optimum by .2 standard errors
+# where the surface is off by a tenth of the spread, as another seed of the noise does
+# (benchmarks/constants.py).
+_NEIGHBOURS = 4
+
 
 @dataclass(frozen=True, eq=False)
 class Surrogate:
@@ -383,8 +389,7 @@ class Surrogate:
         """Return the residuals at the nearest design points that did not fail, shape (n, k)."""
         residuals = self.error.residuals[np.isfinite(self.responses)]
         dimensions = unit.shape[1]
-        # 8 or more residuals tell an rms to a quarter or better, 1 / sqrt(2 k); more are less near.
-        k = min(residuals.size, 4 * (dimensions + 1))
+        k = min(residuals.size, _NEIGHBOURS * (dimensions + 1))
         _, good_points = self._trees
         # What is not finite is outside, and has no neighbours: any will do.
         known = np.where(np.isfinite(unit), unit, 0.5)
