@@ -17,10 +17,6 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats
 
-# Longest element of a step, in the units of the parameters: beyond a few standard errors, or prior
-# standard deviations, a quadratic model says nothing.
-_LONGEST = 3.0
-
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
@@ -172,7 +168,10 @@ def _planned(active: NDArray[np.intp], inverse: Floats, g: Floats) -> _Steps:
         steps = -np.einsum("bij,bj->bi", inverse[active], slopes)
         promise = -(steps * slopes).sum(axis=-1)
         length = np.abs(steps).max(axis=-1)
-        shorter = _LONGEST / np.maximum(length, _LONGEST)
+        # Beyond a few standard errors, or prior standard deviations, a quadratic model says
+        # nothing.
+        longest = 3.0
+        shorter = longest / np.maximum(length, longest)
         steps = steps * shorter[:, None]
     sound = np.isfinite(promise) & np.isfinite(length)
     plan = _Steps(active, steps, promise)

@@ -17,14 +17,10 @@ from prbayes._checks import Floats
 from prbayes.estimate.batch_objective import BatchObjective
 from prbayes.estimate.batch_simplex import descend_by_simplex
 from prbayes.estimate.curvature import second_differences
-from prbayes.estimate.data_sets import simulated_sets
+from prbayes.estimate.data_sets import SETS, simulated_sets
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
 
-# Data sets: standard errors from their middle 89% then have an error of 6%.
-_SETS = 200
-# First edges of the simplex, in prior standard deviations: a step that priors mean to be ordinary.
-_FIRST = 0.5
 # Largest steps, in prior standard deviations, over which it is looked whether the discrepancy
 # rises.
 _WIDEST = 0.5
@@ -135,11 +131,11 @@ class Refits:
         simulators: tuple[int, ...],
     ) -> Refits:
         """Draw and minimise."""
-        sets = simulated_sets(evaluator, theta, _SETS, seed=0)
+        sets = simulated_sets(evaluator, theta, SETS, seed=0)
         objective = BatchObjective.of(evaluator, scales, sets, simulators=simulators)
         prior_sd = evaluator.prior_sd
         d = theta.size
-        start = np.zeros((_SETS, d))
+        start = np.zeros((SETS, d))
         # The first simplices know no more than the prior.
         value = _Along(
             objective,
@@ -148,10 +144,11 @@ class Refits:
             axes=np.eye(d),
             steps=np.ones(d),
         )
-        rows = np.arange(_SETS)
+        rows = np.arange(SETS)
         first = value(start[:, None], rows)
         before = first[:, 0]
-        shifts, _, _ = descend_by_simplex(value, start, sizes=[_FIRST])
+        # In spreads of the prior: a step that priors mean to be ordinary.
+        shifts, _, _ = descend_by_simplex(value, start, sizes=[0.5])
         # The second ones know the principal axes.
         axes, sd = principal_axes(shifts)
         along = _Along(objective, theta, prior_sd, axes, sd)

@@ -13,7 +13,7 @@ _GRADIENT_FREE = ("Nelder-Mead", "Powell", "COBYLA", "COBYQA")
 _WITH_GRADIENT = ("BFGS", "CG", "L-BFGS-B", "Newton-CG", "SLSQP", "TNC", "trust-constr")
 # First step of methods without gradient, in spreads of the prior. By judgement: larger than the
 # standard errors of most problems, and within the prior.
-_FIRST = 0.2
+_FIRST_STEP = 0.2
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Method:
         The budget of evaluations alone limits iterations.
         """
         most = 10**9  # never reached
-        simplex = np.vstack([np.zeros(size), _FIRST * np.eye(size)])
+        simplex = np.vstack([np.zeros(size), _FIRST_STEP * np.eye(size)])
         known: dict[str, dict[str, Any]] = {
             "bfgs": {"gtol": tolerance, "maxiter": most},
             "cg": {"gtol": tolerance, "maxiter": most},
@@ -111,10 +111,10 @@ class Method:
                 "maxiter": most,
             },
             "powell": {"xtol": tolerance, "ftol": tolerance**2, "maxfev": most, "maxiter": most},
-            "cobyla": {"tol": tolerance, "rhobeg": _FIRST, "maxiter": most},
+            "cobyla": {"tol": tolerance, "rhobeg": _FIRST_STEP, "maxiter": most},
             "cobyqa": {
                 "final_tr_radius": tolerance,
-                "initial_tr_radius": _FIRST,
+                "initial_tr_radius": _FIRST_STEP,
                 "maxfev": most,
                 "maxiter": most,
             },

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes.estimate.data_sets import siblings
+from prbayes.estimate.data_sets import SETS, siblings
 from prbayes.estimate.sandwich import Information
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
@@ -29,8 +29,8 @@ _GROWTH = 2.0
 # Step of a pilot, in standard deviations of the thetas kept: small against their spread, so that
 # the next ones are within reach of the design; by judgement.
 _PILOT_STEP = 0.4
-# Data sets that tell the noise to which a pilot is led; it only stops the pilot.
-_PILOT_SETS = 50
+# Data sets that tell a noise floor which only says when a pilot stops, or when optima are compared.
+FEW_SETS = 50
 
 
 def refine_at(evaluator: Evaluator, thetas: Floats) -> dict[str, Shortcoming]:
@@ -125,7 +125,7 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         _add(evaluator, best, {n for n in thin if evaluator.designs[n].n_batches <= MAX_ROUNDS})
         # Stop where sampling explains the differences that are left.
         spread = value[order[-1]] - value[order[0]]
-        noise = sum(noise_floors(evaluator, best[0], _PILOT_SETS) / scales)
+        noise = sum(noise_floors(evaluator, best[0], FEW_SETS) / scales)
         if not thin and spread < noise:
             break
         # Step on, from each of them at random.
@@ -147,7 +147,7 @@ def _thin(evaluator: Evaluator, thetas: Floats) -> set[str]:
     return names
 
 
-def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int = 200) -> Floats:
+def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int = SETS) -> Floats:
     """Return the mean discrepancy of data sets drawn from the model at theta, (k,) by simulator."""
     floors = []
     for k in range(len(evaluator.nodes)):

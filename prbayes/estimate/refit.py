@@ -24,16 +24,12 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.base import N_BLOCKS
 
 # Step of differences, in standard errors.
-_STEP = 0.02
+_REFIT_STEP = 0.02
 # Gain, in units of the curvature along a standard error, that is left on the table: the minimiser
 # is then known to about a hundredth of a standard error.
 _TOLERANCE = 1e-4
-# Data sets from which the curvature is guessed; the minimiser does not depend on the guess.
-_TYPICAL = 50
 # Ratio of standard errors from one step of the differences and from its double.
-_SETTLED = 1.5
-# Curvature along an axis, as a share of the largest, that a first guess has at least.
-_LOWEST = 0.05
+_STEADY = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +105,7 @@ class SamplingDistribution:
         variances = np.diag(local.in_theta)
         others = np.diag(other.in_theta)
         ratio = np.sqrt(variances / others)
-        settled = (ratio > 1 / _SETTLED) & (ratio < _SETTLED)
+        settled = (ratio > 1 / _STEADY) & (ratio < _STEADY)
         return [] if settled.all() else jumping
 
     def coordinates(self, thetas: Floats) -> tuple[Floats, Floats]:
@@ -168,7 +164,8 @@ class SamplingDistribution:
             points = max(points, here)
         # Gradients by differences take theta and two neighbours along each axis.
         stencil = 2 * self.stderr.size + 1
-        return max(1, AT_ONCE // (points * stencil))
+        # Each part guesses its own curvature: paths differ with their size, not where they lead.
+        return max(1, 2 * AT_ONCE // (points * stencil))
 
     def design_error(self) -> float:
         """Return how far the optimum of an independent design would be; NaN if not known.
@@ -218,7 +215,8 @@ class SamplingDistribution:
             return objective(self.thetas(x), rows)
 
         def typical(x: Floats) -> Floats:
-            values = value(x, slice(_TYPICAL))
+            # The minimiser does not depend on this guess: some data sets will do.
+            values = value(x, slice(50))
             return np.asarray(values.mean(axis=0))
 
         r = self.stderr.size
@@ -230,7 +228,7 @@ class SamplingDistribution:
         curvature = _mean_hessian(typical, r)
         inverse = np.linalg.inv(curvature)
         tolerance = _TOLERANCE * np.trace(curvature) / r
-        x, _, converged = descend(value, start, inverse, step=_STEP, tolerance=tolerance)
+        x, _, converged = descend(value, start, inverse, step=_REFIT_STEP, tolerance=tolerance)
         return x, converged
 
 
@@ -239,7 +237,8 @@ def _mean_hessian(value: Callable[[Floats], Floats], r: int) -> Floats:
     differences = second_differences(value, r)
     curvatures, vectors = np.linalg.eigh(differences)
     largest = max(np.nanmax(curvatures), 1e-300)
-    lowest = _LOWEST * largest
+    # As a first guess, no direction is flatter than a twentieth of the steepest.
+    lowest = 0.05 * largest
     known = np.nan_to_num(curvatures)
     positive = np.maximum(known, lowest)
     return np.asarray((vectors * positive) @ vectors.T)

@@ -15,8 +15,6 @@ from prbayes.metrics.base import Minimum
 
 # Share of a hyperparameter in unidentified directions above which it is not identified.
 _LOADING = 0.02
-# Singular value above which a direction counts among those that one of the simulators identifies.
-_SPANNED = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +202,8 @@ def _by_data_sets(information: list[Information], scales: Floats, weakest: float
     nothing = np.zeros((prior_sd.size, 1))
     columns = np.concatenate([nothing, *seen], axis=1)
     axes, strength, _ = np.linalg.svd(columns)
-    spanned = strength > _SPANNED
+    # What one of them identifies has a strength of one or more; rounding is far smaller.
+    spanned = strength > 0.1
     rank = int(spanned.sum())
     identified = axes[:, :rank]
     unidentified = axes[:, rank:]

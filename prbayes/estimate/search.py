@@ -23,11 +23,6 @@ from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
 
-# Edge of the simplex where the discrepancy jumps, in spreads of the prior: wide enough to step over
-# the jump of a point that loses its response. By judgement.
-_OVER = 0.5
-# Edge of the simplex that looks whether a stalled line search is at its minimum.
-_NEAR = 0.01
 # Relative gain of a simplex below which a stalled line search counts as converged: far below the
 # noise of any data, which is 1 / N. By judgement.
 _SETTLED = 1e-4
@@ -43,8 +38,6 @@ _OVERLAP = 0.02
 _ENOUGH = 0.5
 # Weight effective sample size below which a design does not reach a population at all.
 _THIN = 2.0
-# Tolerance of the area metric as a guide, which is left before it converges.
-_COARSE = 1e-2
 # Methods whose line searches are stopped where they gain nothing.
 _LINE_SEARCHES = {"bfgs", "cg", "l-bfgs-b"}
 
@@ -241,7 +234,9 @@ def settle(search: Search, run: Run) -> Run:
     spent = run.trace.count
     again = search.objective(run.center, run.scales, run.size, gradient=False, spent=spent)
     begin = (run.best - run.center) / search.prior_sd
-    edge = _OVER if jumps(search, run.best) else _NEAR
+    # In spreads of the prior: wide enough to step over the jump of a point that loses its response,
+    # or small, to see whether a stalled line search is at its minimum.
+    edge = 0.5 if jumps(search, run.best) else 0.01
     simplex = np.vstack([begin, begin + edge * np.eye(begin.size)])
     options = {
         "initial_simplex": simplex,
@@ -336,7 +331,7 @@ def approach(search: Search, theta: Floats, scales: Floats, seed: int) -> Approa
         np.zeros_like(theta),
         jac=True,
         method="BFGS",
-        options={"gtol": _COARSE},
+        options={"gtol": 1e-2},  # coarse: the area metric is left before it converges
         callback=stop_where_near,
     )
     reached = objective.best

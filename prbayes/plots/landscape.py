@@ -19,7 +19,7 @@ from prbayes.plots._objective import check_optimum, free_elements, objective_lab
 
 # Points along each axis, by the number of hyperparameters: contours of 41 look smooth, and as many
 # evaluations are drawn in about a second; a curve can have more. By judgement.
-_POINTS = {1: 161, 2: 41}
+_ALONG_AXIS = {1: 161, 2: 41}
 _PATH = "path of the optimiser"
 
 
@@ -92,7 +92,7 @@ def plot_landscape(
     known = list(free_elements(optimum.evaluator, optimum.theta[None]))
     names = _chosen(pair, known)
     if points is None:
-        points = _POINTS[len(names)]
+        points = _ALONG_AXIS[len(names)]
     else:
         points = positive_integer(points, "points", minimum=5)  # fewer show no bowl
     _check_cost(evaluator, points ** len(names), responses)
@@ -150,7 +150,7 @@ def _chosen(pair: Sequence[str] | None, known: list[str]) -> list[str]:
     names = [pair] if isinstance(pair, str) else list(pair)
     different = set(names)
     allowed = different <= set(known) and len(different) == len(names)
-    if not allowed or len(names) not in _POINTS:
+    if not allowed or len(names) not in _ALONG_AXIS:
         raise KeyError(f"pair: got {pair}, expected one or two of {known}")
     return names
 

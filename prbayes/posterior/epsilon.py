@@ -8,6 +8,7 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes._weighted import INTERVAL
+from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.identifiability import seen_by_area, seen_by_curvature
 from prbayes.estimate.measured import Refits
 from prbayes.estimate.obstacles import simulator_obstacle
@@ -17,12 +18,12 @@ from prbayes.estimate.sandwich import Information, LinearArea
 from prbayes.metrics.base import Minimum
 from prbayes.model.epsilon import Epsilon
 
-# Thetas that carry each simulated data set's posterior.
+# Thetas that carry each simulated data set's posterior: half or twice changes epsilon by 3%, as
+# much as another number of data sets does (benchmarks/constants.py).
 _CLOUD = 500
-# Simulated data sets: 2.2% is the standard error of a coverage of 89%.
-_SETS = 200
 # How much wider than the sampling distribution the cloud is: it has to reach wherever posteriors
-# do.
+# do. Half changes epsilon by 2%; with twice few of its thetas are where posteriors are, and epsilon
+# changes by 11% (benchmarks/constants.py).
 _WIDER = 3.0
 
 
@@ -91,7 +92,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
     require_minimiser(optimum, "calibrate_epsilon")
     found = {}
     for k, node in enumerate(evaluator.nodes):
-        information = Information(evaluator, k, optimum.theta, n_sets=_SETS)
+        information = Information(evaluator, k, optimum.theta, n_sets=SETS)
         found[node.name] = _epsilon(information)
     return Epsilon(found, optimum.identity)
 

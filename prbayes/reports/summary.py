@@ -8,7 +8,8 @@ from prbayes.reports.material import Material, draws_by_element, single_values
 from prbayes.reports.numbers import counted, number, percentage, plus_minus
 from prbayes.validation.validity import ValidityTest
 
-_MOST = 6  # by judgement: more hyperparameters than this make a list, which a table shows better
+# More hyperparameters than this make a list, which a table shows better: by judgement.
+_MOST_NAMES = 6
 
 # How the metrics that ship are called in a sentence; one of the user's own has its class's name.
 _IN_WORDS = {
@@ -48,7 +49,7 @@ def _what_was_calibrated(m: Material) -> str:
     if not names:
         return ""
     hyperparameters = counted(len(names), "hyperparameter")
-    if len(names) <= _MOST:
+    if len(names) <= _MOST_NAMES:
         hyperparameters += f" ({', '.join(names)})"
     if not m.results:
         return f"The model has {hyperparameters}. No result of a calibration was given."
@@ -90,7 +91,7 @@ def _answer(m: Material) -> str:
         what = "optimum and standard error"
     label = next(iter(of_kind))
     estimates = _estimates(m, label)
-    if not estimates or len(estimates) > _MOST:
+    if not estimates or len(estimates) > _MOST_NAMES:
         return f"The answer is in the table of the {kind}."
     pairs = [f"{name} = {plus_minus(value, sd)}" for name, (value, sd) in estimates.items()]
     which = f" of {label}" if len(of_kind) > 1 else ""

@@ -26,10 +26,8 @@ from prbayes.surrogate.surfaces import Predict, RadialBasis, Surface, fitted, se
 
 _log = logging.getLogger("prbayes")
 
-# Times d + 1 is how many residuals are nearby: 8 or more of them tell an rms to a quarter or better,
-# 1 / sqrt(2 k), and more of them are less near. Half or twice moves an optimum by .2 standard errors
-# where the surface is off by a tenth of the spread, as another seed of the noise does
-# (benchmarks/constants.py).
+# Times d + 1 is how many residuals are nearby: 8 or more of them tell an rms to a quarter or
+# better, 1 / sqrt(2 k), and more of them are less near.
 _NEIGHBOURS = 4
 
 
