@@ -18,7 +18,7 @@ by 1.04 in the standard deviation: the first row says how much on these problems
 One process imports and compiles what can be kept; each variation is a fork of it, so that none sees
 another's. The file is written after each row, and rows that it has are not computed again.
 
-    uv run python -m benchmarks.constants [--only sandwich] [--anew] [--out constants.json]
+    uv run python -m benchmarks.constants [--only sandwich] [--anew] [--check] [--out constants.json]
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ SKIPPED = {
 def modules() -> Iterator[tuple[str, Path]]:
     """Yield the modules of the rooms, with their files."""
     for room in ROOMS:
-        inside = sorted((PACKAGE / room).glob("*.py"), reverse=True) or [PACKAGE / f"{room}.py"]
+        inside = sorted((PACKAGE / room).glob("*.py")) or [PACKAGE / f"{room}.py"]
         for path in inside:
             dotted = ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
             yield f"prbayes.{dotted}", path
@@ -460,10 +460,9 @@ def change(a: dict[str, Any] | str, b: dict[str, Any] | str) -> dict[str, Any]:
     }
     found: dict[str, Any] = {}
     for key, value in values.items():
-        largest = float(value.max(initial=0.0))
-        if largest != (1.0 if key in ("stderr", "epsilon", "sd", "responses") else 0.0):
-            if value.size:
-                found[key] = float(f"{largest:.3g}")
+        same = 1.0 if key in ("stderr", "epsilon", "sd", "responses") else 0.0
+        if value.size and value.max() != same:
+            found[key] = float(f"{value.max():.3g}")
     same_known = np.array_equal(np.isfinite(a["stderr"]), np.isfinite(b["stderr"]))
     if a["verdict"] != b["verdict"] or not same_known:
         found["verdict"] = f"{b['verdict']} -> {a['verdict']}"
@@ -480,6 +479,92 @@ def row(found: dict[str, dict[str, Any]]) -> str:
     return " ".join(cells) + "  " + ", ".join(others)
 
 
+@dataclasses.dataclass(frozen=True)
+class Reference:
+    """All problems with the package's own constants.
+
+    Attributes
+    ----------
+    problems : dict
+    half : dict
+        What the first part of each returns.
+    answers : dict
+    read : dict
+        Files and names of the constants that the first part reads, and the second.
+    """
+
+    problems: dict[str, Problem]
+    half: dict[str, Any]
+    answers: dict[str, dict[str, Any]]
+    read: dict[str, tuple[set[tuple[str, str]], set[tuple[str, str]]]]
+
+    @classmethod
+    def made(cls) -> Reference:
+        """Solve all problems, which also compiles what can be kept."""
+        found = cls(problems(), {}, {}, {})
+        reading = Reading()
+        for name, problem in found.problems.items():
+            found.half[name] = problem.first()
+            first = reading.look()
+            again = problem.first()
+            reading.look()
+            found.answers[name] = problem.second(again, 1)
+            found.read[name] = first, reading.look()
+        reading.end()
+        # Garbage is not looked for in what stays for good, nor in what ends soon.
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        return found
+
+    def check(self) -> None:
+        """Solve all again, in forks, whole and from the half: not a digit may differ."""
+        for name, problem in self.problems.items():
+            for solve in (problem, partial(problem.second, self.half[name], 1)):
+                again = change(in_a_fork(partial(answer, solve)), self.answers[name])
+                assert not again, f"{name}: a second run differs by {again}"
+
+    def with_another_seed(self) -> dict[str, Any]:
+        """Return how the answers differ with another seed of the sampler."""
+        found = {}
+        for name, problem in self.problems.items():
+            solve = partial(problem.second, self.half[name], 2)
+            found[name] = change(in_a_fork(partial(answer, solve)), self.answers[name])
+        return {name: differs for name, differs in found.items() if differs}
+
+    def concerned(self, one: Variation) -> dict[str, Callable[[], dict[str, Any]]]:
+        """Return, by problem, what is to be solved again where a constant has another value."""
+        found: dict[str, Callable[[], dict[str, Any]]] = {}
+        for name, problem in self.problems.items():
+            early, late = (one.read_by(names) for names in self.read[name])
+            if not (early or late) or not (problem.everywhere or not found):
+                continue
+            half, answers = self.half[name], self.answers[name]
+            if early and late:
+                found[name] = problem
+            elif early:
+                found[name] = partial(after_first, problem, half, answers)
+            else:
+                found[name] = partial(problem.second, half, 1)
+        return found
+
+    def changes(self, one: Variation) -> dict[str, Any] | str:
+        """Return what changes, by problem."""
+        concerned = self.concerned(one)
+        if not concerned:
+            return "read by none of the problems"
+
+        def answers() -> dict[str, Any]:
+            one.make()
+            return {name: answer(solve) for name, solve in concerned.items()}
+
+        found = in_a_fork(answers)
+        if isinstance(found, str):
+            return {name: {"verdict": found} for name in concerned}
+        differ = {name: change(found[name], self.answers[name]) for name in concerned}
+        return {name: differs for name, differs in differ.items() if differs}
+
+
 def main() -> None:
     """Make the table."""
     parser = argparse.ArgumentParser(
@@ -487,73 +572,28 @@ def main() -> None:
     )
     parser.add_argument("--only", default="", help="constants whose name has this in it")
     parser.add_argument("--anew", action="store_true", help="compute rows that the file has, too")
+    parser.add_argument("--check", action="store_true", help="first solve all problems twice")
     parser.add_argument("--out", type=Path, default=RESULTS)
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.CRITICAL)
 
-    # All problems once, to compile and to know who reads what; then twice, which must be the same.
-    everything = problems()
-    reading = Reading()
-    read: dict[str, tuple[set[str], set[str]]] = {}
-    half: dict[str, Any] = {}
-    before = {}
-    for name, problem in everything.items():
-        half[name] = problem.first()
-        first = reading.look()
-        again = problem.first()
-        reading.look()
-        before[name] = problem.second(again, 1)
-        read[name] = first, reading.look()
-    reading.end()
-    # Garbage is not looked for in what stays for good, nor in what ends soon.
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    for name, problem in everything.items():
-        for solve in (problem, partial(problem.second, half[name], 1)):
-            again = change(in_a_fork(partial(answer, solve)), before[name])
-            assert not again, f"{name}: a second run differs by {again}"
-
-    whole = record.load(arguments.out, {})
-    table: dict[str, Any] = {} if arguments.anew else whole
-    wanted = variations()
-    labels = {"another seed of the sampler", *(one.label for one in wanted)}
-    table = {label: found for label, found in table.items() if label in labels}
-    if "another seed of the sampler" not in table:
-        changes = {
-            name: change(in_a_fork(partial(answer, partial(p.second, half[name], 2))), before[name])
-            for name, p in everything.items()
-        }
-        table["another seed of the sampler"] = {k: v for k, v in changes.items() if v}
+    wanted = {one.label: one for one in variations()}
+    seed = "another seed of the sampler"
+    table = {} if arguments.anew else record.load(arguments.out, {})
+    table = {label: found for label, found in table.items() if label == seed or label in wanted}
+    reference = Reference.made()
+    if arguments.check:
+        reference.check()
+    if seed not in table:
+        table[seed] = reference.with_another_seed()
     print(f"{'':58s}", " ".join(f"{key:>9s}" for key in COLUMNS), flush=True)
-    for one in wanted:
-        if arguments.only not in one.label or one.label in table:
-            continue
-        readers: dict[str, Callable[[], dict[str, Any]]] = {}
-        for name, problem in everything.items():
-            early, late = (one.read_by(names) for names in read[name])
-            if not (early or late) or not (problem.everywhere or not readers):
-                continue
-            if not early:
-                readers[name] = partial(problem.second, half[name], 1)
-            elif late:
-                readers[name] = problem
-            else:
-                readers[name] = partial(after_first, problem, half[name], before[name])
-
-        def varied_answers(one: Variation = one, readers: Any = readers) -> dict[str, Any]:
-            one.make()
-            return {name: answer(solve) for name, solve in readers.items()}
-
-        answers = in_a_fork(varied_answers) if readers else {}
-        if isinstance(answers, str):
-            answers = dict.fromkeys(readers, answers)
-        changes = {name: change(answers[name], before[name]) for name in readers}
-        table[one.label] = {name: found for name, found in changes.items() if found}
-        if not readers:
-            table[one.label] = "read by none of the problems"
-        print(f"{one.label:58s}", row(table[one.label]) if readers else "unread", flush=True)
-        record.save(arguments.out, table)
+    for label, one in wanted.items():
+        if arguments.only in label and label not in table:
+            table[label] = reference.changes(one)
+            record.save(arguments.out, table)
+        if label in table:
+            found = table[label]
+            print(f"{label:58s}", found if isinstance(found, str) else row(found), flush=True)
     record.save(arguments.out, table)
 
 

@@ -17,7 +17,7 @@ from prbayes._checks import Floats
 from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
-from prbayes.posterior.adjustment import _drawn_in, transported
+from prbayes.posterior.adjustment import transported
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N = OBSERVED.size
