@@ -28,7 +28,7 @@ from prbayes.model.hyperparameters import THETAS
 _SETTLED = 1e-4
 # Evaluations in a line search without progress; those of scipy that arrive take fewer. By
 # judgement.
-_PATIENCE = 15
+_STALLED = 15
 # Step of differences in spreads of the prior: errors of rounding, 1e-16 / step, and of curvature,
 # step^2, are then both below the tolerance.
 _STEP = 1e-4
@@ -202,7 +202,7 @@ def minimise(search: Search, theta: Floats, scales: Floats, trace: Trace) -> Run
     size = search.size(theta, scales)
     objective = search.objective(theta, scales, size, gradient=search.gradient, spent=trace.count)
     if search.method.name.lower() in _LINE_SEARCHES:
-        objective.patience = _PATIENCE
+        objective.patience = _STALLED
     success, message = _scipy(
         search,
         objective,

@@ -14,6 +14,7 @@ from scipy.stats import gamma, norm
 
 import prbayes as prb
 from prbayes._checks import Floats
+from prbayes.estimate.measured import drawn_in
 from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
@@ -132,7 +133,7 @@ def test_the_least_motion_among_all_maps() -> None:
         np.random.default_rng(3).standard_normal((200, 2)) @ np.array([[1.0, 0.4], [0.0, 0.8]])
     )
     x, remainder = sampling.coordinates(draws)
-    counted = np.cov(_drawn_in(x, 3.0), rowvar=False)
+    counted = np.cov(drawn_in(x, 3.0), rowvar=False)
     np.testing.assert_allclose(
         transported(sampling, x, remainder, np.median(x, axis=0), counted), draws, atol=1e-9
     )
@@ -156,7 +157,7 @@ def test_draws_get_the_moments_that_the_target_says() -> None:
     x, _ = sampling.coordinates(thetas(idata))
     np.testing.assert_allclose(np.median(x, axis=0), center, atol=0.05)
     np.testing.assert_allclose(
-        np.cov(_drawn_in(x, 3.0), rowvar=False), covariance, rtol=0.05, atol=0.02
+        np.cov(drawn_in(x, 3.0), rowvar=False), covariance, rtol=0.05, atol=0.02
     )
 
 
