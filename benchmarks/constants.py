@@ -55,6 +55,7 @@ ROOMS = (
     "estimate",
     "propagation",
     "metrics",
+    "_weighted",
     "_predict",
     "_diagnose",
 )
@@ -64,7 +65,7 @@ RESULTS = Path(__file__).parent / "results" / "constants.json"
 PATIENCE = 300
 # What by its nature touches no answer.
 SKIPPED = {
-    "estimate.data_sets._MOST": "memory",
+    "estimate.data_sets._MOST_POINTS": "memory",
     "estimate.measured._LEVELS": "quantiles, and what they are of a normal distribution",
     "estimate.measured._WIDTH": "quantiles, and what they are of a normal distribution",
     "posterior.sbc._CHUNK": "how often progress is shown",
@@ -424,10 +425,12 @@ def in_a_fork(work: Callable[[], Any]) -> Any:
     reading, writing = os.pipe()
     child = os.fork()
     if not child:
-        os.close(reading)
-        with os.fdopen(writing, "wb") as pipe:
-            pickle.dump(work(), pipe)
-        os._exit(0)
+        try:
+            os.close(reading)
+            with os.fdopen(writing, "wb") as pipe:
+                pickle.dump(work(), pipe)
+        finally:
+            os._exit(0)
     os.close(writing)
     content = b""
     with DefaultSelector() as selector, os.fdopen(reading, "rb") as pipe:

@@ -17,6 +17,7 @@ import pymc as pm
 from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes._progress import shown
 from prbayes.estimate.caveats import breakdown, caveats, elements_at_edge
+from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.methods import Method
 from prbayes.estimate.obstacles import sampling_obstacle
 from prbayes.estimate.optimum import Optimum
@@ -426,7 +427,7 @@ def _minimised(
     run = minimise(plan.search, theta, scales, trace)
     unset = np.isnan(plan.evaluator.epsilon)
     if plan.several and unset.any():
-        noise = noise_floors(plan.evaluator, run.best)
+        noise = noise_floors(plan.evaluator, run.best, SETS)
         scales = np.where(unset, noise, plan.evaluator.epsilon)
         run = minimise(plan.search, run.best, scales, run.trace)
     sampling = _sampling(plan.evaluator, run.best, scales)
@@ -487,7 +488,7 @@ def _rivals(plan: _Plan, state: _State) -> list[Rival]:
     """
     evaluator = plan.evaluator
     assert state.local is not None
-    floors = noise_floors(evaluator, state.theta, n_sets=FEW_SETS)
+    floors = noise_floors(evaluator, state.theta, FEW_SETS)
     noise = _NOISE_SHARE * float((floors / state.scales).sum())
     # Most need one look.
     for _ in range(3):

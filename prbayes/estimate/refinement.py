@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes.estimate.data_sets import SETS, siblings
+from prbayes.estimate.data_sets import siblings
 from prbayes.estimate.sandwich import Information
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
@@ -147,7 +147,7 @@ def _thin(evaluator: Evaluator, thetas: Floats) -> set[str]:
     return names
 
 
-def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int = SETS) -> Floats:
+def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int) -> Floats:
     """Return the mean discrepancy of data sets drawn from the model at theta, (k,) by simulator."""
     floors = []
     for k in range(len(evaluator.nodes)):

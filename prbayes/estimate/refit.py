@@ -15,7 +15,7 @@ from prbayes.estimate.batch_bfgs import descend
 from prbayes.estimate.batch_objective import BatchObjective
 from prbayes.estimate.batch_simplex import descend_by_simplex
 from prbayes.estimate.curvature import second_differences
-from prbayes.estimate.data_sets import DataSets, observed_set
+from prbayes.estimate.data_sets import SETS, DataSets, observed_set
 from prbayes.estimate.measured import Refits
 from prbayes.estimate.obstacles import measured_by_refits
 from prbayes.estimate.sampling import Local, first_order_shifts, local_sampling
@@ -71,7 +71,7 @@ class SamplingDistribution:
         identified.
         """
         number = len(evaluator.nodes)
-        information = [Information(evaluator, k, theta) for k in range(number)]
+        information = [Information(evaluator, k, theta, n_sets=SETS) for k in range(number)]
         if measured_by_refits(evaluator):
             local = Refits.at(evaluator, theta, scales).local(weakest)
         else:
