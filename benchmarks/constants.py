@@ -65,9 +65,11 @@ RESULTS = Path(__file__).parent / "results" / "constants.json"
 PATIENCE = 300
 # What by its nature touches no answer.
 SKIPPED = {
+    "_diagnose._NOISE": "the limit of a test that simulates it (tests/test_diagnose.py)",
     "estimate.data_sets._MOST_POINTS": "memory",
     "estimate.measured._LEVELS": "quantiles, and what they are of a normal distribution",
     "estimate.measured._WIDTH": "quantiles, and what they are of a normal distribution",
+    "model.support.VISIBLE": "pictures",
     "posterior.sbc._CHUNK": "how often progress is shown",
 }
 
