@@ -2,8 +2,8 @@
 
 Every number at the top of a module in the rooms that touch statistics, elements of tuples and of the
 levels of support among them, but for those of `SKIPPED`, that by their nature touch memory or words.
-Each is set to half and to twice its value; of a probability beyond one half that is half and twice
-its complement. Then every problem is calibrated that runs code which reads the constant: optimum,
+Each is set to half and to twice its value; of a share beyond one half, or a ratio close to one, that
+is half and twice its distance from one. Then every problem is calibrated that runs code which reads the constant: optimum,
 standard errors, epsilon and an adjusted posterior of 400 draws, or a test of validity. The table has,
 for each problem whose answers change at all, the largest change over hyperparameters of
 
@@ -122,11 +122,11 @@ def _in_record(value: Any, name: str, whole: Callable[[float], Any], other: floa
 
 
 def varied(value: float, factor: float) -> float:
-    """Return a number that is larger by a factor, or a probability that is farther from one."""
+    """Return a number that is larger by a factor, or farther from one where it is close to it."""
     if isinstance(value, int):
         return max(1, round(value * factor))
-    if 0.5 < value < 1:
-        return 1 - (1 - value) * factor
+    if 0.5 < value <= 1.5 and value != 1:
+        return 1 + (value - 1) * factor
     return value * factor
 
 
