@@ -12,6 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 
+# Numbers held at a time where work is done in parts: 32 MiB. It bounds memory; where the parts
+# leave a trace in an answer, that place says so.
+AT_ONCE = 1 << 22
+
 
 def real_array(values: ArrayLike, name: str) -> Floats:
     """Return ``values`` as a float array, or raise a `TypeError` that says what was got.

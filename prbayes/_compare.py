@@ -12,6 +12,7 @@ import xarray as xr
 from scipy.stats import norm
 
 from prbayes._checks import Floats
+from prbayes._weighted import INTERVAL
 from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
@@ -29,7 +30,6 @@ from prbayes.model.identity import as_attributes, require_together
 from prbayes.model.node import nodes
 from prbayes.model.support import shortcomings
 
-INTERVAL = 0.89  # probability: what ArviZ takes by default, az.rcParams["stats.ci_prob"]
 _METRICS = (ProbabilityResidual(), KullbackLeibler(), AreaMetric(), LogLikelihood())
 
 

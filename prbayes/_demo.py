@@ -32,9 +32,6 @@ EXPONENT = 2.6
 # Million cycles: the last reading before cracks fail is at 0.08, so that all are known at both, and
 # the test is one of extrapolation.
 CALIBRATED_AT, TESTED_AT = 0.05, 0.08
-_USED = 11  # specimens for the calibration, of the 21: about half
-# Where it is used the crack is infinite: any small positive value keeps NumPy from a warning.
-_SMALLEST = 1e-12
 
 
 def relative_length(million_cycles: float) -> Callable[[Any, Any], Any]:
@@ -42,7 +39,8 @@ def relative_length(million_cycles: float) -> Callable[[Any, Any], Any]:
 
     def growth(C: Any, m: Any) -> Any:  # noqa: N803 (Paris' coefficient)
         left = 1 - (m - 1) * C * million_cycles
-        length = np.maximum(left, _SMALLEST) ** (-1 / (m - 1))
+        # Where that is used the crack is infinite; any small value keeps NumPy from a warning.
+        length = np.maximum(left, 1e-12) ** (-1 / (m - 1))
         return np.where(left > 0, length, np.inf)
 
     return growth
@@ -106,7 +104,8 @@ def _specimens() -> tuple[_Specimens, _Specimens]:
     data = datasets.crack_growth()
     lengths = data.crack_length_inch / data.notch_inch
     order = np.random.default_rng(0).permutation(data.specimen.size)
-    used, fresh = np.sort(order[:_USED]), np.sort(order[_USED:])
+    # About half of the 21 are for the calibration.
+    used, fresh = np.sort(order[:11]), np.sort(order[11:])
     parts = [
         _Specimens(data.specimen.values[some], lengths.isel(specimen=some))
         for some in (used, fresh)

@@ -17,19 +17,12 @@ from prbayes.model.elements import single_elements, stacked_draws
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level
 from prbayes.model.node import model_on_context
-from prbayes.model.support import shortcoming
+from prbayes.model.support import ENOUGH, shortcoming
 
-_RHAT = 1.01  # recommended by Vehtari et al. (2021)
 # R-hat of independent draws exceeds 1 + _NOISE / (chains x draws) about once in a thousand cases:
 # the quantile was 9 to 12 with 2 to 8 chains of 25 to 500 draws, 1500 to 4000 sets of each
 # (4 chains of 50 draws in tests/test_diagnose.py).
 _NOISE = 11.0
-_ESS = 400  # recommended by Vehtari et al. (2021), for R-hat and ESS themselves to be reliable
-# By judgement: of few draws no more than a quarter need be independent.
-_INDEPENDENT = 0.25
-_FEWEST_DRAWS = 4  # of a chain: ArviZ gives NaN for fewer
-# Accepted steps per particle: with fewer, many copies of a particle are still the same draw.
-_FEWEST_MOVES = 1
 
 _SUPPORT = ("weight_ess", "mean_weight", "lost_mass")
 
@@ -165,7 +158,8 @@ def _sentences(lines: Any) -> list[str]:
 
 def _convergence(posterior: xr.Dataset) -> list[str]:
     """Say where chains disagree, and where there are too few independent draws."""
-    if posterior.sizes["draw"] < _FEWEST_DRAWS:
+    # ArviZ gives NaN for shorter chains.
+    if posterior.sizes["draw"] < 4:
         return []
     return [*_disagreement(posterior), *_dependence(posterior)]
 
@@ -174,7 +168,8 @@ def _disagreement(posterior: xr.Dataset) -> list[str]:
     chains, draws = posterior.sizes["chain"], posterior.sizes["draw"]
     if chains == 1:
         return []
-    limit = max(_RHAT, 1 + _NOISE / (chains * draws))
+    # Recommended by Vehtari et al. (2021).
+    limit = max(1.01, 1 + _NOISE / (chains * draws))
     rhats = _by_element("rhat", posterior)
     high = {name: rhat for name, rhat in rhats.items() if rhat > limit}
     if not high:
@@ -189,7 +184,9 @@ def _disagreement(posterior: xr.Dataset) -> list[str]:
 
 def _dependence(posterior: xr.Dataset) -> list[str]:
     total = posterior.sizes["chain"] * posterior.sizes["draw"]
-    needed = min(_ESS, _INDEPENDENT * total)
+    # Recommended by Vehtari et al. (2021), for R-hat and ESS themselves to be reliable; of few
+    # draws no more than a quarter need be independent.
+    needed = min(400, 0.25 * total)
     sizes = _by_element("ess", posterior)
     low = {name: size for name, size in sizes.items() if size < needed}
     if not low:
@@ -221,7 +218,8 @@ def _motion(result: xr.DataTree) -> list[str]:
     moves: Any = (stats["accept_rate"] * stats["n_steps"]).values
     # Chains have different numbers of stages: NaN from the end of a chain on.
     last = [chain[~np.isnan(chain)][-1] for chain in moves]
-    stuck = [str(i) for i, moved in enumerate(last) if moved < _FEWEST_MOVES]
+    # With less than one, many copies of a particle are still the same draw.
+    stuck = [str(i) for i, moved in enumerate(last) if moved < 1]
     if not stuck:
         return []
     chains = "chains" if len(stuck) > 1 else "chain"
@@ -230,7 +228,7 @@ def _motion(result: xr.DataTree) -> list[str]:
     why = f" (its Monte Carlo error is {noise:.1f} epsilon)" if noise > 1 else ""
     return [
         f"Particles hardly moved in the last stage of {chains} {', '.join(stuck)} "
-        f"({min(last):.2f} accepted steps per particle, expected at least {_FEWEST_MOVES}), "
+        f"({min(last):.2f} accepted steps per particle, expected at least 1), "
         "so that many draws are the same. "
         f"The discrepancy is too noisy{why}, or epsilon too small: "
         "use prb.Reweighted or prb.Resimulated instead of prb.Fresh, "
@@ -312,7 +310,7 @@ def _unsupported(designs: _Designs) -> list[str]:
     messages = []
     for name, needs in designs.needs.items():
         own = {key: designs.support[key].sel(simulator=name).values for key in _SUPPORT}
-        lacking = shortcoming(own, needs.weight_ess, needs.max_lost, needs.n_points)
+        lacking = shortcoming(own, needs.weight_ess, needs.max_lost, needs.n_points, ENOUGH)
         if lacking:
             messages.append(
                 f"{name}: the design does not support the answer: {lacking}. "

@@ -26,7 +26,7 @@ from prbayes.model.labels import versions
 from prbayes.model.node import Node, model_on_context, nodes
 from prbayes.model.support import TOLERABLE, shortcoming
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.points import base_points
+from prbayes.propagation.points import base_points, inside
 from prbayes.propagation.reweighted import Design
 from prbayes.response.calling import ResponseError
 from prbayes.response.compilation import compile_batched
@@ -35,10 +35,6 @@ from prbayes.response.inputs import Inputs, read_inputs
 from prbayes.response.response import Responses, refuse_uncallable, refuse_version
 
 _log = logging.getLogger("prbayes")
-
-# Of the unit interval, by which points keep off its ends: any value from 1e-16 to 1e-9 moves only
-# specimens that are rarer than one in 1e9.
-_EDGE = 1e-12
 
 
 def predict(
@@ -370,8 +366,7 @@ def _new_specimens(
     shifted = []
     for points in base:
         shift = rng.random((k, 1, *points.shape[1:]))
-        # Inverse distribution functions are infinite at 0 and 1.
-        shifted.append(np.clip((points[order] + shift) % 1, _EDGE, 1 - _EDGE))
+        shifted.append(inside((points[order] + shift) % 1))
     function = compile_batched([*symbols, *uniforms], [*placed, *epistemic])
     values = function(*roots, *shifted)
     aleatory = values[: len(placed)]

@@ -22,6 +22,9 @@ from prbayes._checks import Floats
 # values.
 Sorting = Literal["stable", "quicksort"]
 
+# Probability of intervals: what ArviZ takes by default, az.rcParams["stats.ci_prob"].
+INTERVAL = 0.89
+
 
 def ranked(
     values: Floats, points: Floats, *, kind: Sorting = "stable"

@@ -321,6 +321,66 @@ def test_the_sign_of_a_discrepancy_changes_in_one_place() -> None:
     assert found == ["model.node.log_kernel"]
 
 
+def constants(path: Path) -> list[tuple[str, ast.expr, ast.Assign]]:
+    """Return the constants at the top of a file: names in capitals, their values, the statements."""
+    found: list[tuple[str, ast.expr, ast.Assign]] = []
+    for statement in tree(path).body:
+        if not isinstance(statement, ast.Assign):
+            continue
+        (target,) = statement.targets
+        pairs = [(target, statement.value)]
+        if isinstance(target, ast.Tuple) and isinstance(statement.value, ast.Tuple):
+            pairs = list(zip(target.elts, statement.value.elts, strict=True))
+        for name, value in pairs:
+            if isinstance(name, ast.Name) and name.id.isupper():
+                found.append((name.id, value, statement))
+    return found
+
+
+def is_numeric(value: ast.expr) -> bool:
+    """Return whether a value is made of numbers alone."""
+    leaves = [n for n in ast.walk(value) if isinstance(n, ast.Constant | ast.Name | ast.Call)]
+    numbers = [
+        n for n in leaves if isinstance(n, ast.Constant) and isinstance(n.value, int | float)
+    ]
+    return bool(leaves) and len(numbers) == len(leaves)
+
+
+def reason(path: Path, statement: ast.Assign) -> str:
+    """Return what is said of a constant: beside it, or above it and its neighbours."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    last = lines[statement.end_lineno - 1 if statement.end_lineno else 0]
+    _, _, beside = last.partition("  # ")
+    first = statement.lineno - 1
+    neighbours = {
+        n for _, _, other in constants(path) for n in range(other.lineno - 1, other.end_lineno or 0)
+    }
+    while first - 1 in neighbours:
+        first -= 1
+    above = []
+    while lines[first - 1].startswith("# "):
+        first -= 1
+        above.append(lines[first][2:])
+    return " ".join([*reversed(above), beside])
+
+
+def test_a_constant_has_a_name_of_its_own() -> None:
+    homes: dict[str, list[str]] = {}
+    for path in FILES:
+        for name, _, _ in constants(path):
+            homes.setdefault(name, []).append(dotted(path))
+    shared = {name: where for name, where in homes.items() if len(where) > 1}
+    assert not shared, "one name, one meaning: rename, or let one module import the other's"
+
+
+@pytest.mark.parametrize("path", FILES, ids=dotted)
+def test_a_number_says_why(path: Path) -> None:
+    for name, value, statement in constants(path):
+        if is_numeric(value):
+            said = re.sub(r"by judgement", "", reason(path, statement), flags=re.IGNORECASE)
+            assert len(said.split()) >= 5, f"{dotted(path)}.{name}: a comment says why"
+
+
 # Inner names of PyMC, PyTensor and ArviZ by the files that use them: what `tests/test_contracts.py` tests directly.
 INNER = {
     "estimate.search": {"pytensor.gradient.NullTypeGradError"},

@@ -17,16 +17,6 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats
 
-# Halvings of a step: a 1/256 of one is no worse than none.
-_HALVINGS = 8
-# Longest element of a step, in the units of the parameters: beyond a few standard errors, or prior
-# standard deviations, a quadratic model says nothing.
-_LONGEST = 3.0
-# Of the promised gain, that a step has to keep (Nocedal and Wright, eq. 3.4).
-_ARMIJO = 1e-4
-# Cosine of step and change of gradient below which an update would spoil the inverse Hessian.
-_CURVED = 1e-4
-
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
@@ -170,7 +160,10 @@ def _planned(active: NDArray[np.intp], inverse: Floats, g: Floats) -> _Steps:
         steps = -np.einsum("bij,bj->bi", inverse[active], slopes)
         promise = -(steps * slopes).sum(axis=-1)
         length = np.abs(steps).max(axis=-1)
-        shorter = _LONGEST / np.maximum(length, _LONGEST)
+        # Beyond a few standard errors, or prior standard deviations, a quadratic model says
+        # nothing.
+        longest = 3.0
+        shorter = longest / np.maximum(length, longest)
         steps = steps * shorter[:, None]
     sound = np.isfinite(promise) & np.isfinite(length)
     plan = _Steps(active, steps, promise)
@@ -185,14 +178,16 @@ def _line_search(problem: _Problem, plan: _Steps, x: Floats, f: Floats, g: Float
     new_g = g[rows].copy()
     waiting = np.arange(rows.size)
     share = 1.0
-    for _ in range(_HALVINGS):
+    # A 1/256 of a step is no worse than none.
+    for _ in range(8):
         these = rows[waiting]
         steps = plan.steps[waiting]
         trial = x[these] + share * steps
         trial_f, trial_g = problem(trial, these)
         finite = np.isfinite(trial_g).all(-1)
         with np.errstate(invalid="ignore"):
-            promised = _ARMIJO * share * plan.promise[waiting]
+            # Of the promised gain, that a step has to keep: Nocedal and Wright, eq. 3.4.
+            promised = 1e-4 * share * plan.promise[waiting]
             enough = trial_f <= f[these] - promised
         # Rows that keep the step are done; the others wait for half of it.
         kept = enough & finite
@@ -215,7 +210,8 @@ def _updated(inverse: Floats, s: Floats, y: Floats) -> Floats:
     sy = (s * y).sum(axis=-1)
     lengths = np.linalg.norm(s, axis=-1)
     changes = np.linalg.norm(y, axis=-1)
-    good = sy > _CURVED * lengths * changes
+    # Steps and changes that are nearly orthogonal would spoil the inverse Hessian.
+    good = sy > 1e-4 * lengths * changes
     # The others have rho = 0, which leaves them as they are.
     safe = np.where(good, sy, 1.0)
     inverted = np.where(good, 1 / safe, 0.0)

@@ -12,25 +12,19 @@ from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.rivals import Rival
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.hyperparameters import THETAS
 
-# Step, in spreads of the prior, within which nothing changes where there is no information; small
-# enough to stay on a plateau, and large against rounding. By judgement.
-_NEAR = 0.01
-# A relative change that is rounding: 1e4 times that of a sum in double precision. By judgement.
-_ROUNDING = 1e-12
 # Design error of which is warned, in standard errors: half as much again as is asked for, since an
 # estimate from eight blocks is itself uncertain by a quarter.
 _TOLERATED = 1.5 * AGREE
 # Where an element left its prior, by spreads of the prior from its middle; nearer to it nothing is
 # evaluated. Collapsed populations end 2.9 to 24 of them out, with priors of sigma from narrow to
 # fifty times as wide as its truth (test: a collapsed population is known by the objective).
-_FAR = 2.0
+_OUTSIDE = 2.0
 # A change that is none, of the objective's typical size. Of collapsed populations a spread further
 # changes 2e-7 at most, and the way back to the prior's middle 7e-4 at least: any value in
 # [1e-6, 1e-4] gives the same verdicts on them, on four processors and with noise of 1e-12.
 _UNCHANGED = 1e-5
-# Draws of the prior, whose median is known from them to a twelfth of a spread.
-_PRIOR_DRAWS = 256
 # Distance between distribution functions from which two populations differ. A half of the mass
 # whose spread shrinks by a factor of 1.3 makes 0.035; where a population stands still it is a
 # point's 1/n.
@@ -62,12 +56,14 @@ def breakdown(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> list[str]:
 
 def no_information(evaluator: Evaluator, theta: Floats) -> bool:
     """Return whether no discrepancy changes around theta, as where populations miss the data."""
-    step = _NEAR * evaluator.prior_sd
+    # In spreads of the prior: small enough to stay on a plateau, and large against rounding.
+    step = 0.01 * evaluator.prior_sd
     found = evaluator(cross(theta, step)).discrepancies
     here = found[0]
     with np.errstate(invalid="ignore"):
         change = np.abs(found - here)
-        rounding = _ROUNDING * np.abs(here)
+        # 1e4 times the rounding of a sum in double precision.
+        rounding = 1e-12 * np.abs(here)
         # Infinite values are equal, although their difference is not zero.
         same = (found == here) | (change <= rounding)
     return bool(same.all())
@@ -100,10 +96,10 @@ def elements_at_edge(
     seed : int
     """
     # Elements far from the middle of their prior.
-    middle = np.median(evaluator.prior_thetas(_PRIOR_DRAWS, seed), axis=0)
+    middle = np.median(evaluator.prior_thetas(THETAS, seed), axis=0)
     away = theta - middle
     distance = np.abs(away)
-    far = np.flatnonzero(distance > _FAR * evaluator.prior_sd)
+    far = np.flatnonzero(distance > _OUTSIDE * evaluator.prior_sd)
     if not far.size or no_information(evaluator, theta):
         return ()
     # What changes further out, and on the way back.

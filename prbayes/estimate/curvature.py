@@ -9,9 +9,6 @@ import numpy as np
 from prbayes._checks import Floats
 from prbayes.estimate.differences import cross
 
-# Signs of the steps along a pair of axes; a mixed difference is the first and last less the others.
-_CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
-
 
 def stencil(r: int) -> Floats:
     """Return the cross of unit steps around zero, then the four corners of each pair of axes.
@@ -25,9 +22,7 @@ def stencil(r: int) -> Floats:
     for i, j in _pairs(r):
         one = unit[i]
         other = unit[j]
-        for a, b in _CORNERS:
-            corner = a * one + b * other
-            rows.append(corner)
+        rows += [one + other, one - other, other - one, -one - other]
     return np.array(rows)
 
 
@@ -40,7 +35,7 @@ def hessian_of(values: Floats, r: int) -> Floats:
     with np.errstate(invalid="ignore"):
         along = up - 2 * here + down
         out = np.diag(along)
-        mixed = corners.reshape(-1, len(_CORNERS))
+        mixed = corners.reshape(-1, 4)
         for (i, j), around in zip(_pairs(r), mixed, strict=True):
             pp, pm, mp, mm = around
             twist = (pp - pm - mp + mm) / 4

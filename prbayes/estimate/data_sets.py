@@ -19,9 +19,10 @@ from prbayes.response.distributions import PopulationSampler
 
 # Points of a resimulated population from which data sets are drawn: hundreds of data sets are then
 # weights of some ten million numbers at most.
-_MOST = 1 << 15
-# Draws for each specimen that is needed, in case three of four responses are not finite.
-_SPARE = 4
+_MOST_POINTS = 1 << 15
+# Data sets that tell a sampling distribution: standard errors from them have an error of 5%, those
+# of their middle 89% of 6%, and a coverage of 89% one of 2.2%.
+SETS = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,10 +213,10 @@ def _counted(places: NDArray[np.intp], own: Floats, *, size: int) -> Floats:
 
 def thinned(values: Floats, weights: Floats, node: Node) -> tuple[Floats, Floats]:
     """Return the first 2^15 points, of equal weights, of resimulated populations, (k, n) each."""
-    if node.bound.stored or values.shape[-1] <= _MOST:
+    if node.bound.stored or values.shape[-1] <= _MOST_POINTS:
         return values, weights
-    equal = np.broadcast_to(1 / _MOST, (len(values), _MOST))
-    return values[:, :_MOST], equal
+    equal = np.broadcast_to(1 / _MOST_POINTS, (len(values), _MOST_POINTS))
+    return values[:, :_MOST_POINTS], equal
 
 
 def _refuse_unlike(nodes: list[Node]) -> None:
@@ -255,7 +256,8 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
         _refuse_unlike([nodes[k] for k in group])
         columns = []
         for k in group:
-            column = _responses(evaluator, theta, k, _SPARE * total, generator)
+            # Four for each that is needed, in case three of four responses are not finite.
+            column = _responses(evaluator, theta, k, 4 * total, generator)
             columns.append(column)
         # What one simulator of a specimen cannot measure, none of them has.
         finite = np.isfinite(columns).all(axis=0)

@@ -8,13 +8,6 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 from prbayes.estimate.sandwich import Information, LinearArea
 
-# Of the largest element of a direction, below which another is not mentioned.
-_SHARE = 0.15
-# Of the largest element, from which on another is called equal to it.
-_EQUAL = 0.95
-# Singular values below which directions are used up; those left are 1 up to rounding.
-_NOTHING = 1e-6
-
 
 def unidentified_directions(unidentified: Floats, names: list[str]) -> list[str]:
     """Name the directions about which the data tell less than the prior.
@@ -45,7 +38,8 @@ def unidentified_directions(unidentified: Floats, names: list[str]) -> list[str]
         along = np.outer(direction, direction @ left)
         without = left - along
         axes, strength, _ = np.linalg.svd(without, full_matrices=False)
-        left = axes[:, strength > _NOTHING]
+        # Directions that are left have a strength of one, up to rounding.
+        left = axes[:, strength > 1e-6]
     return found
 
 
@@ -57,22 +51,22 @@ def _named(direction: Floats, names: list[str]) -> str:
     for i in order:
         share = shares[i]
         size = abs(share)
-        if size <= _SHARE:
+        # What is left out, and what is called equal, is wording.
+        if size <= 0.15:
             continue
         sign = "-" if share < 0 else "+"
-        factor = "" if size > _EQUAL else f"{size:.1f} "
+        factor = "" if size > 0.95 else f"{size:.1f} "
         terms.append(f"{sign} {factor}{names[i]}")
     return " ".join(terms).removeprefix("+ ")
 
 
 # Points from which two halves can be held against each other.
 _HALVED = 256
-# Correlation of the changes of two halves of the points from which a change is taken as real.
+# Correlation of the changes of two halves of the points from which a change is taken as real. Half
+# or twice changes no answer, nor does half or twice of the others (benchmarks/constants.py).
 _AGREEMENT = 0.35
 # Change of the area over one prior standard deviation, in noise floors, that counts.
 _CHANGE = 0.5
-# Curvature, in units of the gradient's variance over the curvature, that is a rounding error.
-_ROUNDING = 0.01
 
 
 def identified_by_area(information: Information) -> Floats:
@@ -140,6 +134,7 @@ def identified_by_curvature(
     total = float(np.trace(hessian))
     if total > 0:
         variance = float(np.trace(noise))
-        floor = _ROUNDING * variance / total
+        # A hundredth of what it is elsewhere.
+        floor = 0.01 * variance / total
     precise = noise_along < (weakest * values) ** 2
     return values, vectors, (values > floor) & precise

@@ -17,21 +17,15 @@ from prbayes._checks import Floats
 from prbayes.estimate.batch_objective import BatchObjective
 from prbayes.estimate.batch_simplex import descend_by_simplex
 from prbayes.estimate.curvature import second_differences
-from prbayes.estimate.data_sets import simulated_sets
+from prbayes.estimate.data_sets import SETS, simulated_sets
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
 
-# Data sets: standard errors from their middle 89% then have an error of 6%.
-_SETS = 200
-# First edges of the simplex, in prior standard deviations: a step that priors mean to be ordinary.
-_FIRST = 0.5
 # Largest steps, in prior standard deviations, over which it is looked whether the discrepancy
 # rises.
 _WIDEST = 0.5
 # Standard errors along principal axes, as a share of the largest, that are taken apart.
 _LEAST = 1e-4
-# Refits held: the optimum's, and for epsilon one for each of a few simulators.
-_REMEMBERED = 4
 # The middle 89%, ArviZ's interval, with the median; and the width of a normal distribution's in
 # standard deviations.
 _LEVELS = (0.055, 0.5, 0.945)
@@ -83,8 +77,6 @@ class Refits:
         scales: Floats,
         *,
         simulators: Sequence[int] | None = None,
-        n_sets: int = _SETS,
-        seed: int = 0,
     ) -> Refits:
         """Draw data sets at theta and minimise the discrepancy of each; no response is computed.
 
@@ -104,8 +96,6 @@ class Refits:
             tuple(theta),
             tuple(ratios),
             chosen,
-            n_sets,
-            seed,
             tuple(fingerprints),
         )
 
@@ -116,15 +106,13 @@ class Refits:
         theta: Floats,
         scales: Floats,
         simulators: tuple[int, ...],
-        n_sets: int,
-        seed: int,
     ) -> Refits:
         """Draw and minimise."""
-        sets = simulated_sets(evaluator, theta, n_sets, seed)
+        sets = simulated_sets(evaluator, theta, SETS, seed=0)
         objective = BatchObjective.of(evaluator, scales, sets, simulators=simulators)
         prior_sd = evaluator.prior_sd
         d = theta.size
-        start = np.zeros((n_sets, d))
+        start = np.zeros((SETS, d))
         # The first simplices know no more than the prior.
         value = _Along(
             objective,
@@ -133,10 +121,11 @@ class Refits:
             axes=np.eye(d),
             steps=np.ones(d),
         )
-        rows = np.arange(n_sets)
+        rows = np.arange(SETS)
         first = value(start[:, None], rows)
         before = first[:, 0]
-        shifts, _, _ = descend_by_simplex(value, start, sizes=[_FIRST])
+        # In spreads of the prior: a step that priors mean to be ordinary.
+        shifts, _, _ = descend_by_simplex(value, start, sizes=[0.5])
         # The second ones know the principal axes.
         axes, sd = principal_axes(shifts)
         along = _Along(objective, theta, prior_sd, axes, sd)
@@ -199,20 +188,18 @@ class Refits:
         return np.asarray(back @ known @ back.T)
 
 
-@lru_cache(maxsize=_REMEMBERED)
+@lru_cache(maxsize=4)  # the optimum's, and for epsilon one for each of a few simulators
 def _refits(
     evaluator: Evaluator,
     theta: tuple[float, ...],
     scales: tuple[float, ...],
     simulators: tuple[int, ...],
-    n_sets: int,
-    seed: int,
     designs: tuple[int, ...],
 ) -> Refits:
     """Return refits on designs as they are now, of which ``designs`` has fingerprints."""
     at = np.array(theta)
     weights = np.array(scales)
-    return Refits.made(evaluator, at, weights, simulators, n_sets, seed)
+    return Refits.made(evaluator, at, weights, simulators)
 
 
 def principal_axes(points: Floats) -> tuple[Floats, Floats]:
@@ -225,9 +212,7 @@ def principal_axes(points: Floats) -> tuple[Floats, Floats]:
     if d == 0:
         return np.empty((0, 0)), np.empty(0)
     # Runaways are drawn in before they count in the covariance.
-    low, middle, high = np.quantile(points, _LEVELS, axis=0)
-    reach = 3 * (high - low) / _WIDTH
-    counted = np.clip(points, middle - reach, middle + reach)
+    counted = drawn_in(points, 3.0)
     covariance = np.cov(counted, rowvar=False).reshape(d, d)
     _, axes = np.linalg.eigh(covariance)
     # Spreads along the axes, none so small that a division by it fails.
@@ -237,3 +222,14 @@ def principal_axes(points: Floats) -> tuple[Floats, Floats]:
     largest = sd.max()
     least = _LEAST * largest if largest > 0 else 1.0
     return axes, np.maximum(sd, least)
+
+
+def drawn_in(points: Floats, most: float) -> Floats:
+    """Return points, (n, d), at most so many standard deviations from the median.
+
+    The middle 89% tell the standard deviation. A few in a thousand far out, as where a bounded
+    parameter comes near its bound, would otherwise decide about all others.
+    """
+    low, middle, high = np.quantile(points, _LEVELS, axis=0)
+    far = most * (high - low) / _WIDTH
+    return np.clip(points, middle - far, middle + far)

@@ -11,11 +11,9 @@ import numpy as np
 # Names of scipy's minimisers that need no Hessian.
 _GRADIENT_FREE = ("Nelder-Mead", "Powell", "COBYLA", "COBYQA")
 _WITH_GRADIENT = ("BFGS", "CG", "L-BFGS-B", "Newton-CG", "SLSQP", "TNC", "trust-constr")
-# Where the budget of evaluations alone is to limit a method.
-_UNLIMITED = 10**9
-# First step of methods without gradient, in spreads of the prior. By judgement: larger than the
-# standard errors of most problems, and within the prior.
-_FIRST = 0.2
+# First step of methods without gradient, in spreads of the prior: larger than the standard errors
+# of most problems, and within the prior. Half or twice changes no answer (benchmarks/constants.py).
+_FIRST_STEP = 0.2
 
 
 @dataclass(frozen=True)
@@ -95,8 +93,8 @@ class Method:
 
         The budget of evaluations alone limits iterations.
         """
-        most = _UNLIMITED
-        simplex = np.vstack([np.zeros(size), _FIRST * np.eye(size)])
+        most = 10**9  # never reached
+        simplex = np.vstack([np.zeros(size), _FIRST_STEP * np.eye(size)])
         known: dict[str, dict[str, Any]] = {
             "bfgs": {"gtol": tolerance, "maxiter": most},
             "cg": {"gtol": tolerance, "maxiter": most},
@@ -113,10 +111,10 @@ class Method:
                 "maxiter": most,
             },
             "powell": {"xtol": tolerance, "ftol": tolerance**2, "maxfev": most, "maxiter": most},
-            "cobyla": {"tol": tolerance, "rhobeg": _FIRST, "maxiter": most},
+            "cobyla": {"tol": tolerance, "rhobeg": _FIRST_STEP, "maxiter": most},
             "cobyqa": {
                 "final_tr_radius": tolerance,
-                "initial_tr_radius": _FIRST,
+                "initial_tr_radius": _FIRST_STEP,
                 "maxfev": most,
                 "maxiter": most,
             },

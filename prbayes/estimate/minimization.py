@@ -17,11 +17,13 @@ import pymc as pm
 from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes._progress import shown
 from prbayes.estimate.caveats import breakdown, caveats, elements_at_edge
+from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.methods import Method
 from prbayes.estimate.obstacles import sampling_obstacle
 from prbayes.estimate.optimum import Optimum
 from prbayes.estimate.refinement import (
     AGREE,
+    FEW_SETS,
     MAX_ROUNDS,
     grow,
     noise_floors,
@@ -97,22 +99,17 @@ def refine(
     return {name: design.n_points for name, design in evaluator.designs.items()}
 
 
-# Looks at other optima, with a design that is refined in between; most need one. By judgement.
-_LOOKS = 3
 # Points of the prior from which other optima are searched for where a theta costs no response; the
-# better half of four times as many. By judgement: more take time, fewer may leave out a basin.
+# better half of four times as many. More take time, fewer may leave out a basin: with half or twice
+# as many the same optima are found (benchmarks/constants.py).
 _STARTS = 32
 # Points of the prior that tell whether other terms weigh, or only exclude some of them. By
 # judgement; a power of two, as Sobol points are balanced then.
 _TERMS = 64
-# Spreads of the prior from which what is known of an optimum is looked up again: a simplex that
-# settles a line search moves it by less, and standard errors change by less.
-_MOVED = 0.01
 # Of the noise floor: about the difference of the discrepancy between the data's fit and the
-# truth's.
-_FLOOR = 0.3
-# Data sets that tell the noise floor, which only says when optima are compared.
-_FLOOR_SETS = 50
+# truth's. It decides which optima are told of: of five problems half or twice changes what is said
+# of one each, no optimum and no standard error (benchmarks/constants.py).
+_NOISE_SHARE = 0.3
 
 
 def minimize(
@@ -404,7 +401,7 @@ def _minimised(
     run = minimise(plan.search, theta, scales, trace)
     unset = np.isnan(plan.evaluator.epsilon)
     if plan.several and unset.any():
-        noise = noise_floors(plan.evaluator, run.best)
+        noise = noise_floors(plan.evaluator, run.best, SETS)
         scales = np.where(unset, noise, plan.evaluator.epsilon)
         run = minimise(plan.search, run.best, scales, run.trace)
     sampling = _sampling(plan.evaluator, run.best, scales)
@@ -465,9 +462,10 @@ def _rivals(plan: _Plan, state: _State) -> list[Rival]:
     """
     evaluator = plan.evaluator
     assert state.local is not None
-    floors = noise_floors(evaluator, state.theta, n_sets=_FLOOR_SETS)
-    noise = _FLOOR * float((floors / state.scales).sum())
-    for _ in range(_LOOKS):
+    floors = noise_floors(evaluator, state.theta, FEW_SETS)
+    noise = _NOISE_SHARE * float((floors / state.scales).sum())
+    # Most need one look.
+    for _ in range(3):
         found = rivals(
             evaluator,
             state.theta,
@@ -493,7 +491,8 @@ def _settled(plan: _Plan, state: _State) -> _State:
     if state.sampling is None:
         return state
     away = np.abs(state.theta - before)
-    if (away > _MOVED * plan.evaluator.prior_sd).any():
+    # A simplex that settles a line search mostly moves less, and standard errors change by less.
+    if (away > 0.01 * plan.evaluator.prior_sd).any():
         sampling = _sampling(plan.evaluator, state.theta, state.scales)
         state = replace(state, sampling=sampling)
     known = not np.isnan(state.design_error) and not away.any()

@@ -9,14 +9,6 @@ import numpy as np
 
 from prbayes._checks import Floats
 
-# A gain that is none, of the objective's typical size: rounding of a sum over thousands of points.
-_PROGRESS = 1e-10
-# Values where there is none: simplices compare them, and line searches differ them.
-_HUGE = 1e300
-_STEEP = 1e10
-# Evaluations without progress that are never reached.
-_UNLIMITED = 10**9
-
 
 class SpentError(Exception):
     """The budget of evaluations is spent."""
@@ -61,7 +53,7 @@ class Objective:
         self.gradient = gradient
         self.most = most
         self.count = 0
-        self.patience = _UNLIMITED
+        self.patience: float = np.inf
         self._lowest = np.inf
         self._since = 0
         self.thetas: list[Floats] = []
@@ -79,11 +71,11 @@ class Objective:
         value = float(value) / self.size
         self._look_for_progress(value, cost)
         if not self.gradient:
-            return value if np.isfinite(value) else _HUGE
+            return value if np.isfinite(value) else 1e300
         slope = np.asarray(gradient) * self.prior_sd / self.size
         if not np.isfinite(value) or not np.isfinite(slope).all():
             # Back towards the start, without breaking a line search.
-            return _STEEP + float(t @ t), 2 * t
+            return 1e10 + float(t @ t), 2 * t
         return value, slope
 
     def _record(self, theta: Floats, value: float, cost: int) -> None:
@@ -93,7 +85,8 @@ class Objective:
         self.counts.append(self.count)
 
     def _look_for_progress(self, value: float, cost: int) -> None:
-        gained = value < self._lowest - _PROGRESS
+        # A smaller gain is rounding of a sum over thousands of points.
+        gained = value < self._lowest - 1e-10
         self._since = 0 if gained else self._since + 1
         self._lowest = min(self._lowest, value)
         self.report(cost, f"discrepancy {self._lowest * self.size:.4g}")

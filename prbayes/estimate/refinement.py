@@ -11,6 +11,7 @@ from prbayes._checks import Floats
 from prbayes.estimate.data_sets import siblings
 from prbayes.estimate.sandwich import Information
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.hyperparameters import THETAS
 from prbayes.model.support import Shortcoming, shortcomings
 from prbayes.propagation.base import DesignError
 
@@ -20,9 +21,6 @@ MAX_ROUNDS = 8
 # Standard errors within which the optima of two independent designs are to be: a tenth adds half a
 # per cent to the width of an interval.
 AGREE = 0.1
-# Thetas that stand for the populations around an optimum; by judgement: more cost time, not
-# responses.
-_THETAS = 256
 # The power of its size with which the error of a design of several inputs falls, about; it only
 # says how many points are added at a time (benchmarks/dimensions.py).
 _RATE = 0.65
@@ -31,10 +29,8 @@ _GROWTH = 2.0
 # Step of a pilot, in standard deviations of the thetas kept: small against their spread, so that
 # the next ones are within reach of the design; by judgement.
 _PILOT_STEP = 0.4
-# Data sets that tell the noise to which a pilot is led; it only stops the pilot.
-_PILOT_SETS = 50
-# Share of each variance added to a covariance, so that its root exists.
-_RIDGE = 1e-12
+# Data sets that tell a noise floor which only says when a pilot stops, or when optima are compared.
+FEW_SETS = 50
 
 
 def refine_at(evaluator: Evaluator, thetas: Floats) -> dict[str, Shortcoming]:
@@ -116,26 +112,27 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         Thetas whose discrepancies differ by no more than sampling noise.
     """
     rng = np.random.default_rng(seed)
-    thetas = evaluator.prior_thetas(4 * _THETAS, seed)
+    thetas = evaluator.prior_thetas(4 * THETAS, seed)
     for _ in range(2 * MAX_ROUNDS):
         # Keep the best.
         found = evaluator(thetas)
         value = (found.discrepancies / scales).sum(axis=-1) - found.log_other
         value = np.where(np.isfinite(found.log_prior), value, np.inf)
-        order = np.argsort(value)[:_THETAS]
+        order = np.argsort(value)[:THETAS]
         best = thetas[order]
         # Let the designs reach them.
         thin = _thin(evaluator, best)
         _add(evaluator, best, {n for n in thin if evaluator.designs[n].n_batches <= MAX_ROUNDS})
         # Stop where sampling explains the differences that are left.
         spread = value[order[-1]] - value[order[0]]
-        noise = sum(noise_floors(evaluator, best[0], _PILOT_SETS) / scales)
+        noise = sum(noise_floors(evaluator, best[0], FEW_SETS) / scales)
         if not thin and spread < noise:
             break
         # Step on, from each of them at random.
         covariance = np.atleast_2d(np.cov(best, rowvar=False))
-        root = np.linalg.cholesky(covariance + _RIDGE * np.diag(np.diag(covariance)))
-        parents = best[rng.integers(len(best), size=4 * _THETAS)]
+        # A share of each variance is added, so that there is a root.
+        root = np.linalg.cholesky(covariance + 1e-12 * np.diag(np.diag(covariance)))
+        parents = best[rng.integers(len(best), size=4 * THETAS)]
         steps = _PILOT_STEP * rng.standard_normal(parents.shape) @ root.T
         thetas = parents + steps
     return best
@@ -150,7 +147,7 @@ def _thin(evaluator: Evaluator, thetas: Floats) -> set[str]:
     return names
 
 
-def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int = 200) -> Floats:
+def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int) -> Floats:
     """Return the mean discrepancy of data sets drawn from the model at theta, (k,) by simulator."""
     floors = []
     for k in range(len(evaluator.nodes)):
@@ -184,5 +181,5 @@ def spread_around(center: Floats, covariance: Floats, prior_sd: Floats, *, seed:
     known[np.diag_indices_from(known)] = np.where(np.isfinite(variances), np.diag(known), 1.0)
     values, vectors = np.linalg.eigh(known)
     sd = np.sqrt(np.clip(values, 0, 1))
-    z = np.random.default_rng(seed).standard_normal((_THETAS, center.size))
+    z = np.random.default_rng(seed).standard_normal((THETAS, center.size))
     return np.asarray(center + (z * sd) @ vectors.T * prior_sd)

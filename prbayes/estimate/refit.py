@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
+from prbayes._checks import AT_ONCE, Floats
 from prbayes._progress import progress
 from prbayes.estimate.batch_bfgs import descend
 from prbayes.estimate.batch_objective import BatchObjective
 from prbayes.estimate.batch_simplex import descend_by_simplex
 from prbayes.estimate.curvature import second_differences
-from prbayes.estimate.data_sets import DataSets, observed_set
+from prbayes.estimate.data_sets import SETS, DataSets, observed_set
 from prbayes.estimate.measured import Refits
 from prbayes.estimate.obstacles import measured_by_refits
 from prbayes.estimate.sampling import Local, first_order_shifts, local_sampling
@@ -24,22 +24,12 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.base import N_BLOCKS
 
 # Step of differences, in standard errors.
-_STEP = 0.02
+_REFIT_STEP = 0.02
 # Gain, in units of the curvature along a standard error, that is left on the table: the minimiser
 # is then known to about a hundredth of a standard error.
 _TOLERANCE = 1e-4
-# Data sets from which the curvature is guessed; the minimiser does not depend on the guess.
-_TYPICAL = 50
-# Weights held at a time: 64 MiB.
-_BLOCK = 1 << 23
 # Ratio of standard errors from one step of the differences and from its double.
-_SETTLED = 1.5
-# Curvature along an axis, as a share of the largest, that a first guess has at least.
-_LOWEST = 0.05
-# Smallest variance and curvature, where rounding leaves none.
-_TINY = 1e-300
-# First edges of simplices, in standard errors: the second one starts where the first has ended.
-_SIMPLICES = (1.0, -0.5)
+_STEADY = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +57,7 @@ class SamplingDistribution:
         identified.
         """
         number = len(evaluator.nodes)
-        information = [Information(evaluator, k, theta) for k in range(number)]
+        information = [Information(evaluator, k, theta, n_sets=SETS) for k in range(number)]
         if measured_by_refits(evaluator):
             local = Refits.at(evaluator, theta, scales).local(weakest)
         else:
@@ -75,7 +65,7 @@ class SamplingDistribution:
         variances, vectors = np.linalg.eigh(local.covariance)
         axes = local.identified @ vectors
         # Rounding may leave a variance of zero or less.
-        positive = np.maximum(variances, _TINY)
+        positive = np.maximum(variances, 1e-300)
         return cls(
             evaluator,
             theta,
@@ -95,13 +85,13 @@ class SamplingDistribution:
         jumping = [one.k for one in self.information if one.jumps]
         if not jumping:
             return []
-        wider = [replace(one, wide=2 * one.wide) for one in self.information]
+        wider = [replace(one, widened=2.0) for one in self.information]
         local = local_sampling(self.information, self.scales)
         other = local_sampling(wider, self.scales)
         variances = np.diag(local.in_theta)
         others = np.diag(other.in_theta)
         ratio = np.sqrt(variances / others)
-        settled = (ratio > 1 / _SETTLED) & (ratio < _SETTLED)
+        settled = (ratio > 1 / _STEADY) & (ratio < _STEADY)
         return [] if settled.all() else jumping
 
     def coordinates(self, thetas: Floats) -> tuple[Floats, Floats]:
@@ -160,7 +150,8 @@ class SamplingDistribution:
             points = max(points, here)
         # Gradients by differences take theta and two neighbours along each axis.
         stencil = 2 * self.stderr.size + 1
-        return max(1, _BLOCK // (points * stencil))
+        # Each part guesses its own curvature: paths differ with their size, not where they lead.
+        return max(1, 2 * AT_ONCE // (points * stencil))
 
     def design_error(self) -> float:
         """Return how far the optimum of an independent design would be; NaN if not known.
@@ -210,18 +201,20 @@ class SamplingDistribution:
             return objective(self.thetas(x), rows)
 
         def typical(x: Floats) -> Floats:
-            values = value(x, slice(_TYPICAL))
+            # The minimiser does not depend on this guess: some data sets will do.
+            values = value(x, slice(50))
             return np.asarray(values.mean(axis=0))
 
         r = self.stderr.size
         start = np.zeros((objective.n_sets, r))
         if measured_by_refits(self.evaluator):
-            x, _, converged = descend_by_simplex(value, start, sizes=_SIMPLICES)
+            # In standard errors; the second one starts where the first has ended.
+            x, _, converged = descend_by_simplex(value, start, sizes=(1.0, -0.5))
             return x, converged
         curvature = _mean_hessian(typical, r)
         inverse = np.linalg.inv(curvature)
         tolerance = _TOLERANCE * np.trace(curvature) / r
-        x, _, converged = descend(value, start, inverse, step=_STEP, tolerance=tolerance)
+        x, _, converged = descend(value, start, inverse, step=_REFIT_STEP, tolerance=tolerance)
         return x, converged
 
 
@@ -229,8 +222,9 @@ def _mean_hessian(value: Callable[[Floats], Floats], r: int) -> Floats:
     """Return the Hessian at zero by differences of one unit, made positive definite."""
     differences = second_differences(value, r)
     curvatures, vectors = np.linalg.eigh(differences)
-    largest = max(np.nanmax(curvatures), _TINY)
-    lowest = _LOWEST * largest
+    largest = max(np.nanmax(curvatures), 1e-300)
+    # As a first guess, no direction is flatter than a twentieth of the steepest.
+    lowest = 0.05 * largest
     known = np.nan_to_num(curvatures)
     positive = np.maximum(known, lowest)
     return np.asarray((vectors * positive) @ vectors.T)

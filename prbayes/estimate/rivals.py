@@ -12,23 +12,11 @@ from prbayes.estimate.batch_bfgs import descend
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
 
-# Points looked at between two optima; a barrier narrower than a tenth of the way is missed. By
-# judgement.
-_BETWEEN = 9
-# Height of the barrier, in multiples of the noise, that separates two optima.
-_BARRIER = 1.0
 # Difference, in multiples of the noise, up to which data could come from either optimum; three of
 # them are about the noise floor, since the noise is a third of it.
 _COMPARABLE = 3.0
 # Difference, in multiples of the noise, from which one is better than what was thought the best.
 _BETTER = 0.1
-# What the descents leave on the table, in multiples of the noise: far below both.
-_TOLERANCE = 0.01
-# Step of their differences, in spreads of the prior.
-_STEP = 1e-3
-# Points of the prior for each start: of the better half of them every fourth by rank is taken.
-_CANDIDATES = 8
-_EVERY = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +58,10 @@ def _starts(objective: _Objective, n: int, noise: float, seed: int) -> tuple[Flo
 
     They are the better half of points of the prior, without crowding.
     """
-    points = objective.evaluator.prior_points(_CANDIDATES * n, seed)
+    points = objective.evaluator.prior_points(8 * n, seed)
     values = objective(points)
     ranked = np.argsort(values, kind="stable")
-    some = ranked[::_EVERY]
+    some = ranked[::4]
     chosen = points[some[:n]]
     finite = values[np.isfinite(values)]
     quantiles = np.quantile(finite, [0.0, 0.5])
@@ -123,8 +111,9 @@ def rivals(
         objective.along,
         starts_at,
         np.eye(best.size) / size,
-        step=_STEP,
-        tolerance=_TOLERANCE * noise,
+        step=1e-3,
+        # Far below the differences that matter.
+        tolerance=0.01 * noise,
     )
     lowest = float(objective(best[None])[0])
     ends, values = _in_line(objective, local.unidentified, ends, values, noise)
@@ -154,7 +143,7 @@ def _in_line(
     hidden = ends @ unidentified @ unidentified.T
     in_line = ends - hidden
     also = objective.along(in_line, None)
-    as_good = also < values + _TOLERANCE * noise
+    as_good = also < values + 0.01 * noise
     aligned = np.where(as_good[:, None], in_line, ends)
     return aligned, np.minimum(also, values)
 
@@ -173,9 +162,12 @@ def _separate(
     value_b: float,
     noise: float,
 ) -> bool:
-    """Return whether the objective between two optima is above both by more than the noise."""
-    share = np.linspace(0, 1, _BETWEEN + 2)
+    """Return whether the objective between two optima is above both by more than the noise.
+
+    A barrier narrower than a tenth of the way is missed.
+    """
+    share = np.linspace(0, 1, 11)
     inside = share[1:-1, None]
     between = objective(a + inside * (b - a))
     barrier = np.max(between) - max(value_a, value_b)
-    return bool(barrier > _BARRIER * noise)
+    return bool(barrier > noise)

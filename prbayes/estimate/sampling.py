@@ -13,16 +13,8 @@ from prbayes.estimate.identifiability import identified_by_area, identified_by_c
 from prbayes.estimate.sandwich import Information, LinearArea
 from prbayes.metrics.base import Minimum
 
-# Iterations of reweighting.
-_IRLS = 30
-# Squared gap of distribution functions below which an absolute value counts as a parabola.
-_KINK = 1e-8
-# Of a system's trace, added to its diagonal: directions that no area sees stay where they are.
-_RIDGE = 1e-10
 # Share of a hyperparameter in unidentified directions above which it is not identified.
 _LOADING = 0.02
-# Singular value above which a direction counts among those that one of the simulators identifies.
-_SPANNED = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +51,7 @@ def first_order_shifts(
     expansion = _expanded(information, scales, basis, sets)
     shifts = np.zeros_like(expansion.force)
     # Without an area one solution is exact.
-    iterations = _IRLS if expansion.areas else 1
+    iterations = 30 if expansion.areas else 1
     for _ in range(iterations):
         shifts = _solved(expansion, shifts)
     return shifts
@@ -100,14 +92,15 @@ def _solved(expansion: _Expansion, shifts: Floats) -> Floats:
     for area in expansion.areas:
         slopes = area.slopes
         gaps = area.gaps + shifts @ slopes
-        sizes = np.sqrt(gaps**2 + _KINK)
+        # Below a gap of 1e-4 an absolute value counts as a parabola.
+        sizes = np.sqrt(gaps**2 + 1e-8)
         weight = area.lengths / sizes
         pull = weight * area.gaps
         left += np.einsum("bm,im,jm->bij", weight, slopes, slopes, optimize=True)
         right -= np.einsum("bm,im->bi", pull, slopes, optimize=True)
     # A ridge, small against the system's size, keeps it regular.
     size = np.trace(left, axis1=1, axis2=2)
-    ridge = _RIDGE * size[:, None, None]
+    ridge = 1e-10 * size[:, None, None]
     regular = left + ridge * np.eye(r)
     solution = np.linalg.solve(regular, right[..., None])
     return np.asarray(solution[..., 0])
@@ -190,7 +183,8 @@ def _by_data_sets(information: list[Information], scales: Floats, weakest: float
     nothing = np.zeros((prior_sd.size, 1))
     columns = np.concatenate([nothing, *spans], axis=1)
     axes, strength, _ = np.linalg.svd(columns)
-    spanned = strength > _SPANNED
+    # What one of them identifies has a strength of one or more; rounding is far smaller.
+    spanned = strength > 0.1
     rank = int(spanned.sum())
     identified = axes[:, :rank]
     unidentified = axes[:, rank:]

@@ -13,26 +13,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
+from prbayes._checks import AT_ONCE, Floats
 from prbayes._weighted import distribution_function, reached
 from prbayes.estimate.curvature import hessian_of, stencil
-from prbayes.estimate.data_sets import DataSets, dependent, simulated_sets, thinned
+from prbayes.estimate.data_sets import SETS, DataSets, dependent, simulated_sets, thinned
 from prbayes.estimate.differences import slopes
 from prbayes.metrics.base import Discrepancy
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node
 
 # Step of differences of densities, which are twice differentiable, in prior standard deviations.
-_STEP = 1e-3
+_NARROW_STEP = 1e-3
 # The same where a distribution function of simulated values, a step function, a jump or an edge of
 # the support is differenced.
 _WIDE_STEP = 0.05
 # Knots on which distribution functions are linearised.
 _KNOTS = 400
-# Numbers held at a time where data sets meet the features of a stencil: 8 MiB.
-_BLOCK = 1 << 20
 # Single observations over which the covariance of an additive gradient is taken.
-_POINTS = 1000
+_SINGLE = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +62,10 @@ class Information:
     evaluator: Evaluator
     k: int  # which simulator
     theta: Floats  # (d,)
-    n_sets: int = 200  # number of simulated data sets, each of the observed size
+    n_sets: int = SETS  # number of simulated data sets, each of the observed size
     seed: int = 0
-    # Step in prior standard deviations where the discrepancy is a step function of theta, or jumps.
-    wide: float = _WIDE_STEP
+    # Factor of the step where the discrepancy is a step function of theta, or jumps.
+    widened: float = 1.0
 
     @property
     def node(self) -> Node:
@@ -87,22 +85,23 @@ class Information:
     def jumps(self) -> bool:
         """Whether points lose their response close to theta, where a smooth discrepancy jumps."""
         smooth = self._target.differentiable and not self.node.bound.stored
-        return smooth and self._stencil.share > _STEP
+        return smooth and self._stencil.share > _NARROW_STEP
 
     @cached_property
     def _stencil(self) -> Stencil:
         """The populations around theta, as close as the discrepancy can be differenced."""
         if self.node.bound.stored:
             # Over several points of those that an edge passes one after the other.
-            return self._around(self.wide if self.node.bound.support_moves else _STEP)
+            moves = self.node.bound.support_moves
+            return self._around(self.widened * _WIDE_STEP if moves else _NARROW_STEP)
         if self._target.differentiable:
-            narrow = self._around(_STEP)
+            narrow = self._around(_NARROW_STEP)
             finite = np.isfinite(narrow.values)
             # Unless a point gains or loses its response within the step.
             unchanged = finite == finite[0]
             if unchanged.all():
                 return narrow
-        return self._around(self.wide)
+        return self._around(self.widened * _WIDE_STEP)
 
     def _around(self, share: float) -> Stencil:
         """Return the populations within steps of a share of the prior's spread."""
@@ -152,7 +151,7 @@ class Information:
         at_once = len(weights)
         if weights.ndim > 1:
             size = sum(f.size for f in features)
-            at_once = max(1, _BLOCK // size)
+            at_once = max(1, AT_ONCE // size)
         found = []
         for i in range(0, len(weights), at_once):
             some = weights[i : i + at_once]
@@ -203,8 +202,8 @@ class Information:
             return np.atleast_2d(covariance)
         # A mean over observations: the covariance of single ones, at equal steps of probability,
         # by N.
-        single = self._quantiles(_POINTS)
-        gradients = self.gradients(single, np.eye(_POINTS))
+        single = self._quantiles(_SINGLE)
+        gradients = self.gradients(single, np.eye(_SINGLE))
         covariance = np.cov(gradients, rowvar=False)
         return np.atleast_2d(covariance) / self._target.n_effective
 

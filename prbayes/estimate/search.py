@@ -21,24 +21,14 @@ from prbayes.estimate.objective import Objective, SpentError, StalledError
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.hyperparameters import THETAS
 
-# Edge of the simplex where the discrepancy jumps, in spreads of the prior: wide enough to step over
-# the jump of a point that loses its response. By judgement.
-_OVER = 0.5
-# Edge of the simplex that looks whether a stalled line search is at its minimum.
-_NEAR = 0.01
-# Its tolerances: coarse, since it only has to gain less than _SETTLED.
-_SIMPLEX = {"xatol": 1e-4, "fatol": 1e-7}
-# Its evaluations for each parameter.
-_SIMPLEX_EVALUATIONS = 60
 # Relative gain of a simplex below which a stalled line search counts as converged: far below the
 # noise of any data, which is 1 / N. By judgement.
 _SETTLED = 1e-4
-# Points of the prior that are tried as starts where a theta costs no response: they take one batch.
-_SCREENED = 256
 # Evaluations in a line search without progress; those of scipy that arrive take fewer. By
 # judgement.
-_PATIENCE = 15
+_STALLED = 15
 # Step of differences in spreads of the prior: errors of rounding, 1e-16 / step, and of curvature,
 # step^2, are then both below the tolerance.
 _STEP = 1e-4
@@ -48,12 +38,8 @@ _OVERLAP = 0.02
 _ENOUGH = 0.5
 # Weight effective sample size below which a design does not reach a population at all.
 _THIN = 2.0
-# Tolerance of the area metric as a guide, which is left before it converges.
-_COARSE = 1e-2
 # Methods whose line searches are stopped where they gain nothing.
 _LINE_SEARCHES = {"bfgs", "cg", "l-bfgs-b"}
-# Smallest divisor of a relative gain.
-_TINY = 1e-300
 
 Function = Callable[[Floats], tuple[float, Floats | None, int]]
 
@@ -164,7 +150,7 @@ def start(
         return evaluator.unconstrained(given), 0
     if evaluator.responses_per_theta:
         return evaluator.initial, 0
-    points = evaluator.prior_points(_SCREENED, seed)
+    points = evaluator.prior_points(THETAS, seed)
     candidates = np.concatenate([evaluator.initial[None], points])
     return search.best_of(candidates, scales), len(candidates)
 
@@ -174,7 +160,7 @@ def minimise(search: Search, theta: Floats, scales: Floats, trace: Trace) -> Run
     size = search.size(theta, scales)
     objective = search.objective(theta, scales, size, gradient=search.gradient, spent=trace.count)
     if search.method.name.lower() in _LINE_SEARCHES:
-        objective.patience = _PATIENCE
+        objective.patience = _STALLED
     success, message = _scipy(
         search,
         objective,
@@ -206,15 +192,19 @@ def settle(search: Search, run: Run) -> Run:
     spent = run.trace.count
     again = search.objective(run.center, run.scales, run.size, gradient=False, spent=spent)
     begin = (run.best - run.center) / search.prior_sd
-    edge = _OVER if jumps(search, run.best) else _NEAR
+    # In spreads of the prior: wide enough to step over the jump of a point that loses its response,
+    # or small, to see whether a stalled line search is at its minimum.
+    edge = 0.5 if jumps(search, run.best) else 0.01
     simplex = np.vstack([begin, begin + edge * np.eye(begin.size)])
     options = {
         "initial_simplex": simplex,
-        "maxfev": _SIMPLEX_EVALUATIONS * begin.size,
-        **_SIMPLEX,
+        "maxfev": 60 * begin.size,
+        # Coarse, since it only has to gain less than _SETTLED.
+        "xatol": 1e-4,
+        "fatol": 1e-7,
     }
     success, message = _scipy(search, again, begin, method="Nelder-Mead", options=options)
-    gain = (run.lowest - again.lowest) / max(abs(run.lowest), _TINY)
+    gain = (run.lowest - again.lowest) / max(abs(run.lowest), 1e-300)
     return replace(
         run,
         best=again.best if again.lowest <= run.lowest else run.best,
@@ -274,7 +264,7 @@ def approach(search: Search, theta: Floats, scales: Floats, seed: int) -> Approa
         return Approach(theta, Trace())
     guide = _Guide(evaluator, scales)
     if not evaluator.responses_per_theta:
-        points = evaluator.prior_points(_SCREENED, seed)
+        points = evaluator.prior_points(THETAS, seed)
         candidates = np.vstack([theta, points])
         theta = candidates[np.argmin(guide(candidates))]
     function = differences(guide, _STEP * search.prior_sd)
@@ -291,7 +281,7 @@ def approach(search: Search, theta: Floats, scales: Floats, seed: int) -> Approa
         np.zeros_like(theta),
         jac=True,
         method="BFGS",
-        options={"gtol": _COARSE},
+        options={"gtol": 1e-2},  # coarse: the area metric is left before it converges
         callback=stop_where_near,
     )
     reached = objective.best

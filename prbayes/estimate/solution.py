@@ -15,13 +15,6 @@ from prbayes.estimate.search import Run, Search
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import identity_of
 
-# Step of differences from theta to the user's units, in spreads of the prior: transforms are
-# smooth.
-_STEP = 1e-4
-# Variance, in squared spreads of the prior, below which it can be that of rounding errors; whether
-# it is, the discrepancy tells.
-_ROUNDING = 1e-16
-
 
 def assemble(
     search: Search,
@@ -89,7 +82,8 @@ def point_and_stderr(
     evaluator: Evaluator, theta: Floats, covariance: Floats
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return variables and deterministics in the user's units, and their standard errors."""
-    step = _STEP * evaluator.prior_sd
+    # Any small step serves: transforms are smooth.
+    step = 1e-4 * evaluator.prior_sd
     values = evaluator.constrained(cross(theta, step))
     point = {name: plain(v[0]) for name, v in values.items()}
     stderr = {name: plain(_stderr(slopes(v, step), covariance)) for name, v in values.items()}
@@ -112,7 +106,8 @@ def _stderr(gradients: Floats, covariance: Floats) -> Floats:
 def _nowhere(evaluator: Evaluator, theta: Floats, covariance: Floats) -> bool:
     """Return whether the search ended where no hyperparameter changes the discrepancy."""
     variance = np.diag(covariance) / evaluator.prior_sd**2
-    suspect = np.isinf(variance) | (variance < _ROUNDING)
+    # A smaller variance can be that of rounding errors; the discrepancy tells.
+    suspect = np.isinf(variance) | (variance < 1e-16)
     return bool(suspect.all()) and no_information(evaluator, theta)
 
 

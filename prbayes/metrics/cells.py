@@ -16,10 +16,6 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 from prbayes.metrics._loops import SPLINE, count, read, smooth
 
-# Of a bin's width: by how much a value may miss the outermost edge and still be in the last bin.
-# Edges are rounded to parts in 1e16 of their size, and there are at most some thousands of them.
-_EDGE = 1e-9
-
 
 def product(weights: Floats, matrix: Floats) -> Floats:
     """Return weights @ matrix, shapes (..., n), (n, m) -> (..., m), as one product of two matrices.
@@ -240,8 +236,9 @@ class BinCells(Cells):
         # The upper edge belongs to the last bin, also after rounding in low + bins * width.
         inner = np.clip(finite, 0, bins - 1)
         cell = inner.astype(np.intp)
-        too_high = position > bins + _EDGE
-        too_low = position < -_EDGE
+        # Edges are rounded to parts in 1e16 of their size, and there are some thousands at most.
+        too_high = position > bins + 1e-9
+        too_low = position < -1e-9
         cell = np.where(too_high, above, cell)
         cell = np.where(too_low, below, cell)
         return np.where(np.isnan(position), nowhere, cell)

@@ -17,10 +17,6 @@ from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes._weighted import quantile
 from prbayes.metrics.cells import BinCells, Cells, KernelCells
 
-# Bandwidths of grid beyond the outermost observation, at least. A Gaussian kernel has 1e-9 of its
-# mass farther out, as much as the floor of logarithms (`DensityDiscrepancy.floored`).
-_MARGIN = 6.0
-
 # Grid nodes per bandwidth. The density is then exact to 3e-5 of a kernel's peak, which a test
 # holds; with three nodes to 1e-4, with six to 6e-6. The cost of comparing densities grows in
 # proportion.
@@ -30,11 +26,6 @@ _PER_BANDWIDTH = 4
 # outlier stands a thousand bandwidths away from the other observations.
 _MAX_CELLS = 8192
 
-# Standard deviations at which the smoothing kernel ends: 2e-11 of its peak.
-_KERNEL_REACH = 7
-
-# By judgement: bins of a histogram at least, so that few observations still show a shape.
-_MIN_BINS = 5
 
 BandwidthRule = Callable[[Floats, Floats], float]
 
@@ -174,7 +165,9 @@ class GaussianKDE(DensityEstimator):
 def _grid(observed: Floats, h: float, step: float) -> tuple[float, int]:
     """Return the first node of a grid over observed values and their margins, and its length."""
     length = float(np.ptp(observed))
-    margin = max(_MARGIN * h, length / 2)
+    # Farther out a Gaussian kernel has 1e-9 of its mass, as much as the floor of logarithms
+    # (`DensityDiscrepancy.floored`).
+    margin = max(6.0 * h, length / 2)
     low = float(observed.min()) - margin
     high = float(observed.max())
     n_nodes = int(np.ceil((high - low + margin) / step)) + 1
@@ -191,7 +184,8 @@ def _grid(observed: Floats, h: float, step: float) -> tuple[float, int]:
 def _narrowed_kernel(h: float, step: float) -> Floats:
     """Return a Gaussian kernel at the nodes, less the variance step^2 / 3 of a cubic B-spline."""
     s = np.sqrt(h**2 - step**2 / 3)
-    reach = int(np.ceil(_KERNEL_REACH * s / step))
+    # The kernel ends where it is 2e-11 of its peak.
+    reach = int(np.ceil(7 * s / step))
     nodes = np.arange(-reach, reach + 1)
     u = step * nodes / s
     height = np.exp(-0.5 * u**2)
@@ -251,7 +245,8 @@ class Histogram(DensityEstimator):
         width = 2 * 1.34 * spread(observed, weights) * inverse_n ** (1 / 3)
         if not width > 0:
             return _MAX_CELLS
-        return int(np.clip(np.ceil(length / width), _MIN_BINS, _MAX_CELLS))
+        # At least five, so that few observations still show a shape.
+        return int(np.clip(np.ceil(length / width), 5, _MAX_CELLS))
 
 
 def density_estimator(density: object) -> None:

@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 from prbayes.metrics.base import Discrepancy, Metric
 
-# Of counts that are computed from weights; weights that are no counts differ from such by far more.
-_ROUNDING = 1e-6
-
 
 @dataclass(frozen=True)
 class FunctionMetric(Metric):
@@ -160,7 +157,8 @@ def repeated(values: Floats, weights: Floats, size: int) -> Floats:
     """
     for counts in (weights * size, weights / weights[weights > 0].min()):
         whole = np.round(counts)
-        if np.abs(counts - whole).max() < _ROUNDING:
+        # Weights that are no counts differ from such by far more.
+        if np.abs(counts - whole).max() < 1e-6:
             return np.repeat(values, whole.astype(int))
     raise ValueError(
         "observed weights: got weights that are no counts, expected repeated values; a "

@@ -15,11 +15,6 @@ from pytensor.graph.traversal import walk
 
 from prbayes.model.node import Node, nodes
 
-# Characters: an attribute of an HDF5 file holds less than 64 KiB, with what surrounds it.
-# JSON writes letters beyond ASCII as six characters of a byte each, so that these are bytes.
-_LONGEST = 60_000
-_MOST_LABELS = 40  # specimens that are named one by one; by judgement: three lines of a report
-
 # What is told of a variable and of a simulator.
 _VARIABLE = ("name", "role", "distribution")
 _SIMULATOR = ("name", "response", "inputs", "metric", "propagation", "n_points", "specimens")
@@ -61,7 +56,16 @@ def without_addresses(configuration: object) -> str:
 def as_attribute(model: pm.Model) -> dict[str, str]:
     """Return the description as an attribute of a file; none where it is too long for one."""
     text = json.dumps(describe(model))
-    return {"model": text} if len(text) <= _LONGEST else {}
+    return {"model": text} if fits_attribute(text) else {}
+
+
+def fits_attribute(text: str) -> bool:
+    """Return whether a text is short enough for an attribute of an HDF5 file.
+
+    That holds less than 64 KiB, with what surrounds it. JSON writes letters beyond ASCII as six
+    characters of a byte each, so that its characters are bytes.
+    """
+    return len(text) <= 60_000
 
 
 def from_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
@@ -138,6 +142,7 @@ def _specimens(node: Node) -> str:
     if node.specimens is None:
         return ""
     labels = list(dict.fromkeys(map(str, node.specimens.tolist())))
-    text = f"{len(labels)} specimens: {', '.join(labels[:_MOST_LABELS])}"
-    more = len(labels) - _MOST_LABELS
+    shown = labels[:40]  # three lines of a report
+    text = f"{len(labels)} specimens: {', '.join(shown)}"
+    more = len(labels) - len(shown)
     return f"{text}, and {more} more" if more > 0 else text

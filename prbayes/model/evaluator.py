@@ -14,15 +14,12 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 
-from prbayes._checks import Floats
+from prbayes._checks import AT_ONCE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.hyperparameters import Hyperparameters
 from prbayes.model.node import Node, log_kernel, required_nodes
 from prbayes.propagation.reweighted import Design
 from prbayes.response.compilation import compiled, ninf_for_invalid
-
-# Design points times thetas evaluated at a time: arrays of 32 MB; it bounds memory, not the answer.
-_CHUNK = 1 << 22
 
 
 @dataclass(frozen=True)
@@ -159,7 +156,7 @@ class Evaluator:
         """Evaluate a batch, shape (P, d); invalid thetas leave the others alone."""
         size, k = len(thetas), len(self.nodes)
         points = max((node.bound.n_points for node in self.nodes), default=1)
-        step = max(1, _CHUNK // max(1, points))
+        step = max(1, AT_ONCE // max(1, points))
         log_prior, log_other = np.empty(size), np.empty(size)
         discrepancies = np.empty((size, k))
         for first in range(0, size, step):

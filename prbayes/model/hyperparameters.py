@@ -22,10 +22,10 @@ from prbayes.response.compilation import compiled, ninf_for_invalid
 from prbayes.response.distributions import PriorPoints, PriorSampler
 from prbayes.response.inputs import event_shape
 
-# The prior's spread only sets the units of parameters: a tenth more or less changes no answer.
-_PRIOR_DRAWS = 256
 # Levels of a normal distribution one standard deviation above and below its mean.
-_ONE_SD = (0.84, 0.16)
+# Thetas that stand for a distribution of them: for the prior, for what surrounds an optimum, for a
+# posterior. They cost time, not responses.
+THETAS = 256
 
 
 class Hyperparameters:
@@ -212,8 +212,9 @@ class Hyperparameters:
 
         The unit of parameters.
         """
-        thetas = self.prior_thetas(_PRIOR_DRAWS, seed=0)
-        upper, lower = np.quantile(thetas, _ONE_SD, axis=0)
+        thetas = self.prior_thetas(THETAS, seed=0)
+        # Of a normal distribution, one standard deviation above and below the mean.
+        upper, lower = np.quantile(thetas, [0.84, 0.16], axis=0)
         spread = (upper - lower) / 2
         known = (spread > 0) & np.isfinite(spread)
         return np.where(known, spread, 1.0)

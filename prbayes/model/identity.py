@@ -21,20 +21,9 @@ import pymc as pm
 from pymc.printing import str_for_dist
 
 from prbayes._checks import Floats
-from prbayes.model.description import describe, without_addresses
+from prbayes.model.description import describe, fits_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node, nodes
-
-# Points of the prior at which densities and discrepancies are kept: a change that leaves the values
-# at all of them as they are is none that matters. A power of two, as Sobol points are balanced
-# then.
-_POINTS = 4
-# Responses kept of each simulator. Stored ones are appended to, so that the first stay the first.
-_RESPONSES = 8
-# Relative difference of numbers that another machine, or another version of NumPy, may make.
-_ROUNDING = 1e-6
-# Characters that an attribute of an HDF5 file can hold, less what goes with it.
-_LONGEST = 60_000
 
 
 class Level(IntEnum):
@@ -148,7 +137,9 @@ def identity_of(evaluator: Evaluator, *, prior_minimised: bool | None = None) ->
 
     No response is computed for them.
     """
-    thetas = evaluator.hyperparameters.fixed_points(_POINTS)
+    # A change that leaves the values at all of them as they are is none that matters. A power of
+    # two, as Sobol points are balanced then.
+    thetas = evaluator.hyperparameters.fixed_points(4)
     by_name = np.argsort(evaluator.names)
     simulators = []
     for k, node in enumerate(evaluator.nodes):
@@ -202,6 +193,7 @@ def _simulator(node: Node, discrepancies: Floats) -> SimulatorIdentity:
     labels = []
     if node.specimens is not None:
         labels = node.specimens[order].tolist()
+    # Stored responses are appended to, so that the first stay the first.
     return SimulatorIdentity(
         name=node.name,
         data=_digest(observed[order].tobytes()),
@@ -213,7 +205,7 @@ def _simulator(node: Node, discrepancies: Floats) -> SimulatorIdentity:
         n_points=node.bound.n_points,
         batches=1 if node.design is None else node.design.n_batches,
         epsilon=node.epsilon_value,
-        responses=_numbers(node.bound.known_responses[:_RESPONSES]),
+        responses=_numbers(node.bound.known_responses[:8]),
         discrepancies=_numbers(discrepancies),
     )
 
@@ -278,7 +270,7 @@ def as_attributes(identity: Identity | None) -> dict[str, str]:
     if identity is None:
         return {}
     text = as_text(identity)
-    return {"identity": text} if len(text) <= _LONGEST else {}
+    return {"identity": text} if fits_attribute(text) else {}
 
 
 def from_attributes(attributes: Mapping[Any, Any]) -> Identity | None:
@@ -475,4 +467,5 @@ def _close(got: Any, expected: Any) -> bool:
         return False
     finite = a[np.isfinite(a)]
     size = np.abs(finite).max(initial=0.0)
-    return bool(np.allclose(a, b, rtol=0.0, atol=_ROUNDING * size, equal_nan=True))
+    # As much as another machine, or another version of NumPy, may make.
+    return bool(np.allclose(a, b, rtol=0.0, atol=1e-6 * size, equal_nan=True))

@@ -27,10 +27,6 @@ INK, GREY, PALE = "B1", "B2", "B3"
 SOLID, DASHED, DOTTED, DASHDOT = "C0", "C1", "C2", "C3"
 CIRCLE, CROSS, DIAMOND = "C0", "C3", "C4"
 
-# Pixels below the panels that the legend takes, by judgement: two or three rows of text.
-_LEGEND_PIXELS = 60
-_LEGEND_PIXELS_BOKEH = 70  # for each row of panels: bokeh has a legend below each panel
-_PIXELS_PER_INCH = 100
 
 # What has no artist of its own to keep.
 _OF_AXES = frozenset({"title", "xlabel", "ylabel", "xlim", "ylim", "xticks", "yticks"})
@@ -62,9 +58,11 @@ def _figure_settings(backend: str, width: float, height: float, rows: int) -> di
         # Its layout makes room for the legend
         size = (width, height)
         return {"figsize": size, "figsize_units": "inches", "layout": "constrained"}
-    legend = _LEGEND_PIXELS_BOKEH * rows if backend == "bokeh" else _LEGEND_PIXELS
-    across = _PIXELS_PER_INCH * width
-    down = _PIXELS_PER_INCH * height + legend
+    # By judgement: 100 pixels an inch, and two or three rows of text below the panels for the
+    # legend; bokeh has one below each panel.
+    legend = 70 * rows if backend == "bokeh" else 60
+    across = 100 * width
+    down = 100 * height + legend
     return {"figsize": (across, down), "figsize_units": "dots"}
 
 

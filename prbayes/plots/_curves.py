@@ -12,14 +12,6 @@ from prbayes.metrics.density import GaussianKDE, Histogram, silverman
 
 # Points of a curve, 256 steps: a step is about a pixel or two of a panel, by judgement.
 GRID_POINTS = 257
-# Populations that set the bandwidth of all, a median: by judgement, as their bandwidths differ
-# little beside what a bandwidth changes; all of them would cost a sort each.
-_BANDWIDTH_POPULATIONS = 40
-# Smallest bandwidth as a share of the grid, as the kernel's own cells are limited in number: half
-# of a grid's step, so that a narrower curve could not be drawn anyway.
-_SMALLEST_BANDWIDTH = 2e-3
-# Shares of populations whose own range need not fit on the axis, on each side, by judgement.
-_WIDE_POPULATIONS = 0.1
 
 
 def _finite_samples(values: Floats, weights: Floats) -> Iterator[tuple[Floats, Floats]]:
@@ -46,7 +38,8 @@ def typical_bandwidth(values: Floats, weights: Floats) -> float:
 
 def smooth_densities(values: Floats, weights: Floats, grid: Floats) -> Floats:
     """Return densities, shape (P, g), of weighted samples, (P, n), smoothed by one bandwidth."""
-    some = slice(_BANDWIDTH_POPULATIONS)
+    # A median of 40 will do: bandwidths differ little beside what a bandwidth changes.
+    some = slice(40)
     bandwidth = typical_bandwidth(values[some], weights[some])
     return densities(values, weights, grid, bandwidth)
 
@@ -59,7 +52,8 @@ def densities(values: Floats, weights: Floats, grid: Floats, bandwidth: float) -
     """
     # Densities at the centres of the kernel's own cells
     ends = grid[[0, -1]]
-    smallest = _SMALLEST_BANDWIDTH * float(np.ptp(ends))
+    # Half of the grid's step, so that a narrower curve could not be drawn anyway.
+    smallest = 2e-3 * float(np.ptp(ends))
     kernel = GaussianKDE(max(bandwidth, smallest))
     cells = kernel.cells(ends, np.array([0.5, 0.5]))
     centers = cells.centers
@@ -122,8 +116,9 @@ def central_range(values: Floats, weights: Floats, tail: float) -> tuple[float, 
     for row, w in _finite_samples(values, weights):
         lows.append(quantile(row, w, tail))
         highs.append(quantile(row, w, 1 - tail))
-    low = np.quantile(lows, _WIDE_POPULATIONS)
-    high = np.quantile(highs, 1 - _WIDE_POPULATIONS)
+    # A tenth of the populations need not fit on the axis, on each side.
+    low = np.quantile(lows, 0.1)
+    high = np.quantile(highs, 0.9)
     return float(low), float(high)
 
 

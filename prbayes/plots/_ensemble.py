@@ -11,25 +11,14 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
+from prbayes._checks import AT_ONCE, Floats
 from prbayes._predict import populations_of
 from prbayes.estimate.optimum import Optimum, require_of_model
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level
 from prbayes.model.node import model_on_context
+from prbayes.model.support import VISIBLE, supports_each
 from prbayes.propagation.base import DesignError
-
-# Populations in a band, whose sides are quantiles of so many curves: with 200 the standard error of
-# the share beyond one side of an 89% band is 1.6%, which a reader does not see; with 40, where each
-# costs responses, it is 3.6%. Never fewer than eight. By judgement.
-_FREE, _COSTLY, _FEWEST = 200, 40, 8
-_MOST_RESPONSES = 1 << 22  # held in memory at a time: 32 MiB of float64
-# A curve of fewer responses than ten, by their effective number, shows the design, no population; a
-# mean weight away from one says that the design misses a part of it. By judgement: a curve may be
-# worse than an estimate, which needs more (`model.support`).
-_LEAST_ESS = 10.0
-_MEAN_WEIGHTS = (0.5, 2.0)
-_ROUNDING = 1e-12  # of a sum of weights that is zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,13 +48,9 @@ def supported(evaluator: Evaluator, thetas: Floats) -> NDArray[np.bool_]:
     if not where.size:
         return out
     good = np.ones(where.size, dtype=bool)
-    lightest, heaviest = _MEAN_WEIGHTS
-    for name, found in evaluator.support(thetas[where]).items():
-        mean_weight = found["mean_weight"]
-        allowed = max(evaluator.designs[name].config.max_lost, _ROUNDING)
-        good &= found["weight_ess"] >= _LEAST_ESS
-        good &= (mean_weight > lightest) & (mean_weight < heaviest)
-        good &= found["lost_mass"] <= allowed
+    for name, support in evaluator.support(thetas[where]).items():
+        design = evaluator.designs[name]
+        good &= supports_each(support, design.required_ess, design.config.max_lost, VISIBLE)
     out[where] = good
     return out
 
@@ -126,10 +111,12 @@ def _evaluator_of(result: Optimum | xr.DataTree, model: pm.Model | None, caller:
 
 def _affordable(cost: int) -> int:
     """Return how many populations are drawn if each costs so many responses."""
+    # The sides of a band are quantiles of so many curves: with 200 the standard error of the share
+    # beyond one side of an 89% band is 1.6%, which a reader does not see; with 40 it is 3.6%.
     if not cost:
-        return _FREE
-    fitting = min(_COSTLY, _MOST_RESPONSES // cost)
-    return max(_FEWEST, fitting)
+        return 200
+    fitting = min(40, AT_ONCE // cost)
+    return max(8, fitting)
 
 
 def _supported_draws(evaluator: Evaluator, thetas: Floats, caller: str) -> Floats:

@@ -17,13 +17,6 @@ from prbayes.plots._objective import free_elements, objective
 # How far an axis goes from the optimum, in standard errors: the discrepancy is far above its lowest
 # there, and the normal approximation has no probability (6e-5). By judgement.
 _STANDARD_ERRORS = 4.0
-# Draws and quantiles of the prior that say how far an axis may follow the optimiser's path, by
-# judgement: ten draws lie beyond each.
-_PRIOR_DRAWS, _PRIOR_QUANTILES = 1000, (0.01, 0.99)
-# Points at which half an axis is checked against the priors' support, by judgement: its end is
-# short of the support's by less than a 32nd.
-_SUPPORT_POINTS = 33
-_MARGIN = 0.04  # of an axis, beyond what is marked on it; about the size of a marker
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +62,9 @@ class _Plane:
     def within_support(self, name: str, end: float) -> float:
         """Return how far an axis can go from the optimum towards an end within the support."""
         start = self.center[name][0]
-        steps = np.linspace(start, end, _SUPPORT_POINTS)
-        places = np.tile(_columns(self.center, self.names), (_SUPPORT_POINTS, 1))
+        # With 33 points the axis ends short of the support's end by less than a 32nd.
+        steps = np.linspace(start, end, 33)
+        places = np.tile(_columns(self.center, self.names), (steps.size, 1))
         places[:, self.names.index(name)] = steps
         thetas = self.thetas(places)
         ok = np.isfinite(thetas).all(axis=1)
@@ -91,13 +85,13 @@ def landscape(optimum: Optimum, evaluator: Evaluator, names: list[str], points: 
     others = np.array([rival["theta"] for rival in optimum.rivals])
     others = others.reshape(-1, optimum.theta.size)
     rivals = free_elements(evaluator, others)
-    prior = free_elements(evaluator, evaluator.prior_thetas(_PRIOR_DRAWS, 0))
+    prior = free_elements(evaluator, evaluator.prior_thetas(1000, 0))
 
     # Axes
     axes = []
     for name in names:
-        # Of the path only what is inside the prior's bulk
-        bulk = np.quantile(prior[name], _PRIOR_QUANTILES)
+        # Of the path only what is inside the prior's bulk: ten draws lie beyond each end
+        bulk = np.quantile(prior[name], (0.01, 0.99))
         marked = np.append(np.clip(path[name], *bulk), rivals[name])
         error = _standard_error(optimum, name, bulk)
         low, high = _ends(plane.center[name], error, marked)
@@ -147,7 +141,8 @@ def _ends(center: Floats, error: float, marked: Floats) -> tuple[float, float]:
     """Return where an axis should end: beyond some standard errors, and beyond what is marked."""
     first, last = center[0] + _STANDARD_ERRORS * error * np.array([-1, 1])
     lowest, highest = marked.min(), marked.max()
-    margin = _MARGIN * (max(last, highest) - min(first, lowest))
+    # About the size of a marker.
+    margin = 0.04 * (max(last, highest) - min(first, lowest))
     return min(first, lowest - margin), max(last, highest + margin)
 
 

@@ -4,15 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-# Widths of text are estimated, by judgement: a wrong one costs a row more or a crowded row.
-_CHARACTERS_PER_INCH = 11.5  # of matplotlib's default font
-_MARK_CHARACTERS = 8  # the line or marker before an entry, in matplotlib, with the gaps beside it
-_CHARACTER_PIXELS, _MARK_PIXELS, _FRAME_PIXELS = (
-    7,
-    40,
-    60,
-)  # the same in bokeh; axis beside the legend
-
 
 def legend_entry(backend: str, text: str, *, first: bool) -> dict[str, Any]:
     """Return keywords that give an artist an entry; ``first``: no other has the text yet."""
@@ -44,8 +35,9 @@ def _below_matplotlib(figure: Any, targets: list[Any]) -> None:
 
     # As many columns as fit, then rows of equal length
     count = len(handles)
-    characters = sum(len(text) + _MARK_CHARACTERS for text in handles)
-    available = _CHARACTERS_PER_INCH * figure.get_figwidth()
+    # By judgement, of the default font: 11.5 characters an inch, a mark with its gaps takes eight
+    characters = sum(len(text) + 8 for text in handles)
+    available = 11.5 * figure.get_figwidth()
     fitting = int(count * available / characters)
     fitting = max(1, min(count, fitting))
     rows = -(-count // fitting)
@@ -75,7 +67,8 @@ def _below_bokeh(targets: list[Any]) -> None:
             continue
         legend = target.legend[0]
         texts = [item.label.value for item in legend.items]
-        widths = sorted(_CHARACTER_PIXELS * len(text) + _MARK_PIXELS for text in texts)
-        two_fit = sum(widths[-2:]) < target.width - _FRAME_PIXELS
+        # Pixels of a character, of the mark before a text, and of the axis beside the legend
+        widths = sorted(7 * len(text) + 40 for text in texts)
+        two_fit = sum(widths[-2:]) < target.width - 60
         legend.ncols = 2 if two_fit else 1
         target.add_layout(legend, "below")

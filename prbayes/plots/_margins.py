@@ -22,15 +22,6 @@ from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, is_mvnormal
 from prbayes.response.inputs import Inputs
 
-# Random draws of inputs, never of responses, that say what an axis covers: specimens from each of
-# some populations, by judgement.
-_SPECIMENS, _RANGE_POPULATIONS = 400, 40
-# Where a density is estimated from draws, as many more: the estimate's noise is half as large.
-_DENSITY_SPECIMENS = 4 * _SPECIMENS
-# Share of a population beyond each end of the axis, where a density is hardly above zero: of that
-# many specimens the outermost one.
-_TAIL = 0.002
-
 
 @dataclass(frozen=True, eq=False)
 class Margin:
@@ -151,18 +142,18 @@ class _Draws:
 
     @cached_property
     def few(self) -> list[Any]:
-        """Specimens from some populations, by input."""
+        """Specimens from some populations, by input; they say what an axis covers."""
         populations = len(self.roots[0])
-        step = max(1, populations // _RANGE_POPULATIONS)
+        step = max(1, populations // 40)
         some = [root[::step] for root in self.roots]
         rng = np.random.default_rng(0)
-        return list(self.sampler(some, _SPECIMENS, rng)[0])
+        return list(self.sampler(some, 400, rng)[0])
 
     @cached_property
     def many(self) -> list[Any]:
-        """Specimens from all populations, by input."""
+        """Specimens from all populations, by input; densities are estimated from them."""
         rng = np.random.default_rng(1)
-        return list(self.sampler(self.roots, _DENSITY_SPECIMENS, rng)[0])
+        return list(self.sampler(self.roots, 1600, rng)[0])
 
 
 def _values(drawn: list[Any], margin: Margin) -> Floats:
@@ -178,7 +169,8 @@ def _equal_weights(values: Floats) -> Floats:
 
 def _axis(margin: Margin, values: Floats) -> Floats:
     """Return where a density is evaluated: over most draws, or at the whole numbers there."""
-    low, high = central_range(values, _equal_weights(values), _TAIL)
+    # Beyond these ends a density is hardly above zero.
+    low, high = central_range(values, _equal_weights(values), tail=0.002)
     if margin.discrete:
         first, last = np.floor(low), np.ceil(high)
         return np.arange(first, last + 1)

@@ -6,16 +6,6 @@ import numpy as np
 
 from prbayes._checks import Floats
 
-# Most ticks of an axis whose labels stand side by side, by judgement.
-_MOST_ROUND, _MOST_POWERS = 5, 6
-# Steps of round numbers, over a power of ten: those that people count by.
-_ROUND_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
-# Ratio of the largest to the smallest value above which a logarithm shows them better: on an even
-# axis the smallest would be within a twentieth of the bottom. By judgement.
-_DECADES_RATIO = 20
-# Of a step: what rounding may put on the wrong side of an end.
-_ROUNDING = 1e-9
-
 Ticks = tuple[list[float], list[str]]  # positions and labels
 
 
@@ -23,10 +13,12 @@ def round_ticks(low: float, high: float) -> Ticks:
     """Return a few round numbers within a range, and their labels."""
     from matplotlib.ticker import MaxNLocator  # heavy, and only needed for pictures
 
-    locator = MaxNLocator(_MOST_ROUND, steps=list(_ROUND_STEPS))
+    # Five of them at most
+    locator = MaxNLocator(5, steps=[1.0, 2.0, 2.5, 5.0, 10.0])
     found = np.asarray(locator.tick_values(low, high))
     step = found[1] - found[0]
-    slack = _ROUNDING * step
+    # An end that is a tick is one in spite of rounding
+    slack = 1e-9 * step
     at = found[(found >= low - slack) & (found <= high + slack)]
     labels = []
     for x in at:
@@ -40,7 +32,8 @@ def spans_decades(values: Floats) -> bool:
     finite = values[np.isfinite(values)]
     if not finite.size or finite.min() <= 0:
         return False
-    threshold = _DECADES_RATIO * finite.min()
+    # On an even axis the smallest would be within a twentieth of the bottom
+    threshold = 20 * finite.min()
     return bool(finite.max() > threshold)
 
 
@@ -50,14 +43,14 @@ def log_ticks(values: Floats) -> Ticks:
     shown = np.log10(finite[finite > 0])
     low, high = shown.min(), shown.max()
 
-    # Powers of ten, every second or third where there are many; 1, 2, 5 where there are few
+    # Powers of ten, some of them where there are more than six; 1, 2, 5 where there are few
     first, last = np.floor(low), np.ceil(high)
     powers = np.arange(first, last + 1)
-    every = -(-powers.size // _MOST_POWERS)
+    every = -(-powers.size // 6)
     factors = (1, 2, 5) if high - low < 2 else (1,)
 
     # Ticks a little outside the values are still on the axis, which has a margin of a twentieth
-    slack = 0.05 * (high - low) + _ROUNDING
+    slack = 0.05 * (high - low) + 1e-9
     at: list[float] = []
     labels: list[str] = []
     for power in powers[::every]:

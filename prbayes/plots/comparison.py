@@ -15,8 +15,6 @@ from prbayes.plots._ticks import round_ticks
 
 # What a comparison has by result besides scores.
 _COSTS = ("n_responses", "seconds")
-# Of an axis on each side, and of the distance of rows: markers at the ends are whole.
-_MARGIN, _ROW_MARGIN = 0.06, 0.6
 
 
 def plot_comparison(
@@ -76,7 +74,7 @@ def plot_comparison(
     row_names = [named(str(result), labels) for result in comparison.result.values]
     count = len(row_names)
     rows = np.arange(count - 1.0, -1.0, -1.0)  # the first on top
-    limits = (-_ROW_MARGIN, count - 1 + _ROW_MARGIN)
+    limits = (-0.6, count - 0.4)
 
     height = 1.6 + 0.34 * count
     canvas = Canvas(names, size=(4.8, height), backend=backend, pc_kwargs=pc_kwargs)
@@ -155,7 +153,7 @@ def _covered(shown: Floats) -> tuple[float, float]:
     low, high = 0.0, 1.0
     if known.size:
         low, high = known.min(), known.max()
-    margin = _MARGIN * (high - low)
+    margin = 0.06 * (high - low)  # markers at the ends are whole
     if not margin:
         margin = 0.01 * max(abs(low), 1.0)
     return float(low - margin), float(high + margin)

@@ -19,9 +19,7 @@ from prbayes.plots._objective import check_optimum, free_elements, objective_lab
 
 # Points along each axis, by the number of hyperparameters: contours of 41 look smooth, and as many
 # evaluations are drawn in about a second; a curve can have more. By judgement.
-_POINTS = {1: 161, 2: 41}
-_FEWEST_POINTS = 5  # fewer show no bowl
-_LEVELS = np.linspace(0, 1, 11)  # of the root of the objective over its lowest value: ten colours
+_ALONG_AXIS = {1: 161, 2: 41}
 _PATH = "path of the optimiser"
 
 
@@ -94,9 +92,9 @@ def plot_landscape(
     known = list(free_elements(optimum.evaluator, optimum.theta[None]))
     names = _chosen(pair, known)
     if points is None:
-        points = _POINTS[len(names)]
+        points = _ALONG_AXIS[len(names)]
     else:
-        points = positive_integer(points, "points", minimum=_FEWEST_POINTS)
+        points = positive_integer(points, "points", minimum=5)  # fewer show no bowl
     _check_cost(evaluator, points ** len(names), responses)
 
     found = landscape(optimum, evaluator, names, points)
@@ -152,7 +150,7 @@ def _chosen(pair: Sequence[str] | None, known: list[str]) -> list[str]:
     names = [pair] if isinstance(pair, str) else list(pair)
     different = set(names)
     allowed = different <= set(known) and len(different) == len(names)
-    if not allowed or len(names) not in _POINTS:
+    if not allowed or len(names) not in _ALONG_AXIS:
         raise KeyError(f"pair: got {pair}, expected one or two of {known}")
     return names
 
@@ -177,7 +175,7 @@ def _draw_plane(panel: Panel, found: Landscape) -> tuple[float, float]:
     """Draw the objective over two hyperparameters; return its values at the ends of the colours."""
     roots, low, high = rooted(found.heights)
     first, second = found.axes
-    panel.heights("landscape", (first, second), roots, _LEVELS)
+    panel.heights("landscape", (first, second), roots, np.linspace(0, 1, 11))
     x, y = found.path.T
     panel.line("path", x, y, INK, width=1.0)
     panel.points("asked", x, y, INK, size=14, legend=_PATH)

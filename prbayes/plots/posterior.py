@@ -22,14 +22,6 @@ from prbayes.plots._names import named
 from prbayes.plots._objective import free_elements
 from prbayes.plots._ticks import round_ticks
 
-# Draws of the prior, whose density they show: at a normal's peak within 2%, by the sum of kernels.
-_PRIOR_DRAWS = 4000
-# Points of a curve: one or two pixels each, by judgement.
-_GRID_POINTS = 301
-# Heights of the two intervals below the axis, in units of the posterior's peak: the diamond of one
-# does not touch the dot of the other. By judgement.
-_ROWS = (-0.07, -0.15)
-
 
 def plot_posterior(
     posterior: xr.DataTree,
@@ -141,7 +133,7 @@ class _Hyperparameter:
             reach = 3 * (self.error or 0.0)
             low = min(low, self.best - reach)
             high = max(high, self.best + reach)
-        return np.linspace(low, high, _GRID_POINTS)
+        return np.linspace(low, high, 301)
 
 
 def _read_hyperparameters(
@@ -159,7 +151,8 @@ def _read_hyperparameters(
     prior: dict[str, Floats] = {}
     if model is not None:
         evaluator = Evaluator(model)
-        thetas = evaluator.prior_thetas(_PRIOR_DRAWS, 0)
+        # So many tell a normal density's peak within 2%.
+        thetas = evaluator.prior_thetas(4000, 0)
         prior = free_elements(evaluator, thetas)
         shared &= set(prior)
 
@@ -188,7 +181,8 @@ def _draw(panel: Panel, hyperparameter: _Hyperparameter, level: float) -> float:
     grid = hyperparameter.grid
     density = bounded_density(draws, grid)
     top = float(density.max())
-    posterior_row, optimum_row = np.array(_ROWS) * top
+    # So far apart that the diamond of one does not touch the dot of the other.
+    posterior_row, optimum_row = np.array([-0.07, -0.15]) * top
 
     if hyperparameter.prior is not None:
         y = bounded_density(hyperparameter.prior, grid)

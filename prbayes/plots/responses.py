@@ -29,13 +29,6 @@ from prbayes.plots._names import named
 from prbayes.plots._populations import calibrated, draw_calibrated
 
 _log = logging.getLogger("prbayes")
-# Shares of a population beyond each end of the axis, by judgement: hardly any of the calibrated;
-# of the one before, which is there to be compared, more, and it widens the axis by at most half on
-# each side.
-_TAIL, _TAIL_BEFORE, _ROOM_BEFORE = 0.005, 0.05, 0.5
-_MARGIN = 0.03  # of the axis
-# A curve before that is more than twice as high as all else is cut off there, by judgement.
-_TALLEST = 2
 
 
 def plot_responses(
@@ -176,23 +169,26 @@ def _covered(node: Node, after: _Simulated, earlier: _Simulated | None) -> tuple
     """Return what the axis covers: data and populations, the earlier one unless it is far off."""
     observed = node.target.observed
     finite = observed[np.isfinite(observed)]
-    low, high = central_range(after.values, after.weights, _TAIL)
+    # Hardly any of the calibrated population is beyond the axis; of the one before, which is there
+    # to be compared, more, and it widens the axis by at most half on each side.
+    low, high = central_range(after.values, after.weights, tail=0.005)
     low = min(low, finite.min())
     high = max(high, finite.max())
     if earlier is not None:
-        first, last = central_range(earlier.values, earlier.weights, _TAIL_BEFORE)
-        room = _ROOM_BEFORE * (high - low)
+        first, last = central_range(earlier.values, earlier.weights, tail=0.05)
+        room = 0.5 * (high - low)
         low = min(low, max(first, low - room))
         high = max(high, min(last, high + room))
-    margin = _MARGIN * (high - low)
+    margin = 0.03 * (high - low)
     return float(low - margin), float(high + margin)
 
 
 def _cut(before: Floats, top: float) -> tuple[float, float] | None:
     """Return where the axis ends if a narrow peak before would dwarf all else, up to ``top``."""
-    if before.max() <= _TALLEST * top:
+    tallest = 2 * top
+    if before.max() <= tallest:
         return None
-    return -0.05 * top, _TALLEST * top
+    return -0.05 * top, tallest
 
 
 def _draw_measured(panel: Panel, node: Node, covered: tuple[float, float], *, ecdf: bool) -> float:

@@ -23,8 +23,6 @@ _LABELS = {
 }
 # Chains differ in colour and in style; five times four before they repeat.
 _STYLES = (SOLID, DASHED, DOTTED, DASHDOT)
-# Whole numbers on an axis, so that they do not touch; by judgement.
-_MOST_TICKS = 10
 
 
 def plot_stages(
@@ -151,7 +149,7 @@ def _draw(panel: Panel, statistic: _Statistic, label: str) -> None:
 
 
 def _whole(names: list[str]) -> Ticks:
-    """Return ticks at 1, 2 and so on, or at some of them where there are many."""
-    every = -(-len(names) // _MOST_TICKS)
+    """Return ticks at 1, 2 and so on, or at ten of them at most."""
+    every = -(-len(names) // 10)
     at = [float(place + 1) for place in range(0, len(names), every)]
     return at, names[::every]

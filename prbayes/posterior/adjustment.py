@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.estimate.data_sets import observed_set, simulated_sets
+from prbayes.estimate.measured import drawn_in
 from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.hyperparameters import THETAS
 
 # Standard errors from which on a minimiser is elsewhere than where its sampling distribution was
 # taken: an optimum by itself is within a hundredth of one, one that the prior held may be far off.
@@ -20,24 +22,20 @@ from prbayes.model.evaluator import Evaluator
 _ELSEWHERE = 1.0
 # Times that it is followed; one or two arrive.
 _STEPS = 5
-# Draws of a mode below which it is left as it is: a covariance needs some.
+# Draws of a mode below which it is left as it is: standard deviations from 50 have an error of a
+# tenth. With 25 a mode that has 36 of 400 draws is mapped as well (benchmarks/constants.py).
 _FEWEST = 50
-# Ratio of distances to two modes below which a draw is between them.
-_APART = 1.5
-# Share of such draws above which modes are not separate.
-_BETWEEN = 0.05
-# Standard deviations to which draws farther out are drawn in.
+# Standard deviations to which draws farther out are drawn in. Half or twice moves a mean by .012
+# standard deviations at most (benchmarks/constants.py).
 _FAR = 6.0
-# Standard errors beyond which a refit counts as so far away, and no farther.
+# Standard errors beyond which a refit counts as so far away, and no farther. Twice changes means by
+# .016 standard deviations and spreads by 2% at most; with half, where refits within are cut as
+# well, spreads shrink by up to 7% (benchmarks/constants.py).
 _REACH = 3.0
-# Standard error, in units of the prior's spread, up to which refits follow a direction.
+# Standard error, in units of the prior's spread, up to which refits follow a direction. Twice
+# changes nothing; with half, directions about which data and prior tell as much are left to draws
+# of exp(-d / epsilon), whose spread differs by a third there (benchmarks/constants.py).
 _WEAKEST = 2.0
-# Levels of the middle 89% of draws, and the width of a normal distribution's in standard
-# deviations.
-_LEVELS = (0.055, 0.5, 0.945)
-_WIDTH = 3.2
-# Prior draws that tell its mean and precision along the axes.
-_PRIOR_DRAWS = 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +105,7 @@ class Affine:
         information = _precision(shifts, r)
         bias = np.median(shifts, axis=0)
         # What the prior tells.
-        draws = evaluator.prior_thetas(_PRIOR_DRAWS, self.random_seed)
+        draws = evaluator.prior_thetas(4 * THETAS, self.random_seed)
         prior, _ = sampling.coordinates(draws)
         precision = _precision(prior, r)
         # Both together.
@@ -172,7 +170,7 @@ class Affine:
         x, remainder = sampling.coordinates(draws)
         center, covariance = self.target(sampling)
         out = transported(sampling, x, remainder, center, covariance)
-        outside = _drawn_in(x, _FAR) != x
+        outside = drawn_in(x, _FAR) != x
         return out, outside.any(axis=1)
 
 
@@ -215,8 +213,9 @@ def _run_together(distances: Floats) -> bool:
     if len(distances) < 2:
         return False
     first, second = np.sort(distances, axis=0)[:2]
-    between = second < _APART * first
-    return bool(np.mean(between) > _BETWEEN)
+    # Half or twice of either changes nothing where modes are apart (benchmarks/constants.py).
+    between = second < 1.5 * first
+    return bool(np.mean(between) > 0.05)
 
 
 def transported(
@@ -232,9 +231,9 @@ def transported(
     no farther from it than three standard deviations.
     """
     r = sampling.stderr.size
-    x = _drawn_in(x, _FAR)
+    x = drawn_in(x, _FAR)
     # The symmetric map between two normal distributions.
-    counted = _drawn_in(x, _REACH)
+    counted = drawn_in(x, _REACH)
     before = np.cov(counted, rowvar=False).reshape(r, r)
     root = _root(before)
     inverse = np.linalg.inv(root)
@@ -272,17 +271,6 @@ def _among(sampling: SamplingDistribution, thetas: Floats) -> SamplingDistributi
     # Where more or fewer directions are identified there, the coordinates would not be the same.
     same = found.stderr.size == sampling.stderr.size
     return found if same else sampling
-
-
-def _drawn_in(x: Floats, most: float) -> Floats:
-    """Return draws, (n, r), at most so many standard deviations from the median.
-
-    The middle 89% tell the standard deviation. A few in a thousand far out, as where a bounded
-    parameter comes near its bound, would otherwise decide how all others are mapped.
-    """
-    low, middle, high = np.quantile(x, _LEVELS, axis=0)
-    far = most * (high - low) / _WIDTH
-    return np.clip(x, middle - far, middle + far)
 
 
 def _precision(points: Floats, r: int) -> Floats:

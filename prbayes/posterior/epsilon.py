@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from prbayes._checks import Floats
+from prbayes._weighted import INTERVAL
+from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.identifiability import identified_by_area, identified_by_curvature
 from prbayes.estimate.measured import Refits
 from prbayes.estimate.obstacles import simulator_obstacle
@@ -16,19 +18,13 @@ from prbayes.estimate.sandwich import Information, LinearArea
 from prbayes.metrics.base import Minimum
 from prbayes.model.epsilon import Epsilon
 
-# Thetas that carry each simulated data set's posterior.
+# Thetas that carry each simulated data set's posterior: half or twice changes epsilon by 3%, as
+# much as another number of data sets does (benchmarks/constants.py).
 _CLOUD = 500
-# Simulated data sets: 2.2% is the standard error of a coverage of 89%.
-_SETS = 200
-# ArviZ's interval, for which compatibility with the rest of the package is wanted.
-_LEVEL = 0.89
 # How much wider than the sampling distribution the cloud is: it has to reach wherever posteriors
-# do.
+# do. Half changes epsilon by 2%; with twice few of its thetas are where posteriors are, and epsilon
+# changes by 11% (benchmarks/constants.py).
 _WIDER = 3.0
-# Times the noise floor: between these epsilon is looked for.
-_RANGE = (1e-3, 10.0)
-# Halvings of a range of 10^4 on a logarithmic scale: to rounding.
-_BISECTIONS = 40
 
 
 def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
@@ -96,7 +92,7 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
     require_minimiser(optimum, "calibrate_epsilon")
     found = {}
     for k, node in enumerate(evaluator.nodes):
-        information = Information(evaluator, k, optimum.theta, n_sets=_SETS)
+        information = Information(evaluator, k, optimum.theta, n_sets=SETS)
         found[node.name] = _epsilon(information)
     return Epsilon(found, optimum.identity)
 
@@ -155,7 +151,6 @@ def _by_refits(information: Information) -> float:
         information.theta,
         scales,
         simulators=[information.k],
-        n_sets=_SETS,
     )
     local = refits.local()
     p = local.identified.shape[1]
@@ -212,7 +207,7 @@ class _Cloud:
             share = (weights * (z < 0)).sum(axis=1)
             below.append(share)
         off_center = np.abs(np.stack(below) - 0.5)
-        inside = off_center < _LEVEL / 2
+        inside = off_center < INTERVAL / 2
         return float(np.mean(inside))
 
 
@@ -233,10 +228,11 @@ def _by_coverage(information: Information) -> float:
     directions = axes * information.prior_sd[:, None]
     cloud = _Cloud.around(area, directions, information.seed)
     # Coverage grows with epsilon.
-    low, high = (information.noise_floor * factor for factor in _RANGE)
-    for _ in range(_BISECTIONS):
+    low, high = (information.noise_floor * factor for factor in (1e-3, 10.0))
+    # To rounding.
+    for _ in range(40):
         middle = float(np.sqrt(low * high))
-        if cloud.coverage(middle) < _LEVEL:
+        if cloud.coverage(middle) < INTERVAL:
             low = middle
         else:
             high = middle

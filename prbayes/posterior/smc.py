@@ -22,6 +22,7 @@ from prbayes.estimate.optimum import Optimum, require_sampling
 from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse
 from prbayes.model.epsilon import checked_epsilon
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.hyperparameters import THETAS
 from prbayes.model.identity import identity_of, require_same
 from prbayes.model.node import Node, model_on_context
 from prbayes.model.support import shortcomings
@@ -32,9 +33,6 @@ from prbayes.posterior.epsilon import calibrate_epsilon
 from prbayes.posterior.trees import posterior_tree
 
 _log = logging.getLogger("prbayes")
-
-# Draws at whose populations the design is looked at: their 5% quantiles are then those of a dozen.
-_LOOKED_AT = 256
 
 
 def sample_smc(
@@ -309,7 +307,7 @@ class _Rounds:
         """Return some draws, before and after the adjustment: the design has to support both."""
         both = np.concatenate([found.particles.thetas, found.thetas])
         rows = both.reshape(-1, self.run.evaluator.size)
-        return np.random.default_rng(self.seeds).permutation(rows)[:_LOOKED_AT]
+        return np.random.default_rng(self.seeds).permutation(rows)[:THETAS]
 
 
 @contextmanager

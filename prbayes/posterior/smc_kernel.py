@@ -13,23 +13,12 @@ from prbayes._checks import Floats, share
 from prbayes.model.evaluator import Evaluation, Evaluator
 from prbayes.model.node import model_on_context
 
-# Proposals at most in a stage: a bound on the cost where particles do not forget.
-_MAX_STEPS = 25
 # Mean absolute correlation with the particles before a stage at which they count as new draws;
 # among 500 particles that share nothing it is .036. On the way to the posterior six times as much
-# will do: later stages forget the rest.
+# will do: later stages forget the rest. Half or twice of either changes answers as
+# another seed does (benchmarks/constants.py).
 _UNCORRELATED = 0.05
 _ON_THE_WAY = 6
-# Gain in correlation below which more proposals are in vain.
-_NO_PROGRESS = 0.01
-# Random walks: the scale that is best for normal targets, and the acceptance rate that it is
-# steered to (Roberts, Gelman and Gilks 1997, doi:10.1214/aoap/1034625254: .234 in many dimensions,
-# .44 in one).
-_WALK = 2.38
-_WALK_RATE = 0.3
-# Relative and absolute jitter that makes the covariance of identical particles a proper one.
-_JITTER = 1e-12
-_TINY = 1e-300
 
 
 class BatchedKernel(SMC_KERNEL):
@@ -127,10 +116,14 @@ class BatchedKernel(SMC_KERNEL):
         before = self.tempered_posterior.copy()
         fitted = _Normal.of(before)
         enough = _UNCORRELATED if self.beta == 1 else _UNCORRELATED * _ON_THE_WAY
-        scale = _WALK / np.sqrt(before.shape[1])
+        # The scale that is best for normal targets, steered to an acceptance rate between those for
+        # many dimensions and for one: Roberts, Gelman and Gilks (1997),
+        # doi:10.1214/aoap/1034625254.
+        scale = 2.38 / np.sqrt(before.shape[1])
         correlation = 1.0
         accepted = []
-        for step in range(1, _MAX_STEPS + 1):
+        # A bound on the cost where particles do not forget.
+        for step in range(1, 25 + 1):
             # In turn: new places at once, and steps from where each particle is
             noise = self.rng.standard_normal(before.shape)
             if step % 2:
@@ -138,12 +131,12 @@ class BatchedKernel(SMC_KERNEL):
                 continue
             rate = self._walk(fitted, scale * noise)
             accepted.append(rate)
-            scale *= np.exp(rate - _WALK_RATE)
+            scale *= np.exp(rate - 0.3)
 
             # Terminate when the particles have forgotten, or stop forgetting
             last = correlation
             correlation = _correlation(before, self.tempered_posterior)
-            if correlation < enough or correlation > last - _NO_PROGRESS:
+            if correlation < enough or correlation > last - 0.01:
                 break
         self.accept_rate = float(np.mean(accepted))
         self.n_steps = step
@@ -237,7 +230,8 @@ class _Normal:
     @classmethod
     def of(cls, particles: Floats) -> _Normal:
         covariance = np.atleast_2d(np.cov(particles, rowvar=False))
-        jitter = _JITTER * np.diag(np.diag(covariance) + _TINY)
+        # Makes the covariance of identical particles a proper one.
+        jitter = 1e-12 * np.diag(np.diag(covariance) + 1e-300)
         return cls(particles.mean(axis=0), np.linalg.cholesky(covariance + jitter))
 
 

@@ -14,9 +14,6 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import as_attributes, identity_of
 from prbayes.model.labels import labelled, observed_dataset, versions
 
-# Probability that the ECDF of uniform ranks stays inside: that of ArviZ's own pictures of ranks.
-_ENVELOPE = 0.95
-
 
 def posterior_tree(
     evaluator: Evaluator,
@@ -247,11 +244,12 @@ def _envelopes(ranks: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
     """Return ECDFs of ranks with ArviZ's envelope for uniform ones, and who leaves it."""
     from arviz_stats.ecdf_utils import ecdf_pit
 
+    probability = 0.95  # that of ArviZ's own pictures of ranks
     rows, names = {}, []
     values = {name: variable.values[0] for name, variable in ranks.data_vars.items()}
     for name, column in split_elements(values).items():
         x, ecdf, lower, upper = ecdf_pit(  # type: ignore[no-untyped-call]
-            column, _ENVELOPE, n_simulations=1000, rng=np.random.default_rng(0)
+            column, probability, n_simulations=1000, rng=np.random.default_rng(0)
         )
         rows[name] = ecdf
         if ((ecdf < lower) | (ecdf > upper)).any():
@@ -263,7 +261,7 @@ def _envelopes(ranks: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
             "upper": ("x", upper),
         },
         coords={"variable": list(rows), "x": x},
-        attrs={"probability": _ENVELOPE},
+        attrs={"probability": probability},
     )
     return found, names
 

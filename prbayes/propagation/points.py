@@ -10,9 +10,14 @@ import numpy as np
 from prbayes._checks import Floats
 from prbayes.response.inputs import Inputs
 
-# Coordinates keep this distance from 0 and 1, where quantiles may be infinite; a point of 10^11 is
-# ever closer.
-_SMALLEST = 1e-12
+
+def inside(points: Floats) -> Floats:
+    """Return points of the unit cube that keep off 0 and 1, where quantiles may be infinite.
+
+    A point of 10^11 is ever closer; any distance from 1e-16 to 1e-9 moves only specimens that are
+    rarer than one in 1e9.
+    """
+    return np.clip(points, 1e-12, 1 - 1e-12)
 
 
 def sobol(n: int, dimensions: int, seed: int) -> Floats:
@@ -40,7 +45,7 @@ def sobol(n: int, dimensions: int, seed: int) -> Floats:
     else:
         power = int(np.ceil(np.log2(n)))
         points = engine.random_base2(power)[:n]
-    return np.asarray(np.clip(points, _SMALLEST, 1 - _SMALLEST, out=points))
+    return inside(points)
 
 
 def monte_carlo(n: int, dimensions: int, seed: int) -> Floats:
@@ -62,7 +67,7 @@ def monte_carlo(n: int, dimensions: int, seed: int) -> Floats:
     (4, 1)
     """
     points = np.random.default_rng(seed).random((n, dimensions))
-    return np.clip(points, _SMALLEST, 1 - _SMALLEST)
+    return inside(points)
 
 
 def points_from(points: object) -> Callable[[int, int, int], Floats]:

@@ -14,7 +14,7 @@ from pytensor import shared
 from pytensor.compile import function
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats, positive_integer
+from prbayes._checks import AT_ONCE, Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
 from prbayes.propagation.base import Bound, Propagation, probe, refuse_nested
 from prbayes.propagation.ops import ResponseOp, symbolic_discrepancy
@@ -25,9 +25,6 @@ from prbayes.response.inputs import Inputs
 from prbayes.response.response import Responses
 
 _log = logging.getLogger("prbayes")
-
-# Base points whose transforms may stay in memory: 16 MiB for each input.
-_KEPT = 1 << 21
 
 
 @dataclass(frozen=True)
@@ -87,7 +84,7 @@ class ResimulatedBound(Bound):
         _, points = base_points(inputs, config.n, config.random_seed, make_points)
         # What depends on constants alone, PyTensor computes once and keeps: fast, unless it is too
         # large to keep.
-        keep = config.n <= _KEPT
+        keep = config.n <= AT_ONCE
         self._points: list[Any] = points if keep else [shared(u) for u in points]
         for dist, u in zip(inputs.aleatory, self._points, strict=True):
             quantiles(name, dist, u)  # refuses what has no inverse distribution function

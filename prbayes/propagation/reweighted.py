@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pytensor.gradient import disconnected_grad
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats, positive_integer, positive_number
+from prbayes._checks import AT_ONCE, Floats, positive_integer, positive_number
 from prbayes.metrics.base import Discrepancy
 from prbayes.propagation.base import N_BLOCKS, Bound, Propagation, refuse_all_nan, refuse_nested
 from prbayes.propagation.edges import averaged_log_density, cells_around, moving_inputs
@@ -36,23 +36,9 @@ _log = logging.getLogger("prbayes")
 # Components of a batch's mixture density: as many as there are points would be as good, and cost
 # their square.
 _COMPONENTS = 512
-# Draft points, whose response is not computed, for each point of a one-dimensional design; from
-# 2^18 on they are a grid that is fine enough for any design, so that more only cost time.
-_DRAFT = 16
-_LARGEST_DRAFT = 1 << 18
-# Components times points whose log-densities are held at a time: 32 MiB of floats.
-_CHUNK = 1 << 22
-# Responses under other conditions that are kept: more conditions than a study has, fewer than fill
-# the memory.
-_OTHER_RESPONSES = 32
-# Batches differ in their seeds by a prime, so that seeds 0, 1, 2, ... of a user share no batch.
-_SEED_STEP = 7919
 # Neighbours on either side in the cells of an input whose support moves, beside other inputs: its
 # points then pass an edge some at a time, as their weights differ. On a line the cells meet.
-_NEIGHBOURS = 8
-# Inputs beyond which the weights become so uneven that another propagation is recommended
-# (docs/choose.md).
-_MANY_INPUTS = 4
+_ABREAST = 8
 
 
 @dataclass(frozen=True)
@@ -174,7 +160,8 @@ class Design(Bound):
         self._stored: Batches | None = None
         self._shared: list[Any] = []
         self._basis: tuple[Any, int, Any] = (None, 0, None)
-        self._others: deque[tuple[Responses, Floats]] = deque(maxlen=_OTHER_RESPONSES)
+        # More conditions than a study has, fewer than fill the memory.
+        self._others: deque[tuple[Responses, Floats]] = deque(maxlen=32)
         self._moving: tuple[int, ...] | None = None
         components = prior_draws(inputs.roots, min(config.n, _COMPONENTS), config.random_seed)
         size = self.add(components)
@@ -183,10 +170,12 @@ class Design(Bound):
             self._warn_of_thin_support(size)
 
     def _warn_of_thin_support(self, size: float) -> None:
+        # With more inputs weights become so uneven that another propagation is better
+        # (docs/choose.md).
         advice = (
             "prb.minimize and prb.sample_smc refine it themselves, "
             "before pm.sample call prb.refine(model)"
-            if self._dimensions <= _MANY_INPUTS
+            if self._dimensions <= 4
             else f"{self._dimensions} inputs are many for stored responses: rather use "
             "propagation=prb.Resimulated(n), which has no design"
         )
@@ -327,7 +316,8 @@ class Design(Bound):
             The median weight effective sample size over these populations.
         """
         n = n or self.config.n
-        seed = self.config.random_seed + _SEED_STEP * self.n_batches
+        # A prime, so that seeds 0, 1, 2, ... of a user share no batch.
+        seed = self.config.random_seed + 7919 * self.n_batches
         components = self.valid_only(components)
         place = self._equal_mass if self.is_line else self._place
         points, counts = place(components, n, seed)
@@ -352,7 +342,7 @@ class Design(Bound):
 
     def _cell_ends(self) -> list[Floats]:
         """Return lower and upper ends of the points' cells, of each input whose support moves."""
-        reach = 1 if self.is_line else _NEIGHBOURS
+        reach = 1 if self.is_line else _ABREAST
         found = []
         for i in self._moving or ():
             cells = cells_around(self.batches.points[i], reach)
@@ -384,7 +374,9 @@ class Design(Bound):
         self, components: Sequence[Floats], n: int, seed: int
     ) -> tuple[list[Floats], Floats]:
         """Return n points of one input that cut the whole mixture into parts of equal mass."""
-        n_draft = min(_DRAFT * n, _LARGEST_DRAFT)
+        # 16 draft points for each, whose response is not computed; from 2^18 on they are a grid
+        # that is fine enough for any design.
+        n_draft = min(16 * n, 1 << 18)
         (draft,), counts = self._place(components, n_draft, seed)
         grid = np.unique(draft[np.isfinite(draft)])
         log_g, _ = self._log_mixture(components, counts, [grid], summed=False)
@@ -432,7 +424,7 @@ class Design(Bound):
         n = len(points[0])
         log_g = np.empty(n)
         sums = np.full((2, counts.size), -np.inf)
-        step = max(1, _CHUNK // counts.size)
+        step = max(1, AT_ONCE // counts.size)
         for start in range(0, n, step):
             chunk = slice(start, start + step)
             here = [p[chunk] for p in points]
@@ -447,7 +439,7 @@ class Design(Bound):
     def copied(self) -> Self:
         """Return a design with the same points, which grows by itself."""
         other = super().copied()
-        other._others = deque(self._others, maxlen=_OTHER_RESPONSES)
+        other._others = deque(self._others, maxlen=self._others.maxlen)
         other._shared = []
         other._share([shared.get_value() for shared in self._shared])
         other.__dict__.pop("_log_weights", None)  # compiled on the shared variables of this one

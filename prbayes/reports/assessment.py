@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._compare import INTERVAL
 from prbayes._diagnose import Diagnosis
+from prbayes._weighted import INTERVAL
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import alike, number, percentage, plus_minus, shown, span
 from prbayes.reports.section import Section

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._compare import INTERVAL
+from prbayes._weighted import INTERVAL
 from prbayes.model.elements import single_elements, split_elements, stacked_draws
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import NOTHING, alike, counted, number, places

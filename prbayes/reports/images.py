@@ -11,12 +11,6 @@ _BEGINNINGS = (
     (b"\x89PNG\r\n", "png", "image/png"),
     (b"\xff\xd8\xff", "jpg", "image/jpeg"),
 )
-# By judgement: where the tag must begin, after a declaration, a DOCTYPE and a comment.
-_BEFORE_SVG_TAG = 2000
-# By judgement, in bytes: the pictures of this package have a fifth of it. What is larger, such as a
-# scatter of ten thousand points, is kept as pixels, so that a browser opens a report at once.
-_LARGEST_SVG = 500_000
-_PIXELS_PER_INCH = 200  # by judgement: sharp in print at a column's width
 
 
 def image(picture: Any) -> bytes:
@@ -41,10 +35,12 @@ def image(picture: Any) -> bytes:
     with tempfile.TemporaryDirectory() as folder, rc_context(reproducible):
         vector = Path(folder, "picture.svg")
         picture.savefig(vector, bbox_inches="tight", metadata={"Date": None})
-        if vector.stat().st_size <= _LARGEST_SVG:
+        # Five times as large as this package's pictures. What is larger, such as a scatter of ten
+        # thousand points, is kept as pixels, so that a browser opens a report at once.
+        if vector.stat().st_size <= 500_000:
             return vector.read_bytes()
         pixels = Path(folder, "picture.png")
-        picture.savefig(pixels, bbox_inches="tight", dpi=_PIXELS_PER_INCH)
+        picture.savefig(pixels, bbox_inches="tight", dpi=200)
         return pixels.read_bytes()
 
 
@@ -59,7 +55,8 @@ def kind_of(picture: bytes) -> tuple[str, str]:
     for beginning, ending, media_type in _BEGINNINGS:
         if picture.startswith(beginning):
             return ending, media_type
-    if b"<svg" in picture[:_BEFORE_SVG_TAG]:
+    # The tag begins after a declaration, a DOCTYPE and a comment.
+    if b"<svg" in picture[:2000]:
         return "svg", "image/svg+xml"
     raise ValueError(
         f"picture: got bytes that begin with {picture[:8]!r}, expected SVG, PNG or JPEG"

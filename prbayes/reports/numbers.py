@@ -10,18 +10,16 @@ import numpy as np
 
 NOTHING = "\u2013"  # an en dash, as printed tables have it where there is no number
 
-# By judgement: four digits show a change of a thousandth, which no estimate from tens of specimens
-# reaches; more would only make tables wide.
-_DIGITS = 4
 # Numbers from 0.0001 up to ten million are written out, others with an exponent: the same lower end
 # as Python's own "g"; the upper one keeps loads in newtons and cycles to failure readable.
 _SMALLEST_WRITTEN_OUT, _LARGEST_WRITTEN_OUT = -4, 7
-# A spread may be a hundred times smaller than its value, and its decimals are still written out.
-_SMALLEST_SPREAD_WRITTEN_OUT = _SMALLEST_WRITTEN_OUT - 2
 
 
-def number(value: Any, digits: int = _DIGITS) -> str:
-    """Return a number with so many significant digits, and anything else as its text."""
+def number(value: Any, digits: int = 4) -> str:
+    """Return a number with so many significant digits, and anything else as its text.
+
+    Four show a change of a thousandth, which no estimate from tens of specimens reaches.
+    """
     if value is None:
         return NOTHING
     if isinstance(value, bool | np.bool_):
@@ -57,7 +55,8 @@ def places(sd: float, digits: int = 3) -> int | None:
     # Rounded first: 0.0996 with two digits is 0.10, which needs two decimals and not three.
     rounded = float(f"{sd:.{digits - 1}e}")
     magnitude = math.floor(math.log10(rounded))
-    if not _SMALLEST_SPREAD_WRITTEN_OUT <= magnitude < _LARGEST_WRITTEN_OUT:
+    # A spread may be a hundred times smaller than its value, and is still written out.
+    if not _SMALLEST_WRITTEN_OUT - 2 <= magnitude < _LARGEST_WRITTEN_OUT:
         return None
     return max(0, digits - 1 - magnitude)
 

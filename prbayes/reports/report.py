@@ -26,7 +26,6 @@ from prbayes.validation.validity import ValidityTest
 _MARKUP = re.compile(r"([\\`*_{}\[\]<>|&~$!])")
 # Headings, items, rules and underlines begin a line (CommonMark 0.31, 4.1 to 4.3 and 5.2).
 _AT_START = re.compile(r"^(?:#+|[-+](?=\s|$)|-{2,}|={1,}|\d{1,9}(?=[.)](?:\s|$)))")
-_LONGEST_NAME = 40  # characters of a picture's file name; any value that file systems take will do
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +238,7 @@ def _file_name(i: int, section: Section) -> str | None:
     """Return the name of the file with a section's picture, if it has one."""
     if section.picture is None:
         return None
-    slug = re.sub(r"[^a-z0-9]+", "-", section.title.lower()).strip("-")[:_LONGEST_NAME]
+    slug = re.sub(r"[^a-z0-9]+", "-", section.title.lower()).strip("-")[:40]
     return f"{i:02d}-{slug or 'picture'}.{section.kind}"
 
 

@@ -10,7 +10,8 @@ from prbayes.reports.material import Material
 from prbayes.reports.numbers import counted, number, percentage, plus_minus
 from prbayes.validation.validity import ValidityTest
 
-_MOST = 6  # by judgement: more hyperparameters than this make a list, which a table shows better
+# More hyperparameters than this make a list, which a table shows better: by judgement.
+_MOST_NAMES = 6
 
 
 def summary(m: Material) -> list[str]:
@@ -42,7 +43,7 @@ def _what_was_calibrated(m: Material) -> str:
     if not names:
         return ""
     hyperparameters = counted(len(names), "hyperparameter")
-    if len(names) <= _MOST:
+    if len(names) <= _MOST_NAMES:
         hyperparameters += f" ({', '.join(names)})"
     if not m.results:
         return f"The model has {hyperparameters}. No result of a calibration was given."
@@ -84,7 +85,7 @@ def _answer(m: Material) -> str:
         what = "optimum and standard error"
     label = next(iter(of_kind))
     estimates = _estimates(m, label)
-    if not estimates or len(estimates) > _MOST:
+    if not estimates or len(estimates) > _MOST_NAMES:
         return f"The answer is in the table of the {kind}."
     pairs = [f"{name} = {plus_minus(value, sd)}" for name, (value, sd) in estimates.items()]
     which = f" of {label}" if len(of_kind) > 1 else ""

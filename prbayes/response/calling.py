@@ -28,26 +28,9 @@ _log = logging.getLogger("prbayes")
 
 Rows = NDArray[np.intp]
 
-# Seconds that a chunk should take: long against the 4.5 ms that sending one costs (`python -m
-# benchmarks.scale`), short against what is lost with a worker. By judgement.
-_CHUNK_SECONDS = 0.2
-# Seconds from which a response of one specimen at a time is a chunk of its own, so that none waits
-# for others to be stored. By judgement: twice what sending it costs.
-_ALONE_SECONDS = 0.01
-# Points of the first chunk of a response that takes arrays, whose cost is not known yet. By
-# judgement: what a call costs by itself is spread over a few, and a response of minutes is not
-# called for long.
-_FIRST = 16
-# Share of earlier chunks in the measured cost of a response; it only sizes the next chunks. By
-# judgement.
-_MEMORY = 0.7
 # Relative difference of a response that another machine, or another version of a library, may make;
 # any value from 1e-9 to 1e-3 tells another response from rounding, but for chaotic ones.
 _ROUNDING = 1e-6
-# Chunks sent out at a time to an executor that does not tell how many workers it has: as many as
-# workers that are known of in practice; what one costs in memory is measured by `python -m
-# benchmarks.scale`. By judgement.
-_MANY = 1024
 
 
 class ResponseError(RuntimeError):
@@ -177,7 +160,8 @@ class Tally:
         self.computed += size
         each = seconds / size
         known = self.seconds != 0
-        self.seconds = _MEMORY * self.seconds + (1 - _MEMORY) * each if known else each
+        # A running mean, which only sizes the next chunks.
+        self.seconds = 0.7 * self.seconds + 0.3 * each if known else each
 
 
 def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
@@ -325,7 +309,9 @@ def capacity(executor: Executor | None) -> Capacity:
     if not workers and callable(threads):
         workers = sum(threads().values())
     if not workers:
-        return Capacity(os.cpu_count() or 1, _MANY)
+        # As many as workers that are known of in practice; what one costs in memory is measured by
+        # `python -m benchmarks.scale`.
+        return Capacity(os.cpu_count() or 1, 1024)
     # While a worker computes a chunk, the next one is there already.
     return Capacity(int(workers), 2 * int(workers))
 
@@ -334,12 +320,17 @@ def chunk_size(calling: Calling, tally: Tally, left: int, workers: int) -> int:
     """Return how many of the points that are left go into the next chunk."""
     alone = isinstance(calling.function, scalar)
     if tally.seconds == 0:
-        return 1 if alone else min(left, _FIRST)
-    if alone and tally.seconds >= _ALONE_SECONDS:
+        # The cost is not known yet: that of a call is spread over a few, and a response of minutes
+        # is not called for long.
+        return 1 if alone else min(left, 16)
+    # Twice what sending a chunk costs: none waits for others to be stored.
+    if alone and tally.seconds >= 0.01:
         return 1
-    # Towards the end chunks get smaller, so that all workers have some.
+    # Towards the end chunks get smaller, so that all workers have some. Others take 0.2 s: long
+    # against the 4.5 ms that sending one costs (`python -m benchmarks.scale`), short against what
+    # is lost with a worker.
     share = left if calling.executor is None else max(1, left // (2 * workers))
-    return int(max(1, min(share, _CHUNK_SECONDS / tally.seconds)))
+    return int(max(1, min(share, 0.2 / tally.seconds)))
 
 
 def chunks(

@@ -48,9 +48,6 @@ _SETTINGS = (
     "mmap_size = 0",
     "synchronous = FULL",
 )
-# Bytes of the smallest page (https://www.sqlite.org/fileformat.html); SQLite takes a file that was
-# cut to nothing for a new one.
-_SMALLEST = 512
 # States of a run.
 COMPUTED, FAILED = "computed", "failed"
 
@@ -104,12 +101,12 @@ _COMPLAINTS = {
     sqlite3.SQLITE_PERM: _CLOSED,
     sqlite3.SQLITE_IOERR: _CLOSED,
 }
-_PRIMARY = 0xFF  # the bits of an extended result code that make its kind (https://www.sqlite.org/rescode.html)
 
 
 def complaint_of(error: sqlite3.Error) -> Complaint:
     """Return what SQLite reported, and what to do; what is not known to be harmless is damage."""
-    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & _PRIMARY
+    # These bits of an extended result code make its kind (https://www.sqlite.org/rescode.html).
+    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & 0xFF
     known = _COMPLAINTS.get(code)
     if known is None:
         return damaged(f"{error!s:.200}")  # it may quote what is damaged
@@ -163,7 +160,9 @@ def connected(path: Path, mode: str = "rw") -> sqlite3.Connection:
 
 def complaint_about(path: Path, connection: sqlite3.Connection) -> Complaint | None:
     """Return what is wrong with a file as a whole."""
-    if path.stat().st_size < _SMALLEST:
+    # The smallest page (https://www.sqlite.org/fileformat.html): SQLite takes a file that was cut
+    # to nothing for a new one.
+    if path.stat().st_size < 512:
         return _CUT
     (application,) = connection.execute("PRAGMA application_id").fetchone()
     if application != APPLICATION:

@@ -16,9 +16,6 @@ from prbayes.response.store import StoreError
 from prbayes.surrogate.error import CrossValidation
 from prbayes.surrogate.ranges import Range, Ranges
 
-# Of the files' layout.
-_VERSION = 1
-
 
 @dataclass(frozen=True, eq=False)
 class Kept:
@@ -49,7 +46,7 @@ def write(path: str | PathLike[str], kept: Kept) -> None:
             "probes": ("probe", kept.probes),
         },
         attrs={
-            "prbayes_surrogate": _VERSION,
+            "prbayes_surrogate": 1,
             "configuration": json.dumps(_configuration(kept)),
         },
     )

@@ -15,11 +15,6 @@ from prbayes._checks import Floats, real_array
 from prbayes.propagation.points import sobol
 from prbayes.surrogate.prior_predictive import POPULATIONS, SPECIMENS, predictive_inputs
 
-# Share of a range by which a number may lie outside of it, for a bound that was computed in another
-# way: far above the rounding of double precision, and far below any distance at which a surface
-# would go astray.
-_ROUNDING = 1e-9
-
 
 @dataclass(frozen=True, eq=False)
 class Range:
@@ -92,7 +87,9 @@ class Ranges:
 
     def outside(self, columns: Floats) -> NDArray[np.bool_]:
         """Return which numbers are outside of their range, NaN included, shape (n, columns)."""
-        slack = _ROUNDING * (self.high - self.low)
+        # For a bound that was computed in another way: far above rounding, and far below any
+        # distance at which a surface would go astray.
+        slack = 1e-9 * (self.high - self.low)
         above_low = columns >= self.low - slack
         below_high = columns <= self.high + slack
         # Comparisons with NaN are false.

@@ -27,16 +27,8 @@ from prbayes.surrogate.surfaces import Predict, RadialBasis, Surface, fitted, se
 
 _log = logging.getLogger("prbayes")
 
-# Of the response's spread, within which a loaded surface must repeat what was saved. By judgement:
-# above what the linear algebra of another processor leaves, below what another setting changes.
-_SAME = 1e-6
-
-# Points at which a file keeps the values of its surface. By judgement: more than surfaces that ship
-# have coefficients, in few dimensions, so that another one cannot agree at all of them.
-_PROBES = 64
-
-# Times d + 1 is how many residuals are nearby. By judgement: 8 or more of them tell an rms to a
-# quarter or better, 1 / sqrt(2 k), and more of them are less near.
+# Times d + 1 is how many residuals are nearby: 8 or more of them tell an rms to a quarter or
+# better, 1 / sqrt(2 k), and more of them are less near.
 _NEIGHBOURS = 4
 
 
@@ -349,7 +341,9 @@ class Surrogate:
         found = unfitted._completed()
         good = kept.responses[np.isfinite(kept.responses)]
         spread = float(np.nanstd(good)) or 1.0
-        tolerance = _SAME * spread
+        # Above what the linear algebra of another processor leaves, below what another setting
+        # changes.
+        tolerance = 1e-6 * spread
         if not np.allclose(found._probes(), kept.probes, rtol=0, atol=tolerance, equal_nan=True):
             raise ValueError(
                 f"Surrogate.load: got a {type(model).__name__} that gives other values than the "
@@ -407,7 +401,9 @@ class Surrogate:
 
     def _probes(self) -> Floats:
         """Return values of the surface, without noise, at a few fixed points."""
-        return self._predict(sobol(_PROBES, self.domain.dimensions, 0))
+        # More than surfaces that ship have coefficients, in few dimensions, so that another one
+        # cannot agree at all of them.
+        return self._predict(sobol(64, self.domain.dimensions, 0))
 
 
 def _refuse_wrong(name: str, response: object, model: Any, outside: object, store: object) -> None:

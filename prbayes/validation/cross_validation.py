@@ -17,9 +17,6 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import versions
 from prbayes.model.node import Node
 
-# Sets the random numbers of folds apart from others with the same seed; any integer does.
-_STREAM = 3
-
 
 def cross_validate(
     optimum: Optimum, *, folds: int = 5, random_seed: int = 0, progressbar: bool = True
@@ -123,7 +120,8 @@ class _Folds:
             raise ValueError(
                 f"folds: got {folds} for {total} specimens, expected at most {total // 2}"
             )
-        rng = np.random.default_rng([random_seed, _STREAM])
+        # The number sets these random numbers apart from others with the same seed; any does.
+        rng = np.random.default_rng([random_seed, 3])
         fold_of = rng.permutation(np.arange(total) % folds)
         left_out = []
         kept = []

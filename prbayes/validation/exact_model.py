@@ -13,15 +13,6 @@ from prbayes.validation.conditions import Case
 from prbayes.validation.envelope import ENVELOPED, envelope
 from prbayes.validation.nulls import Judgement, Null
 
-# Values in the pool for each one observed. By judgement: with m times as many the pool itself adds
-# 1 / m to the variance of an ECDF, a tenth here, which makes a test at 5% reject in some 6% of
-# cases.
-_POOLED = 10
-
-# Levels of the table between which the slope of the tail beyond it, p < 1e-6, is taken, counted
-# from its last one: from n = 20 on any value in [1, 12] gives a slope within 5%.
-_BACK = 7
-
 
 @dataclass(frozen=True, eq=False)
 class _Table:
@@ -84,7 +75,8 @@ class ExactModel(Null):
             log = np.interp(scaled, quantiles, logs)
             return float(np.exp(-log))
         # Further out the logarithm falls like the square (Brownian bridge: exp(-6 x^2)).
-        first = -1 - _BACK
+        # From n = 20 on any of the last 12 but one gives a slope within 5%.
+        first = -1 - 7
         last_squared = quantiles[-1] ** 2
         first_squared = quantiles[first] ** 2
         slope = (logs[-1] - logs[first]) / (last_squared - first_squared)
@@ -125,7 +117,9 @@ def _refuse_few(case: Case) -> None:
     """Raise if a population has too few values to be taken as exact."""
     for condition in case.conditions:
         predicted, observed = condition.predicted.size, condition.observed.size
-        if predicted < _POOLED * observed:
+        # With m times as many the pool itself adds 1 / m to the variance of an ECDF: a tenth makes
+        # a test at 5% reject in some 6% of cases.
+        if predicted < 10 * observed:
             raise ValueError(
                 f"{condition.name}: predicted: got {predicted} values for {observed} observed "
                 "ones, expected at least 10 times as many, so that the population is known "

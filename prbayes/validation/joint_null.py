@@ -21,19 +21,6 @@ from prbayes.validation.conditions import Case, Condition
 from prbayes.validation.nulls import LEAST_REPLICATES, SimulatedNull
 from prbayes.validation.predictive import Predictive
 
-# Between the distribution functions of predicted values and of the population at the optimum. By
-# judgement: 500 random samples of a population differ from it by .06 at 5%, and those of `predict`
-# by far less; a normal population a quarter of a standard deviation away differs by .1.
-_DIFFERENT = 0.1
-
-# Probabilities at which the two are compared; between them a distribution function moves by .05,
-# half of the above.
-_PROBED = np.linspace(0.05, 0.95, 19)
-
-# Share of minimisations that must converge. By judgement: replicates are then those of most data
-# sets, and not of an odd few.
-_CONVERGED = 0.5
-
 
 @dataclass(frozen=True)
 class JointNull(SimulatedNull):
@@ -146,7 +133,8 @@ class JointNull(SimulatedNull):
         evaluator = self.optimum.evaluator
         sampling = self.optimum.sampling()
         x, converged = sampling.refit(sets_at(evaluator, populations, points))
-        if converged.mean() < _CONVERGED:
+        # Replicates are then those of most data sets, and not of an odd few.
+        if converged.mean() < 0.5:
             raise ValueError(
                 f"JointNull: got {converged.mean():.0%} of the minimisations converged, expected "
                 "most; look at prb.diagnose(optimum)"
@@ -291,11 +279,14 @@ def _matched(observed: Floats, measured: Floats, numbers: NDArray[np.intp]) -> N
 def _refuse_other(condition: Condition, values: Floats, weights: Floats) -> None:
     """Raise if the predicted population is not that at the optimum."""
     predicted = condition.predicted[~np.isnan(condition.predicted)]
-    at = np.quantile(predicted, _PROBED, method="nearest")
+    # Between these a distribution function moves by .05, half of what is a difference.
+    at = np.quantile(predicted, np.linspace(0.05, 0.95, 19), method="nearest")
     expected = Predictive(values, weights).transform(at, None)
     got = Predictive(condition.predicted).transform(at, None)
     apart = np.abs(expected - got).max()
-    if apart > _DIFFERENT:
+    # 500 random samples of a population differ from it by .06 at 5%, and those of `predict` by far
+    # less; a normal population a quarter of a standard deviation away differs by .1.
+    if apart > 0.1:
         raise ValueError(
             f"{condition.name}: predicted: got values whose distribution function differs by "
             f"{apart:.2f} from that of the population at the optimum, expected "

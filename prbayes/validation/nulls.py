@@ -14,24 +14,15 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats, positive_integer
+from prbayes._checks import AT_ONCE, Floats, positive_integer
 from prbayes._progress import progress
 from prbayes.validation.conditions import Case, Condition
 from prbayes.validation.envelope import ENVELOPED, envelope
 from prbayes.validation.predictive import Predictive, between
 from prbayes.validation.statistic import area
 
-# u-values of replicates that are held at a time, 32 MiB of each array. Blocks are drawn one after
-# the other from one generator, so that results depend on it where replicates need more than one.
-_BLOCK = 1 << 22
-
 # The fewest replicates that can reject at 5%: p is at least 1 / 20.
 LEAST_REPLICATES = 19
-
-# Rounding must not make .05 * 20 less than one replicate, nor a tie with the observed statistic a
-# difference: far above the rounding of double precision, far below one replicate or the gaps
-# between areas.
-_COUNT_ROUNDING, _TIE_ROUNDING = 1e-9, 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,14 +65,15 @@ class SimulatedNull(Null):
         areas, some = self._simulated(case)
         total = areas.size + 1
         # The largest number of replicates, less the observed data, that a rejection allows to be as
-        # large.
-        allowed = int(np.floor(level * total + _COUNT_ROUNDING)) - 1
+        # large; rounding must not make .05 * 20 less than one.
+        allowed = int(np.floor(level * total + 1e-9)) - 1
         if allowed < 0:
             raise ValueError(
                 f"level: got {level} with {areas.size} replicates, expected at least "
                 f"1 / ({areas.size} + 1); pass a null with more replicates"
             )
-        as_large = np.sum(areas >= statistic * (1 - _TIE_ROUNDING))
+        # Nor must rounding make a tie a difference.
+        as_large = np.sum(areas >= statistic * (1 - 1e-12))
         lower, upper = envelope(some, level)
         return Judgement(
             p_value=float((1 + as_large) / total),
@@ -146,7 +138,9 @@ class PosteriorNull(SimulatedNull):
             )
         # Every draw of the posterior as often as any other, in random order.
         each = rng.permutation(draws[np.arange(self.replicates) % draws.size])
-        step = max(1, _BLOCK // case.size)
+        # Blocks are drawn one after the other from one generator, so that results depend on their
+        # size where replicates need more than one.
+        step = max(1, AT_ONCE // case.size)
         for start in range(0, self.replicates, step):
             # One population for each replicate, and one place in it for each specimen.
             draw = each[start : start + step, None]

@@ -10,7 +10,7 @@ import pytest
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.estimate.measured import Refits, principal_axes
+from prbayes.estimate.measured import Refits, drawn_in, principal_axes
 from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
 
@@ -155,6 +155,16 @@ def test_principal_axes_of_a_normal_cloud_with_runaways() -> None:
     axes, sd = principal_axes(points)
     np.testing.assert_allclose(sd, [0.5, 3.0], rtol=0.06)
     np.testing.assert_allclose(np.abs(axes.T @ turn), np.eye(2), atol=0.03)
+
+
+def test_points_far_out_are_drawn_in_to_where_the_middle_puts_them() -> None:
+    rng = np.random.default_rng(4)
+    points = rng.normal([1.0, -2.0], [0.5, 3.0], (4000, 2))
+    points[0] = [1e6, -1e6]
+    drawn = drawn_in(points, 3.0)
+    np.testing.assert_allclose(drawn[0], [1 + 3 * 0.5, -2 - 3 * 3], rtol=0.05)
+    near = np.abs((points - [1.0, -2.0]) / [0.5, 3.0]).max(axis=1) < 2.8
+    np.testing.assert_array_equal(drawn[near], points[near])
 
 
 def test_no_refits_without_stored_responses() -> None:

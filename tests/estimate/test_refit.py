@@ -133,7 +133,7 @@ def test_blocks_of_data_sets_make_no_difference(monkeypatch: pytest.MonkeyPatch)
     sampling = neighbourhood("kl")
     sets = simulated_sets(sampling.evaluator, sampling.theta, 23)
     whole, _ = sampling.refit(sets)
-    monkeypatch.setattr(refit, "_BLOCK", 10 * 5 * (256 + sets.values[0].size))
+    monkeypatch.setattr(refit, "AT_ONCE", 5 * 5 * (256 + sets.values[0].size))
     parts, converged = sampling.refit(sets)
     assert converged.size == 23
     # Each block guesses its curvature from its own data sets, so that paths differ, but not where

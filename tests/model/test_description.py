@@ -14,6 +14,7 @@ import prbayes as prb
 from prbayes.model.description import (
     as_attribute,
     describe,
+    fits_attribute,
     from_attributes,
     without_addresses,
 )
@@ -86,10 +87,10 @@ def test_a_file_tells_what_the_model_does(model: pm.Model) -> None:
 def test_what_is_too_long_for_an_attribute_is_left_out(
     model: pm.Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    size = len(as_attribute(model)["model"])
-    monkeypatch.setattr("prbayes.model.description._LONGEST", size)
     assert as_attribute(model)
-    monkeypatch.setattr("prbayes.model.description._LONGEST", size - 1)
+    assert fits_attribute("x" * 60_000)
+    assert not fits_attribute("x" * (1 << 16))
+    monkeypatch.setattr("prbayes.model.description.fits_attribute", lambda text: False)
     assert as_attribute(model) == {}
 
 

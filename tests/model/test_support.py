@@ -5,7 +5,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from prbayes.model.support import ENOUGH, TOLERABLE, Level, Shortcoming, shortcoming
+from prbayes.model.support import (
+    ENOUGH,
+    TOLERABLE,
+    VISIBLE,
+    Level,
+    Shortcoming,
+    shortcoming,
+    supports_each,
+)
 
 
 def support(ess: Any = 100.0, mass: Any = 1.0, lost: Any = 0.0) -> dict[str, Any]:
@@ -62,3 +70,16 @@ def test_lost_mass_is_said_first_and_alone() -> None:
     assert str(short).startswith("lost mass: 50.0% of a population's weight")
     assert "effective" not in str(short)
     assert "expected 8 and 80, and mean raw weight from 3.00" in str(found(ess=1.0, mass=3.0))
+
+
+def test_each_population_by_itself_is_supported_or_not() -> None:
+    found = {
+        "weight_ess": np.array([50.0, 9.0, 50.0, 50.0, 50.0, np.nan]),
+        "mean_weight": np.array([1.0, 1.0, 0.4, 2.1, 1.0, 1.0]),
+        "lost_mass": np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.0]),
+    }
+    drawn = supports_each(found, 50.0, 0.05, VISIBLE)
+    np.testing.assert_array_equal(drawn, [True, False, False, False, False, False])
+    # A sum of weights that is zero, but for rounding, is none.
+    found["lost_mass"] = np.full(6, 1e-16)
+    assert supports_each(found, 50.0, 0.0, VISIBLE)[0]

@@ -15,10 +15,11 @@ from scipy.stats import gamma, norm
 
 import prbayes as prb
 from prbayes._checks import Floats
+from prbayes.estimate.measured import drawn_in
 from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
-from prbayes.posterior.adjustment import _drawn_in, transported
+from prbayes.posterior.adjustment import transported
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N = OBSERVED.size
@@ -118,7 +119,7 @@ def test_the_least_motion_among_all_maps() -> None:
         np.random.default_rng(3).standard_normal((200, 2)) @ np.array([[1.0, 0.4], [0.0, 0.8]])
     )
     x, remainder = sampling.coordinates(draws)
-    counted = np.cov(_drawn_in(x, 3.0), rowvar=False)
+    counted = np.cov(drawn_in(x, 3.0), rowvar=False)
     np.testing.assert_allclose(
         transported(sampling, x, remainder, np.median(x, axis=0), counted), draws, atol=1e-9
     )
@@ -142,7 +143,7 @@ def test_draws_get_the_moments_that_the_target_says() -> None:
     x, _ = sampling.coordinates(thetas(idata))
     np.testing.assert_allclose(np.median(x, axis=0), center, atol=0.05)
     np.testing.assert_allclose(
-        np.cov(_drawn_in(x, 3.0), rowvar=False), covariance, rtol=0.05, atol=0.02
+        np.cov(drawn_in(x, 3.0), rowvar=False), covariance, rtol=0.05, atol=0.02
     )
 
 
