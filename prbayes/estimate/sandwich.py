@@ -162,7 +162,13 @@ class Information:
 
     @cached_property
     def noise_floor(self) -> float:
-        """The mean discrepancy between the population at theta and data sets drawn from it."""
+        """The mean discrepancy between the population at theta and data sets drawn from it.
+
+        Of a log-likelihood, what it is expected to gain on the way from the truth to its maximum:
+        half for each hyperparameter, over N (Wilks 1938, doi:10.1214/aoms/1177732360).
+        """
+        if not self.node.metric.distance:
+            return self.theta.size / (2 * self._target.n_effective)
         around = self._stencil
         values, weights = thinned(
             around.values[:1],

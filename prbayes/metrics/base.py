@@ -216,10 +216,15 @@ class Metric(ABC):
         too little of the population's tails; zero where that does not matter.
     likelihood : bool
         Whether N times the discrepancy is on the scale of a log-likelihood, so that epsilon is 1/N.
+    distance : bool
+        Whether equal samples have a discrepancy of zero, so that its size between a population and
+        data drawn from it is sampling noise. Only a likelihood may do without: its size depends on
+        the unit of the response.
     """
 
     minimum: ClassVar[Minimum] = Minimum.UNKNOWN
     likelihood: ClassVar[bool] = False
+    distance: ClassVar[bool] = True
     tail_responses: ClassVar[int] = 0
 
     @property

@@ -50,6 +50,7 @@ class LogLikelihood(Metric):
     density: DensityEstimator = field(default_factory=lambda: GaussianKDE(likelihood_bandwidth))
     minimum: ClassVar[Minimum] = Minimum.QUADRATIC
     likelihood: ClassVar[bool] = True
+    distance: ClassVar[bool] = False
     tail_responses: ClassVar[int] = 300  # from which standard errors are right to a tenth
 
     def __post_init__(self) -> None:

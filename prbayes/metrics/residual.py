@@ -94,14 +94,22 @@ class ResidualDiscrepancy(DensityDiscrepancy):
         return self.cells.widths if self.cells.smooth else 1.0
 
     @property
+    def _root(self) -> Any:
+        """The root of S: times a density it is of the order of one, and its square never too large.
+
+        Of NumPy's type, as PyTensor tries Python's in single precision first.
+        """
+        return np.sqrt(np.float64(self.scale_factor))
+
+    @property
     def scale(self) -> float:
         """The residual of a population without any density: S times the integral of q squared."""
-        integrand = self.density**2 * self._measure
-        return float(self.scale_factor * integrand.sum())
+        integrand = (self._root * self.density) ** 2 * self._measure
+        return float(integrand.sum())
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return S times the integral (or sum) of (p - q)^2: eq. 6, 8, 9."""
         (p,) = features
         q = self.density
-        integrand = (p - q) ** 2 * self._measure
-        return self.scale_factor * integrand.sum(axis=-1)
+        integrand = (self._root * (p - q)) ** 2 * self._measure
+        return integrand.sum(axis=-1)

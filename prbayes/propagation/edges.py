@@ -62,16 +62,17 @@ def moving_inputs(
     given = with_leading_axis(inputs.aleatory)
     outside = []
     for dist, x in zip(dists, given, strict=True):
-        log = pm.logp(dist, x, warn_rvs=False)
+        everywhere_positive = is_mvnormal(dist)
+        log = pt.zeros(x.shape[0]) if everywhere_positive else pm.logp(dist, x, warn_rvs=False)
         outside.append(pt.isneginf(log))
     compiled = compile_batched(symbols, outside, given)
     found = compiled(*components, *points)
     moving = []
     k = len(components[0])
     for i, dist in enumerate(dists):
-        if is_mvnormal(dist):
-            continue  # everywhere positive
-        at_each = np.broadcast_to(found[i], (k, *points[i].shape))
+        # One of each element, or one of a vector that is drawn as a whole.
+        each = points[i].shape[: outside[i].type.ndim]
+        at_each = np.broadcast_to(found[i], (k, *each))
         sometimes = at_each.any(axis=0)
         always = at_each.all(axis=0)
         if np.any(sometimes & ~always):
