@@ -12,8 +12,7 @@ for each problem whose answers change at all, the largest change over hyperparam
 - the number of responses, as a factor; p-values, as a difference; and whether the verdict (converged,
   warnings by their number) changes, or an error ends it.
 
-A posterior of 400 draws with another seed differs by about .05 standard deviations in the mean, and
-by 1.04 in the standard deviation: the first row says how much on these problems.
+The first row says how much another seed of the sampler changes. docs/constants.md shows the table.
 
 One process imports and compiles what can be kept; each variation is a fork of it, so that none sees
 another's. The file is written after each row, and rows that it has are not computed again.

@@ -63,7 +63,7 @@ def _named(direction: Floats, names: list[str]) -> str:
 # Points from which two halves can be held against each other.
 _HALVED = 256
 # Correlation of the changes of two halves of the points from which a change is taken as real. Half
-# or twice changes no answer, nor does half or twice of the others (benchmarks/constants.py).
+# or twice changes no answer, nor does half or twice of the others (docs/constants.md).
 _AGREEMENT = 0.35
 # Change of the area over one prior standard deviation, in noise floors, that counts.
 _CHANGE = 0.5

@@ -12,7 +12,7 @@ import numpy as np
 _GRADIENT_FREE = ("Nelder-Mead", "Powell", "COBYLA", "COBYQA")
 _WITH_GRADIENT = ("BFGS", "CG", "L-BFGS-B", "Newton-CG", "SLSQP", "TNC", "trust-constr")
 # First step of methods without gradient, in spreads of the prior: larger than the standard errors
-# of most problems, and within the prior. Half or twice changes no answer (benchmarks/constants.py).
+# of most problems, and within the prior. Half or twice changes no answer (docs/constants.md).
 _FIRST_STEP = 0.2
 
 

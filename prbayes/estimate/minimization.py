@@ -101,14 +101,15 @@ def refine(
 
 # Points of the prior from which other optima are searched for where a theta costs no response; the
 # better half of four times as many. More take time, fewer may leave out a basin: with half or twice
-# as many the same optima are found (benchmarks/constants.py).
+# as many the same optima are found (docs/constants.md).
 _STARTS = 32
 # Points of the prior that tell whether other terms weigh, or only exclude some of them. By
-# judgement; a power of two, as Sobol points are balanced then.
+# judgement, half or twice changes no answer (docs/constants.md); a power of two, as Sobol points
+# are balanced then.
 _TERMS = 64
 # Of the noise floor: about the difference of the discrepancy between the data's fit and the
 # truth's. It decides which optima are told of: of five problems half or twice changes what is said
-# of one each, no optimum and no standard error (benchmarks/constants.py).
+# of one each, no optimum and no standard error (docs/constants.md).
 _NOISE_SHARE = 0.3
 
 

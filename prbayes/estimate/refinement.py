@@ -16,7 +16,8 @@ from prbayes.model.support import Shortcoming, shortcomings
 from prbayes.propagation.base import DesignError
 
 _log = logging.getLogger("prbayes")
-# Batches added before a design is refused: by judgement.
+# Batches added before a design is refused: by judgement; half or twice changes no answer
+# (docs/constants.md).
 MAX_ROUNDS = 8
 # Standard errors within which the optima of two independent designs are to be: a tenth adds half a
 # per cent to the width of an interval.
@@ -27,7 +28,8 @@ _RATE = 0.65
 # Most by which a design grows at a time: the estimate of its error is itself uncertain.
 _GROWTH = 2.0
 # Step of a pilot, in standard deviations of the thetas kept: small against their spread, so that
-# the next ones are within reach of the design; by judgement.
+# the next ones are within reach of the design. Half or twice leads to another design, and moves an
+# optimum within that design's own error (docs/constants.md).
 _PILOT_STEP = 0.4
 # Data sets that tell a noise floor which only says when a pilot stops, or when optima are compared.
 FEW_SETS = 50

@@ -25,7 +25,7 @@ class Level:
 # Where an answer is made: the optimiser and the samplers, whose designs grow until it holds. A mean
 # weight of 0.8 to 1.25 is a fifth of the population's mass either way. Half the effective sample
 # size moves an optimum by .05 standard errors; twice is more than 1024 points give with two inputs
-# (benchmarks/constants.py).
+# (docs/constants.md).
 ENOUGH = Level(ess=1.0, lowest_ess=0.1, mass=(0.8, 1.25), tails=True)
 # Where an answer is used: designs do not grow for a prediction. By judgement: laxer, as draws at
 # the edge of a posterior are less well supported than its centre, and resampling needs no

@@ -23,18 +23,18 @@ _ELSEWHERE = 1.0
 # Times that it is followed; one or two arrive.
 _STEPS = 5
 # Draws of a mode below which it is left as it is: standard deviations from 50 have an error of a
-# tenth. With 25 a mode that has 36 of 400 draws is mapped as well (benchmarks/constants.py).
+# tenth. With 25 a mode that has 36 of 400 draws is mapped as well (docs/constants.md).
 _FEWEST = 50
 # Standard deviations to which draws farther out are drawn in. Half or twice moves a mean by .012
-# standard deviations at most (benchmarks/constants.py).
+# standard deviations at most (docs/constants.md).
 _FAR = 6.0
 # Standard errors beyond which a refit counts as so far away, and no farther. Twice changes means by
 # .016 standard deviations and spreads by 2% at most; with half, where refits within are cut as
-# well, spreads shrink by up to 7% (benchmarks/constants.py).
+# well, spreads shrink by up to 7% (docs/constants.md).
 _REACH = 3.0
 # Standard error, in units of the prior's spread, up to which refits follow a direction. Twice
 # changes nothing; with half, directions about which data and prior tell as much are left to draws
-# of exp(-d / epsilon), whose spread differs by a third there (benchmarks/constants.py).
+# of exp(-d / epsilon), whose spread differs by a third there (docs/constants.md).
 _WEAKEST = 2.0
 
 
@@ -213,7 +213,7 @@ def _run_together(distances: Floats) -> bool:
     if len(distances) < 2:
         return False
     first, second = np.sort(distances, axis=0)[:2]
-    # Half or twice of either changes nothing where modes are apart (benchmarks/constants.py).
+    # Half or twice of either changes nothing where modes are apart (docs/constants.md).
     between = second < 1.5 * first
     return bool(np.mean(between) > 0.05)
 

@@ -19,11 +19,11 @@ from prbayes.metrics.base import Minimum
 from prbayes.model.epsilon import Epsilon
 
 # Thetas that carry each simulated data set's posterior: half or twice changes epsilon by 3%, as
-# much as another number of data sets does (benchmarks/constants.py).
+# much as another number of data sets does (docs/constants.md).
 _CLOUD = 500
 # How much wider than the sampling distribution the cloud is: it has to reach wherever posteriors
 # do. Half changes epsilon by 2%; with twice few of its thetas are where posteriors are, and epsilon
-# changes by 11% (benchmarks/constants.py).
+# changes by 11% (docs/constants.md).
 _WIDER = 3.0
 
 
