@@ -455,6 +455,7 @@ def test_a_response_that_raises_where_a_number_is_stored_is_another_one(tmp_path
         model(prb.scalar(broken), store=tmp_path)
 
 
+@pytest.mark.exact
 def test_responses_of_each_version_are_kept_apart(tmp_path: Path) -> None:
     for version, factor in (("1", 1.0), ("2", 3.0), (None, 5.0), ("1", 1.0)):
         found = model(prb.scalar(by_factor(factor)), store=tmp_path, version=version)
