@@ -378,11 +378,18 @@ class Design(Bound):
         # that is fine enough for any design.
         n_draft = min(16 * n, 1 << 18)
         (draft,), counts = self._place(components, n_draft, seed)
-        grid = np.unique(draft[np.isfinite(draft)])
-        log_g, _ = self._log_mixture(components, counts, [grid], summed=False)
         shift = np.random.default_rng(seed).uniform()
+        finite = draft[np.isfinite(draft)]
+        grid, repeated = np.unique(finite, return_counts=True)
         levels = (np.arange(n) + shift) / n
-        points = _inverted(levels, grid, np.exp(log_g))
+        log_g, _ = self._log_mixture(components, counts, [grid], summed=False)
+        # Values that have probability themselves, such as the bounds of a censored input, are there
+        # more often than two design points stand for, and their density is finite.
+        if np.any((repeated > 2 * n_draft / n) & np.isfinite(log_g)):
+            places = (levels * finite.size).astype(int)
+            points = np.sort(finite)[places]
+        else:
+            points = _inverted(levels, grid, np.exp(log_g))
         return [points], counts * (n / counts.sum())
 
     def _off_the_edges(
