@@ -426,7 +426,10 @@ INNER = {
         "pytensor.compile.function",
         "pytensor.tensor.variable.TensorVariable",
     },
-    "propagation.edges": {"pytensor.tensor.variable.TensorVariable"},
+    "propagation.edges": {
+        "pymc.distributions.censored.CensoredRV",
+        "pytensor.tensor.variable.TensorVariable",
+    },
     "propagation.reweighted": {
         "pytensor.gradient.disconnected_grad",
         "pytensor.tensor.variable.TensorVariable",

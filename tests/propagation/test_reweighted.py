@@ -19,6 +19,8 @@ from prbayes.model.node import nodes
 from prbayes.model.support import shortcomings
 from prbayes.propagation.reweighted import Design
 from prbayes.response.distributions import PopulationSampler
+from prbayes.response.inputs import read_inputs
+from prbayes.response.response import Responses
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 KL, PR, AREA = prb.KullbackLeibler(), prb.ProbabilityResidual(), prb.AreaMetric()
@@ -621,3 +623,28 @@ def test_a_log_likelihood_of_few_resimulated_responses_is_warned_of(
     assert 0.88 < error(likelihood, prb.Resimulated(16_384)) / right < 1.05
     assert error(prb.KullbackLeibler(), prb.Resimulated(1024)) > 0.9 * right
     assert not caplog.records
+
+
+def test_another_response_is_computed_at_the_new_points_only() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", same, x, metric=AREA, observed=OBSERVED, propagation=prb.Reweighted(64))
+    asked: list[int] = []
+
+    def later(x: Any) -> Any:
+        asked.append(np.size(x))
+        return 2 * x
+
+    (design,) = Evaluator(model).designs.values()
+    inputs = read_inputs("later", [x], model)
+    for batches in range(1, 4):
+        # A new description of the same response, as each call of predict makes one.
+        found = design.values_of(Responses("later", later, inputs))
+        assert np.array_equal(found, 2 * design.values)
+        assert asked == [64] * batches
+        design.add([np.array([1.0, 2.0]), np.array([0.5, 0.5])])
+    # Points that are forgotten take their responses with them.
+    with design.undone():
+        design.add([np.array([1.0, 2.0]), np.array([0.5, 0.5])])
+        design.values_of(Responses("later", later, inputs))
+    assert np.array_equal(design.values_of(Responses("later", later, inputs)), 2 * design.values)
