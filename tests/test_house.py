@@ -462,6 +462,7 @@ INNER = {
         "pymc.distributions.distribution.SymbolicRandomVariable",
         "pytensor.graph.basic.Variable",
         "pytensor.graph.replace.graph_replace",
+        "pytensor.graph.traversal.ancestors",
         "pytensor.graph.traversal.walk",
         "pytensor.tensor.random.op.RandomVariable",
         "pytensor.tensor.variable.TensorVariable",
