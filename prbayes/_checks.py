@@ -5,6 +5,7 @@ Every message says what was got, what was expected, and what to do.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -162,6 +163,51 @@ def positive_integer(value: object, name: str, *, minimum: int = 1) -> int:
     if value < minimum:
         raise ValueError(f"{name}: got {value}, expected an integer >= {minimum}")
     return int(value)
+
+
+# What PyMC takes for a seed.
+type Seed = int | Sequence[int] | np.random.Generator | np.random.RandomState | None
+
+
+def seed_number(random_seed: object, name: str = "random_seed") -> int:
+    """Return a seed as an integer, of all that PyMC takes for one.
+
+    An integer is itself. A generator is asked for its next number, a sequence of integers makes
+    one, and None one that no other call has.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is none of these, or a negative integer.
+    """
+    match random_seed:
+        case None:
+            return int(np.random.SeedSequence().generate_state(1)[0])
+        case np.random.Generator():
+            return int(random_seed.integers(2**32))
+        case np.random.RandomState():
+            return int(random_seed.randint(2**32, dtype=np.uint32))
+        case list() | tuple() | np.ndarray() if np.size(random_seed) > 0:
+            whole = [positive_integer(x, name, minimum=0) for x in np.ravel(random_seed)]
+            return int(np.random.SeedSequence(whole).generate_state(1)[0])
+        case bool() | np.bool():
+            pass
+        case int() | np.integer():
+            return positive_integer(random_seed, name, minimum=0)
+    raise TypeError(
+        f"{name}: got {type(random_seed).__name__} {random_seed!r:.60}, expected an integer >= 0, "
+        "a sequence of them, a numpy.random.Generator or None"
+    )
+
+
+def refuse_single_precision(caller: str, dtype: str) -> None:
+    """Raise if hyperparameters are numbers of single precision."""
+    if dtype not in ("float64", "longdouble"):
+        raise TypeError(
+            f"{caller}: got hyperparameters of {dtype}, expected float64, without which "
+            "differences between populations are lost in rounding; set "
+            'pytensor.config.floatX = "float64" before the model is made, and leave out dtype='
+        )
 
 
 def share(value: object, name: str) -> float:

@@ -16,7 +16,7 @@ import pytensor.tensor as pt
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from prbayes._checks import Floats, positive_integer
+from prbayes._checks import Floats, Seed, positive_integer, seed_number
 from prbayes._progress import shown
 from prbayes._weighted import reached
 from prbayes.estimate.optimum import Optimum, identity_in, require_of_model
@@ -49,7 +49,7 @@ def predict(
     executor: Executor | None = None,
     store: str | PathLike[str] | None = None,
     version: str | None = None,
-    random_seed: int | None = 0,
+    random_seed: Seed = 0,
     progressbar: bool = True,
 ) -> xr.DataArray:
     """Draw responses of the calibrated population.
@@ -91,7 +91,7 @@ def predict(
         A folder that keeps every computed response, by ``name``.
     version : str, optional
         Of the response, for the store; as for `Reweighted`.
-    random_seed : int, optional
+    random_seed : int, sequence of int, numpy.random.Generator or None
     progressbar : bool
         Whether work of more than two seconds shows a bar on stderr.
 
@@ -147,7 +147,8 @@ def predict(
     responses = Responses(
         label, response, sorted_inputs, executor=executor, store=store, version=version
     )
-    rng = np.random.default_rng(random_seed)
+    seed = None if random_seed is None else seed_number(random_seed)
+    rng = np.random.default_rng(seed)
     node = serving(list(nodes(model).values()), responses) if stored else None
     with shown(progressbar):
         if node is None:
@@ -165,7 +166,7 @@ def predict(
             "responses": responses.count,
             "nan": missing,
             "specimens_id": _digest(*drawn.specimens),
-            "random_seed": str(random_seed),
+            "random_seed": str(seed),
             **_calibration(result, model),
             **as_attributes(identity_in(result) or identity_of_model(model)),
             **versions(),

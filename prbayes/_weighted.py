@@ -55,7 +55,8 @@ def cumulated(weights: Any, order: NDArray[np.intp], xp: Any = np) -> Any:
     distribution function. ``xp`` is `numpy` or `pytensor.tensor`.
     """
     total = xp.cumsum(xp.take(weights, order, axis=-1), axis=-1)
-    nothing = xp.zeros_like(total[..., :1])
+    # Of a length that is known, which JAX asks for.
+    nothing = xp.zeros((*total.shape[:-1], 1))
     return xp.concatenate([nothing, total], axis=-1)
 
 

@@ -12,7 +12,9 @@ from prbayes._checks import (
     positive_integer,
     positive_number,
     real_array,
+    refuse_single_precision,
     sample_weights,
+    seed_number,
     share,
     simulated_sample,
 )
@@ -222,3 +224,35 @@ def test_a_share_is_between_zero_and_one() -> None:
     for other in (True, "0.5", None, [0.5]):
         with pytest.raises(TypeError, match=r"level: got .*, expected a number between 0 and 1"):
             share(other, "level")
+
+
+def test_every_seed_that_pymc_takes_becomes_an_integer() -> None:
+    assert seed_number(3) == seed_number(np.int64(3)) == 3
+    assert (
+        seed_number([1, 2])
+        == seed_number((1, 2))
+        == seed_number(np.array([1, 2]))
+        != seed_number([2, 1])
+    )
+    a, b = np.random.default_rng(5), np.random.default_rng(5)
+    first = seed_number(a)
+    assert first == seed_number(b)
+    assert seed_number(a) != first
+    assert seed_number(np.random.RandomState(1)) == seed_number(np.random.RandomState(1))
+    assert seed_number(None) != seed_number(None)
+
+
+@pytest.mark.parametrize("value", [True, -1, 1.5, "1", [], [1, -2], [0.5], np.bool(True), object()])
+def test_what_is_no_seed_is_refused(value: Any) -> None:
+    with pytest.raises(
+        (TypeError, ValueError), match=r"run: random_seed: got .*, expected an integer >= 0"
+    ):
+        seed_number(value, "run: random_seed")
+
+
+def test_single_precision_is_refused() -> None:
+    refuse_single_precision("model", "float64")
+    with pytest.raises(
+        TypeError, match=r"model: got hyperparameters of float32, expected float64.*floatX"
+    ):
+        refuse_single_precision("model", "float32")

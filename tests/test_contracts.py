@@ -18,6 +18,7 @@ import pytensor
 import pytensor.tensor as pt
 import pytest
 from arviz_stats.ecdf_utils import ecdf_pit
+from pymc.distributions.censored import CensoredRV
 from pymc.distributions.distribution import SymbolicRandomVariable
 from pymc.distributions.multivariate import MvNormal
 from pymc.distributions.shape_utils import change_dist_size
@@ -267,6 +268,11 @@ def test_a_multivariate_normal_is_known_by_its_operation() -> None:
     assert isinstance(x.owner.op, type(MvNormal.rv_op))
     mean, covariance = x.owner.op.dist_params(x.owner)
     assert (mean.type.ndim, covariance.type.ndim) == (1, 2)
+
+
+def test_a_censored_distribution_is_known_by_its_operation() -> None:
+    x = pm.Censored.dist(pm.Normal.dist(0.0, 1.0), lower=0.0, upper=None)
+    assert isinstance(x.owner.op, CensoredRV)
 
 
 def test_distributions_are_resized_by_leading_axes() -> None:

@@ -426,7 +426,10 @@ INNER = {
         "pytensor.compile.function",
         "pytensor.tensor.variable.TensorVariable",
     },
-    "propagation.edges": {"pytensor.tensor.variable.TensorVariable"},
+    "propagation.edges": {
+        "pymc.distributions.censored.CensoredRV",
+        "pytensor.tensor.variable.TensorVariable",
+    },
     "propagation.reweighted": {
         "pytensor.gradient.disconnected_grad",
         "pytensor.tensor.variable.TensorVariable",
@@ -459,6 +462,7 @@ INNER = {
         "pymc.distributions.distribution.SymbolicRandomVariable",
         "pytensor.graph.basic.Variable",
         "pytensor.graph.replace.graph_replace",
+        "pytensor.graph.traversal.ancestors",
         "pytensor.graph.traversal.walk",
         "pytensor.tensor.random.op.RandomVariable",
         "pytensor.tensor.variable.TensorVariable",

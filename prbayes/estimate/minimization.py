@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 
-from prbayes._checks import Floats, positive_integer, positive_number
+from prbayes._checks import Floats, Seed, positive_integer, positive_number, real_array, seed_number
 from prbayes._progress import shown
 from prbayes.estimate.caveats import breakdown, caveats, elements_at_edge
 from prbayes.estimate.data_sets import SETS
@@ -92,11 +92,27 @@ def refine(
         if thetas is None:
             find_optimum(evaluator, Minimisation())
         else:
+            wanted = _finite_thetas(thetas, evaluator)
             for _ in range(MAX_ROUNDS):
-                if not refine_at(evaluator, np.asarray(thetas, dtype=np.float64)):
+                if not refine_at(evaluator, wanted):
                     break
-            refuse(shortcomings(evaluator, thetas), evaluator)
+            refuse(shortcomings(evaluator, wanted), evaluator)
     return {name: design.n_points for name, design in evaluator.designs.items()}
+
+
+def _finite_thetas(thetas: object, evaluator: Evaluator) -> Floats:
+    """Return thetas as an array (P, d) of numbers, or raise."""
+    array = real_array(thetas, "refine: thetas")  # type: ignore[arg-type]
+    if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] != evaluator.size:
+        raise ValueError(
+            f"refine: thetas: got shape {array.shape}, expected (P, {evaluator.size}), one row for "
+            f"each population, of {', '.join(evaluator.names)}"
+        )
+    if not np.isfinite(array).all():
+        raise ValueError(
+            "refine: thetas: got NaN or infinity, expected finite numbers; leave such rows out"
+        )
+    return array
 
 
 # Points of the prior from which other optima are searched for where a theta costs no response; the
@@ -124,7 +140,7 @@ def minimize(
     max_evaluations: int = 5000,
     refine: bool = True,
     starts: int | None = None,
-    random_seed: int = 0,
+    random_seed: Seed = 0,
     progressbar: bool = True,
 ) -> Optimum:
     """Find the hyperparameters with the smallest discrepancy, inside the support of their priors.
@@ -168,7 +184,7 @@ def minimize(
         Number of Sobol points of the prior from which other optima, such as mirror solutions, are
         searched for, all at once; 0 for none. By default 32 where a theta costs no response
         (`Reweighted`), and else none.
-    random_seed : int
+    random_seed : int, sequence of int, numpy.random.Generator or None
         Seed of the starting points.
     progressbar : bool
         Whether work of more than two seconds shows a bar on stderr.
@@ -211,7 +227,7 @@ def minimize(
         max_evaluations=positive_integer(max_evaluations, "max_evaluations"),
         refine=refine,
         starts=starts,
-        random_seed=random_seed,
+        random_seed=seed_number(random_seed),
     )
     with shown(progressbar):
         return find_optimum(evaluator, asked)

@@ -207,6 +207,8 @@ class SamplingDistribution:
 
         r = self.stderr.size
         start = np.zeros((objective.n_sets, r))
+        if r == 0:  # the data tell nothing: there is no direction to go
+            return start, np.ones(len(start), dtype=bool)
         if measured_by_refits(self.evaluator):
             # In standard errors; the second one starts where the first has ended.
             x, _, converged = descend_by_simplex(value, start, sizes=(1.0, -0.5))

@@ -13,7 +13,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
+from prbayes._checks import AT_ONCE, Floats
 from prbayes.metrics._loops import SPLINE, count, read, smooth
 
 
@@ -47,12 +47,22 @@ class Cells(ABC):
         """Return A, shape (n, m), with ``density(sample, w) == w @ A``."""
         return self.density(sample[:, None], np.ones(1))
 
-    @abstractmethod
     def reading(self, points: Floats, weights: Floats) -> Floats:
         """Return r such that ``r @ g`` is the weighted mean at points of g, given on the cells.
 
         Shapes (n,), (..., n) -> (..., m).
         """
+        # A matrix of points by cells is held for some points at a time.
+        some = max(1, AT_ONCE // self.widths.size)
+        total = self._reading(points[:some], weights[..., :some])
+        for first in range(some, points.size, some):
+            part = slice(first, first + some)
+            total = total + self._reading(points[part], weights[..., part])
+        return total
+
+    @abstractmethod
+    def _reading(self, points: Floats, weights: Floats) -> Floats:
+        """Return the same for some of the points."""
 
     @abstractmethod
     def value(self, sample: Floats, cotangent: Floats) -> Floats:
@@ -111,7 +121,7 @@ class KernelCells(Cells):
         smooth(rows, self.kernel, out)
         return out.reshape(values.shape)
 
-    def reading(self, points: Floats, weights: Floats) -> Floats:
+    def _reading(self, points: Floats, weights: Floats) -> Floats:
         """Return cubic convolution weights (Keys 1981), which are exact for parabolas."""
         # Where the points are: a node, and a fraction of a step beyond it.
         t = points / self.step - self._low
@@ -218,7 +228,7 @@ class BinCells(Cells):
         without_nan = counts[..., :-1]
         return cast(Floats, without_nan / self.widths[0])
 
-    def reading(self, points: Floats, weights: Floats) -> Floats:
+    def _reading(self, points: Floats, weights: Floats) -> Floats:
         """Return the weight of the points in each bin."""
         density = weights @ self.basis(points)
         return np.asarray(density * self.widths)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -62,6 +62,8 @@ class Evaluator:
         self.nodes: list[Node] = list(found.values())
         self._variables = list(found)
         self.hyperparameters = Hyperparameters(model)
+        # Compiled, by what they were asked for; they live as long as this evaluator.
+        self._objectives: dict[tuple[bool, bool], Any] = {}
         names = self.hyperparameters
         self.size = names.size
         self.initial = names.initial
@@ -178,7 +180,6 @@ class Evaluator:
             if bound.symbolic:
                 bound.responses.count += bound.n_per_theta * thetas
 
-    @cache  # noqa: B019 (lives as long as the evaluator)
     def objective(self, *, prior: bool, gradient: bool) -> Any:
         """Compile the objective as a function of theta and scales.
 
@@ -192,6 +193,12 @@ class Evaluator:
         NotImplementedError, TypeError
             If a gradient is asked for and there is none.
         """
+        asked = (prior, gradient)
+        if asked not in self._objectives:
+            self._objectives[asked] = self._objective(prior=prior, gradient=gradient)
+        return self._objectives[asked]
+
+    def _objective(self, *, prior: bool, gradient: bool) -> Any:
         scales = pt.dvector("scales")
         scaled = sum(graph / scales[k] for k, graph in enumerate(self._graphs()))
         total = scaled - self._log_other()
@@ -278,6 +285,13 @@ class Evaluator:
             design = node.design
             if design is None:
                 continue
-            roots = self.roots(thetas, k)
-            found[node.name] = design.support(roots)
+            # Some populations at a time: their weights are held at all points.
+            step = max(1, AT_ONCE // design.n_points)
+            parts = []
+            for first in range(0, max(1, len(thetas)), step):
+                roots = self.roots(thetas[first : first + step], k)
+                parts.append(design.support(roots))
+            found[node.name] = {
+                key: np.concatenate([part[key] for part in parts]) for key in parts[0]
+            }
         return found

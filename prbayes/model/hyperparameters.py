@@ -15,7 +15,7 @@ import pytensor.tensor as pt
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.replace import graph_replace, vectorize_graph
 
-from prbayes._checks import Floats, real_array
+from prbayes._checks import Floats, real_array, refuse_single_precision
 from prbayes.model.elements import element_names
 from prbayes.propagation.points import sobol
 from prbayes.response.compilation import compiled, ninf_for_invalid
@@ -58,6 +58,8 @@ class Hyperparameters:
                 f"model: got discrete hyperparameters {discrete}, expected continuous ones; "
                 "use pm.sample, or fix them"
             )
+        for v in model.value_vars:
+            refuse_single_precision(f"model: {v.name}", v.dtype)
         self._point = model.initial_point(random_seed=0)
         values = [self._point[v.name] for v in model.value_vars]
         names = [str(v.name) for v in model.value_vars]

@@ -279,7 +279,10 @@ def required_nodes(model: pm.Model) -> dict[Any, Node]:
 
 
 def model_on_context(model: pm.Model | None, caller: str) -> pm.Model:
-    """Return the model given, or the one on the context, or raise."""
+    """Return the model given, or the one on the context, or raise.
+
+    Within another model, the outermost: that has the variables of all.
+    """
     found = pm.Model.get_context(error_if_none=False) if model is None else model
     if not isinstance(found, pm.Model):
         got = "no model on the context" if found is None else type(found).__name__
@@ -287,4 +290,4 @@ def model_on_context(model: pm.Model | None, caller: str) -> pm.Model:
             f"{caller}: got {got}, expected a pm.Model; "
             "call it inside `with pm.Model():` or pass model="
         )
-    return found
+    return found.root

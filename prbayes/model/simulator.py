@@ -6,10 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pymc as pm
 from numpy.typing import ArrayLike, NDArray
+from pytensor import config
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import observed_sample, positive_number
+from prbayes._checks import observed_sample, positive_number, refuse_single_precision
 from prbayes._progress import shown
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.node import Node, SimulatorDistribution, model_on_context, shared_epsilon
@@ -93,7 +95,11 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     >>> y.name
     'y'
     """
-    model = model_on_context(None, f"prb.Simulator({name!r}, ...)")
+    caller = f"prb.Simulator({name!r}, ...)"
+    refuse_single_precision(caller, config.floatX)
+    model = model_on_context(None, caller)
+    # A model within another one puts its own name before those of its variables.
+    name = pm.modelcontext(None).name_for(name)
     target = _target(name, metric, observed, weights)
     propagation = Reweighted() if propagation is None else propagation
     if not isinstance(propagation, Propagation):

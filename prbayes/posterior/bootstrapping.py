@@ -6,7 +6,7 @@ import time
 
 import xarray as xr
 
-from prbayes._checks import positive_integer
+from prbayes._checks import Seed, positive_integer, seed_number
 from prbayes._progress import shown
 from prbayes.estimate.data_sets import reweighted_sets, simulated_sets
 from prbayes.estimate.identifiability import unidentified_directions
@@ -19,7 +19,7 @@ def bootstrap(
     draws: int = 1000,
     *,
     parametric: bool = False,
-    random_seed: int = 0,
+    random_seed: Seed = 0,
     progressbar: bool = True,
 ) -> xr.DataTree:
     """Minimise the discrepancy once for each of many data sets that resemble the observed one.
@@ -39,7 +39,7 @@ def bootstrap(
         From `minimize`, without the prior.
     draws : int
     parametric : bool
-    random_seed : int
+    random_seed : int, sequence of int, numpy.random.Generator or None
     progressbar : bool
         Whether work of more than two seconds shows a bar on stderr.
 
@@ -77,6 +77,7 @@ def bootstrap(
     clock = time.perf_counter()
     evaluator = require_refits(optimum, "bootstrap", "; use prb.sample_smc").evaluator
     positive_integer(draws, "draws", minimum=2)
+    seed = seed_number(random_seed)
     sampling = optimum.sampling()
     unidentified = unidentified_directions(sampling.local.unidentified, evaluator.readable_names)
     if unidentified:
@@ -86,9 +87,9 @@ def bootstrap(
             "falls back on the prior there, or fix a hyperparameter"
         )
     if parametric:
-        data = simulated_sets(evaluator, optimum.theta, draws, random_seed)
+        data = simulated_sets(evaluator, optimum.theta, draws, seed)
     else:
-        data = reweighted_sets(evaluator, draws, random_seed)
+        data = reweighted_sets(evaluator, draws, seed)
     with shown(progressbar):
         x, converged = sampling.refit(data)
     return bootstrap_tree(
@@ -96,7 +97,7 @@ def bootstrap(
         sampling.thetas(x)[None],
         sampler="parametric bootstrap" if parametric else "loss-likelihood bootstrap",
         converged=float(converged.mean()),
-        seed=random_seed,
+        seed=seed,
         n_responses=optimum.n_responses,
         seconds=time.perf_counter() - clock,
     )

@@ -17,7 +17,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats, positive_integer
+from prbayes._checks import Floats, Seed, positive_integer, seed_number
 from prbayes._progress import progress, shown
 from prbayes.estimate.data_sets import fresh_data
 from prbayes.model.evaluator import Evaluator
@@ -39,7 +39,7 @@ def simulation_based_calibration(
     draws: int = 500,
     adjust: Affine | bool = True,
     executor: Executor | None = None,
-    random_seed: int = 0,
+    random_seed: Seed = 0,
     progressbar: bool = True,
 ) -> xr.DataTree:
     """Calibrate many data sets with known hyperparameters, and rank these among the draws.
@@ -62,7 +62,7 @@ def simulation_based_calibration(
         As in `sample_smc`.
     executor : concurrent.futures.Executor, optional
         Where data sets are analysed, ten at a time; the model is sent with cloudpickle.
-    random_seed : int
+    random_seed : int, sequence of int, numpy.random.Generator or None
         The result does not depend on the executor.
     progressbar : bool
 
@@ -106,6 +106,7 @@ def simulation_based_calibration(
     model = model_on_context(model, "prb.simulation_based_calibration")
     positive_integer(n, "n", minimum=2)
     positive_integer(draws, "draws", minimum=10)
+    seed = seed_number(random_seed)
     evaluator = Evaluator(model)
     if evaluator.has_other_terms:
         raise ValueError(
@@ -116,7 +117,7 @@ def simulation_based_calibration(
     jobs = []
     for start in starts:
         numbers = range(start, min(start + _CHUNK, n))
-        jobs.append(_Job(numbers, draws, adjust, random_seed))
+        jobs.append(_Job(numbers, draws, adjust, seed))
     with shown(progressbar), progress("data sets", n) as report:
         if executor is None:
             parts = [_analyse(evaluator, job, lambda: report(1, "")) for job in jobs]
@@ -135,7 +136,7 @@ def simulation_based_calibration(
             f"first: {failed[0]}"
         )
     return calibration_tree(
-        evaluator, good, failed=len(failed), draws=draws, adjust=adjust, seed=random_seed
+        evaluator, good, failed=len(failed), draws=draws, adjust=adjust, seed=seed
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats, positive_integer
+from prbayes._checks import Floats, Seed, positive_integer, seed_number
 from prbayes._progress import shown
 from prbayes.estimate.minimization import Minimisation, find_optimum
 from prbayes.estimate.obstacles import refit_obstacle
@@ -46,7 +46,7 @@ def sample_smc(
     threshold: float = 0.5,
     refine: bool = True,
     checkpoint: str | PathLike[str] | None = None,
-    random_seed: int | None = 0,
+    random_seed: Seed = 0,
     progressbar: bool = True,
 ) -> xr.DataTree:
     """Draw from the pseudo-posterior by sequential Monte Carlo.
@@ -77,7 +77,7 @@ def sample_smc(
         A file that keeps the state after every stage: a run that was killed goes on from there when
         it is called again, and gives the same draws. Give the propagations a ``store`` as well, so
         that the search for the optimum computes nothing again.
-    random_seed : int, optional
+    random_seed : int, sequence of int, numpy.random.Generator or None
     progressbar : bool
 
     Returns
@@ -137,7 +137,7 @@ def sample_smc(
         threshold=threshold,
         refine=refine,
         checkpoint=checkpoint,
-        random_seed=random_seed,
+        random_seed=None if random_seed is None else seed_number(random_seed),
         progressbar=progressbar,
     )
     evaluator = _evaluator(model, optimum)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
+from pymc.distributions.censored import CensoredRV
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats
@@ -77,6 +78,7 @@ def moving_inputs(
         always = at_each.all(axis=0)
         if np.any(sometimes & ~always):
             _require_distribution_function(name, dist)
+            _refuse_atoms(name, dist)
             moving.append(i)
     return tuple(moving)
 
@@ -97,6 +99,16 @@ def _require_distribution_function(name: str, dist: TensorVariable) -> None:
             "responses jump where an edge passes them; use propagation=prb.Resimulated() or "
             "prb.Fresh()"
         ) from None
+
+
+def _refuse_atoms(name: str, dist: TensorVariable) -> None:
+    """Refuse bounds that have probability themselves, and move."""
+    if isinstance(dist.owner.op, CensoredRV):
+        raise TypeError(
+            f"{name}: got {dist.owner.op} with bounds that move with its hyperparameters and have "
+            "probability themselves, which no stored point has at other hyperparameters, expected "
+            "bounds that stay; use propagation=prb.Resimulated() or prb.Fresh()"
+        )
 
 
 def cells_around(points: Floats, reach: int) -> Cells:

@@ -280,14 +280,14 @@ class Design(Bound):
         """
         if responses.same_as(self.responses):
             return self.values
-        known = np.empty(0)
-        for other, values in self._others:
-            if responses.same_as(other):
-                known = values
-                break
+        before = [pair for pair in self._others if responses.same_as(pair[0])]
+        known = before[0][1] if before else np.empty(0)
         if known.size < self.n_points:
             missing = [p[known.size :] for p in self.points_of(responses.inputs)]
             known = np.concatenate([known, responses(missing, [])])
+            # Instead of the fewer that were known before.
+            if before:
+                self._others.remove(before[0])
             self._others.append((responses, known))
         return known
 
@@ -378,11 +378,18 @@ class Design(Bound):
         # that is fine enough for any design.
         n_draft = min(16 * n, 1 << 18)
         (draft,), counts = self._place(components, n_draft, seed)
-        grid = np.unique(draft[np.isfinite(draft)])
-        log_g, _ = self._log_mixture(components, counts, [grid], summed=False)
         shift = np.random.default_rng(seed).uniform()
+        finite = draft[np.isfinite(draft)]
+        grid, repeated = np.unique(finite, return_counts=True)
         levels = (np.arange(n) + shift) / n
-        points = _inverted(levels, grid, np.exp(log_g))
+        log_g, _ = self._log_mixture(components, counts, [grid], summed=False)
+        # Values that have probability themselves, such as the bounds of a censored input, are there
+        # more often than two design points stand for, and their density is finite.
+        if np.any((repeated > 2 * n_draft / n) & np.isfinite(log_g)):
+            places = (levels * finite.size).astype(int)
+            points = np.sort(finite)[places]
+        else:
+            points = _inverted(levels, grid, np.exp(log_g))
         return [points], counts * (n / counts.sum())
 
     def _off_the_edges(
@@ -454,6 +461,8 @@ class Design(Bound):
             yield
         finally:
             self._stored = stored
+            kept = [(responses, known[: self.n_points]) for responses, known in self._others]
+            self._others = deque(kept, maxlen=self._others.maxlen)
             self._basis = (None, 0, None)
             self._share(shared)
 

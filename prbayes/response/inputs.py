@@ -12,7 +12,7 @@ import pymc as pm
 import pytensor.tensor as pt
 from pytensor.graph.basic import Variable
 from pytensor.graph.replace import graph_replace
-from pytensor.graph.traversal import walk
+from pytensor.graph.traversal import ancestors, walk
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
@@ -90,7 +90,7 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
     arguments: list[Any] = []
     aleatory: list[TensorVariable] = []
     roots: dict[TensorVariable, None] = {}
-    nested = False
+    within: list[set[Variable]] = []  # of each aleatory input, what it is made of besides itself
     for i, x in enumerate(inputs):
         label = f"{name}: input {i + 1}"
         if not isinstance(x, Variable):
@@ -108,12 +108,27 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
                 f"{label}: got an expression of a `.dist()` ({x}), expected the `.dist()` itself; "
                 "write the expression inside the response"
             )
-        nested = nested or len(latent) > 1
         if x not in aleatory:
             aleatory.append(x)
+            within.append(set(latent) - {x})
         arguments.append(aleatory.index(x))
     _refuse_too_little(name, len(inputs), bool(aleatory), bool(roots))
+    nested = any(
+        parts and not _marginal(x, parts) for x, parts in zip(aleatory, within, strict=True)
+    )
     return Inputs(tuple(arguments), tuple(aleatory), tuple(roots), nested)
+
+
+def _marginal(x: TensorVariable, parts: set[Variable]) -> bool:
+    """Return whether PyMC knows the density of an input without a value of its parts.
+
+    As of a mixture, which has copies of what it is made of.
+    """
+    try:
+        density = pm.logp(x, pt.zeros_like(x), warn_rvs=False)
+    except (NotImplementedError, TypeError, ValueError):
+        return False
+    return not parts & set(ancestors([density], blockers=[x]))
 
 
 def _refuse_too_little(name: str, n: int, aleatory: bool, roots: bool) -> None:

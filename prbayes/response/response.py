@@ -86,7 +86,7 @@ class Responses:
         on_failure: OnFailure | None = None,
     ) -> None:
         refuse_uncallable(name, function)
-        policy = on_failure or Abort()
+        policy = Abort() if on_failure is None else on_failure
         kept = None if store is None else Store(store, name, _columns(inputs), version=version)
         self.name = name
         self.function = function

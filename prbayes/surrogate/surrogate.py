@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from prbayes._checks import Floats, positive_integer, share
+from prbayes._checks import Floats, Seed, positive_integer, seed_number, share
 from prbayes._progress import shown
 from prbayes.propagation.points import sobol
 from prbayes.response.calling import Calling, Points, ResponseError, Tally, respond
@@ -105,7 +105,7 @@ class Surrogate:
         store: str | PathLike[str] | None = None,
         version: str | None = None,
         on_failure: OnFailure | None = None,
-        random_seed: int = 0,
+        random_seed: Seed = 0,
         progressbar: bool = True,
     ) -> Surrogate:
         """Compute the response on a scrambled Sobol design, and fit a surface.
@@ -135,7 +135,7 @@ class Surrogate:
         executor, store, version, on_failure
             As for `Reweighted`. A point that fails in the end is left out of the fit; the surrogate
             then fails where that is the nearest point.
-        random_seed : int
+        random_seed : int, sequence of int, numpy.random.Generator or None
         progressbar : bool
             Whether work of more than two seconds shows a bar on stderr.
 
@@ -156,20 +156,21 @@ class Surrogate:
         ...     data = [0.5, 1.0, 4.0]
         ...     y = prb.Simulator("y", surrogate, x, metric=prb.AreaMetric(), observed=data)
         """
-        model = model or RadialBasis()
-        outside = outside or Replace()
+        model = RadialBasis() if model is None else model
+        outside = Replace() if outside is None else outside
         _refuse_wrong(name, response, model, outside, store)
         share(coverage, f"{name}: coverage")
-        positive_integer(random_seed, f"{name}: random_seed", minimum=0)
+        seed = seed_number(random_seed, f"{name}: random_seed")
         refuse_version(version)
-        domain, predictive = read_ranges(name, inputs, coverage, random_seed)
+        domain, predictive = read_ranges(name, inputs, coverage, seed)
         needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=needed)
 
         # Compute the responses.
-        points = domain.at(sobol(n, domain.dimensions, random_seed))
+        points = domain.at(sobol(n, domain.dimensions, seed))
         kept = None if store is None else Store(store, name, points.shape[1], version=version)
-        calling = Calling(name, response, executor, kept, on_failure or Abort())
+        policy = Abort() if on_failure is None else on_failure
+        calling = Calling(name, response, executor, kept, policy)
         varying = [not one.constant for one in domain.inputs]
         tally = Tally()
         with shown(progressbar):
@@ -183,7 +184,7 @@ class Surrogate:
         # Tell the error.
         unit = domain.scaled(points)
         residuals = np.full(n, np.nan)
-        residuals[good] = cross_validated(model, unit[good], responses[good], random_seed)
+        residuals[good] = cross_validated(model, unit[good], responses[good], seed)
         error = CrossValidation(residuals, float(responses[good].std()))
 
         # Fit the surface; only then is the spread over the prior predictive distribution known.
@@ -255,7 +256,7 @@ class Surrogate:
         rms = np.sqrt((near**2).mean(axis=1))
         return np.asarray(rms.reshape(batch))
 
-    def with_error(self, random_seed: int = 0) -> Surrogate:
+    def with_error(self, random_seed: Seed = 0) -> Surrogate:
         """Return the surrogate with its own error added.
 
         That is a cross-validation residual from nearby, with either sign. Which one is chosen as if
@@ -267,7 +268,7 @@ class Surrogate:
 
         Parameters
         ----------
-        random_seed : int
+        random_seed : int, sequence of int, numpy.random.Generator or None
 
         Examples
         --------
@@ -276,7 +277,7 @@ class Surrogate:
         >>> bool(surrogate(1.0) == surrogate(1.0))
         True
         """
-        noise = positive_integer(random_seed, "with_error: random_seed", minimum=0)
+        noise = seed_number(random_seed, "with_error: random_seed")
         return replace(self, noise=noise)
 
     def save(self, path: str | PathLike[str]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats, positive_integer, real_array
+from prbayes._checks import Floats, Seed, real_array, seed_number
 from prbayes._predict import specimen_names
 from prbayes.model.identity import Identity, Level, from_attributes, require_together
 from prbayes.validation.predictive import Predictive
@@ -99,7 +99,7 @@ def read_case(
     *,
     folded: bool = False,
     randomize: bool = False,
-    random_seed: int | None = 0,
+    random_seed: Seed = 0,
 ) -> Case:
     """Return the conditions, checked; arguments are those of `area_test`.
 
@@ -108,8 +108,7 @@ def read_case(
     TypeError, ValueError
         If an argument is not as described there.
     """
-    if random_seed is not None:
-        positive_integer(random_seed, "random_seed", minimum=0)
+    seed = None if random_seed is None else seed_number(random_seed)
     numbers: dict[object, int] = {}
     conditions = []
     for name, measured, simulated, labels in _by_condition(observed, predicted, specimens):
@@ -136,7 +135,7 @@ def read_case(
         n_specimens=len(numbers),
         shared=distinct > len(numbers),
         randomize=randomize,
-        random_seed=random_seed,
+        random_seed=seed,
         folded=folded,
         identity=identity,
     )

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats, positive_integer
+from prbayes._checks import Floats, Seed, positive_integer, seed_number
 from prbayes._progress import shown
 from prbayes.estimate.data_sets import DataSets, specimens
 from prbayes.estimate.optimum import Optimum, require_refits
@@ -19,7 +19,7 @@ from prbayes.model.node import Node
 
 
 def cross_validate(
-    optimum: Optimum, *, folds: int = 5, random_seed: int = 0, progressbar: bool = True
+    optimum: Optimum, *, folds: int = 5, random_seed: Seed = 0, progressbar: bool = True
 ) -> xr.Dataset:
     """Calibrate on parts of the specimens, and return the discrepancy of those left out.
 
@@ -35,7 +35,7 @@ def cross_validate(
         From `minimize`, without the prior.
     folds : int
         Number of parts; specimens are dealt out at random, those with the same label together.
-    random_seed : int
+    random_seed : int, sequence of int, numpy.random.Generator or None
         Models with as many specimens have the same folds with the same seed.
     progressbar : bool
         Whether work of more than two seconds shows a bar on stderr.
@@ -73,7 +73,8 @@ def cross_validate(
     advice = ", so that the model cannot be calibrated anew"
     evaluator = require_refits(optimum, "cross_validate", advice).evaluator
     folds = positive_integer(folds, "folds", minimum=2)
-    parts = _Folds.dealt(evaluator.nodes, folds, random_seed)
+    seed = seed_number(random_seed)
+    parts = _Folds.dealt(evaluator.nodes, folds, seed)
 
     # Calibrate on the others of each fold.
     observed = [node.target.observed for node in evaluator.nodes]
@@ -98,7 +99,7 @@ def cross_validate(
             "fold": np.arange(folds),
             "simulator": [node.name for node in evaluator.nodes],
         },
-        attrs={"random_seed": str(random_seed), **versions()},
+        attrs={"random_seed": str(seed), **versions()},
     )
 
 

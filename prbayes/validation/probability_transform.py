@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from numpy.typing import ArrayLike
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, Seed
 from prbayes.validation.conditions import Predicted, read_case
 
 
@@ -15,7 +15,7 @@ def u_values(
     predicted: Predicted | Mapping[str, Predicted] | Sequence[Predicted],
     *,
     randomize: bool = False,
-    random_seed: int | None = 0,
+    random_seed: Seed = 0,
 ) -> Floats:
     r"""Return where measured responses stand in the pooled predictive distribution.
 
@@ -34,7 +34,7 @@ def u_values(
     randomize : bool
         Whether u is uniform between P(Y < y) and P(Y <= y), and not the middle: then u-values of
         ties, such as failed specimens or discrete responses, are uniform too if the model is right.
-    random_seed : int, optional
+    random_seed : int, sequence of int, numpy.random.Generator or None
         Of that choice.
 
     Returns

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from prbayes._checks import Floats, share
+from prbayes._checks import Floats, Seed, share
 from prbayes._predict import data_digest
 from prbayes._progress import shown
 from prbayes.model.identity import Identity, as_attributes
@@ -115,7 +115,7 @@ def area_test(
     | None = None,
     folded: bool = False,
     randomize: bool = False,
-    random_seed: int | None = 0,
+    random_seed: Seed = 0,
     progressbar: bool = True,
 ) -> ValidityTest:
     r"""Test whether measured responses may come from the calibrated population.

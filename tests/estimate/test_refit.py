@@ -186,3 +186,25 @@ def test_a_minimiser_goes_where_its_data_go() -> None:
 def test_a_simulator_without_a_design_has_no_design_error() -> None:
     sampling = neighbourhood("pr", design=False)
     assert np.isnan(sampling.design_error())
+
+
+def test_data_that_tell_nothing_leave_nothing_to_refit() -> None:
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 1, 0.001)  # far better known before than after
+        x = pm.Normal.dist(mu, 1.0)
+        prb.Simulator(
+            "y",
+            lambda x, z: x + z,
+            x,
+            pm.Normal.dist(0, 1),
+            metric=prb.AreaMetric(),
+            observed=OBSERVED,
+        )
+    optimum = prb.minimize(model)
+    distribution = SamplingDistribution.of(optimum.evaluator, optimum.theta, np.ones(1))
+    assert distribution.stderr.size == 0
+    sets = reweighted_sets(optimum.evaluator, 5, seed=0)
+    minimisers, converged = distribution.refit(sets)
+    assert minimisers.shape == (5, 0)
+    assert converged.all()
+    assert distribution.design_error() == 0

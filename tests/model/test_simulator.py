@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import numpy as np
 import pymc as pm
 import pytest
 from line_problem import EPSILON, MU, POINTS, QUIET, SIGMA, N, build, line
+from pytensor import config
 from scipy import stats
 
 import prbayes as prb
@@ -331,3 +333,62 @@ def test_the_posterior_is_that_of_sample_smc(sampler: str, metric: prb.Metric) -
         # Means of several hundred effective draws each: a standard error of .05 sd; sds to 4%.
         assert abs(float(nuts.posterior[name].mean() - smc.posterior[name].mean())) < 0.25 * sd
         np.testing.assert_allclose(nuts.posterior[name].std(), sd, rtol=0.2)
+
+
+@pytest.mark.parametrize("propagation", [prb.Reweighted(64), prb.Resimulated(64)])
+def test_simulators_of_submodels_have_names_and_variables_of_their_own(propagation: Any) -> None:
+    observed = np.linspace(0, 2, 20)
+    with pm.Model() as parent:
+        mu, sigma = pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1)
+        for name, scale in (("one", 1.0), ("two", 2.0)):
+            with pm.Model(name=name) as child:
+                own = pm.Normal.dist(mu, sigma)
+                prb.Simulator(
+                    "y",
+                    lambda x, scale=scale: scale * x,
+                    own,
+                    metric=prb.AreaMetric(),
+                    observed=scale * observed,
+                    propagation=propagation,
+                )
+    optimum = prb.minimize(parent)
+    assert list(optimum.discrepancies) == ["one::y", "two::y"]
+    assert optimum.point["mu"] == pytest.approx(1, abs=0.05)
+    # Within a submodel the whole is meant.
+    with child:
+        assert prb.minimize().point == pytest.approx(optimum.point, abs=0.01)
+
+
+def test_single_precision_is_refused_before_the_response_is_computed() -> None:
+    with config.change_flags(floatX="float32"), pm.Model():
+        x = pm.Normal.dist(pm.Normal("mu"), 1.0)
+        with pytest.raises(TypeError, match=r"got hyperparameters of float32, expected float64"):
+            prb.Simulator("y", lambda x: 1 / 0, x, metric=prb.AreaMetric(), observed=[1.0, 2.0])
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", dtype="float32"), 1.0)
+        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=[1.0, 2.0])
+    with pytest.raises(TypeError, match=r"model: mu: got hyperparameters of float32"):
+        prb.minimize(model)
+
+
+@pytest.mark.parametrize(
+    "metric", [prb.AreaMetric(), prb.ProbabilityResidual(), prb.LogLikelihood()]
+)
+def test_a_reweighted_log_density_is_the_same_compiled_by_jax(metric: prb.Metric) -> None:
+    pytest.importorskip("jax")
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
+        prb.Simulator(
+            "y",
+            np.positive,
+            x,
+            metric=metric,
+            observed=np.linspace(0, 2, 9),
+            epsilon=0.1,
+            propagation=prb.Reweighted(64),
+        )
+    point = model.initial_point()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = model.compile_logp(mode="JAX")(point)
+    assert float(found) == pytest.approx(float(model.compile_logp(mode=PLAIN)(point)), rel=1e-10)

@@ -19,6 +19,8 @@ from prbayes.model.node import nodes
 from prbayes.model.support import shortcomings
 from prbayes.propagation.reweighted import Design
 from prbayes.response.distributions import PopulationSampler
+from prbayes.response.inputs import read_inputs
+from prbayes.response.response import Responses
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 KL, PR, AREA = prb.KullbackLeibler(), prb.ProbabilityResidual(), prb.AreaMetric()
@@ -621,3 +623,69 @@ def test_a_log_likelihood_of_few_resimulated_responses_is_warned_of(
     assert 0.88 < error(likelihood, prb.Resimulated(16_384)) / right < 1.05
     assert error(prb.KullbackLeibler(), prb.Resimulated(1024)) > 0.9 * right
     assert not caplog.records
+
+
+def test_another_response_is_computed_at_the_new_points_only() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", same, x, metric=AREA, observed=OBSERVED, propagation=prb.Reweighted(64))
+    asked: list[int] = []
+
+    def later(x: Any) -> Any:
+        asked.append(np.size(x))
+        return 2 * x
+
+    (design,) = Evaluator(model).designs.values()
+    inputs = read_inputs("later", [x], model)
+    for batches in range(1, 4):
+        # A new description of the same response, as each call of predict makes one.
+        found = design.values_of(Responses("later", later, inputs))
+        assert np.array_equal(found, 2 * design.values)
+        assert asked == [64] * batches
+        design.add([np.array([1.0, 2.0]), np.array([0.5, 0.5])])
+    # Points that are forgotten take their responses with them.
+    with design.undone():
+        design.add([np.array([1.0, 2.0]), np.array([0.5, 0.5])])
+        design.values_of(Responses("later", later, inputs))
+    assert np.array_equal(design.values_of(Responses("later", later, inputs)), 2 * design.values)
+
+
+def test_a_value_with_probability_itself_has_its_share_of_points_and_weight() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
+        censored = pm.Censored.dist(x, lower=0.0, upper=None)
+        prb.Simulator(
+            "y", same, censored, metric=AREA, observed=OBSERVED, propagation=prb.Reweighted(512)
+        )
+    evaluator = Evaluator(model)
+    mu = np.array([[0.5], [1.5]])
+    values, weights = evaluator.populations(mu, 0)
+    at_the_bound = (weights * (values == 0)).sum(axis=-1)
+    assert at_the_bound == pytest.approx(norm.cdf(-mu[:, 0]), abs=0.01)
+    below_one = (weights * (values <= 1)).sum(axis=-1)
+    assert below_one == pytest.approx(norm.cdf(1 - mu[:, 0]), abs=0.01)
+
+
+def test_a_mixture_is_reweighted() -> None:
+    shares = np.array([0.3, 0.7])
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 1, 1)
+        mixture = pm.Mixture.dist(shares, [pm.Normal.dist(mu, 1.0), pm.Normal.dist(5.0, 0.5)])
+        prb.Simulator(
+            "y", same, mixture, metric=AREA, observed=OBSERVED, propagation=prb.Reweighted(512)
+        )
+    values, weights = Evaluator(model).populations(np.array([[0.5], [1.5]]), 0)
+    for mu, w in zip((0.5, 1.5), weights, strict=True):
+        for at in (0.0, 1.0, 3.0, 5.0):
+            expected = 0.3 * norm.cdf(at, mu, 1.0) + 0.7 * norm.cdf(at, 5.0, 0.5)
+            assert w[values[0] <= at].sum() == pytest.approx(expected, abs=0.02)
+
+
+def test_bounds_that_have_probability_and_move_are_refused() -> None:
+    with pm.Model():
+        s = pm.HalfNormal("s", 1)
+        x = pm.Censored.dist(pm.Normal.dist(0.0, 1.0), lower=-s, upper=s)
+        with pytest.raises(
+            TypeError, match=r"bounds that move .* use propagation=prb.Resimulated\(\)"
+        ):
+            prb.Simulator("y", same, x, metric=AREA, observed=OBSERVED)

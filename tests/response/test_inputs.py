@@ -140,3 +140,13 @@ def test_bad_inputs_are_refused(case: str) -> None:
 def test_inputs_that_are_too_little_are_refused(make: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         read(make)
+
+
+def test_a_mixture_is_one_input() -> None:
+    with pm.Model() as model:
+        mu = pm.Normal("mu")
+        part, other = pm.Normal.dist(mu, 1.0), pm.Normal.dist(3.0, 1.0)
+        mixture = pm.Mixture.dist(np.array([0.3, 0.7]), [part, other])
+        censored = pm.Censored.dist(pm.Normal.dist(mu, 1.0), lower=0.0, upper=None)
+        assert not read_inputs("y", [mixture, censored], model).nested
+        assert read_inputs("y", [mixture, pm.Normal.dist(part, 1.0)], model).nested

@@ -192,3 +192,10 @@ def test_a_surrogate_survives_plain_pickle(surface: Any) -> None:
     x, y = np.random.default_rng(1).uniform((0, 1), (3, 2), (20, 2)).T
     np.testing.assert_array_equal(back(x, y), fitted(x, y))
     np.testing.assert_array_equal(back.local_error(x, y), fitted.local_error(x, y))
+
+
+def test_a_model_whose_length_is_unknown_before_it_is_fitted_is_taken() -> None:
+    ensemble = pytest.importorskip("sklearn.ensemble")
+    forest = ensemble.RandomForestRegressor(n_estimators=5, random_state=0)
+    found = prb.Surrogate.fit(bent, BOX, 64, model=forest)
+    assert found(1.5, 1.5) == pytest.approx(bent(1.5, 1.5), abs=0.3)

@@ -1,0 +1,134 @@
+"""Memory: what is made for one call is gone after it, and work in parts holds one part at a time."""
+
+from __future__ import annotations
+
+import gc
+import os
+import subprocess
+import sys
+import tracemalloc
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+from line_problem import OBSERVED, line
+
+import prbayes as prb
+from prbayes.model.evaluator import Evaluator
+
+MIB = 1 << 20
+GROWTH = """
+import gc, os, sys
+import test_memory
+
+def resident():
+    gc.collect()
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGESIZE") / 2**20
+
+call = getattr(test_memory, sys.argv[1])
+for _ in range(5):
+    call()
+before = resident()
+for _ in range(int(sys.argv[2])):
+    call()
+print(resident() - before)
+"""
+linux = pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="no /proc here")
+
+
+def build(n: int = 128) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1))
+        keywords: dict[str, Any] = {
+            "metric": prb.AreaMetric(),
+            "observed": OBSERVED,
+            "progressbar": False,
+        }
+        prb.Simulator("y", line, x, propagation=prb.Reweighted(n), **keywords)
+    return model
+
+
+def minimize_one(made: list[pm.Model] = []) -> None:  # noqa: B006 (one model for all calls)
+    if not made:
+        made.append(build())
+    prb.minimize(made[0], progressbar=False)
+
+
+def grown(what: str, calls: int) -> float:
+    """Return by how many MiB a process grows in so many calls, after a few that fill what is kept."""
+    here = os.path.dirname(__file__)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([here, os.path.join(here, "helpers")]),
+    }
+    command = [sys.executable, "-c", GROWTH, what, str(calls)]
+    found = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return float(found.stdout.split()[-1])
+
+
+def test_an_evaluator_goes_with_its_last_user() -> None:
+    model = build()
+    prb.minimize(model, progressbar=False)
+    for _ in range(2):
+        prb.minimize(model, progressbar=False)
+    gc.collect()
+    kept = sum(isinstance(thing, Evaluator) for thing in gc.get_objects())
+    # The memo of refits keeps four at the most.
+    assert kept <= 5
+    before = kept
+    for _ in range(6):
+        prb.minimize(model, progressbar=False)
+    gc.collect()
+    assert sum(isinstance(thing, Evaluator) for thing in gc.get_objects()) <= max(before, 5)
+
+
+@linux
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["build", "minimize_one"])
+def test_five_hundred_calls_grow_by_less_than_twenty_mib(what: str) -> None:
+    assert grown(what, 500) < 20
+
+
+@linux
+def test_ten_calls_of_minimize_grow_little() -> None:
+    # Each evaluator that were kept would be 2 MiB.
+    assert grown("minimize_one", 10) < 10
+
+
+def test_the_support_of_many_populations_is_looked_at_in_parts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    evaluator = Evaluator(build())
+    thetas = evaluator.prior_thetas(50, 1)
+    whole = evaluator.support(thetas)["y"]
+    monkeypatch.setattr("prbayes.model.evaluator.AT_ONCE", 1024)
+    parts = evaluator.support(thetas)["y"]
+    assert all(np.array_equal(whole[key], parts[key]) for key in whole)
+    design = evaluator.designs["y"]
+    sizes = []
+    support = design.support
+    monkeypatch.setattr(
+        design, "support", lambda params: sizes.append(len(params[0])) or support(params)
+    )
+    evaluator.support(thetas)
+    assert max(sizes) == 1024 // design.n_points
+
+
+@pytest.mark.parametrize("density", [prb.GaussianKDE(), prb.Histogram()])
+def test_the_log_likelihood_of_many_observations_takes_little_memory(density: Any) -> None:
+    observed = np.random.default_rng(1).normal(size=20_000)
+    tracemalloc.start()
+    prb.LogLikelihood(density).against(observed)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 200 * MIB
+
+
+def test_readings_in_parts_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    observed = np.random.default_rng(1).normal(size=200)
+    whole = prb.LogLikelihood().against(observed)
+    monkeypatch.setattr("prbayes.metrics.cells.AT_ONCE", 20 * whole.reading.size)  # type: ignore[attr-defined]
+    parts = prb.LogLikelihood().against(observed)
+    assert np.allclose(parts.reading, whole.reading, rtol=1e-12, atol=1e-15)  # type: ignore[attr-defined]
