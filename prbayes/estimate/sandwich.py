@@ -168,7 +168,7 @@ class Information:
         half for each hyperparameter, over N (Wilks 1938, doi:10.1214/aoms/1177732360).
         """
         if not self.node.metric.distance:
-            return self.theta.size / (2 * self._target.n_effective)
+            return self.theta.size / (2 * self.node.n_specimens)
         around = self._stencil
         values, weights = thinned(
             around.values[:1],

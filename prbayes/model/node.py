@@ -61,12 +61,29 @@ class Node:
     @property
     def epsilon_is_default(self) -> bool:
         """Whether nobody gave epsilon: it is the 1/N of a metric on a likelihood's scale."""
-        return self.metric.likelihood and self.epsilon_value == 1 / self.target.n_effective
+        return self.metric.likelihood and self.epsilon_value == 1 / self.n_specimens
+
+    @property
+    def n_specimens(self) -> float:
+        """Effective number of specimens: repeated observations of one are no further ones."""
+        return effective_specimens(self.target, self.specimens)
 
     def copied(self) -> Node:
         """Return the same simulator with its own design, count of responses and epsilon."""
         epsilon = shared_epsilon(self.name, self.epsilon_value)
         return replace(self, bound=self.bound.copied(), epsilon=epsilon)
+
+
+def effective_specimens(target: Discrepancy, labels: NDArray[Any] | None) -> float:
+    """Return 1 / sum of squared weights of the specimens; without labels, of the observations."""
+    if labels is None:
+        return target.n_effective
+    _, number = np.unique(labels.astype(str), return_inverse=True)
+    weights = np.bincount(number.ravel(), target.weights)
+    # All different: the same number to the last digit.
+    if weights.size == target.weights.size:
+        return target.n_effective
+    return float(1 / (weights**2).sum())
 
 
 def shared_epsilon(name: str, value: float) -> Any:
