@@ -16,7 +16,7 @@ import pymc as pm
 
 from prbayes._checks import Floats, positive_integer, positive_number
 from prbayes._progress import shown
-from prbayes.estimate.caveats import breakdown, caveats, elements_at_edge
+from prbayes.estimate.caveats import breakdown, caveats, elements_at_edge, heavy_tails
 from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.methods import Method
 from prbayes.estimate.obstacles import sampling_obstacle
@@ -233,6 +233,8 @@ class Minimisation:
 
 def find_optimum(evaluator: Evaluator, asked: Minimisation) -> Optimum:
     """Do what `minimize` does, for an evaluator."""
+    for node in evaluator.nodes:
+        node.bound.restart(asked.random_seed)
     plan = _planned(evaluator, asked)
     begun = _begun(plan, asked)
     # Step: minimise, look at the design, until it is enough
@@ -521,6 +523,7 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State, others: list[Rival]
     )
     warnings = (
         *breakdown(edge, jump),
+        *heavy_tails(evaluator, state.theta),
         *caveats(evaluator, state.local, others, state.design_error),
     )
     for line in warnings:

@@ -21,7 +21,7 @@ from prbayes.model.node import (
     nodes,
     shared_epsilon,
 )
-from prbayes.propagation.base import Propagation
+from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
@@ -82,7 +82,10 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     Returns
     -------
     TensorVariable
-        The observed variable. Predictive sampling draws N different specimens for it.
+        The observed variable. PyMC's predictive sampling draws N specimens for it: new ones under
+        `Fresh`, else from the population's points, by weight and with replacement, so that one may
+        come twice; and independent of those of other variables, of which a warning is logged where
+        simulators share inputs (`predict` draws the same specimens for them).
 
     Raises
     ------
@@ -116,7 +119,8 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
             "prb.Resimulated(n) or prb.Fresh(n)"
         )
     labels = None if specimens is None else _labels(name, specimens, target.observed.size)
-    others = [other for other in nodes(model).values() if other.specimens is not None]
+    before = list(nodes(model).values())
+    others = [other for other in before if other.specimens is not None]
     if labels is not None:
         _refuse_alike_labels(name, labels, others)
     if epsilon is not None:
@@ -137,7 +141,15 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     if epsilon is None:
         likelihood = metric.likelihood
         epsilon = 1 / effective_specimens(target, labels) if likelihood else np.nan
-    node = Node(name, target, bound, propagation, shared_epsilon(name, epsilon), labels)
+    node = Node(
+        name,
+        target,
+        bound,
+        propagation,
+        shared_epsilon(name, epsilon),
+        labels,
+        _with_inputs(bound, before),
+    )
     _warn_of_shared_specimens(node, others)
     rv = SimulatorDistribution(
         name, *sorted_inputs.roots, node=node, observed=target.observed, dims=dims
@@ -181,6 +193,13 @@ def _labels(name: str, specimens: ArrayLike, n: int) -> NDArray[Any]:
             "one label per observation"
         )
     return labels
+
+
+def _with_inputs(bound: Bound, others: list[Node]) -> tuple[str, ...]:
+    """Return the names of the simulators that have an aleatory input of this one."""
+    own = {id(dist) for dist in bound.inputs.aleatory}
+    theirs = {other.name: map(id, other.bound.inputs.aleatory) for other in others}
+    return tuple(name for name, inputs in theirs.items() if not own.isdisjoint(inputs))
 
 
 def _refuse_alike_labels(name: str, labels: NDArray[Any], others: list[Node]) -> None:
