@@ -621,3 +621,21 @@ def test_a_log_likelihood_of_few_resimulated_responses_is_warned_of(
     assert 0.88 < error(likelihood, prb.Resimulated(16_384)) / right < 1.05
     assert error(prb.KullbackLeibler(), prb.Resimulated(1024)) > 0.9 * right
     assert not caplog.records
+
+
+def test_data_that_were_set_anew_are_refused_where_points_are_added() -> None:
+    with pm.Model() as model:
+        shift = pm.Data("shift", 0.0)
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1) + shift, 1.0)
+        prb.Simulator(
+            "y", lambda x: x, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0],
+            propagation=prb.Reweighted(64),
+        )  # fmt: skip
+    design = Evaluator(model).designs["y"]
+    components = [np.linspace(-1, 1, 16)]
+    model.set_data("shift", 1.0)
+    with pytest.raises(prb.propagation.DesignError, match="got other values of shift, which is"):
+        design.add(components)
+    model.set_data("shift", 0.0)
+    design.add(components)
+    assert design.n_points == 128
