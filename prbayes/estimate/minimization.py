@@ -33,7 +33,7 @@ from prbayes.estimate.refinement import (
     spread_around,
 )
 from prbayes.estimate.refit import SamplingDistribution
-from prbayes.estimate.rivals import Rival, rivals
+from prbayes.estimate.rivals import Rival, excluded, rivals
 from prbayes.estimate.sampling import Local
 from prbayes.estimate.search import Approach, Run, Search, Trace, approach, minimise, settle
 from prbayes.estimate.search import start as begin
@@ -483,7 +483,8 @@ def _rivals(plan: _Plan, state: _State) -> list[Rival]:
         if not thin or not plan.refine:
             break
         refine_at(evaluator, thin[0].theta[None])
-    return [r for r in found if not shortcomings(evaluator, r.theta[None])]
+    supported = [r for r in found if not shortcomings(evaluator, r.theta[None])]
+    return excluded(evaluator, state.theta, supported, _NOISE_SHARE * floors)
 
 
 def _settled(plan: _Plan, state: _State) -> _State:
