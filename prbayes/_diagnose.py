@@ -12,6 +12,9 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._checks import Floats
+from prbayes.estimate.data_sets import SETS
+from prbayes.estimate.goodness import fit_probability, of_another_family
+from prbayes.estimate.obstacles import sampling_obstacle
 from prbayes.estimate.optimum import Optimum, require_of_model
 from prbayes.model.elements import single_elements, stacked_draws
 from prbayes.model.evaluator import Evaluator
@@ -23,6 +26,13 @@ from prbayes.model.support import ENOUGH, shortcoming
 # the quantile was 9 to 12 with 2 to 8 chains of 25 to 500 draws, 1500 to 4000 sets of each
 # (4 chains of 50 draws in tests/test_diagnose.py).
 _NOISE = 11.0
+
+# Draws of a chain that have to differ, where there are at least twice as many: a standard deviation
+# from so many has an error of a tenth.
+_ALL_DIFFERENT = 50
+# Part of their size below which draws are the same: thousands of times rounding, and far below the
+# width of any posterior from measured data.
+_SAME_DIGITS = 1e-12
 
 _SUPPORT = ("weight_ess", "mean_weight", "lost_mass")
 
@@ -55,8 +65,10 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     """Say in sentences what is wrong with a result, and what to do, whichever sampler gave it.
 
     Looked at are: what is not identified; whether an optimiser converged; R-hat and effective
-    sample size of draws, by ArviZ; how far the particles of `sample_smc` moved in its last stage;
-    and whether the stored responses of `Reweighted` supported the answer.
+    sample size of draws, by ArviZ; how many of them differ; how far the particles of `sample_smc`
+    moved in its last stage; whether the stored responses of `Reweighted` supported the answer; and,
+    of optima and of adjusted draws, whether the data can have come from the best population
+    (refits on stored responses; p < .01).
 
     Parameters
     ----------
@@ -107,11 +119,19 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
 
 
 def _of_optimum(optimum: Optimum) -> Diagnosis:
-    messages = _sentences(optimum.warnings)
+    messages = _sentences([*optimum.warnings, *_of_family(optimum)])
     if not optimum.converged and not optimum.at_edge:  # an edge is one of the warnings
         messages.append(_not_converged(optimum.message))
     designs = _computed(optimum.evaluator, optimum.theta[None])
     return Diagnosis((*messages, *_unsupported(designs)), designs.support)
+
+
+def _of_family(optimum: Optimum) -> list[str]:
+    """Say where the data are too far from the best population to have come from its family."""
+    known = optimum.converged and not optimum.at_edge and not optimum.at_jump
+    if not known or optimum.prior or sampling_obstacle(optimum.evaluator) is not None:
+        return []
+    return of_another_family(fit_probability(optimum.sampling(), SETS, 0))
 
 
 def _of_stored_optimum(attrs: Mapping[Any, Any]) -> Diagnosis:
@@ -141,6 +161,7 @@ def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
     messages = [
         *_warnings(posterior.attrs),
         *_convergence(variables),
+        *_copies(_before_adjustment(result, variables)),
         *_motion(result),
         *_unsupported(designs),
     ]
@@ -208,6 +229,36 @@ def _by_element(statistic: str, posterior: xr.Dataset) -> dict[str, float]:
 def _listed(values: Mapping[str, float], form: str) -> str:
     each = [f"{value:{form}} for {name}" for name, value in values.items()]
     return ", ".join(each)
+
+
+def _before_adjustment(result: xr.DataTree, variables: xr.Dataset) -> xr.Dataset:
+    """Return the draws that a sampler made: an adjustment stretches those that are too narrow."""
+    if "unadjusted" not in result:
+        return variables
+    return result["unadjusted"].to_dataset()[list(variables.data_vars)]
+
+
+def _copies(draws: xr.Dataset) -> list[str]:
+    """Say which chains have hardly any different draws."""
+    counts = []
+    for chain in range(draws.sizes["chain"]):
+        columns = []
+        for variable in draws.isel(chain=chain).transpose("draw", ...).data_vars.values():
+            columns.append(variable.values.reshape(draws.sizes["draw"], -1))
+        table = np.concatenate(columns, axis=1)
+        size = np.abs(table).max(axis=0, initial=0.0)
+        digits = np.round(table / np.where(size > 0, size, 1.0) / _SAME_DIGITS)
+        counts.append(len(np.unique(digits, axis=0)))
+    expected = min(_ALL_DIFFERENT, draws.sizes["draw"] // 2)
+    few = [str(chain) for chain, count in enumerate(counts) if count < expected]
+    if not few:
+        return []
+    chains = "chains" if len(few) > 1 else "chain"
+    return [
+        f"Of {draws.sizes['draw']} draws only {min(counts)} differ in {chains} {', '.join(few)}, "
+        f"expected at least {expected}: few particles, or one, survived, and the width of the "
+        "draws means nothing. Pass more draws, priors nearer to the data, or a larger epsilon."
+    ]
 
 
 def _motion(result: xr.DataTree) -> list[str]:

@@ -320,3 +320,27 @@ def test_loo_speaks_of_one_observation() -> None:
     pm.compute_log_likelihood(idata, model=model, progressbar=False)
     assert idata["log_likelihood"]["y"].shape == (2, 100)
     assert az.loo(idata).n_data_points == 1
+
+
+def test_few_different_draws() -> None:
+    """One particle survived, and its copies were moved by roundings."""
+    model, _ = sampled()
+    tree = normal_tree([0.0])
+    rng = np.random.default_rng(2)
+    for name in ("mu", "sigma"):
+        tree["posterior"][name].values[:] = 5.2 * (1 + 5e-15 * rng.normal(size=(1, 500)))
+    text = str(prb.diagnose(tree, model=model))
+    assert "Of 500 draws only 1 differ in chain 0, expected at least 50" in text
+    # As many as that are told by the effective sample size, if it is too small.
+    for name in ("mu", "sigma"):
+        tree["posterior"][name].values[:] = np.repeat(rng.normal(5.2, 1e-6, (1, 100)), 5, axis=1)
+    assert "differ in" not in str(prb.diagnose(tree, model=model))
+
+
+def test_an_adjustment_does_not_hide_that_one_particle_survived() -> None:
+    _, idata = sampled()
+    collapsed = idata.copy(deep=True)
+    for name in ("mu", "sigma"):
+        collapsed["unadjusted"][name].values[2] = 0.5
+    text = str(prb.diagnose(collapsed))
+    assert "Of 500 draws only 1 differ in chain 2, expected at least 50" in text

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes._weighted import distribution_function
+from prbayes._weighted import distribution_function, quantile
 from prbayes.estimate.differences import cross
 from prbayes.estimate.identifiability import unidentified_directions
 from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.rivals import Rival
 from prbayes.estimate.sampling import Local
+from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
 
@@ -29,6 +30,12 @@ _UNCHANGED = 1e-5
 # whose spread shrinks by a factor of 1.3 makes 0.035; where a population stands still it is a
 # point's 1/n.
 _DIFFERENT = 0.02
+# Share of a population whose tail is looked at, and the tail index (Hill 1975) up to which its area
+# is said to hang on what no point of a design reaches: with one or less there is no mean. At 1024
+# quantiles of a half-Cauchy population it is 1.0, of Student's t with 1.5 and 2 degrees of freedom
+# 1.5 and 1.9, of lognormal ones with a spread of 1, 2 and 2.5 2.4, 1.3 and 1.1.
+_TAIL = 0.02
+_NO_MEAN = 1.1
 # Halvings of the way back to the middle of the prior: a thousandth of it is a tenth of a spread
 # where an optimum is a hundred spreads out.
 _HALVINGS = 10
@@ -155,6 +162,44 @@ def _apart(evaluator: Evaluator, a: Floats, b: Floats) -> float:
         gaps = np.abs(below[0] - below[1])
         largest = max(largest, float(gaps.max(initial=0.0)))
     return largest
+
+
+def heavy_tails(evaluator: Evaluator, theta: Floats) -> list[str]:
+    """Say which populations have no mean, or hardly one, so that their area is not known.
+
+    Of stored responses only: others would be computed for it.
+    """
+    lines = []
+    for k, node in enumerate(evaluator.nodes):
+        if node.metric.minimum is not Minimum.ABSOLUTE or not node.bound.stored:
+            continue
+        values, weights = evaluator.populations(theta[None], k)
+        index = _tail_index(values[0], weights[0])
+        if index < _NO_MEAN:
+            lines.append(
+                f"{node.name}: the tail of the simulated responses is so long (tail index "
+                f"{index:.2f}, of which one or less has no mean) that the area between "
+                "distribution functions is infinite, or rests on responses beyond all that were "
+                "computed: use prb.ProbabilityResidual() or prb.KullbackLeibler(), inputs with a "
+                "mean, or the logarithm of the response"
+            )
+    return lines
+
+
+def _tail_index(values: Floats, weights: Floats) -> float:
+    """Return Hill's index of the longer tail of a weighted population, from its middle."""
+    known = np.isfinite(values) & (weights > 0)
+    values, weights = values[known], weights[known] / weights[known].sum()
+    away = values - quantile(values, weights, 0.5)
+    found = [np.inf]
+    for side in (away, -away):
+        start = float(quantile(side, weights, 1 - _TAIL))
+        beyond = side > start
+        if start > 0 and weights[beyond].sum() > 0:
+            mass = weights[beyond]
+            length = float(mass @ np.log(side[beyond] / start))
+            found.append(float(mass.sum()) / max(length, 1e-300))
+    return min(found)
 
 
 def caveats(

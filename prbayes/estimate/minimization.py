@@ -16,7 +16,7 @@ import pymc as pm
 
 from prbayes._checks import Floats, Seed, positive_integer, positive_number, real_array, seed_number
 from prbayes._progress import shown
-from prbayes.estimate.caveats import breakdown, caveats, elements_at_edge
+from prbayes.estimate.caveats import breakdown, caveats, elements_at_edge, heavy_tails
 from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.methods import Method
 from prbayes.estimate.obstacles import sampling_obstacle
@@ -33,7 +33,7 @@ from prbayes.estimate.refinement import (
     spread_around,
 )
 from prbayes.estimate.refit import SamplingDistribution
-from prbayes.estimate.rivals import Rival, rivals
+from prbayes.estimate.rivals import Rival, excluded, rivals
 from prbayes.estimate.sampling import Local
 from prbayes.estimate.search import Approach, Run, Search, Trace, approach, minimise, settle
 from prbayes.estimate.search import start as begin
@@ -249,6 +249,8 @@ class Minimisation:
 
 def find_optimum(evaluator: Evaluator, asked: Minimisation) -> Optimum:
     """Do what `minimize` does, for an evaluator."""
+    for node in evaluator.nodes:
+        node.bound.restart(asked.random_seed)
     plan = _planned(evaluator, asked)
     begun = _begun(plan, asked)
     # Step: minimise, look at the design, until it is enough
@@ -497,7 +499,8 @@ def _rivals(plan: _Plan, state: _State) -> list[Rival]:
         if not thin or not plan.refine:
             break
         refine_at(evaluator, thin[0].theta[None])
-    return [r for r in found if not shortcomings(evaluator, r.theta[None])]
+    supported = [r for r in found if not shortcomings(evaluator, r.theta[None])]
+    return excluded(evaluator, state.theta, supported, _NOISE_SHARE * floors)
 
 
 def _settled(plan: _Plan, state: _State) -> _State:
@@ -537,6 +540,7 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State, others: list[Rival]
     )
     warnings = (
         *breakdown(edge, jump),
+        *heavy_tails(evaluator, state.theta),
         *caveats(evaluator, state.local, others, state.design_error),
     )
     for line in warnings:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -130,6 +130,31 @@ def rivals(
             kept.append((end, value))
     found = kept[1:]
     return [_rival(theta, value, lowest, noise) for theta, value in found]
+
+
+def excluded(evaluator: Evaluator, best: Floats, found: list[Rival], noises: Floats) -> list[Rival]:
+    """Return optima, not comparable where one simulator alone tells them from the best.
+
+    The noise of several simulators together grows with their number, and would hide it.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    best : ndarray, shape (d,)
+    found : list of Rival
+    noises : ndarray, shape (k,)
+        By simulator: a difference of its discrepancy that sampling explains.
+    """
+    if len(noises) < 2 or not found:
+        return found
+    thetas = np.array([best, *(rival.theta for rival in found)])
+    discrepancies = evaluator(thetas).discrepancies
+    worse = discrepancies[1:] - discrepancies[0]
+    told = (worse > _COMPARABLE * noises).any(axis=1)
+    return [
+        replace(rival, comparable=rival.comparable and not alone)
+        for rival, alone in zip(found, told, strict=True)
+    ]
 
 
 def _in_line(

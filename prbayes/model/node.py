@@ -9,6 +9,7 @@ module.
 
 from __future__ import annotations
 
+import logging
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -30,6 +31,8 @@ from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Design, design_of
 
+_log = logging.getLogger("prbayes")
+
 
 @dataclass(frozen=True, eq=False)
 class Node:
@@ -42,6 +45,8 @@ class Node:
     epsilon: Any  # scalar; NaN while it is not set
     # (N,), or None: labels of the specimens that the observed responses were measured on.
     specimens: NDArray[Any] | None
+    # Names of the simulators before it in the model that have a ``.dist()`` of its inputs.
+    same_inputs: tuple[str, ...] = ()
 
     @property
     def metric(self) -> Metric:
@@ -61,12 +66,29 @@ class Node:
     @property
     def epsilon_is_default(self) -> bool:
         """Whether nobody gave epsilon: it is the 1/N of a metric on a likelihood's scale."""
-        return self.metric.likelihood and self.epsilon_value == 1 / self.target.n_effective
+        return self.metric.likelihood and self.epsilon_value == 1 / self.n_specimens
+
+    @property
+    def n_specimens(self) -> float:
+        """Effective number of specimens: repeated observations of one are no further ones."""
+        return effective_specimens(self.target, self.specimens)
 
     def copied(self) -> Node:
         """Return the same simulator with its own design, count of responses and epsilon."""
         epsilon = shared_epsilon(self.name, self.epsilon_value)
         return replace(self, bound=self.bound.copied(), epsilon=epsilon)
+
+
+def effective_specimens(target: Discrepancy, labels: NDArray[Any] | None) -> float:
+    """Return 1 / sum of squared weights of the specimens; without labels, of the observations."""
+    if labels is None:
+        return target.n_effective
+    _, number = np.unique(labels.astype(str), return_inverse=True)
+    weights = np.bincount(number.ravel(), target.weights)
+    # All different: the same number to the last digit.
+    if weights.size == target.weights.size:
+        return target.n_effective
+    return float(1 / (weights**2).sum())
 
 
 def shared_epsilon(name: str, value: float) -> Any:
@@ -108,6 +130,7 @@ class SimulatorRV(RandomVariable):
         super().__init__(name=name, signature=signature, dtype=dtype, inplace=inplace)
         self.node = node
         self._owner: weakref.ref[Any] | None = None
+        self._warned = False
 
     def __str__(self) -> str:
         """Show the name and the signature, without what the node holds."""
@@ -134,7 +157,8 @@ class SimulatorRV(RandomVariable):
         return own.own_node(apply)
 
     def rng_fn(self, rng: np.random.Generator, *arguments: Any) -> Floats:
-        """Draw responses of different specimens; their shape is the last of the arguments."""
+        """Draw responses of specimens; their shape is the last of the arguments."""
+        self._warn_of_independence()
         *params, size = arguments
         bound = self.node.bound
         batches = []
@@ -152,6 +176,20 @@ class SimulatorRV(RandomVariable):
             drawn = bound.draw(rng, there.size, at)
             values[places] = drawn.reshape(there.shape)
         return values
+
+    def _warn_of_independence(self) -> None:
+        """Say once that PyMC draws each variable by itself."""
+        others = self.node.same_inputs
+        if not others or self._warned:
+            return
+        self._warned = True
+        _log.warning(
+            "%s has inputs that %s has too, the same specimens; PyMC's predictive sampling draws "
+            "each variable by itself, and so as independent of the others: use prb.predict for "
+            "responses of the same specimens",
+            self.node.name,
+            ", ".join(others),
+        )
 
 
 def _own_index(index: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, ...]:

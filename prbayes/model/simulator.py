@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -14,11 +15,20 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._checks import observed_sample, positive_number, refuse_single_precision
 from prbayes._progress import shown
 from prbayes.metrics.base import Discrepancy, Metric
-from prbayes.model.node import Node, SimulatorDistribution, model_on_context, shared_epsilon
-from prbayes.propagation.base import Propagation
+from prbayes.model.node import (
+    Node,
+    SimulatorDistribution,
+    effective_specimens,
+    model_on_context,
+    nodes,
+    shared_epsilon,
+)
+from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
+
+_log = logging.getLogger("prbayes")
 
 
 def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
@@ -54,12 +64,16 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     observed : array_like, shape (N,)
         Measured responses, one per specimen, at least two.
     epsilon : float, optional
-        Scale of the discrepancy. 1/N for metrics on the scale of a likelihood; unset for the
-        others, until `calibrate_epsilon` and `set_epsilon`, or `sample_smc`, set it.
+        Scale of the discrepancy. 1/N for metrics on the scale of a likelihood, N the effective
+        number of specimens; unset for the others, until `calibrate_epsilon` and `set_epsilon`, or
+        `sample_smc`, set it.
     weights : array_like, shape (N,), optional
         Weights of the observed responses.
     specimens : array_like, shape (N,), optional
-        Labels of the specimens.
+        Labels of the specimens. Observations with the same label, also of several simulators,
+        belong together: data sets are drawn specimen by specimen. Each simulator's default epsilon
+        counts its specimens, so that those that several share count several times under
+        `pymc.sample`, until `calibrate_epsilon` corrects for it; a warning says so.
     dims : str, optional
         Name of the observed dimension.
     propagation : Propagation, optional
@@ -70,7 +84,10 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     Returns
     -------
     TensorVariable
-        The observed variable. Predictive sampling draws N different specimens for it.
+        The observed variable. PyMC's predictive sampling draws N specimens for it: new ones under
+        `Fresh`, else from the population's points, by weight and with replacement, so that one may
+        come twice; and independent of those of other variables, of which a warning is logged where
+        simulators share inputs (`predict` draws the same specimens for them).
 
     Raises
     ------
@@ -108,6 +125,10 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
             "prb.Resimulated(n) or prb.Fresh(n)"
         )
     labels = None if specimens is None else _labels(name, specimens, target.observed.size)
+    before = list(nodes(model).values())
+    others = [other for other in before if other.specimens is not None]
+    if labels is not None:
+        _refuse_alike_labels(name, labels, others)
     if epsilon is not None:
         positive_number(epsilon, f"{name}: epsilon")
     refuse_uncallable(name, response)
@@ -124,8 +145,18 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     with shown(progressbar):
         bound = propagation.bind(name, sorted_inputs, target, responses)
     if epsilon is None:
-        epsilon = 1 / target.n_effective if metric.likelihood else np.nan
-    node = Node(name, target, bound, propagation, shared_epsilon(name, epsilon), labels)
+        likelihood = metric.likelihood
+        epsilon = 1 / effective_specimens(target, labels) if likelihood else np.nan
+    node = Node(
+        name,
+        target,
+        bound,
+        propagation,
+        shared_epsilon(name, epsilon),
+        labels,
+        _with_inputs(bound, before),
+    )
+    _warn_of_shared_specimens(node, others)
     rv = SimulatorDistribution(
         name, *sorted_inputs.roots, node=node, observed=target.observed, dims=dims
     )
@@ -168,3 +199,59 @@ def _labels(name: str, specimens: ArrayLike, n: int) -> NDArray[Any]:
             "one label per observation"
         )
     return labels
+
+
+def _with_inputs(bound: Bound, others: list[Node]) -> tuple[str, ...]:
+    """Return the names of the simulators that have an aleatory input of this one."""
+    own = {id(dist) for dist in bound.inputs.aleatory}
+    theirs = {other.name: map(id, other.bound.inputs.aleatory) for other in others}
+    return tuple(name for name, inputs in theirs.items() if not own.isdisjoint(inputs))
+
+
+def _refuse_alike_labels(name: str, labels: NDArray[Any], others: list[Node]) -> None:
+    """Raise where labels look the same and are not, as 1 and "1": they would be two specimens."""
+    seen: dict[str, tuple[str, object]] = {}
+    labelled = [(other.name, other.specimens) for other in others]
+    for simulator, own in [*labelled, (name, labels)]:
+        for label in [] if own is None else own.tolist():
+            if label is None or label != label:
+                raise ValueError(
+                    f"{name}: specimens: got {label!r} among the labels, expected one for each "
+                    "observation; give a specimen that nothing else was measured on its own"
+                )
+            first, known = seen.setdefault(_read(label), (simulator, label))
+            if known != label:
+                raise TypeError(
+                    f"{name}: specimens: got the label {label!r} and, in {first}, {known!r}, "
+                    "expected labels of one type, since these would count as two specimens; "
+                    "pass numbers, or strings, in all simulators"
+                )
+
+
+def _read(label: object) -> str:
+    """Return how a label reads."""
+    if isinstance(label, bytes):
+        return label.decode(errors="replace").strip()
+    if isinstance(label, float) and label.is_integer():
+        return str(int(label))
+    return str(label).strip()
+
+
+def _warn_of_shared_specimens(node: Node, others: list[Node]) -> None:
+    """Say so where default epsilons count specimens more than once."""
+    if node.specimens is None:
+        return
+    own = set(node.specimens.tolist())
+    for other in others:
+        theirs = other.specimens
+        if theirs is None or own.isdisjoint(theirs.tolist()):
+            continue
+        if node.epsilon_is_default or other.epsilon_is_default:
+            _log.warning(
+                "%s and %s share specimens, and each epsilon counts them: under pm.sample they "
+                "count twice, and the posterior comes out too narrow; call "
+                "prb.set_epsilon(model, prb.calibrate_epsilon(prb.minimize(model))) before, or use "
+                "prb.sample_smc, whose adjustment knows of it",
+                other.name,
+                node.name,
+            )

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.estimate.data_sets import observed_set, simulated_sets
+from prbayes.estimate.goodness import of_another_family, probability_of_fit
 from prbayes.estimate.measured import drawn_in
 from prbayes.estimate.obstacles import refit_obstacle
-from prbayes.estimate.refit import SamplingDistribution
+from prbayes.estimate.refit import ARRIVED, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
 
@@ -32,6 +32,18 @@ _FAR = 6.0
 # .016 standard deviations and spreads by 2% at most; with half, where refits within are cut as
 # well, spreads shrink by up to 7% (docs/constants.md).
 _REACH = 3.0
+# Resamples of the refits that tell the Monte Carlo error of what they tell: to 7%, as any bootstrap
+# standard deviation from so many.
+_RESAMPLES = 100
+# Monte Carlo errors that are said to be large: of the centre in standard deviations, of the width
+# as a share of it. From 200 refits they are .09 and .05, from the twenty that are the least .28 and
+# .16.
+_UNSURE_CENTER = 0.25
+_UNSURE_WIDTH = 0.15
+# Standard deviations, the narrower of both, between the medians before and after, from which prior
+# and data are said to be in conflict. Where they agree it is .45 at most (four metrics, 10 to 50
+# data), with a prior that is narrow and several of its spreads off, 0.9 to 5.7.
+_APART = 0.75
 # Standard error, in units of the prior's spread, up to which refits follow a direction. Twice
 # changes nothing; with half, directions about which data and prior tell as much are left to draws
 # of exp(-d / epsilon), whose spread differs by a third there (docs/constants.md).
@@ -45,11 +57,64 @@ class Adjusted:
     thetas: Floats  # (..., d): the draws; the given ones if nothing was done
     done: str = ""  # what was done; empty if nothing
     reason: str | None = None  # why nothing was done, None if something was
+    # Monte Carlo errors, from the number of refits, of the worst direction: of the centre in
+    # standard deviations of the draws, and of the width as a share of it; NaN if nothing was done.
+    center_error: float = np.nan
+    width_error: float = np.nan
+    # How far the medians moved, of the worst element, in standard deviations.
+    moved: float = np.nan
+    # Of the data's distance from the best population, among data sets drawn there.
+    fit_probability: float = np.nan
+    warnings: tuple[str, ...] = ()
 
     @property
     def note(self) -> str:
         """What was done, or why nothing, as results state it."""
         return self.done if self.reason is None else f"none: {self.reason}"
+
+
+class UnsettledError(ValueError):
+    """Refits of which too few converged to tell a sampling distribution."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """What refits and the prior tell of one mode, in coordinates (r)."""
+
+    center: Floats  # (r,): of the minimiser
+    shifts: Floats  # (n, r): of refits that converged, from the centre
+    prior_mean: Floats  # (r,)
+    prior_precision: Floats  # (r, r)
+    fit_probability: float  # as in `Adjusted`
+
+    def combined(self, shifts: Floats) -> tuple[Floats, Floats]:
+        """Return the centre (r,) and covariance (r, r) that draws should have."""
+        # What the data tell: the minimiser's information and its bias, which as a median is the
+        # same in every parametrisation, as where a scale comes near zero.
+        information = _precision(shifts, self.center.size)
+        bias = np.median(shifts, axis=0)
+        covariance = np.linalg.inv(information + self.prior_precision)
+        from_data = information @ (self.center - bias)
+        from_prior = self.prior_precision @ self.prior_mean
+        return covariance @ (from_data + from_prior), covariance
+
+    def errors(self, seed: int) -> tuple[float, float]:
+        """Return the Monte Carlo errors of centre and width, of the worst direction.
+
+        From resampled refits: of the centre in standard deviations, of the width as a share of it.
+        """
+        rng = np.random.default_rng([seed, 3])
+        n = len(self.shifts)
+        _, covariance = self.combined(self.shifts)
+        sd = np.sqrt(np.diag(covariance))
+        centers = []
+        widths = []
+        for _ in range(_RESAMPLES):
+            chosen = rng.integers(n, size=n)
+            center, spread = self.combined(self.shifts[chosen])
+            centers.append(center / sd)
+            widths.append(np.sqrt(np.diag(spread)) / sd)
+        return float(np.std(centers, axis=0).max()), float(np.std(widths, axis=0).max())
 
 
 @dataclass(frozen=True)
@@ -90,29 +155,43 @@ class Affine:
         positive_integer(self.random_seed, "Affine: random_seed", minimum=0)
 
     def target(self, sampling: SamplingDistribution) -> tuple[Floats, Floats]:
-        """Return the centre (r,) and covariance (r, r) that draws should have, in coordinates."""
+        """Return the centre (r,) and covariance (r, r) that draws should have, in coordinates.
+
+        Raises
+        ------
+        ValueError
+            If too few refits converge.
+        """
+        told = self._told(sampling)
+        return told.combined(told.shifts)
+
+    def _told(self, sampling: SamplingDistribution) -> _Told:
+        """Return what refits and the prior tell.
+
+        Raises
+        ------
+        UnsettledError
+            If too few refits converge.
+        """
         evaluator = sampling.evaluator
-        r = sampling.stderr.size
         # Where the minimiser is, and data sets drawn from the model there.
         (center,), _ = sampling.refit(observed_set(evaluator))
         at = sampling.thetas(center)
         sets = simulated_sets(evaluator, at, self.n_sets, self.random_seed)
-        # What the data tell: the minimiser's information and its bias, which as a median is the
-        # same in every parametrisation, as where a scale comes near zero.
         x, converged = sampling.refit(sets)
+        if converged.mean() < ARRIVED:
+            raise UnsettledError(
+                f"{int(converged.sum())} of {self.n_sets} refits converged, expected at least "
+                f"{ARRIVED:.0%}, so that they do not tell how wide the draws should be"
+            )
         away = x[converged] - center
         shifts = np.clip(away, -_REACH, _REACH)
-        information = _precision(shifts, r)
-        bias = np.median(shifts, axis=0)
         # What the prior tells.
         draws = evaluator.prior_thetas(4 * THETAS, self.random_seed)
         prior, _ = sampling.coordinates(draws)
-        precision = _precision(prior, r)
-        # Both together.
-        covariance = np.linalg.inv(information + precision)
-        from_data = information @ (center - bias)
-        from_prior = precision @ prior.mean(axis=0)
-        return covariance @ (from_data + from_prior), covariance
+        precision = _precision(prior, sampling.stderr.size)
+        fit = probability_of_fit(sampling, center, sets, x, converged)
+        return _Told(center, shifts, prior.mean(axis=0), precision, fit)
 
     def __call__(self, evaluator: Evaluator, thetas: Floats, optima: Sequence[Floats]) -> Adjusted:
         """Map draws of the pseudo-posterior, each mode by itself.
@@ -140,38 +219,118 @@ class Affine:
         distances = np.array([_distance(mode, draws) for mode in modes])
         if _run_together(distances):
             return Adjusted(thetas, reason="the posterior has modes that run into each other")
+        return self._adjusted(evaluator, thetas, modes, distances)
+
+    def _adjusted(
+        self,
+        evaluator: Evaluator,
+        thetas: Floats,
+        modes: list[SamplingDistribution],
+        distances: Floats,
+    ) -> Adjusted:
+        """Map the draws of each mode, (..., d), given their distances (modes, n) from each."""
+        draws = thetas.reshape(-1, thetas.shape[-1])
         nearest = distances.argmin(axis=0)
         out = draws.copy()
-        count = 0
-        far = 0
+        mapped = []
         for m, mode in enumerate(modes):
             own = nearest == m
             if own.sum() < _FEWEST:
                 continue
-            mapped, outside = self._mapped(mode, draws[own])
-            out[own] = mapped
-            far += int(outside.sum())
-            count += 1
-        if not count:
+            try:
+                found = self._mapped(mode, draws[own])
+            except UnsettledError as error:
+                reason = str(error)
+                return Adjusted(thetas, reason=reason, warnings=(_UNADJUSTED.format(reason),))
+            out[own] = found.draws
+            mapped.append(found)
+        if not mapped:
             return Adjusted(thetas, reason=f"there are fewer than {_FEWEST} draws of a mode")
-        done = f"{self!r}"
-        if len(modes) > 1:
-            done += f", {count} modes each by itself"
-        if far:
-            share = far / len(draws)
-            done += f", {share:.1%} of the draws drawn in to {_FAR:.0f} standard deviations"
-        return Adjusted(out.reshape(thetas.shape), done)
+        center_error = max(found.center_error for found in mapped)
+        width_error = max(found.width_error for found in mapped)
+        moves = _moves(draws, out)
+        return Adjusted(
+            out.reshape(thetas.shape),
+            self._said(mapped, len(modes), len(draws)),
+            center_error=center_error,
+            width_error=width_error,
+            moved=float(moves.max()),
+            fit_probability=mapped[0].fit_probability,
+            warnings=(
+                *_of_conflict(moves, evaluator.readable_names),
+                *_of_noise(center_error, width_error, self.n_sets),
+                *of_another_family(mapped[0].fit_probability),
+            ),
+        )
 
-    def _mapped(
-        self, sampling: SamplingDistribution, draws: Floats
-    ) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return the draws of one mode where they should be, and which of them were far out."""
+    def _said(self, mapped: list[_Mapped], modes: int, draws: int) -> str:
+        """Return what was done, in words."""
+        done = f"{self!r}"
+        if modes > 1:
+            done += f", {len(mapped)} modes each by itself"
+        far = sum(found.outside for found in mapped)
+        if far:
+            share = far / draws
+            done += f", {share:.1%} of the draws drawn in to {_FAR:.0f} standard deviations"
+        return done
+
+    def _mapped(self, sampling: SamplingDistribution, draws: Floats) -> _Mapped:
+        """Return the draws of one mode where they should be."""
         sampling = _among(sampling, draws)
         x, remainder = sampling.coordinates(draws)
-        center, covariance = self.target(sampling)
+        told = self._told(sampling)
+        center, covariance = told.combined(told.shifts)
         out = transported(sampling, x, remainder, center, covariance)
         outside = drawn_in(x, _FAR) != x
-        return out, outside.any(axis=1)
+        errors = told.errors(self.random_seed)
+        return _Mapped(out, int(outside.any(axis=1).sum()), *errors, told.fit_probability)
+
+
+@dataclass(frozen=True, eq=False)
+class _Mapped:
+    """The draws of one mode where they should be."""
+
+    draws: Floats  # (n, d)
+    outside: int  # how many of them were far out
+    center_error: float  # as in `Adjusted`
+    width_error: float
+    fit_probability: float
+
+
+_UNADJUSTED = "the draws are not adjusted: {}; their width is epsilon's"
+
+
+def _moves(before: Floats, after: Floats) -> Floats:
+    """Return how far the medians of draws, (n, d), moved, in standard deviations, (d,)."""
+    spreads = [drawn_in(draws, _REACH).std(axis=0) for draws in (before, after)]
+    narrower = np.maximum(np.min(spreads, axis=0), 1e-300)
+    shift = np.median(after, axis=0) - np.median(before, axis=0)
+    return np.asarray(np.abs(shift) / narrower)
+
+
+def _of_conflict(moves: Floats, names: list[str]) -> list[str]:
+    """Say so where the adjusted draws are elsewhere than those of the prior and epsilon."""
+    apart = [i for i, move in enumerate(moves) if move > _APART]
+    if not apart:
+        return []
+    listed = ", ".join(f"{moves[i]:.1f} for {names[i]}" for i in apart)
+    return [
+        "the medians of the draws before and after the adjustment are some standard deviations "
+        f"apart ({listed}), expected at most {_APART}: prior and data probably contradict each "
+        "other, where the adjustment, which takes both as normal, is not to be relied on; look at "
+        "the prior, and at the group `unadjusted`, or pass adjust=False"
+    ]
+
+
+def _of_noise(center_error: float, width_error: float, n_sets: int) -> list[str]:
+    """Say so where too few refits tell."""
+    if center_error <= _UNSURE_CENTER and width_error <= _UNSURE_WIDTH:
+        return []
+    return [
+        f"the adjustment rests on {n_sets} refits, from which its centre has a Monte Carlo error "
+        f"of {center_error:.2f} standard deviations and its width one of {width_error:.0%}; pass "
+        "adjust=prb.posterior.Affine(n_sets=...) with more"
+    ]
 
 
 def _identified_modes(evaluator: Evaluator, optima: Sequence[Floats]) -> list[SamplingDistribution]:

@@ -112,6 +112,9 @@ class Chains:
     def _begun(self, chain: int, seed: np.random.SeedSequence) -> tuple[BatchedKernel, Stages]:
         """Return a kernel at the stage its chain had reached, and the statistics until then."""
         evaluator = self.evaluator
+        (stream,) = seed.generate_state(1)
+        for node in evaluator.nodes:
+            node.bound.restart(int(stream))
         kernel = BatchedKernel(
             self.draws, model=evaluator.model, threshold=self.threshold, evaluator=evaluator
         )

@@ -8,12 +8,12 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes._weighted import INTERVAL
-from prbayes.estimate.data_sets import SETS
+from prbayes.estimate.data_sets import SETS, DataSets, groups
 from prbayes.estimate.identifiability import identified_by_area, identified_by_curvature
 from prbayes.estimate.measured import Refits
 from prbayes.estimate.obstacles import simulator_obstacle
 from prbayes.estimate.optimum import Optimum, require_minimiser, require_sampling
-from prbayes.estimate.sampling import first_order_shifts
+from prbayes.estimate.sampling import first_order_shifts, local_sampling
 from prbayes.estimate.sandwich import Information, LinearArea
 from prbayes.metrics.base import Minimum
 from prbayes.model.epsilon import Epsilon
@@ -30,7 +30,8 @@ _WIDER = 3.0
 def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
     """Return an epsilon for each simulator, so that the posterior is as wide as the data warrant.
 
-    - KLD and log-likelihood: 1/N, which puts them on the scale of a log-likelihood.
+    - KLD and log-likelihood: 1/N, which puts them on the scale of a log-likelihood, N the effective
+      number of specimens.
     - Other smooth metrics (probability residual): trace(H^-1 J) / p over the p identified
       directions, H the Hessian of the discrepancy at the optimum and J the sampling covariance of
       its gradient: then the posterior's covariance epsilon H^-1 matches the estimator's
@@ -43,6 +44,10 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
       minimiser plus delta, delta drawn from the sampling distribution. For any density proportional
       to exp(-d / epsilon) that mean is epsilon, by integration by parts; for a quadratic d it is
       trace(H Sigma) / p, which is the sandwich's.
+
+    Simulators that share specimens count them several times: their epsilons are then multiplied by
+    the ratio of the variance of their common minimiser, over data sets, to that it would have if
+    their specimens were different ones (not where a metric declares nothing of its minimum).
 
     No response is computed under `Reweighted`.
 
@@ -94,13 +99,45 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
     for k, node in enumerate(evaluator.nodes):
         information = Information(evaluator, k, optimum.theta, n_sets=SETS)
         found[node.name] = _epsilon(information)
+    for group in groups(evaluator.nodes):
+        names = [evaluator.nodes[k].name for k in group]
+        factor = _dependence(optimum, group, np.array([found[name] for name in names]))
+        for name in names:
+            found[name] *= factor
     return Epsilon(found, optimum.identity)
+
+
+def _dependence(optimum: Optimum, group: list[int], epsilon: Floats) -> float:
+    """Return by how much the minimiser of simulators that share specimens varies more for it.
+
+    The ratio of variances over data sets, and over the same data sets with the simulators' ones
+    exchanged, averaged over the directions identified.
+    """
+    evaluator = optimum.evaluator
+    information = [Information(evaluator, k, optimum.theta, n_sets=SETS) for k in group]
+    if len(group) < 2 or any(one.node.metric.minimum is Minimum.UNKNOWN for one in information):
+        return 1.0
+    basis = local_sampling(information, epsilon).identified
+    if not basis.shape[1]:
+        return 1.0
+    sets = information[0].data_sets
+
+    def variance(shift: int) -> Floats:
+        # Rows that belong together are apart, by another number of rows in each simulator.
+        weights = [np.roll(w, shift * k, axis=0) for k, w in enumerate(sets.weights)]
+        moved = first_order_shifts(information, epsilon, basis, DataSets(sets.values, weights))
+        return np.atleast_2d(np.cov(moved, rowvar=False))
+
+    # The mean of some, so that only the errors of the numerator are left.
+    apart = np.mean([variance(shift) for shift in range(1, 5)], axis=0)
+    ratio = np.linalg.solve(apart, variance(0))
+    return float(np.trace(ratio) / len(ratio))
 
 
 def _epsilon(information: Information) -> float:
     node = information.node
     if node.metric.likelihood:
-        return 1 / node.target.n_effective
+        return 1 / node.n_specimens
     obstacle = simulator_obstacle(information.evaluator, information.k)
     if obstacle is not None:
         raise TypeError(

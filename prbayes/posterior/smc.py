@@ -90,7 +90,12 @@ def sample_smc(
         simulator) and ``observed_data``; ArviZ takes it, ``to_netcdf`` saves it. Attributes of
         ``posterior``: ``log_marginal_likelihood``, from all chains, and
         ``log_marginal_likelihood_sd``, the spread of the chains' own; a number to compare models by
-        with one metric and one epsilon, and with no others.
+        with one metric and one epsilon, and with no others. Of an adjustment they have
+        ``adjustment_center_error`` and ``adjustment_width_error``, its Monte Carlo errors from the
+        number of refits, in standard deviations of the draws and as a share of the width, for the
+        worst direction; ``adjustment_moved``, how far it moved the medians, in standard deviations,
+        for the worst hyperparameter; and ``fit_probability``, how often data sets drawn from the
+        model at its minimiser are as far from their own fit as the data are.
 
     Raises
     ------
@@ -172,6 +177,9 @@ def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
         found = rounds.until_supported(asked.progressbar)
         if found.reason is not None:
             _log.warning("the draws are not adjusted: %s; their width is epsilon's", found.reason)
+        else:
+            for line in found.warnings:
+                _log.warning("%s", line)
         particles = found.particles
         return posterior_tree(
             evaluator,
@@ -180,7 +188,8 @@ def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
             particles.stats,
             unadjusted=None if found.thetas is particles.thetas else particles.thetas,
             adjustment=found.note,
-            warnings=() if optimum is None else optimum.warnings,
+            measured=found.measured,
+            warnings=(*(() if optimum is None else optimum.warnings), *found.warnings),
             errors=_discrepancy_errors(evaluator, particles),
             seed=asked.random_seed,
             n_responses=evaluator.n_responses - before,
@@ -254,6 +263,24 @@ class _Draws:
     def reason(self) -> str | None:
         """Why an adjustment that was asked for left the draws as they are; None if it did not."""
         return None if self.adjusted is None else self.adjusted.reason
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is to be said of the adjustment."""
+        return () if self.adjusted is None else self.adjusted.warnings
+
+    @property
+    def measured(self) -> dict[str, float]:
+        """What was measured of the adjustment, by name."""
+        found = self.adjusted
+        if found is None or found.reason is not None:
+            return {}
+        return {
+            "adjustment_center_error": found.center_error,
+            "adjustment_width_error": found.width_error,
+            "adjustment_moved": found.moved,
+            "fit_probability": found.fit_probability,
+        }
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,7 @@ def posterior_tree(
     *,
     unadjusted: Floats | None = None,
     adjustment: str = "none",
+    measured: dict[str, float] | None = None,
     warnings: tuple[str, ...] = (),
     errors: Floats | None = None,
     seed: int | None,
@@ -43,8 +44,10 @@ def posterior_tree(
     unadjusted : ndarray, shape (chains, draws, d), or None
     adjustment : str
         What was done to the draws.
+    measured : dict, or None
+        Numbers that tell how well the adjustment is known, for the attributes.
     warnings : tuple of str
-        What is not identified.
+        What is not identified, and what is to be said of the adjustment.
     errors : ndarray, shape (k,), or None
         Monte Carlo errors of the discrepancies.
     seed : int or None
@@ -60,6 +63,7 @@ def posterior_tree(
         "seconds": seconds,
         "random_seed": "None" if seed is None else str(seed),
         "adjustment": adjustment,
+        **(measured or {}),
         "warnings": "\n".join(warnings),
         **versions(),
     }

@@ -63,8 +63,10 @@ class Bound(ABC):
     is_line : bool
         Whether the points are a quadrature rule of one dimension, whose error falls like 1 / n.
     draws : int
-        Number of evaluations so far that a random propagation's next draws depend on; with the seed
-        it determines them.
+        Number of evaluations so far that a random propagation's next draws depend on; with the
+        seeds and the roots it determines them.
+    stream : int
+        Seed of the sampler that is at work, which they depend on as well.
     """
 
     n_per_theta: int = 0
@@ -73,6 +75,7 @@ class Bound(ABC):
     random: ClassVar[bool] = False
     support_moves: bool = False
     draws: int = 0
+    stream: int = 0
     _probed: Floats = np.empty(0)
 
     @property
@@ -102,6 +105,11 @@ class Bound(ABC):
         other = copy.copy(self)
         other.responses = self.responses.copied()
         return other
+
+    def restart(self, stream: int) -> None:
+        """Begin a sampler's own stream of random draws."""
+        self.stream = stream
+        self.draws = 0
 
     @property
     def n_points(self) -> int:
@@ -189,7 +197,10 @@ class Bound(ABC):
         return [p[ok] for p in params]
 
     def draw(self, rng: np.random.Generator, size: int, params: Sequence[Any]) -> Floats:
-        """Draw responses of ``size`` different specimens at one value of the roots."""
+        """Draw responses of ``size`` specimens at one value of the roots.
+
+        They are specimens of the population's points, by weight and with replacement.
+        """
         at = [np.asarray(p)[None] for p in params]
         if not self.valid(at).all():
             return np.full(size, np.nan)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -30,7 +31,9 @@ class Fresh(Propagation):
     n : int
         Number of draws for each theta.
     random_seed : int
-        Seed of the generator that belongs to the simulator.
+        Seed of the draws. They depend as well on the number of evaluations, on the seed of
+        `sample_smc`, and on the hyperparameters: chains in processes of their own draw different
+        specimens, and the same ones when they are run again.
     executor, store, version, on_failure
         As for `Reweighted`.
 
@@ -59,7 +62,7 @@ class FreshBound(Bound):
     Attributes
     ----------
     draws : int
-        Number of evaluations so far; with the seed it determines the next draws.
+        Number of evaluations so far; with the seeds and the roots it determines the next draws.
     """
 
     random: ClassVar[bool] = True
@@ -80,11 +83,27 @@ class FreshBound(Bound):
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
         """Return fresh responses with equal weights."""
         self.draws += 1
-        rng = np.random.default_rng([self._seed, self.draws])
+        rng = np.random.default_rng([self._seed, self.stream, self.draws, _digest_of(params)])
         aleatory, epistemic = self._sampler(params, self.n_per_theta, rng)
         values = self.responses(aleatory, epistemic)
         equal = np.broadcast_to(1 / self.n_per_theta, values.shape)
         return values, equal
+
+    def draw(self, rng: np.random.Generator, size: int, params: Sequence[Any]) -> Floats:
+        """Draw responses of new specimens at one value of the roots."""
+        at = [np.asarray(p)[None] for p in params]
+        if not self.valid(at).all():
+            return np.full(size, np.nan)
+        aleatory, epistemic = self._sampler(at, size, rng)
+        return np.asarray(self.responses(aleatory, epistemic)[0])
+
+
+def _digest_of(params: Sequence[Any]) -> int:
+    """Return a number of the roots' values, the same in all processes."""
+    content = hashlib.blake2b(digest_size=8)
+    for values in params:
+        content.update(np.ascontiguousarray(values, dtype=np.float64).tobytes())
+    return int.from_bytes(content.digest(), "little")
 
 
 class FreshOp(OwnOp):

@@ -22,7 +22,14 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import AT_ONCE, Floats, positive_integer, positive_number
 from prbayes.metrics.base import Discrepancy
-from prbayes.propagation.base import N_BLOCKS, Bound, Propagation, refuse_all_nan, refuse_nested
+from prbayes.propagation.base import (
+    N_BLOCKS,
+    Bound,
+    DesignError,
+    Propagation,
+    refuse_all_nan,
+    refuse_nested,
+)
 from prbayes.propagation.edges import averaged_log_density, cells_around, moving_inputs
 from prbayes.propagation.ops import OpaqueOp
 from prbayes.propagation.points import base_points
@@ -315,6 +322,7 @@ class Design(Bound):
         float
             The median weight effective sample size over these populations.
         """
+        self._refuse_other_data()
         n = n or self.config.n
         # A prime, so that seeds 0, 1, 2, ... of a user share no batch.
         seed = self.config.random_seed + 7919 * self.n_batches
@@ -339,6 +347,19 @@ class Design(Bound):
         ess = np.exp(log_ess)
         of_these = ess[-len(counts) :]
         return float(np.median(of_these))
+
+    def _refuse_other_data(self) -> None:
+        """Raise if data above the inputs were set anew: old points are of other populations."""
+        now = {name: np.array(shared.get_value()) for name, shared in self.inputs.data.items()}
+        before = self.__dict__.setdefault("_data", now)
+        changed = [name for name in now if not np.array_equal(before[name], now[name])]
+        if changed:
+            raise DesignError(
+                f"{self.name}: got other values of {', '.join(changed)}, which is above the "
+                "inputs, than when the design was begun, expected the same ones: the density of "
+                "its points is that of the old values, and no points can be added to it; build "
+                "the model again with the new ones"
+            )
 
     def _cell_ends(self) -> list[Floats]:
         """Return lower and upper ends of the points' cells, of each input whose support moves."""

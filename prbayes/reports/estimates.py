@@ -127,11 +127,24 @@ def _width(tree: xr.DataTree) -> list[str]:
         return [
             "The draws are adjusted to the width that the data warrant: "
             "that of the metric's own estimate over repeated sets of specimens, "
-            f"combined with the prior ({adjustment})."
+            f"combined with the prior ({adjustment}).",
+            *_width_error(attrs),
         ]
     reason = adjustment.removeprefix("none").removeprefix(": ")
     why = f" ({reason})" if reason else ""
     return [f"The draws are not adjusted{why}: their width is that of epsilon."]
+
+
+def _width_error(attrs: Mapping[Any, Any]) -> list[str]:
+    """Say how well the adjustment is known."""
+    errors = [attrs.get(f"adjustment_{what}_error", math.nan) for what in ("center", "width")]
+    if not all(map(math.isfinite, errors)):
+        return []
+    center, width = errors
+    return [
+        f"From the number of refits its centre has a Monte Carlo error of up to {center:.2f} "
+        f"standard deviations, and its width one of up to {width:.0%}."
+    ]
 
 
 def _whole(value: float) -> str:

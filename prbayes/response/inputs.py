@@ -37,6 +37,16 @@ class Inputs:
         """The arguments that are model variables, or functions of them."""
         return tuple(a for a in self.arguments if isinstance(a, Variable))
 
+    @cached_property
+    def data(self) -> dict[str, Any]:
+        """The values above the inputs that can be set anew, as `pymc.Data`, by name."""
+        above = walk([*self.aleatory, *self.epistemic], _inputs_of)
+        found = {}
+        for i, variable in enumerate(above):
+            if hasattr(variable, "get_value") and isinstance(variable, TensorVariable):
+                found[str(variable.name or f"shared variable {i}")] = variable
+        return found
+
     def rebuilt(self, params: Sequence[Any]) -> tuple[list[TensorVariable], list[TensorVariable]]:
         """Return the aleatory and epistemic inputs with the roots replaced by ``params``."""
         # In two steps, because params may themselves depend on the roots.
@@ -145,6 +155,10 @@ def _refuse_too_little(name: str, n: int, aleatory: bool, roots: bool) -> None:
             "to calibrate; give the `.dist()` parameters that are model variables, such as "
             "mu = pm.Normal('mu', 0, 1)"
         )
+
+
+def _inputs_of(variable: Variable) -> Any:
+    return None if variable.owner is None else variable.owner.inputs
 
 
 def _ancestry(x: Variable, known: set[Variable]) -> list[Variable]:

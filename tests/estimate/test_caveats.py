@@ -56,3 +56,25 @@ def test_a_mean_at_the_bound_of_its_prior_is_at_no_edge(out: float) -> None:
             "y", mean, x, metric=metric, observed=observed, propagation=prb.Resimulated(64)
         )
     assert edges(model, out, -1.0) == ()
+
+
+def test_an_area_of_a_population_without_a_mean_is_warned_of() -> None:
+    def minimum(metric: prb.Metric, make: Any, observed: Any) -> prb.Optimum:
+        with pm.Model() as model:
+            x = make(pm.HalfNormal("scale", 2))
+            prb.Simulator(
+                "y", lambda x: x, x, metric=metric, observed=observed,
+                propagation=prb.Reweighted(256),
+            )  # fmt: skip
+        return prb.minimize(model)
+
+    observed = np.abs(np.random.default_rng(1).standard_cauchy(30))
+    said = "one or less has no mean"
+    area = minimum(prb.AreaMetric(), pm.HalfCauchy.dist, observed)
+    assert said in "".join(area.warnings)
+    assert said in str(prb.diagnose(area))
+    other = minimum(prb.KullbackLeibler(), pm.HalfCauchy.dist, observed)
+    assert said not in "".join(other.warnings)
+    observed = np.random.default_rng(1).exponential(1.0, 30)
+    short = minimum(prb.AreaMetric(), lambda s: pm.Exponential.dist(scale=s), observed)
+    assert said not in "".join(short.warnings)

@@ -217,3 +217,24 @@ def test_rivals_stand_where_the_optimum_does_along_unidentified_directions() -> 
     assert len(comparable) == 1
     assert comparable[0]["point"]["idle"] == pytest.approx(optimum.point["idle"], abs=1e-6)
     assert len(optimum.warnings) == 2
+
+
+@pytest.mark.parametrize(("slope", "comparable"), [(0.25, False), (0.0, True)])
+def test_one_output_of_many_excludes_a_mirror(slope: float, comparable: bool) -> None:
+    """Five outputs are the same for either sign; what one tells is not lost in their noise."""
+    inputs = np.random.default_rng(0).normal(1.0, 0.4, 30)
+
+    def sees_the_sign(x: Any) -> Any:
+        return np.abs(x) + slope * x
+
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        for k, response in enumerate([np.square] * 5 + [sees_the_sign]):
+            prb.Simulator(
+                f"y{k}", response, x, metric=prb.AreaMetric(), observed=response(inputs),
+                propagation=prb.Reweighted(128),
+            )  # fmt: skip
+    optimum = prb.minimize(model)
+    assert optimum.rivals
+    assert any(rival["comparable"] for rival in optimum.rivals) == comparable
+    assert ("mirror solution" in "".join(optimum.warnings)) == comparable

@@ -136,3 +136,22 @@ def test_noise_floor_of_the_area_metric_is_the_expected_distance_at_the_truth() 
     distances = np.abs(data[:, (u * N).astype(int)] - quantiles).mean(axis=1)
     error = distances.std() * (1 / 200 + 1 / 1000) ** 0.5
     assert abs(floor - distances.mean()) < 4 * error
+
+
+@pytest.mark.parametrize("metric", [prb.ProbabilityResidual(), prb.AreaMetric()])
+def test_a_prior_however_wide_leaves_standard_errors_as_they_are(metric: prb.Metric) -> None:
+    """A difference over a share of the prior would step over the population."""
+
+    def error(spread: float) -> float:
+        observed = np.random.default_rng(0).normal(1.0, 0.5, 30)
+        with pm.Model() as model:
+            x = pm.Normal.dist(pm.Normal("mu", 0, spread), 0.5)
+            prb.Simulator(
+                "y", lambda x: x, x, metric=metric, observed=observed,
+                propagation=prb.Resimulated(256),
+            )  # fmt: skip
+        return float(prb.minimize(model).stderr["mu"])
+
+    ordinary = error(2.0)
+    for spread in (200.0, 2e4):
+        assert error(spread) == pytest.approx(ordinary, rel=0.1)

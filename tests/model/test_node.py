@@ -329,3 +329,19 @@ def test_the_value_that_a_log_density_is_asked_at_has_to_be_the_data() -> None:
     for other in (OBSERVED[::-1], np.append(OBSERVED, 1.0)):
         with pytest.raises(ParameterValueError, match=OTHER):
             symbolic.eval({**at, value: other})
+
+
+def test_predictive_draws_of_the_same_specimens_are_warned_of(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        for name in ("y", "z"):
+            prb.Simulator(
+                name, lambda x: x, x, metric=prb.AreaMetric(), observed=[0.0, 1.0],
+                propagation=prb.Reweighted(64),
+            )  # fmt: skip
+    assert "draws each variable by itself" not in caplog.text
+    pm.sample_prior_predictive(3, model=model, random_seed=1)
+    assert caplog.text.count("z has inputs that y has too, the same specimens") == 1
+    assert "use prb.predict" in caplog.text

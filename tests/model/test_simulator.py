@@ -392,3 +392,33 @@ def test_a_reweighted_log_density_is_the_same_compiled_by_jax(metric: prb.Metric
         warnings.simplefilter("ignore")
         found = model.compile_logp(mode="JAX")(point)
     assert float(found) == pytest.approx(float(model.compile_logp(mode=PLAIN)(point)), rel=1e-10)
+
+
+# Labels of specimens.
+
+
+def _labelled(*labels: Any) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        for name, own in zip("yz", labels, strict=False):
+            prb.Simulator(
+                name, line, x, metric=prb.AreaMetric(), observed=np.arange(3.0), specimens=own,
+                propagation=prb.Reweighted(64),
+            )  # fmt: skip
+    return model
+
+
+def test_labels_that_only_look_the_same_are_refused() -> None:
+    with pytest.raises(TypeError, match=r"z: specimens: got the label '0' and, in y, 0, expected"):
+        _labelled([0, 1, 2], ["0", "1", "2"])
+    with pytest.raises(TypeError, match=r"y: specimens: got the label '1' and, in y, 1"):
+        _labelled(np.array([0, 1, "1"], dtype=object))
+    with pytest.raises(TypeError, match=r"got the label b'a' and, in y, 'a'"):
+        _labelled(["a", "b", "c"], [b"a", b"b", b"c"])
+    with pytest.raises(ValueError, match="got nan among the labels"):
+        _labelled([0.0, np.nan, 2.0])
+
+
+def test_labels_of_equal_numbers_are_the_same() -> None:
+    _labelled([0, 1, 2], [0.0, 1.0, 3.0])
+    _labelled(["a", "b", "c"], np.array(["c", "d", "e"], dtype=object))

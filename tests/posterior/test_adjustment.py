@@ -618,3 +618,80 @@ def test_an_optimum_that_the_prior_held_gives_the_same_draws() -> None:
         sd = float(first[name].std())
         assert abs(float(first[name].mean() - second[name].mean())) < 0.1 * sd
         assert float(second[name].std()) == pytest.approx(sd, rel=0.1)
+
+
+# -- what is said of it
+# ----------------------------------------------------------------------------------
+
+
+def test_an_adjustment_from_refits_that_did_not_converge_is_refused(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    optimum = fit("pr")
+    refit = SamplingDistribution.refit
+
+    def three_converge(self: SamplingDistribution, sets: Any) -> Any:
+        x, ok = refit(self, sets)
+        return x, ok if len(ok) == 1 else np.arange(len(ok)) < 3
+
+    monkeypatch.setattr(SamplingDistribution, "refit", three_converge)
+    with caplog.at_level(logging.WARNING, logger="prbayes"):
+        idata = sample(optimum.model, 200, optimum=optimum)
+    assert "unadjusted" not in idata
+    reason = "3 of 200 refits converged, expected at least 90%"
+    assert reason in idata.posterior.attrs["adjustment"]
+    assert caplog.text.count(reason) == 1
+    assert f"The draws are not adjusted: {reason}" in str(prb.diagnose(idata))
+    with pytest.raises(ValueError, match="3 of 200 refits converged"):
+        prb.posterior.Affine().target(optimum.sampling())
+
+
+def test_the_error_from_the_number_of_refits_is_that_over_seeds() -> None:
+    optimum = fit("pr")
+    evaluator = optimum.evaluator
+    sampling = SamplingDistribution.of(evaluator, optimum.theta, np.ones(1), 2.0)
+    targets = [prb.posterior.Affine(100, seed).target(sampling) for seed in range(12)]
+    centers = np.array([center for center, _ in targets])
+    widths = np.sqrt([np.diag(covariance) for _, covariance in targets])
+    over_seeds = (
+        (centers.std(axis=0, ddof=1) / widths.mean(axis=0)).max(),
+        (widths.std(axis=0, ddof=1) / widths.mean(axis=0)).max(),
+    )
+    told = [prb.posterior.Affine(100, seed)._told(sampling).errors(seed) for seed in range(3)]
+    # A standard deviation of 12 has an error of 21%, and the larger of two is larger.
+    np.testing.assert_allclose(np.mean(told, axis=0), over_seeds, rtol=0.6)
+
+
+def test_results_have_the_error_from_the_number_of_refits() -> None:
+    optimum = fit("pr")
+    few = sample(optimum.model, 200, optimum=optimum, adjust=prb.posterior.Affine(20))
+    many = sample(optimum.model, 200, optimum=optimum)
+    for name in ("adjustment_center_error", "adjustment_width_error"):
+        assert 0.02 < many.posterior.attrs[name] < 0.15
+        # The root of ten; of twenty refits it is known to a sixth.
+        assert 1.5 < few.posterior.attrs[name] / many.posterior.attrs[name] < 6
+    assert "The adjustment rests on 20 refits" in str(prb.diagnose(few))
+    assert prb.diagnose(many).ok
+
+
+@pytest.mark.parametrize("name", ["pr", slow("kl"), slow("area"), slow("ll")])
+def test_a_prior_in_conflict_with_the_data_is_said(
+    name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    # The prior of the standard deviation, .5 in the data, is a fifth as wide.
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 0.1))
+        prb.Simulator("y", same, x, metric=METRICS[name], observed=OBSERVED, propagation=R256)
+    with caplog.at_level(logging.WARNING, logger="prbayes"):
+        idata = sample(model)
+    assert idata.posterior.attrs["adjustment_moved"] > 1
+    said = "prior and data probably contradict each other"
+    assert said in caplog.text
+    assert said in str(prb.diagnose(idata))
+
+
+@pytest.mark.parametrize("name", ["pr", "area", slow("kl"), slow("ll")])
+def test_a_prior_that_agrees_with_the_data_is_not(name: str) -> None:
+    idata = sample(fit(name).model, optimum=fit(name))
+    assert idata.posterior.attrs["adjustment_moved"] < 0.6
+    assert prb.diagnose(idata).ok

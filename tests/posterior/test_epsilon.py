@@ -306,3 +306,51 @@ def test_set_epsilon_scales_the_log_density() -> None:
         expected = -found.discrepancies[:, 0] / epsilon
         np.testing.assert_allclose(found.log_likelihood(evaluator.epsilon), expected, rtol=1e-12)
     assert found.discrepancies[0, 0] > found.discrepancies[1, 0] > 0
+
+
+# -- specimens that were measured several times
+
+
+def _shared(metric: prb.Metric, labels: Any, others: Any = None, observed: Any = None) -> pm.Model:
+    values = np.random.default_rng(0).normal(1.0, 0.5, 30) if observed is None else observed
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        for name, own in (("y", labels), ("z", others)):
+            if own is not None:
+                prb.Simulator(
+                    name, lambda x: x, x, metric=metric, observed=values, specimens=own,
+                    propagation=prb.Reweighted(256),
+                )  # fmt: skip
+    return model
+
+
+@pytest.mark.parametrize("metric", [prb.KullbackLeibler(), prb.LogLikelihood()])
+def test_a_likelihood_counts_specimens_and_not_observations(metric: prb.Metric) -> None:
+    thrice = np.repeat(np.random.default_rng(0).normal(1.0, 0.5, 10), 3)
+    model = _shared(metric, np.arange(30) // 3, observed=thrice)
+    (node,) = nodes(model).values()
+    assert node.epsilon_value == pytest.approx(0.1)
+    assert node.epsilon_is_default
+    assert prb.calibrate_epsilon(prb.minimize(model))["y"] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    "metric", [prb.KullbackLeibler(), prb.ProbabilityResidual(), prb.AreaMetric()]
+)
+def test_two_simulators_that_say_the_same_count_once(metric: prb.Metric) -> None:
+    numbers = np.arange(30)
+    alone = prb.calibrate_epsilon(prb.minimize(_shared(metric, numbers)))["y"]
+    twice = prb.calibrate_epsilon(prb.minimize(_shared(metric, numbers, numbers)))
+    apart = prb.calibrate_epsilon(prb.minimize(_shared(metric, numbers, numbers + 30)))
+    # A ratio of variances of 200 data sets.
+    np.testing.assert_allclose(list(twice.values()), 2 * alone, rtol=0.15)
+    np.testing.assert_allclose(list(apart.values()), alone, rtol=0.1)
+
+
+def test_specimens_that_count_twice_are_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    numbers = np.arange(30)
+    said = "y and z share specimens, and each epsilon counts them"
+    _shared(prb.KullbackLeibler(), numbers, numbers + 30)
+    assert said not in caplog.text
+    _shared(prb.KullbackLeibler(), numbers, numbers)
+    assert said in caplog.text

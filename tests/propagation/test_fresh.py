@@ -58,3 +58,52 @@ def test_the_operation_takes_a_batch_and_has_no_gradient() -> None:
     np.testing.assert_array_equal(np.isfinite(values), [True, False, True])
     with pytest.raises(TypeError, match="its log-density is random and has no gradient"):
         pt.grad(graph.sum(), mu)
+
+
+def test_chains_in_processes_of_their_own_draw_different_specimens() -> None:
+    """Processes begin as copies, with the same seeds and counts; what they ask for differs."""
+    here, there = bound(), bound()
+    a = here.populations([np.array([0.5]), np.array([1.0])])[0]
+    b = there.populations([np.array([0.51]), np.array([1.0])])[0]
+    # The same noise would be moved by .01.
+    assert np.abs(np.sqrt(np.sort(b[0])) - np.sqrt(np.sort(a[0]))).max() > 0.05
+
+
+def test_predictive_draws_follow_the_seed_and_are_new_specimens() -> None:
+    found = bound(n=5)
+    params = [np.array(0.5), np.array(1.0)]
+    one, same, other = (found.draw(np.random.default_rng(s), 50, params) for s in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    assert not np.isin(one, other).any()
+    assert np.unique(one).size == 50
+    assert np.isnan(found.draw(np.random.default_rng(1), 3, [np.array(0.5), np.array(-1.0)])).all()
+
+
+def model() -> pm.Model:
+    with pm.Model() as found:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
+        prb.Simulator(
+            "y", np.square, x, metric=prb.AreaMetric(), observed=[0.5, 1.0, 1.5], epsilon=0.5,
+            propagation=prb.Fresh(20),
+        )  # fmt: skip
+    return found
+
+
+def test_a_sampler_s_seed_decides_the_draws_of_every_run() -> None:
+    one = model()
+    runs = [
+        prb.sample_smc(30, chains=2, model=one, random_seed=seed, progressbar=False)
+        for seed in (1, 1, 2)
+    ]
+    first, again, other = (run.calibration["discrepancy"].values for run in runs)
+    np.testing.assert_array_equal(first, again)
+    assert not np.isin(first, other).any()
+
+
+def test_prior_predictive_sampling_follows_its_seed() -> None:
+    drawn = [
+        pm.sample_prior_predictive(3, model=model(), random_seed=seed).prior_predictive["y"].values
+        for seed in (1, 1, 2)
+    ]
+    np.testing.assert_array_equal(drawn[0], drawn[1])
+    assert not np.isin(drawn[0], drawn[2]).any()

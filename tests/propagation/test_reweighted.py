@@ -689,3 +689,21 @@ def test_bounds_that_have_probability_and_move_are_refused() -> None:
             TypeError, match=r"bounds that move .* use propagation=prb.Resimulated\(\)"
         ):
             prb.Simulator("y", same, x, metric=AREA, observed=OBSERVED)
+
+
+def test_data_that_were_set_anew_are_refused_where_points_are_added() -> None:
+    with pm.Model() as model:
+        shift = pm.Data("shift", 0.0)
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1) + shift, 1.0)
+        prb.Simulator(
+            "y", lambda x: x, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0],
+            propagation=prb.Reweighted(64),
+        )  # fmt: skip
+    design = Evaluator(model).designs["y"]
+    components = [np.linspace(-1, 1, 16)]
+    model.set_data("shift", 1.0)
+    with pytest.raises(prb.propagation.DesignError, match="got other values of shift, which is"):
+        design.add(components)
+    model.set_data("shift", 0.0)
+    design.add(components)
+    assert design.n_points == 128

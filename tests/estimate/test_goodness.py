@@ -1,0 +1,113 @@
+"""Goodness of fit: how often right families are called wrong, and wrong ones are seen."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+from four_metrics import METRICS, R256, same
+
+import prbayes as prb
+from prbayes._checks import Floats
+from prbayes.estimate.goodness import UNLIKELY, fit_probability, of_another_family
+
+Draw = Callable[[np.random.Generator, int], Floats]
+FAMILIES: dict[str, Draw] = {
+    "normal": lambda rng, n: rng.normal(1, 0.5, n),
+    "t3": lambda rng, n: 1 + 0.5 * rng.standard_t(3, n),
+    "bimodal": lambda rng, n: rng.choice([0.3, 1.7], n) + rng.normal(0, 0.25, n),
+    "exponential": lambda rng, n: 0.5 + rng.exponential(0.5, n),
+}
+
+
+def optimum(name: str, family: str, seed: int, n: int = 50, **keywords: Any) -> prb.Optimum:
+    """Fit a normal population to data of a family."""
+    observed = FAMILIES[family](np.random.default_rng([7, seed, n]), n)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        prb.Simulator(
+            "y", same, x, metric=METRICS[name], observed=observed, propagation=R256, **keywords
+        )
+    return prb.minimize(model, starts=0)
+
+
+def probabilities(name: str, family: str, sets: int) -> Floats:
+    found = []
+    for seed in range(sets):
+        sampling = optimum(name, family, seed).sampling()
+        found.append(fit_probability(sampling, 200, 0))
+    return np.array(found)
+
+
+def test_a_right_family_is_called_wrong_as_rarely_as_said() -> None:
+    p = probabilities("pr", "normal", 60)
+    # A binomial number of 60 with probability .05: 3, and eight or more once in 150 cases.
+    assert (p < 0.05).sum() < 8
+    assert (p < UNLIKELY).sum() < 4
+    # Uniform: a mean of .5 with a standard error of .037.
+    assert abs(p.mean() - 0.5) < 0.16
+
+
+@pytest.mark.parametrize("name", sorted(METRICS))
+def test_a_population_with_two_modes_is_no_normal_one(name: str) -> None:
+    assert (probabilities(name, "bimodal", 3) < UNLIKELY).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(METRICS))
+@pytest.mark.parametrize(
+    ("family", "low", "high"),
+    [
+        ("normal", 0.0, 0.06),
+        ("t3", 0.3, 1.0),
+        ("bimodal", 0.95, 1.0),
+        ("exponential", 0.8, 1.0),
+    ],
+)
+def test_how_often_families_are_called_wrong(
+    name: str, family: str, low: float, high: float
+) -> None:
+    share = (probabilities(name, family, 60) < UNLIKELY).mean()
+    assert low <= share <= high
+
+
+def test_diagnose_says_so_of_optima_and_draws() -> None:
+    wrong = optimum("pr", "bimodal", 0)
+    said = "the inputs probably have another family"
+    assert said in str(prb.diagnose(wrong))
+    idata = prb.sample_smc(200, chains=2, optimum=wrong, model=wrong.model, progressbar=False)
+    assert idata.posterior.attrs["fit_probability"] < UNLIKELY
+    assert said in str(prb.diagnose(idata))
+    assert prb.diagnose(optimum("pr", "normal", 0)).ok
+
+
+def test_it_costs_no_response() -> None:
+    found = optimum("pr", "t3", 0)
+    before = found.evaluator.n_responses
+    fit_probability(found.sampling(), 50, 0)
+    assert found.evaluator.n_responses == before
+
+
+def test_repeated_measurements_of_a_specimen_are_drawn_together() -> None:
+    """Each of ten values twice is no normal sample of twenty, but is one of ten specimens."""
+    values = np.repeat(np.random.default_rng(5).normal(1, 0.5, 10), 2)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        prb.Simulator(
+            "y", same, x, metric=prb.AreaMetric(), observed=values, propagation=R256,
+            specimens=np.repeat(np.arange(10), 2),
+        )  # fmt: skip
+    p = fit_probability(prb.minimize(model).sampling(), 200, 0)
+    assert p > 0.05
+
+
+def test_what_is_not_stored_is_not_known() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        prb.Simulator(
+            "y", same, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0],
+            propagation=prb.Resimulated(64),
+        )  # fmt: skip
+    assert np.isnan(fit_probability(prb.minimize(model).sampling(), 50, 0))
+    assert of_another_family(np.nan) == []
