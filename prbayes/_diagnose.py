@@ -94,6 +94,8 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     >>> print(prb.diagnose(prb.minimize(model)))
     No problem was found.
     """
+    if not isinstance(result, Optimum):
+        _refuse_other(result)
     if model is not None:
         require_of_model(result, model, "diagnose", Level.OPTIMUM)
     if isinstance(result, Optimum):
@@ -101,6 +103,16 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     if "optimum" in result and "posterior" not in result:
         return _of_stored_optimum(result["optimum"].attrs)
     return _of_draws(result, model)
+
+
+def _refuse_other(result: object) -> None:
+    """Raise if a result is no tree of draws or of an optimum."""
+    known = isinstance(result, xr.DataTree) and {"posterior", "optimum"} & set(result.children)
+    if not known:
+        raise TypeError(
+            f"diagnose: result: got {type(result).__name__}, expected an Optimum from "
+            "prb.minimize, or a DataTree with a posterior group, such as prb.sample_smc returns"
+        )
 
 
 # -- optima ----------------------------------------------------------------------------------

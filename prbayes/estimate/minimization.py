@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pymc as pm
 
-from prbayes._checks import Floats, positive_integer, positive_number
+from prbayes._checks import Floats, flag, positive_integer, positive_number, real_array
+from prbayes._checks import random_seed as refuse_seed
 from prbayes._progress import shown
 from prbayes.estimate.caveats import breakdown, caveats, elements_at_edge
 from prbayes.estimate.data_sets import SETS
@@ -92,11 +93,26 @@ def refine(
         if thetas is None:
             find_optimum(evaluator, Minimisation())
         else:
+            wanted = _thetas(evaluator, thetas)
             for _ in range(MAX_ROUNDS):
-                if not refine_at(evaluator, np.asarray(thetas, dtype=np.float64)):
+                if not refine_at(evaluator, wanted):
                     break
-            refuse(shortcomings(evaluator, thetas), evaluator)
+            refuse(shortcomings(evaluator, wanted), evaluator)
     return {name: design.n_points for name, design in evaluator.designs.items()}
+
+
+def _thetas(evaluator: Evaluator, thetas: Any) -> Floats:
+    """Return thetas, shape (P, d), or raise if they are none of the model's."""
+    found = real_array(thetas, "thetas")
+    size = evaluator.size
+    if found.ndim != 2 or found.shape[1] != size or not len(found):
+        raise ValueError(
+            f"thetas: got shape {found.shape}, expected (P, {size}) with P >= 1: a row for each "
+            f"population, a column for each of {evaluator.names}"
+        )
+    if not np.isfinite(found).all():
+        raise ValueError("thetas: got NaN or infinite values, expected finite ones")
+    return found
 
 
 # Points of the prior from which other optima are searched for where a theta costs no response; the
@@ -203,13 +219,16 @@ def minimize(
     True
     """
     evaluator = Evaluator(model_on_context(model, "prb.minimize"))
+    if starts is not None:
+        positive_integer(starts, "starts", minimum=0)
+    refuse_seed(random_seed)
     asked = Minimisation(
         start=start,
         method=Method.of(method, options),
-        prior=prior,
+        prior=flag(prior, "prior"),
         tolerance=positive_number(tolerance, "tolerance"),
         max_evaluations=positive_integer(max_evaluations, "max_evaluations"),
-        refine=refine,
+        refine=flag(refine, "refine"),
         starts=starts,
         random_seed=random_seed,
     )

@@ -6,7 +6,8 @@ import time
 
 import xarray as xr
 
-from prbayes._checks import positive_integer
+from prbayes._checks import flag, positive_integer
+from prbayes._checks import random_seed as refuse_seed
 from prbayes._progress import shown
 from prbayes.estimate.data_sets import reweighted_sets, simulated_sets
 from prbayes.estimate.identifiability import unidentified_directions
@@ -77,6 +78,8 @@ def bootstrap(
     clock = time.perf_counter()
     evaluator = require_refits(optimum, "bootstrap", "; use prb.sample_smc").evaluator
     positive_integer(draws, "draws", minimum=2)
+    flag(parametric, "parametric")
+    refuse_seed(random_seed)
     sampling = optimum.sampling()
     unidentified = unidentified_directions(sampling.local.unidentified, evaluator.readable_names)
     if unidentified:

@@ -14,7 +14,8 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats, positive_integer
+from prbayes._checks import Floats, file_path, flag, positive_integer, share
+from prbayes._checks import random_seed as refuse_seed
 from prbayes._progress import shown
 from prbayes.estimate.minimization import Minimisation, find_optimum
 from prbayes.estimate.obstacles import refit_obstacle
@@ -26,7 +27,7 @@ from prbayes.model.hyperparameters import THETAS
 from prbayes.model.identity import identity_of, require_same
 from prbayes.model.node import Node, model_on_context
 from prbayes.model.support import shortcomings
-from prbayes.posterior.adjustment import Adjusted, Affine
+from prbayes.posterior.adjustment import Adjusted, Affine, refuse_adjustment
 from prbayes.posterior.chains import Chains, Particles
 from prbayes.posterior.checkpoint import Checkpoint, stored_settings
 from prbayes.posterior.epsilon import calibrate_epsilon
@@ -122,9 +123,12 @@ def sample_smc(
     positive_integer(draws, "draws", minimum=10)
     positive_integer(chains, "chains")
     model = model_on_context(model, "prb.sample_smc")
-    if not isinstance(adjust, Affine | bool):
-        got = f"{type(adjust).__name__} {adjust!r:.60}"
-        raise TypeError(f"adjust: got {got}, expected prb.posterior.Affine(), True or False")
+    refuse_adjustment(adjust)
+    flag(refine, "refine")
+    refuse_seed(random_seed, optional=True)
+    share(threshold, "threshold")
+    if checkpoint is not None:
+        file_path(checkpoint, "checkpoint")
     if optimum is not None and not isinstance(optimum, Optimum):
         got = type(optimum).__name__
         raise TypeError(f"optimum: got {got}, expected an Optimum; call prb.minimize() first")

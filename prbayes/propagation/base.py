@@ -28,7 +28,7 @@ from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, prior_draws, valid
 from prbayes.response.failures import Abort, OnFailure
 from prbayes.response.inputs import Inputs
-from prbayes.response.response import Responses, refuse_version
+from prbayes.response.response import Responses, refuse_calling
 
 # Parts of a population's points whose differences tell its error: few enough that each is a design
 # of its own, and their spread is then known to about a quarter, 1 / sqrt(2 (8 - 1)).
@@ -213,19 +213,7 @@ class Propagation(ABC):
 
     def check(self) -> None:
         """Refuse what is no executor, folder or policy."""
-        executor, store = self.executor, self.store
-        executes = hasattr(executor, "submit") and hasattr(executor, "map")
-        if executor is not None and not executes:
-            got = type(executor).__name__
-            raise TypeError(f"executor: got {got}, expected a concurrent.futures.Executor")
-        if store is not None and not isinstance(store, str | PathLike):
-            raise TypeError(f"store: got {type(store).__name__}, expected the path of a folder")
-        refuse_version(self.version)
-        if not isinstance(self.on_failure, OnFailure):
-            raise TypeError(
-                f"on_failure: got {type(self.on_failure).__name__} {self.on_failure!r:.60}, "
-                "expected prb.response.Abort(), prb.response.Replace() or prb.response.Retry()"
-            )
+        refuse_calling(self.executor, self.store, self.version, self.on_failure)
 
     @abstractmethod
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:

@@ -15,6 +15,7 @@ from typing import Any, Self
 import pymc as pm
 import xarray as xr
 
+from prbayes._checks import called, file_path, flag, folder_path, plain_text
 from prbayes.estimate.optimum import Optimum
 from prbayes.reports.contents import contents
 from prbayes.reports.section import Section
@@ -51,6 +52,8 @@ class _Document:
         KeyError
             If no section has that title.
         """
+        if not isinstance(section, Section):
+            raise TypeError(f"section: got {called(section)}, expected a prb.reports.Section")
         place = len(self.sections) if after is None else self._end_of(after, section.level)
         before, behind = self.sections[:place], self.sections[place:]
         return replace(self, sections=(*before, section, *behind))
@@ -69,14 +72,14 @@ class _Document:
 
     def to_html(self, path: str | PathLike[str]) -> Path:
         """Write one file that holds everything, for a browser and for print; return its path."""
-        return _write(Path(path), self._html())
+        return _write(file_path(path, "path"), self._html())
 
     def to_markdown(self, folder: str | PathLike[str]) -> Path:
         """Write ``report.md``, and pictures as files beside it, into a folder.
 
         The path of ``report.md`` is returned.
         """
-        folder = Path(folder)
+        folder = folder_path(folder, "folder")
         files = [_file_name(i, section) for i, section in enumerate(self.sections, 1)]
         text = (
             _markdown()
@@ -181,6 +184,13 @@ class Report(_Document):
     ) -> None:
         if not isinstance(title, str) or not title.strip():
             raise TypeError(f"Report: title: got {title!r:.60}, expected a text")
+        plain_text(author, "Report: author", empty=True)
+        plain_text(date, "Report: date", empty=True)
+        flag(pictures, "Report: pictures")
+        if not isinstance(sections, Sequence):
+            raise TypeError(
+                f"Report: sections: got {called(sections)}, expected prb.reports.Section objects"
+            )
         made = tuple(sections)
         if not made:
             made = contents(model, optimum, posterior, validity, comparison, pictures=pictures)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pytensor.graph.basic import Variable
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, called, executes, folder_path
 from prbayes.response.batches import batch_shape, broadcast_batch
 from prbayes.response.calling import (
     Calling,
@@ -29,8 +29,8 @@ from prbayes.response.store import Store
 
 def refuse_uncallable(name: str, function: object) -> None:
     """Raise if a response is no function: often the inputs were given first."""
-    if not callable(function):
-        got = type(function).__name__
+    if not callable(function) or isinstance(function, type):
+        got = called(function) if isinstance(function, type) else type(function).__name__
         raise TypeError(
             f"{name}: response: got {got}, expected a function of the inputs, such as "
             "lambda x: x**2; the order is Simulator(name, response, *inputs, metric=..., "
@@ -38,9 +38,22 @@ def refuse_uncallable(name: str, function: object) -> None:
         )
 
 
+def refuse_calling(executor: object, store: object, version: object, on_failure: object) -> None:
+    """Raise if one of the arguments that say how a response is called is not of its kind."""
+    executes(executor, "executor")
+    if store is not None:
+        folder_path(store, "store")
+    refuse_version(version)
+    if not isinstance(on_failure, OnFailure):
+        raise TypeError(
+            f"on_failure: got {called(on_failure)}, expected prb.response.Abort(), "
+            "prb.response.Replace() or prb.response.Retry()"
+        )
+
+
 def refuse_version(version: object) -> None:
-    """Raise if a version is no text."""
-    if version is not None and not isinstance(version, str):
+    """Raise if a version is no text, or an empty one."""
+    if version is not None and (not isinstance(version, str) or not version):
         raise TypeError(
             f"version: got {type(version).__name__} {version!r:.60}, expected a text that names "
             "the response as it is, such as '2' or 'mesh 3, solver 1.4'"

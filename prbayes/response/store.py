@@ -22,7 +22,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, plain_text, positive_integer, stated_path
 from prbayes.response.database import (
     COMPUTED,
     FAILED,
@@ -131,8 +131,12 @@ class Store:
         *,
         version: str | None = None,
     ) -> None:
-        self.folder = Path(folder)
-        self.name = name
+        self.folder = stated_path(folder, "folder", "folder")
+        self.name = plain_text(name, "name")
+        if columns is not None:
+            positive_integer(columns, "columns")
+        if version is not None:
+            plain_text(version, "version")
         self.columns = columns
         self.version = version
         self.verified = version is not None

@@ -12,12 +12,12 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from prbayes._checks import Floats, positive_integer, share
+from prbayes._checks import Floats, file_path, plain_text, positive_integer, share
 from prbayes._progress import shown
 from prbayes.propagation.points import sobol
 from prbayes.response.calling import Calling, Points, ResponseError, Tally, respond
 from prbayes.response.failures import Abort, OnFailure, Replace
-from prbayes.response.response import refuse_version
+from prbayes.response.response import refuse_calling
 from prbayes.response.store import Store
 from prbayes.surrogate.error import CrossValidation, cross_validated, points_needed
 from prbayes.surrogate.files import Kept, read, write
@@ -156,12 +156,13 @@ class Surrogate:
         ...     data = [0.5, 1.0, 4.0]
         ...     y = prb.Simulator("y", surrogate, x, metric=prb.AreaMetric(), observed=data)
         """
+        plain_text(name, "Surrogate.fit: name")
         model = model or RadialBasis()
         outside = outside or Replace()
-        _refuse_wrong(name, response, model, outside, store)
+        _refuse_wrong(name, response, model, outside)
+        refuse_calling(executor, store, version, Abort() if on_failure is None else on_failure)
         share(coverage, f"{name}: coverage")
         positive_integer(random_seed, f"{name}: random_seed", minimum=0)
-        refuse_version(version)
         domain, predictive = read_ranges(name, inputs, coverage, random_seed)
         needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=needed)
@@ -286,6 +287,11 @@ class Surrogate:
         ----------
         path : path-like
         """
+        path = file_path(path, "path")
+        if not path.absolute().parent.is_dir():
+            raise ValueError(
+                f"path: got {path}, whose folder does not exist, expected one that does"
+            )
         kept = Kept(
             ranges=self.domain,
             points=self.points,
@@ -320,7 +326,7 @@ class Surrogate:
         TypeError, ValueError
             If a regressor is needed, or the surface is not that which was saved.
         """
-        kept = read(path)
+        kept = read(file_path(path, "path"))
         if model is None:
             model = shipped(kept.kind, kept.settings)
         if model is None:
@@ -406,7 +412,7 @@ class Surrogate:
         return self._predict(sobol(64, self.domain.dimensions, 0))
 
 
-def _refuse_wrong(name: str, response: object, model: Any, outside: object, store: object) -> None:
+def _refuse_wrong(name: str, response: object, model: Any, outside: object) -> None:
     """Raise if an argument of `Surrogate.fit` is not of its kind."""
     if not callable(response):
         raise TypeError(
@@ -425,5 +431,3 @@ def _refuse_wrong(name: str, response: object, model: Any, outside: object, stor
             f"{name}: outside: got {outside!r:.60}, expected prb.response.Replace() or "
             "prb.response.Abort()"
         )
-    if store is not None and not isinstance(store, str | PathLike):
-        raise TypeError(f"{name}: store: got {type(store).__name__}, expected the path of a folder")

@@ -10,7 +10,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats, positive_integer, real_array
+from prbayes._checks import Floats, flag, real_array, sample_labels
+from prbayes._checks import random_seed as refuse_seed
 from prbayes._predict import specimen_names
 from prbayes.model.identity import Identity, Level, from_attributes, require_together
 from prbayes.validation.predictive import Predictive
@@ -108,8 +109,9 @@ def read_case(
     TypeError, ValueError
         If an argument is not as described there.
     """
-    if random_seed is not None:
-        positive_integer(random_seed, "random_seed", minimum=0)
+    refuse_seed(random_seed, optional=True)
+    flag(folded, "folded")
+    flag(randomize, "randomize")
     numbers: dict[object, int] = {}
     conditions = []
     for name, measured, simulated, labels in _by_condition(observed, predicted, specimens):
@@ -218,13 +220,7 @@ def _labels(name: str, labels: Any, n: int) -> tuple[str, ...] | None:
     """Return the labels of n observations as text."""
     if labels is None:
         return None
-    found = tuple(specimen_names(labels)) if np.ndim(labels) == 1 else ()
-    if len(found) != n:
-        raise ValueError(
-            f"{name}: specimens: got shape {np.shape(labels)}, expected ({n},), one label per "
-            "observation"
-        )
-    return found
+    return tuple(specimen_names(sample_labels(labels, n, f"{name}: specimens")))
 
 
 def _measured(name: str, values: Any) -> Floats:

@@ -9,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
+from prbayes._checks import random_seed as refuse_seed
 from prbayes._progress import shown
 from prbayes.estimate.data_sets import DataSets, specimens
 from prbayes.estimate.optimum import Optimum, require_refits
@@ -73,6 +74,7 @@ def cross_validate(
     advice = ", so that the model cannot be calibrated anew"
     evaluator = require_refits(optimum, "cross_validate", advice).evaluator
     folds = positive_integer(folds, "folds", minimum=2)
+    refuse_seed(random_seed)
     parts = _Folds.dealt(evaluator.nodes, folds, random_seed)
 
     # Calibrate on the others of each fold.
