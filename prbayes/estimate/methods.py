@@ -79,7 +79,7 @@ class Method:
         from scipy import optimize  # takes longer to import than the whole package
 
         # It knows its options only when it runs: here on a parabola, from its minimum.
-        trial = {**self.options, "disp": False}
+        trial = {name: value for name, value in self.options.items() if name != "disp"}
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             # What is wrong with the value of an option, the user's problem tells.

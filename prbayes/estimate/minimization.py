@@ -31,6 +31,7 @@ from prbayes.estimate.refinement import (
     pilot,
     refine_at,
     refuse,
+    refuse_lost,
     spread_around,
 )
 from prbayes.estimate.refit import SamplingDistribution
@@ -538,6 +539,7 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State, others: list[Rival]
         screened=begun.screened,
         responses_before=plan.responses_before,
     )
+    refuse_lost(evaluator, {name: each["lost_mass"] for name, each in found.support.items()})
     warnings = (
         *breakdown(edge, jump),
         *caveats(evaluator, state.local, others, state.design_error),

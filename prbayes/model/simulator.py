@@ -125,6 +125,8 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         store=propagation.store,
         version=propagation.version,
         on_failure=propagation.on_failure,
+        retry_failed=propagation.retry_failed,
+        timeout=propagation.timeout,
     )
     with shown(progressbar):
         bound = propagation.bind(name, sorted_inputs, target, responses)

@@ -20,7 +20,7 @@ from prbayes._progress import shown
 from prbayes.estimate.minimization import Minimisation, find_optimum
 from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, require_sampling
-from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse
+from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
 from prbayes.model.epsilon import checked_epsilon
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
@@ -177,6 +177,8 @@ def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
         if found.reason is not None:
             _log.warning("the draws are not adjusted: %s; their width is epsilon's", found.reason)
         particles = found.particles
+        errors, missing = _at_the_best(evaluator, particles)
+        refuse_lost(evaluator, {name: each["lost_mass"] for name, each in missing.items()})
         return posterior_tree(
             evaluator,
             found.thetas,
@@ -185,7 +187,8 @@ def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
             unadjusted=None if found.thetas is particles.thetas else particles.thetas,
             adjustment=found.note,
             warnings=() if optimum is None else optimum.warnings,
-            errors=_discrepancy_errors(evaluator, particles),
+            errors=errors,
+            missing=missing,
             seed=asked.random_seed,
             n_responses=evaluator.n_responses - before,
             seconds=time.perf_counter() - clock,
@@ -378,16 +381,23 @@ def _optima(optimum: Optimum, evaluator: Evaluator) -> tuple[Floats, ...]:
     return tuple(theta[order] for theta in (optimum.theta, *rivals))
 
 
-def _discrepancy_errors(evaluator: Evaluator, particles: Particles) -> Floats:
-    """Return the Monte Carlo errors of the discrepancies at the best particle, shape (k,)."""
+def _at_the_best(
+    evaluator: Evaluator, particles: Particles
+) -> tuple[Floats, dict[str, dict[str, float]]]:
+    """Return, of the best particle, the Monte Carlo errors of its discrepancies, and what it lacks.
+
+    The errors have shape (k,); shares of its populations without numbers come by simulator.
+    """
     total = (particles.discrepancies / evaluator.epsilon).sum(axis=-1)
     where = np.unravel_index(total.argmin(), total.shape)
     best = particles.thetas[where][None]
     errors = []
+    missing = {}
     for k, node in enumerate(evaluator.nodes):
         roots = evaluator.roots(best, k)
         errors.append(node.bound.discrepancy_error(roots))
-    return np.array(errors)
+        missing[node.name] = evaluator.missing(best[0], k)
+    return np.array(errors), missing
 
 
 def _checkpoint(

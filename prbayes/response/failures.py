@@ -6,7 +6,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from prbayes._checks import called, flag, positive_integer
+from prbayes._checks import Floats, called, flag, positive_integer
+
+
+@dataclass(frozen=True, eq=False)
+class Failure:
+    """A point whose response failed."""
+
+    inputs: Floats  # (columns,): the arguments of the response, one after the other
+    reason: str  # what was raised, in words
 
 
 class OnFailure:

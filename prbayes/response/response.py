@@ -22,7 +22,7 @@ from prbayes.response.calling import (
     scalar,
     shapes,
 )
-from prbayes.response.failures import Abort, OnFailure
+from prbayes.response.failures import Abort, Failure, OnFailure
 from prbayes.response.inputs import Inputs
 from prbayes.response.store import Store
 
@@ -80,6 +80,9 @@ class Responses:
     version : str, optional
         Of the function, for the store.
     on_failure : OnFailure, optional
+    retry_failed : bool
+    timeout : float, optional
+        Seconds.
 
     Attributes
     ----------
@@ -97,6 +100,8 @@ class Responses:
         store: Any = None,
         version: str | None = None,
         on_failure: OnFailure | None = None,
+        retry_failed: bool = False,
+        timeout: float | None = None,
     ) -> None:
         refuse_uncallable(name, function)
         policy = on_failure or Abort()
@@ -111,14 +116,14 @@ class Responses:
             and not isinstance(function, scalar)
         )
         self.count = 0
-        self._calling = Calling(name, function, executor, kept, policy)
+        self._calling = Calling(name, function, executor, kept, policy, retry_failed, timeout)
         self._tally = Tally()
         self._event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
 
     def copied(self) -> Responses:
         """Return the same function with counts of its own; executor and store are the same."""
         other = copy.copy(self)
-        other._tally = copy.copy(self._tally)
+        other._tally = self._tally.copied()
         return other
 
     @property
@@ -130,6 +135,11 @@ class Responses:
     def failures(self) -> int:
         """Points whose response failed and was replaced."""
         return self._tally.failures
+
+    @property
+    def failed(self) -> tuple[Failure, ...]:
+        """The points that failed, each once, with their reasons; the first ten thousand."""
+        return tuple(self._tally.failed.values())
 
     def same_as(self, other: Responses) -> bool:
         """Return whether another has the same function, aleatory inputs and constants."""
@@ -170,7 +180,7 @@ class Responses:
         try:
             with np.errstate(all="ignore"):
                 result = self.function(*arguments)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise ResponseError(
                 f"{self.name}: the response raised {type(error).__name__}: {error}; it was called "
                 f"with inputs of shapes {shapes(arguments)} and is expected to take arrays of any "

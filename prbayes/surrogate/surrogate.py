@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from prbayes._checks import Floats, file_path, plain_text, positive_integer, share
+from prbayes._checks import Floats, file_path, flag, plain_text, positive_integer, share
 from prbayes._progress import shown
 from prbayes.propagation.points import sobol
 from prbayes.response.calling import Calling, Points, ResponseError, Tally, respond
@@ -105,6 +105,7 @@ class Surrogate:
         store: str | PathLike[str] | None = None,
         version: str | None = None,
         on_failure: OnFailure | None = None,
+        retry_failed: bool = False,
         random_seed: int = 0,
         progressbar: bool = True,
     ) -> Surrogate:
@@ -132,7 +133,7 @@ class Surrogate:
         coverage : float
         name : str
             For messages, and of the store.
-        executor, store, version, on_failure
+        executor, store, version, on_failure, retry_failed
             As for `Reweighted`. A point that fails in the end is left out of the fit; the surrogate
             then fails where that is the nearest point.
         random_seed : int
@@ -161,6 +162,7 @@ class Surrogate:
         outside = outside or Replace()
         _refuse_wrong(name, response, model, outside)
         refuse_calling(executor, store, version, Abort() if on_failure is None else on_failure)
+        flag(retry_failed, f"{name}: retry_failed")
         share(coverage, f"{name}: coverage")
         positive_integer(random_seed, f"{name}: random_seed", minimum=0)
         domain, predictive = read_ranges(name, inputs, coverage, random_seed)
@@ -170,7 +172,7 @@ class Surrogate:
         # Compute the responses.
         points = domain.at(sobol(n, domain.dimensions, random_seed))
         kept = None if store is None else Store(store, name, points.shape[1], version=version)
-        calling = Calling(name, response, executor, kept, on_failure or Abort())
+        calling = Calling(name, response, executor, kept, on_failure or Abort(), retry_failed)
         varying = [not one.constant for one in domain.inputs]
         tally = Tally()
         with shown(progressbar):
