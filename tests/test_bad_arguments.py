@@ -159,6 +159,9 @@ PROPAGATION: dict[str, Sequence[Any]] = {
     **CALLING,
     "random_seed": SEED_NEEDED,
     "on_failure": ("abort", prb.response.Abort, None, 3),
+    "max_lost": (1.0, -0.1, np.nan, "a", None, True, False),
+    "retry_failed": FLAG,
+    "timeout": (0, -1.0, np.nan, "a", True, 5.0),
 }
 PICTURE: dict[str, Sequence[Any]] = {
     "backend": ("gnuplot", 3, ""),
@@ -270,7 +273,6 @@ TABLE: dict[str, Row] = {
         {
             **PROPAGATION,
             "n": COUNT,
-            "max_lost": (1.0, -0.1, np.nan, "a", None, True),
             "max_points": (3, 0, 1.5, "a", True),
         },
     ),
@@ -558,6 +560,7 @@ TABLE: dict[str, Row] = {
             "name": (*TEXT, "", None),
             **CALLING,
             "on_failure": ("abort", prb.response.Abort, 3),
+            "retry_failed": FLAG,
             "random_seed": SEED_NEEDED,
             "progressbar": FLAG,
         },

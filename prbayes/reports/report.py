@@ -29,6 +29,20 @@ _MARKUP = re.compile(r"([\\`*_{}\[\]<>|&~$!])")
 _AT_START = re.compile(r"^(?:#+|[-+](?=\s|$)|-{2,}|={1,}|\d{1,9}(?=[.)](?:\s|$)))")
 
 
+# What readers make a link of although nothing marks it as one (autolinks of GitHub, 6.9).
+_BARE_LINK = re.compile(r"(?i)\b(https?|ftp)(:)(?=//)|\b(www)(\.)")
+# Characters that are not seen but change what is: controls but for line ends, and marks of the
+# direction of writing (Unicode, annex 9), which turn what follows around.
+_UNSEEN = re.compile(
+    "[\x00-\x08\x0e-\x1f\x7f-\x84\x86-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ufeff]"
+)
+
+
+def visible(text: str) -> str:
+    """Return a text with a mark in the place of characters that are not seen."""
+    return _UNSEEN.sub("\N{REPLACEMENT CHARACTER}", text)
+
+
 @dataclass(frozen=True, eq=False)
 class _Document:
     """A title and sections, and how they are written."""
@@ -206,9 +220,16 @@ class Report(_Document):
 @cache
 def _environment() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
+
+    def seen(value: Any) -> Any:
+        return visible(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
     return Environment(
-        loader=PackageLoader("prbayes.reports"), autoescape=True, undefined=StrictUndefined
+        loader=PackageLoader("prbayes.reports"),
+        autoescape=True,
+        finalize=seen,
+        undefined=StrictUndefined,
     )
 
 
@@ -230,7 +251,8 @@ def _markdown() -> Any:
 
 def _literal(text: str) -> str:
     """Return a text, in one line, that Markdown shows as it is."""
-    line = _MARKUP.sub(r"\\\1", " ".join(text.split()))
+    line = _MARKUP.sub(r"\\\1", " ".join(visible(text).split()))
+    line = _BARE_LINK.sub(r"\1\3\\\2\4", line)
     return _AT_START.sub(_escaped_start, line)
 
 
