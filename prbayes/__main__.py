@@ -14,7 +14,8 @@ import xarray as xr
 
 from prbayes._demo import run_demo
 from prbayes.model.identity import from_attributes
-from prbayes.reports.report import Report
+from prbayes.reports.report import Report, visible
+from prbayes.reports.soundness import complaints
 from prbayes.validation.validity import ValidityTest
 
 _REPORT = """examples:
@@ -139,13 +140,20 @@ def _report(given: argparse.Namespace) -> list[Path]:
         )
     except (TypeError, ValueError, KeyError) as error:
         raise UserError(f"{', '.join(map(str, given.files))}: {_line(error)}") from error
+    except UserError:
+        raise
+    except Exception as error:  # whatever a part of a report makes of a crafted file
+        raise UserError(
+            f"{', '.join(map(str, given.files))}: got contents that cannot be reported "
+            f"({type(error).__name__}: {_line(error)}), expected files as prbayes writes them"
+        ) from error
     written = []
     try:
         if given.markdown is not None:
             written.append(report.to_markdown(given.markdown))
         if given.out is not None or given.markdown is None:
             written.append(report.to_html(given.out or Path("report.html")))
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise UserError(f"cannot write: {_line(error)}") from error
     return written
 
@@ -201,6 +209,9 @@ def _opened(path: Path) -> xr.DataTree:
             f"{path}: got groups {sorted(found.children)}, expected results of prbayes: "
             "a group posterior or optimum, or a validity test"
         )
+    complaint = next(complaints(found), None)
+    if complaint is not None:
+        raise UserError(f"{path}: {complaint}; the file is damaged, or not of prbayes")
     return found
 
 
@@ -221,12 +232,14 @@ def _test_of(path: Path, dataset: xr.Dataset) -> ValidityTest:
         )
     except KeyError as error:
         raise UserError(
-            f"{path}: got no {error}, expected a validity test saved by to_dataset()"
+            f"{path}: got no {_line(error)}, expected a validity test saved by to_dataset()"
         ) from error
 
 
 def _line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+    # A KeyError puts its message in quotes.
+    text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+    return visible(" ".join(text.split())) or type(error).__name__
 
 
 if __name__ == "__main__":

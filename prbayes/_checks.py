@@ -5,7 +5,9 @@ Every message says what was got, what was expected, and what to do.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,27 +39,40 @@ def real_array(values: ArrayLike, name: str) -> Floats:
         raise TypeError(
             f"{name}: got complex numbers, expected real ones; pass the real part or the modulus"
         )
-    if array.dtype.kind not in "fiub":
+    if array.dtype.kind not in "fiu":
         array = _numbers_in_objects(values, array, name)
     return np.asarray(array, dtype=np.float64)
 
 
 def _numbers_in_objects(values: object, array: NDArray[Any], name: str) -> Floats:
     """Return the numbers that an array of Python objects holds, or raise for any other array."""
-    if array.dtype.kind == "O":
+    # NumPy would read numbers out of texts, and NaN out of None; in a list that is one missing.
+    lone = array.ndim == 0 and values is None
+    if array.dtype.kind == "O" and not lone and not any(map(_is_no_number, array.flat)):
         try:
             return array.astype(np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             pass
     got = _describe(values, array)
     raise TypeError(f"{name}: got {got}, expected real numbers")
 
 
+def _is_no_number(value: object) -> bool:
+    return isinstance(value, bool | np.bool_ | str | bytes)
+
+
 def _describe(values: object, array: NDArray[Any]) -> str:
     """Return what was passed, in words for a message."""
     if array.ndim == 0:
-        return f"{type(values).__name__} {values!r:.60}"
+        return called(values)
     return f"an array of dtype {array.dtype}"
+
+
+def called(value: object) -> str:
+    """Return what an argument is, for a message."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    return f"{type(value).__name__} {value!r:.60}"
 
 
 def observed_sample(values: ArrayLike, name: str = "observed", *, minimum: int = 1) -> Floats:
@@ -219,3 +234,95 @@ def share(value: object, name: str) -> float:
     if not 0 < value < 1:
         raise ValueError(f"{name}: got {value!r}, expected a number between 0 and 1")
     return float(value)
+
+
+def flag(value: object, name: str) -> bool:
+    """Return ``value``, or raise a `TypeError` if it is neither True nor False."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name}: got {called(value)}, expected True or False")
+    return bool(value)
+
+
+def random_seed(value: object, name: str = "random_seed", *, optional: bool = False) -> None:
+    """Raise if ``value`` is no seed: an integer >= 0, or, where it is optional, None."""
+    if value is None and optional:
+        return
+    positive_integer(value, name, minimum=0)
+
+
+def plain_text(value: object, name: str, *, empty: bool = False) -> str:
+    """Return ``value``, or raise if it is no text, or one without a letter."""
+    if not isinstance(value, str):
+        raise TypeError(f"{name}: got {called(value)}, expected a text")
+    if not empty and not value.strip():
+        raise ValueError(f"{name}: got {value!r}, expected a text that is not empty")
+    return value
+
+
+def texts(value: object, name: str) -> None:
+    """Raise if ``value`` is no mapping of texts to texts."""
+    pairs = list(value.items()) if isinstance(value, Mapping) else [(value, None)]
+    if not all(isinstance(one, str) for pair in pairs for one in pair):
+        raise TypeError(
+            f"{name}: got {called(value)}, expected a mapping of names to texts, such as "
+            '{"mu": "mean stiffness"}'
+        )
+
+
+def stated_path(value: object, name: str, what: str) -> Path:
+    """Return ``value`` as the path of a file or folder, or raise if it is none."""
+    if not isinstance(value, str | os.PathLike) or isinstance(os.fspath(value), bytes):
+        raise TypeError(f"{name}: got {called(value)}, expected the path of a {what}")
+    if not os.fspath(value):
+        raise ValueError(f"{name}: got {value!r}, expected the path of a {what}")
+    return Path(value)
+
+
+def folder_path(value: object, name: str) -> Path:
+    """Return the path of a folder that is there or can be made, or raise."""
+    path = stated_path(value, name, "folder")
+    if path.exists() and not path.is_dir():
+        raise ValueError(f"{name}: got {path}, which is a file, expected a folder")
+    return path
+
+
+def file_path(value: object, name: str) -> Path:
+    """Return the path of a file that is there or can be written, or raise."""
+    path = stated_path(value, name, "file")
+    if path.is_dir():
+        raise ValueError(f"{name}: got {path}, which is a folder, expected a file")
+    return path
+
+
+def executes(value: object, name: str) -> None:
+    """Raise if ``value`` is neither None nor an executor."""
+    known = callable(getattr(value, "submit", None)) and callable(getattr(value, "map", None))
+    if value is not None and (isinstance(value, type) or not known):
+        raise TypeError(
+            f"{name}: got {called(value)}, expected a concurrent.futures.Executor, such as "
+            "ProcessPoolExecutor(4)"
+        )
+
+
+def sample_labels(values: ArrayLike, n: int, name: str) -> NDArray[Any]:
+    """Return labels of n specimens, shape (n,): texts or numbers, none of them missing."""
+    # As objects: NumPy would make the text 'nan' of a label that is missing.
+    labels = np.asarray(values, dtype=object)
+    if labels.shape != (n,):
+        raise ValueError(
+            f"{name}: got shape {labels.shape}, expected ({n},), one label per observation"
+        )
+    for label in labels:
+        if not _is_label(label):
+            raise ValueError(
+                f"{name}: got {called(label)} as a label, expected texts or numbers; give a "
+                "specimen that has no label one of its own"
+            )
+    return np.asarray(values)
+
+
+def _is_label(value: object) -> bool:
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if number:
+        return bool(np.isfinite(value))  # type: ignore[call-overload]
+    return isinstance(value, str | np.datetime64)

@@ -11,7 +11,7 @@ import pymc as pm
 import xarray as xr
 from scipy.stats import norm
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, called
 from prbayes._weighted import INTERVAL
 from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.metrics.area import AreaMetric
@@ -82,6 +82,12 @@ def compare(
     >>> table.hyperparameter.values.tolist()
     ['mu']
     """
+    if not isinstance(results, Mapping):
+        raise TypeError(
+            f"compare: results: got {called(results)}, expected a mapping such as "
+            "{'optimum': optimum, 'ABC': idata}"
+        )
+    _refuse_metrics(metrics)
     if not results:
         raise ValueError(
             "compare: got no results, expected a dict such as {'optimum': optimum, 'ABC': idata}"
@@ -117,6 +123,17 @@ def compare(
     return xr.Dataset(data, coords=coords, attrs=attrs)
 
 
+def _refuse_metrics(metrics: object) -> None:
+    """Raise if they are no metrics."""
+    if metrics is None:
+        return
+    if not isinstance(metrics, Sequence) or not all(isinstance(m, Metric) for m in metrics):
+        raise TypeError(
+            f"compare: metrics: got {called(metrics)}, expected metric objects, such as "
+            "[prb.AreaMetric()]"
+        )
+
+
 class _Estimate(NamedTuple):
     """Of one element, by one result."""
 
@@ -148,7 +165,7 @@ def _column(label: str, result: Any) -> _Column:
         elements = _normal(optimum.data_vars, result["stderr"].data_vars)
         return _Column(elements, *_cost(optimum.attrs))
     raise TypeError(
-        f"{label}: got {type(result).__name__}, "
+        f"compare: results: {label}: got {type(result).__name__}, "
         "expected an Optimum or a DataTree with a posterior group"
     )
 

@@ -106,13 +106,25 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     >>> print(prb.diagnose(prb.minimize(model)))
     No problem was found.
     """
+    if not isinstance(result, Optimum):
+        _refuse_other(result)
     if model is not None:
         require_of_model(result, model, "diagnose", Level.OPTIMUM)
     if isinstance(result, Optimum):
         return _of_optimum(result)
     if "optimum" in result and "posterior" not in result:
-        return _of_stored_optimum(result["optimum"].attrs)
+        return _of_stored_optimum(result)
     return _of_draws(result, model)
+
+
+def _refuse_other(result: object) -> None:
+    """Raise if a result is no tree of draws or of an optimum."""
+    known = isinstance(result, xr.DataTree) and {"posterior", "optimum"} & set(result.children)
+    if not known:
+        raise TypeError(
+            f"diagnose: result: got {type(result).__name__}, expected an Optimum from "
+            "prb.minimize, or a DataTree with a posterior group, such as prb.sample_smc returns"
+        )
 
 
 # -- optima ----------------------------------------------------------------------------------
@@ -123,7 +135,8 @@ def _of_optimum(optimum: Optimum) -> Diagnosis:
     if not optimum.converged and not optimum.at_edge:  # an edge is one of the warnings
         messages.append(_not_converged(optimum.message))
     designs = _computed(optimum.evaluator, optimum.theta[None])
-    return Diagnosis((*messages, *_unsupported(designs)), designs.support)
+    failed = _failed(optimum.failures)
+    return Diagnosis((*messages, *failed, *_unsupported(designs)), designs.support)
 
 
 def _of_family(optimum: Optimum) -> list[str]:
@@ -134,11 +147,32 @@ def _of_family(optimum: Optimum) -> list[str]:
     return of_another_family(fit_probability(optimum.sampling(), SETS, 0))
 
 
-def _of_stored_optimum(attrs: Mapping[Any, Any]) -> Diagnosis:
+def _of_stored_optimum(result: xr.DataTree) -> Diagnosis:
+    attrs = result["optimum"].attrs
     messages = _warnings(attrs)
     if not attrs.get("converged", True):
         messages.append(_not_converged(str(attrs.get("message", ""))))
-    return Diagnosis(tuple(messages), xr.Dataset())
+    return Diagnosis((*messages, *_failed_in(result)), xr.Dataset())
+
+
+def _failed_in(result: xr.DataTree) -> list[str]:
+    return _failed(result["failures"].to_dataset()) if "failures" in result.children else []
+
+
+def _failed(failures: xr.Dataset) -> list[str]:
+    """Say which responses failed, and why the first did."""
+    found = []
+    names = failures["simulator"].values
+    for name in dict.fromkeys(names.tolist()):
+        own = failures.isel(failure=np.flatnonzero(names == name))
+        inputs = own["inputs"].values[0]
+        at = ", ".join(f"{x:.6g}" for x in inputs[~np.isnan(inputs)])
+        found.append(
+            f"The response of {name} failed at {own.sizes['failure']} point(s), the first at "
+            f"({at}): {own['reason'].values[0]}; what took its place is no result. Look at "
+            "optimum.failures, or the group failures of a result, and repair the response."
+        )
+    return found
 
 
 def _not_converged(message: str) -> str:
@@ -163,6 +197,7 @@ def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
         *_convergence(variables),
         *_copies(_before_adjustment(result, variables)),
         *_motion(result),
+        *_failed_in(result),
         *_unsupported(designs),
     ]
     return Diagnosis(tuple(messages), designs.support)

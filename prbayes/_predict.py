@@ -16,7 +16,7 @@ import pytensor.tensor as pt
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from prbayes._checks import Floats, Seed, positive_integer, seed_number
+from prbayes._checks import Floats, Seed, flag, plain_text, positive_integer, seed_number
 from prbayes._progress import shown
 from prbayes._weighted import reached
 from prbayes.estimate.optimum import Optimum, identity_in, require_of_model
@@ -31,8 +31,9 @@ from prbayes.propagation.reweighted import Design
 from prbayes.response.calling import ResponseError
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, quantiles
+from prbayes.response.failures import Abort
 from prbayes.response.inputs import Inputs, read_inputs
-from prbayes.response.response import Responses, refuse_uncallable, refuse_version
+from prbayes.response.response import Responses, refuse_calling, refuse_uncallable
 
 _log = logging.getLogger("prbayes")
 
@@ -135,6 +136,10 @@ def predict(
     refuse_uncallable("prb.predict", response)
     positive_integer(n_samples, "n_samples", minimum=2)
     positive_integer(draws, "draws")
+    flag(stored, "stored")
+    if name is not None:
+        plain_text(name, "name")
+    refuse_calling(executor, store, version, Abort())
     if model is None and isinstance(result, Optimum):
         model = result.model
     model = model_on_context(model, "prb.predict")
@@ -143,7 +148,6 @@ def predict(
         require_of_model(result, model, "prb.predict", Level.POPULATIONS)
     points, coords = populations_of(result, model, draws, "prb.predict")
     sorted_inputs = read_inputs(label, inputs, model)
-    refuse_version(version)
     responses = Responses(
         label, response, sorted_inputs, executor=executor, store=store, version=version
     )

@@ -20,6 +20,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from prbayes._checks import flag
+
 _log = logging.getLogger("prbayes")
 
 # Expected seconds from which there is a bar. By judgement: as long as one waits without wondering.
@@ -41,6 +43,7 @@ _hidden: ContextVar[bool] = ContextVar("hidden", default=False)
 @contextmanager
 def shown(visible: bool) -> Iterator[bool]:
     """Show bars inside only if ``visible`` here and in all outer calls; gives whether they show."""
+    flag(visible, "progressbar")
     token = _hidden.set(_hidden.get() or not visible)
     try:
         yield not _hidden.get()

@@ -45,11 +45,10 @@ def test_every_kind_of_real_numbers_becomes_float64(check: Callable[..., Any], v
     np.testing.assert_array_equal(array, [1.0, 2.0])
 
 
-def test_booleans_count_as_zero_and_one() -> None:
-    np.testing.assert_array_equal(real_array([True, False], "x"), [1.0, 0.0])
-
-
 NOT_REAL = {
+    "booleans": ([True, False], "got an array of dtype bool, expected real numbers"),
+    "a boolean in objects": (np.array([True, "a"], dtype=object), "dtype object, expected real"),
+    "texts of numbers": (np.array(["1.0", 2], dtype=object), "dtype object, expected real"),
     "complex": ([1 + 2j, 0], "got complex numbers, expected real ones"),
     "complex in objects": (
         np.array([1j, "a"], dtype=object),
@@ -94,7 +93,6 @@ def test_missing_values_in_a_list_are_not_taken_for_numbers() -> None:
     ("values", "match"),
     [
         (3.0, r"shape \(\), expected one dimension, \(N,\)"),
-        (None, r"shape \(\), expected one dimension"),
         (np.ones((2, 3)), r"shape \(2, 3\), expected one dimension.*one Simulator each"),
         ([], "got no values, expected at least 1"),
         (np.ones((0, 2)), r"shape \(0, 2\)"),

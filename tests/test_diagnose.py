@@ -1,5 +1,6 @@
 """Diagnostics of a sampler's result: sentences, silence, and what ArviZ draws of our trees."""
 
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -344,3 +345,75 @@ def test_an_adjustment_does_not_hide_that_one_particle_survived() -> None:
         collapsed["unadjusted"][name].values[2] = 0.5
     text = str(prb.diagnose(collapsed))
     assert "Of 500 draws only 1 differ in chain 2, expected at least 50" in text
+
+
+# -- failures ------------------------------------------------------------------------------------
+
+
+def breaks_above(limit: float) -> Any:
+    def response(x: float) -> float:
+        if x > limit:
+            raise OSError("license server")
+        return x
+
+    return prb.scalar(response)
+
+
+def failing(propagation: Any, limit: float = 1.1) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
+        given = {"metric": prb.AreaMetric(), "observed": OBSERVED, "epsilon": 0.1}
+        prb.Simulator("y", breaks_above(limit), x, propagation=propagation, **given)
+    return model
+
+
+REPLACED = prb.response.Replace()
+
+
+@pytest.mark.parametrize(
+    "propagation",
+    [prb.Resimulated(64, on_failure=REPLACED), prb.Fresh(64, on_failure=REPLACED)],
+    ids=lambda p: type(p).__name__,
+)
+def test_an_answer_that_rests_on_the_specimens_that_are_left_is_refused(propagation: Any) -> None:
+    model = failing(propagation)
+    lost = r"y: lost mass: got \d+\.\d% .*expected at most max_lost = 5.0%.*repair the response"
+    with pytest.raises(prb.propagation.DesignError, match=lost):
+        prb.minimize(model, method="Nelder-Mead", max_evaluations=30, progressbar=False)
+    with pytest.raises(prb.propagation.DesignError, match=lost):
+        prb.sample_smc(20, chains=1, model=model, adjust=False, progressbar=False)
+
+
+def test_more_may_be_lost_where_that_is_asked_for_and_is_reported() -> None:
+    model = failing(prb.Resimulated(64, on_failure=REPLACED, max_lost=0.9))
+    optimum = prb.minimize(model, method="Nelder-Mead", max_evaluations=30, progressbar=False)
+    assert 0.1 < optimum.support["y"]["lost_mass"] < 0.9
+    tree = prb.sample_smc(20, chains=1, model=model, adjust=False, progressbar=False)
+    assert 0.1 < tree["calibration"]["lost_mass_at_best"].item() < 0.9
+
+
+def test_failed_responses_are_part_of_results_diagnosis_and_report() -> None:
+    model = failing(prb.Resimulated(32, on_failure=prb.response.Replace(np.inf)), limit=2.0)
+    optimum = prb.minimize(model, method="Nelder-Mead", max_evaluations=30, progressbar=False)
+    failures = optimum.failures
+    assert failures.sizes["failure"] > 0
+    assert (failures["inputs"].values > 2.0).all()
+    assert set(failures["reason"].values) == {"it raised OSError: license server"}
+    told = r"The response of y failed at \d+ point\(s\), the first at \(\d.*license server"
+    share = optimum.support["y"]["failed_mass"]
+    assert 0 < share < 0.2
+    assert f"y: {share:.1%} of specimens fail" in repr(optimum)
+    tree = prb.sample_smc(20, chains=1, model=model, adjust=False, progressbar=False)
+    assert 0 <= tree["calibration"]["failed_mass_at_best"].item() < 0.3
+    for result in (optimum, optimum.to_datatree(), tree):
+        (message,) = [m for m in prb.diagnose(result).messages if "failed" in m]
+        assert re.search(told, message)
+    report = prb.Report("A", optimum=optimum.to_datatree(), posterior=tree, pictures=False)
+    (section,) = [s for s in report.sections if s.title == "Failed responses"]
+    assert section.table["reason"].tolist()[0] == "it raised OSError: license server"
+    assert len(section.table) <= 20
+
+
+def test_results_without_failures_have_no_table_of_them() -> None:
+    _, tree = sampled()
+    assert "failures" not in tree.children

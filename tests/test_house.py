@@ -182,6 +182,7 @@ TAIL = (
     "store",
     "version",
     "on_failure",
+    "retry_failed",
     "checkpoint",
     "random_seed",
     "progressbar",

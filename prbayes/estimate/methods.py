@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -66,6 +68,35 @@ class Method:
             raise TypeError(
                 f"options: got {type(self.options).__name__}, expected a mapping of names to values"
             )
+        self._refuse_unknown_options()
+
+    def _refuse_unknown_options(self) -> None:
+        """Raise if scipy's method does not know an option, which it would only warn of."""
+        if not isinstance(self.method, str) or not self.options:
+            return
+        if not all(isinstance(name, str) for name in self.options):
+            raise TypeError(f"options: got {list(self.options)} as names, expected texts")
+        from scipy import optimize  # takes longer to import than the whole package
+
+        # It knows its options only when it runs: here on a parabola, from its minimum.
+        trial = {name: value for name, value in self.options.items() if name != "disp"}
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            # What is wrong with the value of an option, the user's problem tells.
+            with suppress(Exception):
+                optimize.minimize(
+                    lambda x: (x @ x, 2 * x),
+                    np.zeros(2),
+                    method=self.method,
+                    jac=True,
+                    options=trial,
+                )
+        for found in caught:
+            if issubclass(found.category, optimize.OptimizeWarning):
+                raise ValueError(
+                    f"options: got {dict(self.options)}, expected options of scipy's "
+                    f"{self.method}; scipy says: {found.message}"
+                )
 
     @classmethod
     def of(

@@ -14,7 +14,15 @@ from typing import Any
 import numpy as np
 import pymc as pm
 
-from prbayes._checks import Floats, Seed, positive_integer, positive_number, real_array, seed_number
+from prbayes._checks import (
+    Floats,
+    Seed,
+    flag,
+    positive_integer,
+    positive_number,
+    real_array,
+    seed_number,
+)
 from prbayes._progress import shown
 from prbayes.estimate.caveats import breakdown, caveats, elements_at_edge, heavy_tails
 from prbayes.estimate.data_sets import SETS
@@ -30,6 +38,7 @@ from prbayes.estimate.refinement import (
     pilot,
     refine_at,
     refuse,
+    refuse_lost,
     spread_around,
 )
 from prbayes.estimate.refit import SamplingDistribution
@@ -92,7 +101,7 @@ def refine(
         if thetas is None:
             find_optimum(evaluator, Minimisation())
         else:
-            wanted = _finite_thetas(thetas, evaluator)
+            wanted = _thetas(evaluator, thetas)
             for _ in range(MAX_ROUNDS):
                 if not refine_at(evaluator, wanted):
                     break
@@ -100,19 +109,18 @@ def refine(
     return {name: design.n_points for name, design in evaluator.designs.items()}
 
 
-def _finite_thetas(thetas: object, evaluator: Evaluator) -> Floats:
-    """Return thetas as an array (P, d) of numbers, or raise."""
-    array = real_array(thetas, "refine: thetas")  # type: ignore[arg-type]
-    if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] != evaluator.size:
+def _thetas(evaluator: Evaluator, thetas: Any) -> Floats:
+    """Return thetas, shape (P, d), or raise if they are none of the model's."""
+    found = real_array(thetas, "thetas")
+    size = evaluator.size
+    if found.ndim != 2 or found.shape[1] != size or not len(found):
         raise ValueError(
-            f"refine: thetas: got shape {array.shape}, expected (P, {evaluator.size}), one row for "
-            f"each population, of {', '.join(evaluator.names)}"
+            f"thetas: got shape {found.shape}, expected (P, {size}) with P >= 1: a row for each "
+            f"population, a column for each of {evaluator.names}"
         )
-    if not np.isfinite(array).all():
-        raise ValueError(
-            "refine: thetas: got NaN or infinity, expected finite numbers; leave such rows out"
-        )
-    return array
+    if not np.isfinite(found).all():
+        raise ValueError("thetas: got NaN or infinite values, expected finite ones")
+    return found
 
 
 # Points of the prior from which other optima are searched for where a theta costs no response; the
@@ -219,13 +227,15 @@ def minimize(
     True
     """
     evaluator = Evaluator(model_on_context(model, "prb.minimize"))
+    if starts is not None:
+        positive_integer(starts, "starts", minimum=0)
     asked = Minimisation(
         start=start,
         method=Method.of(method, options),
-        prior=prior,
+        prior=flag(prior, "prior"),
         tolerance=positive_number(tolerance, "tolerance"),
         max_evaluations=positive_integer(max_evaluations, "max_evaluations"),
-        refine=refine,
+        refine=flag(refine, "refine"),
         starts=starts,
         random_seed=seed_number(random_seed),
     )
@@ -538,6 +548,7 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State, others: list[Rival]
         screened=begun.screened,
         responses_before=plan.responses_before,
     )
+    refuse_lost(evaluator, {name: each["lost_mass"] for name, each in found.support.items()})
     warnings = (
         *breakdown(edge, jump),
         *heavy_tails(evaluator, state.theta),

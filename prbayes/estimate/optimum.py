@@ -24,7 +24,7 @@ from prbayes.model.identity import (
     identity_of_model,
     require_same,
 )
-from prbayes.model.labels import labelled, observed_dataset, versions
+from prbayes.model.labels import failures_dataset, labelled, observed_dataset, versions
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,8 +63,9 @@ class Optimum:
     names : list of str
         Names of the elements of theta.
     support : dict
-        By simulator with `Reweighted`: ``weight_ess``, ``mean_weight`` and ``lost_mass`` at the
-        optimum.
+        By simulator: ``lost_mass``, the share of the population at the optimum that has no
+        response (NaN), and ``failed_mass``, that of specimens that failed (+inf) in the rest; with
+        `Reweighted` also ``weight_ess`` and ``mean_weight``.
     trace : dict
         ``theta`` (n, d), ``discrepancy`` (n,) and ``evaluations`` (n,) of each point that the
         optimiser asked for: unconstrained hyperparameters, the objective there, and how many
@@ -127,7 +128,12 @@ class Optimum:
         what = "Optimum with the prior" if self.prior else "Optimum"
         head = f"{what}: discrepancy {self.discrepancy:.4g} after"
         cost = f"{self.n_evaluations} evaluations, {self.n_responses} responses, {state}"
-        return "\n  ".join([f"{head} {cost}", *found, *self.warnings])
+        return "\n  ".join([f"{head} {cost}", *found, *self._shares(), *self.warnings])
+
+    def _shares(self) -> list[str]:
+        """Say which share of the specimens fails, where some do."""
+        shares = {name: each.get("failed_mass", 0.0) for name, each in self.support.items()}
+        return [f"{name}: {share:.1%} of specimens fail" for name, share in shares.items() if share]
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Travel with the model packed by cloudpickle: those of PyMC have no plain pickle."""
@@ -149,6 +155,15 @@ class Optimum:
         Without those found in a store, with those computed again.
         """
         return sum(node.bound.responses.computed for node in self.evaluator.nodes)
+
+    @property
+    def failures(self) -> xr.Dataset:
+        """Points whose response failed for the model so far.
+
+        Dims (failure) and (failure, column): ``simulator``, ``inputs``, the arguments of the
+        response one after the other, and ``reason``.
+        """
+        return failures_dataset(self.evaluator)
 
     def sampling(self, *, weakest: float = 1.0) -> SamplingDistribution:
         """Return the sampling distribution of the minimiser around the optimum.
@@ -299,6 +314,9 @@ def optimum_tree(optimum: Optimum) -> xr.DataTree:
         "calibration": _calibration_dataset(optimum),
         "observed_data": observed_dataset(evaluator),
     }
+    failures = optimum.failures
+    if failures.sizes["failure"]:
+        groups["failures"] = failures
     return xr.DataTree.from_dict(groups)
 
 
@@ -319,7 +337,7 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
         "discrepancy": ("simulator", list(optimum.discrepancies.values())),
         "scale": ("simulator", list(optimum.scales.values())),
     }
-    for key in ("weight_ess", "mean_weight", "lost_mass"):
+    for key in ("weight_ess", "mean_weight", "lost_mass", "failed_mass"):
         values = [optimum.support.get(n, {}).get(key, np.nan) for n in names]
         variables[key] = ("simulator", values)
     variables["theta"] = ("element", optimum.theta)

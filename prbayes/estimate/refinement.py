@@ -172,6 +172,22 @@ def refuse(short: Mapping[str, Shortcoming], evaluator: Evaluator) -> None:
     )
 
 
+def refuse_lost(evaluator: Evaluator, lost: Mapping[str, float]) -> None:
+    """Raise where too much of a population, of shares by simulator, has no response.
+
+    Of designs, refinement says it.
+    """
+    for node in evaluator.nodes:
+        share, most = lost.get(node.name, 0.0), node.bound.max_lost
+        if node.design is None and share > most:
+            raise DesignError(
+                f"{node.name}: lost mass: got {share:.1%} of the population without a response "
+                f"(NaN) at the answer, expected at most max_lost = {most:.1%}: it would rest on "
+                "the specimens that have one; repair the response, return +inf for specimens that "
+                "fail, or pass a larger max_lost to the propagation"
+            )
+
+
 def spread_around(center: Floats, covariance: Floats, prior_sd: Floats, *, seed: int = 0) -> Floats:
     """Return thetas around an optimum, from a normal with its covariance, no wider than the prior.
 

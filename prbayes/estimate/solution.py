@@ -112,10 +112,13 @@ def _nowhere(evaluator: Evaluator, theta: Floats, covariance: Floats) -> bool:
 
 
 def _support(evaluator: Evaluator, theta: Floats) -> dict[str, dict[str, float]]:
-    """Return how well the designs support the population at theta, by simulator."""
+    """Return how well designs support the population at theta, and what it lacks, by simulator."""
     out = {}
     for name, support in evaluator.support(theta[None]).items():
         out[name] = {key: float(value[0]) for key, value in support.items()}
+    for k, node in enumerate(evaluator.nodes):
+        if node.design is None:
+            out[node.name] = evaluator.missing(theta, k)
     return out
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, flag
 from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric, Minimum
 from prbayes.metrics.density import DensityEstimator, GaussianKDE, density_estimator
 
@@ -48,6 +48,7 @@ class KullbackLeibler(Metric):
 
     def __post_init__(self) -> None:
         density_estimator(self.density)
+        flag(self.reverse, "reverse")
 
     @property
     def additive(self) -> bool:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, flag
 from prbayes.metrics.base import Discrepancy, Metric
 
 
@@ -48,6 +48,7 @@ class FunctionMetric(Metric):
         if not callable(self.function):
             got = type(self.function).__name__
             raise TypeError(f"function: got {got}, expected f(simulated, observed)")
+        flag(self.weighted, "weighted")
 
     @property
     def takes_weights(self) -> bool:

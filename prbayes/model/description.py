@@ -74,7 +74,7 @@ def from_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
         found = json.loads(attrs["model"])
         variables = [_texts(v, _VARIABLE) for v in found["variables"]]
         simulators = [_texts(s, _SIMULATOR) for s in found["simulators"]]
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, RecursionError):
         return None
     return {"variables": variables, "simulators": simulators}
 

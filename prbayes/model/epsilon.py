@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import pymc as pm
 
-from prbayes._checks import positive_number
+from prbayes._checks import called, positive_number
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Identity, identity_of, require_same
 from prbayes.model.node import Node, required_nodes
@@ -37,8 +37,13 @@ def checked_epsilon(
         If a name is unknown, a value is not a positive number, or they were calibrated for another
         problem.
     """
+    if not isinstance(epsilon, Mapping):
+        raise TypeError(
+            f"epsilon: got {called(epsilon)}, expected a mapping of names of simulators to "
+            'positive numbers, such as {"y": 0.1}'
+        )
     names = [node.name for node in simulators]
-    unknown = sorted(set(epsilon) - set(names))
+    unknown = sorted(map(str, set(epsilon) - set(names)))
     if unknown:
         raise KeyError(f"epsilon: got {unknown}, expected names of simulators: {sorted(names)}")
     if isinstance(epsilon, Epsilon):

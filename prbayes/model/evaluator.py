@@ -278,6 +278,14 @@ class Evaluator:
         """Return responses and weights, (P, n) each, of the k-th simulator's populations."""
         return self.nodes[k].bound.populations(self.roots(thetas, k))
 
+    def missing(self, theta: Floats, k: int) -> dict[str, float]:
+        """Return the shares of a population without numbers, by what they are.
+
+        At the theta, shape (d,), that was evaluated last this costs no response.
+        """
+        found = self.nodes[k].bound.missing(self.roots(theta[None], k))
+        return {"lost_mass": float(found.lost[0]), "failed_mass": float(found.failed[0])}
+
     def support(self, thetas: Floats) -> dict[str, dict[str, Floats]]:
         """Return how well each design supports the populations at thetas, arrays of shape (P,)."""
         found = {}

@@ -15,7 +15,7 @@ import pytensor.tensor as pt
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.replace import graph_replace, vectorize_graph
 
-from prbayes._checks import Floats, real_array, refuse_single_precision
+from prbayes._checks import Floats, called, real_array, refuse_single_precision
 from prbayes.model.elements import element_names
 from prbayes.propagation.points import sobol
 from prbayes.response.compilation import compiled, ninf_for_invalid
@@ -146,10 +146,14 @@ class Hyperparameters:
         KeyError, TypeError, ValueError
             If the names are not the model's free variables, or a value is outside its support.
         """
+        if not isinstance(point, Mapping):
+            raise TypeError(
+                f"start: got {called(point)}, expected a dict with a value for each free variable"
+            )
         free = {rv.name: rv for rv in self.model.free_RVs}
         if set(point) != set(free):
             raise KeyError(
-                f"start: got {sorted(point)}, expected a value for each of {sorted(free)}"
+                f"start: got {sorted(map(str, point))}, expected a value for each of {sorted(free)}"
             )
         draws = []
         for name, rv in free.items():

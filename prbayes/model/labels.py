@@ -40,6 +40,30 @@ def labelled(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, in
     return xr.Dataset(variables, coords=coords)
 
 
+def failures_dataset(evaluator: Evaluator) -> xr.Dataset:
+    """Return the points whose response failed so far: simulator, inputs and reason of each.
+
+    Dims (failure) and (failure, column): the arguments of the response one after the other, NaN
+    where another simulator has more of them.
+    """
+    each = []
+    for node in evaluator.nodes:
+        each += [(node.name, failure) for failure in node.bound.responses.failed]
+    columns = max((failure.inputs.size for _, failure in each), default=0)
+    inputs = np.full((len(each), columns), np.nan)
+    for row, (_, failure) in zip(inputs, each, strict=True):
+        row[: failure.inputs.size] = failure.inputs
+    names = np.array([name for name, _ in each], dtype=object)
+    reasons = np.array([failure.reason for _, failure in each], dtype=object)
+    return xr.Dataset(
+        {
+            "simulator": ("failure", names.astype(str)),
+            "inputs": (["failure", "column"], inputs),
+            "reason": ("failure", reasons.astype(str)),
+        }
+    )
+
+
 def observed_dataset(evaluator: Evaluator) -> xr.Dataset:
     """Return the observed responses of all simulators, labelled."""
     observed = {node.name: node.target.observed for node in evaluator.nodes}

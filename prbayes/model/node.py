@@ -26,7 +26,7 @@ from pytensor.graph.basic import Apply, Constant
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, called
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Design, design_of
@@ -291,9 +291,13 @@ def nodes(model: pm.Model) -> dict[Any, Node]:
 
     Raises
     ------
+    TypeError
+        If it is no model.
     ValueError
         If `pymc.observe` gave one other data than it was made with.
     """
+    if not isinstance(model, pm.Model):
+        raise TypeError(f"model: got {called(model)}, expected a pm.Model")
     found = {}
     for rv in model.observed_RVs:
         if isinstance(rv.owner.op, SimulatorRV):

@@ -12,7 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from pytensor import config
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import observed_sample, positive_number, refuse_single_precision
+from prbayes._checks import (
+    called,
+    observed_sample,
+    plain_text,
+    positive_number,
+    refuse_single_precision,
+    sample_labels,
+)
 from prbayes._progress import shown
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.node import (
@@ -25,6 +32,7 @@ from prbayes.model.node import (
 )
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Reweighted
+from prbayes.response.compilation import PLAIN
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 
@@ -116,7 +124,8 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     refuse_single_precision(caller, config.floatX)
     model = model_on_context(None, caller)
     # A model within another one puts its own name before those of its variables.
-    name = pm.modelcontext(None).name_for(name)
+    name = pm.modelcontext(None).name_for(plain_text(name, "prb.Simulator: name"))
+    _refuse_name(name, model)
     target = _target(name, metric, observed, weights)
     propagation = Reweighted() if propagation is None else propagation
     if not isinstance(propagation, Propagation):
@@ -124,11 +133,13 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
             f"{name}: propagation: got {called(propagation)}, expected prb.Reweighted(n), "
             "prb.Resimulated(n) or prb.Fresh(n)"
         )
-    labels = None if specimens is None else _labels(name, specimens, target.observed.size)
+    size = target.observed.size
+    labels = None if specimens is None else sample_labels(specimens, size, f"{name}: specimens")
     before = list(nodes(model).values())
     others = [other for other in before if other.specimens is not None]
     if labels is not None:
         _refuse_alike_labels(name, labels, others)
+    _refuse_dims(name, dims, size, model)
     if epsilon is not None:
         positive_number(epsilon, f"{name}: epsilon")
     refuse_uncallable(name, response)
@@ -141,6 +152,8 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         store=propagation.store,
         version=propagation.version,
         on_failure=propagation.on_failure,
+        retry_failed=propagation.retry_failed,
+        timeout=propagation.timeout,
     )
     with shown(progressbar):
         bound = propagation.bind(name, sorted_inputs, target, responses)
@@ -184,21 +197,36 @@ def _target(
         raise type(error)(f"{name}: {error}") from None
 
 
-def called(thing: object) -> str:
-    """Return what an argument is, for a message."""
-    if isinstance(thing, type):
-        return f"the class {thing.__name__}"
-    return f"{type(thing).__name__} {thing!r:.60}"
-
-
-def _labels(name: str, specimens: ArrayLike, n: int) -> NDArray[Any]:
-    labels = np.asarray(specimens)
-    if labels.shape != (n,):
+def _refuse_name(name: object, model: pm.Model) -> None:
+    """Raise if a name is no text, or one that the model has already."""
+    full = model.name_for(plain_text(name, "prb.Simulator: name"))
+    if full in model.named_vars:
         raise ValueError(
-            f"{name}: specimens: got shape {labels.shape}, expected ({n},), "
-            "one label per observation"
+            f"prb.Simulator: name: got {name!r}, which is in the model already, expected a new "
+            "name; to run this again, run `with pm.Model():` and all below it again"
         )
-    return labels
+
+
+def _refuse_dims(name: str, dims: object, size: int, model: pm.Model) -> None:
+    """Raise if dims are not the name of one dimension of the model, as long as the data."""
+    if dims is None:
+        return
+    names = [dims] if isinstance(dims, str) else dims
+    if not isinstance(names, list | tuple) or [type(one) for one in names] != [str]:
+        raise TypeError(f"{name}: dims: got {called(dims)}, expected the name of one dimension")
+    (dim,) = names
+    lengths = model.dim_lengths
+    if dim not in lengths:
+        raise ValueError(
+            f"{name}: dims: got {dim!r}, expected one of the model's dimensions, {list(lengths)}; "
+            f"add it with pm.Model(coords={{{dim!r}: ...}})"
+        )
+    length = int(lengths[dim].eval(mode=PLAIN))
+    if length != size:
+        raise ValueError(
+            f"{name}: dims: got {dim!r} of length {length}, expected {size}, as many as there are "
+            "observed values"
+        )
 
 
 def _with_inputs(bound: Bound, others: list[Node]) -> tuple[str, ...]:

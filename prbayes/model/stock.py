@@ -10,10 +10,9 @@ import pytensor.tensor as pt
 from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, called
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.node import log_kernel
-from prbayes.model.simulator import called
 
 
 class abc_distance(Op):  # noqa: N801 (reads as a function in a model)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, texts
 from prbayes.plots._legends import draw_legend, legend_entry
 from prbayes.plots._ticks import Ticks
 
@@ -30,6 +30,9 @@ CIRCLE, CROSS, DIAMOND = "C0", "C3", "C4"
 
 # What has no artist of its own to keep.
 _OF_AXES = frozenset({"title", "xlabel", "ylabel", "xlim", "ylim", "xticks", "yticks"})
+
+# Those of ArviZ.
+_BACKENDS = ("matplotlib", "bokeh", "plotly", "none")
 
 Limits = tuple[float, float]
 
@@ -64,6 +67,20 @@ def _figure_settings(backend: str, width: float, height: float, rows: int) -> di
     across = 100 * width
     down = 100 * height + legend
     return {"figsize": (across, down), "figsize_units": "dots"}
+
+
+def refuse_look(labels: object, backend: object) -> None:
+    """Raise if labels are no texts by name, or there is no such backend; before anything is done.
+
+    Raises
+    ------
+    TypeError, ValueError
+        With what was expected.
+    """
+    if labels is not None:
+        texts(labels, "labels")
+    if backend is not None and backend not in _BACKENDS:
+        raise ValueError(f"backend: got {backend!r:.60}, expected one of {', '.join(_BACKENDS)}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -160,7 +160,10 @@ def read_before(
     if before is False:
         return np.empty((0, evaluator.size)), ""
     if isinstance(before, Mapping):
-        return evaluator.unconstrained(dict(before))[None], "as given"
+        try:
+            return evaluator.unconstrained(dict(before))[None], "as given"
+        except (KeyError, TypeError, ValueError) as error:
+            raise type(error)(f"before: {error.args[0]}") from None
     if before not in (None, True):
         raise TypeError(
             f"before: got {type(before).__name__}, expected a dict with a value for each "

@@ -13,7 +13,7 @@ import pymc as pm
 import pytensor.tensor as pt
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, called
 from prbayes.model.elements import element_name
 from prbayes.model.evaluator import Evaluator
 from prbayes.plots._curves import GRID_POINTS, central_range, smooth_densities
@@ -93,6 +93,11 @@ def chosen(known: list[Margin], inputs: Iterable[Any] | None) -> list[Margin]:
         return known
     if isinstance(inputs, str | TensorVariable):
         inputs = [inputs]
+    if not isinstance(inputs, list | tuple) or not inputs:
+        raise TypeError(
+            f"inputs: got {called(inputs)}, expected a list of names or .dist() objects, such as "
+            f"{[margin.name for margin in known][:2]}"
+        )
     found: list[Margin] = []
     for x in inputs:
         new = [margin for margin in known if _is(margin, x)]

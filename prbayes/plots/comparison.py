@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._checks import Floats
-from prbayes.plots._canvas import BLUE, DOTTED, GREY, INK, Canvas, Panel
+from prbayes._checks import Floats, flag
+from prbayes.plots._canvas import BLUE, DOTTED, GREY, INK, Canvas, Panel, refuse_look
 from prbayes.plots._names import named
 from prbayes.plots._ticks import round_ticks
 
@@ -64,6 +64,8 @@ def plot_comparison(
     >>> list(prb.plot_comparison(table, backend="none").viz["estimate"])
     ['mu']
     """
+    refuse_look(labels, backend)
+    flag(scores, "scores")
     if not _is_comparison(comparison):
         got = type(comparison).__name__
         raise TypeError(f"plot_comparison: got {got}, expected the Dataset of prb.compare")

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pymc as pm
 
-from prbayes._checks import Floats, positive_integer
+from prbayes._checks import Floats, called, positive_integer
 from prbayes.estimate.optimum import Optimum, require_of_model
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level
-from prbayes.plots._canvas import BLUE, CROSS, DIAMOND, INK, VERMILION, Canvas, Panel
+from prbayes.plots._canvas import BLUE, CROSS, DIAMOND, INK, VERMILION, Canvas, Panel, refuse_look
 from prbayes.plots._grid import Landscape, landscape, rooted
 from prbayes.plots._names import named
 from prbayes.plots._objective import check_optimum, free_elements, objective_label
@@ -87,6 +87,8 @@ def plot_landscape(
     >>> prb.plot_landscape(prb.minimize(model), backend="none").viz["optimum"].name
     'optimum'
     """
+    refuse_look(labels, backend)
+    positive_integer(responses, "responses", minimum=0)
     check_optimum(optimum, "plot_landscape")
     evaluator = _evaluator_of(optimum, model)
     known = list(free_elements(optimum.evaluator, optimum.theta[None]))
@@ -147,6 +149,8 @@ def _chosen(pair: Sequence[str] | None, known: list[str]) -> list[str]:
     """Return the one or two hyperparameters that are asked for, of those known."""
     if pair is None:
         return known[:2]
+    if not isinstance(pair, str | Sequence):
+        raise TypeError(f"pair: got {called(pair)}, expected one or two of {known}")
     names = [pair] if isinstance(pair, str) else list(pair)
     different = set(names)
     allowed = different <= set(known) and len(different) == len(names)

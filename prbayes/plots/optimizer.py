@@ -9,7 +9,7 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
-from prbayes.plots._canvas import BLUE, DASHED, GREY, VERMILION, Canvas, Panel
+from prbayes.plots._canvas import BLUE, DASHED, GREY, VERMILION, Canvas, Panel, refuse_look
 from prbayes.plots._names import named
 from prbayes.plots._objective import check_optimum, free_elements, objective, objective_label
 from prbayes.plots._ticks import log_ticks, spans_decades
@@ -64,6 +64,7 @@ def plot_optimizer(
     >>> list(prb.plot_optimizer(prb.minimize(model), backend="none").viz["asked"])
     ['discrepancy', 'mu']
     """
+    refuse_look(labels, backend)
     check_optimum(optimum, "plot_optimizer")
     path = free_elements(optimum.evaluator, optimum.trace["theta"])
     final = free_elements(optimum.evaluator, optimum.theta[None])

@@ -8,9 +8,9 @@ from typing import Any
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import share
+from prbayes._checks import positive_integer, share
 from prbayes.estimate.optimum import Optimum
-from prbayes.plots._canvas import Canvas
+from prbayes.plots._canvas import Canvas, refuse_look
 from prbayes.plots._ensemble import read_result
 from prbayes.plots._margins import chosen, margin_densities, margins
 from prbayes.plots._names import named
@@ -76,6 +76,9 @@ def plot_population(
     >>> list(prb.plot_population(prb.minimize(model), backend="none").viz["after"])
     ['load']
     """
+    refuse_look(labels, backend)
+    if draws is not None:
+        positive_integer(draws, "draws")
     share(level, "level")
     shown = read_result(result, model, "prb.plot_population", draws, free=True)
     wanted = chosen(margins(shown.evaluator), inputs)

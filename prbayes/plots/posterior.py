@@ -16,7 +16,17 @@ from prbayes.estimate.optimum import Optimum, identity_in, require_of_model
 from prbayes.model.elements import single_elements, split_elements, stacked_draws
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level, require_together
-from prbayes.plots._canvas import BLUE, DASHED, DIAMOND, DOTTED, GREY, VERMILION, Canvas, Panel
+from prbayes.plots._canvas import (
+    BLUE,
+    DASHED,
+    DIAMOND,
+    DOTTED,
+    GREY,
+    VERMILION,
+    Canvas,
+    Panel,
+    refuse_look,
+)
 from prbayes.plots._curves import bounded_density, central_levels
 from prbayes.plots._names import named
 from prbayes.plots._objective import free_elements
@@ -84,6 +94,7 @@ def plot_posterior(
     >>> list(prb.plot_posterior(posterior, optimum, model=model, backend="none").viz["posterior"])
     ['mu']
     """
+    refuse_look(labels, backend)
     _check_results(posterior, optimum, model)
     share(level, "level")
     found = _read_hyperparameters(posterior, optimum, model)

@@ -11,11 +11,11 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats, share
+from prbayes._checks import Floats, flag, positive_integer, share
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node
-from prbayes.plots._canvas import DASHED, INK, VERMILION, Canvas, Panel
+from prbayes.plots._canvas import DASHED, INK, VERMILION, Canvas, Panel, refuse_look
 from prbayes.plots._curves import (
     GRID_POINTS,
     central_range,
@@ -104,6 +104,10 @@ def plot_responses(
     >>> prb.plot_responses(prb.minimize(model), backend="none").viz["after"].name
     'after'
     """
+    refuse_look(labels, backend)
+    flag(ecdf, "ecdf")
+    if draws is not None:
+        positive_integer(draws, "draws")
     share(level, "level")
     shown = read_result(result, model, "prb.plot_responses", draws)
     start, what = read_before(result, shown.evaluator, before)

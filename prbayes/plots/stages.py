@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from prbayes._checks import Floats
-from prbayes.plots._canvas import CYCLE, DASHDOT, DASHED, DOTTED, SOLID, Canvas, Panel
+from prbayes.plots._canvas import CYCLE, DASHDOT, DASHED, DOTTED, SOLID, Canvas, Panel, refuse_look
 from prbayes.plots._names import named
 from prbayes.plots._ticks import Ticks, log_ticks, spans_decades
 
@@ -72,6 +72,7 @@ def plot_stages(
     >>> "chain_1" in prb.plot_stages(posterior, backend="none").viz
     True
     """
+    refuse_look(labels, backend)
     known = _read_statistics(posterior)
     # Those of the last stage only come last
     statistics = sorted(known, key=lambda statistic: statistic.once)
@@ -103,7 +104,7 @@ def _read_statistics(posterior: xr.DataTree) -> list[_Statistic]:
     """Return the statistics by stage, by order of the group."""
     if not isinstance(posterior, xr.DataTree) or "sample_stats" not in posterior:
         raise TypeError(
-            f"plot_stages: got {type(posterior).__name__}, expected the DataTree of "
+            f"plot_stages: posterior: got {type(posterior).__name__}, expected the DataTree of "
             "prb.sample_smc, with sample_stats"
         )
     found = []

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes.plots._canvas import BLUE, DASHED, INK, PALE, VERMILION, Canvas, Panel
+from prbayes.plots._canvas import BLUE, DASHED, INK, PALE, VERMILION, Canvas, Panel, refuse_look
 from prbayes.plots._curves import steps
 from prbayes.validation.validity import ValidityTest
 
@@ -54,6 +54,7 @@ def plot_validity(
     >>> prb.plot_validity(test, backend="none").viz["ecdf"].name
     'ecdf'
     """
+    refuse_look(None, backend)
     by_name = _by_name(tests)
     # The panel of a test alone has a name nevertheless
     panels = [name or "u" for name in by_name]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prbayes._checks import Floats, positive_integer
+from prbayes._checks import Floats, called, positive_integer
 from prbayes.estimate.data_sets import observed_set, simulated_sets
 from prbayes.estimate.goodness import of_another_family, probability_of_fit
 from prbayes.estimate.measured import drawn_in
@@ -48,6 +48,14 @@ _APART = 0.75
 # changes nothing; with half, directions about which data and prior tell as much are left to draws
 # of exp(-d / epsilon), whose spread differs by a third there (docs/constants.md).
 _WEAKEST = 2.0
+
+
+def refuse_adjustment(adjust: object) -> None:
+    """Raise if it is neither an adjustment nor whether there is to be one."""
+    if not isinstance(adjust, Affine | bool):
+        raise TypeError(
+            f"adjust: got {called(adjust)}, expected prb.posterior.Affine(), True or False"
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ import time
 
 import xarray as xr
 
-from prbayes._checks import Seed, positive_integer, seed_number
+from prbayes._checks import Seed, flag, positive_integer, seed_number
 from prbayes._progress import shown
 from prbayes.estimate.data_sets import reweighted_sets, simulated_sets
 from prbayes.estimate.identifiability import unidentified_directions
@@ -77,6 +77,7 @@ def bootstrap(
     clock = time.perf_counter()
     evaluator = require_refits(optimum, "bootstrap", "; use prb.sample_smc").evaluator
     positive_integer(draws, "draws", minimum=2)
+    flag(parametric, "parametric")
     seed = seed_number(random_seed)
     sampling = optimum.sampling()
     unidentified = unidentified_directions(sampling.local.unidentified, evaluator.readable_names)

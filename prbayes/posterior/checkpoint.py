@@ -68,10 +68,21 @@ class Checkpoint:
         data.attrs["digest"] = _digest(data)
         # Written beside and then renamed, so that the file is whole whenever the process ends.
         part = self.path.with_name(self.path.name + ".part")
-        data.to_netcdf(part, engine="h5netcdf")
-        with part.open("rb") as file:
-            os.fsync(file.fileno())
-        part.replace(self.path)
+        # Made in memory: HDF5 may end the process where the disk is full.
+        payload = data.to_netcdf(engine="h5netcdf")
+        try:
+            with part.open("wb") as file:
+                file.write(payload)
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(self.path)
+        except OSError as error:
+            part.unlink(missing_ok=True)
+            raise StoreError(
+                f"checkpoint: got {self.path}, which cannot be written ({error}), expected space "
+                "and the right to write there; the state of the stage before is kept: free some "
+                "space and run again"
+            ) from error
         self.arrays, self.note = arrays, note
 
     def _read(self) -> None:

@@ -17,12 +17,12 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats, Seed, positive_integer, seed_number
+from prbayes._checks import Floats, Seed, executes, flag, positive_integer, seed_number
 from prbayes._progress import progress, shown
 from prbayes.estimate.data_sets import fresh_data
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import model_on_context
-from prbayes.posterior.adjustment import Affine
+from prbayes.posterior.adjustment import Affine, refuse_adjustment
 from prbayes.posterior.smc import Sampling, sample
 from prbayes.posterior.trees import calibration_tree
 
@@ -106,6 +106,9 @@ def simulation_based_calibration(
     model = model_on_context(model, "prb.simulation_based_calibration")
     positive_integer(n, "n", minimum=2)
     positive_integer(draws, "draws", minimum=10)
+    refuse_adjustment(adjust)
+    executes(executor, "executor")
+    flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
     evaluator = Evaluator(model)
     if evaluator.has_other_terms:

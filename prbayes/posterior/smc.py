@@ -14,19 +14,19 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats, Seed, positive_integer, seed_number
+from prbayes._checks import Floats, Seed, file_path, flag, positive_integer, seed_number, share
 from prbayes._progress import shown
 from prbayes.estimate.minimization import Minimisation, find_optimum
 from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, require_sampling
-from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse
+from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
 from prbayes.model.epsilon import checked_epsilon
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
 from prbayes.model.identity import identity_of, require_same
 from prbayes.model.node import Node, model_on_context
 from prbayes.model.support import shortcomings
-from prbayes.posterior.adjustment import Adjusted, Affine
+from prbayes.posterior.adjustment import Adjusted, Affine, refuse_adjustment
 from prbayes.posterior.chains import Chains, Particles
 from prbayes.posterior.checkpoint import Checkpoint, stored_settings
 from prbayes.posterior.epsilon import calibrate_epsilon
@@ -127,9 +127,11 @@ def sample_smc(
     positive_integer(draws, "draws", minimum=10)
     positive_integer(chains, "chains")
     model = model_on_context(model, "prb.sample_smc")
-    if not isinstance(adjust, Affine | bool):
-        got = f"{type(adjust).__name__} {adjust!r:.60}"
-        raise TypeError(f"adjust: got {got}, expected prb.posterior.Affine(), True or False")
+    refuse_adjustment(adjust)
+    flag(refine, "refine")
+    share(threshold, "threshold")
+    if checkpoint is not None:
+        file_path(checkpoint, "checkpoint")
     if optimum is not None and not isinstance(optimum, Optimum):
         got = type(optimum).__name__
         raise TypeError(f"optimum: got {got}, expected an Optimum; call prb.minimize() first")
@@ -181,6 +183,8 @@ def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
             for line in found.warnings:
                 _log.warning("%s", line)
         particles = found.particles
+        errors, missing = _at_the_best(evaluator, particles)
+        refuse_lost(evaluator, {name: each["lost_mass"] for name, each in missing.items()})
         return posterior_tree(
             evaluator,
             found.thetas,
@@ -190,7 +194,8 @@ def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
             adjustment=found.note,
             measured=found.measured,
             warnings=(*(() if optimum is None else optimum.warnings), *found.warnings),
-            errors=_discrepancy_errors(evaluator, particles),
+            errors=errors,
+            missing=missing,
             seed=asked.random_seed,
             n_responses=evaluator.n_responses - before,
             seconds=time.perf_counter() - clock,
@@ -401,16 +406,23 @@ def _optima(optimum: Optimum, evaluator: Evaluator) -> tuple[Floats, ...]:
     return tuple(theta[order] for theta in (optimum.theta, *rivals))
 
 
-def _discrepancy_errors(evaluator: Evaluator, particles: Particles) -> Floats:
-    """Return the Monte Carlo errors of the discrepancies at the best particle, shape (k,)."""
+def _at_the_best(
+    evaluator: Evaluator, particles: Particles
+) -> tuple[Floats, dict[str, dict[str, float]]]:
+    """Return, of the best particle, the Monte Carlo errors of its discrepancies, and what it lacks.
+
+    The errors have shape (k,); shares of its populations without numbers come by simulator.
+    """
     total = (particles.discrepancies / evaluator.epsilon).sum(axis=-1)
     where = np.unravel_index(total.argmin(), total.shape)
     best = particles.thetas[where][None]
     errors = []
+    missing = {}
     for k, node in enumerate(evaluator.nodes):
         roots = evaluator.roots(best, k)
         errors.append(node.bound.discrepancy_error(roots))
-    return np.array(errors)
+        missing[node.name] = evaluator.missing(best[0], k)
+    return np.array(errors), missing
 
 
 def _checkpoint(

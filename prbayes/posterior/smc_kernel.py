@@ -9,7 +9,8 @@ import numpy as np
 import pymc as pm
 from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 
-from prbayes._checks import Floats, share
+from prbayes._checks import Floats, positive_integer, share
+from prbayes._checks import random_seed as refuse_seed
 from prbayes.model.evaluator import Evaluation, Evaluator
 from prbayes.model.node import model_on_context
 
@@ -62,7 +63,8 @@ class BatchedKernel(SMC_KERNEL):
         evaluator: Evaluator | None = None,
     ) -> None:
         # PyMC's constructor compiles functions of single particles, which this kernel never calls.
-        self.draws = draws
+        self.draws = positive_integer(draws, "draws")
+        refuse_seed(random_seed, optional=True)
         self.start = start
         self.threshold = share(threshold, "threshold")
         model = model_on_context(model, "BatchedKernel")

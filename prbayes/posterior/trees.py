@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.elements import split_elements
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import as_attributes, identity_of
-from prbayes.model.labels import labelled, observed_dataset, versions
+from prbayes.model.labels import failures_dataset, labelled, observed_dataset, versions
 
 
 def posterior_tree(
@@ -26,6 +27,7 @@ def posterior_tree(
     measured: dict[str, float] | None = None,
     warnings: tuple[str, ...] = (),
     errors: Floats | None = None,
+    missing: Mapping[str, Mapping[str, float]] | None = None,
     seed: int | None,
     n_responses: int,
     seconds: float,
@@ -50,6 +52,8 @@ def posterior_tree(
         What is not identified, and what is to be said of the adjustment.
     errors : ndarray, shape (k,), or None
         Monte Carlo errors of the discrepancies.
+    missing : mapping, optional
+        By simulator: shares of the best draw's population that were lost, and that failed.
     seed : int or None
     n_responses : int
         Scalar responses computed, the designs' included.
@@ -72,9 +76,14 @@ def posterior_tree(
     groups = {
         "posterior": _posterior(evaluator, thetas, attrs | _evidence(stats)),
         "sample_stats": _sample_stats(stats),
-        "calibration": _calibration(evaluator, thetas, discrepancies, errors).assign_attrs(attrs),
+        "calibration": _calibration(
+            evaluator, thetas, discrepancies, errors, missing or {}
+        ).assign_attrs(attrs),
         "observed_data": observed_dataset(evaluator),
     }
+    failures = failures_dataset(evaluator)
+    if failures.sizes["failure"]:
+        groups["failures"] = failures
     if unadjusted is not None:
         groups["unadjusted"] = _draws(evaluator, unadjusted)
     return xr.DataTree.from_dict(groups)
@@ -93,16 +102,25 @@ def _posterior(evaluator: Evaluator, thetas: Floats, attrs: dict[str, Any]) -> x
 
 
 def _calibration(
-    evaluator: Evaluator, thetas: Floats, discrepancies: Floats, errors: Floats
+    evaluator: Evaluator,
+    thetas: Floats,
+    discrepancies: Floats,
+    errors: Floats,
+    missing: Mapping[str, Mapping[str, float]],
 ) -> xr.Dataset:
     """Return what is known of the simulators, by draw and over all."""
     chains, draws, _ = thetas.shape
+    at_the_best = {}
+    for key in ("lost_mass", "failed_mass"):
+        shares = [missing.get(node.name, {}).get(key, np.nan) for node in evaluator.nodes]
+        at_the_best[f"{key}_at_best"] = ("simulator", shares)
     return xr.Dataset(
         {
             "discrepancy": (_EACH_DRAW, discrepancies),
             **_support(evaluator, thetas),
             "theta": (["chain", "draw", "element"], thetas),
             "discrepancy_error": ("simulator", errors),
+            **at_the_best,
             **_by_simulator(evaluator),
         },
         coords={
@@ -143,7 +161,7 @@ def _support(evaluator: Evaluator, thetas: Floats) -> dict[str, Any]:
     chains, draws, d = thetas.shape
     found = evaluator.support(thetas.reshape(-1, d))
     variables = {}
-    for key in ("weight_ess", "mean_weight", "lost_mass"):
+    for key in ("weight_ess", "mean_weight", "lost_mass", "failed_mass"):
         columns = np.full((chains * draws, len(evaluator.nodes)), np.nan)
         for k, node in enumerate(evaluator.nodes):
             if node.name in found:

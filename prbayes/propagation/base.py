@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from pytensor.graph.replace import graph_replace
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, flag, positive_number
 from prbayes.metrics.base import Discrepancy
-from prbayes.response.calling import ResponseError
+from prbayes.response.calling import ResponseError, refuse_timeout
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, prior_draws, valid
 from prbayes.response.failures import Abort, OnFailure
 from prbayes.response.inputs import Inputs
-from prbayes.response.response import Responses, refuse_version
+from prbayes.response.response import Responses, refuse_calling
 
 # Parts of a population's points whose differences tell its error: few enough that each is a design
 # of its own, and their spread is then known to about a quarter, 1 / sqrt(2 (8 - 1)).
@@ -37,6 +37,22 @@ N_BLOCKS = 8
 
 class DesignError(RuntimeError):
     """A design that cannot support the answer, even after refinement."""
+
+
+@dataclass(frozen=True, eq=False)
+class Missing:
+    """Shares of populations of which there are no numbers, shapes (k,)."""
+
+    lost: Floats  # of the weight, on points without response (NaN)
+    failed: Floats  # of the weight that is not lost, on specimens that failed (+inf)
+
+    @classmethod
+    def of(cls, values: Floats, weights: Floats) -> Missing:
+        """Return the shares of responses and weights, shapes (k, n)."""
+        lost = np.where(np.isnan(values), weights, 0.0).sum(axis=-1)
+        failed = np.where(np.isposinf(values), weights, 0.0).sum(axis=-1)
+        known = np.maximum(1 - lost, np.finfo(float).tiny)
+        return cls(lost, failed / known)
 
 
 class Bound(ABC):
@@ -62,6 +78,8 @@ class Bound(ABC):
         that their weights change along an edge only.
     is_line : bool
         Whether the points are a quadrature rule of one dimension, whose error falls like 1 / n.
+    max_lost : float
+        Largest share of a population's weight, at an answer, on points without response.
     draws : int
         Number of evaluations so far that a random propagation's next draws depend on; with the
         seeds and the roots it determines them.
@@ -74,8 +92,11 @@ class Bound(ABC):
     stored: ClassVar[bool] = False
     random: ClassVar[bool] = False
     support_moves: bool = False
+    max_lost: float = 0.05
     draws: int = 0
     stream: int = 0
+    # Of the populations that were looked at last.
+    _missing: Missing | None = None
     _probed: Floats = np.empty(0)
 
     @property
@@ -142,10 +163,23 @@ class Bound(ABC):
         size = len(params[0]) if params else 1
         result = np.full(size, np.inf)
         ok = self.valid(params)
+        self._missing = None
         if ok.any():
             values, weights = self.populations([p[ok] for p in params])
+            self._missing = Missing.of(values, weights)
             result[ok] = target.of(values, weights)
         return result
+
+    def missing(self, params: Sequence[Any]) -> Missing:
+        """Return the shares without numbers of the population at given roots, shapes (1, ...).
+
+        It was looked at last, commonly, and is then not computed again.
+        """
+        if self._missing is None or self._missing.lost.size != 1:
+            if not self.valid(params).all():
+                return Missing(np.ones(1), np.zeros(1))
+            self._missing = Missing.of(*self.populations(params))
+        return self._missing
 
     @property
     def blocks(self) -> NDArray[np.intp]:
@@ -161,6 +195,7 @@ class Bound(ABC):
         if self.n_points < 2 * N_BLOCKS:
             return np.nan
         values, weights = self.populations(params)
+        self._missing = Missing.of(values, weights)
         without_block = []
         for block in range(N_BLOCKS):
             left = self.blocks != block
@@ -221,26 +256,26 @@ class Propagation(ABC):
     store: str | PathLike[str] | None = field(default=None, repr=False)
     version: str | None = field(default=None, repr=False)
     on_failure: OnFailure = field(default_factory=Abort, repr=False)
+    retry_failed: bool = field(default=False, repr=False)
+    timeout: float | None = field(default=None, repr=False)
 
     def check(self) -> None:
         """Refuse what is no executor, folder or policy."""
-        executor, store = self.executor, self.store
-        executes = hasattr(executor, "submit") and hasattr(executor, "map")
-        if executor is not None and not executes:
-            got = type(executor).__name__
-            raise TypeError(f"executor: got {got}, expected a concurrent.futures.Executor")
-        if store is not None and not isinstance(store, str | PathLike):
-            raise TypeError(f"store: got {type(store).__name__}, expected the path of a folder")
-        refuse_version(self.version)
-        if not isinstance(self.on_failure, OnFailure):
-            raise TypeError(
-                f"on_failure: got {type(self.on_failure).__name__} {self.on_failure!r:.60}, "
-                "expected prb.response.Abort(), prb.response.Replace() or prb.response.Retry()"
-            )
+        refuse_calling(self.executor, self.store, self.version, self.on_failure)
+        flag(self.retry_failed, "retry_failed")
+        refuse_timeout(self.timeout, self.executor)
 
     @abstractmethod
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Return the moving part for one simulator; raises what this propagation cannot do."""
+
+
+def refuse_max_lost(max_lost: object, name: str) -> None:
+    """Raise if it is no share of a population's weight: from 0 on, and below 1."""
+    if isinstance(max_lost, bool) or max_lost != 0:
+        number = positive_number(max_lost, f"{name}: max_lost")
+        if number >= 1:
+            raise ValueError(f"{name}: max_lost: got {max_lost}, expected a share below 1")
 
 
 def refuse_nested(name: str, inputs: Inputs) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,7 +12,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
-from prbayes.propagation.base import Bound, Propagation, probe
+from prbayes.propagation.base import Bound, Propagation, probe, refuse_max_lost
 from prbayes.propagation.ops import OwnOp
 from prbayes.response.batches import batch_shape, broadcast_batch
 from prbayes.response.distributions import PopulationSampler
@@ -34,7 +34,9 @@ class Fresh(Propagation):
         Seed of the draws. They depend as well on the number of evaluations, on the seed of
         `sample_smc`, and on the hyperparameters: chains in processes of their own draw different
         specimens, and the same ones when they are run again.
-    executor, store, version, on_failure
+    max_lost : float
+        Largest share of a population whose response is NaN, at the answer.
+    executor, store, version, on_failure, retry_failed, timeout
         As for `Reweighted`.
 
     Examples
@@ -45,11 +47,13 @@ class Fresh(Propagation):
 
     n: int = 1024
     random_seed: int = 0
+    max_lost: float = field(default=0.05, repr=False)
 
     def __post_init__(self) -> None:
         self.check()
         positive_integer(self.n, "Fresh: n", minimum=1)
         positive_integer(self.random_seed, "Fresh: random_seed", minimum=0)
+        refuse_max_lost(self.max_lost, "Fresh")
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Prepare the generator of draws."""
@@ -72,6 +76,7 @@ class FreshBound(Bound):
     ) -> None:
         super().__init__(name, inputs, target, responses)
         self.n_per_theta = config.n
+        self.max_lost = config.max_lost
         self._seed = config.random_seed
         self._sampler = PopulationSampler(inputs)
         probe(self, self._sampler, config.random_seed)

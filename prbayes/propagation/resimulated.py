@@ -16,7 +16,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import AT_ONCE, Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
-from prbayes.propagation.base import Bound, Propagation, probe, refuse_nested
+from prbayes.propagation.base import Bound, Propagation, probe, refuse_max_lost, refuse_nested
 from prbayes.propagation.ops import ResponseOp, symbolic_discrepancy
 from prbayes.propagation.points import base_points, points_from
 from prbayes.response.compilation import PLAIN, compile_batched, ninf_for_invalid
@@ -41,7 +41,9 @@ class Resimulated(Propagation):
         Scrambled Sobol points, random numbers that are the same for each theta, or a function
         ``points(n, dimensions, seed)`` that returns points in the open unit cube, shape (n,
         dimensions).
-    executor, store, version, on_failure
+    max_lost : float
+        Largest share of a population whose response is NaN, at the answer.
+    executor, store, version, on_failure, retry_failed, timeout
         As for `Reweighted`.
 
     Examples
@@ -53,11 +55,13 @@ class Resimulated(Propagation):
     n: int = 1024
     random_seed: int = 0
     points: str | Callable[[int, int, int], Floats] = field(default="sobol", repr=False)
+    max_lost: float = field(default=0.05, repr=False)
 
     def __post_init__(self) -> None:
         self.check()
         positive_integer(self.n, "Resimulated: n", minimum=2)
         points_from(self.points)
+        refuse_max_lost(self.max_lost, "Resimulated")
         positive_integer(self.random_seed, "Resimulated: random_seed", minimum=0)
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
@@ -79,6 +83,7 @@ class ResimulatedBound(Bound):
     ) -> None:
         super().__init__(name, inputs, target, responses)
         self.n_per_theta = config.n
+        self.max_lost = config.max_lost
         self._warn_of_few_responses()
         make_points = points_from(config.points)
         _, points = base_points(inputs, config.n, config.random_seed, make_points)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pytensor.gradient import disconnected_grad
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import AT_ONCE, Floats, positive_integer, positive_number
+from prbayes._checks import AT_ONCE, Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
 from prbayes.propagation.base import (
     N_BLOCKS,
@@ -28,6 +28,7 @@ from prbayes.propagation.base import (
     DesignError,
     Propagation,
     refuse_all_nan,
+    refuse_max_lost,
     refuse_nested,
 )
 from prbayes.propagation.edges import averaged_log_density, cells_around, moving_inputs
@@ -77,6 +78,12 @@ class Reweighted(Propagation):
         the response changes; needed for one that is random, or minutes long.
     on_failure : Abort, Replace or Retry
         What to do with a response that raises or is NaN.
+    retry_failed : bool
+        Whether points that the store has as failed are computed again. Under `Abort` they are in
+        any case: a failure is no result.
+    timeout : float, optional
+        Seconds that a response may take before it is one that failed; with executors of processes
+        only, as nothing else ends one that hangs.
 
     References
     ----------
@@ -98,8 +105,7 @@ class Reweighted(Propagation):
         self.check()
         positive_integer(self.n, "Reweighted: n", minimum=16)
         positive_integer(self.random_seed, "Reweighted: random_seed", minimum=0)
-        if self.max_lost != 0 and positive_number(self.max_lost, "Reweighted: max_lost") >= 1:
-            raise ValueError(f"Reweighted: max_lost: got {self.max_lost}, expected a share below 1")
+        refuse_max_lost(self.max_lost, "Reweighted")
         if (
             self.max_points is not None
             and positive_integer(self.max_points, "Reweighted: max_points") < self.n
@@ -164,6 +170,7 @@ class Design(Bound):
     ) -> None:
         super().__init__(name, inputs, target, responses)
         self.config = config
+        self.max_lost = config.max_lost
         self._stored: Batches | None = None
         self._shared: list[Any] = []
         self._basis: tuple[Any, int, Any] = (None, 0, None)
@@ -594,20 +601,25 @@ class Design(Bound):
         dict
             ``weight_ess``, the effective sample size of the weights; ``mean_weight``, the mean raw
             weight (1 in expectation; less when part of the population is out of the design's
-            reach); ``lost_mass``, the share of weight on points whose response is NaN.
+            reach); ``lost_mass``, the share of weight on points whose response is NaN;
+            ``failed_mass``, that of specimens that failed (+inf) in the rest.
         """
         (logs,) = self._log_weights(*params)
         total = _log_sum(logs, axis=-1)
         squares = _log_sum(2 * logs, axis=-1)
         failed = np.isnan(self.values)
         without_response = _log_sum(logs[..., failed], axis=-1)
+        broken = _log_sum(logs[..., np.isposinf(self.values)], axis=-1)
+        known = _log_sum(logs[..., ~failed], axis=-1)
         with np.errstate(invalid="ignore"):
             ess = np.exp(2 * total - squares)
             lost = np.exp(without_response - total)
+            broken_share = np.exp(broken - known)
         return {
             "weight_ess": np.nan_to_num(ess),
             "mean_weight": np.exp(total - np.log(self.values.size)),
             "lost_mass": np.nan_to_num(lost, nan=1.0),
+            "failed_mass": np.nan_to_num(broken_share),
         }
 
 

@@ -159,6 +159,33 @@ def _evidence(attrs: Mapping[Any, Any]) -> str:
     )
 
 
+# -- failures --------------------------------------------------------------------------------
+
+
+def failures(m: Material) -> list[Section]:
+    """Return which responses failed, and why."""
+    rows: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for tree in m.results.values():
+        if "failures" in tree.children:
+            for row in _failure_rows(tree["failures"].to_dataset()):
+                rows.setdefault(tuple(row.values()), row)
+    if not rows:
+        return []
+    shown = list(rows.values())[:20]  # a page
+    about = f"{len(rows)} responses failed; what took their place is no result."
+    more = "" if len(shown) == len(rows) else f" The first {len(shown)} are told."
+    return [Section("Failed responses", about + more, rows_table(shown), level=3)]
+
+
+def _failure_rows(failures: xr.Dataset) -> list[dict[str, Any]]:
+    names, reasons = failures["simulator"].values, failures["reason"].values
+    found = []
+    for name, inputs, reason in zip(names, failures["inputs"].values, reasons, strict=True):
+        at = ", ".join(f"{x:.6g}" for x in inputs[~np.isnan(inputs)])
+        found.append({"simulator": str(name), "inputs": at, "reason": str(reason)})
+    return found
+
+
 # -- validity --------------------------------------------------------------------------------
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from prbayes.reports.assessment import comparison as comparison_of
-from prbayes.reports.assessment import diagnostics, origin
+from prbayes.reports.assessment import diagnostics, failures, origin
 from prbayes.reports.assessment import validity as validity_of
 from prbayes.reports.estimates import optima, posteriors
 from prbayes.reports.illustrations import illustrate, with_graph
@@ -31,6 +31,7 @@ _PARTS = (
     posteriors,
     comparison_of,
     diagnostics,
+    failures,
     validity_of,
     origin,
 )

@@ -15,6 +15,7 @@ from typing import Any, Self
 import pymc as pm
 import xarray as xr
 
+from prbayes._checks import called, file_path, flag, folder_path, plain_text
 from prbayes.estimate.optimum import Optimum
 from prbayes.reports.contents import contents
 from prbayes.reports.section import Section
@@ -26,6 +27,20 @@ from prbayes.validation.validity import ValidityTest
 _MARKUP = re.compile(r"([\\`*_{}\[\]<>|&~$!])")
 # Headings, items, rules and underlines begin a line (CommonMark 0.31, 4.1 to 4.3 and 5.2).
 _AT_START = re.compile(r"^(?:#+|[-+](?=\s|$)|-{2,}|={1,}|\d{1,9}(?=[.)](?:\s|$)))")
+
+
+# What readers make a link of although nothing marks it as one (autolinks of GitHub, 6.9).
+_BARE_LINK = re.compile(r"(?i)\b(https?|ftp)(:)(?=//)|\b(www)(\.)")
+# Characters that are not seen but change what is: controls but for line ends, and marks of the
+# direction of writing (Unicode, annex 9), which turn what follows around.
+_UNSEEN = re.compile(
+    "[\x00-\x08\x0e-\x1f\x7f-\x84\x86-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ufeff]"
+)
+
+
+def visible(text: str) -> str:
+    """Return a text with a mark in the place of characters that are not seen."""
+    return _UNSEEN.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +66,8 @@ class _Document:
         KeyError
             If no section has that title.
         """
+        if not isinstance(section, Section):
+            raise TypeError(f"section: got {called(section)}, expected a prb.reports.Section")
         place = len(self.sections) if after is None else self._end_of(after, section.level)
         before, behind = self.sections[:place], self.sections[place:]
         return replace(self, sections=(*before, section, *behind))
@@ -69,14 +86,14 @@ class _Document:
 
     def to_html(self, path: str | PathLike[str]) -> Path:
         """Write one file that holds everything, for a browser and for print; return its path."""
-        return _write(Path(path), self._html())
+        return _write(file_path(path, "path"), self._html())
 
     def to_markdown(self, folder: str | PathLike[str]) -> Path:
         """Write ``report.md``, and pictures as files beside it, into a folder.
 
         The path of ``report.md`` is returned.
         """
-        folder = Path(folder)
+        folder = folder_path(folder, "folder")
         files = [_file_name(i, section) for i, section in enumerate(self.sections, 1)]
         text = (
             _markdown()
@@ -181,6 +198,13 @@ class Report(_Document):
     ) -> None:
         if not isinstance(title, str) or not title.strip():
             raise TypeError(f"Report: title: got {title!r:.60}, expected a text")
+        plain_text(author, "Report: author", empty=True)
+        plain_text(date, "Report: date", empty=True)
+        flag(pictures, "Report: pictures")
+        if not isinstance(sections, Sequence):
+            raise TypeError(
+                f"Report: sections: got {called(sections)}, expected prb.reports.Section objects"
+            )
         made = tuple(sections)
         if not made:
             made = contents(model, optimum, posterior, validity, comparison, pictures=pictures)
@@ -196,9 +220,16 @@ class Report(_Document):
 @cache
 def _environment() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
+
+    def seen(value: Any) -> Any:
+        return visible(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
     return Environment(
-        loader=PackageLoader("prbayes.reports"), autoescape=True, undefined=StrictUndefined
+        loader=PackageLoader("prbayes.reports"),
+        autoescape=True,
+        finalize=seen,
+        undefined=StrictUndefined,
     )
 
 
@@ -220,7 +251,8 @@ def _markdown() -> Any:
 
 def _literal(text: str) -> str:
     """Return a text, in one line, that Markdown shows as it is."""
-    line = _MARKUP.sub(r"\\\1", " ".join(text.split()))
+    line = _MARKUP.sub(r"\\\1", " ".join(visible(text).split()))
+    line = _BARE_LINK.sub(r"\1\3\\\2\4", line)
     return _AT_START.sub(_escaped_start, line)
 
 

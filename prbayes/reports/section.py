@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from prbayes._checks import plain_text
 from prbayes.reports.images import image, kind_of
 from prbayes.reports.tables import cells
 
@@ -76,6 +77,8 @@ class Section(_Content):
     ) -> None:
         if not isinstance(title, str) or not title.strip():
             raise TypeError(f"Section: title: got {title!r:.60}, expected a text")
+        plain_text(alt, f"Section {title!r}: alt", empty=True)
+        plain_text(caption, f"Section {title!r}: caption", empty=True)
         if level not in (2, 3):
             raise ValueError(
                 f"Section: level: got {level!r}, expected 2, or 3 for a part of a section"
@@ -108,7 +111,9 @@ class Section(_Content):
 
 
 def _paragraphs(title: str, text: str | Sequence[str]) -> tuple[str, ...]:
-    given = (text,) if isinstance(text, str) else tuple(text)
-    if not all(isinstance(paragraph, str) for paragraph in given):
+    given = (text,) if isinstance(text, str) else text
+    if not isinstance(given, Sequence) or not all(
+        isinstance(paragraph, str) for paragraph in given
+    ):
         raise TypeError(f"Section {title!r}: text: got {text!r:.60}, expected a text or several")
     return tuple(paragraph for paragraph in given if paragraph.strip())

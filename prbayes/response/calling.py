@@ -7,21 +7,33 @@ with one.
 
 from __future__ import annotations
 
+import faulthandler
 import logging
 import os
+import signal as signals
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from typing import Any
+from inspect import signature
+from typing import Any, cast
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, called, positive_number
 from prbayes._progress import progress
-from prbayes.response.failures import Abort, OnFailure
+from prbayes.response.failures import Abort, Failure, OnFailure
 from prbayes.response.store import Store, StoreError
 
 _log = logging.getLogger("prbayes")
@@ -144,6 +156,18 @@ class Calling:
     executor: Executor | None = None  # where; None is here
     store: Store | None = None  # where responses are kept
     on_failure: OnFailure = field(default_factory=Abort)
+    retry_failed: bool = False  # whether points that are stored as failed are computed again
+    timeout: float | None = None  # seconds that a response may take, where workers keep it
+
+    @property
+    def takes_failures(self) -> bool:
+        """Whether points that are stored as failed stay what they are."""
+        return self.on_failure.final.goes_on and not self.retry_failed
+
+
+# Failures of which inputs and reasons are kept: more than anyone reads, and some 10 MB at most. All
+# are counted.
+_TOLD = 10_000
 
 
 @dataclass
@@ -154,6 +178,7 @@ class Tally:
     computed: int = 0
     failures: int = 0  # points whose response failed in the end and was replaced
     seconds: float = 0.0  # that one response takes, measured; 0 as long as nothing is known
+    failed: dict[bytes, Failure] = field(default_factory=dict)  # by inputs, the first of them
 
     def take(self, size: int, seconds: float) -> None:
         """Take note of a chunk of so many responses."""
@@ -162,6 +187,18 @@ class Tally:
         known = self.seconds != 0
         # A running mean, which only sizes the next chunks.
         self.seconds = 0.7 * self.seconds + 0.3 * each if known else each
+
+    def note(self, points: Points, reasons: dict[int, str]) -> None:
+        """Take note of points that failed, by their rows."""
+        for row, reason in reasons.items():
+            if len(self.failed) == _TOLD:
+                break
+            (inputs,) = points.at(np.array([row])).keys()
+            self.failed.setdefault(inputs.tobytes(), Failure(inputs, reason))
+
+    def copied(self) -> Tally:
+        """Return a tally that counts on by itself."""
+        return replace(self, failed=dict(self.failed))
 
 
 def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
@@ -177,7 +214,7 @@ def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
     policy = calling.on_failure
     _verify(calling, points, tally)
     keys = points.keys() if calling.store is not None else np.empty((len(points), 0))
-    values, missing = _stored(calling.store, keys)
+    values, missing, failed = _stored(calling, keys)
     raised: dict[int, str] = {}
     for attempt in range(policy.tries):
         last = attempt == policy.tries - 1
@@ -192,11 +229,12 @@ def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
                 keep = ~np.isnan(chunk.values) | (last and whole)
                 _keep(calling.store, keys[rows], chunk, keep)
         if raised and not tolerant:
+            tally.note(points, raised)
             raise _failed(calling, raised)
         missing = missing[np.isnan(values[missing])]
         if not missing.size:
             break
-    return _settled(calling, values, raised, tally)
+    return _settled(calling, points, values, failed | raised, tally)
 
 
 def _verify(calling: Calling, points: Points, tally: Tally) -> None:
@@ -236,12 +274,20 @@ def _again(calling: Calling, point: Points, tally: Tally) -> tuple[float, str]:
     return np.nan, f"nothing ({next(iter(chunk.raised.values()), 'it was lost')})"
 
 
-def _stored(store: Store | None, keys: Floats) -> tuple[Floats, Rows]:
-    """Return responses that are stored, shape (n,), and the rows of those that are not."""
-    if store is None:
-        return np.full(len(keys), np.nan), np.arange(len(keys))
-    values, known = store.find(keys)
-    return values, np.flatnonzero(~known)
+def _stored(calling: Calling, keys: Floats) -> tuple[Floats, Rows, dict[int, str]]:
+    """Return responses that are stored, (n,), rows that are to be computed, and what failed.
+
+    A point that is stored as failed is no result: it stays one that failed, where the policy goes
+    on after failures, and else is computed again.
+    """
+    if calling.store is None:
+        return np.full(len(keys), np.nan), np.arange(len(keys)), {}
+    values, known = calling.store.find(keys)
+    failed = calling.store.failed(keys)
+    if not calling.takes_failures:
+        known[list(failed)] = False
+        failed = {}
+    return values, np.flatnonzero(~known), failed
 
 
 def _keep(store: Store, keys: Floats, chunk: Chunk, keep: NDArray[np.bool_]) -> None:
@@ -255,8 +301,11 @@ def _keep(store: Store, keys: Floats, chunk: Chunk, keep: NDArray[np.bool_]) -> 
         store.add(keys[kept], chunk.values[kept], reasons)
 
 
-def _settled(calling: Calling, values: Floats, raised: dict[int, str], tally: Tally) -> Floats:
+def _settled(
+    calling: Calling, points: Points, values: Floats, raised: dict[int, str], tally: Tally
+) -> Floats:
     """Return responses with what the policy puts in the place of those that are NaN."""
+    tally.note(points, raised)
     bad = np.isnan(values)
     policy = calling.on_failure.final
     n_bad = int(bad.sum())
@@ -269,6 +318,7 @@ def _settled(calling: Calling, values: Floats, raised: dict[int, str], tally: Ta
         tally.failures += n_bad
         text = f"{n_bad} of {bad.size} responses failed, replaced by {policy.replacement}"
         _log.warning("%s: %s; the first: %s", calling.name, text, first)
+        tally.note(points, dict.fromkeys(map(int, np.flatnonzero(bad)), "it is NaN"))
         values[bad] = policy.replacement
     return values
 
@@ -305,15 +355,19 @@ def capacity(executor: Executor | None) -> Capacity:
     if executor is None:
         return Capacity(1, 1)
     workers = getattr(executor, "_max_workers", 0) or getattr(executor, "num_workers", 0)
-    threads = getattr(getattr(executor, "_client", None), "nthreads", None)
-    if not workers and callable(threads):
-        workers = sum(threads().values())
+    workers = workers or _threads(executor) or 0
     if not workers:
         # As many as workers that are known of in practice; what one costs in memory is measured by
         # `python -m benchmarks.scale`.
         return Capacity(os.cpu_count() or 1, 1024)
     # While a worker computes a chunk, the next one is there already.
     return Capacity(int(workers), 2 * int(workers))
+
+
+def _threads(executor: Executor | None) -> int | None:
+    """Return how many threads the workers of Dask have; None for others."""
+    threads = getattr(getattr(executor, "_client", None), "nthreads", None)
+    return sum(threads().values()) if callable(threads) else None
 
 
 def chunk_size(calling: Calling, tally: Tally, left: int, workers: int) -> int:
@@ -347,20 +401,32 @@ def chunks(
         After everything else, if a worker was lost, or a result is no response.
     """
     work, room = _work(calling), capacity(calling.executor)
+    pool = _Pool(calling.name, calling.executor)
+    suspects: list[Rows] = []  # what was at work when a worker was lost
     begun: dict[Future[Chunk], Rows] = {}
     left = rows
     error: BaseException | None = None
     with progress(f"responses of {calling.name}", rows.size) as report:
-        while left.size or begun:
+        while left.size or begun or suspects:
+            if suspects and not begun:
+                # Which of them ended its worker shows when each is alone.
+                for some, chunk in _alone(pool, work, points, suspects):
+                    tally.take(some.size, chunk.seconds)
+                    report(some.size, "")
+                    yield some, chunk
+                suspects = []
             # Send out as many chunks as the executor takes.
-            while left.size and len(begun) < room.chunks:
+            while left.size and not suspects and len(begun) < room.chunks:
                 size = chunk_size(calling, tally, left.size, room.workers)
                 some, left = left[:size], left[size:]
-                begun[_submitted(calling.executor, work, points.at(some), tolerant)] = some
+                begun[pool.submitted(work, points.at(some), tolerant)] = some
             # Take what is done.
-            for future in wait(begun, return_when=FIRST_COMPLETED).done:
+            for future in pool.done(begun):
                 some = begun.pop(future)
                 failure = future.exception()
+                if tolerant and _is_loss(failure):
+                    suspects.append(some)
+                    continue
                 if failure is not None:
                     error = error or failure
                     left = left[:0]
@@ -373,6 +439,121 @@ def chunks(
                 yield some, chunk
     if error is not None:
         _raise_lost(calling.name, error)
+
+
+# Seconds without a result after which the log says so. By judgement: longer than most responses
+# take, and shorter than one waits for nothing.
+_SILENCE = 60.0
+
+# Executors in the place of those whose workers were lost, as long as those are there.
+_renewed: WeakKeyDictionary[Executor, Executor] = WeakKeyDictionary()
+
+
+@dataclass
+class _Pool:
+    """An executor, or a new one like it where its workers were lost."""
+
+    name: str  # of the simulator, for messages
+    given: Executor | None
+
+    @property
+    def executor(self) -> Executor | None:
+        """The executor at work."""
+        return None if self.given is None else _renewed.get(self.given, self.given)
+
+    def renew(self, failure: BaseException | None) -> None:
+        """Take a new executor if this one is broken; those of others start workers themselves."""
+        if self.given is None or not isinstance(failure, BrokenExecutor):
+            return
+        _renewed[self.given] = _alike(self.given)
+
+    def submitted(
+        self, work: Callable[[Points, bool], Chunk], points: Points, tolerant: bool
+    ) -> Future[Chunk]:
+        """Return the work as a future: done already without an executor, failed if broken."""
+        return _submitted(self.executor, work, points, tolerant)
+
+    def done(self, begun: Iterable[Future[Chunk]]) -> set[Future[Chunk]]:
+        """Return futures that are done; waits for one, and says so after a minute.
+
+        Raises
+        ------
+        ResponseError
+            If no worker is left, so that none will ever be done.
+        """
+        waiting = list(begun)
+        silent = 0.0
+        while True:
+            found = wait(waiting, timeout=_SILENCE, return_when=FIRST_COMPLETED).done
+            if found or not waiting:
+                return found
+            silent += _SILENCE
+            _log.warning(
+                "%s: no response for %.0f s; %d chunks are at work", self.name, silent, len(waiting)
+            )
+            if _threads(self.executor) == 0:
+                for future in waiting:
+                    future.cancel()
+                raise ResponseError(
+                    f"{self.name}: got no response for {silent:.0f} s, and no worker is left, "
+                    "expected workers; start some and run again: with store= nothing that was "
+                    "computed is computed again"
+                )
+
+
+def _alike(executor: Executor) -> Executor:
+    """Return a new executor of processes like one whose workers were lost.
+
+    The interface does not tell how one was made: those of the standard library and of loky keep it
+    under the same names.
+    """
+    kind = next((c for c in type(executor).__mro__ if c.__name__ == "ProcessPoolExecutor"), None)
+    if kind is None:
+        return executor
+    known = signature(kind).parameters
+    made: dict[str, Any] = {"max_workers": getattr(executor, "_max_workers", None)}
+    for name, kept in (
+        ("mp_context", "_mp_context"),
+        ("context", "_context"),
+        ("initializer", "_initializer"),
+        ("initargs", "_initargs"),
+    ):
+        if name in known and getattr(executor, kept, None) is not None:
+            made[name] = getattr(executor, kept)
+    return cast(Executor, kind(**made))
+
+
+def _is_loss(failure: BaseException | None) -> bool:
+    """Return whether a chunk failed since its worker was lost; Dask names that by a class."""
+    names = {kind.__name__ for kind in type(failure).__mro__}
+    return isinstance(failure, BrokenExecutor) or "KilledWorker" in names
+
+
+def _alone(
+    pool: _Pool, work: Callable[[Points, bool], Chunk], points: Points, suspects: list[Rows]
+) -> Iterator[tuple[Rows, Chunk]]:
+    """Compute chunks one at a time, halved where the worker is lost, and yield them.
+
+    A point that is alone with its worker when that is lost has failed.
+    """
+    left = list(reversed(suspects))
+    failure: BaseException | None = BrokenExecutor()
+    while left:
+        pool.renew(failure)
+        some = left.pop()
+        future = pool.submitted(work, points.at(some), True)
+        pool.done([future])
+        failure = future.exception()
+        if failure is None:
+            yield some, future.result()
+        elif not _is_loss(failure):
+            _raise_lost(pool.name, failure)
+        elif some.size == 1:
+            text = f"it ended its worker ({type(failure).__name__}), or took far too long"
+            yield some, Chunk(np.array([np.nan]), {0: text}, 0.0)
+        else:
+            left += [some[some.size // 2 :], some[: some.size // 2]]
+    pool.renew(failure)
 
 
 def _raise_lost(name: str, error: BaseException) -> None:
@@ -388,7 +569,7 @@ def _work(calling: Calling) -> Callable[[Points, bool], Chunk]:
     """Return what is done with points; to other processes the function travels packed."""
     if calling.executor is None or isinstance(calling.executor, ThreadPoolExecutor):
         return partial(compute, calling.function)
-    return partial(compute_packed, packed(calling.function))
+    return partial(compute_packed, packed(calling.function), timeout=calling.timeout)
 
 
 def _submitted(
@@ -405,26 +586,71 @@ def _submitted(
     return future
 
 
+def refuse_timeout(timeout: object, executor: Executor | None) -> None:
+    """Raise if it is no time, or one that the executor's workers cannot keep."""
+    if timeout is None:
+        return
+    positive_number(timeout, "timeout")
+    processes = any(kind.__name__ == "ProcessPoolExecutor" for kind in type(executor).__mro__)
+    if not processes or not hasattr(signals, "setitimer"):
+        raise ValueError(
+            f"timeout: got {timeout} with executor {called(executor)}, expected an executor of "
+            "processes, such as concurrent.futures.ProcessPoolExecutor(4), on a system with "
+            "signals: nothing else ends a response that hangs"
+        )
+
+
 # -- at work ---------------------------------------------------------------------------------------
 
 
-def compute(function: Callable[..., Any], points: Points, tolerant: bool) -> Chunk:
+def compute(
+    function: Callable[..., Any], points: Points, tolerant: bool, timeout: float | None = None
+) -> Chunk:
     """Return the responses at points; unless failures are tolerated, those up to the first one."""
     clock = time.perf_counter()
     if isinstance(function, scalar):
-        values, raised = _one_by_one(function, points, tolerant)
+        values, raised = _one_by_one(function, points, tolerant, timeout)
     else:
-        values, raised = _at_once(function, points, tolerant)
+        values, raised = _at_once(function, points, tolerant, timeout)
     return Chunk(values, raised, time.perf_counter() - clock)
 
 
-def _one_by_one(function: scalar, points: Points, tolerant: bool) -> tuple[Floats, dict[int, str]]:
+@contextmanager
+def _limited(seconds: float | None) -> Iterator[None]:
+    """Raise `TimeoutError` inside after some seconds; end this worker if that does not help.
+
+    A signal reaches Python code. What hangs in other code, never to come back, ends with its
+    worker.
+    """
+    if seconds is None:
+        yield
+        return
+
+    def late(*_: object) -> None:
+        raise TimeoutError(f"no result within timeout = {seconds:g} s")
+
+    before = signals.signal(signals.SIGALRM, late)
+    with open(os.devnull, "w") as nowhere:
+        # Half as long again, and a second, so that the signal comes first.
+        faulthandler.dump_traceback_later(1.5 * seconds + 1, exit=True, file=nowhere)
+        signals.setitimer(signals.ITIMER_REAL, seconds)
+        try:
+            yield
+        finally:
+            signals.setitimer(signals.ITIMER_REAL, 0)
+            faulthandler.cancel_dump_traceback_later()
+            signals.signal(signals.SIGALRM, before)
+
+
+def _one_by_one(
+    function: scalar, points: Points, tolerant: bool, timeout: float | None
+) -> tuple[Floats, dict[int, str]]:
     values, raised = np.full(len(points), np.nan), {}
     for i in range(len(points)):
         try:
-            with np.errstate(all="ignore"):
+            with np.errstate(all="ignore"), _limited(timeout):
                 values[i] = float(function.function(*points.at(i).arguments))
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raised[i] = _said(error)
             if not tolerant:
                 break
@@ -432,13 +658,13 @@ def _one_by_one(function: scalar, points: Points, tolerant: bool) -> tuple[Float
 
 
 def _at_once(
-    function: Callable[..., Any], points: Points, tolerant: bool
+    function: Callable[..., Any], points: Points, tolerant: bool, timeout: float | None
 ) -> tuple[Floats, dict[int, str]]:
     size = len(points)
     try:
-        with np.errstate(all="ignore"):
+        with np.errstate(all="ignore"), _limited(timeout and timeout * size):
             result = function(*points.arguments)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         if not tolerant or size == 1:
             return np.full(size, np.nan), {0: _said(error)}
     else:
@@ -446,12 +672,12 @@ def _at_once(
     # Halve until the points that fail are alone.
     values, raised = np.full(size, np.nan), {}
     for half in (np.arange(size // 2), np.arange(size // 2, size)):
-        values[half], said = _at_once(function, points.at(half), tolerant)
+        values[half], said = _at_once(function, points.at(half), tolerant, timeout)
         raised.update({int(half[i]): text for i, text in said.items()})
     return values, raised
 
 
-def _said(error: Exception) -> str:
+def _said(error: BaseException) -> str:
     return f"it raised {type(error).__name__}: {error}"
 
 
@@ -491,6 +717,8 @@ def _unpacked(payload: bytes) -> Callable[..., Any]:
     return cloudpickle.loads(payload)  # type: ignore[no-any-return]
 
 
-def compute_packed(payload: bytes, points: Points, tolerant: bool) -> Chunk:
+def compute_packed(
+    payload: bytes, points: Points, tolerant: bool, timeout: float | None = None
+) -> Chunk:
     """Unpack the function, once for all chunks of a worker, and compute."""
-    return compute(_unpacked(payload), points, tolerant)
+    return compute(_unpacked(payload), points, tolerant, timeout)

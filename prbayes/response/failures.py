@@ -6,7 +6,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from prbayes._checks import positive_integer
+from prbayes._checks import Floats, called, flag, positive_integer
+
+
+@dataclass(frozen=True, eq=False)
+class Failure:
+    """A point whose response failed."""
+
+    inputs: Floats  # (columns,): the arguments of the response, one after the other
+    reason: str  # what was raised, in words
 
 
 class OnFailure:
@@ -58,6 +66,9 @@ class Abort(OnFailure):
 
     on_nan: bool = False
 
+    def __post_init__(self) -> None:
+        flag(self.on_nan, "Abort: on_nan")
+
     @property
     def goes_on(self) -> bool:
         """It does not."""
@@ -80,8 +91,8 @@ class Replace(OnFailure):
 
     Raises
     ------
-    TypeError
-        If the value is not a number.
+    TypeError, ValueError
+        If the value is not a number, or is -inf.
 
     Examples
     --------
@@ -92,10 +103,14 @@ class Replace(OnFailure):
     value: float = np.nan
 
     def __post_init__(self) -> None:
-        number = isinstance(self.value, int | float | np.floating)
-        if isinstance(self.value, bool) or not number:
-            got = f"{type(self.value).__name__} {self.value!r:.60}"
-            raise TypeError(f"Replace: value: got {got}, expected a number")
+        number = isinstance(self.value, int | float | np.number)
+        if isinstance(self.value, bool | complex) or not number:
+            raise TypeError(f"Replace: value: got {called(self.value)}, expected a number")
+        if np.isneginf(self.value):
+            raise ValueError(
+                "Replace: value: got -inf, expected a number, NaN (no response) or +inf (the "
+                "specimen failed)"
+            )
 
     @property
     def replacement(self) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pytensor.graph.basic import Variable
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, called, executes, folder_path
 from prbayes.response.batches import batch_shape, broadcast_batch
 from prbayes.response.calling import (
     Calling,
@@ -22,15 +22,15 @@ from prbayes.response.calling import (
     scalar,
     shapes,
 )
-from prbayes.response.failures import Abort, OnFailure
+from prbayes.response.failures import Abort, Failure, OnFailure
 from prbayes.response.inputs import Inputs
 from prbayes.response.store import Store
 
 
 def refuse_uncallable(name: str, function: object) -> None:
     """Raise if a response is no function: often the inputs were given first."""
-    if not callable(function):
-        got = type(function).__name__
+    if not callable(function) or isinstance(function, type):
+        got = called(function) if isinstance(function, type) else type(function).__name__
         raise TypeError(
             f"{name}: response: got {got}, expected a function of the inputs, such as "
             "lambda x: x**2; the order is Simulator(name, response, *inputs, metric=..., "
@@ -38,9 +38,22 @@ def refuse_uncallable(name: str, function: object) -> None:
         )
 
 
+def refuse_calling(executor: object, store: object, version: object, on_failure: object) -> None:
+    """Raise if one of the arguments that say how a response is called is not of its kind."""
+    executes(executor, "executor")
+    if store is not None:
+        folder_path(store, "store")
+    refuse_version(version)
+    if not isinstance(on_failure, OnFailure):
+        raise TypeError(
+            f"on_failure: got {called(on_failure)}, expected prb.response.Abort(), "
+            "prb.response.Replace() or prb.response.Retry()"
+        )
+
+
 def refuse_version(version: object) -> None:
-    """Raise if a version is no text."""
-    if version is not None and not isinstance(version, str):
+    """Raise if a version is no text, or an empty one."""
+    if version is not None and (not isinstance(version, str) or not version):
         raise TypeError(
             f"version: got {type(version).__name__} {version!r:.60}, expected a text that names "
             "the response as it is, such as '2' or 'mesh 3, solver 1.4'"
@@ -67,6 +80,9 @@ class Responses:
     version : str, optional
         Of the function, for the store.
     on_failure : OnFailure, optional
+    retry_failed : bool
+    timeout : float, optional
+        Seconds.
 
     Attributes
     ----------
@@ -84,6 +100,8 @@ class Responses:
         store: Any = None,
         version: str | None = None,
         on_failure: OnFailure | None = None,
+        retry_failed: bool = False,
+        timeout: float | None = None,
     ) -> None:
         refuse_uncallable(name, function)
         policy = Abort() if on_failure is None else on_failure
@@ -98,14 +116,14 @@ class Responses:
             and not isinstance(function, scalar)
         )
         self.count = 0
-        self._calling = Calling(name, function, executor, kept, policy)
+        self._calling = Calling(name, function, executor, kept, policy, retry_failed, timeout)
         self._tally = Tally()
         self._event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
 
     def copied(self) -> Responses:
         """Return the same function with counts of its own; executor and store are the same."""
         other = copy.copy(self)
-        other._tally = copy.copy(self._tally)
+        other._tally = self._tally.copied()
         return other
 
     @property
@@ -117,6 +135,11 @@ class Responses:
     def failures(self) -> int:
         """Points whose response failed and was replaced."""
         return self._tally.failures
+
+    @property
+    def failed(self) -> tuple[Failure, ...]:
+        """The points that failed, each once, with their reasons; the first ten thousand."""
+        return tuple(self._tally.failed.values())
 
     def same_as(self, other: Responses) -> bool:
         """Return whether another has the same function, aleatory inputs and constants."""
@@ -157,7 +180,7 @@ class Responses:
         try:
             with np.errstate(all="ignore"):
                 result = self.function(*arguments)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise ResponseError(
                 f"{self.name}: the response raised {type(error).__name__}: {error}; it was called "
                 f"with inputs of shapes {shapes(arguments)} and is expected to take arrays of any "

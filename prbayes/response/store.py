@@ -22,7 +22,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, plain_text, positive_integer, stated_path
 from prbayes.response.database import (
     COMPUTED,
     FAILED,
@@ -68,6 +68,8 @@ class _Session:
     entry : _Entry
     known : dict
         Values of the store's response by keys, both as bytes.
+    failed : dict
+        Why there is no value, by the keys of those that failed.
     seen : int
         The last run that was read, of any response.
     """
@@ -76,6 +78,7 @@ class _Session:
     opened: tuple[int, ...]
     entry: _Entry
     known: dict[bytes, bytes] = field(default_factory=dict)
+    failed: dict[bytes, str] = field(default_factory=dict)
     seen: int = 0
 
     def __post_init__(self) -> None:
@@ -131,8 +134,12 @@ class Store:
         *,
         version: str | None = None,
     ) -> None:
-        self.folder = Path(folder)
-        self.name = name
+        self.folder = stated_path(folder, "folder", "folder")
+        self.name = plain_text(name, "name")
+        if columns is not None:
+            positive_integer(columns, "columns")
+        if version is not None:
+            plain_text(version, "version")
         self.columns = columns
         self.version = version
         self.verified = version is not None
@@ -163,8 +170,19 @@ class Store:
         present = np.array([value is not None for value in found], dtype=bool)
         return _numbers(_NAN if value is None else value for value in found), present
 
+    def failed(self, inputs: Floats) -> dict[int, str]:
+        """Return which of the inputs, (n, columns), are stored as failed, and why, by row."""
+        failed = self._read().failed
+        if not failed:
+            return {}
+        keys = enumerate(_keys(inputs))
+        return {row: failed[key] for row, key in keys if key in failed}
+
     def known(self) -> tuple[Floats, Floats]:
-        """Return the inputs, (n, columns), and values, (n,), in the order in which they came."""
+        """Return the inputs, (n, columns), and values, (n,), in the order in which they came.
+
+        NaN is a result, or a response that failed; `failed` tells.
+        """
         session = self._read()
         inputs = _numbers(session.known).reshape(-1, session.entry.columns)
         return inputs, _numbers(session.known.values())
@@ -190,12 +208,18 @@ class Store:
         Returns
         -------
         Dataset
-            ``inputs``, dims (point, column), and ``response``, dim (point), in the order in which
-            they came.
+            ``inputs``, dims (point, column), ``response`` and ``reason``, dim (point), in the order
+            in which they came; a reason is empty where the response did not fail.
         """
         inputs, values = self.known()
+        failed = self.failed(inputs)
+        reasons = np.array([failed.get(row, "") for row in range(len(values))], dtype=object)
         return xr.Dataset(
-            {"inputs": (["point", "column"], inputs), "response": ("point", values)},
+            {
+                "inputs": (["point", "column"], inputs),
+                "response": ("point", values),
+                "reason": ("point", reasons.astype(str)),
+            },
             attrs={"simulator": self.name},
         )
 
@@ -297,9 +321,13 @@ class Store:
                     raise self._refusal(damaged(f"run {session.seen + 1} is missing"))
                 if written != checksum(*row):
                     raise self._refusal(damaged(f"run {number} does not match its checksum"))
-                response, key, _, _, value = row
+                response, key, state, reason, value = row
                 if response == session.entry.number:
                     session.known[key] = value
+                    # The last run of a point counts: one that failed may have been tried again.
+                    session.failed.pop(key, None)
+                    if state == FAILED:
+                        session.failed[key] = reason
                 session.seen = number
 
     @contextmanager

@@ -83,8 +83,8 @@ def read(path: str | PathLike[str]) -> Kept:
     # Damaged files raise whatever the library that meets the damage raises.
     except Exception as error:
         raise StoreError(
-            f"Surrogate.load: {path} is no surrogate that can be read "
-            f"({type(error).__name__}: {error})"
+            f"Surrogate.load: path: got {path}, expected a file of Surrogate.save that can be "
+            f"read ({type(error).__name__}: {error})"
         ) from error
 
 

@@ -198,6 +198,8 @@ def read_ranges(
             f"{name}: inputs: got {inputs!r:.60}, expected a dict such as {{'k': (200, 300)}}, "
             "or a list"
         )
+    if isinstance(inputs, Mapping) and not all(isinstance(key, str) for key in inputs):
+        raise TypeError(f"{name}: inputs: got {list(inputs)} as names, expected texts")
     named = dict(inputs) if isinstance(inputs, Mapping) else dict(enumerate(inputs, 1))
     drawn = _drawn(name, named, random_seed)
     ranges = _ranges(name, named, drawn, coverage)
@@ -226,8 +228,8 @@ def _ranges(name: str, named: dict[Any, Any], drawn: dict[Any, Floats], coverage
         one = _given(name, label, x) if draws is None else _covering(label, draws, coverage)
         if not one.proper:
             raise ValueError(
-                f"{name}: {label}: got {one.low} to {one.high}, expected a range (low, high) with "
-                "low < high"
+                f"{name}: inputs: {label}: got {one.low} to {one.high}, expected a range (low, "
+                "high) with low < high"
             )
         found.append(one)
     ranges = Ranges(tuple(found))
@@ -247,13 +249,16 @@ def _label(key: str | int, x: Any) -> str:
 
 def _given(name: str, label: str, x: Any) -> Range:
     """Return the range that was given, or a constant."""
-    array = real_array(x, f"{name}: {label}")
+    # A list of a number and True is one of numbers to NumPy.
+    if isinstance(x, list | tuple) and any(isinstance(one, bool) for one in x):
+        x = np.asarray(x, dtype=object)
+    array = real_array(x, f"{name}: inputs: {label}")
     if array.shape == ():
         return Range(label, array, array, constant=True)
     if array.shape != (2,):
         raise ValueError(
-            f"{name}: {label}: got shape {array.shape}, expected a range (low, high), a `.dist()`, "
-            "a variable of the model or a number"
+            f"{name}: inputs: {label}: got shape {array.shape}, expected a range (low, high), a "
+            "`.dist()`, a variable of the model or a number"
         )
     return Range(label, array[0, ...], array[1, ...])
 

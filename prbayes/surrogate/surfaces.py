@@ -100,7 +100,7 @@ class RadialBasis(Surface):
         if self.degree is not None:
             lowest = _LOWEST_DEGREE[self.kernel]
             positive_integer(self.degree, "RadialBasis: degree", minimum=lowest)
-        is_number = isinstance(self.smoothing, int | float)
+        is_number = isinstance(self.smoothing, int | float) and self.smoothing is not True
         if not is_number or not 0 <= self.smoothing < np.inf:
             raise ValueError(
                 f"RadialBasis: smoothing: got {self.smoothing!r}, expected a number >= 0"

@@ -12,12 +12,21 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from prbayes._checks import Floats, Seed, positive_integer, seed_number, share
+from prbayes._checks import (
+    Floats,
+    Seed,
+    file_path,
+    flag,
+    plain_text,
+    positive_integer,
+    seed_number,
+    share,
+)
 from prbayes._progress import shown
 from prbayes.propagation.points import sobol
 from prbayes.response.calling import Calling, Points, ResponseError, Tally, respond
 from prbayes.response.failures import Abort, OnFailure, Replace
-from prbayes.response.response import refuse_version
+from prbayes.response.response import refuse_calling
 from prbayes.response.store import Store
 from prbayes.surrogate.error import CrossValidation, cross_validated, points_needed
 from prbayes.surrogate.files import Kept, read, write
@@ -105,6 +114,7 @@ class Surrogate:
         store: str | PathLike[str] | None = None,
         version: str | None = None,
         on_failure: OnFailure | None = None,
+        retry_failed: bool = False,
         random_seed: Seed = 0,
         progressbar: bool = True,
     ) -> Surrogate:
@@ -132,7 +142,7 @@ class Surrogate:
         coverage : float
         name : str
             For messages, and of the store.
-        executor, store, version, on_failure
+        executor, store, version, on_failure, retry_failed
             As for `Reweighted`. A point that fails in the end is left out of the fit; the surrogate
             then fails where that is the nearest point.
         random_seed : int, sequence of int, numpy.random.Generator or None
@@ -156,12 +166,15 @@ class Surrogate:
         ...     data = [0.5, 1.0, 4.0]
         ...     y = prb.Simulator("y", surrogate, x, metric=prb.AreaMetric(), observed=data)
         """
+        plain_text(name, "Surrogate.fit: name")
         model = RadialBasis() if model is None else model
         outside = Replace() if outside is None else outside
-        _refuse_wrong(name, response, model, outside, store)
+        policy = Abort() if on_failure is None else on_failure
+        _refuse_wrong(name, response, model, outside)
+        refuse_calling(executor, store, version, policy)
+        flag(retry_failed, f"{name}: retry_failed")
         share(coverage, f"{name}: coverage")
         seed = seed_number(random_seed, f"{name}: random_seed")
-        refuse_version(version)
         domain, predictive = read_ranges(name, inputs, coverage, seed)
         needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=needed)
@@ -169,8 +182,7 @@ class Surrogate:
         # Compute the responses.
         points = domain.at(sobol(n, domain.dimensions, seed))
         kept = None if store is None else Store(store, name, points.shape[1], version=version)
-        policy = Abort() if on_failure is None else on_failure
-        calling = Calling(name, response, executor, kept, policy)
+        calling = Calling(name, response, executor, kept, policy, retry_failed)
         varying = [not one.constant for one in domain.inputs]
         tally = Tally()
         with shown(progressbar):
@@ -287,6 +299,11 @@ class Surrogate:
         ----------
         path : path-like
         """
+        path = file_path(path, "path")
+        if not path.absolute().parent.is_dir():
+            raise ValueError(
+                f"path: got {path}, whose folder does not exist, expected one that does"
+            )
         kept = Kept(
             ranges=self.domain,
             points=self.points,
@@ -321,7 +338,7 @@ class Surrogate:
         TypeError, ValueError
             If a regressor is needed, or the surface is not that which was saved.
         """
-        kept = read(path)
+        kept = read(file_path(path, "path"))
         if model is None:
             model = shipped(kept.kind, kept.settings)
         if model is None:
@@ -407,7 +424,7 @@ class Surrogate:
         return self._predict(sobol(64, self.domain.dimensions, 0))
 
 
-def _refuse_wrong(name: str, response: object, model: Any, outside: object, store: object) -> None:
+def _refuse_wrong(name: str, response: object, model: Any, outside: object) -> None:
     """Raise if an argument of `Surrogate.fit` is not of its kind."""
     if not callable(response):
         raise TypeError(
@@ -426,5 +443,3 @@ def _refuse_wrong(name: str, response: object, model: Any, outside: object, stor
             f"{name}: outside: got {outside!r:.60}, expected prb.response.Replace() or "
             "prb.response.Abort()"
         )
-    if store is not None and not isinstance(store, str | PathLike):
-        raise TypeError(f"{name}: store: got {type(store).__name__}, expected the path of a folder")

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats, Seed, real_array, seed_number
+from prbayes._checks import Floats, Seed, flag, real_array, sample_labels, seed_number
 from prbayes._predict import specimen_names
 from prbayes.model.identity import Identity, Level, from_attributes, require_together
 from prbayes.validation.predictive import Predictive
@@ -109,6 +109,8 @@ def read_case(
         If an argument is not as described there.
     """
     seed = None if random_seed is None else seed_number(random_seed)
+    flag(folded, "folded")
+    flag(randomize, "randomize")
     numbers: dict[object, int] = {}
     conditions = []
     for name, measured, simulated, labels in _by_condition(observed, predicted, specimens):
@@ -217,13 +219,7 @@ def _labels(name: str, labels: Any, n: int) -> tuple[str, ...] | None:
     """Return the labels of n observations as text."""
     if labels is None:
         return None
-    found = tuple(specimen_names(labels)) if np.ndim(labels) == 1 else ()
-    if len(found) != n:
-        raise ValueError(
-            f"{name}: specimens: got shape {np.shape(labels)}, expected ({n},), one label per "
-            "observation"
-        )
-    return found
+    return tuple(specimen_names(sample_labels(labels, n, f"{name}: specimens")))
 
 
 def _measured(name: str, values: Any) -> Floats:

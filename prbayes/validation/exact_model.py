@@ -8,7 +8,7 @@ from importlib.resources import files
 
 import numpy as np
 
-from prbayes._checks import Floats, positive_integer
+from prbayes._checks import Floats, positive_integer, positive_number, share
 from prbayes.validation.conditions import Case
 from prbayes.validation.envelope import ENVELOPED, envelope
 from prbayes.validation.nulls import Judgement, Null
@@ -61,6 +61,7 @@ class ExactModel(Null):
     def critical_value(self, n: int, level: float = 0.05) -> float:
         """Return the area that is exceeded with probability ``level`` by n uniform numbers."""
         n = positive_integer(n, "n")
+        level = share(level, "level")
         quantiles = table().at(n)
         scaled = np.interp(-np.log(level), table().logs, quantiles)
         return float(scaled / np.sqrt(n))
@@ -68,6 +69,8 @@ class ExactModel(Null):
     def p_value(self, statistic: float, n: int) -> float:
         """Return the probability that n uniform numbers have a larger area."""
         n = positive_integer(n, "n")
+        if statistic != 0:
+            positive_number(statistic, "statistic")
         scaled = np.sqrt(n) * statistic
         quantiles = table().at(n)
         logs = table().logs

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats, positive_integer
+from prbayes._checks import Floats, called, positive_integer
 from prbayes._predict import data_digest, serving, specimen_names
 from prbayes.estimate.data_sets import groups, sets_at, simulated_points, specimens
 from prbayes.estimate.optimum import Optimum, require_refits
@@ -80,6 +80,7 @@ class JointNull(SimulatedNull):
     def __post_init__(self) -> None:
         advice = ", so that the model cannot be calibrated anew; use prb.validation.PosteriorNull()"
         require_refits(self.optimum, "JointNull", advice)
+        _refuse_responses(self.responses)
         positive_integer(self.replicates, "JointNull: replicates", minimum=LEAST_REPLICATES)
         positive_integer(self.random_seed, "JointNull: random_seed", minimum=0)
 
@@ -180,6 +181,18 @@ class JointNull(SimulatedNull):
         raise ValueError(
             f"JointNull: got the condition {condition.name!r}, expected the name of a simulator, "
             f"{names}; or pass responses={{{condition.name!r}: (response, *inputs)}}"
+        )
+
+
+def _refuse_responses(responses: object) -> None:
+    """Raise if they are neither a tuple of a response and its inputs, nor several by condition."""
+    if responses is None:
+        return
+    each = list(responses.values()) if isinstance(responses, Mapping) else [responses]
+    if not each or not all(isinstance(one, tuple) and one and callable(one[0]) for one in each):
+        raise TypeError(
+            f"JointNull: responses: got {called(responses)}, expected a tuple (response, *inputs), "
+            "or a mapping of conditions to such"
         )
 
 

@@ -148,3 +148,21 @@ def test_a_folder_that_is_not_there_is_refused_before_any_work(
     with pytest.raises(StoreError, match="whose folder does not exist"):
         Checkpoint(tmp_path / "no" / "state.nc", problem, {})
     assert stored_settings(tmp_path / "no" / "state.nc") == {}
+
+
+def test_a_full_disk_is_an_error_and_the_state_before_is_kept(problem: Any, tmp_path: Path) -> None:
+    import resource
+
+    path = tmp_path / "run.nc"
+    saved = Checkpoint(path, problem, {})
+    saved.save({"theta": np.arange(3.0)}, {"stage": 1})
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, hard))
+    try:
+        with pytest.raises(StoreError, match=r"cannot be written .*stage before is kept"):
+            saved.save({"theta": np.arange(10_000.0)}, {"stage": 2})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    again = Checkpoint(path, problem, {})
+    assert again.note == {"stage": 1}
+    assert [p.name for p in tmp_path.iterdir()] == ["run.nc"]

@@ -10,7 +10,7 @@ import pytest
 
 import prbayes as prb
 from prbayes.model.node import nodes
-from prbayes.propagation.base import Bound, Propagation
+from prbayes.propagation.base import Bound, Missing, Propagation
 
 OBSERVED = [0.5, 1.0, 1.5, 2.5]
 PROPAGATIONS = [prb.Reweighted(128), prb.Resimulated(128), prb.Fresh(128)]
@@ -118,3 +118,39 @@ def test_what_is_no_executor_folder_or_policy_is_refused(
 ) -> None:
     with pytest.raises(TypeError, match=words):
         kind(64, **keywords)
+
+
+def half(x: Any) -> Any:
+    return np.where(x > 2.0, np.nan, np.where(x < 0.0, np.inf, x))
+
+
+@pytest.mark.parametrize("propagation", PROPAGATIONS, ids=lambda p: type(p).__name__)
+def test_shares_without_numbers_are_told(propagation: Propagation) -> None:
+    found = bound(propagation, half)
+    params = at([1.0], [1.0])
+    missing = found.missing(params)
+    values, weights = np.full((1, 10), 1.0), np.full((1, 10), 0.1)
+    values[0, :2], values[0, 2:6] = np.nan, np.inf
+    told = Missing.of(values, weights)
+    np.testing.assert_allclose((told.lost[0], told.failed[0]), (0.2, 0.5))
+    # Of a normal population, with five standard errors of 128 random draws.
+    assert abs(missing.lost[0] - 0.159) < 0.16
+    assert abs(missing.failed[0] - 0.159 / 0.841) < 0.18
+
+
+def test_what_was_looked_at_last_is_not_computed_again() -> None:
+    found = bound(prb.Resimulated(64), half)
+    found.discrepancies(at([1.0], [1.0]), found.target)
+    count = found.responses.count
+    found.missing(at([1.0], [1.0]))
+    assert found.responses.count == count
+    # At parameters that are not valid there is no population.
+    found.discrepancies(at([1.0], [-1.0]), found.target)
+    assert found.missing(at([1.0], [-1.0])).lost == [1.0]
+
+
+def test_the_failed_share_of_a_design_is_that_of_its_populations() -> None:
+    found = bound(prb.Reweighted(512), half)
+    support = found.support(at([1.0], [1.0]))  # type: ignore[attr-defined]
+    np.testing.assert_allclose(support["lost_mass"], 0.159, atol=0.02)
+    np.testing.assert_allclose(support["failed_mass"], 0.159 / 0.841, atol=0.02)

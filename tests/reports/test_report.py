@@ -261,3 +261,16 @@ def test_a_browser_needs_no_sideways_scrolling(
     found = re.findall(r"<title>(.*?)</title>", dom)
     assert found == ["0;Shaft;true"]
     assert path.stat().st_size < 2_000_000
+
+
+def test_bare_links_and_unseen_characters_of_a_text_are_shown_as_text(tmp_path: Path) -> None:
+    text = "see http://evil.example/x and www.evil.example, \u202etxt.exe\u2066 a\x07b \x1b[2J"
+    report = prb.Report(text, sections=(prb.reports.Section(text, text),), author=text)
+    for written in (report.to_markdown(tmp_path), report.to_html(tmp_path / "r.html")):
+        found = written.read_text(encoding="utf-8")
+        assert not set(found) & set("\u202e\u2066\x07\x1b")
+        assert "\N{REPLACEMENT CHARACTER}txt.exe" in found
+    markdown = (tmp_path / "report.md").read_text(encoding="utf-8")
+    assert "http\\://evil.example/x" in markdown
+    assert "www\\.evil.example" in markdown
+    assert "http://" not in markdown

@@ -11,7 +11,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -665,3 +671,183 @@ def test_a_killed_run_computes_nothing_again_and_gives_the_same(
     # A kill may fall between the end of a response and its record: then that one is computed again.
     assert len(calls) - len(set(calls)) <= 1
     assert set(calls) == set(expected)
+
+
+# -- failures are not results ----------------------------------------------------------------------
+
+
+def fails_when_busy(busy: list[bool]) -> Any:
+    def response(x: float, a: float) -> float:
+        if busy[0] and x > 2:
+            raise OSError("license server")
+        return a * x
+
+    return prb.scalar(response)
+
+
+@pytest.mark.exact
+@pytest.mark.parametrize(
+    "first", [prb.response.Replace(np.inf), prb.response.Retry(2, then=prb.response.Replace())]
+)
+def test_a_failure_in_the_store_is_no_result_under_abort(tmp_path: Path, first: OnFailure) -> None:
+    busy = [True]
+    response = fails_when_busy(busy)
+    model(response, store=tmp_path, on_failure=first)
+    with pytest.raises(prb.response.ResponseError, match="license server"):
+        model(response, store=tmp_path)
+    busy[0] = False
+    found = model(response, store=tmp_path)
+    np.testing.assert_array_equal(stored(found), EXPECTED)
+    # One to see whether the response is the same, and those that had failed.
+    assert responses(found).computed == 1 + STEEP.sum()
+
+
+@pytest.mark.exact
+def test_failures_are_tried_again_when_asked_for(tmp_path: Path) -> None:
+    busy, replace = [True], prb.response.Replace(-1.0)
+    response = fails_when_busy(busy)
+    model(response, store=tmp_path, on_failure=replace, version="1")
+    busy[0] = False
+    kept = model(response, store=tmp_path, on_failure=replace, version="1")
+    np.testing.assert_array_equal(stored(kept), np.where(STEEP, -1.0, EXPECTED))
+    assert responses(kept).computed == 0
+    assert len(responses(kept).failed) == STEEP.sum()
+    assert {f.reason for f in responses(kept).failed} == {"it raised OSError: license server"}
+    other = model(response, store=tmp_path, on_failure=replace, version="2")
+    np.testing.assert_array_equal(stored(other), EXPECTED)
+    again = model(response, store=tmp_path, on_failure=replace, version="1", retry_failed=True)
+    np.testing.assert_array_equal(stored(again), EXPECTED)
+    assert responses(again).computed == STEEP.sum()
+    assert not responses(again).failed
+    # What was tried again is a result from then on.
+    assert not responses(model(response, store=tmp_path, on_failure=replace, version="1")).failed
+
+
+@BATCHED
+def test_failures_are_told_with_their_inputs(kind: str) -> None:
+    found = failing(kind, fails_above_two, prb.response.Replace(np.inf))
+    failed = responses(found).failed
+    assert sorted(f.inputs[0] for f in failed) == sorted(POINTS[STEEP])
+    assert {f.reason for f in failed} == {"it raised ArithmeticError: too steep"}
+
+
+def test_a_copy_of_a_response_has_failures_of_its_own() -> None:
+    found = responses(failing("scalar", fails_above_two, prb.response.Replace(np.inf)))
+    other = found.copied()
+    other([np.array([5.0])], [])
+    assert len(other.failed) == len(found.failed) + 1
+
+
+# -- responses that end their worker, or hang ------------------------------------------------------
+
+
+class Fragile(ThreadPoolExecutor):
+    """Breaks as a whole, like a pool of processes, when a response ends its worker."""
+
+    made = 0
+
+    def __init__(self, max_workers: int = 2) -> None:
+        super().__init__(max_workers)
+        type(self).made += 1
+        self.broken = False
+
+    def submit(self, work: Any, /, *job: Any, **keywords: Any) -> Any:
+        if self.broken:
+            raise BrokenExecutor("broken before")
+        if 7.0 in job[0].arguments[0]:
+            self.broken = True
+            future: Any = Future()
+            future.set_exception(BrokenExecutor("a process ended"))
+            return future
+        return super().submit(work, *job, **keywords)
+
+
+# By this name those of the standard library and of loky are known.
+Fragile.__name__ = "ProcessPoolExecutor"
+
+
+@pytest.mark.parametrize("response", [prb.scalar(times), times], ids=["scalar", "batched"])
+@pytest.mark.parametrize(
+    "policy", [prb.response.Replace(), prb.response.Retry(1, then=prb.response.Replace())]
+)
+def test_a_response_that_ends_its_worker_costs_that_point(response: Any, policy: Any) -> None:
+    points = Points([np.arange(24.0), 2.0], [True, False])
+    pool, tally = Fragile(), Tally()
+    for _ in range(2):  # the executor that is broken serves again
+        found = respond(Calling("y", response, pool, None, policy), points, tally)
+        expected = 2 * np.arange(24.0)
+        expected[7] = np.nan
+        np.testing.assert_array_equal(found, expected)
+    ((failure),) = tally.failed.values()
+    assert failure.inputs[0] == 7.0
+    assert failure.reason.startswith("it ended its worker (BrokenExecutor)")
+
+
+def test_a_response_that_ends_its_worker_aborts_where_the_policy_says_so() -> None:
+    points = Points([np.arange(24.0), 2.0], [True, False])
+    with pytest.raises(prb.response.ResponseError, match=r"y: a worker was lost .*store="):
+        respond(Calling("y", prb.scalar(times), Fragile()), points, Tally())
+
+
+def ends_its_worker(x: float) -> float:
+    if x == 1.0:
+        os._exit(3)
+    if x == 2.0:
+        time.sleep(600)
+    return 2 * x
+
+
+def test_processes_that_end_or_hang_cost_their_points() -> None:
+    points, tally = Points([np.arange(4.0)], [True]), Tally()
+    with ProcessPoolExecutor(1, mp_context=get_context("forkserver")) as pool:
+        calling = Calling(
+            "y", prb.scalar(ends_its_worker), pool, None, prb.response.Replace(), timeout=1.0
+        )
+        found = respond(calling, points, tally)
+    np.testing.assert_array_equal(found, [0.0, np.nan, np.nan, 6.0])
+    assert [f.reason for f in sorted(tally.failed.values(), key=lambda f: f.inputs[0])] == [
+        "it ended its worker (BrokenProcessPool), or took far too long",
+        "it raised TimeoutError: no result within timeout = 1 s",
+    ]
+
+
+@pytest.mark.parametrize("executor", [None, ThreadPoolExecutor(1)])
+def test_a_time_limit_that_nobody_keeps_is_refused(executor: Any) -> None:
+    with pytest.raises(ValueError, match=r"timeout: got 5 with executor .*expected an executor of"):
+        prb.Reweighted(executor=executor, timeout=5)
+
+
+@BATCHED
+def test_a_response_that_leaves_python_is_a_failure_like_another(kind: str) -> None:
+    def leaves(x: float, a: float) -> float:
+        if x > 2:
+            raise SystemExit("bye")
+        return a * x
+
+    found = failing(kind, leaves, prb.response.Replace(np.inf))
+    np.testing.assert_array_equal(stored(found), np.where(STEEP, np.inf, EXPECTED))
+    with pytest.raises(prb.response.ResponseError, match="raised SystemExit: bye"):
+        failing(kind, leaves)
+
+
+def test_silence_is_told_and_without_workers_ended(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Client:
+        def nthreads(self) -> dict[str, int]:
+            return {}
+
+    class Deserted(ThreadPoolExecutor):
+        _client = Client()
+
+        def submit(self, work: Any, /, *job: Any, **keywords: Any) -> Any:
+            return Future()
+
+    monkeypatch.setattr("prbayes.response.calling._SILENCE", 0.05)
+    points = Points([np.arange(4.0), 2.0], [True, False])
+    with (
+        caplog.at_level(logging.WARNING, "prbayes"),
+        pytest.raises(prb.response.ResponseError, match="no worker is left, expected workers"),
+    ):
+        respond(Calling("y", prb.scalar(times), Deserted(1)), points, Tally())
+    assert "y: no response for" in caplog.text

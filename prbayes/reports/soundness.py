@@ -1,0 +1,111 @@
+"""Whether results from a file are what the package writes, before they are reported."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+# What a group has to have for those who report it, where there is such a group.
+_OF_POSTERIOR = {
+    "calibration": (
+        *("epsilon", "metric", "propagation", "n_points", "required_ess", "max_lost"),
+        *("discrepancy", "discrepancy_error", "weight_ess", "mean_weight", "lost_mass"),
+    ),
+}
+_OF_STAGES = ("beta", "accept_rate", "n_steps")
+_OF_OPTIMUM = {"calibration": ("discrepancy", "metric"), "stderr": ()}
+_OF_TEST = ("statistic", "critical_value", "p_value", "level", "folded")
+
+
+def complaints(tree: xr.DataTree) -> Iterator[str]:
+    """Yield what is wrong with a posterior, an optimum or a test of validity: got, expected."""
+    groups = {str(name): group.to_dataset() for name, group in tree.children.items()}
+    if "posterior" in groups:
+        yield from _of_posterior(groups)
+    elif "optimum" in groups:
+        yield from _of_optimum(groups)
+    else:
+        yield from _of_test(tree.to_dataset())
+    for name in ("posterior", "optimum"):
+        if name in groups:
+            yield from _of_attributes(name, groups[name].attrs)
+    if "observed_data" in groups:
+        yield from _not_numbers("observed_data", groups["observed_data"].data_vars)
+
+
+def _of_posterior(groups: Mapping[str, xr.Dataset]) -> Iterator[str]:
+    draws = groups["posterior"].data_vars
+    yield from _not_numbers("posterior", draws)
+    yield from _without_values("posterior", draws)
+    yield from _lacking(groups, _OF_POSTERIOR)
+    stats = groups.get("sample_stats")
+    if stats is not None and "stage" in stats.dims:
+        yield from _lacking(groups, {"sample_stats": _OF_STAGES})
+        yield from _not_numbers("sample_stats", stats.data_vars)
+
+
+def _of_optimum(groups: Mapping[str, xr.Dataset]) -> Iterator[str]:
+    point = groups["optimum"].data_vars
+    yield from _not_numbers("optimum", point)
+    yield from _without_values("optimum", point)
+    yield from _lacking(groups, _OF_OPTIMUM)
+    errors = groups.get("stderr")
+    if errors is None:
+        return
+    for name, value in point.items():
+        if name not in errors or errors[name].shape != value.shape:
+            yield f"stderr: got no standard error of {name}, expected one of the same shape"
+
+
+def _of_test(test: xr.Dataset) -> Iterator[str]:
+    lacking = [name for name in (*_OF_TEST, "lower", "upper") if name not in test.variables]
+    if lacking:
+        yield f"got no {lacking}, expected a validity test saved by to_dataset()"
+        return
+    for name in _OF_TEST:
+        if name in test and (test[name].size != 1 or test[name].dtype.kind not in "fiub"):
+            yield f"{name}: got shape {test[name].shape}, expected one number"
+            return
+    u = test["u"]
+    yield from _not_numbers("a validity test", {"u": u})
+    if u.ndim != 1 or not u.size or not bool(((u >= 0) & (u <= 1)).all()):
+        yield f"u: got shape {u.shape}, expected one or more numbers between 0 and 1"
+    for name in ("condition", "specimen", "lower", "upper"):
+        if name in test.variables and test[name].shape != u.shape:
+            yield f"{name}: got shape {test[name].shape}, expected that of u, {u.shape}"
+    for name in ("statistic", "p_value"):
+        if name in test and not np.isfinite(test[name].values).all():
+            yield f"{name}: got NaN or an infinite number, expected a finite one"
+
+
+def _of_attributes(group: str, attrs: Mapping[Any, Any]) -> Iterator[str]:
+    for name in ("n_responses", "seconds"):
+        value = np.asarray(attrs.get(name, 0.0))
+        if value.size != 1 or value.dtype.kind not in "fiu" or np.isnan(value).any():
+            yield f"{group}: {name}: got {attrs[name]!r:.60}, expected a number"
+
+
+def _not_numbers(group: str, variables: Mapping[Any, xr.DataArray]) -> Iterator[str]:
+    for name, values in variables.items():
+        if values.dtype.kind not in "fiu":
+            yield f"{group}: {name}: got values of dtype {values.dtype}, expected numbers"
+
+
+def _without_values(group: str, variables: Mapping[Any, xr.DataArray]) -> Iterator[str]:
+    for name, values in variables.items():
+        if not values.size:
+            yield f"{group}: {name}: got no values (shape {values.shape}), expected some"
+        elif values.dtype.kind == "f" and not np.isfinite(values.values).any():
+            yield f"{group}: {name}: got NaN or infinite values only, expected finite ones"
+
+
+def _lacking(
+    groups: Mapping[str, xr.Dataset], needed: Mapping[str, tuple[str, ...]]
+) -> Iterator[str]:
+    for group, names in needed.items():
+        lacking = [name for name in names if group in groups and name not in groups[group]]
+        if lacking:
+            yield f"{group}: got no {lacking}, expected them beside {list(groups[group])}"
