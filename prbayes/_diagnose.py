@@ -142,6 +142,8 @@ def _of_optimum(optimum: Optimum) -> Diagnosis:
 def _of_family(optimum: Optimum) -> list[str]:
     """Say where the data are too far from the best population to have come from its family."""
     known = optimum.converged and not optimum.at_edge and not optimum.at_jump
+    if optimum.evaluator.responses_per_theta:
+        return []  # refits would compute responses
     if not known or optimum.prior or sampling_obstacle(optimum.evaluator) is not None:
         return []
     return of_another_family(fit_probability(optimum.sampling(), SETS, 0))

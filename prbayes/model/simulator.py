@@ -242,11 +242,6 @@ def _refuse_alike_labels(name: str, labels: NDArray[Any], others: list[Node]) ->
     labelled = [(other.name, other.specimens) for other in others]
     for simulator, own in [*labelled, (name, labels)]:
         for label in [] if own is None else own.tolist():
-            if label is None or label != label:
-                raise ValueError(
-                    f"{name}: specimens: got {label!r} among the labels, expected one for each "
-                    "observation; give a specimen that nothing else was measured on its own"
-                )
             first, known = seen.setdefault(_read(label), (simulator, label))
             if known != label:
                 raise TypeError(

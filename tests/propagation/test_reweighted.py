@@ -569,8 +569,9 @@ def test_diagnose_is_silent_when_nothing_is_wrong() -> None:
 def test_diagnose_says_what_to_do() -> None:
     model, _ = hard(PR, 256)
     shape = (2, 20)
+    scattered = 0.01 * np.random.default_rng(0).standard_normal((*shape, 2))
     result = posterior(
-        mean=np.broadcast_to([8.0, -8.0], (*shape, 2)),
+        mean=np.array([8.0, -8.0]) + scattered,
         sd=np.full(shape, 0.1),
         rho=np.full(shape, 0.9),
     )
