@@ -77,7 +77,7 @@ def answers(kind: str, factor: float) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
-@pytest.mark.parametrize("kind", METRICS)
+@pytest.mark.parametrize("kind", [kind for kind in METRICS if kind != "one's own"])
 def test_answers_do_not_depend_on_the_unit_of_the_response(kind: str, factor: float) -> None:
     expected, found = answers(kind, 1.0), answers(kind, factor)
     for name, value in expected.items():
@@ -85,7 +85,7 @@ def test_answers_do_not_depend_on_the_unit_of_the_response(kind: str, factor: fl
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factor", [1e-150, 1e-30, 1e-3, 1e3, 1e30, 1e150])
+@pytest.mark.parametrize("factor", [1e-150, 1e-30, 1e-6, 1e-3, 1e3, 1e6, 1e30, 1e150])
 @pytest.mark.parametrize("kind", METRICS)
 def test_nor_on_units_far_from_any_size(kind: str, factor: float) -> None:
     test_answers_do_not_depend_on_the_unit_of_the_response(kind, factor)

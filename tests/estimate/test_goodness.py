@@ -40,6 +40,7 @@ def probabilities(name: str, family: str, sets: int) -> Floats:
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_a_right_family_is_called_wrong_as_rarely_as_said() -> None:
     p = probabilities("pr", "normal", 60)
     # A binomial number of 60 with probability .05: 3, and eight or more once in 150 cases.
