@@ -33,7 +33,7 @@ from prbayes.model.node import (
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.response.compilation import PLAIN
-from prbayes.response.inputs import read_inputs
+from prbayes.response.inputs import Inputs, read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 
 _log = logging.getLogger("prbayes")
@@ -127,12 +127,7 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     name = pm.modelcontext(None).name_for(plain_text(name, "prb.Simulator: name"))
     _refuse_name(name, model)
     target = _target(name, metric, observed, weights)
-    propagation = Reweighted() if propagation is None else propagation
-    if not isinstance(propagation, Propagation):
-        raise TypeError(
-            f"{name}: propagation: got {called(propagation)}, expected prb.Reweighted(n), "
-            "prb.Resimulated(n) or prb.Fresh(n)"
-        )
+    propagation = _propagation(name, propagation)
     size = target.observed.size
     labels = None if specimens is None else sample_labels(specimens, size, f"{name}: specimens")
     before = list(nodes(model).values())
@@ -144,19 +139,8 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         positive_number(epsilon, f"{name}: epsilon")
     refuse_uncallable(name, response)
     sorted_inputs = read_inputs(name, inputs, model)
-    responses = Responses(
-        name,
-        response,
-        sorted_inputs,
-        executor=propagation.executor,
-        store=propagation.store,
-        version=propagation.version,
-        on_failure=propagation.on_failure,
-        retry_failed=propagation.retry_failed,
-        timeout=propagation.timeout,
-    )
     with shown(progressbar):
-        bound = propagation.bind(name, sorted_inputs, target, responses)
+        bound = _bound(name, response, sorted_inputs, target, propagation)
     if epsilon is None:
         likelihood = metric.likelihood
         epsilon = 1 / effective_specimens(target, labels) if likelihood else np.nan
@@ -175,6 +159,40 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     )
     rv.owner.op.own_node(rv.owner)
     return rv
+
+
+def _propagation(name: str, propagation: Propagation | None) -> Propagation:
+    """Return the propagation, which is `Reweighted` by default."""
+    if propagation is None:
+        return Reweighted()
+    if not isinstance(propagation, Propagation):
+        raise TypeError(
+            f"{name}: propagation: got {called(propagation)}, expected prb.Reweighted(n), "
+            "prb.Resimulated(n) or prb.Fresh(n)"
+        )
+    return propagation
+
+
+def _bound(
+    name: str,
+    response: Callable[..., Any],
+    inputs: Inputs,
+    target: Discrepancy,
+    propagation: Propagation,
+) -> Bound:
+    """Return the propagation at work, with the responses that it needs at first."""
+    responses = Responses(
+        name,
+        response,
+        inputs,
+        executor=propagation.executor,
+        store=propagation.store,
+        version=propagation.version,
+        on_failure=propagation.on_failure,
+        retry_failed=propagation.retry_failed,
+        timeout=propagation.timeout,
+    )
+    return propagation.bind(name, inputs, target, responses)
 
 
 def _target(
