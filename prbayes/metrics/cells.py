@@ -122,14 +122,10 @@ class KernelCells(Cells):
         return out.reshape(values.shape)
 
     def _reading(self, points: Floats, weights: Floats) -> Floats:
-        """Return cubic convolution weights (Keys 1981), which are exact for parabolas.
-
-        Points off the grid are read at the cell of the mass on their side.
-        """
+        """Return cubic convolution weights (Keys 1981), which are exact for parabolas."""
         # Where the points are: a node, and a fraction of a step beyond it.
         t = points / self.step - self._low
         last = self.centers.size - 2
-        below, above = t < 1, t >= last
         inside = (t >= 1) & (t < last)
         t = np.where(inside, t, 1.0)
         node = t.astype(np.intp)
@@ -147,8 +143,6 @@ class KernelCells(Cells):
         for k, share in enumerate(keys):
             at = node - 1 + k
             each[row, at] += np.where(inside, share, 0.0)
-        each[below, -2] = 1.0
-        each[above, -1] = 1.0
         return product(weights, each)
 
     def value(self, sample: Floats, cotangent: Floats) -> Floats:

@@ -163,16 +163,14 @@ def test_kernel_reading_is_exact_up_to_parabolas(
     np.testing.assert_allclose(reading @ on_cells, w @ function(points), rtol=1e-10)
 
 
-def test_kernel_reading_of_a_gaussian_is_close_and_points_outside_are_read_on_their_side() -> None:
+def test_kernel_reading_of_a_gaussian_is_close_and_of_points_outside_is_zero() -> None:
     cells = kernel_cells()
     points, w = draw(2, 12)
     on_cells = np.r_[norm.pdf(cells.centers, 0.3, 1), 0, 0]
     np.testing.assert_allclose(
         cells.reading(points, w) @ on_cells, w @ norm.pdf(points, 0.3, 1), rtol=1e-3
     )
-    outside = cells.reading(np.array([-99.0, 99.0]), np.array([0.2, 0.8]))
-    np.testing.assert_array_equal(outside[-2:], [0.2, 0.8])
-    assert (outside[:-2] == 0).all()
+    assert (cells.reading(np.array([-99.0, 99.0]), np.full(2, 0.5)) == 0).all()
 
 
 def test_histogram_reading_is_the_mass_in_each_bin() -> None:

@@ -63,25 +63,3 @@ def test_what_it_declares() -> None:
     assert LogLikelihood().additive
     assert LogLikelihood().density == GaussianKDE(likelihood_bandwidth)
     assert LogLikelihood().against([0.0, 1.0, 5.0]).scale == 1
-
-
-@pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_an_outlier_counts_alike_whether_it_was_there_at_first_or_in_a_refit(side: float) -> None:
-    rng = np.random.default_rng(3)
-    observed = rng.normal(size=30)
-    simulated = rng.normal(size=2000)
-    far = np.append(observed, side * 60.0)
-    metric = LogLikelihood(GaussianKDE(0.3))
-    inner = metric.against(observed)
-    refitted = inner.with_observed(far)
-    direct = metric.against(far)
-    # The floor is spread over grids of two lengths.
-    lengths = [d.cells.widths.sum() for d in (inner, direct)]
-    per_value = abs(np.log(lengths[1] / lengths[0])) / far.size
-    assert abs(refitted(simulated) - direct(simulated)) < per_value + 1e-4
-    # And not better than without it.
-    assert refitted(simulated) > inner(simulated) + 0.5
-    # From weights of stored values just the same.
-    basis = refitted.basis(simulated)
-    (features,) = refitted.from_basis(np.full(2000, 1 / 2000), basis, np)
-    np.testing.assert_allclose(refitted.outer(features, xp=np), refitted(simulated), rtol=1e-9)
