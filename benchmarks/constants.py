@@ -17,7 +17,7 @@ The first row says how much another seed of the sampler changes. docs/constants.
 One process imports and compiles what can be kept; each variation is a fork of it, so that none sees
 another's. The file is written after each row, and rows that it has are not computed again.
 
-    uv run python -m benchmarks.constants [--only sandwich] [--anew] [--check] [--out constants.json]
+    uv run python -m benchmarks.constants [--only sandwich] [--anew] [--check]
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ ROOMS = (
     "_diagnose",
 )
 COLUMNS = ("optimum", "stderr", "epsilon", "mean", "sd", "responses", "p")
-RESULTS = Path(__file__).parent / "results" / "constants.json"
+RESULTS = record.RESULTS / "constants.json"
 # Seconds for all problems of one variation: many times what they take.
 PATIENCE = 300
 # What by its nature touches no answer.

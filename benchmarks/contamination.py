@@ -5,7 +5,7 @@ gross outliers 8 standard deviations above the mean. The same data sets, clean a
 calibrated with each metric, and the shift of the posterior mean and the ratio of the posterior's sd
 to the clean one are averaged.
 
-    uv run python -m benchmarks.contamination [--replicates 40] [--out contamination.json]
+    uv run python -m benchmarks.contamination [--replicates 40]
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def main() -> None:
     """Calibrate clean and contaminated data; print a table and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--replicates", type=int, default=40)
-    parser.add_argument("--out", type=Path, default=Path("contamination.json"))
+    parser.add_argument("--out", type=Path, default=record.RESULTS / "contamination.json")
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
     table: dict[str, Any] = {

@@ -30,7 +30,7 @@ from benchmarks import record
 
 METRICS = ("ProbabilityResidual", "KullbackLeibler", "AreaMetric", "LogLikelihood")
 SIZES = (20, 50, 200)
-STORE = Path(__file__).parent / "results" / "coverage"
+STORE = record.RESULTS / "coverage"
 POSTERIORS = ("plain", "sandwich", "affine", "bootstrap", "exact")
 LEVELS = (0.5, 0.89, 0.95)
 HELD_OUT = ("bell", "correlated")  # no constant was chosen by looking at them
@@ -410,7 +410,7 @@ def main() -> None:
     parser.add_argument("--problems", nargs="+", default=list(PROBLEMS), choices=list(PROBLEMS))
     parser.add_argument("--sizes", nargs="+", type=int, default=list(SIZES))
     parser.add_argument("--store", type=Path, default=STORE)
-    parser.add_argument("--out", type=Path, default=None)
+    parser.add_argument("--out", type=Path, default=record.RESULTS / "coverage.json")
     parser.add_argument("--only-table", action="store_true")
     arguments = parser.parse_args()
     arguments.store.mkdir(parents=True, exist_ok=True)
@@ -435,8 +435,7 @@ def main() -> None:
                 path.with_suffix(".part").write_text(json.dumps(job.result()))
                 path.with_suffix(".part").replace(path)
     found = table(arguments.store)
-    if arguments.out:
-        record.save(arguments.out, found)
+    record.save(arguments.out, found)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ standard deviation; N = 50. Reweighted(n) grows until another design's optimum w
 tenth of a standard error, or says that it does not get there; Resimulated(65 536) is the reference
 for the minimiser.
 
-Run: uv run python -m benchmarks.dimensions [--seeds 2] [--out benchmarks/results/dimensions.json]
+Run: uv run python -m benchmarks.dimensions [--seeds 2]
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--n", type=int, default=1024)
-    parser.add_argument("--out", type=Path, default=Path("dimensions.json"))
+    parser.add_argument("--out", type=Path, default=record.RESULTS / "dimensions.json")
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
     table: dict[str, Any] = {}

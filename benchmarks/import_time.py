@@ -1,6 +1,6 @@
 """Import time of prbayes on top of pymc, in fresh processes; prints a table and writes JSON.
 
-Run: uv run python -m benchmarks.import_time [--runs 7] [--out import_time.json]
+Run: uv run python -m benchmarks.import_time [--runs 7]
 """
 
 import argparse
@@ -28,7 +28,7 @@ def main():
     """Time both imports in the same fresh process, several times."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=7)
-    parser.add_argument("--out", type=Path, default=Path("import_time.json"))
+    parser.add_argument("--out", type=Path, default=record.RESULTS / "import_time.json")
     arguments = parser.parse_args()
     times = []
     for _ in range(arguments.runs + 1):

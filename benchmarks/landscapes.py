@@ -7,7 +7,7 @@ the gradient is below a thousandth of its largest, and the share of starts from 
 exact derivatives reaches an optimum (the true one or its mirror image), followed as they are and
 with the area metric as a guide where densities do not overlap.
 
-    uv run python -m benchmarks.landscapes [--out landscapes.json] [--images docs/images]
+    uv run python -m benchmarks.landscapes
 """
 
 from __future__ import annotations
@@ -94,8 +94,8 @@ def basins(evaluator: Any, name: str, metric: str, *, guided: bool) -> tuple[Any
 def main() -> None:
     """Compute, draw, print, write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("landscapes.json"))
-    parser.add_argument("--images", type=Path, default=Path("."))
+    parser.add_argument("--out", type=Path, default=record.RESULTS / "landscapes.json")
+    parser.add_argument("--images", type=Path, default=Path("docs/images"))
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
     out: dict[str, Any] = {}

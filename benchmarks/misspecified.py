@@ -7,7 +7,7 @@ deviations, the area between the calibrated and the true distribution function i
 deviations, and the error of the 95% quantile. Ties and rounding: normal data of N = 50, rounded to
 multiples of 0.1 to 2 standard deviations, or with half of the values equal to the median.
 
-    uv run python -m benchmarks.misspecified [--seeds 20] [--out misspecified.json]
+    uv run python -m benchmarks.misspecified [--seeds 20]
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ def main() -> None:
     """Fit, print tables, write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--out", type=Path, default=Path("misspecified.json"))
+    parser.add_argument("--out", type=Path, default=record.RESULTS / "misspecified.json")
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
     base = evaluator()

@@ -13,7 +13,7 @@ the case study. 3. Time to the optimum, compilation included and import excluded
 
 All ratios are of times in one run, on one core.
 
-    uv run python -m benchmarks.optimizer [--repeats 5] [--out optimizer.json]
+    uv run python -m benchmarks.optimizer [--repeats 5]
 """
 
 from __future__ import annotations
@@ -236,7 +236,7 @@ def main() -> None:
     """Measure, print, write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--out", type=Path, default=Path("optimizer.json"))
+    parser.add_argument("--out", type=Path, default=record.RESULTS / "optimizer.json")
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
     out = {

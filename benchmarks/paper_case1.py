@@ -9,8 +9,7 @@ optimiser says so, or if mean or standard deviation are off by more than half.
 
 One process; every fit is kept as it is made, so that a run can be stopped and started again.
 
-    uv run python -m benchmarks.paper_case1 [--seeds 20] [--mc-seeds 20] [--out
-    benchmarks/results/paper_case1.json]
+    uv run python -m benchmarks.paper_case1 [--seeds 20] [--mc-seeds 20]
 """
 
 from __future__ import annotations
@@ -194,7 +193,7 @@ def main() -> None:
     parser.add_argument(
         "--tables", action="store_true", help="print the tables of what there is, fit nothing"
     )
-    parser.add_argument("--out", type=Path, default=Path("paper_case1.json"))
+    parser.add_argument("--out", type=Path, default=record.RESULTS / "paper_case1.json")
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
     tables(record.load(arguments.out, None)["fits"] if arguments.tables else work(arguments))

@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+RESULTS = Path(__file__).parent / "results"
 PACKAGES = ("prbayes", "pymc", "pytensor", "arviz", "numba", "numpy", "scipy", "xarray")
 
 
@@ -24,7 +25,8 @@ def about() -> dict[str, Any]:
     """Return how, on what and when this process runs."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     module = f"-m {spec.name}" if spec is not None else sys.argv[0]
-    changed = " with changes" if _git("status", "--porcelain", "--untracked-files=no") else ""
+    status = _git("status", "--porcelain", "--untracked-files=no", "--", ".", f":!{RESULTS}")
+    changed = " with changes" if status else ""
     versions = {"python": platform.python_version()}
     for name in PACKAGES:
         versions[name] = importlib.metadata.version(name)

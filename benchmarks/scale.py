@@ -8,7 +8,7 @@ Times are CPU seconds; *growth* is that against the row above, for ten times the
 sends responses that cost nothing, each a task of its own, to a Dask cluster of two processes on the
 loopback interface: what a task costs the client, the scheduler and a worker together.
 
-    uv run python -m benchmarks.scale [--out scale.json]
+    uv run python -m benchmarks.scale
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def tasks(size: int) -> dict[str, float]:
 def main() -> None:
     """Run everything, print a table and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("scale.json"))
+    parser.add_argument("--out", type=Path, default=record.RESULTS / "scale.json")
     parser.add_argument(
         "--only", choices=(*KINDS, "tasks"), help="replace these rows of what is in --out"
     )

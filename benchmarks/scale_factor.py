@@ -7,7 +7,7 @@ Nelder-Mead with scipy's default tolerances; on raw parameters (mu, sigma), and 
 ones, mu in units of the initial spread and log sigma. A fit has failed if it is off by more than a
 per cent of the standard deviation. Last, `prb.minimize`, whose tolerances are relative.
 
-    uv run python -m benchmarks.scale_factor [--out scale_factor.json]
+    uv run python -m benchmarks.scale_factor
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def packages(maximum: float, base: int) -> tuple[int, float, float]:
 def main() -> None:
     """Fit all combinations, print a table, write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("scale_factor.json"))
+    parser.add_argument("--out", type=Path, default=record.RESULTS / "scale_factor.json")
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
     out: dict[str, Any] = {}

@@ -7,7 +7,7 @@ deviations within 20%; the table says whether they do. Every run is a process of
 core, and import is not counted. Cold is a run with an empty compilation cache. ELFI 0.8.8 cannot be
 installed beside PyMC 6: it needs matplotlib 3.8, which does not build on Python 3.13.
 
-    uv run --with pyabc python -m benchmarks.smc [--runs 3] [--only pymc] [--out smc.json]
+    uv run --with pyabc python -m benchmarks.smc [--runs 3] [--only pymc]
 """
 
 from __future__ import annotations
@@ -351,7 +351,7 @@ def main() -> None:
     parser.add_argument(
         "--only", choices=(*SYSTEMS, "10ms"), help="replace these rows of what is in --out"
     )
-    parser.add_argument("--out", type=Path, default=Path("smc.json"))
+    parser.add_argument("--out", type=Path, default=record.RESULTS / "smc.json")
     parser.add_argument("--child", nargs="+", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.child:

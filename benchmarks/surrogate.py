@@ -125,7 +125,7 @@ def main():
             print(
                 f"stiffness {name:7s} {label:15s} error of the mean {mean_error:+.3f}%, of the sd {sd_error:+.2f}%"
             )
-    path = ROOT / "results" / "surrogate.json"
+    path = record.RESULTS / "surrogate.json"
     record.save(path, {"rows": rows, "stated frequency, errors in %": fits})
     print(f"{path.name}; {time.perf_counter() - clock:.0f} s")
 

@@ -11,7 +11,7 @@ Kolmogorov-Smirnov, Cramer-von Mises, Anderson-Darling and ArviZ's tests of unif
 same u-values in the posterior's pool (in closed form, Student's t), and all with critical values
 from the same simulation of a right model, so that each has the nominal size.
 
-    uv run python -m benchmarks.validity [--parts size pipeline power] [--out validity.json]
+    uv run python -m benchmarks.validity [--parts size pipeline power]
 """
 
 from __future__ import annotations
@@ -182,7 +182,10 @@ def main() -> None:
         default=("size", "pipeline", "power"),
     )
     parser.add_argument(
-        "--out", type=Path, default=Path("validity.json"), help="other parts that it has are kept"
+        "--out",
+        type=Path,
+        default=record.RESULTS / "validity.json",
+        help="other parts that it has are kept",
     )
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
