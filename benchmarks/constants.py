@@ -197,7 +197,7 @@ def two_inputs(rng: np.random.Generator) -> pm.Model:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu_a", 1, 1), pm.HalfNormal("sd_a", 1))
         y = pm.Normal.dist(pm.Normal("mu_b", 2, 1), pm.HalfNormal("sd_b", 1))
-        common = {"metric": prb.ProbabilityResidual(), "specimens": np.arange(30)}
+        common: dict[str, Any] = {"metric": prb.ProbabilityResidual(), "specimens": np.arange(30)}
         for name, sign in (("sum", 1), ("difference", -1)):
             prb.Simulator(
                 name,
@@ -230,7 +230,7 @@ def sampled(optimum: prb.Optimum, random_seed: int) -> dict[str, Any]:
     posterior = prb.sample_smc(
         400, chains=1, model=optimum.model, optimum=optimum, random_seed=random_seed, progressbar=False
     )  # fmt: skip
-    draws = posterior["calibration"]["theta"].values[0]
+    draws = posterior["calibration"].dataset["theta"].values[0]
     return {
         "theta": optimum.theta,
         "stderr": np.sqrt(np.diag(optimum.covariance)),

@@ -21,7 +21,7 @@ import pymc as pm
 import prbayes as prb
 from benchmarks import record
 from prbayes.model.evaluator import Evaluator
-from prbayes.posterior.smc import sample
+from prbayes.posterior.smc import Sampling, sample
 
 SIZE = 50
 SHARE = 0.05
@@ -45,7 +45,7 @@ def evaluator_of(metric: str) -> Evaluator:
 
 def posterior(evaluator: Evaluator, data: Any, adjust: bool) -> Any:
     """Return means and standard deviations of mu and sigma."""
-    tree = sample(evaluator.observing({"y": data}), adjust=adjust, random_seed=1)
+    tree = sample(evaluator.observing({"y": data}), Sampling(adjust=adjust, random_seed=1))
     draws = tree["posterior"].dataset
     return np.array([[float(draws[n].mean()), float(draws[n].std())] for n in ("mu", "sigma")])
 

@@ -215,13 +215,13 @@ def analyse(
 ) -> dict[str, Any]:
     """Calibrate one data set; return the estimate, and by posterior: probability below the truth, mean, sd."""
     from prbayes.estimate.data_sets import reweighted_sets
-    from prbayes.estimate.minimization import find_optimum
+    from prbayes.estimate.minimization import Minimisation, find_optimum
     from prbayes.estimate.refit import SamplingDistribution
     from prbayes.posterior.adjustment import Affine, transported
     from prbayes.posterior.epsilon import calibrate_epsilon
 
     ev = evaluator.observing({"y": data})
-    optimum = find_optimum(ev, tolerance=1e-6, starts=0)
+    optimum = find_optimum(ev, Minimisation(starts=0))
     epsilon = np.array([calibrate_epsilon(optimum)["y"]])
     ev.nodes[0].epsilon.set_value(epsilon[0])
     sampling = SamplingDistribution.of(ev, optimum.theta, epsilon)
@@ -365,7 +365,7 @@ def table(store: Path) -> dict[str, Any]:
         f"{'sd/own':>11s} {'sd/exact':>11s} {'rmse ratio':>11s}"
     )
     for key, c in cells.items():
-        problem, size, metric, posterior = key.split("/")
+        problem, n_data, metric, posterior = key.split("/")
         figures = [c[f"coverage_{level:.0%}"] for level in LEVELS]
         figures += [
             c[k] for k in ("sd_over_own_sampling_sd", "sd_over_exact_sd", "rmse_over_exact_rmse")
@@ -373,7 +373,7 @@ def table(store: Path) -> dict[str, Any]:
         shown = " ".join(
             "/".join(f"{v:.2f}".replace("0.", ".", 1) for v in f).rjust(11) for f in figures
         )
-        print(f"{problem:12s}{size:>4s} {metric:20s} {posterior:10s} {shown}")
+        print(f"{problem:12s}{n_data:>4s} {metric:20s} {posterior:10s} {shown}")
     pooled: dict[str, Any] = {}
     print("\npooled over hyperparameters and cells; held-out problems: " + ", ".join(HELD_OUT))
     for group, names in {"all": tuple(PROBLEMS), "held out": HELD_OUT}.items():

@@ -136,7 +136,7 @@ def tasks(size: int) -> dict[str, float]:
         how = calling.Calling("y", function, executor)  # type: ignore[arg-type]
         points = calling.Points(list(numbers.T), [True] * 5)
         calling.respond(how, points.at(np.arange(10)), calling.Tally())  # the workers are up
-        calling.chunk_size = lambda *_: 1  # type: ignore[assignment]
+        calling.chunk_size = lambda *_: 1
         before, clock = peak(), time.perf_counter()
         calling.respond(how, points, calling.Tally())
         spent = time.perf_counter() - clock

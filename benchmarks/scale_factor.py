@@ -108,13 +108,12 @@ def main() -> None:
         "\nprb.minimize, integral form, BFGS: evaluations of value and gradient, mu / sd, sigma / sd"
     )
     for maximum in MAXIMA:
-        found = [packages(maximum, base) for base in BASES]
-        out[f"{maximum}/prbayes"] = found
+        own = [packages(maximum, base) for base in BASES]
+        out[f"{maximum}/prbayes"] = own
         print(
             f"{maximum:6g} "
             + " ".join(
-                f"C = {c}: {n}, {m:.6f}, {s:.6f};"
-                for c, (n, m, s) in zip(BASES, found, strict=True)
+                f"C = {c}: {n}, {m:.6f}, {s:.6f};" for c, (n, m, s) in zip(BASES, own, strict=True)
             )
         )
     record.save(arguments.out, out)

@@ -102,7 +102,7 @@ def exact(problem: str) -> dict[str, float]:
     logs = logs + halfnorm.logpdf(sigma, scale=scale)
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
-    out = {}
+    out: dict[str, float] = {}
     for name, value in (("mu", mu), ("sigma", sigma)):
         mean = float((value * weights).sum())
         out |= {

@@ -28,9 +28,6 @@ from scipy.special import ndtr, ndtri, stdtr
 
 import prbayes as prb
 from benchmarks import record
-from prbayes.estimate.minimization import find_optimum
-from prbayes.model.evaluator import Evaluator
-from prbayes.posterior.smc import sample
 from prbayes.validation.statistic import area
 
 LEVELS = (0.01, 0.05, 0.10)
@@ -82,20 +79,17 @@ def same(x: Any) -> Any:
     return x
 
 
-def pipeline_model(n0: int) -> tuple[Evaluator, Any]:
-    """Return an evaluator of a normal population, to be given data, and its input."""
+def pipeline_model(data: Any) -> tuple[pm.Model, Any]:
+    """Return a model of a normal population, and its input."""
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 10, 3), pm.HalfNormal("sigma", 3))
-        prb.Simulator(
-            "y", same, x, metric=prb.AreaMetric(), observed=np.random.default_rng(0).normal(10, 1, n0),
-            propagation=prb.Reweighted(512),
-        )  # fmt: skip
-    return Evaluator(model), x
+        propagation = prb.Reweighted(512)
+        prb.Simulator("y", same, x, metric=prb.AreaMetric(), observed=data, propagation=propagation)
+    return model, x
 
 
 def pipeline(n0: int, n: int, replicates: int) -> dict[str, Any]:
     """Return p-values of a right model through prbayes: fresh data, and the calibration's own."""
-    evaluator, x = pipeline_model(n0)
     found: dict[str, Any] = {
         "default": [],
         "optimum, ExactModel": [],
@@ -105,10 +99,12 @@ def pipeline(n0: int, n: int, replicates: int) -> dict[str, Any]:
     for i in range(replicates):
         rng = np.random.default_rng([8, n0, i])
         data, fresh = rng.normal(10, 1, n0), rng.normal(10, 1, n)
-        other = evaluator.observing({"y": data})
-        optimum = find_optimum(other)
-        posterior = sample(other, draws=400, optimum=optimum, random_seed=i)
-        predicted = prb.predict(posterior, same, x, model=evaluator.model, random_seed=i)
+        model, x = pipeline_model(data)
+        optimum = prb.minimize(model, progressbar=False)
+        posterior = prb.sample_smc(
+            400, chains=1, model=model, optimum=optimum, random_seed=i, progressbar=False
+        )
+        predicted = prb.predict(posterior, same, x, model=model, random_seed=i)
         best = prb.predict(optimum, same, x, random_seed=i)
         found["default"].append(
             prb.area_test(
