@@ -17,6 +17,13 @@ from prbayes.model.evaluator import Evaluator
 _COMPARABLE = 3.0
 # Difference, in multiples of the noise, from which one is better than what was thought the best.
 _BETTER = 0.1
+# Points of the prior looked at for each start; the better half of them, thinned, are the starts.
+# benchmarks/constants.py: half and twice as many find the same optima.
+_LOOKED_AT = 8
+# Steps of the way between two optima at which a barrier is looked for: one narrower is missed.
+_SECTIONS = 10
+# Multiples of the noise that are nothing: what descents stop at, and what may be given up.
+_NEGLIGIBLE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +65,11 @@ def _starts(objective: _Objective, n: int, noise: float, seed: int) -> tuple[Flo
 
     They are the better half of points of the prior, without crowding.
     """
-    points = objective.evaluator.prior_points(8 * n, seed)
+    points = objective.evaluator.prior_points(_LOOKED_AT * n, seed)
     values = objective(points)
     ranked = np.argsort(values, kind="stable")
-    some = ranked[::4]
-    chosen = points[some[:n]]
+    thinned = ranked[: len(ranked) // 2 : max(_LOOKED_AT // 2, 1)]
+    chosen = points[thinned[:n]]
     finite = values[np.isfinite(values)]
     quantiles = np.quantile(finite, [0.0, 0.5])
     half = float(np.ptp(quantiles))
@@ -112,8 +119,7 @@ def rivals(
         starts_at,
         np.eye(best.size) / size,
         step=1e-3,
-        # Far below the differences that matter.
-        tolerance=0.01 * noise,
+        tolerance=_NEGLIGIBLE * noise,
     )
     lowest = float(objective(best[None])[0])
     ends, values = _in_line(objective, local.unidentified, ends, values, noise)
@@ -168,7 +174,7 @@ def _in_line(
     hidden = ends @ unidentified @ unidentified.T
     in_line = ends - hidden
     also = objective.along(in_line, None)
-    as_good = also < values + 0.01 * noise
+    as_good = also < values + _NEGLIGIBLE * noise
     aligned = np.where(as_good[:, None], in_line, ends)
     return aligned, np.minimum(also, values)
 
@@ -187,11 +193,8 @@ def _separate(
     value_b: float,
     noise: float,
 ) -> bool:
-    """Return whether the objective between two optima is above both by more than the noise.
-
-    A barrier narrower than a tenth of the way is missed.
-    """
-    share = np.linspace(0, 1, 11)
+    """Return whether the objective between two optima is above both by more than the noise."""
+    share = np.linspace(0, 1, _SECTIONS + 1)
     inside = share[1:-1, None]
     between = objective(a + inside * (b - a))
     barrier = np.max(between) - max(value_a, value_b)
