@@ -1,0 +1,279 @@
+"""Tables of the pages, written from benchmarks/results between `<!-- table: name -->` and `<!-- end -->`.
+
+Run: uv run python -m benchmarks.pages
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import record
+
+PAGES = Path(__file__).parents[1] / "docs"
+METRICS = {
+    "PR": "ProbabilityResidual",
+    "KLD": "KullbackLeibler",
+    "area": "AreaMetric",
+    "log-likelihood": "LogLikelihood",
+}
+POSTERIORS = {
+    "Gibbs, calibrated epsilon": "plain",
+    "sandwich": "sandwich",
+    "**adjusted (default)**": "affine",
+    "bootstrap": "bootstrap",
+    "exact": "exact",
+}
+Row = Iterable[str]
+
+
+def found(name: str) -> Any:
+    """Return what a benchmark found."""
+    return record.load(record.RESULTS / f"{name}.json", None)
+
+
+def short(value: float, digits: int = 2) -> str:
+    """Return a number without the zero before its point."""
+    return f"{value:.{digits}f}".replace("0.", ".", 1) if abs(value) < 1 else f"{value:.{digits}f}"
+
+
+def pooled() -> Iterator[Row]:
+    """Return the rows of coverage over all cells."""
+    table = found("coverage")["pooled"]
+    for label, name in POSTERIORS.items():
+        for sizes, at in (("50, 200", ">= 50"), ("20", "= 20")):
+            row = table[f"all, {name}, N {at}"]
+            mean, *others = (row[key] for key in list(row))
+            yield [label, sizes, short(mean, 3), *(short(value) for value in others)]
+
+
+def coverage() -> Iterator[Row]:
+    """Return the rows of coverage by problem."""
+    table = found("coverage")["cells"]
+    problems = {
+        "linear": "linear",
+        "quadratic": "x^2 - 2x + 1",
+        "bell": "exp(-1/(1 + 100 x^2)) (held out)",
+        "lognormal": "lognormal input",
+        "correlated": "correlated inputs (held out)",
+    }
+    for (problem, label), size in product(problems.items(), (20, 50, 200)):
+        cells = [table[f"{problem}/{size}/{m}/affine"]["coverage_89%"] for m in METRICS.values()]
+        yield [label, str(size), *(" / ".join(map(short, cell)) for cell in cells)]
+
+
+def outliers() -> Iterator[Row]:
+    """Return the rows of shifts by gross outliers."""
+    table = found("contamination")
+    for label, name in METRICS.items():
+        adjusted, plain = table[f"{name}/adjusted"], table[f"{name}/plain"]
+        shifts = zip(adjusted["shift"], adjusted["standard_error"], strict=True)
+        yield [
+            label,
+            *(f"{shift:.2f} ± {error:.2f}" for shift, error in shifts),
+            *(f"{value:.2f}" for value in (*adjusted["sd_ratio"], *plain["shift"])),
+        ]
+
+
+def samplers() -> Iterator[Row]:
+    """Return the rows of sampling beside other packages."""
+    table = found("smc")
+    systems = {
+        "prbayes, `Reweighted(256)`": "reweighted",
+        "prbayes, `Resimulated(256)`": "resimulated",
+        "stock PyMC": "pymc",
+        "pyABC": "pyabc",
+    }
+    problems = {"y = x": "linear", "y = x² - 2x + 1": "quadratic"}
+    for (problem, at), (label, name) in product(problems.items(), systems.items()):
+        row = table[f"{at} {name}"]
+        yield [
+            problem,
+            label,
+            f"{row['responses']:,}",
+            f"{row['cpu']:.1f}",
+            ", ".join(f"{value:.2f}" for value in row["mean off"]),
+            ", ".join(f"{value:.2f}" for value in row["sd ratio"]),
+            "yes" if row["accurate"] else "no",
+        ]
+
+
+def sizes() -> Iterator[Row]:
+    """Return the rows of the area test's size."""
+    table = found("validity")["size"]
+    for n0, n in product((15, 30, 100), (10, 20, 50)):
+        cells = [
+            short(table[f"{n0}/{n}/{null}"][level], 3)
+            for null in ("default", "best fit", "pool, uniform")
+            for level in ("0.01", "0.05", "0.1")
+        ]
+        cells[1] = f"**{cells[1]}**"
+        yield [str(n0), str(n), *cells]
+
+
+def sizes_through() -> Iterator[Row]:
+    """Return the rows of the area test's size, through the whole package."""
+    table = found("validity")["size_through_prbayes"]
+    nulls = {
+        "default, fresh data": "default",
+        "optimum taken as exact, fresh data": "optimum, ExactModel",
+        "`JointNull`, the calibration's own data": "own data, JointNull",
+        "`ExactModel`, the calibration's own data": "own data, ExactModel",
+    }
+    for n0, (label, null) in product((15, 30), nulls.items()):
+        row = table[f"{n0}/20/{null}"]
+        yield [str(n0), label, *(short(value, 3) for value in row.values())]
+
+
+def power() -> Iterator[Row]:
+    """Return the rows of the power of tests."""
+    for name, row in found("validity")["power"].items():
+        yield [name.replace("|", "\\|"), *(short(value, 3) for value in row.values())]
+
+
+def case_study(points: str) -> Iterator[Row]:
+    """Return the rows of errors in the paper's case study."""
+    from benchmarks.paper_case1 import SIZES, collect
+    from benchmarks.systems import SYSTEMS
+
+    fits = found("paper_case1")["fits"]
+    for system, n in product(SYSTEMS, SIZES):
+        cells = [collect(fits, points, system, n, metric, "BFGS") for metric in METRICS]
+        if any(cell is None for cell in cells):
+            continue
+        yield [system, str(n), *map(_median_errors, cells)]
+
+
+def _median_errors(cell: Any) -> str:
+    mean, sd = np.median(cell[:, 0]), np.median(cell[:, 1])
+    return f"{mean:.2f} / {sd:.2f}" + _failed(cell)
+
+
+def _failed(cell: Any) -> str:
+    count = int(cell[:, 3].sum())
+    return f" ({count})" if count else ""
+
+
+def evaluations() -> Iterator[Row]:
+    """Return the rows of evaluations in the paper's case study."""
+    from benchmarks.paper_case1 import METHODS, SIZES, collect
+    from benchmarks.systems import SYSTEMS
+
+    fits = found("paper_case1")["fits"]
+    for system, method in product(SYSTEMS, METHODS):
+        cells = []
+        for metric in METRICS:
+            parts = [collect(fits, "sobol", system, n, metric, method) for n in SIZES]
+            every = np.concatenate(parts)
+            cells.append(f"{np.median(every[:, 2]):.0f}" + _failed(every))
+        yield [system, method.replace("NM", "Nelder-Mead,"), *cells]
+
+
+def scale_factor() -> Iterator[Row]:
+    """Return the rows of the paper's scale factor."""
+    table = found("scale_factor")
+    for maximum, form, method, parameters in product(
+        ("5000.0", "0.005"),
+        ("sum", "integral"),
+        ("BFGS", "Nelder-Mead"),
+        ("raw", "standardised"),
+    ):
+        cells = [
+            f"{n}" if error < 0.01 else f"{n} ({error:.2g})"
+            for n, error in table[f"{maximum}/{form}/{method}/{parameters}"]
+        ]
+        yield [f"{float(maximum):g}", form, method, parameters, *cells]
+
+
+def landscapes() -> Iterator[Row]:
+    """Return the rows of convexity and arrival."""
+    for name, row in found("landscapes").items():
+        yield [
+            *name.split("/"),
+            *(f"{row[key]:.1%}" for key in ("convex", "flat", "arrive")),
+            f"{row['evaluations']:.0f}",
+            f"{row['arrive_guided']:.1%}",
+            f"{row['evaluations_guided']:.0f}",
+        ]
+
+
+def families(at: tuple[int, ...]) -> Iterator[Row]:
+    """Return the rows of wrong families."""
+    table = found("misspecified")["families"]
+    for truth, n, metric in product(("Weibull", "gamma", "mixture"), at, METRICS):
+        size = [] if len(at) == 1 else [str(n)]
+        figures = table[f"{truth}/{n}/{metric}"][:4]
+        # No negative zero.
+        yield [truth, *size, metric, *(f"{round(value, 3) + 0.0:.3f}" for value in figures)]
+
+
+def ties() -> Iterator[Row]:
+    """Return the rows of rounded and tied data."""
+    for name, (shift, ratio, failed) in found("misspecified")["ties"].items():
+        data, metric = name.split("/")
+        label = "half equal to the median" if "tied" in data else f"{data} sd"
+        label = label.replace("round ", "rounded to ")
+        yield [label, metric, f"{shift:.3f}", f"{ratio:.3f}", str(failed)]
+
+
+def surrogates() -> Iterator[Row]:
+    """Return the rows of a calibration through surrogates."""
+    for row in found("surrogate")["rows"]:
+        error = row["cross_validated"]
+        what = re.sub(r"(Reweighted|Resimulated)\(\d+\)", r"`\g<0>`", row["what"])
+        yield [
+            what,
+            str(row["runs"]),
+            "" if error is None else f"{error:.1%}",
+            f"{row['error']:.3f}",
+        ]
+
+
+# Where the rows of each table are from; the first two lines of it are the page's.
+TABLES: dict[str, Callable[[], Iterator[Row]]] = {
+    "coverage, pooled": pooled,
+    "coverage, by problem": coverage,
+    "outliers": outliers,
+    "samplers": samplers,
+    "size": sizes,
+    "size, through prbayes": sizes_through,
+    "power": power,
+    "case study, Sobol points": lambda: case_study("sobol"),
+    "case study, Monte Carlo": lambda: case_study("monte carlo"),
+    "case study, evaluations": evaluations,
+    "scale factor": scale_factor,
+    "landscapes": landscapes,
+    "wrong families, many data": lambda: families((100_000,)),
+    "wrong families, few data": lambda: families((20, 50)),
+    "ties": ties,
+    "surrogates": surrogates,
+}
+_MARKED = re.compile(
+    r"(<!-- table: (?P<name>[^>]+) -->\n\n(?:\|[^\n]*\n){2})(?:\|[^\n]*\n)*(\n<!-- end -->)"
+)
+
+
+def written(page: str) -> str:
+    """Return a page with its tables' rows from the results; their heads stay."""
+
+    def table(match: re.Match[str]) -> str:
+        rows = TABLES[match["name"]]()
+        return match[1] + "".join(f"| {' | '.join(row)} |\n" for row in rows) + match[3]
+
+    return _MARKED.sub(table, page)
+
+
+def main() -> None:
+    """Write all pages."""
+    for path in sorted(PAGES.glob("*.md")):
+        page = path.read_text(encoding="utf-8")
+        path.write_text(written(page), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

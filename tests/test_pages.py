@@ -1,0 +1,51 @@
+"""Figures in the README and in the pages are those that the benchmarks found."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+from benchmarks import pages  # noqa: E402
+
+README = re.sub(r"\s+", " ", (ROOT / "README.md").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("path", sorted(pages.PAGES.glob("*.md")), ids=lambda path: path.stem)
+def test_tables_are_what_the_benchmarks_found(path: Path) -> None:
+    page = path.read_text(encoding="utf-8")
+    assert pages.written(page) == page, "run python -m benchmarks.pages"
+
+
+def test_every_table_is_on_a_page() -> None:
+    told = "".join(path.read_text(encoding="utf-8") for path in pages.PAGES.glob("*.md"))
+    assert set(re.findall(r"<!-- table: (.+) -->", told)) == set(pages.TABLES)
+
+
+def test_the_readme_tells_the_coverage_that_was_found() -> None:
+    found = pages.found("coverage")
+    rows = found["pooled"]
+    own, exact = rows["all, affine, N >= 50"], rows["all, exact, N >= 50"]
+    replicates = found["cells"]["linear/50/AreaMetric/affine"]["replicates"]
+    lowest, highest = own["lowest_coverage_89"], own["highest_coverage_89"]
+    assert (
+        f"89% intervals contain the truth in {own['mean_coverage_89']:.1%} of {replicates} data sets "
+        f"each, on average over all cells ({lowest:.1%} to {highest:.1%}); those of the exact "
+        f"posterior, on the same data, in {exact['mean_coverage_89']:.1%}"
+    ) in README
+
+
+def test_the_readme_tells_the_cost_of_sampling_that_was_found() -> None:
+    found = pages.found("smc")
+    own, stock, other = (found[f"linear {name}"] for name in ("reweighted", "pymc", "pyabc"))
+    for told in (
+        f"draws from {own['responses']} responses in {own['cpu']:.1f} s",
+        f"{stock['responses']:,} responses and {stock['cpu']:.1f} s".replace(",", " "),
+        f"pyABC {other['responses']:,} and".replace(",", " "),
+    ):
+        assert told in README
