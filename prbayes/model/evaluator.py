@@ -19,6 +19,7 @@ from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.hyperparameters import Hyperparameters
 from prbayes.model.node import Node, log_kernel, required_nodes
 from prbayes.propagation.reweighted import Design
+from prbayes.response.budget import budget
 from prbayes.response.compilation import compiled, ninf_for_invalid
 
 
@@ -151,6 +152,7 @@ class Evaluator:
 
     def discrepancies(self, thetas: Floats, k: int, target: Discrepancy | None = None) -> Floats:
         """Return the k-th simulator's discrepancies, shape (P,), or those from another target."""
+        budget().go_on()
         node = self.nodes[k]
         return node.bound.discrepancies(self.roots(thetas, k), target or node.target)
 
@@ -178,7 +180,7 @@ class Evaluator:
         for node in self.nodes:
             bound = node.bound
             if bound.symbolic:
-                bound.responses.count += bound.n_per_theta * thetas
+                bound.responses.count_symbolic(bound.n_per_theta * thetas)
 
     def objective(self, *, prior: bool, gradient: bool) -> Any:
         """Compile the objective as a function of theta and scales.
@@ -212,6 +214,7 @@ class Evaluator:
         function = compiled([theta, scales], ninf_for_invalid(graphs))
 
         def counted(theta: Floats, scales: Floats) -> Any:
+            budget().go_on()
             self._count(1)
             return function(theta, scales)
 

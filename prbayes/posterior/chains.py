@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,7 @@ from prbayes._progress import CONSOLE, shown
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.checkpoint import Checkpoint
 from prbayes.posterior.smc_kernel import BatchedKernel
+from prbayes.response.budget import BudgetError
 
 Stages = dict[str, list[float]]
 
@@ -24,6 +26,7 @@ class Particles:
     thetas: Floats  # (chains, draws, d)
     discrepancies: Floats  # (chains, draws, k)
     stats: list[Stages]  # by chain: statistics by name, one value per stage
+    stopped: str = ""  # which budget was spent before all chains were finished; empty if none
 
 
 class Chains:
@@ -38,16 +41,28 @@ class Chains:
     """
 
     def __init__(
-        self, evaluator: Evaluator, draws: int, threshold: float, checkpoint: Checkpoint | None
+        self,
+        evaluator: Evaluator,
+        draws: int,
+        threshold: float,
+        checkpoint: Checkpoint | None,
+        max_stages: int | None = None,
     ) -> None:
         self.evaluator = evaluator
         self.draws = draws
         self.threshold = threshold
         self.checkpoint = checkpoint
+        self.max_stages = max_stages
         self.refined: list[Floats] = []
 
     def __call__(self, seeds: list[np.random.SeedSequence], progressbar: bool) -> Particles:
-        """Run one chain for each seed."""
+        """Run one chain for each seed, or as many as a budget allows.
+
+        Raises
+        ------
+        BudgetError
+            If it is spent before the first one is finished.
+        """
         columns = (
             TextColumn("SMC chain {task.fields[chain]}"),
             BarColumn(),
@@ -57,6 +72,7 @@ class Chains:
         )
         done: list[tuple[Floats, Floats]] = []
         stats: list[Stages] = []
+        stopped = ""
         with (
             shown(progressbar) as visible,
             Progress(*columns, console=CONSOLE, disable=not visible) as progress,
@@ -68,17 +84,38 @@ class Chains:
                     done.append(finished)
                     stats.append(self._saved["stats"][chain])
                     continue
-                kernel, stages = self._begun(chain, seed)
-                while kernel.beta < 1:
-                    kernel.update_beta_and_weights()
-                    for name, value in kernel.step().items():
-                        stages[name].append(value)
-                    self._save(done, [*stats, stages], kernel)
-                    progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
+                try:
+                    kernel, stages = self._begun(chain, seed)
+                    for _ in self._stages(kernel, stages):
+                        self._save(done, [*stats, stages], kernel)
+                        progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
+                except BudgetError as spent:
+                    stopped = f"{spent} in chain {chain + 1} of {len(seeds)}"
+                    break
                 done.append((kernel.tempered_posterior, kernel.discrepancies))
                 stats.append(stages)
+        if not done:
+            raise BudgetError(stopped)
         thetas, discrepancies = zip(*done, strict=True)
-        return Particles(np.array(thetas), np.array(discrepancies), stats)
+        return Particles(np.array(thetas), np.array(discrepancies), stats, stopped)
+
+    def _stages(self, kernel: BatchedKernel, stages: Stages) -> Iterator[None]:
+        """Do the stages of a chain that are left, and yield after each.
+
+        Raises
+        ------
+        BudgetError
+            If a budget is spent before the last one.
+        """
+        while kernel.beta < 1:
+            if len(stages["beta"]) == self.max_stages:
+                raise BudgetError(
+                    f"max_stages = {self.max_stages} was reached (beta {kernel.beta:.3g}, of 1)"
+                )
+            kernel.update_beta_and_weights()
+            for name, value in kernel.step().items():
+                stages[name].append(value)
+            yield
 
     # -- What was saved --
 

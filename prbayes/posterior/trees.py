@@ -28,6 +28,7 @@ def posterior_tree(
     warnings: tuple[str, ...] = (),
     errors: Floats | None = None,
     missing: Mapping[str, Mapping[str, float]] | None = None,
+    stopped: str = "",
     seed: int | None,
     n_responses: int,
     seconds: float,
@@ -54,6 +55,8 @@ def posterior_tree(
         Monte Carlo errors of the discrepancies.
     missing : mapping, optional
         By simulator: shares of the best draw's population that were lost, and that failed.
+    stopped : str
+        Which budget ended the run before everything was done.
     seed : int or None
     n_responses : int
         Scalar responses computed, the designs' included.
@@ -68,6 +71,7 @@ def posterior_tree(
         "random_seed": "None" if seed is None else str(seed),
         "adjustment": adjustment,
         **(measured or {}),
+        "stopped": stopped,
         "warnings": "\n".join(warnings),
         **versions(),
     }
