@@ -135,6 +135,7 @@ def but_none(bad: Sequence[Any]) -> list[Any]:
     return [value for value in bad if value is not None]
 
 
+LOST: Sequence[Any] = (1.0, -0.1, np.nan, "a", None, True, False)
 BUDGETS: Mapping[str, Sequence[Any]] = {
     "max_seconds": but_none(POSITIVE),
     "max_responses": but_none(COUNT),
@@ -172,7 +173,7 @@ PROPAGATION: dict[str, Sequence[Any]] = {
     **CALLING,
     "random_seed": INTEGER_SEED,
     "on_failure": ("abort", prb.response.Abort, None, 3),
-    "max_lost": (1.0, -0.1, np.nan, "a", None, True, False),
+    "max_lost": LOST,
     "retry_failed": FLAG,
     "timeout": (0, -1.0, np.nan, "a", True, 5.0),
 }
@@ -471,6 +472,7 @@ TABLE: dict[str, Row] = {
             "n_samples": (*COUNT, 1),
             "draws": COUNT,
             "stored": FLAG,
+            "max_lost": but_none(LOST),
             "name": (3, "", True),
             **CALLING,
             "random_seed": SEED,

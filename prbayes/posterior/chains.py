@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -19,12 +19,21 @@ from prbayes.response.budget import BudgetError
 Stages = dict[str, list[float]]
 
 
+class Chain(NamedTuple):
+    """The draws of a chain that is finished, as in `Particles`."""
+
+    thetas: Floats  # (draws, d)
+    discrepancies: Floats  # (draws, k)
+    lost: Floats  # (draws, k)
+
+
 @dataclass(frozen=True, eq=False)
 class Particles:
     """Draws of the pseudo-posterior."""
 
     thetas: Floats  # (chains, draws, d)
     discrepancies: Floats  # (chains, draws, k)
+    lost: Floats  # (chains, draws, k): share of a population without response; NaN of stored ones
     stats: list[Stages]  # by chain: statistics by name, one value per stage
     stopped: str = ""  # which budget was spent before all chains were finished; empty if none
 
@@ -70,7 +79,7 @@ class Chains:
             TextColumn("acceptance {task.fields[rate]:.2f}"),
             TimeElapsedColumn(),
         )
-        done: list[tuple[Floats, Floats]] = []
+        done: list[Chain] = []
         stats: list[Stages] = []
         stopped = ""
         with (
@@ -92,12 +101,12 @@ class Chains:
                 except BudgetError as spent:
                     stopped = f"{spent} in chain {chain + 1} of {len(seeds)}"
                     break
-                done.append((kernel.tempered_posterior, kernel.discrepancies))
+                done.append(Chain(kernel.tempered_posterior, kernel.discrepancies, kernel.lost))
                 stats.append(stages)
         if not done:
             raise BudgetError(stopped)
-        thetas, discrepancies = zip(*done, strict=True)
-        return Particles(np.array(thetas), np.array(discrepancies), stats, stopped)
+        thetas, discrepancies, lost = map(np.array, zip(*done, strict=True))
+        return Particles(thetas, discrepancies, lost, stats, stopped)
 
     def _stages(self, kernel: BatchedKernel, stages: Stages) -> Iterator[None]:
         """Do the stages of a chain that are left, and yield after each.
@@ -139,12 +148,11 @@ class Chains:
                 found[key.removeprefix(prefix)] = array
         return found
 
-    def _finished(self, chain: int) -> tuple[Floats, Floats] | None:
-        """Return thetas and discrepancies of a chain that was at its end."""
+    def _finished(self, chain: int) -> Chain | None:
+        """Return a chain that was at its end."""
         if chain >= self._saved.get("chain", 0):
             return None
-        arrays = self._arrays(f"chain{chain}_")
-        return arrays["thetas"], arrays["discrepancies"]
+        return Chain(**self._arrays(f"chain{chain}_"))
 
     def _begun(self, chain: int, seed: np.random.SeedSequence) -> tuple[BatchedKernel, Stages]:
         """Return a kernel at the stage its chain had reached, and the statistics until then."""
@@ -165,16 +173,14 @@ class Chains:
                 node.bound.draws = saved["generators"][node.name]
         return kernel, saved["stats"][chain]
 
-    def _save(
-        self, done: list[tuple[Floats, Floats]], stats: list[Stages], kernel: BatchedKernel
-    ) -> None:
+    def _save(self, done: list[Chain], stats: list[Stages], kernel: BatchedKernel) -> None:
         if self.checkpoint is None:
             return
         now, state = kernel.state()
         arrays = {f"now_{key}": value for key, value in now.items()}
-        for i, (thetas, discrepancies) in enumerate(done):
-            arrays[f"chain{i}_thetas"] = thetas
-            arrays[f"chain{i}_discrepancies"] = discrepancies
+        for i, chain in enumerate(done):
+            for key, value in chain._asdict().items():
+                arrays[f"chain{i}_{key}"] = value
         for i, thetas in enumerate(self.refined):
             arrays[f"refined{i}_thetas"] = thetas
         bounds = [node.bound for node in self.evaluator.nodes]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
@@ -31,10 +31,13 @@ from prbayes.posterior.adjustment import Adjusted, Affine, refuse_adjustment
 from prbayes.posterior.chains import Chains, Particles
 from prbayes.posterior.checkpoint import Checkpoint, stored_settings
 from prbayes.posterior.epsilon import calibrate_epsilon
-from prbayes.posterior.trees import posterior_tree
+from prbayes.posterior.trees import posterior_tree, share_of_lossy
 from prbayes.response.budget import BudgetError, limited, unlimited
 
 _log = logging.getLogger("prbayes")
+
+# Share of draws that may fall short, as single ones far out do: that of what designs support.
+_FAR_OUT = 0.05
 
 
 def sample_smc(
@@ -100,16 +103,17 @@ def sample_smc(
         Groups ``posterior`` (chain, draw), ``unadjusted`` (the draws before the adjustment, if
         there was one), ``sample_stats`` (chain, stage; NaN after the last stage), ``calibration``
         (discrepancy, epsilon, weight effective sample size, mean raw weight, lost mass,
-        ``discrepancy_error``: the Monte Carlo error of the discrepancy at the best draw; by
-        simulator) and ``observed_data``; ArviZ takes it, ``to_netcdf`` saves it. Attributes of
-        ``posterior``: ``log_marginal_likelihood``, from all chains, and
-        ``log_marginal_likelihood_sd``, the spread of the chains' own; a number to compare models by
-        with one metric and one epsilon, and with no others. Of an adjustment they have
-        ``adjustment_center_error`` and ``adjustment_width_error``, its Monte Carlo errors from the
-        number of refits, in standard deviations of the draws and as a share of the width, for the
-        worst direction; ``adjustment_moved``, how far it moved the medians, in standard deviations,
-        for the worst hyperparameter; and ``fit_probability``, how often data sets drawn from the
-        model at its minimiser are as far from their own fit as the data are.
+        ``lossy_draws``: the share of draws, as they were sampled, of whose populations more than
+        ``max_lost`` has no response; ``discrepancy_error``: the Monte Carlo error of the
+        discrepancy at the best draw; by simulator) and ``observed_data``; ArviZ takes it,
+        ``to_netcdf`` saves it. Attributes of ``posterior``: ``log_marginal_likelihood``, from all
+        chains, and ``log_marginal_likelihood_sd``, the spread of the chains' own; a number to
+        compare models by with one metric and one epsilon, and with no others. Of an adjustment they
+        have ``adjustment_center_error`` and ``adjustment_width_error``, its Monte Carlo errors from
+        the number of refits, in standard deviations of the draws and as a share of the width, for
+        the worst direction; ``adjustment_moved``, how far it moved the medians, in standard
+        deviations, for the worst hyperparameter; and ``fit_probability``, how often data sets drawn
+        from the model at its minimiser are as far from their own fit as the data are.
 
     Raises
     ------
@@ -217,18 +221,20 @@ def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
         except BudgetError as spent:
             stopped = stopped or str(spent)
         else:
-            refuse_lost(evaluator, {name: each["lost_mass"] for name, each in missing.items()})
+            _refuse_lost(evaluator, particles, missing)
         with unlimited():
             return posterior_tree(
                 evaluator,
                 found.thetas,
                 particles.discrepancies,
+                particles.lost,
                 particles.stats,
                 unadjusted=None if found.thetas is particles.thetas else particles.thetas,
                 adjustment=found.note,
                 measured=found.measured,
                 warnings=(
                     *_of_budget(stopped, particles, asked),
+                    *_of_lost(evaluator, particles),
                     *(() if optimum is None else optimum.warnings),
                     *found.warnings,
                 ),
@@ -252,6 +258,40 @@ def _of_budget(stopped: str, particles: Particles, asked: Sampling) -> list[str]
     )
     _log.warning("%s", line)
     return [line]
+
+
+def _refuse_lost(
+    evaluator: Evaluator, particles: Particles, missing: Mapping[str, Mapping[str, float]]
+) -> None:
+    """Raise where too much of the best draw's population, or of most draws', has no response."""
+    lost = {}
+    for k, node in enumerate(evaluator.nodes):
+        lost[node.name] = missing[node.name]["lost_mass"]
+        if node.design is None:
+            of_most = float(np.median(particles.lost[:, :, k]))
+            lost[node.name] = max(lost[node.name], of_most)
+    refuse_lost(evaluator, lost)
+
+
+def _of_lost(evaluator: Evaluator, particles: Particles) -> list[str]:
+    """Say, also in the log, of how many draws too much of the population has no response.
+
+    Of designs, `diagnose` says it, as it does where more than these draws are concerned.
+    """
+    lines = []
+    for k, node in enumerate(evaluator.nodes):
+        most = node.bound.max_lost
+        share = share_of_lossy(particles.lost[:, :, k], most)
+        if share > _FAR_OUT:
+            lines.append(
+                f"{node.name}: lost mass: of {share:.0%} of the draws more than max_lost = "
+                f"{most:.1%} of the population has no response (NaN), so that they rest on the "
+                "specimens that have one; repair the response, return +inf for specimens that "
+                "fail, or narrow the priors"
+            )
+    for line in lines:
+        _log.warning("%s", line)
+    return lines
 
 
 def _prepared(evaluator: Evaluator, asked: Sampling) -> tuple[Affine | None, Optimum | None]:

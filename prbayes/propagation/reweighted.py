@@ -23,6 +23,7 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._checks import AT_ONCE, Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
 from prbayes.propagation.base import (
+    MAX_LOST,
     N_BLOCKS,
     Bound,
     DesignError,
@@ -98,7 +99,7 @@ class Reweighted(Propagation):
 
     n: int = 1024
     random_seed: int = 0
-    max_lost: float = 0.05
+    max_lost: float = MAX_LOST
     max_points: int | None = None
 
     def __post_init__(self) -> None:
