@@ -132,7 +132,8 @@ def _refuse_other(result: object) -> None:
 
 def _of_optimum(optimum: Optimum) -> Diagnosis:
     messages = _sentences([*optimum.warnings, *_of_family(optimum)])
-    if not optimum.converged and not optimum.at_edge:  # an edge is one of the warnings
+    told = optimum.at_edge or optimum.stopped  # by the warnings
+    if not optimum.converged and not told:
         messages.append(_not_converged(optimum.message))
     designs = _computed(optimum.evaluator, optimum.theta[None])
     failed = _failed(optimum.failures)
@@ -152,7 +153,7 @@ def _of_family(optimum: Optimum) -> list[str]:
 def _of_stored_optimum(result: xr.DataTree) -> Diagnosis:
     attrs = result["optimum"].attrs
     messages = _warnings(attrs)
-    if not attrs.get("converged", True):
+    if not attrs.get("converged", True) and not attrs.get("stopped"):
         messages.append(_not_converged(str(attrs.get("message", ""))))
     return Diagnosis((*messages, *_failed_in(result)), xr.Dataset())
 

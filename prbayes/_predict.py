@@ -25,7 +25,7 @@ from prbayes.model.identity import Level, as_attributes, identity_of_model
 from prbayes.model.labels import versions
 from prbayes.model.node import Node, model_on_context, nodes
 from prbayes.model.support import TOLERABLE, shortcoming
-from prbayes.propagation.base import DesignError
+from prbayes.propagation.base import MAX_LOST, DesignError, refuse_max_lost
 from prbayes.propagation.points import base_points, inside
 from prbayes.propagation.reweighted import Design
 from prbayes.response.calling import ResponseError
@@ -46,6 +46,7 @@ def predict(
     n_samples: int = 500,
     draws: int = 400,
     stored: bool = True,
+    max_lost: float | None = None,
     name: str | None = None,
     executor: Executor | None = None,
     store: str | PathLike[str] | None = None,
@@ -84,6 +85,9 @@ def predict(
     stored : bool
         Whether design points may serve. With False the response is computed for draws x n_samples
         specimens.
+    max_lost : float, optional
+        Largest share of the predicted responses that may be NaN; by default what the model's
+        simulators allow, the largest.
     name : str, optional
         Of the result; by default that of the function.
     executor : concurrent.futures.Executor, optional
@@ -111,7 +115,8 @@ def predict(
         If an argument is not as described, or the result lacks a free variable, or is of other
         populations or data than the model.
     DesignError
-        If the design points do not support the populations.
+        If the design points do not support the populations, or more responses than ``max_lost`` are
+        NaN.
     ResponseError
         If the response raises, has the wrong shape, or is NaN everywhere.
 
@@ -137,6 +142,8 @@ def predict(
     positive_integer(n_samples, "n_samples", minimum=2)
     positive_integer(draws, "draws")
     flag(stored, "stored")
+    if max_lost is not None:
+        refuse_max_lost(max_lost, "prb.predict")
     if name is not None:
         plain_text(name, "name")
     refuse_calling(executor, store, version, Abort())
@@ -159,7 +166,9 @@ def predict(
             drawn = _new_responses(label, responses, points, n_samples, rng)
         else:
             drawn = _resampled_responses(node, responses, points, n_samples, rng)
-    missing = _count_missing(label, drawn.values)
+    if max_lost is None:
+        max_lost = max((node.bound.max_lost for node in nodes(model).values()), default=MAX_LOST)
+    missing = _count_missing(label, drawn.values, max_lost)
     return xr.DataArray(
         drawn.values.reshape(len(coords["chain"]), len(coords["draw"]), n_samples),
         dims=("chain", "draw", "sample"),
@@ -198,13 +207,20 @@ def _label(response: Callable[..., Any], name: str | None, store: object) -> str
     return label
 
 
-def _count_missing(label: str, values: Floats) -> int:
-    """Return how many responses are NaN, said in the log; raise if all are."""
+def _count_missing(label: str, values: Floats, max_lost: float) -> int:
+    """Return how many responses are NaN, said in the log; raise if too many are."""
     missing = int(np.isnan(values).sum())
     if missing == values.size:
         raise ResponseError(
             f"{label}: got NaN at all {missing} specimens, expected numbers; +inf is a specimen "
             "that fails"
+        )
+    if missing > max_lost * values.size:
+        raise DesignError(
+            f"{label}: lost mass: got {missing / values.size:.1%} NaN among the predicted "
+            f"responses, expected at most max_lost = {max_lost:.1%}: the prediction would rest on "
+            "the specimens that have a response; repair it, return +inf for specimens that fail, "
+            "or pass a larger max_lost"
         )
     if missing:
         _log.warning("%s: %d of %d predicted responses are NaN", label, missing, values.size)

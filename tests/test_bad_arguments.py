@@ -128,6 +128,18 @@ FLAG: Sequence[Any] = ("no", 1, 0.0, None, [])
 COUNT: Sequence[Any] = (0, -5, 1.5, 64.0, "64", None, True, np.nan, [64])
 SHARE: Sequence[Any] = (0, 1, -0.5, 5, "a", np.nan, None, True)
 POSITIVE: Sequence[Any] = (0, -1.0, np.nan, np.inf, "a", True, None, [0.1])
+
+
+def but_none(bad: Sequence[Any]) -> list[Any]:
+    """Return what is bad where None is good."""
+    return [value for value in bad if value is not None]
+
+
+LOST: Sequence[Any] = (1.0, -0.1, np.nan, "a", None, True, False)
+BUDGETS: Mapping[str, Sequence[Any]] = {
+    "max_seconds": but_none(POSITIVE),
+    "max_responses": but_none(COUNT),
+}
 EXECUTOR: Sequence[Any] = (4, map, "processes", object())
 STORE: Sequence[Any] = (4, True, b"folder", "")
 VERSION: Sequence[Any] = (2, 1.5, True, "")
@@ -161,7 +173,7 @@ PROPAGATION: dict[str, Sequence[Any]] = {
     **CALLING,
     "random_seed": INTEGER_SEED,
     "on_failure": ("abort", prb.response.Abort, None, 3),
-    "max_lost": (1.0, -0.1, np.nan, "a", None, True, False),
+    "max_lost": LOST,
     "retry_failed": FLAG,
     "timeout": (0, -1.0, np.nan, "a", True, 5.0),
 }
@@ -333,6 +345,7 @@ TABLE: dict[str, Row] = {
             "max_evaluations": COUNT,
             "refine": FLAG,
             "starts": (-1, 1.5, "many", True),
+            **BUDGETS,
             "random_seed": SEED,
             "progressbar": FLAG,
         },
@@ -353,6 +366,7 @@ TABLE: dict[str, Row] = {
                 np.empty((0, 1)),
                 [[True]],
             ),
+            **BUDGETS,
             "progressbar": FLAG,
         },
         {"thetas": [[1.0]]},
@@ -396,6 +410,8 @@ TABLE: dict[str, Row] = {
             "adjust": ("affine", 1, None, prb.posterior.Affine),
             "threshold": SHARE,
             "refine": FLAG,
+            "max_stages": but_none(COUNT),
+            **BUDGETS,
             "checkpoint": (3, True, "", b"a", "/dev/null/run.nc", "/"),
             "random_seed": SEED,
             "progressbar": FLAG,
@@ -456,6 +472,7 @@ TABLE: dict[str, Row] = {
             "n_samples": (*COUNT, 1),
             "draws": COUNT,
             "stored": FLAG,
+            "max_lost": but_none(LOST),
             "name": (3, "", True),
             **CALLING,
             "random_seed": SEED,

@@ -1,6 +1,7 @@
 """Diagnostics of a sampler's result: sentences, silence, and what ArviZ draws of our trees."""
 
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -13,10 +14,14 @@ import pymc as pm
 import pytest
 import xarray as xr
 from arviz_stats import rhat
+from scipy import stats
 
 import prbayes as prb
 from prbayes._diagnose import _NOISE
 from prbayes.model.evaluator import Evaluator
+from prbayes.posterior.chains import Particles
+from prbayes.posterior.smc import _refuse_lost
+from prbayes.propagation.base import DesignError
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 
@@ -390,6 +395,33 @@ def test_more_may_be_lost_where_that_is_asked_for_and_is_reported() -> None:
     assert 0.1 < optimum.support["y"]["lost_mass"] < 0.9
     tree = prb.sample_smc(20, chains=1, model=model, adjust=False, progressbar=False)
     assert 0.1 < tree["calibration"]["lost_mass_at_best"].item() < 0.9
+
+
+def test_draws_that_lose_too_much_are_counted_and_told() -> None:
+    # The best draws lose next to nothing; those above 1, of which there are some, do.
+    model = failing(prb.Resimulated(64, on_failure=REPLACED, max_lost=0.2), limit=1.6)
+    tree = prb.sample_smc(50, chains=1, model=model, epsilon=0.5, adjust=False, progressbar=False)
+    calibration = tree["calibration"].to_dataset()
+    lost = calibration["lost_mass"].values.ravel()
+    exact = stats.norm.sf((1.6 - tree["posterior"]["mu"].values.ravel()) / 0.5)
+    np.testing.assert_allclose(lost, exact, atol=0.02)
+    share = np.mean(lost > 0.2)
+    assert 0.05 < share < 0.5
+    assert calibration["lossy_draws"].item() == share
+    told = [m for m in prb.diagnose(tree).messages if "lost mass" in m]
+    (message,) = told
+    assert message.startswith(f"Y: lost mass: of {share:.0%} of the draws more than")
+
+
+@pytest.mark.parametrize(("of_draws", "refused"), [(0.4, False), (0.6, True)])
+def test_an_answer_is_refused_where_most_draws_lose_too_much(
+    of_draws: float, refused: bool
+) -> None:
+    evaluator = Evaluator(failing(prb.Resimulated(16, on_failure=REPLACED)))
+    lost = np.where(np.arange(50) < 50 * of_draws, 0.3, 0.0).reshape(1, 50, 1)
+    particles = Particles(np.zeros((1, 50, 1)), np.zeros((1, 50, 1)), lost, [])
+    with nullcontext() if not refused else pytest.raises(DesignError, match=r"got 30\.0% of the"):
+        _refuse_lost(evaluator, particles, {"y": {"lost_mass": 0.0}})
 
 
 def test_failed_responses_are_part_of_results_diagnosis_and_report() -> None:

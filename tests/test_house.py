@@ -44,6 +44,7 @@ TOGETHER = ({"_checks", "_progress", "_weighted", "datasets"}, {"_demo", "__main
 # Results, errors and base classes, which nobody makes; and a kernel that is passed to PyMC.
 WITHOUT_EXAMPLE = {
     "BatchedKernel",
+    "BudgetError",
     "Bound",
     "CrossValidation",
     "DensityDiscrepancy",
@@ -183,6 +184,9 @@ TAIL = (
     "version",
     "on_failure",
     "retry_failed",
+    "max_stages",
+    "max_seconds",
+    "max_responses",
     "checkpoint",
     "random_seed",
     "progressbar",

@@ -353,9 +353,15 @@ def test_failed_specimens_stay_and_nan_is_counted(caplog: pytest.LogCaptureFixtu
     def fragile(x: Any) -> Any:
         return np.where(x > 1.5, np.inf, np.where(x < 0.2, np.nan, x))
 
-    found = prb.predict(POSTERIOR, fragile, x, model=model, random_seed=1)
+    given: dict[str, Any] = {"model": model, "random_seed": 1}
+    found = prb.predict(POSTERIOR, fragile, x, max_lost=0.5, **given)
     assert np.isinf(found).any()
     assert found.attrs["nan"] == int(np.isnan(found).sum()) > 0
+    share = found.attrs["nan"] / found.size
+    assert share > 0.05
+    for stored in (True, False):
+        with pytest.raises(DesignError, match=r"fragile: lost mass: got \d+\.\d% NaN .* = 5\.0%"):
+            prb.predict(POSTERIOR, fragile, x, stored=stored, **given)
     assert f"{found.attrs['nan']} of {found.size} predicted responses are NaN" in caplog.text
     with pytest.raises(ResponseError, match="got NaN at all 3000 specimens"):
         prb.predict(POSTERIOR, lambda x: x * np.nan, x, model=model)

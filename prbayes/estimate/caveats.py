@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from prbayes._checks import Floats
@@ -203,7 +205,7 @@ def _tail_index(values: Floats, weights: Floats) -> float:
 
 
 def caveats(
-    evaluator: Evaluator, local: Local | None, others: list[Rival], design_error: float
+    evaluator: Evaluator, local: Local | None, others: Sequence[Rival], design_error: float
 ) -> tuple[str, ...]:
     """Say whether the design is too small, what other optima there are, what is not identified."""
     lines = []

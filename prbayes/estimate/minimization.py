@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -48,14 +48,21 @@ from prbayes.estimate.search import Approach, Run, Search, Trace, approach, mini
 from prbayes.estimate.search import start as begin
 from prbayes.estimate.solution import assemble, rival_record
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.interruption import explained, kept
 from prbayes.model.node import model_on_context
 from prbayes.model.support import shortcomings
+from prbayes.response.budget import BudgetError, limited, unlimited
 
 _log = logging.getLogger("prbayes")
 
 
 def refine(
-    model: pm.Model | None = None, thetas: Floats | None = None, *, progressbar: bool = True
+    model: pm.Model | None = None,
+    thetas: Floats | None = None,
+    *,
+    max_seconds: float | None = None,
+    max_responses: int | None = None,
+    progressbar: bool = True,
 ) -> dict[str, int]:
     """Add design points where the posterior's populations live, until the designs support them.
 
@@ -68,6 +75,10 @@ def refine(
         The one on the context by default.
     thetas : ndarray, shape (P, d), optional
         Unconstrained hyperparameters whose populations matter; by default those around the optimum.
+    max_seconds : float, optional
+        Seconds after which nothing new is begun.
+    max_responses : int, optional
+        Largest number of responses to compute, without those found in a store.
     progressbar : bool
         Whether work of more than two seconds shows a bar on stderr.
 
@@ -80,6 +91,8 @@ def refine(
     ------
     DesignError
         If a design does not support them after eight more batches, or at ``max_points``.
+    BudgetError
+        If a budget is spent before they are supported; whole batches of points stay in the designs.
 
     References
     ----------
@@ -97,11 +110,15 @@ def refine(
     """
     model = model_on_context(model, "prb.refine")
     evaluator = Evaluator(model)
-    with shown(progressbar):
-        if thetas is None:
-            find_optimum(evaluator, Minimisation())
+    wanted = None if thetas is None else _thetas(evaluator, thetas)
+    with (
+        shown(progressbar),
+        explained(evaluator, "prb.refine"),
+        limited(max_seconds, max_responses),
+    ):
+        if wanted is None:
+            require_finished(find_optimum(evaluator, Minimisation()))
         else:
-            wanted = _thetas(evaluator, thetas)
             for _ in range(MAX_ROUNDS):
                 if not refine_at(evaluator, wanted):
                     break
@@ -148,6 +165,8 @@ def minimize(
     max_evaluations: int = 5000,
     refine: bool = True,
     starts: int | None = None,
+    max_seconds: float | None = None,
+    max_responses: int | None = None,
     random_seed: Seed = 0,
     progressbar: bool = True,
 ) -> Optimum:
@@ -192,6 +211,14 @@ def minimize(
         Number of Sobol points of the prior from which other optima, such as mirror solutions, are
         searched for, all at once; 0 for none. By default 32 where a theta costs no response
         (`Reweighted`), and else none.
+    max_seconds : float, optional
+        Seconds after which nothing new is begun: what was found until then is returned, with
+        ``stopped`` and not converged. The same call on the same model, built again, with a larger
+        budget gives the optimum that it would have given at once; with a ``store`` it computes
+        nothing again.
+    max_responses : int, optional
+        Largest number of responses to compute, without those found in a store; as for
+        ``max_seconds``.
     random_seed : int, sequence of int, numpy.random.Generator or None
         Seed of the starting points.
     progressbar : bool
@@ -210,6 +237,8 @@ def minimize(
         likelihood terms or potentials are to be weighed against a discrepancy without epsilon.
     DesignError
         If a design does not support the optimum after refinement.
+    BudgetError
+        If a budget is spent before the discrepancy is known anywhere.
 
     References
     ----------
@@ -239,7 +268,11 @@ def minimize(
         starts=starts,
         random_seed=seed_number(random_seed),
     )
-    with shown(progressbar):
+    with (
+        shown(progressbar),
+        explained(evaluator, "prb.minimize"),
+        limited(max_seconds, max_responses),
+    ):
         return find_optimum(evaluator, asked)
 
 
@@ -258,21 +291,35 @@ class Minimisation:
 
 
 def find_optimum(evaluator: Evaluator, asked: Minimisation) -> Optimum:
-    """Do what `minimize` does, for an evaluator."""
+    """Do what `minimize` does, for an evaluator.
+
+    Raises
+    ------
+    BudgetError
+        If a budget is spent before the discrepancy is known anywhere.
+    """
     for node in evaluator.nodes:
         node.bound.restart(asked.random_seed)
     plan = _planned(evaluator, asked)
     begun = _begun(plan, asked)
-    # Step: minimise, look at the design, until it is enough
-    state = _minimised(plan, begun.led.theta, begun.scales, begun.led.trace)
-    rounds = 0
-    while (state := _judged(plan, state, rounds)).restart is not None:
-        rounds += 1
-        state = _minimised(plan, state.restart, state.scales, state.run.trace, state.cloud)
-    # Terminate: other optima, stalled line searches, the error of the design where it ended
-    state, others = _against_rivals(plan, state)
-    state = _settled(plan, state)
-    return _reported(plan, begun, state, others)
+    last = None
+    try:
+        for state in _states(plan, begun):
+            last = state
+        assert last is not None
+        return _reported(plan, begun, last)
+    except BudgetError as spent:
+        if last is None:
+            raise
+        with unlimited():
+            return _stopped(plan, begun, last, str(spent))
+
+
+def require_finished(optimum: Optimum) -> Optimum:
+    """Return an optimum that no budget ended, or raise that it was spent."""
+    if optimum.stopped:
+        raise BudgetError(optimum.stopped)
+    return optimum
 
 
 # -- what a minimisation is, and where it stands ---------------------------------------------------
@@ -319,6 +366,7 @@ class _State:
     cloud: Floats | None = None
     # (d,), or None: where to minimise again, on a design that has grown.
     restart: Floats | None = None
+    others: tuple[Rival, ...] = ()  # other optima
 
     @property
     def local(self) -> Local | None:
@@ -423,16 +471,34 @@ def _initial_scales(plan: _Plan, *, weighed: bool) -> Floats:
 # -- steps -----------------------------------------------------------------------------------------
 
 
+def _states(plan: _Plan, begun: _Beginning) -> Iterator[_State]:
+    """Yield where the minimisation stands after each step; the last is where it ended."""
+    # Step: minimise, look at the design, until it is enough
+    state = yield from _minimised(plan, begun.led.theta, begun.scales, begun.led.trace)
+    rounds = 0
+    while (state := _judged(plan, state, rounds)).restart is not None:
+        rounds += 1
+        restart, trace = state.restart, state.run.trace
+        state = yield from _minimised(plan, restart, state.scales, trace, state.cloud)
+    yield state
+    # Terminate: other optima, stalled line searches, the error of the design where it ended
+    state = _against_rivals(plan, state)
+    yield state
+    yield _settled(plan, state)
+
+
 def _minimised(
     plan: _Plan, theta: Floats, scales: Floats, trace: Trace, cloud: Floats | None = None
-) -> _State:
+) -> Generator[_State, None, _State]:
     """Minimise from theta; with several simulators again, with the noise at that pilot optimum."""
     run = minimise(plan.search, theta, scales, trace)
+    yield _State(run.best, scales, run, None, cloud=cloud)
     unset = np.isnan(plan.evaluator.epsilon)
     if plan.several and unset.any():
         noise = noise_floors(plan.evaluator, run.best, SETS)
         scales = np.where(unset, noise, plan.evaluator.epsilon)
         run = minimise(plan.search, run.best, scales, run.trace)
+        yield _State(run.best, scales, run, None, cloud=cloud)
     sampling = _sampling(plan.evaluator, run.best, scales)
     return _State(run.best, scales, run, sampling, cloud=cloud)
 
@@ -471,17 +537,17 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
     return replace(state, restart=plan.search.best_of(candidates, state.scales))
 
 
-def _against_rivals(plan: _Plan, state: _State) -> tuple[_State, list[Rival]]:
+def _against_rivals(plan: _Plan, state: _State) -> _State:
     """Look for other optima, and leave for a better one."""
     if not plan.starts or state.local is None:
-        return state, []
+        return state
     others = _rivals(plan, state)
     if not others or not others[0].better:
-        return state, others
+        return replace(state, others=tuple(others))
     run = minimise(plan.search, others[0].theta, state.scales, state.run.trace)
     sampling = _sampling(plan.evaluator, run.best, state.scales)
     state = replace(state, theta=run.best, run=run, sampling=sampling)
-    return state, ([] if sampling is None else _rivals(plan, state))
+    return state if sampling is None else replace(state, others=tuple(_rivals(plan, state)))
 
 
 def _rivals(plan: _Plan, state: _State) -> list[Rival]:
@@ -534,12 +600,12 @@ def _settled(plan: _Plan, state: _State) -> _State:
 # -- after -----------------------------------------------------------------------------------------
 
 
-def _reported(plan: _Plan, begun: _Beginning, state: _State, others: list[Rival]) -> Optimum:
+def _reported(plan: _Plan, begun: _Beginning, state: _State) -> Optimum:
     """Return the record; where nothing is known of the sampling distribution, it has none."""
     evaluator = plan.evaluator
     edge, jump = _breakdown(plan, state)
     if edge or jump:
-        state, others = replace(state, sampling=None), []
+        state = replace(state, sampling=None, others=())
     found = assemble(
         plan.search,
         state.run,
@@ -552,7 +618,7 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State, others: list[Rival]
     warnings = (
         *breakdown(edge, jump),
         *heavy_tails(evaluator, state.theta),
-        *caveats(evaluator, state.local, others, state.design_error),
+        *caveats(evaluator, state.local, state.others, state.design_error),
     )
     for line in warnings:
         _log.warning("%s", line)
@@ -563,11 +629,31 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State, others: list[Rival]
         message=found.message + ran_out,
         seconds=time.perf_counter() - plan.clock,
         design_error=state.design_error,
-        rivals=tuple(rival_record(evaluator, o) for o in others),
+        rivals=tuple(rival_record(evaluator, o) for o in state.others),
         warnings=warnings,
         at_edge=edge,
         at_jump=jump,
     )
+
+
+def _stopped(plan: _Plan, begun: _Beginning, state: _State, reason: str) -> Optimum:
+    """Return the record of a minimisation that a budget ended; no response is computed for it."""
+    found = assemble(
+        plan.search,
+        state.run,
+        covariance=_covariance(state),
+        remark=f"{begun.led.remark} {reason} before the minimisation was finished.",
+        screened=begun.screened,
+        responses_before=plan.responses_before,
+        stopped=reason,
+    )
+    line = (
+        f"{reason} before the minimisation was finished, so that this is no answer yet; "
+        f"{kept(plan.evaluator)}; call prb.minimize with a larger budget, on a model that is built "
+        "again, to go on"
+    )
+    _log.warning("%s", line)
+    return replace(found, seconds=time.perf_counter() - plan.clock, warnings=(line,))
 
 
 def _breakdown(plan: _Plan, state: _State) -> tuple[tuple[str, ...], tuple[str, ...]]:

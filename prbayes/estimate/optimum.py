@@ -89,6 +89,9 @@ class Optimum:
         nothing is known of standard errors.
     prior : bool
         Whether minus the log prior was part of the objective.
+    stopped : str
+        Which budget ended it before it was finished; empty if none. It has not converged then, and
+        what would have cost responses is NaN or left out.
     identity : Identity or None
         Of the problem that was solved, by which it is known again.
     """
@@ -116,6 +119,7 @@ class Optimum:
     at_edge: tuple[str, ...] = ()
     at_jump: tuple[str, ...] = ()
     prior: bool = False
+    stopped: str = ""
     identity: Identity | None = None
 
     def __repr__(self) -> str:
@@ -298,6 +302,7 @@ def optimum_tree(optimum: Optimum) -> xr.DataTree:
         "converged": int(optimum.converged),
         "prior": int(optimum.prior),
         "message": optimum.message,
+        "stopped": optimum.stopped,
         "n_evaluations": optimum.n_evaluations,
         "n_screened": optimum.n_screened,
         "n_responses": optimum.n_responses,

@@ -22,6 +22,7 @@ from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
+from prbayes.response.budget import BudgetError
 
 # Relative gain of a simplex below which a stalled line search counts as converged: far below the
 # noise of any data, which is 1 / N. By judgement.
@@ -235,6 +236,10 @@ def _scipy(
             result = optimize.minimize(objective, begin, **settings)
     except SpentError:
         return False, f"max_evaluations = {search.most} was reached before convergence."
+    except BudgetError:
+        if not np.isfinite(objective.lowest):
+            raise
+        return False, "Stopped."
     except StalledError:
         return False, f"The line search gained nothing in {objective.patience} evaluations."
     return bool(result.success), str(result.message)

@@ -24,6 +24,7 @@ def assemble(
     remark: str,
     screened: int,
     responses_before: int,
+    stopped: str = "",
 ) -> Optimum:
     """Return the record of a search that has ended.
 
@@ -40,6 +41,8 @@ def assemble(
         Points of the prior tried as starts.
     responses_before : int
         Scalar responses that were computed for something else.
+    stopped : str
+        Which budget ended the search; no response is computed then.
     """
     evaluator, theta, scales = search.evaluator, run.best, run.scales
     point, stderr = point_and_stderr(evaluator, theta, covariance)
@@ -49,7 +52,11 @@ def assemble(
         lost = (
             " No hyperparameter changes the discrepancy here, far from the data: try another start."
         )
-    values = evaluator(theta[None]).discrepancies[0]
+    affordable = not (stopped and evaluator.responses_per_theta)
+    if affordable:
+        values = evaluator(theta[None]).discrepancies[0]
+    else:
+        values = _known_discrepancies(search, run)
     names = [n.name for n in evaluator.nodes]
     discrepancies = dict(zip(names, map(float, values), strict=True))
     return Optimum(
@@ -60,20 +67,21 @@ def assemble(
         n_evaluations=run.trace.count,
         n_screened=screened,
         n_responses=evaluator.n_responses - responses_before,
-        converged=run.success and not nowhere,
+        converged=run.success and not nowhere and not stopped,
         message=f"{run.message}{remark}{lost}",
         stderr=stderr,
         covariance=covariance,
         theta=theta,
         names=evaluator.names,
         evaluator=evaluator,
-        support=_support(evaluator, theta),
+        support=_support(evaluator, theta, affordable=affordable),
         trace={
             "theta": np.array(run.trace.thetas).reshape(-1, theta.size),
             "discrepancy": np.array(run.trace.values),
             "evaluations": np.array(run.trace.counts, dtype=np.int64),
         },
         prior=search.prior,
+        stopped=stopped,
         identity=identity_of(evaluator, prior_minimised=search.prior),
     )
 
@@ -111,13 +119,22 @@ def _nowhere(evaluator: Evaluator, theta: Floats, covariance: Floats) -> bool:
     return bool(suspect.all()) and no_information(evaluator, theta)
 
 
-def _support(evaluator: Evaluator, theta: Floats) -> dict[str, dict[str, float]]:
+def _known_discrepancies(search: Search, run: Run) -> Floats:
+    """Return what the search tells of the discrepancies where it ended, NaN if nothing."""
+    if len(run.scales) > 1 or search.prior or search.evaluator.has_other_terms:
+        return np.full(len(run.scales), np.nan)
+    return run.lowest * run.scales
+
+
+def _support(
+    evaluator: Evaluator, theta: Floats, *, affordable: bool
+) -> dict[str, dict[str, float]]:
     """Return how well designs support the population at theta, and what it lacks, by simulator."""
     out = {}
     for name, support in evaluator.support(theta[None]).items():
         out[name] = {key: float(value[0]) for key, value in support.items()}
     for k, node in enumerate(evaluator.nodes):
-        if node.design is None:
+        if node.design is None and affordable:
             out[node.name] = evaluator.missing(theta, k)
     return out
 

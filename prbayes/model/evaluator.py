@@ -19,6 +19,7 @@ from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.hyperparameters import Hyperparameters
 from prbayes.model.node import Node, log_kernel, required_nodes
 from prbayes.propagation.reweighted import Design
+from prbayes.response.budget import budget
 from prbayes.response.compilation import compiled, ninf_for_invalid
 
 
@@ -30,6 +31,9 @@ class Evaluation:
     log_other: Floats  # (P,): log-likelihood of ordinary observed variables, and potentials
     # (P, k): one column per simulator; +inf where a population is invalid or has no support.
     discrepancies: Floats
+    # (P, k): share of a population's weight on points without response; NaN where it is invalid,
+    # and of stored responses, whose support tells.
+    lost: Floats
 
     def log_likelihood(self, epsilon: Floats) -> Floats:
         """Return the pseudo log-likelihood, shape (P,), for epsilons of shape (k,)."""
@@ -151,6 +155,7 @@ class Evaluator:
 
     def discrepancies(self, thetas: Floats, k: int, target: Discrepancy | None = None) -> Floats:
         """Return the k-th simulator's discrepancies, shape (P,), or those from another target."""
+        budget().go_on()
         node = self.nodes[k]
         return node.bound.discrepancies(self.roots(thetas, k), target or node.target)
 
@@ -160,7 +165,7 @@ class Evaluator:
         points = max((node.bound.n_points for node in self.nodes), default=1)
         step = max(1, AT_ONCE // max(1, points))
         log_prior, log_other = np.empty(size), np.empty(size)
-        discrepancies = np.empty((size, k))
+        discrepancies, lost = np.empty((size, k)), np.empty((size, k))
         for first in range(0, size, step):
             rows = slice(first, first + step)
             block = np.ascontiguousarray(thetas[rows])
@@ -168,17 +173,18 @@ class Evaluator:
             log_other[rows] = self.log_other(block)
             for i in range(k):
                 discrepancies[rows, i] = self.discrepancies(block, i)
+                lost[rows, i] = self.nodes[i].bound.lost
         log_prior[np.isnan(log_prior)] = -np.inf
         log_other[np.isnan(log_other)] = -np.inf
         discrepancies[np.isnan(discrepancies)] = np.inf
-        return Evaluation(log_prior, log_other, discrepancies)
+        return Evaluation(log_prior, log_other, discrepancies, lost)
 
     def _count(self, thetas: int) -> None:
         """Count the responses that are part of a graph, evaluated at so many thetas."""
         for node in self.nodes:
             bound = node.bound
             if bound.symbolic:
-                bound.responses.count += bound.n_per_theta * thetas
+                bound.responses.count_symbolic(bound.n_per_theta * thetas)
 
     def objective(self, *, prior: bool, gradient: bool) -> Any:
         """Compile the objective as a function of theta and scales.
@@ -212,6 +218,7 @@ class Evaluator:
         function = compiled([theta, scales], ninf_for_invalid(graphs))
 
         def counted(theta: Floats, scales: Floats) -> Any:
+            budget().go_on()
             self._count(1)
             return function(theta, scales)
 

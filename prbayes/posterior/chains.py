@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -13,8 +14,17 @@ from prbayes._progress import CONSOLE, shown
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.checkpoint import Checkpoint
 from prbayes.posterior.smc_kernel import BatchedKernel
+from prbayes.response.budget import BudgetError
 
 Stages = dict[str, list[float]]
+
+
+class Chain(NamedTuple):
+    """The draws of a chain that is finished, as in `Particles`."""
+
+    thetas: Floats  # (draws, d)
+    discrepancies: Floats  # (draws, k)
+    lost: Floats  # (draws, k)
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +33,9 @@ class Particles:
 
     thetas: Floats  # (chains, draws, d)
     discrepancies: Floats  # (chains, draws, k)
+    lost: Floats  # (chains, draws, k): share of a population without response; NaN of stored ones
     stats: list[Stages]  # by chain: statistics by name, one value per stage
+    stopped: str = ""  # which budget was spent before all chains were finished; empty if none
 
 
 class Chains:
@@ -38,16 +50,28 @@ class Chains:
     """
 
     def __init__(
-        self, evaluator: Evaluator, draws: int, threshold: float, checkpoint: Checkpoint | None
+        self,
+        evaluator: Evaluator,
+        draws: int,
+        threshold: float,
+        checkpoint: Checkpoint | None,
+        max_stages: int | None = None,
     ) -> None:
         self.evaluator = evaluator
         self.draws = draws
         self.threshold = threshold
         self.checkpoint = checkpoint
+        self.max_stages = max_stages
         self.refined: list[Floats] = []
 
     def __call__(self, seeds: list[np.random.SeedSequence], progressbar: bool) -> Particles:
-        """Run one chain for each seed."""
+        """Run one chain for each seed, or as many as a budget allows.
+
+        Raises
+        ------
+        BudgetError
+            If it is spent before the first one is finished.
+        """
         columns = (
             TextColumn("SMC chain {task.fields[chain]}"),
             BarColumn(),
@@ -55,8 +79,9 @@ class Chains:
             TextColumn("acceptance {task.fields[rate]:.2f}"),
             TimeElapsedColumn(),
         )
-        done: list[tuple[Floats, Floats]] = []
+        done: list[Chain] = []
         stats: list[Stages] = []
+        stopped = ""
         with (
             shown(progressbar) as visible,
             Progress(*columns, console=CONSOLE, disable=not visible) as progress,
@@ -68,17 +93,38 @@ class Chains:
                     done.append(finished)
                     stats.append(self._saved["stats"][chain])
                     continue
-                kernel, stages = self._begun(chain, seed)
-                while kernel.beta < 1:
-                    kernel.update_beta_and_weights()
-                    for name, value in kernel.step().items():
-                        stages[name].append(value)
-                    self._save(done, [*stats, stages], kernel)
-                    progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
-                done.append((kernel.tempered_posterior, kernel.discrepancies))
+                try:
+                    kernel, stages = self._begun(chain, seed)
+                    for _ in self._stages(kernel, stages):
+                        self._save(done, [*stats, stages], kernel)
+                        progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
+                except BudgetError as spent:
+                    stopped = f"{spent} in chain {chain + 1} of {len(seeds)}"
+                    break
+                done.append(Chain(kernel.tempered_posterior, kernel.discrepancies, kernel.lost))
                 stats.append(stages)
-        thetas, discrepancies = zip(*done, strict=True)
-        return Particles(np.array(thetas), np.array(discrepancies), stats)
+        if not done:
+            raise BudgetError(stopped)
+        thetas, discrepancies, lost = map(np.array, zip(*done, strict=True))
+        return Particles(thetas, discrepancies, lost, stats, stopped)
+
+    def _stages(self, kernel: BatchedKernel, stages: Stages) -> Iterator[None]:
+        """Do the stages of a chain that are left, and yield after each.
+
+        Raises
+        ------
+        BudgetError
+            If a budget is spent before the last one.
+        """
+        while kernel.beta < 1:
+            if len(stages["beta"]) == self.max_stages:
+                raise BudgetError(
+                    f"max_stages = {self.max_stages} was reached (beta {kernel.beta:.3g}, of 1)"
+                )
+            kernel.update_beta_and_weights()
+            for name, value in kernel.step().items():
+                stages[name].append(value)
+            yield
 
     # -- What was saved --
 
@@ -102,12 +148,11 @@ class Chains:
                 found[key.removeprefix(prefix)] = array
         return found
 
-    def _finished(self, chain: int) -> tuple[Floats, Floats] | None:
-        """Return thetas and discrepancies of a chain that was at its end."""
+    def _finished(self, chain: int) -> Chain | None:
+        """Return a chain that was at its end."""
         if chain >= self._saved.get("chain", 0):
             return None
-        arrays = self._arrays(f"chain{chain}_")
-        return arrays["thetas"], arrays["discrepancies"]
+        return Chain(**self._arrays(f"chain{chain}_"))
 
     def _begun(self, chain: int, seed: np.random.SeedSequence) -> tuple[BatchedKernel, Stages]:
         """Return a kernel at the stage its chain had reached, and the statistics until then."""
@@ -128,16 +173,14 @@ class Chains:
                 node.bound.draws = saved["generators"][node.name]
         return kernel, saved["stats"][chain]
 
-    def _save(
-        self, done: list[tuple[Floats, Floats]], stats: list[Stages], kernel: BatchedKernel
-    ) -> None:
+    def _save(self, done: list[Chain], stats: list[Stages], kernel: BatchedKernel) -> None:
         if self.checkpoint is None:
             return
         now, state = kernel.state()
         arrays = {f"now_{key}": value for key, value in now.items()}
-        for i, (thetas, discrepancies) in enumerate(done):
-            arrays[f"chain{i}_thetas"] = thetas
-            arrays[f"chain{i}_discrepancies"] = discrepancies
+        for i, chain in enumerate(done):
+            for key, value in chain._asdict().items():
+                arrays[f"chain{i}_{key}"] = value
         for i, thetas in enumerate(self.refined):
             arrays[f"refined{i}_thetas"] = thetas
         bounds = [node.bound for node in self.evaluator.nodes]

@@ -18,6 +18,8 @@ from prbayes._checks import Floats
 from prbayes.model.identity import Identity, Level, as_text, differences, from_text
 from prbayes.response.store import StoreError
 
+_FORMAT = 3  # of what is in a file; others are refused
+
 
 class Checkpoint:
     """Arrays and a JSON note in one netCDF file, always whole: each save replaces the file at once.
@@ -59,7 +61,7 @@ class Checkpoint:
             dims = [f"{name}_{i}" for i in range(np.ndim(array))]
             variables[name] = (dims, np.asarray(array))
         attributes = {
-            "prbayes_checkpoint": 2,
+            "prbayes_checkpoint": _FORMAT,
             "problem": as_text(self.problem),
             "settings": json.dumps(self.settings),
             "note": json.dumps(note),
@@ -88,6 +90,7 @@ class Checkpoint:
     def _read(self) -> None:
         try:
             data = _loaded(self.path)
+            written_in = int(data.attrs["prbayes_checkpoint"])
             problem = from_text(data.attrs["problem"])
             settings, note = (json.loads(data.attrs[key]) for key in ("settings", "note"))
             sound = data.attrs["digest"] == _digest(data)
@@ -96,6 +99,8 @@ class Checkpoint:
             raise StoreError(self._refusal(reason)) from error
         if not sound:
             raise StoreError(self._refusal("is damaged: its contents do not match their digest"))
+        if written_in != _FORMAT:
+            raise StoreError(self._refusal("was written by another version of prbayes"))
         other = differences(problem, self.problem, Level.RUN)
         for key in sorted({*settings, *self.settings}):
             got, expected = settings.get(key), self.settings.get(key)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
@@ -16,7 +16,7 @@ import xarray as xr
 
 from prbayes._checks import Floats, Seed, file_path, flag, positive_integer, seed_number, share
 from prbayes._progress import shown
-from prbayes.estimate.minimization import Minimisation, find_optimum
+from prbayes.estimate.minimization import Minimisation, find_optimum, require_finished
 from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, require_sampling
 from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
@@ -24,15 +24,20 @@ from prbayes.model.epsilon import checked_epsilon
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
 from prbayes.model.identity import identity_of, require_same
+from prbayes.model.interruption import designs_as_before, explained
 from prbayes.model.node import Node, model_on_context
 from prbayes.model.support import shortcomings
 from prbayes.posterior.adjustment import Adjusted, Affine, refuse_adjustment
 from prbayes.posterior.chains import Chains, Particles
 from prbayes.posterior.checkpoint import Checkpoint, stored_settings
 from prbayes.posterior.epsilon import calibrate_epsilon
-from prbayes.posterior.trees import posterior_tree
+from prbayes.posterior.trees import posterior_tree, share_of_lossy
+from prbayes.response.budget import BudgetError, limited, unlimited
 
 _log = logging.getLogger("prbayes")
+
+# Share of draws that may fall short, as single ones far out do: that of what designs support.
+_FAR_OUT = 0.05
 
 
 def sample_smc(
@@ -45,6 +50,9 @@ def sample_smc(
     adjust: Affine | bool = True,
     threshold: float = 0.5,
     refine: bool = True,
+    max_stages: int | None = None,
+    max_seconds: float | None = None,
+    max_responses: int | None = None,
     checkpoint: str | PathLike[str] | None = None,
     random_seed: Seed = 0,
     progressbar: bool = True,
@@ -73,6 +81,15 @@ def sample_smc(
         Share of the effective sample size that a stage keeps; higher means more stages.
     refine : bool
         Whether designs of `Reweighted` that do not support the posterior get more points.
+    max_stages : int, optional
+        Largest number of stages of a chain. Where it is reached, or another budget is spent, the
+        chains that are finished are returned, if there are any and no design had to grow for them;
+        the attribute ``stopped`` and a warning say so. The same call with a larger budget and the
+        same ``checkpoint`` goes on, and gives the draws that it would have given at once.
+    max_seconds : float, optional
+        Seconds after which nothing new is begun.
+    max_responses : int, optional
+        Largest number of responses to compute, without those found in a store.
     checkpoint : path-like, optional
         A file that keeps the state after every stage: a run that was killed goes on from there when
         it is called again, and gives the same draws. Give the propagations a ``store`` as well, so
@@ -86,16 +103,17 @@ def sample_smc(
         Groups ``posterior`` (chain, draw), ``unadjusted`` (the draws before the adjustment, if
         there was one), ``sample_stats`` (chain, stage; NaN after the last stage), ``calibration``
         (discrepancy, epsilon, weight effective sample size, mean raw weight, lost mass,
-        ``discrepancy_error``: the Monte Carlo error of the discrepancy at the best draw; by
-        simulator) and ``observed_data``; ArviZ takes it, ``to_netcdf`` saves it. Attributes of
-        ``posterior``: ``log_marginal_likelihood``, from all chains, and
-        ``log_marginal_likelihood_sd``, the spread of the chains' own; a number to compare models by
-        with one metric and one epsilon, and with no others. Of an adjustment they have
-        ``adjustment_center_error`` and ``adjustment_width_error``, its Monte Carlo errors from the
-        number of refits, in standard deviations of the draws and as a share of the width, for the
-        worst direction; ``adjustment_moved``, how far it moved the medians, in standard deviations,
-        for the worst hyperparameter; and ``fit_probability``, how often data sets drawn from the
-        model at its minimiser are as far from their own fit as the data are.
+        ``lossy_draws``: the share of draws, as they were sampled, of whose populations more than
+        ``max_lost`` has no response; ``discrepancy_error``: the Monte Carlo error of the
+        discrepancy at the best draw; by simulator) and ``observed_data``; ArviZ takes it,
+        ``to_netcdf`` saves it. Attributes of ``posterior``: ``log_marginal_likelihood``, from all
+        chains, and ``log_marginal_likelihood_sd``, the spread of the chains' own; a number to
+        compare models by with one metric and one epsilon, and with no others. Of an adjustment they
+        have ``adjustment_center_error`` and ``adjustment_width_error``, its Monte Carlo errors from
+        the number of refits, in standard deviations of the draws and as a share of the width, for
+        the worst direction; ``adjustment_moved``, how far it moved the medians, in standard
+        deviations, for the worst hyperparameter; and ``fit_probability``, how often data sets drawn
+        from the model at its minimiser are as far from their own fit as the data are.
 
     Raises
     ------
@@ -107,6 +125,8 @@ def sample_smc(
         If a design does not support the posterior after refinement.
     StoreError
         If the checkpoint is damaged, or belongs to another run.
+    BudgetError
+        If a budget is spent before there is a chain to return.
 
     References
     ----------
@@ -135,6 +155,8 @@ def sample_smc(
     if optimum is not None and not isinstance(optimum, Optimum):
         got = type(optimum).__name__
         raise TypeError(f"optimum: got {got}, expected an Optimum; call prb.minimize() first")
+    if max_stages is not None:
+        positive_integer(max_stages, "max_stages")
     asked = Sampling(
         draws=draws,
         chains=chains,
@@ -143,12 +165,18 @@ def sample_smc(
         adjust=adjust,
         threshold=threshold,
         refine=refine,
+        max_stages=max_stages,
         checkpoint=checkpoint,
         random_seed=None if random_seed is None else seed_number(random_seed),
         progressbar=progressbar,
     )
     evaluator = _evaluator(model, optimum)
-    with shown(progressbar):
+    stages = () if checkpoint is None else (f"all finished stages ({checkpoint})",)
+    with (
+        shown(progressbar),
+        explained(evaluator, "prb.sample_smc", *stages),
+        limited(max_seconds, max_responses),
+    ):
         return sample(evaluator, asked)
 
 
@@ -163,6 +191,7 @@ class Sampling:
     adjust: Affine | bool = True
     threshold: float = 0.5
     refine: bool = True
+    max_stages: int | None = None
     checkpoint: str | PathLike[str] | None = None
     random_seed: int | None = 0
     progressbar: bool = False
@@ -173,33 +202,96 @@ def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     clock = time.perf_counter()
     in_designs = sum(design.n_points for design in evaluator.designs.values())
     before = evaluator.n_responses - in_designs
-    with _epsilons_restored(evaluator):
+    with _epsilons_restored(evaluator), designs_as_before(evaluator):
         adjustment, optimum = _prepared(evaluator, asked)
         rounds = _rounds(evaluator, asked, adjustment, optimum)
         found = rounds.until_supported(asked.progressbar)
+        grown = sum(design.n_points for design in evaluator.designs.values()) > in_designs
+        if found.particles.stopped and grown:
+            raise BudgetError(found.particles.stopped)
         if found.reason is not None:
             _log.warning("the draws are not adjusted: %s; their width is epsilon's", found.reason)
         else:
             for line in found.warnings:
                 _log.warning("%s", line)
         particles = found.particles
-        errors, missing = _at_the_best(evaluator, particles)
-        refuse_lost(evaluator, {name: each["lost_mass"] for name, each in missing.items()})
-        return posterior_tree(
-            evaluator,
-            found.thetas,
-            particles.discrepancies,
-            particles.stats,
-            unadjusted=None if found.thetas is particles.thetas else particles.thetas,
-            adjustment=found.note,
-            measured=found.measured,
-            warnings=(*(() if optimum is None else optimum.warnings), *found.warnings),
-            errors=errors,
-            missing=missing,
-            seed=asked.random_seed,
-            n_responses=evaluator.n_responses - before,
-            seconds=time.perf_counter() - clock,
-        )
+        stopped, errors, missing = particles.stopped, None, None
+        try:
+            errors, missing = _at_the_best(evaluator, particles)
+        except BudgetError as spent:
+            stopped = stopped or str(spent)
+        else:
+            _refuse_lost(evaluator, particles, missing)
+        with unlimited():
+            return posterior_tree(
+                evaluator,
+                found.thetas,
+                particles.discrepancies,
+                particles.lost,
+                particles.stats,
+                unadjusted=None if found.thetas is particles.thetas else particles.thetas,
+                adjustment=found.note,
+                measured=found.measured,
+                warnings=(
+                    *_of_budget(stopped, particles, asked),
+                    *_of_lost(evaluator, particles),
+                    *(() if optimum is None else optimum.warnings),
+                    *found.warnings,
+                ),
+                errors=errors,
+                missing=missing,
+                stopped=stopped,
+                seed=asked.random_seed,
+                n_responses=evaluator.n_responses - before,
+                seconds=time.perf_counter() - clock,
+            )
+
+
+def _of_budget(stopped: str, particles: Particles, asked: Sampling) -> list[str]:
+    """Say, also in the log, that a budget was spent before everything was done."""
+    if not stopped:
+        return []
+    again = "" if asked.checkpoint is None else f" and checkpoint={asked.checkpoint}"
+    line = (
+        f"{stopped}, so that {len(particles.stats)} of {asked.chains} chains are here, and what "
+        f"would have cost responses is left out; call prb.sample_smc with a larger budget{again}"
+    )
+    _log.warning("%s", line)
+    return [line]
+
+
+def _refuse_lost(
+    evaluator: Evaluator, particles: Particles, missing: Mapping[str, Mapping[str, float]]
+) -> None:
+    """Raise where too much of the best draw's population, or of most draws', has no response."""
+    lost = {}
+    for k, node in enumerate(evaluator.nodes):
+        lost[node.name] = missing[node.name]["lost_mass"]
+        if node.design is None:
+            of_most = float(np.median(particles.lost[:, :, k]))
+            lost[node.name] = max(lost[node.name], of_most)
+    refuse_lost(evaluator, lost)
+
+
+def _of_lost(evaluator: Evaluator, particles: Particles) -> list[str]:
+    """Say, also in the log, of how many draws too much of the population has no response.
+
+    Of designs, `diagnose` says it, as it does where more than these draws are concerned.
+    """
+    lines = []
+    for k, node in enumerate(evaluator.nodes):
+        most = node.bound.max_lost
+        share = share_of_lossy(particles.lost[:, :, k], most)
+        if share > _FAR_OUT:
+            lines.append(
+                f"{node.name}: lost mass: of {share:.0%} of the draws more than max_lost = "
+                f"{most:.1%} of the population has no response (NaN), so that they rest on the "
+                "specimens that have one; repair the response, return +inf for specimens that "
+                "fail, or narrow the priors"
+            )
+    for line in lines:
+        _log.warning("%s", line)
+    return lines
 
 
 def _prepared(evaluator: Evaluator, asked: Sampling) -> tuple[Affine | None, Optimum | None]:
@@ -209,7 +301,7 @@ def _prepared(evaluator: Evaluator, asked: Sampling) -> tuple[Affine | None, Opt
     adjustment = _adjustment(asked.adjust, evaluator, unset)
     optimum = asked.optimum
     if optimum is None and _needs_optimum(evaluator, unset, adjustment):
-        optimum = find_optimum(evaluator, Minimisation(refine=asked.refine))
+        optimum = require_finished(find_optimum(evaluator, Minimisation(refine=asked.refine)))
     if optimum is not None and adjustment is not None:
         require_sampling(optimum, "sample_smc")
     if optimum is not None and unset:
@@ -235,7 +327,7 @@ def _rounds(
     )
     entropy = asked.random_seed if saved is None else int(saved.settings["entropy"])
     return _Rounds(
-        run=Chains(evaluator, asked.draws, asked.threshold, saved),
+        run=Chains(evaluator, asked.draws, asked.threshold, saved, asked.max_stages),
         chains=asked.chains,
         seeds=np.random.SeedSequence(entropy),
         adjustment=adjustment,
@@ -306,6 +398,8 @@ class _Rounds:
         ------
         DesignError
             If there is none.
+        BudgetError
+            If a budget is spent before.
         """
         evaluator = self.run.evaluator
         for round_ in range(MAX_ROUNDS + 1):
@@ -319,6 +413,8 @@ class _Rounds:
             if not self.refine:
                 return found
             some = self._some_of(found)
+            if found.particles.stopped and shortcomings(evaluator, some):
+                raise BudgetError(found.particles.stopped)
             if round_ == MAX_ROUNDS:
                 refuse(shortcomings(evaluator, some), evaluator)
                 return found
@@ -332,7 +428,11 @@ class _Rounds:
         particles = self.run(children, progressbar)
         if self.adjustment is None:
             return _Draws(particles, None)
-        adjusted = self.adjustment(self.run.evaluator, particles.thetas, self.optima)
+        if particles.stopped and not self.run.evaluator.responses_per_theta:
+            with unlimited():
+                adjusted = self.adjustment(self.run.evaluator, particles.thetas, self.optima)
+        else:
+            adjusted = self.adjustment(self.run.evaluator, particles.thetas, self.optima)
         return _Draws(particles, adjusted)
 
     def _some_of(self, found: _Draws) -> Floats:

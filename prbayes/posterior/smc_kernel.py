@@ -88,15 +88,16 @@ class BatchedKernel(SMC_KERNEL):
         """Take over a chain's generator."""
         self.rng = rng
 
-    def _evaluate(self, thetas: Floats) -> tuple[Floats, Floats, Floats]:
+    def _evaluate(self, thetas: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         found: Evaluation = self.evaluator(thetas)
-        return found.log_prior, found.log_likelihood(self.evaluator.epsilon), found.discrepancies
+        likelihood = found.log_likelihood(self.evaluator.epsilon)
+        return found.log_prior, likelihood, found.discrepancies, found.lost
 
     def _initialize_kernel(self) -> None:
         seed = int(self.rng.integers(2**31))
         self.tempered_posterior = self.evaluator.prior_thetas(self.draws, seed)
         found = self._evaluate(self.tempered_posterior)
-        self.prior_logp, self.likelihood_logp, self.discrepancies = found
+        self.prior_logp, self.likelihood_logp, self.discrepancies, self.lost = found
         if not np.isfinite(self.likelihood_logp).any():
             raise ValueError(
                 f"model: got no finite discrepancy among {self.draws} draws from the prior, "
@@ -112,6 +113,7 @@ class BatchedKernel(SMC_KERNEL):
         self.prior_logp = self.prior_logp[index]
         self.likelihood_logp = self.likelihood_logp[index]
         self.discrepancies = self.discrepancies[index]
+        self.lost = self.lost[index]
 
     def mutate(self) -> None:
         """Move all particles by Metropolis-Hastings steps that keep the tempered posterior."""
@@ -165,7 +167,7 @@ class BatchedKernel(SMC_KERNEL):
 
         ``log_ratio`` is that of the proposal's densities.
         """
-        prior, likelihood, discrepancies = self._evaluate(proposed)
+        prior, likelihood, discrepancies, lost = self._evaluate(proposed)
         with np.errstate(invalid="ignore"):
             tempered = self.beta * (likelihood - self.likelihood_logp)
             gain = prior - self.prior_logp + tempered + log_ratio
@@ -175,6 +177,7 @@ class BatchedKernel(SMC_KERNEL):
         self.prior_logp[ok] = prior[ok]
         self.likelihood_logp[ok] = likelihood[ok]
         self.discrepancies[ok] = discrepancies[ok]
+        self.lost[ok] = lost[ok]
         return float(ok.mean())
 
     def sample_stats(self) -> dict[str, Any]:
@@ -193,6 +196,7 @@ class BatchedKernel(SMC_KERNEL):
             "prior": self.prior_logp,
             "likelihood": self.likelihood_logp,
             "discrepancies": self.discrepancies,
+            "lost": self.lost,
         }
         note = {
             "beta": self.beta,
@@ -208,6 +212,7 @@ class BatchedKernel(SMC_KERNEL):
         self.prior_logp = arrays["prior"].copy()
         self.likelihood_logp = arrays["likelihood"].copy()
         self.discrepancies = arrays["discrepancies"].copy()
+        self.lost = arrays["lost"].copy()
         self.beta = note["beta"]
         self.log_marginal_likelihood = note["evidence"]
         self.iteration = note["iteration"]

@@ -20,6 +20,7 @@ def posterior_tree(
     evaluator: Evaluator,
     thetas: Floats,
     discrepancies: Floats,
+    lost: Floats,
     stats: list[dict[str, list[float]]],
     *,
     unadjusted: Floats | None = None,
@@ -28,6 +29,7 @@ def posterior_tree(
     warnings: tuple[str, ...] = (),
     errors: Floats | None = None,
     missing: Mapping[str, Mapping[str, float]] | None = None,
+    stopped: str = "",
     seed: int | None,
     n_responses: int,
     seconds: float,
@@ -41,6 +43,8 @@ def posterior_tree(
     discrepancies : ndarray, shape (chains, draws, k)
         Before an adjustment; afterwards they are computed anew where that costs no response, and
         else NaN.
+    lost : ndarray, shape (chains, draws, k)
+        Before an adjustment: shares of populations without response; NaN of stored responses.
     stats : list of dict
         By chain: statistics by name, one value per stage.
     unadjusted : ndarray, shape (chains, draws, d), or None
@@ -54,6 +58,8 @@ def posterior_tree(
         Monte Carlo errors of the discrepancies.
     missing : mapping, optional
         By simulator: shares of the best draw's population that were lost, and that failed.
+    stopped : str
+        Which budget ended the run before everything was done.
     seed : int or None
     n_responses : int
         Scalar responses computed, the designs' included.
@@ -68,6 +74,7 @@ def posterior_tree(
         "random_seed": "None" if seed is None else str(seed),
         "adjustment": adjustment,
         **(measured or {}),
+        "stopped": stopped,
         "warnings": "\n".join(warnings),
         **versions(),
     }
@@ -77,7 +84,12 @@ def posterior_tree(
         "posterior": _posterior(evaluator, thetas, attrs | _evidence(stats)),
         "sample_stats": _sample_stats(stats),
         "calibration": _calibration(
-            evaluator, thetas, discrepancies, errors, missing or {}
+            evaluator,
+            thetas,
+            discrepancies,
+            errors,
+            missing or {},
+            _support(evaluator, thetas, lost, adjusted=unadjusted is not None),
         ).assign_attrs(attrs),
         "observed_data": observed_dataset(evaluator),
     }
@@ -107,6 +119,7 @@ def _calibration(
     discrepancies: Floats,
     errors: Floats,
     missing: Mapping[str, Mapping[str, float]],
+    support: dict[str, Any],
 ) -> xr.Dataset:
     """Return what is known of the simulators, by draw and over all."""
     chains, draws, _ = thetas.shape
@@ -117,7 +130,7 @@ def _calibration(
     return xr.Dataset(
         {
             "discrepancy": (_EACH_DRAW, discrepancies),
-            **_support(evaluator, thetas),
+            **support,
             "theta": (["chain", "draw", "element"], thetas),
             "discrepancy_error": ("simulator", errors),
             **at_the_best,
@@ -156,8 +169,13 @@ def _sample_stats(stats: list[dict[str, list[float]]]) -> xr.Dataset:
     return xr.Dataset(variables, coords=coords)
 
 
-def _support(evaluator: Evaluator, thetas: Floats) -> dict[str, Any]:
-    """Return how well designs support each draw, by simulator; NaN where there is no design."""
+def _support(
+    evaluator: Evaluator, thetas: Floats, lost: Floats, *, adjusted: bool
+) -> dict[str, Any]:
+    """Return how well designs support each draw, by simulator; NaN where there is no design.
+
+    ``lost``, as in `posterior_tree`, is what is known without one.
+    """
     chains, draws, d = thetas.shape
     found = evaluator.support(thetas.reshape(-1, d))
     variables = {}
@@ -166,8 +184,19 @@ def _support(evaluator: Evaluator, thetas: Floats) -> dict[str, Any]:
         for k, node in enumerate(evaluator.nodes):
             if node.name in found:
                 columns[:, k] = found[node.name][key]
+            elif key == "lost_mass" and not adjusted:
+                columns[:, k] = lost[:, :, k].ravel()
         variables[key] = (_EACH_DRAW, columns.reshape(chains, draws, -1))
-    return variables
+    too_much = []
+    for k, node in enumerate(evaluator.nodes):
+        own = found[node.name]["lost_mass"] if node.name in found else lost[:, :, k]
+        too_much.append(share_of_lossy(own, node.bound.max_lost))
+    return variables | {"lossy_draws": ("simulator", too_much)}
+
+
+def share_of_lossy(lost: Floats, max_lost: float) -> float:
+    """Return the share of draws of whose populations too much has no response."""
+    return float((lost > max_lost).mean())
 
 
 def _by_simulator(evaluator: Evaluator) -> dict[str, Any]:
@@ -175,11 +204,10 @@ def _by_simulator(evaluator: Evaluator) -> dict[str, Any]:
     nodes = evaluator.nodes
     designs = [node.design for node in nodes]
     required = [np.nan if design is None else design.required_ess for design in designs]
-    max_lost = [np.nan if design is None else design.config.max_lost for design in designs]
     return {
         "epsilon": ("simulator", evaluator.epsilon),
         "required_ess": ("simulator", required),
-        "max_lost": ("simulator", max_lost),
+        "max_lost": ("simulator", [node.bound.max_lost for node in nodes]),
         "metric": ("simulator", [without_addresses(node.metric) for node in nodes]),
         "propagation": ("simulator", [without_addresses(node.propagation) for node in nodes]),
         "n_points": ("simulator", [node.bound.n_points for node in nodes]),

@@ -34,6 +34,10 @@ from prbayes.response.response import Responses, refuse_calling
 # of its own, and their spread is then known to about a quarter, 1 / sqrt(2 (8 - 1)).
 N_BLOCKS = 8
 
+# Share of a population's weight, at an answer, that may fall on points without response. By
+# judgement: as much as one may choose to overlook; whoever knows better passes another.
+MAX_LOST = 0.05
+
 
 class DesignError(RuntimeError):
     """A design that cannot support the answer, even after refinement."""
@@ -92,9 +96,12 @@ class Bound(ABC):
     stored: ClassVar[bool] = False
     random: ClassVar[bool] = False
     support_moves: bool = False
-    max_lost: float = 0.05
+    max_lost: float = MAX_LOST
     draws: int = 0
     stream: int = 0
+    # Of the populations whose discrepancies were asked for last, (k,): share of the weight on
+    # points without response. NaN of stored responses, whose support tells.
+    lost: Floats | float = np.nan
     # Of the populations that were looked at last.
     _missing: Missing | None = None
     _probed: Floats = np.empty(0)
@@ -163,11 +170,14 @@ class Bound(ABC):
         size = len(params[0]) if params else 1
         result = np.full(size, np.inf)
         ok = self.valid(params)
+        lost = np.full(size, np.nan)
         self._missing = None
         if ok.any():
             values, weights = self.populations([p[ok] for p in params])
             self._missing = Missing.of(values, weights)
+            lost[ok] = self._missing.lost
             result[ok] = target.of(values, weights)
+        self.lost = lost
         return result
 
     def missing(self, params: Sequence[Any]) -> Missing:

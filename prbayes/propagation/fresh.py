@@ -12,7 +12,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
-from prbayes.propagation.base import Bound, Propagation, probe, refuse_max_lost
+from prbayes.propagation.base import MAX_LOST, Bound, Propagation, probe, refuse_max_lost
 from prbayes.propagation.ops import OwnOp
 from prbayes.response.batches import batch_shape, broadcast_batch
 from prbayes.response.distributions import PopulationSampler
@@ -47,7 +47,7 @@ class Fresh(Propagation):
 
     n: int = 1024
     random_seed: int = 0
-    max_lost: float = field(default=0.05, repr=False)
+    max_lost: float = field(default=MAX_LOST, repr=False)
 
     def __post_init__(self) -> None:
         self.check()

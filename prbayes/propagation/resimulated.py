@@ -16,7 +16,14 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import AT_ONCE, Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
-from prbayes.propagation.base import Bound, Propagation, probe, refuse_max_lost, refuse_nested
+from prbayes.propagation.base import (
+    MAX_LOST,
+    Bound,
+    Propagation,
+    probe,
+    refuse_max_lost,
+    refuse_nested,
+)
 from prbayes.propagation.ops import ResponseOp, symbolic_discrepancy
 from prbayes.propagation.points import base_points, points_from
 from prbayes.response.compilation import PLAIN, compile_batched, ninf_for_invalid
@@ -55,7 +62,7 @@ class Resimulated(Propagation):
     n: int = 1024
     random_seed: int = 0
     points: str | Callable[[int, int, int], Floats] = field(default="sobol", repr=False)
-    max_lost: float = field(default=0.05, repr=False)
+    max_lost: float = field(default=MAX_LOST, repr=False)
 
     def __post_init__(self) -> None:
         self.check()
@@ -172,5 +179,5 @@ class ResimulatedBound(Bound):
         """Return the responses at the base points, with equal weights."""
         (values,) = self._values(*params)
         if self.symbolic:
-            self.responses.count += values.size
+            self.responses.count_symbolic(values.size)
         return values, np.broadcast_to(1 / self.n_per_theta, values.shape)

@@ -23,6 +23,7 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._checks import AT_ONCE, Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
 from prbayes.propagation.base import (
+    MAX_LOST,
     N_BLOCKS,
     Bound,
     DesignError,
@@ -98,7 +99,7 @@ class Reweighted(Propagation):
 
     n: int = 1024
     random_seed: int = 0
-    max_lost: float = 0.05
+    max_lost: float = MAX_LOST
     max_points: int | None = None
 
     def __post_init__(self) -> None:
@@ -154,6 +155,19 @@ class Batches:
             sizes=(*self.sizes, *other.sizes),
         )
 
+    def rows(self) -> Iterator[slice]:
+        """Yield which points each batch has."""
+        ends = np.cumsum([0, *self.sizes]).tolist()
+        yield from map(slice, ends[:-1], ends[1:])
+
+
+@dataclass(frozen=True, eq=False)
+class Mark:
+    """A design as it was at some time."""
+
+    batches: Batches
+    shared: tuple[Any, ...]  # what its compiled graphs read
+
 
 class Design(Bound):
     """Design points with their responses, and weights p(x given theta) / g(x) for every theta.
@@ -176,6 +190,7 @@ class Design(Bound):
         self._basis: tuple[Any, int, Any] = (None, 0, None)
         # More conditions than a study has, fewer than fill the memory.
         self._others: deque[tuple[Responses, Floats]] = deque(maxlen=32)
+        self._taken_back: Batches | None = None  # all that there were when some were forgotten
         self._moving: tuple[int, ...] | None = None
         components = prior_draws(inputs.roots, min(config.n, _COMPONENTS), config.random_seed)
         size = self.add(components)
@@ -337,7 +352,7 @@ class Design(Bound):
         place = self._equal_mass if self.is_line else self._place
         points, counts = place(components, n, seed)
         points = self._off_the_edges(points, components, counts)
-        values = self.responses(points, [])
+        values = self._responses_at(points)
         batch = Batches(tuple(points), values, tuple(components), counts, (n,))
         self._stored = batch if self._stored is None else self._stored.followed_by(batch)
 
@@ -354,6 +369,17 @@ class Design(Bound):
         ess = np.exp(log_ess)
         of_these = ess[-len(counts) :]
         return float(np.median(of_these))
+
+    def _responses_at(self, points: Sequence[Floats]) -> Floats:
+        """Return the responses at points, which are known where a batch of them was taken back."""
+        before = self._taken_back
+        if before is not None:
+            for rows in before.rows():
+                known = [x[rows] for x in before.points]
+                if all(map(np.array_equal, known, points)):
+                    self.responses.find(len(points[0]))
+                    return before.values[rows]
+        return self.responses(points, [])
 
     def _refuse_other_data(self) -> None:
         """Raise if data above the inputs were set anew: old points are of other populations."""
@@ -483,16 +509,25 @@ class Design(Bound):
     @contextmanager
     def undone(self) -> Iterator[None]:
         """Forget, afterwards, the batches that are added inside."""
-        stored = self._stored
-        shared = [s.get_value() for s in self._shared]
+        before = self.mark()
         try:
             yield
         finally:
-            self._stored = stored
-            kept = [(responses, known[: self.n_points]) for responses, known in self._others]
-            self._others = deque(kept, maxlen=self._others.maxlen)
-            self._basis = (None, 0, None)
-            self._share(shared)
+            self.go_back(before)
+
+    def mark(self) -> Mark:
+        """Return what brings the design back to what it is now."""
+        return Mark(self.batches, tuple(s.get_value() for s in self._shared))
+
+    def go_back(self, mark: Mark, *, remember: bool = False) -> None:
+        """Forget the batches since a mark; their responses may be remembered for the next time."""
+        if remember:
+            self._taken_back = self.batches
+        self._stored = mark.batches
+        kept = [(responses, known[: self.n_points]) for responses, known in self._others]
+        self._others = deque(kept, maxlen=self._others.maxlen)
+        self._basis = (None, 0, None)
+        self._share(mark.shared)
 
     def _share(self, arrays: Sequence[Any]) -> None:
         """Hand arrays to the compiled graphs, which read shared variables of any length."""

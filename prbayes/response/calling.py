@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats, called, positive_number
 from prbayes._progress import progress
+from prbayes.response.budget import BudgetError, budget
 from prbayes.response.failures import Abort, Failure, OnFailure
 from prbayes.response.store import Store, StoreError
 
@@ -392,13 +393,15 @@ def chunks(
 ) -> Iterator[tuple[Rows, Chunk]]:
     """Compute the responses at some rows of the points, and yield chunks of them as they are done.
 
-    After a failure that is not tolerated nothing more is begun, and what was begun is waited for
-    and yielded.
+    After a failure that is not tolerated, and where a budget is spent, nothing more is begun, and
+    what was begun is waited for and yielded.
 
     Raises
     ------
     ResponseError
         After everything else, if a worker was lost, or a result is no response.
+    BudgetError
+        After everything else, if a budget was spent.
     """
     work, room = _work(calling), capacity(calling.executor)
     pool = _Pool(calling.name, calling.executor)
@@ -418,6 +421,12 @@ def chunks(
             # Send out as many chunks as the executor takes.
             while left.size and not suspects and len(begun) < room.chunks:
                 size = chunk_size(calling, tally, left.size, room.workers)
+                try:
+                    size = budget().grant(size, least=1)
+                except BudgetError as spent:
+                    error = error or spent
+                    left = left[:0]
+                    break
                 some, left = left[:size], left[size:]
                 begun[pool.submitted(work, points.at(some), tolerant)] = some
             # Take what is done.
@@ -557,6 +566,8 @@ def _alone(
 
 
 def _raise_lost(name: str, error: BaseException) -> None:
+    if isinstance(error, BudgetError):
+        raise error
     if isinstance(error, ResponseError):
         raise ResponseError(f"{name}: {error}") from None
     raise ResponseError(

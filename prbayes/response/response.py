@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from pytensor.graph.basic import Variable
 
 from prbayes._checks import Floats, called, executes, folder_path
 from prbayes.response.batches import batch_shape, broadcast_batch
+from prbayes.response.budget import budget
 from prbayes.response.calling import (
     Calling,
     Points,
@@ -116,6 +118,7 @@ class Responses:
             and not isinstance(function, scalar)
         )
         self.count = 0
+        self._found = 0
         self._calling = Calling(name, function, executor, kept, policy, retry_failed, timeout)
         self._tally = Tally()
         self._event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
@@ -129,7 +132,7 @@ class Responses:
     @property
     def computed(self) -> int:
         """Responses computed here: without those found in a store, with those tried again."""
-        return self.count if self.plain else self._tally.computed
+        return self.count - self._found if self.plain else self._tally.computed
 
     @property
     def failures(self) -> int:
@@ -140,6 +143,11 @@ class Responses:
     def failed(self) -> tuple[Failure, ...]:
         """The points that failed, each once, with their reasons; the first ten thousand."""
         return tuple(self._tally.failed.values())
+
+    @property
+    def folder(self) -> Path | None:
+        """Where responses are stored."""
+        return None if self._calling.store is None else self._calling.store.folder
 
     def same_as(self, other: Responses) -> bool:
         """Return whether another has the same function, aleatory inputs and constants."""
@@ -170,6 +178,16 @@ class Responses:
         found = respond(self._calling, Points(self._filled(flat), varying), self._tally)
         return found.reshape(batch)
 
+    def count_symbolic(self, size: int) -> None:
+        """Count responses that are computed in a graph."""
+        budget().grant(size, least=size)
+        self.count += size
+
+    def find(self, size: int) -> None:
+        """Count responses that were known and are needed again."""
+        self.count += size
+        self._found += size
+
     def _filled(self, values: Sequence[Floats]) -> list[Any]:
         """Return the function's arguments from values of aleatory, then epistemic inputs."""
         k = len(self.inputs.aleatory)
@@ -177,6 +195,8 @@ class Responses:
 
     def _at_once(self, arguments: Sequence[Any], batch: tuple[int, ...]) -> Floats:
         """Call the function once for a batch of any shape."""
+        size = int(np.prod(batch, dtype=int))
+        budget().grant(size, least=size)
         try:
             with np.errstate(all="ignore"):
                 result = self.function(*arguments)
@@ -186,7 +206,7 @@ class Responses:
                 f"with inputs of shapes {shapes(arguments)} and is expected to take arrays of any "
                 "leading shape, or to be wrapped in prb.scalar"
             ) from error
-        self.count += int(np.prod(batch, dtype=int))
+        self.count += size
         try:
             return checked(result, batch, arguments)
         except ResponseError as error:

@@ -143,7 +143,14 @@ def test_chains_with_different_numbers_of_stages() -> None:
         {"beta": [1.0], "n_steps": [6]},
     ]
     tree = posterior_tree(
-        evaluator, thetas, np.ones((2, 3, 2)), stats, seed=None, n_responses=7, seconds=1.5
+        evaluator,
+        thetas,
+        np.ones((2, 3, 2)),
+        np.full((2, 3, 2), np.nan),
+        stats,
+        seed=None,
+        n_responses=7,
+        seconds=1.5,
     )
     np.testing.assert_array_equal(tree["sample_stats"]["beta"], [[0.2, 1.0], [1.0, np.nan]])
     np.testing.assert_array_equal(tree["sample_stats"]["n_steps"], [[2, 4], [6, np.nan]])

@@ -1,0 +1,53 @@
+"""What is kept of work that stops before its end, so that it can go on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from prbayes.model.evaluator import Evaluator
+from prbayes.response.budget import BudgetError
+
+
+@contextmanager
+def designs_as_before(evaluator: Evaluator) -> Iterator[None]:
+    """Give designs that have grown inside their first size back, where the work is interrupted.
+
+    The same call then begins where this one began, and finds the responses.
+    """
+    before = [(design, design.mark()) for design in evaluator.designs.values()]
+    try:
+        yield
+    except (BudgetError, KeyboardInterrupt):
+        for design, mark in before:
+            design.go_back(mark, remember=True)
+        raise
+
+
+@contextmanager
+def explained(evaluator: Evaluator, caller: str, *also: str) -> Iterator[None]:
+    """Say, where a budget was spent before there was a result, what is kept and what to do.
+
+    ``also`` is what is kept besides responses.
+    """
+    try:
+        yield
+    except BudgetError as spent:
+        raise BudgetError(
+            f"{caller}: {spent} before there was a result; {kept(evaluator, *also)}; call it again "
+            "with a larger budget"
+        ) from None
+
+
+def kept(evaluator: Evaluator, *also: str) -> str:
+    """Say what is kept, for the next time."""
+    stores = [node.bound.responses.folder for node in evaluator.nodes]
+    folders = {str(folder) for folder in stores if folder is not None}
+    parts = list(also)
+    if folders:
+        parts.append(f"all responses ({', '.join(sorted(folders))})")
+    elif evaluator.designs:
+        parts.append("the responses of the model's designs")
+    if not parts:
+        return "nothing is kept: give the propagation a store="
+    return f"kept: {' and '.join(parts)}"

@@ -1,0 +1,249 @@
+"""Budgets of time, responses and stages: nothing new is begun, and the same call goes on later."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+from line_problem import build, line
+
+import prbayes as prb
+from prbayes.response import BudgetError
+from prbayes.response.budget import Budget, budget, limited, unlimited
+
+QUIET: dict[str, Any] = {"progressbar": False}
+
+
+class Counted:
+    """A response that counts for how many specimens it was called, and may take its time."""
+
+    def __init__(self, seconds: float = 0.0) -> None:
+        self.calls = 0
+        self.seconds = seconds
+
+    def __call__(self, x: float) -> float:
+        self.calls += 1
+        time.sleep(self.seconds)
+        return float(line(x))
+
+
+# -- what a budget is ------------------------------------------------------------------------------
+
+
+def test_without_limits_everything_is_granted() -> None:
+    assert budget().grant(10**9, least=10**9) == 10**9
+    assert Budget().grant(3, least=1) == 3
+
+
+def test_responses_are_granted_as_long_as_there_are_some() -> None:
+    with limited(None, 10):
+        assert budget().grant(6, least=1) == 6
+        assert budget().grant(6, least=1) == 4
+        with pytest.raises(BudgetError, match="max_responses = 10 was reached"):
+            budget().grant(1, least=1)
+    assert budget().grant(1, least=1) == 1
+
+
+def test_a_budget_that_was_spent_stays_spent() -> None:
+    with limited(None, 10):
+        with pytest.raises(BudgetError):
+            budget().grant(11, least=11)
+        with pytest.raises(BudgetError):
+            budget().go_on()
+        with unlimited():
+            budget().go_on()
+
+
+def test_time_runs_out() -> None:
+    with limited(0.001, None):
+        time.sleep(0.002)
+        with pytest.raises(BudgetError, match=r"max_seconds = 0\.001 was reached"):
+            budget().go_on()
+
+
+def test_a_budget_holds_in_its_own_thread() -> None:
+    with limited(None, 1), ThreadPoolExecutor(1) as other:
+        assert other.submit(lambda: budget().grant(5, least=5)).result() == 5
+
+
+# -- minimize --------------------------------------------------------------------------------------
+
+
+def found(store: Path, response: Any = None, **limits: Any) -> prb.Optimum:
+    propagation = prb.Resimulated(16, store=store, version="1")
+    model, _ = build(propagation, response or prb.scalar(Counted()))
+    return prb.minimize(model, tolerance=1e-2, **limits, **QUIET)
+
+
+@pytest.fixture(scope="module")
+def at_once(tmp_path_factory: pytest.TempPathFactory) -> prb.Optimum:
+    return found(tmp_path_factory.mktemp("at_once"))
+
+
+def test_minimize_goes_on_to_the_same_bits(tmp_path: Path, at_once: prb.Optimum) -> None:
+    response = Counted()
+    total = 0
+    for most in (200, 300):
+        optimum = found(tmp_path, prb.scalar(response), max_responses=most)
+        assert optimum.stopped == f"max_responses = {most} was reached"
+        assert not optimum.converged
+        assert np.isfinite(optimum.discrepancy)
+        assert np.isnan(optimum.covariance).all()
+        # Those at which the response was tried when the simulator was made are 16.
+        total += most + (16 if total == 0 else 0)
+        assert response.calls == total
+        (message,) = prb.diagnose(optimum).messages
+        assert "is no answer yet" in message
+        assert str(tmp_path) in message
+        assert optimum.to_datatree()["optimum"].attrs["stopped"] == optimum.stopped
+    # A budget that is large enough changes nothing.
+    optimum = found(tmp_path, max_seconds=1000, max_responses=at_once.n_responses)
+    assert not optimum.stopped
+    assert np.array_equal(optimum.theta, at_once.theta)
+    assert np.array_equal(optimum.covariance, at_once.covariance)
+    assert optimum.message == at_once.message
+
+
+def test_before_anything_is_known_minimize_says_what_is_kept(tmp_path: Path) -> None:
+    with pytest.raises(BudgetError, match=r"prb\.minimize: .*no result|before there was a result"):
+        found(tmp_path, max_responses=10)
+    stored = prb.response.Store(tmp_path, "y", version="1")
+    assert len(stored) == 16 + 10
+
+
+def test_minimize_stops_in_time(tmp_path: Path) -> None:
+    # A theta takes 0.16 s, a chunk a hundredth.
+    clock = time.perf_counter()
+    with pytest.raises(BudgetError, match=r"max_seconds = 0\.1 was reached"):
+        found(tmp_path, prb.scalar(Counted(0.01)), max_seconds=0.1)
+    assert time.perf_counter() - clock < 5
+
+
+def test_with_stored_responses_the_best_so_far_is_complete() -> None:
+    model, node = build(prb.Reweighted(16), prb.scalar(Counted()))
+    optimum = prb.minimize(model, max_responses=10, **QUIET)
+    assert optimum.stopped == "max_responses = 10 was reached"
+    assert not optimum.converged
+    assert optimum.discrepancy == pytest.approx(optimum.discrepancies["y"])
+    assert optimum.support["y"]["weight_ess"] > 1
+    assert node.bound.n_points == 16
+
+
+# -- refine ----------------------------------------------------------------------------------------
+
+FAR = np.array([[4.0, 0.0]])
+
+
+def test_refine_goes_on_with_the_design_that_has_grown() -> None:
+    whole, node = build(prb.Reweighted(16))
+    prb.refine(whole, FAR, **QUIET)
+    parts, other = build(prb.Reweighted(16))
+    expected = r"prb\.refine: max_responses = 20 was reached .*the model's designs"
+    with pytest.raises(BudgetError, match=expected):
+        prb.refine(parts, FAR, max_responses=20, **QUIET)
+    assert other.bound.n_points == 32 < node.bound.n_points
+    prb.refine(parts, FAR, **QUIET)
+    assert np.array_equal(other.bound.known_responses, node.bound.known_responses)
+
+
+def test_refinement_around_the_optimum_has_a_budget_too() -> None:
+    model, _ = build(prb.Reweighted(16))
+    with pytest.raises(BudgetError, match="max_responses = 10 was reached"):
+        prb.refine(model, max_responses=10, **QUIET)
+
+
+# -- sample_smc ------------------------------------------------------------------------------------
+
+PROPAGATIONS: dict[str, Any] = {
+    "Reweighted": prb.Reweighted(64),
+    "Resimulated": prb.Resimulated(16),
+    "Fresh": prb.Fresh(16),
+}
+
+
+def sampled(
+    name: str, checkpoint: Path | None = None, model: pm.Model | None = None, **limits: Any
+) -> xr.DataTree:
+    made = model or build(PROPAGATIONS[name], black_box)[0]
+    return prb.sample_smc(
+        30, chains=2, model=made, checkpoint=checkpoint, random_seed=1, **limits, **QUIET
+    )
+
+
+def black_box(x: Any) -> Any:
+    return 0.75 * np.asarray(x, dtype=np.float64)
+
+
+@cache
+def undisturbed(name: str) -> xr.DataTree:
+    return sampled(name)
+
+
+def require_same_draws(a: xr.DataTree, b: xr.DataTree) -> None:
+    for group in ("posterior", "sample_stats", "calibration"):
+        left, right = a[group].to_dataset(), b[group].to_dataset()
+        for variable in left.data_vars:
+            xr.testing.assert_equal(left[variable], right[variable])
+
+
+@pytest.mark.parametrize("name", PROPAGATIONS)
+def test_stages_are_limited_and_go_on(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "run.nc"
+    model, _ = build(PROPAGATIONS[name], black_box)
+    for most in (1, 2):
+        with pytest.raises(BudgetError, match=rf"max_stages = {most} was .*beta 0.*run\.nc"):
+            sampled(name, path, model, max_stages=most)
+    # On the same model: a design that had grown is what it was.
+    require_same_draws(sampled(name, path, model), undisturbed(name))
+
+
+@pytest.mark.parametrize("name", ["Resimulated", "Fresh"])
+def test_finished_chains_are_returned_and_the_rest_goes_on(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "run.nc"
+    most = 3 * undisturbed(name)["posterior"].attrs["n_responses"] // 4
+    part = sampled(name, path, max_responses=most)
+    attrs = part["posterior"].attrs
+    assert attrs["n_responses"] <= most
+    assert attrs["stopped"] == f"max_responses = {most} was reached in chain 2 of 2"
+    assert dict(part["posterior"].sizes) == {"chain": 1, "draw": 30}
+    assert any("1 of 2 chains are here" in line for line in prb.diagnose(part).messages)
+    whole = undisturbed(name)["posterior"]["mu"]
+    assert np.array_equal(part["posterior"]["mu"].values, whole.values[:1])
+    assert np.isnan(part["calibration"]["discrepancy_error"]).all()
+    require_same_draws(sampled(name, path), undisturbed(name))
+
+
+def test_a_design_that_grew_for_nothing_is_what_it_was_and_nothing_is_computed_twice() -> None:
+    response = Counted()
+    model, node = build(prb.Reweighted(16), prb.scalar(response))
+    keywords: dict[str, Any] = {"model": model, "chains": 1} | QUIET
+    before = response.calls
+    with pytest.raises(BudgetError, match=r"prb\.sample_smc: max_responses = 20 was reached"):
+        prb.sample_smc(30, max_responses=20, **keywords)
+    assert node.bound.n_points == 16
+    assert response.calls == before + 20
+    posterior = prb.sample_smc(30, **keywords)["posterior"]
+    # A batch that was broken off is lost without a store.
+    assert response.calls == before + node.bound.n_points - 16 + 4
+    other, _ = build(prb.Reweighted(16), prb.scalar(Counted()))
+    at_once = prb.sample_smc(30, **keywords | {"model": other})["posterior"]
+    xr.testing.assert_equal(posterior.to_dataset(), at_once.to_dataset())
+    assert posterior.attrs["n_responses"] == at_once.attrs["n_responses"]
+
+
+def test_the_optimum_within_is_not_taken_for_an_answer() -> None:
+    model, _ = build(prb.Resimulated(16), black_box, epsilon=None)
+    with pytest.raises(BudgetError, match=r"prb\.sample_smc: max_responses = 100 was reached"):
+        prb.sample_smc(30, model=model, max_responses=100, **QUIET)
+
+
+def test_time_is_a_budget_of_the_sampler() -> None:
+    with pytest.raises(BudgetError, match="max_seconds = 1e-06 was reached"):
+        sampled("Fresh", max_seconds=1e-6)
