@@ -149,6 +149,9 @@ def test_backends_without_an_operation_say_what_to_do_and_not_what_it_holds() ->
         assert len(str(op)) < 200
 
 
+@pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning"
+)
 @pytest.mark.parametrize("propagation", [prb.Resimulated(32), prb.Fresh(32)])
 def test_jax_refuses_densities_of_simulated_values(propagation: Any) -> None:
     pytest.importorskip("jax")
