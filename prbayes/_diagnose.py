@@ -16,7 +16,7 @@ from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.goodness import fit_probability, of_another_family
 from prbayes.estimate.obstacles import sampling_obstacle
 from prbayes.estimate.optimum import Optimum, require_of_model
-from prbayes.model.elements import single_elements, stacked_draws
+from prbayes.model.elements import finite_draws, single_elements
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level
 from prbayes.model.node import model_on_context
@@ -331,7 +331,7 @@ def _thetas(posterior: Any, model: pm.Model) -> Floats:
     missing = [name for name in names if name not in posterior]
     if missing:
         raise KeyError(f"posterior: got no {missing}, expected the model's free variables {names}")
-    draws = stacked_draws(posterior, names)
+    draws = finite_draws(posterior, names)
     return Evaluator(model).thetas_of(list(draws.values()))
 
 

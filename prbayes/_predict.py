@@ -20,7 +20,7 @@ from prbayes._checks import Floats, Seed, flag, plain_text, positive_integer, se
 from prbayes._progress import shown
 from prbayes._weighted import reached
 from prbayes.estimate.optimum import Optimum, identity_in, require_of_model
-from prbayes.model.elements import stacked_draws
+from prbayes.model.elements import finite_draws
 from prbayes.model.identity import Level, as_attributes, identity_of_model
 from prbayes.model.labels import versions
 from prbayes.model.node import Node, model_on_context, nodes
@@ -266,7 +266,7 @@ def populations_of(
     thinned = _thinned(result["posterior"].to_dataset(), draws)
     _refuse_incomplete(thinned, names, caller)
     coords = {dim: np.asarray(thinned[dim]) for dim in ("chain", "draw")}
-    return stacked_draws(thinned, names), coords
+    return finite_draws(thinned, names), coords
 
 
 def _thinned(posterior: xr.Dataset, draws: int) -> xr.Dataset:

@@ -98,9 +98,10 @@ def _solved(expansion: _Expansion, shifts: Floats) -> Floats:
         pull = weight * area.gaps
         left += np.einsum("bm,im,jm->bij", weight, slopes, slopes, optimize=True)
         right -= np.einsum("bm,im->bi", pull, slopes, optimize=True)
-    # A ridge, small against the system's size, keeps it regular.
-    size = np.trace(left, axis1=1, axis2=2)
-    ridge = 1e-10 * size[:, None, None]
+    # A ridge, small against each direction's own size, keeps it regular: where one prior is far
+    # wider than another, the system is as much larger along it.
+    size = np.diagonal(left, axis1=1, axis2=2)
+    ridge = 1e-10 * size[:, :, None]
     regular = left + ridge * np.eye(r)
     solution = np.linalg.solve(regular, right[..., None])
     return np.asarray(solution[..., 0])

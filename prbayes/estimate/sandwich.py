@@ -282,7 +282,9 @@ class Information:
         own = self._stencil.weights
         if among is not None:
             counted = own * among
-            own = counted / counted.sum(axis=-1, keepdims=True)
+            total = counted.sum(axis=-1, keepdims=True)
+            # Points that a population does not reach tell nothing of it: a function of zeros.
+            own = counted / np.where(total > 0, total, 1.0)
         knots = self._knots(observed)
         # Stored responses are the same at all points of the stencil: they are sorted once.
         if np.array_equal(values[0], values[-1], equal_nan=True):

@@ -43,6 +43,25 @@ def single_elements(values: Mapping[Any, Any]) -> dict[str, float]:
     return {name: float(row[0]) for name, row in split_elements(rows).items()}
 
 
+def finite_draws(posterior: Any, names: Sequence[str]) -> dict[str, Floats]:
+    """Return the draws of free variables, by which populations are known.
+
+    Raises
+    ------
+    ValueError
+        If one is no finite number: no population belongs to it.
+    """
+    found = stacked_draws(posterior, names)
+    for name, draws in found.items():
+        known = np.isfinite(draws).reshape(len(draws), -1).all(axis=1)
+        if not known.all():
+            raise ValueError(
+                f"posterior: {name}: got NaN or infinite values in {int((~known).sum())} of "
+                f"{known.size} draws, expected finite ones; leave these draws out, or sample again"
+            )
+    return found
+
+
 def stacked_draws(posterior: Any, names: Iterable[str] | None = None) -> dict[str, Floats]:
     """Return the draws of variables, (chains x draws, *shape), of a group with these dimensions."""
     found = {}

@@ -115,6 +115,7 @@ class FreshOp(OwnOp):
     """Draws a population and returns its discrepancy, () ... -> ()."""
 
     __props__ = ("bound",)
+    __str__ = OwnOp.__str__
 
     def __init__(self, bound: FreshBound) -> None:
         self.bound = bound

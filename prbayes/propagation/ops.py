@@ -30,11 +30,22 @@ class OwnOp(Op):
     """An operation on arrays (..., *event), which takes leading axes itself.
 
     What ``__props__`` names has no equal but itself: two operations that hold it are the same.
+    Beside it stands ``__str__``, or PyTensor makes one of its own that shows all it holds.
     """
 
     __props__: tuple[str, ...] = ()
     event_ndims: Sequence[int] = (1, 1)  # of each input: a sample, and what goes with it
     event_shape: tuple[int | None, ...] = ()  # of the result
+
+    def __str__(self) -> str:
+        """Return the name, and what to do where a backend has no form of it: it shows nothing else.
+
+        Without the cells, values and functions that the operation holds.
+        """
+        return (
+            f"{type(self).__name__}, which is computed by NumPy: PyTensor's JAX mode and NumPyro "
+            "take prb.Reweighted alone; use that, or nuts_sampler='nutpie' or 'pymc'"
+        )
 
     def make_node(self, *inputs: Any) -> Apply[Any, Any]:
         """Apply to arrays; the result has their leading axes, and its own event behind them."""
@@ -62,6 +73,7 @@ class ResponseOp(OwnOp):
     """
 
     __props__ = ("responses",)
+    __str__ = OwnOp.__str__
 
     def __init__(self, responses: Responses) -> None:
         self.responses = responses
@@ -109,6 +121,7 @@ class DensityOp(OwnOp):
     """The density of a weighted sample on cells, (..., n), (..., n) -> (..., m)."""
 
     __props__ = ("cells",)
+    __str__ = OwnOp.__str__
 
     def __init__(self, cells: Cells) -> None:
         self.cells = cells
@@ -140,6 +153,7 @@ class CotangentOp(OwnOp):
     """
 
     __props__ = ("cells", "order")
+    __str__ = OwnOp.__str__
     event_shape = (None,)
 
     def __init__(self, cells: Cells, order: int) -> None:
@@ -162,6 +176,7 @@ class OpaqueOp(OwnOp):
     """A user's metric on weighted responses, (..., n), (..., n) -> (...); it has no gradient."""
 
     __props__ = ("target",)
+    __str__ = OwnOp.__str__
 
     def __init__(self, target: Discrepancy) -> None:
         self.target = target

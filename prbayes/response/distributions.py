@@ -99,19 +99,36 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
 
 
 def valid(inputs: Inputs, aleatory: Sequence[TensorVariable]) -> TensorVariable:
-    """Return whether the parameters of all aleatory inputs are valid, a boolean scalar."""
+    """Return whether the parameters of all aleatory inputs are valid, a boolean scalar.
+
+    Raises
+    ------
+    TypeError
+        If PyMC has no density of an input.
+    """
     from pymc.logprob.utils import CheckParameterValue
 
     if inputs.nested:
         return pt.constant(True)
     # The densities check their parameters, such as sigma > 0, wherever they are evaluated.
-    logps = [pm.logp(d, pt.zeros_like(d), warn_rvs=False) for d in aleatory]
+    logps = [_density_at_zero(dist) for dist in aleatory]
     conditions = []
     for v in ancestors(logps):
         if v.owner is not None and isinstance(v.owner.op, CheckParameterValue):
             _, *checked = v.owner.inputs
             conditions += [pt.all(c) for c in checked]
     return pt.all(conditions) if conditions else pt.constant(True)
+
+
+def _density_at_zero(dist: TensorVariable) -> TensorVariable:
+    try:
+        return pm.logp(dist, pt.zeros_like(dist), warn_rvs=False)
+    except NotImplementedError as error:
+        raise TypeError(
+            f"inputs: got {dist.owner.op}, of which PyMC has no density ({error}), expected one "
+            "that has: it says at which hyperparameters there is a population at all; take "
+            "another distribution, or a pm.CustomDist.dist with logp="
+        ) from None
 
 
 def _generators(function: Any) -> list[Any]:
@@ -224,7 +241,7 @@ class PopulationSampler:
             replaced = dict(zip(inputs.roots, symbols, strict=True))
             specimens = graph_replace(resized, replaced, strict=False)
             common = epistemic
-        self._n_aleatory = len(aleatory)
+        self._event_shapes = inputs.event_shapes
         self._epistemic_ndims = [e.type.ndim for e in epistemic]
         self._function = pm.compile(
             [n, *batched],
@@ -258,10 +275,15 @@ class PopulationSampler:
         else:
             populations = [self._function(n, *row) for row in zip(*params, strict=True)]
             values = [np.stack(column) for column in zip(*populations, strict=True)]
+        n_aleatory = len(self._event_shapes)
+        aleatory = []
+        for v, shape in zip(values[:n_aleatory], self._event_shapes, strict=True):
+            # SciPy's generators, behind some distributions, drop leading axes of length one.
+            aleatory.append(np.reshape(v, (len(params[0]), n, *shape)))
         epistemic = []
-        for v, ndim in zip(values[self._n_aleatory :], self._epistemic_ndims, strict=True):
+        for v, ndim in zip(values[n_aleatory:], self._epistemic_ndims, strict=True):
             epistemic.append(v[:, None] if v.ndim > ndim else v)
-        return values[: self._n_aleatory], epistemic
+        return aleatory, epistemic
 
 
 def _per_specimen(

@@ -10,6 +10,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 import prbayes as prb
+from prbayes.estimate.sampling import local_sampling
 from prbayes.estimate.sandwich import Information
 from prbayes.model.evaluator import Evaluator
 
@@ -155,3 +156,27 @@ def test_a_prior_however_wide_leaves_standard_errors_as_they_are(metric: prb.Met
     ordinary = error(2.0)
     for spread in (200.0, 2e4):
         assert error(spread) == pytest.approx(ordinary, rel=0.1)
+
+
+def test_one_prior_however_wide_leaves_the_other_s_error_as_it_is() -> None:
+    def errors(spread: float) -> list[float]:
+        with pm.Model() as model:
+            x = pm.Normal.dist(pm.Normal("mu", 0, spread), pm.HalfNormal("sigma", 1))
+            prb.Simulator(
+                "y", lambda x: x, x, metric=AREA, observed=OBSERVED,
+                propagation=prb.Resimulated(512),
+            )  # fmt: skip
+        information = Information(Evaluator(model), 0, np.array([MEAN, np.log(SPREAD)]))
+        covariance = local_sampling([information], np.ones(1)).in_theta
+        return list(np.sqrt(np.diag(covariance)))
+
+    # The steps of the differences are other ones, so these are not the same to the last digit.
+    assert errors(1e6) == pytest.approx(errors(2.0), rel=0.1)
+
+
+def test_points_that_no_population_reaches_tell_nothing_of_it() -> None:
+    information = known_sd(AREA)
+    nowhere = np.zeros(256, dtype=bool)
+    found = information.area(*information.data_set, nowhere)
+    assert (found.slopes == 0).all()
+    assert (found.gaps <= 0).all()

@@ -1,11 +1,13 @@
 """Names of elements."""
 
 import numpy as np
+import pytest
 import xarray as xr
 
 from prbayes.model.elements import (
     element_name,
     element_names,
+    finite_draws,
     single_elements,
     split_elements,
     stacked_draws,
@@ -47,3 +49,13 @@ def test_a_point_is_one_number_for_each_element() -> None:
     point = xr.Dataset({"w": (["i", "j"], [[1.0, 2.0], [3.0, 4.0]]), "mu": 5.0})
     values = {"w[0,0]": 1.0, "w[0,1]": 2.0, "w[1,0]": 3.0, "w[1,1]": 4.0, "mu": 5.0}
     assert single_elements(point.data_vars) == values
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_draws_that_are_no_numbers_are_refused(value: float) -> None:
+    w = np.arange(24.0).reshape(2, 3, 4)
+    w[1, 2, 3] = value
+    group = xr.Dataset({"mu": (["chain", "draw"], w[..., 0]), "w": (["chain", "draw", "i"], w)})
+    assert list(finite_draws(group, ["mu"])) == ["mu"]
+    with pytest.raises(ValueError, match=r"posterior: w: got NaN or infinite values in 1 of 6 dra"):
+        finite_draws(group, ["mu", "w"])

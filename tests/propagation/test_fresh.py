@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pymc as pm
 import pytensor
 import pytensor.tensor as pt
 import pytest
+from scipy import stats
 
 import prbayes as prb
 from prbayes.model.node import nodes
@@ -107,3 +110,39 @@ def test_prior_predictive_sampling_follows_its_seed() -> None:
     ]
     np.testing.assert_array_equal(drawn[0], drawn[1])
     assert not np.isin(drawn[0], drawn[2]).any()
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (
+            lambda mu, sigma: pm.SkewNormal.dist(mu=mu, sigma=sigma, alpha=2.0),
+            stats.skewnorm(2.0, 2.0, 0.5),
+        ),
+        (lambda mu, sigma: pm.Rice.dist(nu=mu, sigma=sigma), stats.rice(4.0, scale=0.5)),
+        (lambda mu, sigma: pm.Moyal.dist(mu, sigma), stats.moyal(2.0, 0.5)),
+        (
+            lambda mu, sigma: pm.TruncatedNormal.dist(mu, sigma, lower=2.0),
+            stats.halfnorm(2.0, 0.5),
+        ),
+        (
+            lambda mu, sigma: pm.Truncated.dist(pm.Laplace.dist(mu, sigma), lower=mu),
+            stats.expon(2.0, 0.5),
+        ),
+    ],
+    ids=["SkewNormal", "Rice", "Moyal", "TruncatedNormal", "Truncated"],
+)
+def test_inputs_that_pymc_draws_by_functions_of_its_own(make: Any, expected: Any) -> None:
+    with pm.Model() as model:
+        x = make(pm.Normal("mu", 2, 0.5), pm.HalfNormal("sigma", 1))
+        prb.Simulator(
+            "y", np.positive, x, metric=prb.AreaMetric(), observed=expected.ppf([0.2, 0.5, 0.8]),
+            epsilon=0.5, propagation=prb.Fresh(400),
+        )  # fmt: skip
+    found = next(iter(nodes(model).values())).bound
+    given = {"mu": np.array([2.0]), "sigma": np.array([0.5])}
+    values, weights = found.populations([given[str(r.name)] for r in found.inputs.roots])
+    assert values.shape == weights.shape == (1, 400)
+    # A fixed seed: far from the one in a thousand that another distribution would give.
+    assert stats.kstest(values[0], expected.cdf).pvalue > 0.01
+    assert np.isfinite(prb.sample_smc(20, chains=2, model=model).posterior["mu"]).all()

@@ -136,3 +136,32 @@ def test_the_response_is_not_called_for_populations_without_a_finite_specimen() 
     assert calls == [(2, 2)]
     assert np.isnan(compiled(np.full((1, 2), -np.inf), np.zeros((1, 1)))).all()
     assert len(calls) == 1
+
+
+def test_backends_without_an_operation_say_what_to_do_and_not_what_it_holds() -> None:
+    cells = target(prb.ProbabilityResidual()).density_cells
+    assert cells is not None
+    own = [ResponseOp(response_op([]).responses), DensityOp(cells), CotangentOp(cells, 1)]
+    for op in [*own, OpaqueOp(target(prb.AreaMetric()))]:
+        name = type(op).__name__
+        assert str(op).startswith(f"{name}, which is computed by NumPy: PyTensor's JAX mode and")
+        assert "use that, or nuts_sampler='nutpie' or 'pymc'" in str(op)
+        assert len(str(op)) < 200
+
+
+@pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning"
+)
+@pytest.mark.parametrize("propagation", [prb.Resimulated(32), prb.Fresh(32)])
+def test_jax_refuses_densities_of_simulated_values(propagation: Any) -> None:
+    pytest.importorskip("jax")
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
+        prb.Simulator(
+            "y", lambda x: 2 * x, x, metric=prb.ProbabilityResidual(), observed=OBSERVED,
+            epsilon=0.1, propagation=propagation,
+        )  # fmt: skip
+    with pytest.raises(
+        NotImplementedError, match=r"JAX mode and NumPyro take prb\.Reweighted alon"
+    ):
+        model.compile_logp(mode="JAX")(model.initial_point())

@@ -168,3 +168,30 @@ def test_populations_are_drawn_at_their_own_roots() -> None:
     for seed, same in ((1, True), (2, False)):
         again, _ = sampler(params, 400, np.random.default_rng(seed))
         assert np.array_equal(again[0], aleatory[0]) == same
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda mu, sigma: pm.Rice.dist(nu=mu, sigma=sigma),
+        lambda mu, sigma: pm.TruncatedNormal.dist(mu, sigma, lower=0.0, shape=2),
+    ],
+    ids=["Rice", "TruncatedNormal"],
+)
+def test_one_population_has_the_axes_of_many(make: Any) -> None:
+    """SciPy's generators drop leading axes of length one."""
+    sampler = PopulationSampler(inputs_of(lambda mu, sigma: [make(mu, sigma)])[0])
+    for k, n in ((1, 7), (3, 7), (1, 1), (3, 1)):
+        (drawn,), _ = sampler([np.full(k, 1.0), np.full(k, 2.0)], n, np.random.default_rng(0))
+        assert drawn.shape[:2] == (k, n)
+        assert (drawn > 0).all()
+
+
+def test_what_has_no_density_is_refused() -> None:
+    inputs, _ = inputs_of(
+        lambda mu, sigma: [
+            pm.Truncated.dist(pm.SkewNormal.dist(mu=mu, sigma=sigma, alpha=1.0), lower=0.0)
+        ]
+    )
+    with pytest.raises(TypeError, match=r"inputs: got Trunc.* PyMC has no density .*expected one"):
+        valid(inputs, inputs.aleatory)
