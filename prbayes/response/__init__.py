@@ -1,7 +1,6 @@
 """The user's response: its inputs, how it is called, when it fails, where it is kept."""
 
-from prbayes.response.calling import ResponseError
-from prbayes.response.failures import Abort, Replace, Retry
+from prbayes.response.failures import Abort, Replace, ResponseError, Retry
 from prbayes.response.store import Store, StoreError
 
 __all__ = ["Abort", "Replace", "ResponseError", "Retry", "Store", "StoreError"]

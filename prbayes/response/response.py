@@ -15,14 +15,13 @@ from prbayes.response.batches import batch_shape, broadcast_batch
 from prbayes.response.calling import (
     Calling,
     Points,
-    ResponseError,
     Tally,
     checked,
     respond,
     scalar,
     shapes,
 )
-from prbayes.response.failures import Abort, Failure, OnFailure
+from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
 from prbayes.response.inputs import Inputs
 from prbayes.response.store import Store
 
