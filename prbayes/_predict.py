@@ -28,10 +28,9 @@ from prbayes.model.support import TOLERABLE, shortcoming
 from prbayes.propagation.base import MAX_LOST, DesignError, refuse_max_lost
 from prbayes.propagation.points import base_points, inside
 from prbayes.propagation.reweighted import Design
-from prbayes.response.calling import ResponseError
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, quantiles
-from prbayes.response.failures import Abort
+from prbayes.response.failures import Abort, ResponseError
 from prbayes.response.inputs import Inputs, read_inputs
 from prbayes.response.response import Responses, refuse_calling, refuse_uncallable
 

@@ -10,6 +10,8 @@ from __future__ import annotations
 import inspect
 import pickle
 import re
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -355,3 +357,56 @@ def test_observed_values_are_constants_with_their_data() -> None:
         assert isinstance(value, Constant)
         np.testing.assert_array_equal(value.data, [1.0, 2.0])
     assert isinstance(model.rvs_to_values[y], Constant)
+
+
+# Executors.
+
+
+def test_pools_of_processes_keep_what_they_were_made_with() -> None:
+    context = get_context("spawn")
+    with ProcessPoolExecutor(3, context, divmod, (7, 2)) as pool:
+        assert {"max_workers", "mp_context", "initializer", "initargs"} <= set(
+            inspect.signature(ProcessPoolExecutor).parameters
+        )
+        assert vars(pool)["_max_workers"] == 3
+        assert vars(pool)["_mp_context"] is context
+        assert vars(pool)["_initializer"] is divmod
+        assert vars(pool)["_initargs"] == (7, 2)
+    with ThreadPoolExecutor(2) as threads:
+        assert vars(threads)["_max_workers"] == 2
+
+
+def test_those_of_loky_do_so_too_under_the_same_name() -> None:
+    loky = pytest.importorskip("joblib.externals.loky")
+    pool = loky.ProcessPoolExecutor(3, initializer=divmod, initargs=(7, 2))
+    (kind, *_) = (k for k in type(pool).__mro__ if k.__name__ == "ProcessPoolExecutor")
+    assert issubclass(loky.reusable_executor._ReusablePoolExecutor, kind)
+    known = set(inspect.signature(kind).parameters)
+    assert {"max_workers", "context", "initializer", "initargs"} <= known
+    assert vars(pool)["_max_workers"] == 3
+    assert vars(pool)["_initializer"] is divmod
+    assert vars(pool)["_initargs"] == (7, 2)
+    assert vars(pool)["_context"] is not None
+    assert issubclass(loky.BrokenProcessPool, BrokenExecutor)
+    pool.shutdown()
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
+def test_dask_tells_its_workers_by_address_and_losses_by_a_class() -> None:
+    distributed = pytest.importorskip("distributed")
+    cluster = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
+    )
+    with cluster, distributed.Client(cluster) as client:
+        executor = client.get_executor(pure=False)
+        assert vars(executor)["_client"] is client
+        ((address, threads),) = client.nthreads().items()
+        assert address.startswith("inproc:")
+        assert threads == 2
+    assert distributed.KilledWorker.__name__ == "KilledWorker"
+    assert not issubclass(distributed.KilledWorker, BrokenExecutor)
+
+
+def test_mpi_tells_how_many_workers_it_has() -> None:
+    futures = pytest.importorskip("mpi4py.futures")
+    assert hasattr(futures.MPIPoolExecutor, "num_workers")

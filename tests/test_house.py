@@ -475,6 +475,17 @@ INNER = {
     "response.response": {"pytensor.graph.basic.Variable"},
     "surrogate.ranges": {"pytensor.graph.basic.Variable"},
 }
+# What is read of executors beyond their interface, by name.
+INNER_OF_EXECUTORS = {
+    "_client",
+    "_context",
+    "_initargs",
+    "_initializer",
+    "_max_workers",
+    "_mp_context",
+    "nthreads",
+    "num_workers",
+}
 FOREIGN = ("pymc", "pytensor", "arviz", "arviz_base", "arviz_stats", "arviz_plots")
 
 
@@ -506,3 +517,26 @@ def test_inner_names_of_others_have_contracts() -> None:
 
 def test_the_list_of_inner_names_is_of_files_that_are_there() -> None:
     assert set(INNER) <= {dotted(path) for path in FILES}
+
+
+def asked_of_executors() -> set[str]:
+    """Return names that the package asks executors for: by `getattr`, and in the table of what a pool was made with."""
+    path = PACKAGE / "response" / "executors.py"
+    found: set[str] = set()
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "getattr":
+            name = node.args[1]
+            found |= {str(name.value)} if isinstance(name, ast.Constant) else set()
+        if isinstance(node, ast.Constant) and re.fullmatch(r"_[a-z_]+", str(node.value)):
+            found.add(str(node.value))
+    return found
+
+
+def test_inner_names_of_executors_are_listed_and_have_contracts() -> None:
+    assert asked_of_executors() == INNER_OF_EXECUTORS
+    contracts = (ROOT / "tests" / "test_contracts.py").read_text(encoding="utf-8")
+    assert all(re.search(rf"\b{name}\b", contracts) for name in INNER_OF_EXECUTORS)
+    # Executors are asked nowhere else.
+    others = [path for path in FILES if path.stem != "executors"]
+    texts = [path.read_text(encoding="utf-8") for path in others]
+    assert not any(f'"{name}"' in text for text in texts for name in INNER_OF_EXECUTORS)

@@ -14,7 +14,7 @@ from scipy.special import ndtri
 import prbayes as prb
 from prbayes.model.node import nodes
 from prbayes.propagation.base import DesignError
-from prbayes.response.calling import ResponseError
+from prbayes.response.failures import ResponseError
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
 MEANS = np.array([[0.8, 1.0, 1.1], [0.9, 1.0, 1.2]])  # of two chains with three draws

@@ -23,10 +23,10 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats, flag, positive_number
 from prbayes.metrics.base import Discrepancy
-from prbayes.response.calling import ResponseError, refuse_timeout
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, prior_draws, valid
-from prbayes.response.failures import Abort, OnFailure
+from prbayes.response.executors import refuse_timeout
+from prbayes.response.failures import Abort, OnFailure, ResponseError
 from prbayes.response.inputs import Inputs
 from prbayes.response.response import Responses, refuse_calling
 

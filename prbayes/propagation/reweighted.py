@@ -84,7 +84,8 @@ class Reweighted(Propagation):
         any case: a failure is no result.
     timeout : float, optional
         Seconds that a response may take before it is one that failed; with executors of processes
-        only, as nothing else ends one that hangs.
+        only, Dask's among them, as nothing else ends one that hangs. What hangs outside Python ends
+        with its worker, half as long again and a second later; Dask then tries it on other workers.
 
     References
     ----------

@@ -1,8 +1,7 @@
 """The user's response: its inputs, how it is called, when it fails, where it is kept."""
 
 from prbayes.response.budget import BudgetError
-from prbayes.response.calling import ResponseError
-from prbayes.response.failures import Abort, Replace, Retry
+from prbayes.response.failures import Abort, Replace, ResponseError, Retry
 from prbayes.response.store import Store, StoreError
 
 __all__ = [

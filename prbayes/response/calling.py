@@ -7,35 +7,24 @@ with one.
 
 from __future__ import annotations
 
-import faulthandler
 import logging
-import os
-import signal as signals
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    Executor,
-    Future,
-    ThreadPoolExecutor,
-    wait,
-)
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from inspect import signature
-from typing import Any, cast
-from weakref import WeakKeyDictionary
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats, called, positive_number
+from prbayes._checks import Floats
 from prbayes._progress import progress
 from prbayes.response.budget import BudgetError, budget
-from prbayes.response.failures import Abort, Failure, OnFailure
+from prbayes.response.executors import Pool, capacity, failure_of, is_loss, told
+from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
 from prbayes.response.store import Store, StoreError
+from prbayes.response.time_limit import limited
 
 _log = logging.getLogger("prbayes")
 
@@ -44,10 +33,6 @@ Rows = NDArray[np.intp]
 # Relative difference of a response that another machine, or another version of a library, may make;
 # any value from 1e-9 to 1e-3 tells another response from rounding, but for chaotic ones.
 _ROUNDING = 1e-6
-
-
-class ResponseError(RuntimeError):
-    """The user's response raised, or returned something that is no response."""
 
 
 class scalar:  # noqa: N801 (reads as a function in a model)
@@ -105,6 +90,10 @@ class Points:
         """Return some of the points; with a number that one, without the leading axis."""
         pairs = zip(self.arguments, self.varying, strict=True)
         return Points([a[rows] if varies else a for a, varies in pairs], self.varying)
+
+    def handed_out(self) -> list[Any]:
+        """Return the arguments for a response, which may change its own in place."""
+        return [a.copy() if isinstance(a, np.ndarray) else a for a in self.arguments]
 
     def read(self, keys: Floats) -> Points:
         """Return the points of keys that were made with the same constants."""
@@ -339,38 +328,6 @@ def _failed(calling: Calling, raised: dict[int, str]) -> ResponseError:
 # -- sending out -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Capacity:
-    """How many workers an executor has, and how many chunks it is sent at a time."""
-
-    workers: int
-    chunks: int
-
-
-def capacity(executor: Executor | None) -> Capacity:
-    """Return how much an executor takes.
-
-    The interface does not tell: processes, threads and loky keep ``_max_workers``, MPI
-    ``num_workers``, and Dask's client knows. Of others many chunks are sent out, lest workers wait.
-    """
-    if executor is None:
-        return Capacity(1, 1)
-    workers = getattr(executor, "_max_workers", 0) or getattr(executor, "num_workers", 0)
-    workers = workers or _threads(executor) or 0
-    if not workers:
-        # As many as workers that are known of in practice; what one costs in memory is measured by
-        # `python -m benchmarks.scale`.
-        return Capacity(os.cpu_count() or 1, 1024)
-    # While a worker computes a chunk, the next one is there already.
-    return Capacity(int(workers), 2 * int(workers))
-
-
-def _threads(executor: Executor | None) -> int | None:
-    """Return how many threads the workers of Dask have; None for others."""
-    threads = getattr(getattr(executor, "_client", None), "nthreads", None)
-    return sum(threads().values()) if callable(threads) else None
-
-
 def chunk_size(calling: Calling, tally: Tally, left: int, workers: int) -> int:
     """Return how many of the points that are left go into the next chunk."""
     alone = isinstance(calling.function, scalar)
@@ -404,8 +361,9 @@ def chunks(
         After everything else, if a budget was spent.
     """
     work, room = _work(calling), capacity(calling.executor)
-    pool = _Pool(calling.name, calling.executor)
+    pool = Pool(calling.name, calling.executor)
     suspects: list[Rows] = []  # what was at work when a worker was lost
+    loss: BaseException | None = None
     begun: dict[Future[Chunk], Rows] = {}
     left = rows
     error: BaseException | None = None
@@ -413,7 +371,7 @@ def chunks(
         while left.size or begun or suspects:
             if suspects and not begun:
                 # Which of them ended its worker shows when each is alone.
-                for some, chunk in _alone(pool, work, points, suspects):
+                for some, chunk in _alone(pool, work, points, suspects, loss):
                     tally.take(some.size, chunk.seconds)
                     report(some.size, "")
                     yield some, chunk
@@ -432,9 +390,10 @@ def chunks(
             # Take what is done.
             for future in pool.done(begun):
                 some = begun.pop(future)
-                failure = future.exception()
-                if tolerant and _is_loss(failure):
+                failure = failure_of(future)
+                if tolerant and is_loss(failure):
                     suspects.append(some)
+                    loss = failure
                     continue
                 if failure is not None:
                     error = error or failure
@@ -447,122 +406,40 @@ def chunks(
                 report(some.size, f"{room.workers / max(tally.seconds, 1e-9):.3g}/s")
                 yield some, chunk
     if error is not None:
+        # One that is broken is of no use to what runs next, either.
+        pool.renew(error)
         _raise_lost(calling.name, error)
 
 
-# Seconds without a result after which the log says so. By judgement: longer than most responses
-# take, and shorter than one waits for nothing.
-_SILENCE = 60.0
-
-# Executors in the place of those whose workers were lost, as long as those are there.
-_renewed: WeakKeyDictionary[Executor, Executor] = WeakKeyDictionary()
-
-
-@dataclass
-class _Pool:
-    """An executor, or a new one like it where its workers were lost."""
-
-    name: str  # of the simulator, for messages
-    given: Executor | None
-
-    @property
-    def executor(self) -> Executor | None:
-        """The executor at work."""
-        return None if self.given is None else _renewed.get(self.given, self.given)
-
-    def renew(self, failure: BaseException | None) -> None:
-        """Take a new executor if this one is broken; those of others start workers themselves."""
-        if self.given is None or not isinstance(failure, BrokenExecutor):
-            return
-        _renewed[self.given] = _alike(self.given)
-
-    def submitted(
-        self, work: Callable[[Points, bool], Chunk], points: Points, tolerant: bool
-    ) -> Future[Chunk]:
-        """Return the work as a future: done already without an executor, failed if broken."""
-        return _submitted(self.executor, work, points, tolerant)
-
-    def done(self, begun: Iterable[Future[Chunk]]) -> set[Future[Chunk]]:
-        """Return futures that are done; waits for one, and says so after a minute.
-
-        Raises
-        ------
-        ResponseError
-            If no worker is left, so that none will ever be done.
-        """
-        waiting = list(begun)
-        silent = 0.0
-        while True:
-            found = wait(waiting, timeout=_SILENCE, return_when=FIRST_COMPLETED).done
-            if found or not waiting:
-                return found
-            silent += _SILENCE
-            _log.warning(
-                "%s: no response for %.0f s; %d chunks are at work", self.name, silent, len(waiting)
-            )
-            if _threads(self.executor) == 0:
-                for future in waiting:
-                    future.cancel()
-                raise ResponseError(
-                    f"{self.name}: got no response for {silent:.0f} s, and no worker is left, "
-                    "expected workers; start some and run again: with store= nothing that was "
-                    "computed is computed again"
-                )
-
-
-def _alike(executor: Executor) -> Executor:
-    """Return a new executor of processes like one whose workers were lost.
-
-    The interface does not tell how one was made: those of the standard library and of loky keep it
-    under the same names.
-    """
-    kind = next((c for c in type(executor).__mro__ if c.__name__ == "ProcessPoolExecutor"), None)
-    if kind is None:
-        return executor
-    known = signature(kind).parameters
-    made: dict[str, Any] = {"max_workers": getattr(executor, "_max_workers", None)}
-    for name, kept in (
-        ("mp_context", "_mp_context"),
-        ("context", "_context"),
-        ("initializer", "_initializer"),
-        ("initargs", "_initargs"),
-    ):
-        if name in known and getattr(executor, kept, None) is not None:
-            made[name] = getattr(executor, kept)
-    return cast(Executor, kind(**made))
-
-
-def _is_loss(failure: BaseException | None) -> bool:
-    """Return whether a chunk failed since its worker was lost; Dask names that by a class."""
-    names = {kind.__name__ for kind in type(failure).__mro__}
-    return isinstance(failure, BrokenExecutor) or "KilledWorker" in names
-
-
 def _alone(
-    pool: _Pool, work: Callable[[Points, bool], Chunk], points: Points, suspects: list[Rows]
+    pool: Pool,
+    work: Callable[[Points, bool], Chunk],
+    points: Points,
+    suspects: list[Rows],
+    loss: BaseException | None,
 ) -> Iterator[tuple[Rows, Chunk]]:
     """Compute chunks one at a time, halved where the worker is lost, and yield them.
 
     A point that is alone with its worker when that is lost has failed.
     """
+    pool.renew(loss)
+    pool.refuse_dead()
     left = list(reversed(suspects))
-    failure: BaseException | None = BrokenExecutor()
     while left:
-        pool.renew(failure)
         some = left.pop()
         future = pool.submitted(work, points.at(some), True)
         pool.done([future])
-        failure = future.exception()
+        failure = failure_of(future)
+        pool.renew(failure)
         if failure is None:
             yield some, future.result()
-        elif not _is_loss(failure):
+        elif not is_loss(failure):
             _raise_lost(pool.name, failure)
         elif some.size == 1:
             text = f"it ended its worker ({type(failure).__name__}), or took far too long"
             yield some, Chunk(np.array([np.nan]), {0: text}, 0.0)
         else:
             left += [some[some.size // 2 :], some[: some.size // 2]]
-    pool.renew(failure)
 
 
 def _raise_lost(name: str, error: BaseException) -> None:
@@ -570,9 +447,12 @@ def _raise_lost(name: str, error: BaseException) -> None:
         raise error
     if isinstance(error, ResponseError):
         raise ResponseError(f"{name}: {error}") from None
+    blame = ""
+    if is_loss(error):
+        blame = "if a response ends its worker, on_failure= may let that cost its point only; "
     raise ResponseError(
-        f"{name}: a worker was lost ({type(error).__name__}: {error}); run again: with store= "
-        "nothing that was computed is computed again"
+        f"{name}: {told(error)}; {blame}run again: with store= nothing that was computed is "
+        "computed again"
     ) from error
 
 
@@ -581,34 +461,6 @@ def _work(calling: Calling) -> Callable[[Points, bool], Chunk]:
     if calling.executor is None or isinstance(calling.executor, ThreadPoolExecutor):
         return partial(compute, calling.function)
     return partial(compute_packed, packed(calling.function), timeout=calling.timeout)
-
-
-def _submitted(
-    executor: Executor | None, work: Callable[[Points, bool], Chunk], points: Points, tolerant: bool
-) -> Future[Chunk]:
-    """Return the work as a future: done already without an executor, failed if that is broken."""
-    future: Future[Chunk] = Future()
-    try:
-        if executor is not None:
-            return executor.submit(work, points, tolerant)
-        future.set_result(work(points, tolerant))
-    except Exception as error:
-        future.set_exception(error)
-    return future
-
-
-def refuse_timeout(timeout: object, executor: Executor | None) -> None:
-    """Raise if it is no time, or one that the executor's workers cannot keep."""
-    if timeout is None:
-        return
-    positive_number(timeout, "timeout")
-    processes = any(kind.__name__ == "ProcessPoolExecutor" for kind in type(executor).__mro__)
-    if not processes or not hasattr(signals, "setitimer"):
-        raise ValueError(
-            f"timeout: got {timeout} with executor {called(executor)}, expected an executor of "
-            "processes, such as concurrent.futures.ProcessPoolExecutor(4), on a system with "
-            "signals: nothing else ends a response that hangs"
-        )
 
 
 # -- at work ---------------------------------------------------------------------------------------
@@ -626,41 +478,14 @@ def compute(
     return Chunk(values, raised, time.perf_counter() - clock)
 
 
-@contextmanager
-def _limited(seconds: float | None) -> Iterator[None]:
-    """Raise `TimeoutError` inside after some seconds; end this worker if that does not help.
-
-    A signal reaches Python code. What hangs in other code, never to come back, ends with its
-    worker.
-    """
-    if seconds is None:
-        yield
-        return
-
-    def late(*_: object) -> None:
-        raise TimeoutError(f"no result within timeout = {seconds:g} s")
-
-    before = signals.signal(signals.SIGALRM, late)
-    with open(os.devnull, "w") as nowhere:
-        # Half as long again, and a second, so that the signal comes first.
-        faulthandler.dump_traceback_later(1.5 * seconds + 1, exit=True, file=nowhere)
-        signals.setitimer(signals.ITIMER_REAL, seconds)
-        try:
-            yield
-        finally:
-            signals.setitimer(signals.ITIMER_REAL, 0)
-            faulthandler.cancel_dump_traceback_later()
-            signals.signal(signals.SIGALRM, before)
-
-
 def _one_by_one(
     function: scalar, points: Points, tolerant: bool, timeout: float | None
 ) -> tuple[Floats, dict[int, str]]:
     values, raised = np.full(len(points), np.nan), {}
     for i in range(len(points)):
         try:
-            with np.errstate(all="ignore"), _limited(timeout):
-                values[i] = float(function.function(*points.at(i).arguments))
+            with np.errstate(all="ignore"), limited(timeout):
+                values[i] = float(function.function(*points.at(i).handed_out()))
         except (Exception, SystemExit) as error:
             raised[i] = _said(error)
             if not tolerant:
@@ -673,8 +498,8 @@ def _at_once(
 ) -> tuple[Floats, dict[int, str]]:
     size = len(points)
     try:
-        with np.errstate(all="ignore"), _limited(timeout and timeout * size):
-            result = function(*points.arguments)
+        with np.errstate(all="ignore"), limited(timeout and timeout * size):
+            result = function(*points.handed_out())
     except (Exception, SystemExit) as error:
         if not tolerant or size == 1:
             return np.full(size, np.nan), {0: _said(error)}
@@ -689,12 +514,27 @@ def _at_once(
 
 
 def _said(error: BaseException) -> str:
-    return f"it raised {type(error).__name__}: {error}"
+    """Return what was raised in words that may be printed and stored, whatever it says of itself.
+
+    A few lines are enough: what a program printed may be long.
+    """
+    try:
+        text = str(error)
+    except Exception as other:
+        text = f"(its text raises {type(other).__name__})"
+    text = text.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")
+    return f"it raised {type(error).__name__}: {text:.1000}"
 
 
 def checked(result: Any, batch: tuple[int, ...], arguments: Sequence[Any]) -> Floats:
     """Return a response's result as floats; it has to be real numbers in the batch shape."""
-    array = np.asarray(result)
+    try:
+        array = np.asarray(result)
+    except Exception as error:
+        raise ResponseError(
+            f"the response returned {type(result).__name__} of which no array can be made "
+            f"({_said(error)}), expected an array of real numbers"
+        ) from None
     if array.dtype.kind not in "fiub":
         got = f"{type(result).__name__} of dtype {array.dtype}"
         if array.dtype.kind == "c":

@@ -9,6 +9,10 @@ import numpy as np
 from prbayes._checks import Floats, called, flag, positive_integer
 
 
+class ResponseError(RuntimeError):
+    """The user's response raised, or returned something that is no response."""
+
+
 @dataclass(frozen=True, eq=False)
 class Failure:
     """A point whose response failed."""

@@ -200,7 +200,12 @@ def _constant(x: object, label: str) -> Any:
         raise ValueError(
             f"{label}: got a constant that is not finite ({x!r:.60}), expected a number"
         )
-    return float(array) if array.ndim == 0 else array
+    if array.ndim == 0:
+        return float(array)
+    # Neither the user nor the response is to change it between two responses.
+    array = array.copy()
+    array.setflags(write=False)
+    return array
 
 
 def is_random(variable: Variable) -> bool:

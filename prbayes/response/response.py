@@ -17,14 +17,13 @@ from prbayes.response.budget import budget
 from prbayes.response.calling import (
     Calling,
     Points,
-    ResponseError,
     Tally,
     checked,
     respond,
     scalar,
     shapes,
 )
-from prbayes.response.failures import Abort, Failure, OnFailure
+from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
 from prbayes.response.inputs import Inputs
 from prbayes.response.store import Store
 

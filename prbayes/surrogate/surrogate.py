@@ -24,8 +24,8 @@ from prbayes._checks import (
 )
 from prbayes._progress import shown
 from prbayes.propagation.points import sobol
-from prbayes.response.calling import Calling, Points, ResponseError, Tally, respond
-from prbayes.response.failures import Abort, OnFailure, Replace
+from prbayes.response.calling import Calling, Points, Tally, respond
+from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
 from prbayes.response.response import refuse_calling
 from prbayes.response.store import Store
 from prbayes.surrogate.error import CrossValidation, cross_validated, points_needed

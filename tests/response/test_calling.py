@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import logging
-import os
-import signal
 import sqlite3
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import (
     BrokenExecutor,
     Executor,
-    Future,
     ProcessPoolExecutor,
     ThreadPoolExecutor,
 )
@@ -30,10 +25,8 @@ import prbayes as prb
 from prbayes.model.node import nodes
 from prbayes.response.calling import (
     Calling,
-    Capacity,
     Points,
     Tally,
-    capacity,
     checked,
     chunk_size,
     chunks,
@@ -218,20 +211,6 @@ def test_a_tally_forgets_old_chunks_slowly() -> None:
     assert tally.seconds == pytest.approx(0.7 * 0.5 + 0.3 * 1.5)
 
 
-def test_how_much_an_executor_takes() -> None:
-    class Mpi:
-        num_workers = 7
-
-    class Silent:
-        pass
-
-    assert capacity(None) == Capacity(1, 1)
-    with ThreadPoolExecutor(3) as pool:
-        assert capacity(pool) == Capacity(3, 6)
-    assert capacity(Mpi()) == Capacity(7, 14)  # type: ignore[arg-type]
-    assert capacity(Silent()).chunks == 1024  # type: ignore[arg-type]
-
-
 def test_points_give_keys_of_all_numbers_in_the_order_of_the_arguments() -> None:
     x, z = np.arange(3.0), np.arange(6.0).reshape(3, 2)
     points = Points([z, 7.0, x, np.array([8.0, 9.0])], [True, False, True, False])
@@ -379,14 +358,6 @@ def test_the_store_knows_which_points_failed_and_why(kind: str, tmp_path: Path) 
 def test_a_wrong_shape_is_a_mistake_and_no_failure() -> None:
     with pytest.raises(prb.response.ResponseError, match=r"y: the response returned shape \(2,\)"):
         model(lambda x, a: (a * x)[:2], on_failure=prb.response.Replace())
-
-
-def test_a_lost_worker_is_named() -> None:
-    with (
-        ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
-        pytest.raises(prb.response.ResponseError, match=r"y: a worker was lost .*store="),
-    ):
-        model(prb.scalar(lambda x, a: os._exit(3)), executor=pool)
 
 
 # -- what is stored --------------------------------------------------------------------------------
@@ -585,94 +556,6 @@ def test_stored_failures_are_replaced_as_the_policy_of_the_day_says(tmp_path: Pa
     assert responses(found).computed == 1
 
 
-# -- killed ----------------------------------------------------------------------------------------
-
-SCRIPT = """
-import sys, time
-import numpy as np, pymc as pm, prbayes as prb
-
-folder, kind, pause = sys.argv[1:]
-
-def response(x):
-    time.sleep(float(pause))
-    with open(folder + "/calls", "a") as file:
-        file.write(f"{x!r}\\n")
-    return 2 * x
-
-with pm.Model() as model:
-    mu = pm.Normal("mu", 1, 1)
-    if kind == "reweighted":
-        propagation = prb.Reweighted(100, store=folder + "/store")
-    else:
-        propagation = prb.Resimulated(4, store=folder + "/store")
-    prb.Simulator(
-        "y",
-        prb.scalar(response),
-        pm.Normal.dist(mu, 1.0),
-        metric=prb.AreaMetric(),
-        observed=[1.0, 2.0, 4.0],
-        epsilon=2.0,
-        propagation=propagation,
-    )
-    settings = {"checkpoint": folder + "/run.nc", "progressbar": False}
-    idata = prb.sample_smc(10, chains=2, random_seed=1, **settings)
-print(repr(float(idata.posterior["mu"].sum())))
-"""
-
-
-def killed(folder: Path, kind: str, at: int) -> str:
-    """Run the script in a process; kill it, hard, as soon as so many responses were computed.
-
-    A response takes long enough for the kill to fall between two of them.
-    """
-    folder.mkdir()
-    process = subprocess.Popen(
-        [sys.executable, "-c", SCRIPT, str(folder), kind, "0.012"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    calls = folder / "calls"
-    while process.poll() is None:
-        if calls.exists() and len(calls.read_text().splitlines()) >= at:
-            process.send_signal(signal.SIGKILL)
-        time.sleep(0.002)
-    out, error = process.communicate()
-    assert process.returncode == -signal.SIGKILL, error
-    return out
-
-
-@pytest.mark.parametrize(
-    ("kind", "at"), [("reweighted", 40), pytest.param("resimulated", 200, marks=pytest.mark.slow)]
-)
-def test_a_killed_run_computes_nothing_again_and_gives_the_same(
-    kind: str,
-    at: int,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    def finished(folder: Path) -> str:
-        """Run the script to its end, in this process, which knows nothing of the killed one."""
-        folder.mkdir(exist_ok=True)
-        monkeypatch.setattr(sys, "argv", ["script", str(folder), kind, "0"])
-        capsys.readouterr()
-        exec(compile(SCRIPT, "script", "exec"), {})
-        return capsys.readouterr().out
-
-    once = finished(tmp_path / "a")
-    assert killed(tmp_path / "b", kind, at) == ""
-    before = (tmp_path / "b" / "calls").read_text().splitlines()
-    expected = (tmp_path / "a" / "calls").read_text().splitlines()
-    assert at <= len(before) < len(expected)
-    assert finished(tmp_path / "b") == once
-    calls = (tmp_path / "b" / "calls").read_text().splitlines()
-    assert len(expected) == len(set(expected))
-    # A kill may fall between the end of a response and its record: then that one is computed again.
-    assert len(calls) - len(set(calls)) <= 1
-    assert set(calls) == set(expected)
-
-
 # -- failures are not results ----------------------------------------------------------------------
 
 
@@ -738,85 +621,6 @@ def test_a_copy_of_a_response_has_failures_of_its_own() -> None:
     assert len(other.failed) == len(found.failed) + 1
 
 
-# -- responses that end their worker, or hang ------------------------------------------------------
-
-
-class Fragile(ThreadPoolExecutor):
-    """Breaks as a whole, like a pool of processes, when a response ends its worker."""
-
-    made = 0
-
-    def __init__(self, max_workers: int = 2) -> None:
-        super().__init__(max_workers)
-        type(self).made += 1
-        self.broken = False
-
-    def submit(self, work: Any, /, *job: Any, **keywords: Any) -> Any:
-        if self.broken:
-            raise BrokenExecutor("broken before")
-        if 7.0 in job[0].arguments[0]:
-            self.broken = True
-            future: Any = Future()
-            future.set_exception(BrokenExecutor("a process ended"))
-            return future
-        return super().submit(work, *job, **keywords)
-
-
-# By this name those of the standard library and of loky are known.
-Fragile.__name__ = "ProcessPoolExecutor"
-
-
-@pytest.mark.parametrize("response", [prb.scalar(times), times], ids=["scalar", "batched"])
-@pytest.mark.parametrize(
-    "policy", [prb.response.Replace(), prb.response.Retry(1, then=prb.response.Replace())]
-)
-def test_a_response_that_ends_its_worker_costs_that_point(response: Any, policy: Any) -> None:
-    points = Points([np.arange(24.0), 2.0], [True, False])
-    pool, tally = Fragile(), Tally()
-    for _ in range(2):  # the executor that is broken serves again
-        found = respond(Calling("y", response, pool, None, policy), points, tally)
-        expected = 2 * np.arange(24.0)
-        expected[7] = np.nan
-        np.testing.assert_array_equal(found, expected)
-    ((failure),) = tally.failed.values()
-    assert failure.inputs[0] == 7.0
-    assert failure.reason.startswith("it ended its worker (BrokenExecutor)")
-
-
-def test_a_response_that_ends_its_worker_aborts_where_the_policy_says_so() -> None:
-    points = Points([np.arange(24.0), 2.0], [True, False])
-    with pytest.raises(prb.response.ResponseError, match=r"y: a worker was lost .*store="):
-        respond(Calling("y", prb.scalar(times), Fragile()), points, Tally())
-
-
-def ends_its_worker(x: float) -> float:
-    if x == 1.0:
-        os._exit(3)
-    if x == 2.0:
-        time.sleep(600)
-    return 2 * x
-
-
-def test_processes_that_end_or_hang_cost_their_points() -> None:
-    points, tally = Points([np.arange(4.0)], [True]), Tally()
-    with ProcessPoolExecutor(1, mp_context=get_context("forkserver")) as pool:
-        calling = Calling(
-            "y", prb.scalar(ends_its_worker), pool, None, prb.response.Replace(), timeout=1.0
-        )
-        found = respond(calling, points, tally)
-    np.testing.assert_array_equal(found, [0.0, np.nan, np.nan, 6.0])
-    assert [f.reason for f in sorted(tally.failed.values(), key=lambda f: f.inputs[0])] == [
-        "it ended its worker (BrokenProcessPool), or took far too long",
-        "it raised TimeoutError: no result within timeout = 1 s",
-    ]
-
-
-@pytest.mark.parametrize("executor", [None, ThreadPoolExecutor(1)])
-def test_a_time_limit_that_nobody_keeps_is_refused(executor: Any) -> None:
-    with pytest.raises(ValueError, match=r"timeout: got 5 with executor .*expected an executor of"):
-        prb.Reweighted(executor=executor, timeout=5)
-
-
 @BATCHED
 def test_a_response_that_leaves_python_is_a_failure_like_another(kind: str) -> None:
     def leaves(x: float, a: float) -> float:
@@ -828,26 +632,3 @@ def test_a_response_that_leaves_python_is_a_failure_like_another(kind: str) -> N
     np.testing.assert_array_equal(stored(found), np.where(STEEP, np.inf, EXPECTED))
     with pytest.raises(prb.response.ResponseError, match="raised SystemExit: bye"):
         failing(kind, leaves)
-
-
-def test_silence_is_told_and_without_workers_ended(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    class Client:
-        def nthreads(self) -> dict[str, int]:
-            return {}
-
-    class Deserted(ThreadPoolExecutor):
-        _client = Client()
-
-        def submit(self, work: Any, /, *job: Any, **keywords: Any) -> Any:
-            return Future()
-
-    monkeypatch.setattr("prbayes.response.calling._SILENCE", 0.05)
-    points = Points([np.arange(4.0), 2.0], [True, False])
-    with (
-        caplog.at_level(logging.WARNING, "prbayes"),
-        pytest.raises(prb.response.ResponseError, match="no worker is left, expected workers"),
-    ):
-        respond(Calling("y", prb.scalar(times), Deserted(1)), points, Tally())
-    assert "y: no response for" in caplog.text

@@ -13,8 +13,7 @@ import pytest
 
 import prbayes as prb
 from prbayes.propagation.base import DesignError
-from prbayes.response.calling import ResponseError
-from prbayes.response.failures import Abort, Replace, Retry
+from prbayes.response.failures import Abort, Replace, ResponseError, Retry
 
 BOX = {"x": (0.0, 3.0), "y": (1.0, 2.0)}
 

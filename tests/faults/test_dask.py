@@ -14,7 +14,7 @@ import pytest
 
 import prbayes as prb
 from prbayes.model.node import nodes
-from prbayes.response.calling import Capacity, capacity
+from prbayes.response.executors import Capacity, capacity
 
 distributed = pytest.importorskip("distributed")
 

@@ -1,0 +1,96 @@
+"""Processes that are killed: what they finished is kept, and the same run goes on to the same end."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+SCRIPT = """
+import sys, time
+import numpy as np, pymc as pm, prbayes as prb
+
+folder, kind, pause = sys.argv[1:]
+
+def response(x):
+    time.sleep(float(pause))
+    with open(folder + "/calls", "a") as file:
+        file.write(f"{x!r}\\n")
+    return 2 * x
+
+with pm.Model() as model:
+    mu = pm.Normal("mu", 1, 1)
+    if kind == "reweighted":
+        propagation = prb.Reweighted(100, store=folder + "/store")
+    else:
+        propagation = prb.Resimulated(4, store=folder + "/store")
+    prb.Simulator(
+        "y",
+        prb.scalar(response),
+        pm.Normal.dist(mu, 1.0),
+        metric=prb.AreaMetric(),
+        observed=[1.0, 2.0, 4.0],
+        epsilon=2.0,
+        propagation=propagation,
+    )
+    settings = {"checkpoint": folder + "/run.nc", "progressbar": False}
+    idata = prb.sample_smc(10, chains=2, random_seed=1, **settings)
+print(repr(float(idata.posterior["mu"].sum())))
+"""
+
+
+def killed(folder: Path, kind: str, at: int) -> str:
+    """Run the script in a process; kill it, hard, as soon as so many responses were computed.
+
+    A response takes long enough for the kill to fall between two of them.
+    """
+    folder.mkdir()
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, str(folder), kind, "0.012"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    calls = folder / "calls"
+    while process.poll() is None:
+        if calls.exists() and len(calls.read_text().splitlines()) >= at:
+            process.send_signal(signal.SIGKILL)
+        time.sleep(0.002)
+    out, error = process.communicate()
+    assert process.returncode == -signal.SIGKILL, error
+    return out
+
+
+@pytest.mark.parametrize(
+    ("kind", "at"), [("reweighted", 40), pytest.param("resimulated", 200, marks=pytest.mark.slow)]
+)
+def test_a_killed_run_computes_nothing_again_and_gives_the_same(
+    kind: str,
+    at: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def finished(folder: Path) -> str:
+        """Run the script to its end, in this process, which knows nothing of the killed one."""
+        folder.mkdir(exist_ok=True)
+        monkeypatch.setattr(sys, "argv", ["script", str(folder), kind, "0"])
+        capsys.readouterr()
+        exec(compile(SCRIPT, "script", "exec"), {})
+        return capsys.readouterr().out
+
+    once = finished(tmp_path / "a")
+    assert killed(tmp_path / "b", kind, at) == ""
+    before = (tmp_path / "b" / "calls").read_text().splitlines()
+    expected = (tmp_path / "a" / "calls").read_text().splitlines()
+    assert at <= len(before) < len(expected)
+    assert finished(tmp_path / "b") == once
+    calls = (tmp_path / "b" / "calls").read_text().splitlines()
+    assert len(expected) == len(set(expected))
+    # A kill may fall between the end of a response and its record: then that one is computed again.
+    assert len(calls) - len(set(calls)) <= 1
+    assert set(calls) == set(expected)

@@ -1,0 +1,349 @@
+"""Workers that are lost, and responses that end or hang them: each costs its point, not the study."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
+from contextlib import contextmanager
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import prbayes as prb
+from prbayes.response.calling import Calling, Points, Tally, respond
+from prbayes.response.failures import OnFailure, ResponseError
+from prbayes.response.store import Store
+
+Replace, Retry, Abort = prb.response.Replace, prb.response.Retry, prb.response.Abort
+
+
+def line(n: int) -> Points:
+    return Points([np.arange(float(n))], [True])
+
+
+def by_input(tally: Tally) -> dict[float, str]:
+    return {float(f.inputs[0]): f.reason for f in tally.failed.values()}
+
+
+# -- the executors, as they are --------------------------------------------------------------------
+
+
+@contextmanager
+def processes() -> Iterator[Executor]:
+    context = get_context("forkserver")
+    # Workers are forked from a process that has imported already what takes long.
+    context.set_forkserver_preload(["prbayes.response.calling", "cloudpickle"])
+    with ProcessPoolExecutor(2, context) as pool:
+        yield pool
+
+
+@contextmanager
+def loky() -> Iterator[Executor]:
+    loky = pytest.importorskip("joblib.externals.loky")
+    pool = loky.get_reusable_executor(2)
+    yield pool
+    pool.shutdown(wait=True, kill_workers=True)
+
+
+@contextmanager
+def dask() -> Iterator[Executor]:
+    distributed = pytest.importorskip("distributed")
+    where: dict[str, Any] = {"host": "127.0.0.1", "dashboard_address": None}
+    cluster = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, silence_logs=logging.CRITICAL, **where
+    )
+    with cluster, distributed.Client(cluster) as client:
+        yield client.get_executor(pure=False)
+
+
+@contextmanager
+def threads() -> Iterator[Executor]:
+    with ThreadPoolExecutor(2) as pool:
+        yield pool
+
+
+@contextmanager
+def nothing() -> Iterator[None]:
+    yield None
+
+
+EXECUTORS = {f.__name__: f for f in (nothing, threads, processes, loky, dask)}
+
+
+# -- hostile responses -----------------------------------------------------------------------------
+
+
+def hostile(x: float) -> Any:
+    """Return 2 x, but at some points."""
+    if x == 1:
+        raise ArithmeticError("too steep")
+    if x == 2:
+        return np.nan
+    if x == 3:
+        sys.exit("bye")
+    if x == 4:
+        raise ValueError("long, \0 and \ud800 " + 10_000_000 * "x")
+    if x == 5:
+        return "text"
+    if x == 6:
+        os._exit(3)
+    if x == 7:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if x == 8:
+        spin()
+    if x == 9:
+        time.sleep(600)
+    return 2 * x
+
+
+def spin() -> None:
+    while True:
+        pass
+
+
+REASONS = {
+    1: "it raised ArithmeticError: too steep",
+    2: "it is NaN",
+    3: "it raised SystemExit: bye",
+    4: "it raised ValueError: long, \\0 and \\ud800 xxx",
+    5: "it raised ValueError: could not convert string to float: 'text'",
+    6: "it ended its worker (",
+    7: "it ended its worker (",
+    8: "it raised TimeoutError: no result within timeout = 0.4 s",
+    9: "it ",  # a signal ends a sleep, where there is one
+}
+# Points of the table that end the process, which nothing survives that runs in it; and those that hang.
+ENDING = (6, 7, 8, 9)
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
+@pytest.mark.parametrize(
+    "where",
+    ["nothing", "threads", "processes", pytest.param("loky", marks=SLOW), pytest.param("dask", marks=SLOW)],
+)  # fmt: skip
+def test_hostile_responses_cost_their_points(
+    where: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    safe = where in ("nothing", "threads")
+    n, points = 16, line(16)
+    if safe:
+        points = Points([np.delete(np.arange(float(n)), ENDING)], [True])
+    x = points.arguments[0]
+    expected = np.where(np.isin(x, list(REASONS)), -1.0, 2 * x)
+    tally = Tally()
+    store = Store(tmp_path, "y", 1)
+    with EXECUTORS[where]() as executor:
+        calling = Calling(
+            "y",
+            prb.scalar(hostile),
+            executor,
+            store,
+            Replace(-1.0),
+            timeout=None if safe else 0.4,
+        )
+        found = respond(calling, points, tally)
+        np.testing.assert_array_equal(found, expected)
+        # They are kept as failed, in a few words each, and none is computed again.
+        again = Tally()
+        np.testing.assert_array_equal(respond(calling, points, again), expected)
+        assert again.computed <= 1
+    told = by_input(tally)
+    assert set(told) == set(x) & set(REASONS)
+    for point, reason in told.items():
+        assert reason.startswith(REASONS[int(point)]), reason
+        assert len(reason) < 1100
+    assert store.failed(points.keys()) == {
+        row: told[p] for row, p in enumerate(x) if p in told and p != 2
+    }
+    assert len(caplog.text) < 20_000
+
+
+@pytest.mark.parametrize("result", [[[1], [1, 2]], object(), 1j, np.ones((3, 2000, 1000))])
+@pytest.mark.parametrize("where", ["nothing", "threads"])
+def test_what_is_no_response_ends_the_run_with_a_sentence(where: str, result: Any) -> None:
+    with (
+        EXECUTORS[where]() as executor,
+        pytest.raises(ResponseError, match=r"^y: the response returned .*expected"),
+    ):
+        respond(Calling("y", lambda x: result, executor, None, Replace()), line(3), Tally())
+
+
+def test_a_failure_that_cannot_say_what_it_is_is_told() -> None:
+    class Mute(Exception):  # noqa: N818
+        def __str__(self) -> str:
+            raise RuntimeError
+
+    def response(x: float) -> float:
+        raise Mute
+
+    tally = Tally()
+    respond(Calling("y", prb.scalar(response), None, None, Replace()), line(1), tally)
+    assert by_input(tally) == {0.0: "it raised Mute: (its text raises RuntimeError)"}
+
+
+@pytest.mark.parametrize("wrap", [prb.scalar, lambda f: f], ids=["scalar", "batched"])
+@pytest.mark.parametrize("where", ["nothing", "threads"])
+def test_a_response_that_changes_its_arguments_changes_nothing_else(where: str, wrap: Any) -> None:
+    def greedy(x: Any, a: Any) -> Any:
+        if np.ndim(x):
+            x += a[0]
+            if (x == 8).any():
+                raise ArithmeticError("too steep")
+        elif x == 7:
+            raise ArithmeticError("too steep")
+        else:
+            x = x + a[0]
+        a *= 2
+        return x
+
+    points = Points([np.arange(12.0), np.array([1.0, 5.0])], [True, False])
+    expected = np.where(np.arange(12) == 7, -1.0, np.arange(12) + 1.0)
+    with EXECUTORS[where]() as executor:
+        calling = Calling("y", wrap(greedy), executor, None, Replace(-1.0))
+        np.testing.assert_array_equal(respond(calling, points, Tally()), expected)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
+@pytest.mark.parametrize("where", ["processes", pytest.param("loky", marks=SLOW)])
+def test_a_response_that_ends_its_worker_aborts_where_the_policy_says_so(
+    where: str, tmp_path: Path
+) -> None:
+    def repaired(x: float) -> float:
+        return 2 * x
+
+    store = Store(tmp_path, "y", 1, version="1")
+    with EXECUTORS[where]() as executor:
+        points = Points([np.array([0.0, 10.0, 11.0, 6.0, 12.0])], [True])
+        for policy in (Abort(), Retry(1, then=Abort())):
+            calling = Calling("y", prb.scalar(hostile), executor, store, policy)
+            with pytest.raises(ResponseError, match=r"y: a worker was lost \(.*on_failure=.*store"):
+                respond(calling, points, Tally())
+        # The same executor serves on, and what was finished before is kept.
+        kept = len(store)
+        assert kept >= 1
+        tally = Tally()
+        calling = Calling("y", prb.scalar(repaired), executor, store)
+        np.testing.assert_array_equal(respond(calling, points, tally), 2 * points.arguments[0])
+        assert tally.computed == 5 - kept
+
+
+# -- executors in the place of those, for what takes them long ---------------------------------------
+
+
+class KilledWorker(Exception):  # noqa: N818
+    """By this name Dask says that several workers were lost with a task."""
+
+
+class Fragile(ThreadPoolExecutor):
+    """Loses a worker when a response ends it: as a whole, like pools of processes, or as Dask."""
+
+    def __init__(self, max_workers: int = 2, loss: Any = BrokenExecutor) -> None:
+        super().__init__(max_workers)
+        self.loss, self.broken = loss, False
+
+    def submit(self, work: Any, /, *job: Any, **keywords: Any) -> Any:
+        if self.broken:
+            raise BrokenExecutor("broken before")
+        if job and 7.0 in job[0].arguments[0]:
+            self.broken = self.loss is BrokenExecutor
+            future: Any = Future()
+            future.set_exception(self.loss("a process ended"))
+            return future
+        return super().submit(work, *job, **keywords)
+
+
+# By this name those of the standard library and of loky are known.
+Fragile.__name__ = "ProcessPoolExecutor"
+
+
+def twice(x: Any) -> Any:
+    return 2 * x
+
+
+@pytest.mark.parametrize("response", [prb.scalar(twice), twice], ids=["scalar", "batched"])
+@pytest.mark.parametrize("policy", [Replace(), Retry(1, then=Replace())])
+@pytest.mark.parametrize("loss", [BrokenExecutor, KilledWorker])
+def test_a_response_that_ends_its_worker_costs_that_point(
+    response: Any, policy: OnFailure, loss: Any
+) -> None:
+    points = line(24)
+    pool, tally = Fragile(loss=loss), Tally()
+    for _ in range(2):  # the executor that is broken serves again
+        found = respond(Calling("y", response, pool, None, policy), points, tally)
+        expected = 2 * np.arange(24.0)
+        expected[7] = np.nan
+        np.testing.assert_array_equal(found, expected)
+    ((point, reason),) = by_input(tally).items()
+    assert point == 7.0
+    assert reason.startswith(f"it ended its worker ({loss.__name__})")
+
+
+class Unlucky(ThreadPoolExecutor):
+    """Is broken from the start, and of no kind that can be made anew."""
+
+    def submit(self, work: Any, /, *job: Any, **keywords: Any) -> Any:
+        raise BrokenExecutor("its initializer failed")
+
+
+def test_no_response_is_blamed_for_workers_that_end_by_themselves(tmp_path: Path) -> None:
+    store = Store(tmp_path, "y", 1)
+    with pytest.raises(ResponseError, match=r"y: a worker was lost .*also without a response at w"):
+        respond(Calling("y", twice, Unlucky(), store, Replace()), line(4), Tally())
+    assert len(store) == 0
+
+
+def test_an_executor_that_is_closed_meanwhile_is_told_of_and_nothing_finished_is_lost(
+    tmp_path: Path,
+) -> None:
+    store, points = Store(tmp_path, "y", 1), line(8)
+    pool = ThreadPoolExecutor(1)
+
+    def response(x: float) -> float:
+        if x == 2:
+            pool.shutdown(wait=False, cancel_futures=True)
+        return 2 * x
+
+    with pytest.raises(ResponseError, match=r"y: the executor (was closed|failed) .*run again"):
+        respond(Calling("y", prb.scalar(response), pool, store, Replace()), points, Tally())
+    values, known = store.find(points.keys())
+    assert known[:3].all()
+    np.testing.assert_array_equal(values[known], 2 * np.arange(8.0)[known])
+    # It is closed for good.
+    with pytest.raises(ResponseError, match=r"y: the executor failed \(RuntimeError: cannot sche"):
+        respond(Calling("y", twice, pool, store, Replace()), points, Tally())
+
+
+# -- Dask on the loopback interface ------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
+@pytest.mark.parametrize("what", ["client", "cluster"])
+def test_a_cluster_that_is_closed_is_an_error_and_no_hang(what: str) -> None:
+    def slow(x: float) -> float:
+        time.sleep(0.2)
+        return 2 * x
+
+    with dask() as executor:
+        client = executor._client  # type: ignore[attr-defined]
+        closing = threading.Timer(1.0, getattr(client, what, client).close)
+        closing.start()
+        with pytest.raises(ResponseError, match=r"y: the executor (was closed|failed)"):
+            respond(Calling("y", prb.scalar(slow), executor), line(600), Tally())
+        closing.join()
