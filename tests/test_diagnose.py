@@ -135,10 +135,15 @@ def test_of_few_draws_a_quarter_need_be_independent(every: int, enough: bool) ->
 
 
 def test_particles_that_stick() -> None:
-    text = str(prb.diagnose(stuck()))
+    tree = stuck().copy(deep=True)
+    calibration = tree["calibration"]
+    calibration["discrepancy_error"].values[:] = 1.5 * calibration["epsilon"].values
+    text = str(prb.diagnose(tree))
     assert "Particles hardly moved in the last stage of chains 0, 1 (0.0" in text
-    assert "The discrepancy is too noisy (its Monte Carlo error is 1" in text
+    assert "The discrepancy is too noisy (its Monte Carlo error is 1.5 epsilon)" in text
     assert "R-hat is" in text
+    calibration["discrepancy_error"].values[:] = 0.5 * calibration["epsilon"].values
+    assert "Monte Carlo error" not in str(prb.diagnose(tree))
 
 
 def test_deterministics_do_not_count_twice() -> None:

@@ -626,6 +626,7 @@ def test_a_log_likelihood_of_few_resimulated_responses_is_warned_of(
     assert not caplog.records
 
 
+@pytest.mark.exact
 def test_another_response_is_computed_at_the_new_points_only() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))

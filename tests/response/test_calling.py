@@ -606,6 +606,7 @@ def test_failures_are_tried_again_when_asked_for(tmp_path: Path) -> None:
     assert not responses(model(response, store=tmp_path, on_failure=replace, version="1")).failed
 
 
+@pytest.mark.exact
 @BATCHED
 def test_failures_are_told_with_their_inputs(kind: str) -> None:
     found = failing(kind, fails_above_two, prb.response.Replace(np.inf))
