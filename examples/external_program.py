@@ -8,9 +8,7 @@ Run: uv run python examples/external_program.py [--store FOLDER] [--points 64]
 """
 
 import argparse
-import subprocess
 import sys
-import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -23,13 +21,9 @@ PROGRAM = Path(__file__).parent / "external" / "beam.py"
 FORCE = 1000.0
 
 
-def deflection(modulus_gpa, force_n):
-    """Run the program for one specimen; return the deflection in millimetres."""
-    with tempfile.TemporaryDirectory() as folder:
-        source, target = Path(folder, "input.txt"), Path(folder, "output.txt")
-        source.write_text(f"modulus_gpa={modulus_gpa:.17g}\nforce_n={force_n:.17g}\n")
-        subprocess.run([sys.executable, "-S", PROGRAM, source, target], check=True, timeout=60)
-        return float(target.read_text().split()[1])
+def first_number(folder):
+    """Return the deflection in millimetres that the program wrote."""
+    return float((folder / "output.txt").read_text().split()[1])
 
 
 def main():
@@ -38,6 +32,13 @@ def main():
     parser.add_argument("--store", default="beam_responses")
     parser.add_argument("--points", type=int, default=64)
     arguments = parser.parse_args()
+    deflection = prb.command(
+        [sys.executable, "-S", PROGRAM, "input.txt", "output.txt"],
+        inputs=["modulus_gpa", "force_n"],
+        write={"input.txt": "modulus_gpa={modulus_gpa:.17g}\nforce_n={force_n:.17g}\n"},
+        read=first_number,
+        timeout=60,
+    )
     modulus = np.random.default_rng(7).normal(210.0, 7.0, 24)
     measured = 1e3 * FORCE * 2.0**3 / (48 * modulus * 1e9 * 8.0e-7)
     with ThreadPoolExecutor(4) as threads, pm.Model() as model:
@@ -51,7 +52,7 @@ def main():
         )
         E = pm.Normal.dist(mu, sigma)
         prb.Simulator(
-            "deflection", prb.scalar(deflection), E, FORCE,
+            "deflection", deflection, E, FORCE,
             metric=prb.AreaMetric(), observed=measured, propagation=propagation,
         )  # fmt: skip
         optimum = prb.minimize()

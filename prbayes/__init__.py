@@ -44,6 +44,7 @@ from prbayes.propagation.resimulated import Resimulated
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.reports.report import Report
 from prbayes.response.calling import scalar
+from prbayes.response.program import command
 from prbayes.surrogate.surrogate import Surrogate
 from prbayes.validation.cross_validation import cross_validate
 from prbayes.validation.validity import area_test
@@ -71,6 +72,7 @@ __all__ = [
     "area_test",
     "bootstrap",
     "calibrate_epsilon",
+    "command",
     "compare",
     "cross_validate",
     "datasets",

@@ -7,6 +7,7 @@ each of them.
 from __future__ import annotations
 
 import re
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -302,6 +303,19 @@ TABLE: dict[str, Row] = {
         {"times": COUNT, "then": (None, "abort", prb.response.Retry(), prb.response.Abort)},
     ),
     "scalar": Row(prb.scalar, {"function": (3, "f", None)}),
+    "command": Row(
+        prb.command,
+        {
+            "arguments": ([], "ls", 3, None, [3], [sys.executable, None]),
+            "inputs": ("x", 3, None, ["y"], ["x", "x"], ["a b"], [3]),
+            "read": (3, "float", None),
+            "write": (3, "in.txt", {"../in.txt": "{x}"}, {"/in.txt": "{x}"}, {3: "{x}"}, {"a": 3}),
+            "timeout": but_none(POSITIVE),
+            "folder": (3, "", b"folder"),
+            "keep": FLAG,
+        },
+        {"arguments": [sys.executable, "{x}"], "inputs": ["x"], "read": float},
+    ),
     "ProbabilityResidual": Row(
         prb.ProbabilityResidual,
         {"density": (None, 0.3, prb.GaussianKDE, "kde"), "scale_base": POSITIVE},
