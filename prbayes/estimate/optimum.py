@@ -25,6 +25,7 @@ from prbayes.model.identity import (
     require_same,
 )
 from prbayes.model.labels import failures_dataset, labelled, observed_dataset, versions
+from prbayes.model.turns import in_turn
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -169,6 +170,7 @@ class Optimum:
         """
         return failures_dataset(self.evaluator)
 
+    @in_turn
     def sampling(self, *, weakest: float = 1.0) -> SamplingDistribution:
         """Return the sampling distribution of the minimiser around the optimum.
 
