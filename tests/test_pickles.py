@@ -105,6 +105,7 @@ RESULTS: dict[str, Callable[[], Any]] = {
     "bootstrap": lambda: prb.bootstrap(optimum(), 10, **QUIET),
     "compare": lambda: prb.compare({"optimum": optimum(), "ABC": posterior()}),
     "cross_validate": lambda: prb.cross_validate(optimum(), **QUIET),
+    "sampling": lambda: optimum().sampling(),
     "to_datatree": lambda: optimum().to_datatree(),
 }
 
