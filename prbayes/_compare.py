@@ -29,10 +29,12 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import as_attributes, require_together
 from prbayes.model.node import nodes
 from prbayes.model.support import shortcomings
+from prbayes.model.turns import in_turn
 
 _METRICS = (ProbabilityResidual(), KullbackLeibler(), AreaMetric(), LogLikelihood())
 
 
+@in_turn
 def compare(
     results: Mapping[str, Optimum | xr.DataTree],
     *,

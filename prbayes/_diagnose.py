@@ -21,6 +21,7 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level
 from prbayes.model.node import model_on_context
 from prbayes.model.support import ENOUGH, shortcoming
+from prbayes.model.turns import in_turn
 
 # R-hat of independent draws exceeds 1 + _NOISE / (chains x draws) about once in a thousand cases:
 # the quantile was 9 to 12 with 2 to 8 chains of 25 to 500 draws, 1500 to 4000 sets of each
@@ -61,6 +62,7 @@ class Diagnosis:
         return "\n".join(self.messages) if self.messages else "No problem was found."
 
 
+@in_turn
 def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) -> Diagnosis:
     """Say in sentences what is wrong with a result, and what to do, whichever sampler gave it.
 

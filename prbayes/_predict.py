@@ -25,6 +25,7 @@ from prbayes.model.identity import Level, as_attributes, identity_of_model
 from prbayes.model.labels import versions
 from prbayes.model.node import Node, model_on_context, nodes
 from prbayes.model.support import TOLERABLE, shortcoming
+from prbayes.model.turns import in_turn
 from prbayes.propagation.base import MAX_LOST, DesignError, refuse_max_lost
 from prbayes.propagation.points import base_points, inside
 from prbayes.propagation.reweighted import Design
@@ -37,6 +38,7 @@ from prbayes.response.response import Responses, refuse_calling, refuse_uncallab
 _log = logging.getLogger("prbayes")
 
 
+@in_turn
 def predict(
     result: Optimum | xr.DataTree,
     response: Callable[..., Any],

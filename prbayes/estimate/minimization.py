@@ -51,11 +51,13 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.interruption import explained, kept
 from prbayes.model.node import model_on_context
 from prbayes.model.support import shortcomings
+from prbayes.model.turns import in_turn
 from prbayes.response.budget import BudgetError, limited, unlimited
 
 _log = logging.getLogger("prbayes")
 
 
+@in_turn
 def refine(
     model: pm.Model | None = None,
     thetas: Floats | None = None,
@@ -154,6 +156,7 @@ _TERMS = 64
 _NOISE_SHARE = 0.3
 
 
+@in_turn
 def minimize(
     model: pm.Model | None = None,
     *,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from prbayes.model.identity import (
     require_same,
 )
 from prbayes.model.labels import failures_dataset, labelled, observed_dataset, versions
+from prbayes.model.turns import in_turn
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -139,14 +140,6 @@ class Optimum:
         shares = {name: each.get("failed_mass", 0.0) for name, each in self.support.items()}
         return [f"{name}: {share:.1%} of specimens fail" for name, share in shares.items() if share]
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Travel with the model packed by cloudpickle: those of PyMC have no plain pickle."""
-        import cloudpickle
-
-        values = {each.name: getattr(self, each.name) for each in fields(self)}
-        values["evaluator"] = self.model
-        return _unpacked, (cloudpickle.dumps(values),)
-
     @property
     def model(self) -> pm.Model:
         """The model."""
@@ -169,6 +162,7 @@ class Optimum:
         """
         return failures_dataset(self.evaluator)
 
+    @in_turn
     def sampling(self, *, weakest: float = 1.0) -> SamplingDistribution:
         """Return the sampling distribution of the minimiser around the optimum.
 
@@ -200,14 +194,6 @@ class Optimum:
         Groups ``optimum``, ``stderr``, ``trace`` and ``calibration``.
         """
         return optimum_tree(self)
-
-
-def _unpacked(payload: bytes) -> Optimum:
-    """Return an optimum that was pickled."""
-    import cloudpickle
-
-    values = cloudpickle.loads(payload)
-    return Optimum(**{**values, "evaluator": Evaluator(values["evaluator"])})
 
 
 def _short(value: Any) -> str:

@@ -11,6 +11,7 @@ from prbayes._checks import called, positive_number
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Identity, identity_of, require_same
 from prbayes.model.node import Node, required_nodes
+from prbayes.model.turns import in_turn
 
 
 class Epsilon(dict[str, float]):
@@ -54,6 +55,7 @@ def checked_epsilon(
     return found
 
 
+@in_turn
 def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
     """Set the epsilon of simulators by name.
 

@@ -79,6 +79,20 @@ class Evaluator:
         self.prior_thetas = names.prior_thetas
         self.prior_points = names.prior_points
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel as the model packed by cloudpickle: those of PyMC have no plain pickle."""
+        import cloudpickle
+
+        # What other data are observed by an evaluator is not in the model.
+        targets = [node.target for node in self.nodes] if "objective" in vars(self) else None
+        return _unpacked, (cloudpickle.dumps((self.model, targets)),)
+
+    def __copy__(self) -> Evaluator:
+        """Share the model, and what is compiled for it."""
+        other = object.__new__(Evaluator)
+        vars(other).update(vars(self))
+        return other
+
     @property
     def names(self) -> list[str]:
         """Names of the elements of theta, such as 'sigma_log__' or 'mu[1]'."""
@@ -232,16 +246,20 @@ class Evaluator:
         ``metric`` all simulators have that one.
         """
         _ = self._roots  # compiled once, for all copies
-        other = copy.copy(self)
-        other.nodes = []
+        targets = []
         for node in self.nodes:
             observed = data[node.name]
             before = node.target
             same_size = np.size(observed) == before.observed.size
             weights = before.weights if same_size else None
             chosen = metric or node.metric
-            target = chosen.against(observed, weights)
-            other.nodes.append(replace(node, target=target))
+            targets.append(chosen.against(observed, weights))
+        return self._with_targets(targets)
+
+    def _with_targets(self, targets: list[Discrepancy]) -> Evaluator:
+        other = copy.copy(self)
+        pairs = zip(self.nodes, targets, strict=True)
+        other.nodes = [replace(node, target=target) for node, target in pairs]
         other.__dict__["objective"] = other._uncompiled
         return other
 
@@ -310,3 +328,12 @@ class Evaluator:
                 key: np.concatenate([part[key] for part in parts]) for key in parts[0]
             }
         return found
+
+
+def _unpacked(payload: bytes) -> Evaluator:
+    """Return an evaluator that was pickled."""
+    import cloudpickle
+
+    model, targets = cloudpickle.loads(payload)
+    evaluator = Evaluator(model)
+    return evaluator if targets is None else evaluator._with_targets(targets)

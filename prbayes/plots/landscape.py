@@ -12,6 +12,7 @@ from prbayes._checks import Floats, called, positive_integer
 from prbayes.estimate.optimum import Optimum, require_of_model
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level
+from prbayes.model.turns import in_turn
 from prbayes.plots._canvas import BLUE, CROSS, DIAMOND, INK, VERMILION, Canvas, Panel, refuse_look
 from prbayes.plots._grid import Landscape, landscape, rooted
 from prbayes.plots._names import named
@@ -23,6 +24,7 @@ _ALONG_AXIS = {1: 161, 2: 41}
 _PATH = "path of the optimiser"
 
 
+@in_turn
 def plot_landscape(
     optimum: Optimum,
     *,

@@ -10,6 +10,7 @@ import xarray as xr
 
 from prbayes._checks import positive_integer, share
 from prbayes.estimate.optimum import Optimum
+from prbayes.model.turns import in_turn
 from prbayes.plots._canvas import Canvas, refuse_look
 from prbayes.plots._ensemble import read_result
 from prbayes.plots._margins import chosen, margin_densities, margins
@@ -17,6 +18,7 @@ from prbayes.plots._names import named
 from prbayes.plots._populations import calibrated, draw_calibrated
 
 
+@in_turn
 def plot_population(
     result: Optimum | xr.DataTree,
     *,

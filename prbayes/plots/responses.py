@@ -15,6 +15,7 @@ from prbayes._checks import Floats, flag, positive_integer, share
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node
+from prbayes.model.turns import in_turn
 from prbayes.plots._canvas import DASHED, INK, VERMILION, Canvas, Panel, refuse_look
 from prbayes.plots._curves import (
     GRID_POINTS,
@@ -31,6 +32,7 @@ from prbayes.plots._populations import calibrated, draw_calibrated
 _log = logging.getLogger("prbayes")
 
 
+@in_turn
 def plot_responses(
     result: Optimum | xr.DataTree,
     *,

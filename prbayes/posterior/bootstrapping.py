@@ -11,9 +11,11 @@ from prbayes._progress import shown
 from prbayes.estimate.data_sets import reweighted_sets, simulated_sets
 from prbayes.estimate.identifiability import unidentified_directions
 from prbayes.estimate.optimum import Optimum, require_refits
+from prbayes.model.turns import in_turn
 from prbayes.posterior.trees import bootstrap_tree
 
 
+@in_turn
 def bootstrap(
     optimum: Optimum,
     draws: int = 1000,

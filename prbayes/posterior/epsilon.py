@@ -17,6 +17,7 @@ from prbayes.estimate.sampling import first_order_shifts, local_sampling
 from prbayes.estimate.sandwich import Information, LinearArea
 from prbayes.metrics.base import Minimum
 from prbayes.model.epsilon import Epsilon
+from prbayes.model.turns import in_turn
 
 # Thetas that carry each simulated data set's posterior: half or twice changes epsilon by 3%, as
 # much as another number of data sets does (docs/constants.md).
@@ -27,6 +28,7 @@ _CLOUD = 500
 _WIDER = 3.0
 
 
+@in_turn
 def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
     """Return an epsilon for each simulator, so that the posterior is as wide as the data warrant.
 

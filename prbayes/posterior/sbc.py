@@ -22,6 +22,7 @@ from prbayes._progress import progress, shown
 from prbayes.estimate.data_sets import fresh_data
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import model_on_context
+from prbayes.model.turns import in_turn
 from prbayes.posterior.adjustment import Affine, refuse_adjustment
 from prbayes.posterior.smc import Sampling, sample
 from prbayes.posterior.trees import calibration_tree
@@ -32,6 +33,7 @@ _log = logging.getLogger("prbayes")
 _CHUNK = 10
 
 
+@in_turn
 def simulation_based_calibration(
     n: int = 200,
     *,

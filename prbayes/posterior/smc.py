@@ -27,6 +27,7 @@ from prbayes.model.identity import identity_of, require_same
 from prbayes.model.interruption import designs_as_before, explained
 from prbayes.model.node import Node, model_on_context
 from prbayes.model.support import shortcomings
+from prbayes.model.turns import in_turn
 from prbayes.posterior.adjustment import Adjusted, Affine, refuse_adjustment
 from prbayes.posterior.chains import Chains, Particles
 from prbayes.posterior.checkpoint import Checkpoint, stored_settings
@@ -40,6 +41,7 @@ _log = logging.getLogger("prbayes")
 _FAR_OUT = 0.05
 
 
+@in_turn
 def sample_smc(
     draws: int = 1000,
     *,

@@ -16,8 +16,10 @@ from prbayes.metrics.base import Discrepancy
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import versions
 from prbayes.model.node import Node
+from prbayes.model.turns import in_turn
 
 
+@in_turn
 def cross_validate(
     optimum: Optimum, *, folds: int = 5, random_seed: Seed = 0, progressbar: bool = True
 ) -> xr.Dataset:

@@ -14,6 +14,7 @@ from prbayes._predict import data_digest
 from prbayes._progress import shown
 from prbayes.model.identity import Identity, as_attributes
 from prbayes.model.labels import versions
+from prbayes.model.turns import in_turn
 from prbayes.validation.conditions import Case, Condition, Predicted, read_case
 from prbayes.validation.exact_model import ExactModel
 from prbayes.validation.nulls import Null, PosteriorNull
@@ -103,6 +104,7 @@ class ValidityTest:
         )
 
 
+@in_turn
 def area_test(
     observed: ArrayLike | Mapping[str, ArrayLike] | Sequence[ArrayLike],
     predicted: Predicted | Mapping[str, Predicted] | Sequence[Predicted],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -396,3 +397,20 @@ def test_data_above_the_inputs_is_followed(propagation: Propagation) -> None:
     np.testing.assert_allclose(
         logp(point) - before, first.discrepancies[0] - first.discrepancies[1], rtol=1e-9
     )
+
+
+# Travelling.
+
+
+def test_an_evaluator_of_other_data_travels_with_them() -> None:
+    evaluator = Evaluator(build(prb.Reweighted(POINTS))[0])
+    other = evaluator.observing({"y": OBSERVED + 1})
+    thetas = evaluator.prior_thetas(5, 1)
+    for one in (evaluator, other):
+        back = pickle.loads(pickle.dumps(one))
+        np.testing.assert_array_equal(back(thetas).discrepancies, one(thetas).discrepancies)
+        scales = np.ones(1)
+        expected = one.objective(prior=False, gradient=False)(thetas[0], scales)
+        assert back.objective(prior=False, gradient=False)(thetas[0], scales) == expected
+    assert other.model is evaluator.model
+    assert other.nodes[0].bound is evaluator.nodes[0].bound

@@ -1,0 +1,137 @@
+"""Every public thing travels by plain `pickle`: the table has to name all of them."""
+
+from __future__ import annotations
+
+import inspect
+import pickle
+from collections.abc import Callable
+from functools import cache
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from line_problem import build, line
+
+import prbayes as prb
+from prbayes.model.node import nodes
+
+QUIET: dict[str, Any] = {"progressbar": False}
+
+
+def public_classes() -> dict[str, type]:
+    found = {}
+    for name in prb.__all__:
+        value = getattr(prb, name)
+        inner = value.__all__ if isinstance(value, ModuleType) else ()
+        found |= {f"{name}.{each}": getattr(value, each) for each in inner} or {name: value}
+    return {name: value for name, value in found.items() if isinstance(value, type)}
+
+
+@cache
+def optimum() -> prb.Optimum:
+    return prb.minimize(build(prb.Reweighted(64), epsilon=None)[0], starts=0, **QUIET)
+
+
+@cache
+def posterior() -> xr.DataTree:
+    return prb.sample_smc(20, chains=2, model=optimum().model, optimum=optimum(), **QUIET)
+
+
+@cache
+def predicted() -> xr.DataArray:
+    (x,) = next(iter(nodes(optimum().model).values())).bound.inputs.aleatory
+    return prb.predict(optimum(), line, x, n_samples=50, **QUIET)
+
+
+@cache
+def surrogate() -> prb.Surrogate:
+    return prb.Surrogate.fit(np.square, {"x": (0, 1)}, 20, **QUIET).with_error()
+
+
+def target(metric: Any) -> Any:
+    return metric.against(np.arange(9.0))
+
+
+# What each public class makes; of those that are only derived from, one that is derived.
+MAKE: dict[str, Callable[[], Any]] = {
+    "AreaMetric": prb.AreaMetric,
+    "Diagnosis": lambda: prb.diagnose(optimum()),
+    "Fresh": lambda: prb.Fresh(8),
+    "FunctionMetric": lambda: prb.FunctionMetric(np.mean),
+    "GaussianKDE": lambda: prb.GaussianKDE(0.3),
+    "Histogram": lambda: prb.Histogram(9),
+    "KullbackLeibler": prb.KullbackLeibler,
+    "LogLikelihood": prb.LogLikelihood,
+    "Metric": lambda: prb.ProbabilityResidual(density=prb.Histogram(4)),
+    "Optimum": optimum,
+    "ProbabilityResidual": prb.ProbabilityResidual,
+    "Report": lambda: prb.Report("A beam", optimum=optimum().to_datatree()),
+    "Resimulated": lambda: prb.Resimulated(8),
+    "Reweighted": lambda: prb.Reweighted(64, on_failure=prb.response.Replace()),
+    "Surrogate": surrogate,
+    "abc_distance": lambda: prb.abc_distance(prb.AreaMetric()),
+    "metrics.DensityDiscrepancy": lambda: target(prb.KullbackLeibler()),
+    "metrics.DensityEstimator": lambda: prb.Histogram(4),
+    "metrics.Discrepancy": lambda: target(prb.AreaMetric()),
+    "metrics.Minimum": lambda: prb.metrics.Minimum.QUADRATIC,
+    "posterior.Affine": lambda: prb.posterior.Affine(50),
+    "propagation.DesignError": lambda: prb.propagation.DesignError("y: too thin"),
+    "propagation.Propagation": lambda: prb.Fresh(16),
+    "reports.Section": lambda: prb.reports.Section("A title"),
+    "response.Abort": prb.response.Abort,
+    "response.BudgetError": lambda: prb.response.BudgetError("max_seconds = 1 was reached"),
+    "response.Replace": lambda: prb.response.Replace(1.0),
+    "response.ResponseError": lambda: prb.response.ResponseError("y: it raised"),
+    "response.Retry": lambda: prb.response.Retry(2),
+    "response.StoreError": lambda: prb.response.StoreError("y: store"),
+    "scalar": lambda: prb.scalar(abs),
+    "surrogate.CrossValidation": lambda: surrogate().error,
+    "surrogate.Polynomial": lambda: prb.surrogate.Polynomial(3),
+    "surrogate.RadialBasis": prb.surrogate.RadialBasis,
+    "surrogate.Surface": prb.surrogate.RadialBasis,
+    "validation.ExactModel": prb.validation.ExactModel,
+    "validation.JointNull": lambda: prb.validation.JointNull(optimum(), replicates=19),
+    "validation.PosteriorNull": lambda: prb.validation.PosteriorNull(19),
+    "validation.ValidityTest": lambda: prb.area_test([1.0, 1.5, 2.0], predicted(), **QUIET),
+}
+# What is at work inside a model, and goes with it.
+INSIDE = {"posterior.BatchedKernel", "propagation.Bound"}
+RESULTS: dict[str, Callable[[], Any]] = {
+    "calibrate_epsilon": lambda: prb.calibrate_epsilon(optimum()),
+    "sample_smc": posterior,
+    "predict": predicted,
+    "bootstrap": lambda: prb.bootstrap(optimum(), 10, **QUIET),
+    "compare": lambda: prb.compare({"optimum": optimum(), "ABC": posterior()}),
+    "cross_validate": lambda: prb.cross_validate(optimum(), **QUIET),
+    "sampling": lambda: optimum().sampling(),
+    "to_datatree": lambda: optimum().to_datatree(),
+}
+
+
+def test_the_table_has_all_public_classes() -> None:
+    assert set(MAKE) | INSIDE | {"response.Store"} == set(public_classes())
+
+
+@pytest.mark.parametrize("name", MAKE | RESULTS)
+def test_it_comes_back_from_plain_pickle(name: str) -> None:
+    made = (MAKE | RESULTS)[name]()
+    back = pickle.loads(pickle.dumps(made))
+    assert type(back) is type(made)
+    if isinstance(made, xr.DataTree | xr.Dataset | xr.DataArray):
+        assert back.identical(made)
+    elif "at 0x" not in repr(made):
+        assert repr(back) == repr(made)
+
+
+def test_functions_travel_by_their_names() -> None:
+    functions = [getattr(prb, name) for name in prb.__all__]
+    for function in filter(inspect.isfunction, functions):
+        assert pickle.loads(pickle.dumps(function)) is function
+
+
+def test_a_store_travels_without_what_it_has_open(tmp_path: Any) -> None:
+    store = prb.response.Store(tmp_path, "y", 1)
+    store.add(np.array([[1.0]]), np.array([2.0]))
+    assert len(pickle.loads(pickle.dumps(store))) == 1
