@@ -6,6 +6,7 @@ not. Numba is PyTensor's default backend, so it is there.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cache, update_wrapper
 
@@ -43,14 +44,15 @@ def count(
     equal: bool,
     low: float,
     inverse: float,
+    before: int,
     counts: Floats,
     outside: Floats,
 ) -> None:
     """Add weights at the nodes of a grid, spread by cubic B-splines, and those outside it.
 
-    Node k is at ``(low + k) / inverse``. The sample has shape (rows, n), the counts (rows, g),
-    ``outside`` (rows, 2); the weights are flat, and only the first counts if they are equal. NaN
-    counts nowhere.
+    Node k is at ``(low + k - before) / inverse``. The sample has shape (rows, n), the counts (rows,
+    g), ``outside`` (rows, 2); the weights are flat, and only the first counts if they are equal.
+    NaN counts nowhere.
     """
     rows, n = sample.shape
     g = counts.shape[1]
@@ -60,15 +62,15 @@ def count(
         for i in range(n):
             t = sample[r, i] * inverse - low
             w = weights[0] if equal else weights[r * n + i]
-            if 1 <= t < g - 2:
-                node = int(t)
-                t -= node
+            if 1 - before <= t < g - 2 - before:
+                left = math.floor(t)
+                t -= left
                 for power in range(4):
-                    moments[node, power] += w
+                    moments[left + before, power] += w
                     w *= t
-            elif t < 1:
+            elif t < 1 - before:
                 outside[r, 0] += w
-            elif t >= g - 2:
+            elif t >= g - 2 - before:
                 outside[r, 1] += w
         # Four splines reach these values: the nodes around them get their shares.
         for node in range(1, g - 2):
@@ -81,30 +83,43 @@ def count(
 
 
 @_compiled
-def smooth(values: Floats, kernel: Floats, out: Floats) -> None:
-    """Add the convolution of rows, zero beyond their ends, with a kernel to ``out``, (rows, g)."""
+def smooth(values: Floats, kernel: Floats, first_at: int, out: Floats) -> None:
+    """Add the convolution of rows, zero beyond their ends, with a kernel to ``out``.
+
+    The rows have shape (rows, g), ``out`` (rows, m); the first of g stands at ``first_at`` among
+    the m, which may be before or behind them all.
+    """
     rows, g = values.shape
+    m = out.shape[1]
     half = len(kernel) // 2
     for r in range(rows):
         for node in range(g):
             value = values[r, node]
-            if value != 0:
-                first = max(0, node - half)
-                last = min(g, node + half + 1)
+            at = node + first_at
+            first = max(0, at - half)
+            last = min(m, at + half + 1)
+            if value != 0 and first < last:
                 target = out[r, first:last]
-                weights = kernel[first - node + half :]
+                weights = kernel[first - at + half :]
                 for k in range(last - first):
                     target[k] += value * weights[k]
 
 
 @_compiled
 def read(
-    sample: Floats, coefficients: Floats, outside: Floats, low: float, inverse: float, out: Floats
+    sample: Floats,
+    coefficients: Floats,
+    outside: Floats,
+    low: float,
+    inverse: float,
+    before: int,
+    out: Floats,
 ) -> None:
     """Evaluate piecewise cubics at a sample, shape (1 or rows, n), into ``out``, shape (rows, n).
 
-    The coefficients of 1, t, t^2, t^3 beyond each node have shape (rows, g, 4); values below and
-    above the grid get those of ``outside``, shape (rows, 2), and NaN gets zero.
+    The coefficients of 1, t, t^2, t^3 beyond each node, which are those of `count`, have shape
+    (rows, g, 4); values below and above the grid get those of ``outside``, shape (rows, 2), and NaN
+    gets zero.
     """
     rows, n = out.shape
     g = coefficients.shape[1]
@@ -112,16 +127,16 @@ def read(
         values = sample[r % len(sample)]
         for i in range(n):
             t = values[i] * inverse - low
-            if 1 <= t < g - 2:
-                node = int(t)
-                t -= node
-                c = coefficients[r, node]
+            if 1 - before <= t < g - 2 - before:
+                left = math.floor(t)
+                t -= left
+                c = coefficients[r, left + before]
                 value = c[2] + t * c[3]
                 value = c[1] + t * value
                 out[r, i] = c[0] + t * value
-            elif t < 1:
+            elif t < 1 - before:
                 out[r, i] = outside[r, 0]
-            elif t >= g - 2:
+            elif t >= g - 2 - before:
                 out[r, i] = outside[r, 1]
             else:
                 out[r, i] = 0.0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -81,7 +82,10 @@ class Cells(ABC):
 class KernelCells(Cells):
     """Nodes of a regular grid; mass outside counts as one tight cluster on either side.
 
-    The cluster is a single kernel, which is where that mass is most conspicuous.
+    The cluster is a single kernel, which is where that mass is most conspicuous. A value's kernel
+    is divided between grid and cluster where the grid ends, so that all is smooth in the values
+    there as well. The sample is binned on some nodes more than the grid has: those that kernels
+    reach from.
     """
 
     bandwidth: float  # standard deviation of the kernel, in units of the response
@@ -93,11 +97,33 @@ class KernelCells(Cells):
         """Return the position of the first node, in steps."""
         return float(self.centers[0] / self.step)
 
+    @property
+    def _before(self) -> int:
+        """Return how many nodes before the first, and behind the last, values are binned on.
+
+        From farther out a kernel reaches no node, whichever of four its spline brings it to.
+        """
+        return self.kernel.size // 2 + 2
+
+    @cached_property
+    def _beyond(self) -> Floats:
+        """Return which part of a kernel at each node that values are binned on is off the grid.
+
+        Below and above, shape (2, g + 2 before).
+        """
+        at = np.arange(self.centers.size + 2 * self._before) - self._before
+        # The mass of a kernel up to each of its nodes, and none before the first of them.
+        mass = np.concatenate([[0.0], np.cumsum(self.kernel * self.step)])
+        half = self.kernel.size // 2
+        below = mass[np.clip(half - at, 0, mass.size - 1)]
+        return np.stack([below, below[::-1]])
+
     def density(self, sample: Floats, weights: Floats) -> Floats:
         """Return densities at the nodes, then mass below and above divided by a cluster's width."""
         *batch, n = sample.shape
         rows = int(np.prod(batch, dtype=int))
         nodes = self.centers.size
+        before = self._before
         # Equal weights, the usual case, are passed as a single number.
         equal = _are_equal(weights)
         each = weights if equal else np.broadcast_to(weights, sample.shape)
@@ -105,27 +131,29 @@ class KernelCells(Cells):
         # Bin the sample on the grid.
         values = np.ascontiguousarray(sample, dtype=np.float64)
         values = values.reshape(rows, n)
-        counts = np.zeros((rows, nodes))
+        counts = np.zeros((rows, nodes + 2 * before))
         outside = np.zeros((rows, 2))
-        count(values, each, equal, self._low, 1 / self.step, counts, outside)
-        # Smooth what the grid holds.
-        inner = self._smooth(counts)
+        count(values, each, equal, self._low, 1 / self.step, before, counts, outside)
+        # Smooth what is binned, within the grid and beyond its ends.
+        inner = np.zeros((rows, nodes))
+        smooth(counts, self.kernel, -before, inner)
+        for side, beyond in enumerate(self._beyond):
+            reached = np.flatnonzero(beyond)
+            part = slice(reached[0], reached[-1] + 1)
+            outside[:, side] += (counts[:, part] * beyond[part]).sum(axis=-1)
         outer = outside / self.widths[-1]
         density = np.concatenate([inner, outer], axis=-1)
         return density.reshape(*batch, nodes + 2)
 
-    def _smooth(self, values: Floats) -> Floats:
-        """Return the convolution with the kernel of values at the nodes, shape (..., g)."""
-        rows = np.ascontiguousarray(values).reshape(-1, self.centers.size)
-        out = np.zeros_like(rows)
-        smooth(rows, self.kernel, out)
-        return out.reshape(values.shape)
-
     def _reading(self, points: Floats, weights: Floats) -> Floats:
-        """Return cubic convolution weights (Keys 1981), which are exact for parabolas."""
+        """Return cubic convolution weights (Keys 1981), which are exact for parabolas.
+
+        Points off the grid are read at the cell of the mass on their side.
+        """
         # Where the points are: a node, and a fraction of a step beyond it.
         t = points / self.step - self._low
         last = self.centers.size - 2
+        below, above = t < 1, t >= last
         inside = (t >= 1) & (t < last)
         t = np.where(inside, t, 1.0)
         node = t.astype(np.intp)
@@ -143,6 +171,8 @@ class KernelCells(Cells):
         for k, share in enumerate(keys):
             at = node - 1 + k
             each[row, at] += np.where(inside, share, 0.0)
+        each[below, -2] = 1.0
+        each[above, -1] = 1.0
         return product(weights, each)
 
     def value(self, sample: Floats, cotangent: Floats) -> Floats:
@@ -176,8 +206,8 @@ class KernelCells(Cells):
         batch = np.broadcast_shapes(sample.shape[:-1], cotangent.shape[:-1])
         rows = int(np.prod(batch, dtype=int))
         n = sample.shape[-1]
-        nodes = self.centers.size
-        smoothed = self._smooth(cotangent[..., :-2])
+        smoothed = self._spread(cotangent)
+        nodes = smoothed.shape[-1]
         smoothed = np.broadcast_to(smoothed, (*batch, nodes))
         cubics = _cubics(smoothed.reshape(rows, nodes), spline)
         # Values that all rows share are passed once.
@@ -188,8 +218,23 @@ class KernelCells(Cells):
         ends = np.broadcast_to(outer, (*batch, 2))
         ends = np.ascontiguousarray(ends.reshape(rows, 2))
         out = np.empty((rows, n))
-        read(values, cubics, ends, self._low, 1 / self.step, out)
+        read(values, cubics, ends, self._low, 1 / self.step, self._before, out)
         return out.reshape(*batch, n)
+
+    def _spread(self, cotangent: Floats) -> Floats:
+        """Return what a unit at each node that values are binned on adds to a sum over the density.
+
+        The transpose of the smoothing, shapes (..., g + 2) -> (..., g + 2 before).
+        """
+        nodes = self.centers.size
+        inner = np.ascontiguousarray(cotangent[..., :nodes]).reshape(-1, nodes)
+        spread = np.zeros((len(inner), nodes + 2 * self._before))
+        smooth(inner, self.kernel, self._before, spread)
+        outer = cotangent[..., -2:] / self.widths[-1]
+        spread = spread.reshape(*cotangent.shape[:-1], -1)
+        for side, beyond in enumerate(self._beyond):
+            spread = spread + outer[..., side, None] * beyond
+        return spread
 
 
 def _cubics(coefficients: Floats, spline: Floats) -> Floats:

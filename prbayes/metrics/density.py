@@ -99,7 +99,7 @@ class GaussianKDE(DensityEstimator):
     The sample is binned on a regular grid of four nodes per bandwidth, with cubic B-spline weights,
     and smoothed there; the kernel is narrowed by the spline's variance, so that the density's
     variance is exact, its error is of fourth order in the spacing, and it is twice differentiable
-    in the sample inside the grid.
+    in the sample, also where the grid ends.
 
     Parameters
     ----------

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from prbayes._checks import Floats, called, positive_integer
+from prbayes.estimate.conflict import least_probability, of_conflict, prior_probabilities
 from prbayes.estimate.data_sets import observed_set, simulated_sets
 from prbayes.estimate.goodness import of_another_family, probability_of_fit
 from prbayes.estimate.measured import drawn_in
@@ -73,6 +74,8 @@ class Adjusted:
     moved: float = np.nan
     # Of the data's distance from the best population, among data sets drawn there.
     fit_probability: float = np.nan
+    # Of estimates as far out as that of the data, among those that the prior leads to.
+    prior_probability: float = np.nan
     warnings: tuple[str, ...] = ()
 
     @property
@@ -94,6 +97,7 @@ class _Told:
     prior_mean: Floats  # (r,)
     prior_precision: Floats  # (r, r)
     fit_probability: float  # as in `Adjusted`
+    allowed: dict[str, float]  # by the prior, as `prior_probabilities` says
 
     def combined(self, shifts: Floats) -> tuple[Floats, Floats]:
         """Return the centre (r,) and covariance (r, r) that draws should have."""
@@ -199,7 +203,8 @@ class Affine:
         prior, _ = sampling.coordinates(draws)
         precision = _precision(prior, sampling.stderr.size)
         fit = probability_of_fit(sampling, center, sets, x, converged)
-        return _Told(center, shifts, prior.mean(axis=0), precision, fit)
+        allowed = prior_probabilities(sampling, center, shifts, self.random_seed)
+        return _Told(center, shifts, prior.mean(axis=0), precision, fit, allowed)
 
     def __call__(self, evaluator: Evaluator, thetas: Floats, optima: Sequence[Floats]) -> Adjusted:
         """Map draws of the pseudo-posterior, each mode by itself.
@@ -257,6 +262,8 @@ class Affine:
         center_error = max(found.center_error for found in mapped)
         width_error = max(found.width_error for found in mapped)
         moves = _moves(draws, out)
+        # Of several modes the one that the prior allows most.
+        allowed = max((found.allowed for found in mapped), key=least_probability)
         return Adjusted(
             out.reshape(thetas.shape),
             self._said(mapped, len(modes), len(draws)),
@@ -264,8 +271,10 @@ class Affine:
             width_error=width_error,
             moved=float(moves.max()),
             fit_probability=mapped[0].fit_probability,
+            prior_probability=least_probability(allowed),
             warnings=(
-                *_of_conflict(moves, evaluator.readable_names),
+                *of_conflict(allowed),
+                *_of_motion(moves, evaluator.readable_names),
                 *_of_noise(center_error, width_error, self.n_sets),
                 *of_another_family(mapped[0].fit_probability),
             ),
@@ -291,7 +300,8 @@ class Affine:
         out = transported(sampling, x, remainder, center, covariance)
         outside = drawn_in(x, _FAR) != x
         errors = told.errors(self.random_seed)
-        return _Mapped(out, int(outside.any(axis=1).sum()), *errors, told.fit_probability)
+        far = int(outside.any(axis=1).sum())
+        return _Mapped(out, far, *errors, told.fit_probability, told.allowed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,6 +313,7 @@ class _Mapped:
     center_error: float  # as in `Adjusted`
     width_error: float
     fit_probability: float
+    allowed: dict[str, float]  # as in `_Told`
 
 
 _UNADJUSTED = "the draws are not adjusted: {}; their width is epsilon's"
@@ -316,7 +327,7 @@ def _moves(before: Floats, after: Floats) -> Floats:
     return np.asarray(np.abs(shift) / narrower)
 
 
-def _of_conflict(moves: Floats, names: list[str]) -> list[str]:
+def _of_motion(moves: Floats, names: list[str]) -> list[str]:
     """Say so where the adjusted draws are elsewhere than those of the prior and epsilon."""
     apart = [i for i, move in enumerate(moves) if move > _APART]
     if not apart:

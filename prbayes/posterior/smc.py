@@ -114,8 +114,10 @@ def sample_smc(
         have ``adjustment_center_error`` and ``adjustment_width_error``, its Monte Carlo errors from
         the number of refits, in standard deviations of the draws and as a share of the width, for
         the worst direction; ``adjustment_moved``, how far it moved the medians, in standard
-        deviations, for the worst hyperparameter; and ``fit_probability``, how often data sets drawn
-        from the model at its minimiser are as far from their own fit as the data are.
+        deviations, for the worst hyperparameter; ``fit_probability``, how often data sets drawn
+        from the model at its minimiser are as far from their own fit as the data are; and
+        ``prior_probability``, how often estimates that the prior leads to are as far out as that of
+        the data.
 
     Raises
     ------
@@ -379,6 +381,7 @@ class _Draws:
             "adjustment_width_error": found.width_error,
             "adjustment_moved": found.moved,
             "fit_probability": found.fit_probability,
+            "prior_probability": found.prior_probability,
         }
 
 

@@ -180,3 +180,36 @@ def test_points_that_no_population_reaches_tell_nothing_of_it() -> None:
     found = information.area(*information.data_set, nowhere)
     assert (found.slopes == 0).all()
     assert (found.gaps <= 0).all()
+
+
+NARROW = prb.GaussianKDE(0.15)
+
+
+@pytest.mark.parametrize(
+    "metric",
+    [prb.LogLikelihood(NARROW), prb.KullbackLeibler(NARROW), prb.ProbabilityResidual(NARROW)],
+    ids=["ll", "kl", "pr"],
+)
+def test_responses_beyond_the_grid_leave_the_curvature_as_it_is(metric: prb.Metric) -> None:
+    """Two of a hundred are there; within a step of the differences some pass its end."""
+    spread = 0.8
+
+    def information(propagation: Any) -> Information:
+        observed = 1 + 0.5 * norm.ppf((np.arange(15) + 0.5) / 15)
+        with pm.Model() as model:
+            x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+            prb.Simulator(
+                "y", np.positive, x, metric=metric, observed=observed, propagation=propagation
+            )
+        return Information(Evaluator(model), 0, np.array([1.0, np.log(spread)]))
+
+    moved = information(prb.Resimulated(2048))
+    weighed = information(prb.Reweighted(1024))
+    size = 0.05 * np.abs(weighed.hessian).max()
+    np.testing.assert_allclose(moved.hessian, weighed.hessian, atol=size)
+    size = 0.05 * np.abs(weighed.sampling_covariance).max()
+    np.testing.assert_allclose(moved.sampling_covariance, weighed.sampling_covariance, atol=size)
+    if metric.likelihood:
+        # Of a normal population, which the kernel widens by a few per cent.
+        of_a_normal = np.diag([1 / spread**2, 2.0])
+        np.testing.assert_allclose(moved.hessian, of_a_normal, atol=0.3)

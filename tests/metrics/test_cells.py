@@ -68,6 +68,41 @@ def test_mass_outside_goes_to_the_last_two_cells_and_nan_nowhere(estimator: Any)
     assert (cells.density(np.full(3, NAN), np.full(3, 1 / 3)) == 0).all()
 
 
+# Places of values from the last node on, in bandwidths.
+BEYOND = [-7.5, -3.0, -0.4, 0.0, 0.6, 2.0, 5.0, 7.4, 9.0]
+
+
+@pytest.mark.parametrize("place", BEYOND)
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_kernel_is_divided_between_the_grid_and_the_mass_beyond_its_end(
+    place: float, side: int
+) -> None:
+    cells = kernel_cells()
+    last = cells.centers[-1] if side > 0 else cells.centers[0]
+    x = last + side * place * H
+    found = cells.density(np.array([x]), np.ones(1)) * cells.widths
+    np.testing.assert_allclose(found.sum(), 1, rtol=1e-11)
+    # The cell of the last node ends half a step behind it.
+    expected = norm.cdf(place - cells.step / (2 * H))
+    np.testing.assert_allclose(found[-1 if side > 0 else -2], expected, atol=1e-3)
+    exact = norm.pdf(cells.centers, x, H) * cells.step
+    np.testing.assert_allclose(found[:-2], exact, atol=3e-5 * norm.pdf(0) / H * cells.step)
+
+
+def test_all_is_twice_differentiable_where_values_cross_the_end_of_the_grid() -> None:
+    cells = kernel_cells()
+    e = 1e-2 * H
+    x = cells.centers[-1] + np.arange(-9 * H, 9 * H, e)
+    density = cells.density(x[:, None], np.ones(1))
+    # Of a kernel, and of its distribution function over the width of a cell.
+    steepest = np.r_[np.full(cells.centers.size, norm.pdf(0) / H**3), [0.25 / H**2] * 2]
+    steepest[-2:] /= cells.widths[-1]
+    second = np.diff(density, 2, axis=0) / e**2
+    assert (np.abs(second) < 1.03 * steepest).all()
+    third = np.diff(second, axis=0) / e
+    assert (np.abs(third) < 10 * steepest / H).all()
+
+
 @both
 @pytest.mark.parametrize("batch", [(1,), (3,), (2, 3), (2, 1, 3)])
 def test_batches_equal_a_loop(estimator: Any, batch: tuple[int, ...]) -> None:
@@ -110,6 +145,8 @@ def test_pullback_equals_finite_differences(estimator: Any, batch: tuple[int, ..
     rng = np.random.default_rng(8)
     x, w = draw(9, *batch, 8)
     x[..., :4] = -40.0, 50.0, INF, cells.centers[1] + 0.3 * cells.widths[0]
+    # Beyond the ends, where a kernel reaches back.
+    x[..., 4:6] = cells.centers[0] - 0.7 * H, cells.centers[-1] + 1.3 * H
     cotangent = rng.normal(size=(*batch, cells.widths.size))
     for_sample, for_weights = w * cells.slope(x, cotangent), cells.value(x, cotangent)
     assert for_sample.shape == for_weights.shape == x.shape
@@ -163,14 +200,16 @@ def test_kernel_reading_is_exact_up_to_parabolas(
     np.testing.assert_allclose(reading @ on_cells, w @ function(points), rtol=1e-10)
 
 
-def test_kernel_reading_of_a_gaussian_is_close_and_of_points_outside_is_zero() -> None:
+def test_kernel_reading_of_a_gaussian_is_close_and_points_outside_are_read_on_their_side() -> None:
     cells = kernel_cells()
     points, w = draw(2, 12)
     on_cells = np.r_[norm.pdf(cells.centers, 0.3, 1), 0, 0]
     np.testing.assert_allclose(
         cells.reading(points, w) @ on_cells, w @ norm.pdf(points, 0.3, 1), rtol=1e-3
     )
-    assert (cells.reading(np.array([-99.0, 99.0]), np.full(2, 0.5)) == 0).all()
+    outside = cells.reading(np.array([-99.0, 99.0]), np.array([0.2, 0.8]))
+    np.testing.assert_array_equal(outside[-2:], [0.2, 0.8])
+    assert (outside[:-2] == 0).all()
 
 
 def test_histogram_reading_is_the_mass_in_each_bin() -> None:

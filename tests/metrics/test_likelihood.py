@@ -63,3 +63,47 @@ def test_what_it_declares() -> None:
     assert LogLikelihood().additive
     assert LogLikelihood().density == GaussianKDE(likelihood_bandwidth)
     assert LogLikelihood().against([0.0, 1.0, 5.0]).scale == 1
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("far", [12.0, 60.0])
+def test_an_outlier_counts_alike_whether_it_was_there_at_first_or_in_a_refit(
+    side: float, far: float
+) -> None:
+    rng = np.random.default_rng(3)
+    observed = rng.normal(size=30)
+    simulated = rng.normal(size=2000)
+    with_outlier = np.append(observed, side * far)
+    metric = LogLikelihood(GaussianKDE(0.3))
+    inner = metric.against(observed)
+    refitted = inner.with_observed(with_outlier)
+    direct = metric.against(with_outlier)
+    # The floor is spread over grids of two lengths.
+    lengths = [d.cells.widths.sum() for d in (inner, direct)]
+    per_value = abs(np.log(lengths[1] / lengths[0])) / with_outlier.size
+    assert abs(refitted(simulated) - direct(simulated)) < per_value + 1e-4
+    # And not better than without it.
+    assert refitted(simulated) > inner(simulated) + 0.5
+    # From weights of stored values just the same.
+    basis = refitted.basis(simulated)
+    (features,) = refitted.from_basis(np.full(2000, 1 / 2000), basis, np)
+    np.testing.assert_allclose(refitted.outer(features, xp=np), refitted(simulated), rtol=1e-9)
+
+
+@pytest.mark.parametrize("spread", [0.7, 1.0, 1.4, 2.0])
+def test_no_value_beyond_the_grid_improves_the_likelihood(spread: float) -> None:
+    simulated = spread * norm.ppf((np.arange(2000) + 0.5) / 2000)
+    observed = norm.ppf((np.arange(20) + 0.5) / 20)
+    inner = LogLikelihood().against(observed)
+    assert isinstance(inner, LikelihoodDiscrepancy)
+    for far in inner.cells.centers[-1] + np.array([0.01, 1.0, 100.0]):
+        for value in (far, -far):
+            more = inner.with_observed(np.append(observed, value))
+            assert more(simulated) > inner(simulated)
+    # As a weight among those of other data sets.
+    values = np.append(observed, 99.0)
+    weights = np.stack([np.append(np.full(20, 1 / 20), 0.0), np.full(21, 1 / 21)])
+    several = inner.with_observed(values, weights)
+    without, within = several.of(simulated[None], np.full((1, 2000), 1 / 2000))
+    assert without == pytest.approx(inner(simulated), rel=1e-12)
+    assert within > without

@@ -46,9 +46,16 @@ def test_smoothing_is_a_convolution_that_sees_zero_beyond_the_ends(n: int) -> No
     values, kernel = rng.normal(size=(3, n)), rng.normal(size=7)
     values[1, ::2] = 0
     out = np.zeros_like(values)
-    loops.smooth(values, kernel, out)
+    loops.smooth(values, kernel, 0, out)
     expected = [np.convolve(row, kernel)[3:-3] for row in values]
     np.testing.assert_allclose(out, expected, rtol=1e-12, atol=1e-14)
+    # On fewer nodes, and on more, than the values have.
+    for first_at, size in ((-5, 4), (2, n + 9), (n + 50, 3), (-n - 50, 3)):
+        out = np.zeros((3, size))
+        loops.smooth(values, kernel, first_at, out)
+        wide = np.zeros((3, n + 400))
+        wide[:, 197 : 203 + n] = [np.convolve(row, kernel) for row in values]
+        np.testing.assert_allclose(out, wide[:, 200 - first_at :][:, :size], atol=1e-14)
 
 
 def test_results_do_not_depend_on_layout_or_permission_to_write() -> None:

@@ -690,8 +690,20 @@ def test_a_prior_in_conflict_with_the_data_is_said(
     assert said in str(prb.diagnose(idata))
 
 
+@pytest.mark.parametrize("name", ["area", slow("pr"), slow("kl"), slow("ll")])
+def test_a_prior_six_standard_deviations_off_is_said(name: str) -> None:
+    """Draws may be where the adjusted ones are: that alone would not tell."""
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", OBSERVED.mean() - 1.2, 0.2), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", same, x, metric=METRICS[name], observed=OBSERVED, propagation=R256)
+    idata = sample(model, 60)
+    assert idata.posterior.attrs["prior_probability"] < 0.01
+    assert "Prior and data contradict each other (mu)" in str(prb.diagnose(idata))
+
+
 @pytest.mark.parametrize("name", ["pr", "area", slow("kl"), slow("ll")])
 def test_a_prior_that_agrees_with_the_data_is_not(name: str) -> None:
     idata = sample(fit(name).model, optimum=fit(name))
     assert idata.posterior.attrs["adjustment_moved"] < 0.6
+    assert idata.posterior.attrs["prior_probability"] > 0.05
     assert prb.diagnose(idata).ok
