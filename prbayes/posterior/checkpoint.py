@@ -6,6 +6,7 @@ A run that was killed goes on where it stopped.
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 from pathlib import Path
@@ -67,11 +68,10 @@ class Checkpoint:
             "note": json.dumps(note),
         }
         data = xr.Dataset(variables, attrs=attributes)
-        data.attrs["digest"] = _digest(data)
         # Written beside and then renamed, so that the file is whole whenever the process ends.
         part = self.path.with_name(self.path.name + ".part")
         # Made in memory: HDF5 may end the process where the disk is full.
-        payload = data.to_netcdf(engine="h5netcdf")
+        payload = _sealed(bytes(data.to_netcdf(engine="h5netcdf")))
         try:
             with part.open("wb") as file:
                 file.write(payload)
@@ -93,12 +93,12 @@ class Checkpoint:
             written_in = int(data.attrs["prbayes_checkpoint"])
             problem = from_text(data.attrs["problem"])
             settings, note = (json.loads(data.attrs[key]) for key in ("settings", "note"))
-            sound = data.attrs["digest"] == _digest(data)
+        except _UnsealedError:
+            reason = "is damaged, or no checkpoint of this version: it does not end with its digest"
+            raise StoreError(self._refusal(reason)) from None
         except Exception as error:
             reason = f"cannot be read ({type(error).__name__}: {error})"
             raise StoreError(self._refusal(reason)) from error
-        if not sound:
-            raise StoreError(self._refusal("is damaged: its contents do not match their digest"))
         if written_in != _FORMAT:
             raise StoreError(self._refusal("was written by another version of prbayes"))
         other = differences(problem, self.problem, Level.RUN)
@@ -126,21 +126,26 @@ def stored_settings(path: str | os.PathLike[str]) -> dict[str, Any]:
         return {}
 
 
+class _UnsealedError(ValueError):
+    """A file that does not end with the digest of what comes before."""
+
+
+def _sealed(payload: bytes) -> bytes:
+    """Return a file's contents with their digest behind; netCDF allows of bytes behind its end."""
+    return payload + hashlib.sha256(payload).digest()
+
+
 def _loaded(path: str | os.PathLike[str]) -> xr.Dataset:
-    with xr.open_dataset(path, engine="h5netcdf") as data:
+    """Return what is in a file; HDF5, which may hang on a damaged one, sees sound ones only."""
+    content = Path(path).read_bytes()
+    size = hashlib.sha256().digest_size
+    payload = content[:-size]
+    if _sealed(payload) != content:
+        raise _UnsealedError
+    with xr.open_dataset(io.BytesIO(payload), engine="h5netcdf") as data:
         return data.load()
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:
     """Return what JSON makes of values, so that they compare equal to those that were read."""
     return dict(json.loads(json.dumps(values)))
-
-
-def _digest(data: xr.Dataset) -> str:
-    """Return the digest of all that a checkpoint holds."""
-    texts = [data.attrs[key] for key in ("problem", "settings", "note")]
-    total = hashlib.sha256("".join(texts).encode())
-    for name in sorted(map(str, data.data_vars)):
-        values = np.ascontiguousarray(data[name].values, dtype="<f8")
-        total.update(name.encode() + values.tobytes())
-    return total.hexdigest()

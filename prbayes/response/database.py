@@ -79,7 +79,7 @@ _FOREIGN = Complaint(
 )
 _FULL = Complaint(
     "which cannot grow",
-    "space on the disk",
+    "space on the disk, and within its quota and the largest size of a file",
     "all that was written before is kept: free some space and run again",
 )
 _LOCKED = Complaint(
@@ -94,6 +94,10 @@ _CLOSED = Complaint(
 )
 _COMPLAINTS = {
     sqlite3.SQLITE_FULL: _FULL,
+    sqlite3.SQLITE_IOERR_WRITE: _FULL,
+    sqlite3.SQLITE_IOERR_FSYNC: _FULL,
+    sqlite3.SQLITE_IOERR_TRUNCATE: _FULL,
+    sqlite3.SQLITE_IOERR_SHMSIZE: _FULL,
     sqlite3.SQLITE_BUSY: _LOCKED,
     sqlite3.SQLITE_LOCKED: _LOCKED,
     sqlite3.SQLITE_CANTOPEN: _CLOSED,
@@ -105,9 +109,9 @@ _COMPLAINTS = {
 
 def complaint_of(error: sqlite3.Error) -> Complaint:
     """Return what SQLite reported, and what to do; what is not known to be harmless is damage."""
+    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
     # These bits of an extended result code make its kind (https://www.sqlite.org/rescode.html).
-    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & 0xFF
-    known = _COMPLAINTS.get(code)
+    known = _COMPLAINTS.get(code) or _COMPLAINTS.get(code & 0xFF)
     if known is None:
         return damaged(f"{error!s:.200}")  # it may quote what is damaged
     return Complaint(f"{known.got} ({error})", known.expected, known.todo)

@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-import logging
-import os
-import signal
-import sys
 import threading
 import time
-from collections.abc import Iterator
 from concurrent.futures import (
     BrokenExecutor,
-    Executor,
     Future,
-    ProcessPoolExecutor,
     ThreadPoolExecutor,
 )
-from contextlib import contextmanager
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hostile import ENDING, EXECUTORS, REASONS, hostile
 
 import prbayes as prb
 from prbayes.response.calling import Calling, Points, Tally, respond
@@ -40,96 +32,10 @@ def by_input(tally: Tally) -> dict[float, str]:
     return {float(f.inputs[0]): f.reason for f in tally.failed.values()}
 
 
-# -- the executors, as they are --------------------------------------------------------------------
-
-
-@contextmanager
-def processes() -> Iterator[Executor]:
-    context = get_context("forkserver")
-    # Workers are forked from a process that has imported already what takes long.
-    context.set_forkserver_preload(["prbayes.response.calling", "cloudpickle"])
-    with ProcessPoolExecutor(2, context) as pool:
-        yield pool
-
-
-@contextmanager
-def loky() -> Iterator[Executor]:
-    loky = pytest.importorskip("joblib.externals.loky")
-    pool = loky.get_reusable_executor(2)
-    yield pool
-    pool.shutdown(wait=True, kill_workers=True)
-
-
-@contextmanager
-def dask() -> Iterator[Executor]:
-    distributed = pytest.importorskip("distributed")
-    where: dict[str, Any] = {"host": "127.0.0.1", "dashboard_address": None}
-    cluster = distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, silence_logs=logging.CRITICAL, **where
-    )
-    with cluster, distributed.Client(cluster) as client:
-        yield client.get_executor(pure=False)
-
-
-@contextmanager
-def threads() -> Iterator[Executor]:
-    with ThreadPoolExecutor(2) as pool:
-        yield pool
-
-
-@contextmanager
-def nothing() -> Iterator[None]:
-    yield None
-
-
-EXECUTORS = {f.__name__: f for f in (nothing, threads, processes, loky, dask)}
-
-
 # -- hostile responses -----------------------------------------------------------------------------
 
-
-def hostile(x: float) -> Any:
-    """Return 2 x, but at some points."""
-    if x == 1:
-        raise ArithmeticError("too steep")
-    if x == 2:
-        return np.nan
-    if x == 3:
-        sys.exit("bye")
-    if x == 4:
-        raise ValueError("long, \0 and \ud800 " + 10_000_000 * "x")
-    if x == 5:
-        return "text"
-    if x == 6:
-        os._exit(3)
-    if x == 7:
-        os.kill(os.getpid(), signal.SIGKILL)
-    if x == 8:
-        spin()
-    if x == 9:
-        time.sleep(600)
-    return 2 * x
-
-
-def spin() -> None:
-    while True:
-        pass
-
-
-REASONS = {
-    1: "it raised ArithmeticError: too steep",
-    2: "it is NaN",
-    3: "it raised SystemExit: bye",
-    4: "it raised ValueError: long, \\0 and \\ud800 xxx",
-    5: "it raised ValueError: could not convert string to float: 'text'",
-    6: "it ended its worker (",
-    7: "it ended its worker (",
-    8: "it raised TimeoutError: no result within timeout = 0.4 s",
-    9: "it ",  # a signal ends a sleep, where there is one
-}
-# Points of the table that end the process, which nothing survives that runs in it; and those that hang.
-ENDING = (6, 7, 8, 9)
 SLOW = pytest.mark.slow
+NEEDED = {"loky": "joblib.externals.loky", "dask": "distributed"}
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
@@ -141,6 +47,9 @@ def test_hostile_responses_cost_their_points(
     where: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     safe = where in ("nothing", "threads")
+    limit = 6.0 if where == "dask" else 0.4
+    if where in NEEDED:
+        pytest.importorskip(NEEDED[where])
     n, points = 16, line(16)
     if safe:
         points = Points([np.delete(np.arange(float(n)), ENDING)], [True])
@@ -155,7 +64,7 @@ def test_hostile_responses_cost_their_points(
             executor,
             store,
             Replace(-1.0),
-            timeout=None if safe else 0.4,
+            timeout=None if safe else limit,
         )
         found = respond(calling, points, tally)
         np.testing.assert_array_equal(found, expected)
@@ -340,7 +249,7 @@ def test_a_cluster_that_is_closed_is_an_error_and_no_hang(what: str) -> None:
         time.sleep(0.2)
         return 2 * x
 
-    with dask() as executor:
+    with EXECUTORS["dask"]() as executor:
         client = executor._client  # type: ignore[attr-defined]
         closing = threading.Timer(1.0, getattr(client, what, client).close)
         closing.start()

@@ -1,0 +1,27 @@
+"""Attacks on what is on disk: it is found again bit by bit, or refused with a sentence."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from attacks import ATTACKS, allowed
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_a_few_of_each_attack_are_survived(name: str, tmp_path: Path) -> None:
+    attack, n = ATTACKS[name]
+    found = Counter(attack(tmp_path, np.random.default_rng(3), n))
+    assert found.total() == n
+    assert set(found) <= allowed(name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ATTACKS)
+def test_many_of_each_attack_are_survived(name: str, tmp_path: Path) -> None:
+    attack, n = ATTACKS[name]
+    found = Counter(attack(tmp_path, np.random.default_rng(4), 20 * n))
+    assert found.total() == 20 * n
+    assert set(found) <= allowed(name)
