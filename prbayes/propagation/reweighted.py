@@ -32,11 +32,22 @@ from prbayes.propagation.base import (
     refuse_max_lost,
     refuse_nested,
 )
-from prbayes.propagation.edges import averaged_log_density, cells_around, moving_inputs
+from prbayes.propagation.edges import (
+    averaged_log_density,
+    cells_around,
+    moving_inputs,
+    refuse_moving_atoms,
+)
 from prbayes.propagation.ops import OpaqueOp
 from prbayes.propagation.points import base_points
 from prbayes.response.compilation import compile_batched
-from prbayes.response.distributions import PopulationSampler, log_density, prior_draws, quantiles
+from prbayes.response.distributions import (
+    PopulationSampler,
+    log_density,
+    prior_draws,
+    quantiles,
+    refuse_without_density,
+)
 from prbayes.response.inputs import Inputs
 from prbayes.response.response import Responses
 
@@ -126,6 +137,7 @@ class Reweighted(Propagation):
                 "stored responses cannot be reweighted; use propagation=prb.Resimulated()"
             )
         refuse_nested(name, inputs)
+        refuse_without_density(name, inputs)
         if not target.metric.takes_weights:
             raise TypeError(
                 f"{name}: a metric that takes no weights cannot be used with prb.Reweighted; "
@@ -422,6 +434,7 @@ class Design(Bound):
             rng = np.random.default_rng(seed)
             draws, _ = PopulationSampler(self.inputs)(at, 1, rng)
             points = [x[:, 0] for x in draws]
+        refuse_moving_atoms(self.name, self.inputs, points, which)
         counts = np.bincount(which, minlength=k).astype(float)
         return points, counts
 
