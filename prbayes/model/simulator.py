@@ -62,7 +62,9 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         ``response(*inputs)``, a NumPy-style function: one array per input, any leading batch shape,
         a multivariate input with its event axis last; returns an array of the batch shape, in units
         of the observed values. NaN is a point at which it could not be computed, +inf a specimen
-        that failed.
+        that failed. It is a function of its inputs: where these repeat, as discrete ones do, a
+        design computes it once, unless four that are computed again differ. Scatter of its own is
+        best an input, as ``pm.Normal.dist(0, 1)``.
     *inputs
         Each is a ``.dist()`` (aleatory: varies between specimens), a model variable (epistemic:
         common to all specimens) or a constant. The same ``.dist()`` in two simulators means the

@@ -49,6 +49,7 @@ from prbayes.response.distributions import (
     refuse_without_density,
 )
 from prbayes.response.inputs import Inputs
+from prbayes.response.repeats import Known, once_each
 from prbayes.response.response import Responses
 
 _log = logging.getLogger("prbayes")
@@ -325,8 +326,10 @@ class Design(Bound):
         before = [pair for pair in self._others if responses.same_as(pair[0])]
         known = before[0][1] if before else np.empty(0)
         if known.size < self.n_points:
-            missing = [p[known.size :] for p in self.points_of(responses.inputs)]
-            known = np.concatenate([known, responses(missing, [])])
+            points = self.points_of(responses.inputs)
+            missing = [p[known.size :] for p in points]
+            more = once_each(responses, missing, Known(points, known))
+            known = np.concatenate([known, more])
             # Instead of the fewer that were known before.
             if before:
                 self._others.remove(before[0])
@@ -392,7 +395,9 @@ class Design(Bound):
                 if all(map(np.array_equal, known, points)):
                     self.responses.find(len(points[0]))
                     return before.values[rows]
-        return self.responses(points, [])
+        stored = self._stored
+        known = None if stored is None else Known(stored.points, stored.values)
+        return once_each(self.responses, points, known)
 
     def _refuse_other_data(self) -> None:
         """Raise if data above the inputs were set anew: old points are of other populations."""

@@ -89,6 +89,8 @@ class Responses:
     ----------
     count : int
         Scalar responses that were needed so far, whether computed here or found in the store.
+    scatters : bool or None
+        Whether the response has different values at the same point; None while it is not known.
     """
 
     def __init__(
@@ -117,6 +119,7 @@ class Responses:
             and not isinstance(function, scalar)
         )
         self.count = 0
+        self.scatters: bool | None = None
         self._found = 0
         self._calling = Calling(name, function, executor, kept, policy, retry_failed, timeout)
         self._tally = Tally()
