@@ -181,6 +181,7 @@ class Mark:
 
     batches: Batches
     shared: tuple[Any, ...]  # what its compiled graphs read
+    runs: tuple[Any, ...]  # what other designs of the response may take from it
 
 
 class Design(Bound):
@@ -387,7 +388,7 @@ class Design(Bound):
         return float(np.median(of_these))
 
     def _responses_at(self, points: Sequence[Floats]) -> Floats:
-        """Return the responses at points, which are known where a batch of them was taken back."""
+        """Return the responses at points: none is computed that this or another design had."""
         before = self._taken_back
         if before is not None:
             for rows in before.rows():
@@ -395,9 +396,16 @@ class Design(Bound):
                 if all(map(np.array_equal, known, points)):
                     self.responses.find(len(points[0]))
                     return before.values[rows]
+        runs = self.responses.runs
+        shared = runs.at(points)
+        if shared is not None:
+            self.responses.find(shared.size)
+            return shared
         stored = self._stored
-        known = None if stored is None else Known(stored.points, stored.values)
-        return once_each(self.responses, points, known)
+        own = None if stored is None else Known(stored.points, stored.values)
+        values = once_each(self.responses, points, own)
+        runs.stored.append((list(points), values))
+        return values
 
     def _refuse_other_data(self) -> None:
         """Raise if data above the inputs were set anew: old points are of other populations."""
@@ -536,12 +544,15 @@ class Design(Bound):
 
     def mark(self) -> Mark:
         """Return what brings the design back to what it is now."""
-        return Mark(self.batches, tuple(s.get_value() for s in self._shared))
+        runs = tuple(self.responses.runs.stored)
+        return Mark(self.batches, tuple(s.get_value() for s in self._shared), runs)
 
     def go_back(self, mark: Mark, *, remember: bool = False) -> None:
         """Forget the batches since a mark; their responses may be remembered for the next time."""
         if remember:
             self._taken_back = self.batches
+        else:
+            self.responses.runs.stored[:] = mark.runs
         self._stored = mark.batches
         kept = [(responses, known[: self.n_points]) for responses, known in self._others]
         self._others = deque(kept, maxlen=self._others.maxlen)
