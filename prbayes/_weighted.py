@@ -122,7 +122,8 @@ def quantile(values: Floats, weights: Floats, probability: ArrayLike) -> Floats:
 
 
 def _quantiles_of_row(values: Floats, weights: Floats, levels: Floats) -> Floats:
-    order = np.argsort(values, kind="stable")
+    # Of equal values the lightest first: where they stand does not matter.
+    order = np.lexsort((weights, values))
     ascending = weights[order]
     middles = np.cumsum(ascending) - 0.5 * ascending
     return np.interp(levels, middles, values[order])

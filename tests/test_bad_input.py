@@ -311,12 +311,12 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "Resimulated discrete": (
         simulator(inputs=only(lambda m, s: pm.Poisson.dist(s)), propagation=SMALL[1]),
         TypeError,
-        r"y: poisson.* is discrete; use propagation=prb.Reweighted\(\) or prb.Fresh\(\)",
+        r"y: got poisson.* is discrete, expected .*; use propagation=prb.Reweighted\(\) or prb.Fresh\(\)",
     ),
     "Resimulated without icdf": (
         simulator(inputs=only(lambda m, s: pm.VonMises.dist(m, s)), propagation=SMALL[1]),
         TypeError,
-        r"y: vonmises.* no inverse distribution function .*; use propagation=prb.Reweighted\(\) or prb.Fresh\(\)",
+        r"y: got vonmises.* no inverse distribution function .*; use propagation=prb.Reweighted\(\) or prb.Fresh\(\)",
     ),
     **{
         f"{type(p).__name__} nested": (

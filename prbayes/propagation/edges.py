@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
+from numpy.typing import NDArray
 from pymc.distributions.censored import CensoredRV
 from pytensor.tensor.variable import TensorVariable
 
@@ -25,6 +26,10 @@ from prbayes.response.inputs import Inputs
 # Probability of a cell below which it is the density at the point times the width: the difference
 # of two distribution functions, each rounded to 1e-16, has lost half of its digits there.
 _RESOLVED = 1e-8
+# Share of points with values that only their own population has, and number of these values, above
+# which they are no accident: continuous ones meet by rounding, far out.
+_NO_ROUNDING = 0.01
+_FEW = 8
 
 
 @dataclass(frozen=True)
@@ -104,11 +109,52 @@ def _require_distribution_function(name: str, dist: TensorVariable) -> None:
 def _refuse_atoms(name: str, dist: TensorVariable) -> None:
     """Refuse bounds that have probability themselves, and move."""
     if isinstance(dist.owner.op, CensoredRV):
-        raise TypeError(
-            f"{name}: got {dist.owner.op} with bounds that move with its hyperparameters and have "
-            "probability themselves, which no stored point has at other hyperparameters, expected "
-            "bounds that stay; use propagation=prb.Resimulated() or prb.Fresh()"
-        )
+        raise TypeError(_moving_atoms(name, dist, "bounds"))
+
+
+def _moving_atoms(name: str, dist: TensorVariable, what: str) -> str:
+    return (
+        f"{name}: got {dist.owner.op} with {what} that move with its hyperparameters and have "
+        f"probability themselves, which no stored point has at other hyperparameters, expected "
+        f"{what} that stay; use propagation=prb.Resimulated() or prb.Fresh()"
+    )
+
+
+def refuse_moving_atoms(
+    name: str, inputs: Inputs, points: Sequence[Floats], which: NDArray[np.intp]
+) -> None:
+    """Refuse continuous inputs that have values with probability themselves, which move.
+
+    A value that comes again and again, but from one population only, is such a one.
+
+    Parameters
+    ----------
+    name : str
+        The simulator's, for messages.
+    inputs : Inputs
+    points : sequence of ndarray, shapes (n, *event)
+        Of each aleatory input.
+    which : ndarray, shape (n,)
+        The population that each point was drawn from.
+    """
+    for dist, x in zip(inputs.aleatory, points, strict=True):
+        if not dist.dtype.startswith("float"):
+            continue  # one whose support moves is refused, and in others no value does
+        for column in x.reshape(len(x), -1).T:
+            if _share_of_own_atoms(column, which) > _NO_ROUNDING:
+                raise TypeError(_moving_atoms(name, dist, "values"))
+
+
+def _share_of_own_atoms(column: Floats, which: NDArray[np.intp]) -> float:
+    """Return the share of points whose value comes again, and from one population only.
+
+    Zero if these are of few populations.
+    """
+    _, value, repeated = np.unique(column, return_inverse=True, return_counts=True)
+    pairs = np.unique(value * (which.max() + 1) + which)
+    n_populations = np.bincount(pairs // (which.max() + 1))
+    own = (repeated > 1) & (n_populations == 1)
+    return float(repeated[own].sum() / column.size) if own.sum() >= _FEW else 0.0
 
 
 def cells_around(points: Floats, reach: int) -> Cells:

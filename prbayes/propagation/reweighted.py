@@ -32,12 +32,24 @@ from prbayes.propagation.base import (
     refuse_max_lost,
     refuse_nested,
 )
-from prbayes.propagation.edges import averaged_log_density, cells_around, moving_inputs
+from prbayes.propagation.edges import (
+    averaged_log_density,
+    cells_around,
+    moving_inputs,
+    refuse_moving_atoms,
+)
 from prbayes.propagation.ops import OpaqueOp
 from prbayes.propagation.points import base_points
 from prbayes.response.compilation import compile_batched
-from prbayes.response.distributions import PopulationSampler, log_density, prior_draws, quantiles
+from prbayes.response.distributions import (
+    PopulationSampler,
+    log_density,
+    prior_draws,
+    quantiles,
+    refuse_without_density,
+)
 from prbayes.response.inputs import Inputs
+from prbayes.response.repeats import Known, once_each
 from prbayes.response.response import Responses
 
 _log = logging.getLogger("prbayes")
@@ -126,6 +138,7 @@ class Reweighted(Propagation):
                 "stored responses cannot be reweighted; use propagation=prb.Resimulated()"
             )
         refuse_nested(name, inputs)
+        refuse_without_density(name, inputs)
         if not target.metric.takes_weights:
             raise TypeError(
                 f"{name}: a metric that takes no weights cannot be used with prb.Reweighted; "
@@ -168,6 +181,7 @@ class Mark:
 
     batches: Batches
     shared: tuple[Any, ...]  # what its compiled graphs read
+    runs: tuple[Any, ...]  # what other designs of the response may take from it
 
 
 class Design(Bound):
@@ -313,8 +327,10 @@ class Design(Bound):
         before = [pair for pair in self._others if responses.same_as(pair[0])]
         known = before[0][1] if before else np.empty(0)
         if known.size < self.n_points:
-            missing = [p[known.size :] for p in self.points_of(responses.inputs)]
-            known = np.concatenate([known, responses(missing, [])])
+            points = self.points_of(responses.inputs)
+            missing = [p[known.size :] for p in points]
+            more = once_each(responses, missing, Known(points, known))
+            known = np.concatenate([known, more])
             # Instead of the fewer that were known before.
             if before:
                 self._others.remove(before[0])
@@ -372,7 +388,7 @@ class Design(Bound):
         return float(np.median(of_these))
 
     def _responses_at(self, points: Sequence[Floats]) -> Floats:
-        """Return the responses at points, which are known where a batch of them was taken back."""
+        """Return the responses at points: none is computed that this or another design had."""
         before = self._taken_back
         if before is not None:
             for rows in before.rows():
@@ -380,7 +396,16 @@ class Design(Bound):
                 if all(map(np.array_equal, known, points)):
                     self.responses.find(len(points[0]))
                     return before.values[rows]
-        return self.responses(points, [])
+        runs = self.responses.runs
+        shared = runs.at(points)
+        if shared is not None:
+            self.responses.find(shared.size)
+            return shared
+        stored = self._stored
+        own = None if stored is None else Known(stored.points, stored.values)
+        values = once_each(self.responses, points, own)
+        runs.stored.append((list(points), values))
+        return values
 
     def _refuse_other_data(self) -> None:
         """Raise if data above the inputs were set anew: old points are of other populations."""
@@ -422,6 +447,7 @@ class Design(Bound):
             rng = np.random.default_rng(seed)
             draws, _ = PopulationSampler(self.inputs)(at, 1, rng)
             points = [x[:, 0] for x in draws]
+        refuse_moving_atoms(self.name, self.inputs, points, which)
         counts = np.bincount(which, minlength=k).astype(float)
         return points, counts
 
@@ -518,12 +544,15 @@ class Design(Bound):
 
     def mark(self) -> Mark:
         """Return what brings the design back to what it is now."""
-        return Mark(self.batches, tuple(s.get_value() for s in self._shared))
+        runs = tuple(self.responses.runs.stored)
+        return Mark(self.batches, tuple(s.get_value() for s in self._shared), runs)
 
     def go_back(self, mark: Mark, *, remember: bool = False) -> None:
         """Forget the batches since a mark; their responses may be remembered for the next time."""
         if remember:
             self._taken_back = self.batches
+        else:
+            self.responses.runs.stored[:] = mark.runs
         self._stored = mark.batches
         kept = [(responses, known[: self.n_points]) for responses, known in self._others]
         self._others = deque(kept, maxlen=self._others.maxlen)

@@ -85,7 +85,7 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
     op = dist.owner.op
     other = "use propagation=prb.Reweighted() or prb.Fresh()"
     if dist.dtype.startswith(("int", "uint", "bool")):
-        raise TypeError(f"{name}: {op} is discrete; {other}")
+        raise TypeError(f"{name}: got {op}, which is discrete, expected a continuous one; {other}")
     if is_mvnormal(dist):
         mean, covariance = op.dist_params(dist.owner)
         z = pm.icdf(pm.Normal.dist(0.0, 1.0), u)
@@ -94,41 +94,53 @@ def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
         return pm.icdf(dist, u, warn_rvs=False)
     except NotImplementedError:
         raise TypeError(
-            f"{name}: {op} has no inverse distribution function in PyMC; {other}"
+            f"{name}: got {op}, which has no inverse distribution function in PyMC, expected one "
+            f"that has; {other}"
         ) from None
 
 
-def valid(inputs: Inputs, aleatory: Sequence[TensorVariable]) -> TensorVariable:
-    """Return whether the parameters of all aleatory inputs are valid, a boolean scalar.
+def _density(dist: TensorVariable) -> TensorVariable | None:
+    """Return the log-density at zero as a graph, None where PyMC has none.
 
-    Raises
-    ------
-    TypeError
-        If PyMC has no density of an input.
+    One that is drawn, as that of a `pymc.Simulator`, is none.
     """
+    try:
+        density = pm.logp(dist, pt.zeros_like(dist), warn_rvs=False)
+    except NotImplementedError:
+        return None
+    # Zero takes its shape from the distribution.
+    above = set(ancestors([density], blockers=[dist])) - {dist}
+    return None if any(map(is_random, above)) else density
+
+
+def refuse_without_density(name: str, inputs: Inputs) -> None:
+    """Raise if PyMC does not know the density of an input."""
+    # With symbols for the roots: a sum of two random variables has no density that PyMC knows.
+    dists, _ = inputs.rebuilt(inputs.placeholders())
+    for dist in dists:
+        if not is_mvnormal(dist) and _density(dist) is None:
+            raise TypeError(
+                f"{name}: got {dist.owner.op}, of which PyMC has no density, expected one that it "
+                "has, since responses are stored and weighed by it; give a pm.CustomDist its "
+                "logp=, or use propagation=prb.Fresh()"
+            )
+
+
+def valid(inputs: Inputs, aleatory: Sequence[TensorVariable]) -> TensorVariable:
+    """Return whether the parameters of all aleatory inputs are valid, a boolean scalar."""
     from pymc.logprob.utils import CheckParameterValue
 
     if inputs.nested:
         return pt.constant(True)
-    # The densities check their parameters, such as sigma > 0, wherever they are evaluated.
-    logps = [_density_at_zero(dist) for dist in aleatory]
+    # The densities check their parameters, such as sigma > 0, wherever they are evaluated; what has
+    # none says nothing of its parameters.
+    logps = [density for d in aleatory if (density := _density(d)) is not None]
     conditions = []
     for v in ancestors(logps):
         if v.owner is not None and isinstance(v.owner.op, CheckParameterValue):
             _, *checked = v.owner.inputs
             conditions += [pt.all(c) for c in checked]
     return pt.all(conditions) if conditions else pt.constant(True)
-
-
-def _density_at_zero(dist: TensorVariable) -> TensorVariable:
-    try:
-        return pm.logp(dist, pt.zeros_like(dist), warn_rvs=False)
-    except NotImplementedError as error:
-        raise TypeError(
-            f"inputs: got {dist.owner.op}, of which PyMC has no density ({error}), expected one "
-            "that has: it says at which hyperparameters there is a population at all; take "
-            "another distribution, or a pm.CustomDist.dist with logp="
-        ) from None
 
 
 def _generators(function: Any) -> list[Any]:
@@ -147,6 +159,7 @@ class PriorSampler:
 
     def __init__(self, roots: Sequence[TensorVariable]) -> None:
         self._names = ", ".join(str(r.name) for r in roots)
+        self._shapes = [event_shape(r) for r in roots]
         n = pt.iscalar("n")
         try:
             # Variables that depend on no other are drawn n times; the others follow.
@@ -168,7 +181,9 @@ class PriorSampler:
         _seed(self._generators, np.random.default_rng(seed))
         try:
             if self._batched:
-                return [np.asarray(v) for v in self._function(k)]
+                # Samplers of SciPy's drop leading axes of length one.
+                pairs = zip(self._function(k), self._shapes, strict=True)
+                return [np.asarray(v).reshape(k, *shape) for v, shape in pairs]
             draws = [self._function(k) for _ in range(k)]
         except NotImplementedError as error:
             raise TypeError(
@@ -221,6 +236,7 @@ class PopulationSampler:
     """Random draws of n specimens from the populations at given roots."""
 
     def __init__(self, inputs: Inputs) -> None:
+        self._names = ", ".join(str(x.owner.op) for x in inputs.aleatory)
         symbols = inputs.placeholders()
         aleatory, epistemic = inputs.rebuilt(symbols)
         n = pt.iscalar("n")
@@ -270,11 +286,14 @@ class PopulationSampler:
         epistemic : list of ndarray, shapes (k, 1, *event), or (*event) where they depend on no root
         """
         _seed(self._generators, rng)
-        if self._batched:
-            values = self._function(n, *params)
-        else:
-            populations = [self._function(n, *row) for row in zip(*params, strict=True)]
-            values = [np.stack(column) for column in zip(*populations, strict=True)]
+        try:
+            values = self._drawn(params, n)
+        except (NotImplementedError, RuntimeError, ValueError) as error:
+            reason = str(error).splitlines()[0]
+            raise TypeError(
+                f"inputs: got {self._names}, of which one cannot be drawn ({reason}), expected "
+                "distributions from which specimens can be drawn; give a pm.CustomDist its random="
+            ) from None
         n_aleatory = len(self._event_shapes)
         aleatory = []
         for v, shape in zip(values[:n_aleatory], self._event_shapes, strict=True):
@@ -284,6 +303,13 @@ class PopulationSampler:
         for v, ndim in zip(values[n_aleatory:], self._epistemic_ndims, strict=True):
             epistemic.append(v[:, None] if v.ndim > ndim else v)
         return aleatory, epistemic
+
+    def _drawn(self, params: Sequence[Any], n: int) -> list[Floats]:
+        """Return all inputs, of n specimens from each of k populations."""
+        if self._batched:
+            return list(self._function(n, *params))
+        populations = [self._function(n, *row) for row in zip(*params, strict=True)]
+        return [np.stack(column) for column in zip(*populations, strict=True)]
 
 
 def _per_specimen(

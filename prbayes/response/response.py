@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,42 @@ def refuse_version(version: object) -> None:
         )
 
 
+@dataclass
+class Runs:
+    """Runs of a response that several simulators share, which have the same inputs and settings."""
+
+    # Batches of stored points, each (n, *event) for each aleatory input, and their responses.
+    stored: list[tuple[list[Floats], Floats]] = field(default_factory=list)
+    # What the response was called with last, and what it gave.
+    last: tuple[list[Floats], Floats] | None = None
+    several: bool = False  # whether there is more than one simulator
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "last": None}
+
+    def at(self, points: Sequence[Floats]) -> Floats | None:
+        """Return the responses of a batch that is stored, shape (n,), None if it is not."""
+        return next((values for known, values in self.stored if _alike(known, points)), None)
+
+    def repeated(self, given: list[Floats]) -> Floats | None:
+        """Return what the last call gave if another simulator's was the same, else None."""
+        if not self.several or self.last is None or not _alike(self.last[0], given):
+            return None
+        return self.last[1].copy()
+
+    def note(self, given: list[Floats], found: Floats) -> None:
+        """Keep a call for the simulator that comes next; of one simulator only a small one."""
+        if self.several or found.size <= _SMALL:
+            self.last = [x.copy() for x in given], found.copy()
+        else:
+            self.last = None
+
+
+# Responses of a call that is kept before another simulator is there: the trial at some points of
+# the prior, which both of them make.
+_SMALL = 64
+
+
 class Responses:
     """The user's response: a function of inputs, and how it is called.
 
@@ -89,6 +126,8 @@ class Responses:
     ----------
     count : int
         Scalar responses that were needed so far, whether computed here or found in the store.
+    scatters : bool or None
+        Whether the response has different values at the same point; None while it is not known.
     """
 
     def __init__(
@@ -117,7 +156,9 @@ class Responses:
             and not isinstance(function, scalar)
         )
         self.count = 0
+        self.scatters: bool | None = None
         self._found = 0
+        self.runs = Runs()
         self._calling = Calling(name, function, executor, kept, policy, retry_failed, timeout)
         self._tally = Tally()
         self._event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
@@ -126,7 +167,14 @@ class Responses:
         """Return the same function with counts of its own; executor and store are the same."""
         other = copy.copy(self)
         other._tally = self._tally.copied()
+        # What is known stays known; what is computed from here on is each one's own.
+        other.runs = Runs(list(self.runs.stored))
         return other
+
+    def share(self, other: Responses) -> None:
+        """Compute nothing that another one of the same response, inputs and settings has."""
+        self.runs = other.runs
+        self.runs.several = True
 
     @property
     def computed(self) -> int:
@@ -149,7 +197,7 @@ class Responses:
         return None if self._calling.store is None else self._calling.store.folder
 
     def same_as(self, other: Responses) -> bool:
-        """Return whether another has the same function, aleatory inputs and constants."""
+        """Return whether another has the same function, inputs and constants."""
         mine, others = self.inputs.arguments, other.inputs.arguments
         if self.function is not other.function or len(mine) != len(others):
             return False
@@ -165,6 +213,16 @@ class Responses:
             If the response raises, or if its result is not real numbers in the batch shape.
         """
         given = [np.asarray(v, dtype=np.float64) for v in (*aleatory, *epistemic)]
+        known = self.runs.repeated(given)
+        if known is not None:
+            self.find(known.size)
+            return known
+        found = self._computed(given)
+        self.runs.note(given, found)
+        return found
+
+    def _computed(self, given: list[Floats]) -> Floats:
+        """Call the function for values of the inputs."""
         batch = batch_shape(given, self._event_ndims)
         values = broadcast_batch(given, self._event_ndims, batch)
         if self.plain:
@@ -223,8 +281,16 @@ def _columns(inputs: Inputs) -> int:
 
 
 def _same(inputs: Inputs, x: Any, others: Inputs, y: Any) -> bool:
-    """Return whether arguments of two responses are the same aleatory input, or equal constants."""
+    """Return whether arguments of two responses are the same input, or equal constants."""
     if isinstance(x, int) or isinstance(y, int):
         both = isinstance(x, int) and isinstance(y, int)
         return both and inputs.aleatory[x] is others.aleatory[y]
-    return not isinstance(x, Variable) and np.array_equal(x, y)
+    if isinstance(x, Variable) or isinstance(y, Variable):
+        return x is y
+    return np.array_equal(x, y)
+
+
+def _alike(some: Sequence[Floats], others: Sequence[Floats]) -> bool:
+    """Return whether arrays are the same, one by one."""
+    pairs = zip(some, others, strict=True)
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)

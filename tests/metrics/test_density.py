@@ -65,7 +65,7 @@ def test_default_bins_follow_freedman_and_diaconis_with_at_least_five(n: int, se
     iqr = min(np.subtract(*np.percentile(x, [75, 25], method="hazen")), 1.34 * x.std())
     expected = max(5, np.ceil(np.ptp(x) / (2 * iqr * n ** (-1 / 3))))
     assert Histogram().cells(x, w).centers.size == expected
-    assert Histogram().cells(np.r_[x, 1e9], np.r_[w, 0]).centers.size == density._MAX_CELLS
+    assert Histogram().cells(np.r_[x, 1e9], np.r_[w, 1e-12]).centers.size == density._MAX_CELLS
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -156,6 +156,24 @@ def test_the_order_of_the_observed_values_does_not_matter(rule: Any) -> None:
     x, w = np.round(rng.normal(size=30), 1), rng.dirichlet(np.ones(30))
     order = rng.permutation(30)
     np.testing.assert_allclose(rule(x[order], w[order]), rule(x, w), rtol=1e-12)
+
+
+@pytest.mark.parametrize("estimator", [GaussianKDE(), Histogram()])
+def test_values_without_weight_are_as_if_left_out(estimator: Any) -> None:
+    observed = np.array([0.0, 1.0, 1.0, 2.5, 4.0])
+    weights = np.array([0.2, 0.3, 0.1, 0.2, 0.2])
+    alone = estimator.cells(observed, weights)
+    beside = estimator.cells(np.r_[-50.0, observed, 1.0, 9.0], np.r_[0.0, weights, 0.0, 0.0])
+    np.testing.assert_array_equal(beside.widths, alone.widths)
+    np.testing.assert_array_equal(beside.centers, alone.centers)
+
+
+@pytest.mark.parametrize("rule", [silverman, likelihood_bandwidth])
+def test_which_of_equal_values_comes_first_does_not_matter(rule: Any) -> None:
+    observed = np.array([0.0, 1.0, 1.0, 2.0])
+    weights = np.array([0.1, 0.1, 0.6, 0.2])
+    swapped = weights[[0, 2, 1, 3]]
+    assert rule(observed, weights) == rule(observed, swapped)
 
 
 def test_only_estimators_are_taken_for_estimators() -> None:

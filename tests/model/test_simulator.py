@@ -422,3 +422,67 @@ def test_labels_that_only_look_the_same_are_refused() -> None:
 def test_labels_of_equal_numbers_are_the_same() -> None:
     _labelled([0, 1, 2], [0.0, 1.0, 3.0])
     _labelled(["a", "b", "c"], np.array(["c", "d", "e"], dtype=object))
+
+
+def two_of_one(propagation: Propagation, second: Any = None) -> tuple[pm.Model, list[int]]:
+    """Return a model whose two simulators have one response, and the sizes of its calls."""
+    asked: list[int] = []
+
+    def response(x: Any, z: float) -> Any:
+        x = np.asarray(x, dtype=np.float64)  # no PyTensor variables
+        asked.append(x.size)
+        return z * x
+
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1))
+        observed = np.linspace(1.0, 3.0, 20)
+        common = {"observed": observed, "propagation": propagation}
+        prb.Simulator("a", response, x, 1.0, metric=prb.AreaMetric(), **common)
+        prb.Simulator("b", response, x, second or 1.0, metric=prb.KullbackLeibler(), **common)
+    return model, asked
+
+
+def test_simulators_of_one_response_share_their_design_s_runs() -> None:
+    model, asked = two_of_one(prb.Reweighted(128))
+    assert asked == [128]
+    first, second = Evaluator(model).nodes
+    np.testing.assert_array_equal(first.design.values, second.design.values)
+    narrow = np.array([[2.0, np.log(0.05)]])
+    prb.refine(model, narrow)
+    assert first.design.n_points == second.design.n_points > 128
+    assert sum(asked) == first.design.n_points
+    assert prb.minimize(model, progressbar=False).n_computed == sum(asked)
+
+
+@pytest.mark.parametrize("propagation", [prb.Resimulated(128), prb.Fresh(128)])
+def test_simulators_of_one_response_share_a_population_s_runs(propagation: Propagation) -> None:
+    model, asked = two_of_one(propagation)
+    assert sum(size for size in asked if size == 16) == 16  # tried once
+    before = len(asked)
+    evaluator = Evaluator(model)
+    found = evaluator(evaluator.prior_thetas(3, 0))
+    assert asked[before:] == [3 * 128]
+    assert np.isfinite(found.discrepancies).all()
+
+
+@pytest.mark.parametrize("propagation", [prb.Reweighted(64), prb.Resimulated(64), prb.Fresh(64)])
+def test_another_constant_is_another_run(propagation: Propagation) -> None:
+    model, _ = two_of_one(propagation, second=3.0)
+    evaluator = Evaluator(model)
+    theta = evaluator.unconstrained({"mu": 2.0, "sigma": 0.5})[None]
+    means = []
+    for k in range(2):
+        values, weights = evaluator.populations(theta, k)
+        means.append((values * weights).sum())
+    assert means[1] == pytest.approx(3 * means[0], rel=1e-9)
+
+
+def test_shared_runs_give_what_each_would_have_computed() -> None:
+    model, _ = two_of_one(prb.Fresh(128))
+    evaluator = Evaluator(model)
+    thetas = evaluator.prior_thetas(4, 1)
+    together = evaluator(thetas).discrepancies
+    alone, _ = two_of_one(prb.Fresh(128), second=1.0)
+    evaluator = Evaluator(alone)
+    for k in (1, 0):
+        np.testing.assert_array_equal(evaluator.discrepancies(thetas, k), together[:, k])

@@ -13,7 +13,8 @@ import pytest
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
-from prbayes.propagation.edges import averaged_log_density, cells_around
+from prbayes.propagation.edges import averaged_log_density, cells_around, refuse_moving_atoms
+from prbayes.response.inputs import read_inputs
 
 METRICS = [prb.ProbabilityResidual(), prb.KullbackLeibler(), prb.AreaMetric(), prb.LogLikelihood()]
 
@@ -158,6 +159,36 @@ def test_data_sets_spread_optima_as_much_as_the_standard_errors_say(metric: prb.
         errors.append(float(found.stderr["start"]))
     ratio = float(np.mean(errors) / np.std(optima))
     assert 0.75 < ratio < 1.33
+
+
+def mixture_of_a_point(point: Any) -> Any:
+    return pm.Mixture.dist([0.3, 0.7], [pm.DiracDelta.dist(point), pm.Normal.dist(0.0, 1.0)])
+
+
+@pytest.mark.parametrize(
+    "dist", [mixture_of_a_point, pm.DiracDelta.dist], ids=["beside a density", "alone"]
+)
+def test_a_value_that_has_probability_and_moves_is_refused(dist: Callable[[Any], Any]) -> None:
+    with pytest.raises(TypeError, match=r"values that move .* have probability .*prb.Fresh\(\)"):
+        stored(lambda: dist(pm.Normal("a", 0, 1)))
+
+
+def test_a_value_that_has_probability_and_stays_has_its_share() -> None:
+    bound = stored(lambda: mixture_of_a_point(0.0 * pm.Normal("a", 0, 1) + 0.25))
+    values, weights = bound.populations([np.array([0.3])])
+    assert weights[values == 0.25].sum() == pytest.approx(0.3, abs=0.03)
+
+
+def test_values_that_meet_by_accident_are_no_atoms() -> None:
+    with pm.Model() as model:
+        inputs = read_inputs("y", [pm.Normal.dist(pm.Normal("a", 0, 1), 1.0)], model)
+    which = np.repeat(np.arange(512), 32)
+    x = np.random.default_rng(0).normal(size=which.size)
+    x[: 7 * 32] = np.repeat(np.arange(7.0), 32)
+    refuse_moving_atoms("y", inputs, [x], which)
+    x[: 8 * 32] = np.repeat(np.arange(8.0), 32)
+    with pytest.raises(TypeError, match="values that move"):
+        refuse_moving_atoms("y", inputs, [x], which)
 
 
 @pytest.mark.slow

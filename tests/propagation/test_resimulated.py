@@ -88,7 +88,10 @@ def test_too_few_responses_for_a_log_likelihood_are_said(caplog: pytest.LogCaptu
 def test_discrete_inputs_are_refused() -> None:
     with pm.Model():
         x = pm.Poisson.dist(pm.Exponential("rate", 1.0))
-        with pytest.raises(TypeError, match=r"is discrete; use propagation=prb.Reweighted\(\)"):
+        with pytest.raises(
+            TypeError,
+            match=r"is discrete, expected a continuous one; use propagation=prb.Reweighted\(\)",
+        ):
             prb.Simulator(
                 "y",
                 np.square,

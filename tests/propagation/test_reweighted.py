@@ -688,7 +688,7 @@ def test_bounds_that_have_probability_and_move_are_refused() -> None:
         s = pm.HalfNormal("s", 1)
         x = pm.Censored.dist(pm.Normal.dist(0.0, 1.0), lower=-s, upper=s)
         with pytest.raises(
-            TypeError, match=r"bounds that move .* use propagation=prb.Resimulated\(\)"
+            TypeError, match=r"values that move .* use propagation=prb.Resimulated\(\)"
         ):
             prb.Simulator("y", same, x, metric=AREA, observed=OBSERVED)
 

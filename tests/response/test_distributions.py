@@ -20,6 +20,7 @@ from prbayes.response.distributions import (
     log_density,
     prior_draws,
     quantiles,
+    refuse_without_density,
     valid,
 )
 from prbayes.response.inputs import Inputs, read_inputs
@@ -91,10 +92,12 @@ def test_quantiles_of_a_multivariate_normal_have_its_mean_and_covariance() -> No
 
 
 def test_what_has_no_quantiles_is_refused() -> None:
-    with pytest.raises(TypeError, match=r"y: poisson.* is discrete; use propagation=prb.Reweigh"):
+    with pytest.raises(
+        TypeError, match=r"y: got poisson.* is discrete, .*; use propagation=prb.Reweigh"
+    ):
         quantiles("y", pm.Poisson.dist(2.0), 0.5)
     with pytest.raises(
-        TypeError, match=r"y: vonmises.* has no inverse distribution function .*Fresh"
+        TypeError, match=r"y: got vonmises.* has no inverse distribution function .*Fresh"
     ):
         quantiles("y", pm.VonMises.dist(0.0, 1.0), 0.5)
 
@@ -145,6 +148,47 @@ def test_parameters_are_valid_where_densities_say_so() -> None:
     np.testing.assert_array_equal(found, [True, False, False, False])
 
 
+@pytest.mark.parametrize("size", [1, 4])
+def test_one_population_has_the_shape_of_many(size: int) -> None:
+    inputs, model = inputs_of(
+        lambda mu, sigma: [pm.Moyal.dist(mu, sigma), pm.TruncatedNormal.dist(mu, sigma, lower=0)]
+    )
+    sampler = PopulationSampler(inputs)
+    for k in (1, 3):
+        drawn, _ = sampler([np.ones(k), np.ones(k)], size, np.random.default_rng(0))
+        assert [x.shape for x in drawn] == [(k, size)] * 2
+    with model:
+        below = pm.Moyal("below", model["mu"], 1.0)
+    assert [x.shape for x in PriorSampler([model["mu"], below])(1, 0)] == [(1,)] * 2
+
+
+def drawn_alone(mu: Any, rng: Any = None, size: Any = None) -> Any:
+    return rng.normal(mu, 1.0, size=size)
+
+
+def test_a_distribution_without_density_says_nothing_of_its_parameters() -> None:
+    inputs, _ = inputs_of(
+        lambda mu, sigma: [pm.CustomDist.dist(mu, random=drawn_alone), pm.Normal.dist(mu, sigma)]
+    )
+    symbols = inputs.placeholders()
+    graph = valid(inputs, inputs.rebuilt(symbols)[0])
+    (found,) = compile_batched(symbols, [graph])(np.zeros(2), np.array([1.0, -1.0]))
+    assert list(found) == [True, False]
+    sum_of_two, _ = inputs_of(
+        lambda mu, sigma: [pm.CustomDist.dist(mu, dist=lambda mu, size: mu + pm.Gamma.dist(2, 1))]
+    )
+    refuse_without_density("y", sum_of_two)
+    with pytest.raises(TypeError, match=r"y: got CustomDist.* no density, .*prb.Fresh\(\)"):
+        refuse_without_density("y", inputs)
+
+
+def test_what_cannot_be_drawn_is_refused() -> None:
+    inputs, _ = inputs_of(lambda mu, sigma: [pm.Normal.dist(mu, sigma), pm.Flat.dist()])
+    sampler = PopulationSampler(inputs)
+    with pytest.raises(TypeError, match=r"inputs: got .* flat.* cannot be drawn \(.*expected"):
+        sampler([np.zeros(1), np.ones(1)], 3, np.random.default_rng(0))
+
+
 def test_populations_are_drawn_at_their_own_roots() -> None:
     inputs, _ = inputs_of(
         lambda mu, sigma: [
@@ -193,5 +237,5 @@ def test_what_has_no_density_is_refused() -> None:
             pm.Truncated.dist(pm.SkewNormal.dist(mu=mu, sigma=sigma, alpha=1.0), lower=0.0)
         ]
     )
-    with pytest.raises(TypeError, match=r"inputs: got Trunc.* PyMC has no density .*expected one"):
-        valid(inputs, inputs.aleatory)
+    with pytest.raises(TypeError, match=r"y: got Trunc.* PyMC has no density.* expected one .*"):
+        refuse_without_density("y", inputs)

@@ -1,0 +1,54 @@
+"""Each of PyMC's univariate distributions as an input: right under a propagation, or refused."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks import distributions, record
+
+STORED = record.load(distributions.RESULTS, {})
+# One for each way that an input is told apart.
+TELLING = {
+    "Gamma": ("Reweighted", "Resimulated", "Fresh"),
+    "Poisson": ("Reweighted", "Resimulated"),
+    "Uniform": ("Reweighted",),
+    "Censored": ("Reweighted",),
+    "DiracDelta": ("Reweighted", "Fresh"),
+    "CustomDist, by draws alone": ("Reweighted", "Fresh"),
+    "CustomDist, without draws": ("Reweighted", "Fresh"),
+    "Mixture, of a moving point": ("Reweighted",),
+}
+
+
+def test_the_table_has_every_distribution_that_pymc_exports() -> None:
+    assert distributions.unknown() == set()
+    assert STORED.keys() == distributions.CASES.keys()
+
+
+def test_none_is_wrong_or_ends_in_an_error_of_another() -> None:
+    verdicts = {each["verdict"] for row in STORED.values() for each in row.values()}
+    assert verdicts == {"works", "refused"}
+
+
+@pytest.mark.parametrize(
+    ("name", "propagation"), [(name, each) for name, kinds in TELLING.items() for each in kinds]
+)
+def test_an_input_has_the_discrepancies_of_other_draws_or_is_refused(
+    name: str, propagation: str
+) -> None:
+    case = distributions.CASES[name]
+    found = distributions.trial(case, distributions.PROPAGATIONS[propagation], search=False)
+    assert found["verdict"] == STORED[name][propagation]["verdict"], found
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("name", distributions.CASES)
+def test_the_whole_table(name: str) -> None:
+    for propagation, verdict in STORED[name].items():
+        found = distributions.trial(
+            distributions.CASES[name], distributions.PROPAGATIONS[propagation]
+        )
+        # PolyaGamma asks for a package that tests do not install.
+        if not (name == "PolyaGamma" and found["verdict"] == "works"):
+            assert found["verdict"] == verdict["verdict"], (propagation, found)

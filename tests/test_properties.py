@@ -1,0 +1,356 @@
+"""What holds for any numbers: metrics against plain sums, invariances, small models at random.
+
+Examples are the same in every run. PRBAYES_EXAMPLES=500 makes more of them.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from itertools import pairwise
+from math import fsum
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+import prbayes as prb
+from prbayes._checks import Floats
+from prbayes._weighted import distribution_function, quantile, reached
+from prbayes.metrics.density import likelihood_bandwidth, twice_silverman
+from prbayes.model.evaluator import Evaluator
+
+EXAMPLES = int(os.environ.get("PRBAYES_EXAMPLES", "10"))
+MODELS = max(1, EXAMPLES // 10)
+QUIET = {
+    "derandomize": True,
+    "deadline": None,
+    "database": None,
+    "suppress_health_check": list(HealthCheck),
+}
+many = settings(max_examples=EXAMPLES, **QUIET)
+# A smaller example of a failure would cost many models.
+few = settings(max_examples=MODELS, phases=[Phase.generate], **QUIET)
+
+# Sevenths, so that there are ties and sums are rounded.
+numbers = st.integers(-70, 70).map(lambda k: k / 7)
+sizes = st.sampled_from([1, 2, 3, 4, 7, 20])
+scales = st.integers(-150, 150).map(lambda power: 10.0**power)
+
+
+@st.composite
+def samples(draw: st.DrawFn, smallest: int = 1) -> tuple[Floats, Floats]:
+    """Draw values and weights that sum to one, a few of them zero."""
+    n = draw(sizes.filter(lambda size: size >= smallest))
+    values = np.array(draw(st.lists(numbers, min_size=n, max_size=n)))
+    raw = np.array(draw(st.lists(st.integers(0, 5), min_size=n, max_size=n)), dtype=float)
+    raw = raw if raw.any() else np.ones(n)
+    return values, raw / raw.sum()
+
+
+@st.composite
+def spread_samples(draw: st.DrawFn) -> tuple[Floats, Floats]:
+    """Draw values of which some differ, and have weight."""
+    values, weights = draw(
+        samples(smallest=2).filter(lambda drawn: np.ptp(drawn[0][drawn[1] > 0]) > 0)
+    )
+    return values, weights
+
+
+# -- Plain sums ------------------------------------------------------------------------------------
+
+
+def below(values: Floats, weights: Floats, z: float) -> float:
+    return fsum(w for x, w in zip(values, weights, strict=True) if x <= z)
+
+
+def plain_area(x: Floats, w: Floats, y: Floats, v: Floats) -> float:
+    knots = sorted({*x, *y})
+    pairs = pairwise(knots)
+    return fsum(abs(below(x, w, a) - below(y, v, a)) * (b - a) for a, b in pairs)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Nodes at a quarter of a bandwidth over the observed values and their margins."""
+
+    h: float
+    low: float
+    n: int
+
+    @classmethod
+    def over(cls, observed: Floats, weights: Floats, rule: Any) -> Grid:
+        observed, weights = observed[weights > 0], weights[weights > 0]
+        h = rule(observed, weights)
+        margin = max(6 * h, np.ptp(observed) / 2)
+        low = observed.min() - margin
+        return cls(h, low, int(np.ceil((observed.max() + margin - low) / (h / 4))) + 1)
+
+    def density(self, x: Floats, w: Floats) -> tuple[Floats, Floats]:
+        """Return the sum of kernels at the nodes, and the mass below and above them."""
+        nodes = self.low + self.h / 4 * np.arange(self.n)
+        inside = self.holds(x)
+        u = (nodes[:, None] - x[inside]) / self.h
+        kernels = np.exp(-0.5 * u**2) / (self.h * np.sqrt(2 * np.pi))
+        outer = w[~inside & (x < nodes[2])].sum(), w[~inside & (x > nodes[2])].sum()
+        return kernels @ w[inside], np.array(outer)
+
+    def holds(self, x: Floats) -> Any:
+        """Return which values have four nodes around them."""
+        step = self.h / 4
+        return (x >= self.low + step) & (x < self.low + step * (self.n - 2))
+
+    def both(self, x: Floats, w: Floats) -> tuple[Floats, Floats]:
+        """Return densities on all cells, the mass outside as one kernel's, and the widths."""
+        cluster = 2 * np.sqrt(np.pi) * self.h
+        inner, outer = self.density(x, w)
+        widths = np.r_[np.full(self.n, self.h / 4), cluster, cluster]
+        return np.r_[inner, outer / cluster], widths
+
+
+def floored(p: Floats, widths: Floats) -> Floats:
+    return (1 - 1e-9) * p + 1e-9 / widths.sum()
+
+
+def plain_residual(x: Floats, w: Floats, y: Floats, v: Floats) -> float:
+    grid = Grid.over(y, v, twice_silverman)
+    p, widths = grid.both(x, w)
+    q, _ = grid.both(y, v)
+    return float(((p - q) ** 2 * widths).sum())
+
+
+def plain_divergence(x: Floats, w: Floats, y: Floats, v: Floats) -> float:
+    grid = Grid.over(y, v, twice_silverman)
+    p, widths = grid.both(x, w)
+    q, _ = grid.both(y, v)
+    p, q = floored(p, widths), floored(q, widths)
+    return float((q * np.log(q / p) * widths).sum())
+
+
+def plain_likelihood(x: Floats, w: Floats, y: Floats, v: Floats) -> float:
+    grid = Grid.over(y, v, likelihood_bandwidth)
+    h, (_, widths) = grid.h, grid.both(x, w)
+    inside = grid.holds(x)
+    u = (y[:, None] - x[inside]) / h
+    p = np.exp(-0.5 * u**2) @ w[inside] / (h * np.sqrt(2 * np.pi))
+    return float(-(v @ np.log(floored(p, widths))))
+
+
+# -- Metrics ---------------------------------------------------------------------------------------
+
+
+@many
+@given(samples(), samples(), scales)
+def test_the_area_is_that_of_plain_sums(simulated: Any, observed: Any, scale: float) -> None:
+    (x, w), (y, v) = simulated, observed
+    metric = prb.AreaMetric()
+    found = metric(scale * x, scale * y, weights=w, observed_weights=v)
+    assert found / scale == pytest.approx(plain_area(x, w, y, v), rel=1e-12, abs=1e-13)
+    prepared = metric.against(scale * y, v)
+    stored = prepared.outer(*prepared.from_basis(w, prepared.basis(scale * x), np), xp=np)
+    assert float(stored) / scale == pytest.approx(found / scale, rel=1e-12, abs=1e-13)
+
+
+@many
+@given(samples(), spread_samples(), scales)
+def test_the_residual_is_that_of_plain_sums(simulated: Any, observed: Any, scale: float) -> None:
+    (x, w), (y, v) = simulated, observed
+    prepared = prb.ProbabilityResidual().against(scale * y, v)
+    found = prepared(scale * x, w) / prepared.scale_factor * scale  # type: ignore[attr-defined]
+    h = Grid.over(y, v, twice_silverman).h
+    # The density is right to 3e-5 of a kernel's peak, on a range of some bandwidths.
+    assert found == pytest.approx(plain_residual(x, w, y, v), rel=1e-3, abs=1e-6 / h)
+
+
+@many
+@given(samples(), spread_samples(), scales)
+def test_the_divergence_is_that_of_plain_sums(simulated: Any, observed: Any, scale: float) -> None:
+    (x, w), (y, v) = simulated, observed
+    found = prb.KullbackLeibler().against(scale * y, v)(scale * x, w)
+    # Of densities down to the floor, where an error of 3e-5 of a peak is large.
+    assert found == pytest.approx(plain_divergence(x, w, y, v), rel=0.02, abs=2e-3)
+
+
+@many
+@given(samples(), spread_samples(), scales)
+def test_the_likelihood_is_that_of_plain_sums(simulated: Any, observed: Any, scale: float) -> None:
+    (x, w), (y, v) = simulated, observed
+    found = prb.LogLikelihood().against(scale * y, v)(scale * x, w)
+    expected = plain_likelihood(x, w, y, v) + np.log(scale)
+    assert found == pytest.approx(expected, rel=0.02, abs=0.02)
+
+
+METRICS = {
+    "PR": prb.ProbabilityResidual(),
+    "PR, bins": prb.ProbabilityResidual(prb.Histogram(5)),
+    "KLD": prb.KullbackLeibler(),
+    "KLD, reverse": prb.KullbackLeibler(reverse=True),
+    "area": prb.AreaMetric(),
+    "log-likelihood": prb.LogLikelihood(),
+}
+
+
+@many
+@pytest.mark.parametrize("kind", METRICS)
+@given(samples(), spread_samples(), st.randoms(use_true_random=False))
+def test_order_and_unit_do_not_matter(
+    kind: str, simulated: Any, observed: Any, shuffled: Any
+) -> None:
+    (x, w), (y, v) = simulated, observed
+    metric = METRICS[kind]
+    found = metric(x, y, weights=w, observed_weights=v)
+    i, j = list(range(x.size)), list(range(y.size))
+    shuffled.shuffle(i)
+    shuffled.shuffle(j)
+    other = metric(x[i], y[j], weights=w[i], observed_weights=v[j])
+    assert other == pytest.approx(found, rel=1e-9, abs=1e-11)
+    if "bins" not in kind:  # where rounding brings values on an edge into another one
+        shifted = metric(x + 64, y + 64, weights=w, observed_weights=v)
+        assert shifted == pytest.approx(found, rel=1e-6, abs=1e-9)
+    repeated = metric(np.r_[x, x], y, weights=np.r_[w, w], observed_weights=v)
+    assert repeated == pytest.approx(found, rel=1e-9, abs=1e-11)
+
+
+# -- Weighted samples ------------------------------------------------------------------------------
+
+
+@many
+@given(samples(), st.lists(numbers, min_size=1, max_size=5), scales)
+def test_distribution_functions_are_plain_sums(sample: Any, points: Any, scale: float) -> None:
+    values, weights = sample
+    found = distribution_function(scale * values, weights, scale * np.array(points))
+    expected = [below(scale * values, weights, scale * z) for z in points]
+    assert found == pytest.approx(expected, abs=1e-14)
+
+
+@many
+@given(samples(), st.integers(0, 20).map(lambda k: k / 20), scales)
+def test_quantiles_are_lines_between_the_middles_of_steps(
+    sample: Any, level: float, scale: float
+) -> None:
+    values, weights = sample[0][sample[1] > 0], sample[1][sample[1] > 0]
+    found = float(quantile(scale * values, weights, level)) / scale
+    corners, total = [], 0.0
+    for x, w in sorted(zip(values, weights, strict=True)):
+        corners.append((total + w / 2, x))
+        total += w
+    if level <= corners[0][0]:
+        expected = {corners[0][1]}
+    elif level >= corners[-1][0]:
+        expected = {corners[-1][1]}
+    else:
+        expected = set()
+        for (a, low), (b, high) in pairwise(corners):
+            if a - 1e-12 <= level <= b + 1e-12:
+                part = (level - a) / (b - a) if b > a + 1e-12 else 0.0
+                expected |= {low + part * (high - low), *((low, high) if b <= a + 1e-12 else ())}
+    assert any(found == pytest.approx(each, abs=1e-9) for each in expected)
+
+
+@many
+@given(samples(), st.lists(st.integers(1, 40).map(lambda k: k / 40.5), min_size=1, max_size=4))
+def test_a_level_is_reached_at_the_first_sum_that_is_not_below(sample: Any, levels: Any) -> None:
+    _, weights = sample
+    found = reached(weights, np.array(levels), normalized=True)
+    sums = np.cumsum(weights)
+    expected = [next((i for i, s in enumerate(sums) if s >= z), sums.size - 1) for z in levels]
+    assert list(found) == expected
+
+
+# -- Small models ----------------------------------------------------------------------------------
+
+FAMILIES = {
+    "Normal": lambda a, b: pm.Normal.dist(a, b),
+    "LogNormal": lambda a, b: pm.LogNormal.dist(0.5 * a, 0.5 * b),
+    "Gamma": lambda a, b: pm.Gamma.dist(mu=1.0 + 0.2 * a, sigma=0.6 * b),
+    "Logistic": lambda a, b: pm.Logistic.dist(a, 0.6 * b),
+    "Gumbel": lambda a, b: pm.Gumbel.dist(a, b),
+    "Weibull": lambda a, b: pm.Weibull.dist(1.0 + b, 1.5 + 0.2 * a),
+    "Triangular": lambda a, b: pm.Triangular.dist(lower=-3, c=0.5 * a, upper=3 + 0 * b),
+    "TruncatedNormal": lambda a, b: pm.TruncatedNormal.dist(a, b, lower=-1.0, upper=4.0),
+}
+
+
+@st.composite
+def problems(draw: st.DrawFn) -> dict[str, Any]:
+    """Draw what a small model is made of."""
+    families = draw(st.lists(st.sampled_from(list(FAMILIES)), min_size=1, max_size=2))
+    return {
+        "families": families,
+        "linear": draw(st.sampled_from([1.0, -2.0, 0.5])),
+        "square": draw(st.sampled_from([0.0, 0.0, 0.3])),
+        "kind": draw(st.sampled_from(["PR", "KLD", "area", "log-likelihood"])),
+        "at": (draw(st.sampled_from([-0.4, 0.0, 0.5])), draw(st.sampled_from([0.8, 1.0, 1.3]))),
+        "seed": draw(st.integers(0, 99)),
+    }
+
+
+def evaluator_of(problem: dict[str, Any], propagation: Any) -> Evaluator:
+    def response(*inputs: Any) -> Any:
+        y: Any = 0.0
+        for share, x in zip((1.0, 0.4), inputs, strict=False):
+            y = y + share * (problem["linear"] * x + problem["square"] * x**2)
+        return y
+
+    rng = np.random.default_rng(problem["seed"])
+    with pm.Model() as model:
+        a, b = pm.Normal("a", 0, 0.5), pm.LogNormal("b", 0, 0.3)
+        inputs = [FAMILIES[family](a, b) for family in problem["families"]]
+        truth = [pm.draw(FAMILIES[f](0.0, 1.0), 40, random_seed=rng) for f in problem["families"]]
+        prb.Simulator(
+            "y",
+            response,
+            *inputs,
+            metric=METRICS[problem["kind"]],
+            observed=response(*truth),
+            propagation=propagation,
+        )
+    return Evaluator(model)
+
+
+@few
+@given(problems())
+@pytest.mark.filterwarnings("default")
+def test_three_propagations_agree_and_gradients_are_differences(problem: dict[str, Any]) -> None:
+    n = 1024 * len(problem["families"]) ** 2
+    found, errors = [], []
+    for propagation in (prb.Reweighted(n), prb.Resimulated(2 * n), prb.Fresh(1 << 14)):
+        evaluator = evaluator_of(problem, propagation)
+        bound = evaluator.nodes[0].bound
+        theta = evaluator.unconstrained({"a": problem["at"][0], "b": problem["at"][1]})
+        roots = evaluator.roots(theta[None], 0)
+        (value,) = bound.discrepancies(roots, bound.target)
+        found.append(value)
+        errors.append(bound.discrepancy_error(roots))
+        if bound.random:
+            continue
+        try:
+            objective = evaluator.objective(prior=False, gradient=True)
+        except TypeError:
+            assert "Gamma" in problem["families"]  # whose quantiles have no derivative
+            continue
+        plain, gradient = objective(theta, np.ones(1))
+        assert plain == pytest.approx(value, rel=1e-9)
+        steps = 1e-5 * np.eye(2)
+        for step, slope in zip(steps, gradient, strict=True):
+            above, beneath = (objective(theta + s * step, np.ones(1))[0] for s in (1, -1))
+            difference = (above - beneath) / 2e-5
+            largest = max(np.abs(gradient).max(), 1e-6)
+            assert slope == pytest.approx(difference, rel=2e-3, abs=0.02 * largest)
+    scale = evaluator.nodes[0].target.scale
+    for i, k in ((0, 1), (0, 2), (1, 2)):
+        allowed = 5 * np.hypot(errors[i], errors[k]) + 0.002 * scale
+        assert abs(found[i] - found[k]) < allowed, (found, errors)
+
+
+@pytest.mark.slow
+def test_all_of_this_holds_for_many_examples() -> None:
+    more = os.environ | {"PRBAYES_EXAMPLES": "100"}
+    here = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-x", "-m", "not slow", __file__]
+    done = subprocess.run(here, env=more, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
