@@ -78,7 +78,10 @@ EXECUTORS: dict[str, Callable[[], Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", PROPAGATIONS)
+@pytest.mark.parametrize(
+    "name",
+    ["Resimulated", *(pytest.param(n, marks=pytest.mark.slow) for n in ("Reweighted", "Fresh"))],
+)
 def test_chunks_of_any_size_on_threads_give_the_same_bits(name: str) -> None:
     with ThreadPoolExecutor(3) as threads:
         assert digest(name, uneven, executor=threads) == serial(name)
