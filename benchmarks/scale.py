@@ -129,7 +129,11 @@ def tasks(size: int) -> dict[str, float]:
     numbers = np.random.default_rng(1).normal(size=(size, 5))
     function = calling.scalar(lambda *x: sum(x))
     cluster = distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
     )
     with cluster, distributed.Client(cluster) as client:
         executor = _Untold(client.get_executor(pure=False))

@@ -395,7 +395,7 @@ def test_those_of_loky_do_so_too_under_the_same_name() -> None:
 def test_dask_tells_its_workers_by_address_and_losses_by_a_class() -> None:
     distributed = pytest.importorskip("distributed")
     cluster = distributed.LocalCluster(
-        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address="127.0.0.1:0"
     )
     with cluster, distributed.Client(cluster) as client:
         executor = client.get_executor(pure=False)

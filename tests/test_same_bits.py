@@ -78,7 +78,10 @@ EXECUTORS: dict[str, Callable[[], Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", PROPAGATIONS)
+@pytest.mark.parametrize(
+    "name",
+    ["Resimulated", *(pytest.param(n, marks=pytest.mark.slow) for n in ("Reweighted", "Fresh"))],
+)
 def test_chunks_of_any_size_on_threads_give_the_same_bits(name: str) -> None:
     with ThreadPoolExecutor(3) as threads:
         assert digest(name, uneven, executor=threads) == serial(name)
@@ -97,15 +100,24 @@ def test_executors_give_the_same_bits(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PROPAGATIONS)
-def test_loky_and_dask_give_the_same_bits(name: str) -> None:
+def test_dask_gives_the_same_bits(name: str) -> None:
     distributed = pytest.importorskip("distributed")
     cluster = distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
+        n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
     )
     with cluster, distributed.Client(cluster) as client:
         assert digest(name, executor=client.get_executor(pure=False)) == serial(name)
-    loky = pytest.importorskip("loky")
-    assert digest(name, executor=loky.get_reusable_executor(2)) == serial(name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROPAGATIONS)
+def test_loky_gives_the_same_bits(name: str) -> None:
+    loky = pytest.importorskip("joblib.externals.loky")
+    pool = loky.get_reusable_executor(2)
+    try:
+        assert digest(name, executor=pool) == serial(name)
+    finally:
+        pool.shutdown(wait=True, kill_workers=True)
 
 
 @pytest.mark.slow

@@ -53,7 +53,7 @@ def all_there(model: pm.Model, store: Path) -> None:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
 def test_a_worker_that_leaves_while_it_computes_loses_nothing(tmp_path: Path) -> None:
     cluster = distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
+        n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
     )
     with cluster, distributed.Client(cluster) as client:
         executor = client.get_executor(pure=False)
@@ -71,7 +71,11 @@ def test_a_worker_that_leaves_while_it_computes_loses_nothing(tmp_path: Path) ->
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
 def test_a_worker_is_killed_and_nothing_is_lost(tmp_path: Path) -> None:
     cluster = distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
     )
     with cluster, distributed.Client(cluster) as client:
         # That of the cluster, not of this machine.

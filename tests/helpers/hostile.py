@@ -44,7 +44,7 @@ def loky() -> Iterator[Executor]:
 def dask() -> Iterator[Executor]:
     distributed = importlib.import_module("distributed")
     config = importlib.import_module("dask.config")
-    where: dict[str, Any] = {"host": "127.0.0.1", "dashboard_address": None}
+    where: dict[str, Any] = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
     # One worker that is lost with a task is enough: by default it takes four, of seconds each.
     with config.set({"distributed.scheduler.allowed-failures": 0}):
         cluster = distributed.LocalCluster(

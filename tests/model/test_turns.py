@@ -115,7 +115,11 @@ def test_a_failure_ends_the_turn() -> None:
 
 @pytest.mark.parametrize(
     "propagation",
-    [prb.Reweighted(64), prb.Resimulated(16), prb.Fresh(16)],
+    [
+        prb.Fresh(16),
+        pytest.param(prb.Reweighted(64), marks=pytest.mark.slow),
+        pytest.param(prb.Resimulated(16), marks=pytest.mark.slow),
+    ],
     ids=lambda p: type(p).__name__,
 )
 def test_two_threads_on_one_model_get_what_they_would_have_got_alone(propagation: Any) -> None:

@@ -65,10 +65,10 @@ class Quadratic:
 
     within: float = np.inf
 
-    def __call__(self, thetas: Floats) -> tuple[Floats, Floats, Floats]:
+    def __call__(self, thetas: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         squared = (thetas**2).sum(axis=1)
         likelihood = np.where(np.abs(thetas[:, 0]) < self.within, -squared / 2, np.nan)
-        return -squared / 4, likelihood, squared[:, None]
+        return -squared / 4, likelihood, squared[:, None], thetas[:, :1] ** 3
 
 
 def at_standard_normal(n: int, target: Quadratic) -> BatchedKernel:
@@ -78,7 +78,7 @@ def at_standard_normal(n: int, target: Quadratic) -> BatchedKernel:
     kernel.rng = np.random.default_rng(8)
     kernel.tempered_posterior = kernel.rng.standard_normal((n, 2))
     found = target(kernel.tempered_posterior)
-    kernel.prior_logp, kernel.likelihood_logp, kernel.discrepancies = found
+    kernel.prior_logp, kernel.likelihood_logp, kernel.discrepancies, kernel.lost = found
     return kernel
 
 
@@ -99,10 +99,11 @@ def test_proposals_leave_a_standard_normal_as_it_is(proposal: str) -> None:
     np.testing.assert_allclose(after.var(axis=0), 1.0, atol=5 * 2**0.5 * standard_error)
     assert abs((after[:, 0] * after[:, 1]).mean()) < 5 * standard_error
     # What is noted of the particles goes with them.
-    prior, likelihood, discrepancies = Quadratic()(after)
+    prior, likelihood, discrepancies, lost = Quadratic()(after)
     np.testing.assert_array_equal(kernel.prior_logp, prior)
     np.testing.assert_array_equal(kernel.likelihood_logp, likelihood)
     np.testing.assert_array_equal(kernel.discrepancies, discrepancies)
+    np.testing.assert_array_equal(kernel.lost, lost)
 
 
 def test_places_without_a_discrepancy_are_never_accepted() -> None:
@@ -111,7 +112,8 @@ def test_places_without_a_discrepancy_are_never_accepted() -> None:
     kernel.tempered_posterior = inside
     target = Quadratic(within=1.0)
     kernel._evaluate = target
-    kernel.prior_logp, kernel.likelihood_logp, kernel.discrepancies = target(inside)
+    found = target(inside)
+    kernel.prior_logp, kernel.likelihood_logp, kernel.discrepancies, kernel.lost = found
     rate = kernel._accept(inside + 3.0, np.full(500, 100.0))
     assert rate == 0.0
     np.testing.assert_array_equal(kernel.tempered_posterior, inside)
@@ -151,7 +153,7 @@ def test_the_weights_of_a_stage_keep_the_share_asked_for() -> None:
 def test_what_is_noted_of_particles_is_theirs_after_a_stage() -> None:
     kernel = begun()
     stage(kernel)
-    prior, likelihood, discrepancies = kernel._evaluate(kernel.tempered_posterior)
+    prior, likelihood, discrepancies, _ = kernel._evaluate(kernel.tempered_posterior)
     np.testing.assert_allclose(kernel.prior_logp, prior)
     np.testing.assert_allclose(kernel.likelihood_logp, likelihood)
     np.testing.assert_allclose(kernel.discrepancies, discrepancies)

@@ -34,6 +34,10 @@ class Counted:
         return float(line(x))
 
 
+def slow(value: Any) -> Any:
+    return pytest.param(value, marks=pytest.mark.slow)
+
+
 # -- what a budget is ------------------------------------------------------------------------------
 
 
@@ -79,7 +83,7 @@ def test_a_budget_holds_in_its_own_thread() -> None:
 def found(store: Path, response: Any = None, **limits: Any) -> prb.Optimum:
     propagation = prb.Resimulated(16, store=store, version="1")
     model, _ = build(propagation, response or prb.scalar(Counted()))
-    return prb.minimize(model, tolerance=1e-2, **limits, **QUIET)
+    return prb.minimize(model, tolerance=1e-2, max_evaluations=25, **limits, **QUIET)
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +94,7 @@ def at_once(tmp_path_factory: pytest.TempPathFactory) -> prb.Optimum:
 def test_minimize_goes_on_to_the_same_bits(tmp_path: Path, at_once: prb.Optimum) -> None:
     response = Counted()
     total = 0
-    for most in (200, 300):
+    for most in (100, 150):
         optimum = found(tmp_path, prb.scalar(response), max_responses=most)
         assert optimum.stopped == f"max_responses = {most} was reached"
         assert not optimum.converged
@@ -193,7 +197,7 @@ def require_same_draws(a: xr.DataTree, b: xr.DataTree) -> None:
             xr.testing.assert_equal(left[variable], right[variable])
 
 
-@pytest.mark.parametrize("name", PROPAGATIONS)
+@pytest.mark.parametrize("name", ["Reweighted", *map(slow, ("Resimulated", "Fresh"))])
 def test_stages_are_limited_and_go_on(name: str, tmp_path: Path) -> None:
     path = tmp_path / "run.nc"
     model, _ = build(PROPAGATIONS[name], black_box)
@@ -204,7 +208,7 @@ def test_stages_are_limited_and_go_on(name: str, tmp_path: Path) -> None:
     require_same_draws(sampled(name, path, model), undisturbed(name))
 
 
-@pytest.mark.parametrize("name", ["Resimulated", "Fresh"])
+@pytest.mark.parametrize("name", ["Fresh", slow("Resimulated")])
 def test_finished_chains_are_returned_and_the_rest_goes_on(name: str, tmp_path: Path) -> None:
     path = tmp_path / "run.nc"
     most = 3 * undisturbed(name)["posterior"].attrs["n_responses"] // 4
@@ -240,8 +244,8 @@ def test_a_design_that_grew_for_nothing_is_what_it_was_and_nothing_is_computed_t
 
 def test_the_optimum_within_is_not_taken_for_an_answer() -> None:
     model, _ = build(prb.Resimulated(16), black_box, epsilon=None)
-    with pytest.raises(BudgetError, match=r"prb\.sample_smc: max_responses = 100 was reached"):
-        prb.sample_smc(30, model=model, max_responses=100, **QUIET)
+    with pytest.raises(BudgetError, match=r"prb\.sample_smc: max_responses = 50 was reached"):
+        prb.sample_smc(30, model=model, max_responses=50, **QUIET)
 
 
 def test_time_is_a_budget_of_the_sampler() -> None:
