@@ -23,6 +23,7 @@ from benchmarks import record
 ROOT = Path(__file__).parent
 sys.path.insert(0, str(ROOT.parent / "tests" / "helpers"))
 
+EXECUTORS = ("nothing", "threads", "processes", "loky")
 # Two processes that are killed take seconds of which most is their start.
 SLOW = {"two processes that write and are killed": 2}
 
@@ -33,16 +34,16 @@ def on_disk(factor: int) -> dict[str, Any]:
 
     found = {}
     for name, (attack, n) in ATTACKS.items():
-        tries = n * factor // SLOW.get(name, 1)
+        tries = max(1, n * factor // SLOW.get(name, 1))
         with tempfile.TemporaryDirectory() as folder:
             outcomes = Counter(attack(Path(folder), np.random.default_rng(5), tries))
         found[name] = row(name, outcomes, allowed(name))
     return found
 
 
-def on_workers(tries: int) -> dict[str, Any]:
-    """Return outcomes of hostile responses, by executor and policy."""
-    from hostile import EXECUTORS
+def on_workers(where: str, tries: int) -> dict[str, Any]:
+    """Return outcomes of hostile responses on one kind of executor, by policy."""
+    from hostile import EXECUTORS as MADE
     from hostile import on_workers as attack
 
     import prbayes as prb
@@ -50,15 +51,14 @@ def on_workers(tries: int) -> dict[str, Any]:
     replace, abort = prb.response.Replace(-1.0), prb.response.Abort()
     policies = (replace, prb.response.Retry(1, then=replace), abort)
     found = {}
-    for where in ("nothing", "threads", "processes", "loky"):
-        for policy in policies:
-            outcomes: Counter[str] = Counter()
-            with tempfile.TemporaryDirectory() as folder, EXECUTORS[where]() as executor:
-                for seed in range(tries):
-                    store = Path(folder, str(seed))
-                    outcomes.update(attack(where, executor, policy, store, seed))
-            name = f"hostile responses, {where}, {type(policy).__name__}"
-            found[name] = row(name, outcomes, {"that point failed", "refused"})
+    for policy in policies:
+        outcomes: Counter[str] = Counter()
+        with tempfile.TemporaryDirectory() as folder, MADE[where]() as executor:
+            for seed in range(tries):
+                store = Path(folder, str(seed))
+                outcomes.update(attack(where, executor, policy, store, seed))
+        name = f"hostile responses, {where}, {type(policy).__name__}"
+        found[name] = row(name, outcomes, {"that point failed", "refused"})
     return found
 
 
@@ -77,8 +77,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "faults.json")
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
-    found = on_disk(arguments.factor) | on_workers(max(1, arguments.factor // 10))
+    found = on_disk(arguments.factor)
     record.save(arguments.out, found)
+    for where in EXECUTORS:
+        found |= on_workers(where, max(1, arguments.factor // 10))
+        record.save(arguments.out, found)
 
 
 if __name__ == "__main__":

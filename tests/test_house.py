@@ -540,3 +540,16 @@ def test_inner_names_of_executors_are_listed_and_have_contracts() -> None:
     others = [path for path in FILES if path.stem != "executors"]
     texts = [path.read_text(encoding="utf-8") for path in others]
     assert not any(f'"{name}"' in text for text in texts for name in INNER_OF_EXECUTORS)
+
+
+def test_promises_name_tests_that_are_there() -> None:
+    page = (ROOT / "docs" / "promises.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| \*\*.*\| (.*) \|$", page, flags=re.MULTILINE)
+    assert len(rows) == len(re.findall(r"^\| \*\*", page, flags=re.MULTILINE)) >= 10
+    there: set[str] = set()
+    for path in (ROOT / "tests").rglob("test_*.py"):
+        there |= set(re.findall(r"^def (test_\w+)", path.read_text(encoding="utf-8"), re.MULTILINE))
+    for row in rows:
+        named = re.findall(r"`(test_\w+)`", row)
+        assert named, "each promise has its test"
+        assert set(named) <= there

@@ -184,7 +184,10 @@ class Pool:
         waiting = list(begun)
         silent, absences = 0.0, 0
         while True:
-            found = wait(waiting, timeout=_SILENCE, return_when=FIRST_COMPLETED).done
+            # Those that a pool cancels when it is closed, `wait` waits for in vain.
+            found = {future for future in waiting if future.cancelled()}
+            patience = 0.0 if found else _SILENCE
+            found |= wait(waiting, timeout=patience, return_when=FIRST_COMPLETED).done
             if found or not waiting:
                 return found
             silent += _SILENCE

@@ -150,3 +150,14 @@ def test_a_mixture_is_one_input() -> None:
         censored = pm.Censored.dist(pm.Normal.dist(mu, 1.0), lower=0.0, upper=None)
         assert not read_inputs("y", [mixture, censored], model).nested
         assert read_inputs("y", [mixture, pm.Normal.dist(part, 1.0)], model).nested
+
+
+def test_constants_are_changed_by_nobody() -> None:
+    given = np.array([1.0, 2.0])
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu"), 1.0)
+        kept = read_inputs("y", [x, given], model).arguments[1]
+    given[0] = 7.0
+    np.testing.assert_array_equal(kept, [1.0, 2.0])
+    with pytest.raises(ValueError, match="read-only"):
+        kept *= 2

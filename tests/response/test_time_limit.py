@@ -84,6 +84,22 @@ def test_a_limit_at_the_very_end_is_one_or_the_other(where: str) -> None:
     assert nothing_is_left()
 
 
+def test_an_alarm_while_the_clock_is_stopped_comes_too_late(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stop = signal.setitimer
+
+    def stopped(which: int, seconds: float) -> None:
+        if seconds == 0:
+            signal.raise_signal(signal.SIGALRM)
+        stop(which, seconds)
+
+    monkeypatch.setattr(signal, "setitimer", stopped)
+    with limited(5.0):
+        spin(0.001)
+    assert nothing_is_left()
+
+
 def test_a_time_limit_of_the_response_s_own_is_its_own() -> None:
     def own() -> None:
         with limited(5.0):
