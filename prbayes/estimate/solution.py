@@ -11,7 +11,7 @@ from prbayes.estimate.caveats import no_information
 from prbayes.estimate.differences import cross, slopes
 from prbayes.estimate.optimum import Optimum, plain
 from prbayes.estimate.rivals import Rival
-from prbayes.estimate.search import Run, Search
+from prbayes.estimate.search import Run, Search, apart_from_data
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import identity_of
 
@@ -49,6 +49,10 @@ def assemble(
         lost = (
             " No hyperparameter changes the discrepancy here, far from the data: try another start."
         )
+    elif not search.prior and apart_from_data(evaluator, theta):
+        # Such a minimum is one of the mass beyond the grid, and no fit.
+        nowhere = True
+        lost = " The population here hardly overlaps, far from the data: try another start."
     values = evaluator(theta[None]).discrepancies[0]
     names = [n.name for n in evaluator.nodes]
     discrepancies = dict(zip(names, map(float, values), strict=True))
