@@ -13,9 +13,15 @@ import xarray as xr
 
 from prbayes._checks import Floats
 from prbayes.estimate.data_sets import SETS
-from prbayes.estimate.goodness import fit_probability, of_another_family
-from prbayes.estimate.obstacles import sampling_obstacle
+from prbayes.estimate.goodness import (
+    fit_probability,
+    of_another_family,
+    of_held_away,
+    probability_there,
+)
+from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, require_of_model
+from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.elements import finite_draws, single_elements
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level
@@ -48,10 +54,13 @@ class Diagnosis:
         What is wrong and what to do; empty when nothing is.
     support : xarray.Dataset
         ``weight_ess``, ``mean_weight`` and ``lost_mass`` by simulator and draw, for `Reweighted`.
+    notes : tuple of str
+        What was not looked at, and why.
     """
 
     messages: tuple[str, ...]
     support: xr.Dataset = field(repr=False)
+    notes: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -59,7 +68,7 @@ class Diagnosis:
         return not self.messages
 
     def __str__(self) -> str:
-        return "\n".join(self.messages) if self.messages else "No problem was found."
+        return "\n".join([*(self.messages or ["No problem was found."]), *self.notes])
 
 
 @in_turn
@@ -69,8 +78,8 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     Looked at are: what is not identified; whether an optimiser converged; R-hat and effective
     sample size of draws, by ArviZ; how many of them differ; how far the particles of `sample_smc`
     moved in its last stage; whether the stored responses of `Reweighted` supported the answer; and,
-    of optima and of adjusted draws, whether the data can have come from the best population
-    (refits on stored responses; p < .01).
+    of optima on stored responses and of adjusted draws, whether the data can have come from the
+    best population, by refits (p < .01). No response is computed; what was not looked at is said.
 
     Parameters
     ----------
@@ -133,23 +142,41 @@ def _refuse_other(result: object) -> None:
 
 
 def _of_optimum(optimum: Optimum) -> Diagnosis:
-    messages = _sentences([*optimum.warnings, *_of_family(optimum)])
+    family, notes = _of_family(optimum)
+    messages = _sentences([*optimum.warnings, *family])
     told = optimum.at_edge or optimum.stopped  # by the warnings
     if not optimum.converged and not told:
         messages.append(_not_converged(optimum.message))
     designs = _computed(optimum.evaluator, optimum.theta[None])
     failed = _failed(optimum.failures)
-    return Diagnosis((*messages, *failed, *_unsupported(designs)), designs.support)
+    return Diagnosis((*messages, *failed, *_unsupported(designs)), designs.support, notes)
 
 
-def _of_family(optimum: Optimum) -> list[str]:
-    """Say where the data are too far from the best population to have come from its family."""
-    known = optimum.converged and not optimum.at_edge and not optimum.at_jump
-    if optimum.evaluator.responses_per_theta:
-        return []  # refits would compute responses
-    if not known or optimum.prior or sampling_obstacle(optimum.evaluator) is not None:
-        return []
-    return of_another_family(fit_probability(optimum.sampling(), SETS, 0))
+def _of_family(optimum: Optimum) -> tuple[list[str], tuple[str, ...]]:
+    """Say where the data are too far from the best population to have come from its family.
+
+    Or else why that was not looked at.
+    """
+    evaluator = optimum.evaluator
+    obstacle = refit_obstacle(evaluator)
+    if not optimum.converged or optimum.at_edge or optimum.at_jump:
+        return [], _not_looked_at("nothing is known of the sampling distribution of this optimum")
+    if obstacle is not None:
+        return [], _not_looked_at(obstacle)
+    if evaluator.responses_per_theta:
+        return [], _not_looked_at("it would take responses; draws of prb.sample_smc tell of it")
+    if optimum.prior:
+        scales = np.array(list(optimum.scales.values()))
+        held = SamplingDistribution.of(evaluator, optimum.theta, scales)
+        return of_held_away(probability_there(held, SETS, 0)), ()
+    probability = fit_probability(optimum.sampling(), SETS, 0)
+    if np.isnan(probability):
+        return [], _not_looked_at("the data tell too little, or too few refits converge")
+    return of_another_family(probability), ()
+
+
+def _not_looked_at(reason: str) -> tuple[str, ...]:
+    return (f"Whether the inputs have the right family was not looked at: {reason}.",)
 
 
 def _of_stored_optimum(result: xr.DataTree) -> Diagnosis:
@@ -157,7 +184,8 @@ def _of_stored_optimum(result: xr.DataTree) -> Diagnosis:
     messages = _warnings(attrs)
     if not attrs.get("converged", True) and not attrs.get("stopped"):
         messages.append(_not_converged(str(attrs.get("message", ""))))
-    return Diagnosis((*messages, *_failed_in(result)), xr.Dataset())
+    notes = _not_looked_at("refits need the model; pass the Optimum itself")
+    return Diagnosis((*messages, *_failed_in(result)), xr.Dataset(), notes)
 
 
 def _failed_in(result: xr.DataTree) -> list[str]:
@@ -205,7 +233,16 @@ def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
         *_failed_in(result),
         *_unsupported(designs),
     ]
-    return Diagnosis(tuple(messages), designs.support)
+    return Diagnosis(tuple(messages), designs.support, _of_refits(posterior.attrs))
+
+
+def _of_refits(attrs: Mapping[Any, Any]) -> tuple[str, ...]:
+    """Say why draws do not tell whether the data can have come from the best population."""
+    if np.isfinite(attrs.get("fit_probability", np.nan)):
+        return ()
+    said = str(attrs.get("adjustment", ""))
+    why = said.removeprefix("none").removeprefix(": ") or "there was no adjustment"
+    return _not_looked_at(f"refits tell of it, and {why}; look at prb.diagnose of an optimum")
 
 
 def _warnings(attrs: Mapping[Any, Any]) -> list[str]:

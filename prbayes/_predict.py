@@ -21,7 +21,12 @@ from prbayes._progress import shown
 from prbayes._weighted import reached
 from prbayes.estimate.optimum import Optimum, identity_in, require_of_model
 from prbayes.model.elements import finite_draws
-from prbayes.model.identity import Level, as_attributes, identity_of_model
+from prbayes.model.identity import (
+    Level,
+    as_attributes,
+    identity_of_model,
+    require_same_responses,
+)
 from prbayes.model.labels import versions
 from prbayes.model.node import Node, model_on_context, nodes
 from prbayes.model.support import TOLERABLE, shortcoming
@@ -154,6 +159,7 @@ def predict(
     label = _label(response, name, store)
     if not (isinstance(result, Optimum) and model is result.model):
         require_of_model(result, model, "prb.predict", Level.POPULATIONS)
+        require_same_responses(identity_in(result), model, "prb.predict")
     points, coords = populations_of(result, model, draws, "prb.predict")
     sorted_inputs = read_inputs(label, inputs, model)
     responses = Responses(

@@ -2,10 +2,13 @@
 
 Data sets are drawn from the model at its minimiser, and each is refitted. How far each is from its
 own fit is what the data's distance from theirs is held against (Stute, Gonzalez Manteiga and
-Presedo Quindimil 1993, doi:10.1007/BF02613687). No response is computed.
+Presedo Quindimil 1993, doi:10.1007/BF02613687). With designs no response is computed, and else
+those of the populations one standard error to either side.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,11 +64,11 @@ def probability_of_fit(
         Their minimisers.
     converged : ndarray of bool, shape (n_sets,)
     """
-    stored = all(node.bound.stored for node in sampling.evaluator.nodes)
-    if not stored or converged.mean() < ARRIVED:
+    if converged.mean() < ARRIVED:
         return np.nan
-    observed = _distances(sampling, center[None], observed_set(sampling.evaluator))
-    drawn = _distances(sampling, x, sets)[converged]
+    populations = _Populations.around_center(sampling, center)
+    observed = _distances(populations, center[None], observed_set(sampling.evaluator))
+    drawn = _distances(populations, x, sets)[converged]
     # Distances of several kinds and simulators, each in spreads of its own distribution: the worst.
     middle = drawn.mean(axis=0)
     spread = np.maximum(drawn.std(axis=0), 1e-300)
@@ -74,29 +77,70 @@ def probability_of_fit(
     return float((1 + np.sum(worst >= here)) / (1 + worst.size))
 
 
-def _distances(sampling: SamplingDistribution, x: Floats, sets: DataSets) -> Floats:
+@dataclass(frozen=True, eq=False)
+class _Populations:
+    """The distribution functions of populations at refits."""
+
+    sampling: SamplingDistribution
+    center: Floats  # (r,)
+    # By simulator whose responses are not stored: those at the centre, and one standard error to
+    # either side of it along each axis, values and weights of shape (1 + 2 r, n).
+    around: dict[int, tuple[Floats, Floats]]
+
+    @classmethod
+    def around_center(cls, sampling: SamplingDistribution, center: Floats) -> _Populations:
+        """Compute the populations around a centre, of responses that are not stored."""
+        evaluator = sampling.evaluator
+        r = center.size
+        cross = np.concatenate([np.zeros((1, r)), np.eye(r), -np.eye(r)])
+        around = {}
+        for k, node in enumerate(evaluator.nodes):
+            if not node.bound.stored:
+                around[k] = evaluator.populations(sampling.thetas(center + cross), k)
+        return cls(sampling, center, around)
+
+    def below(self, k: int, x: Floats, at: Floats) -> Floats:
+        """Return distribution functions at values, (m,), of populations at x, (n_sets, r).
+
+        Shape (n_sets, m); of responses that are not stored to first order, as refits are.
+        """
+        if k not in self.around:
+            return _middles(*self.sampling.evaluator.populations(self.sampling.thetas(x), k), at)
+        found = _middles(*self.around[k], at)
+        r = self.center.size
+        slopes = (found[1 : 1 + r] - found[1 + r :]) / 2
+        linear = found[0] + (x - self.center) @ slopes
+        return np.asarray(np.clip(linear, 0.0, 1.0))
+
+
+def _middles(values: Floats, weights: Floats, at: Floats) -> Floats:
+    """Return distribution functions at values, (P, n), (P, n), (m,) -> (P, m).
+
+    Each goes through the middles of its steps.
+    """
+    rows = []
+    for own, share in zip(values, weights, strict=True):
+        # Only what is finite can be observed.
+        finite = np.isfinite(own)
+        order = np.argsort(own[finite], kind="stable")
+        mass = share[finite][order]
+        mass = mass / mass.sum()
+        rows.append(np.interp(at, own[finite][order], np.cumsum(mass) - mass / 2))
+    return np.array(rows)
+
+
+def _distances(populations: _Populations, x: Floats, sets: DataSets) -> Floats:
     """Return logarithms of two distances of each data set from its fit, by simulator.
 
     Those of Cramer and von Mises, which sees the middle of a distribution, and of Anderson and
     Darling, which sees its tails; shape (n_sets, 2 K).
     """
-    thetas = sampling.thetas(x)
     columns = []
     for k, (values, weights) in enumerate(zip(sets.values, sets.weights, strict=True)):
-        simulated, own = sampling.evaluator.populations(thetas, k)
-        # Stored responses are the same at all thetas; only what is finite can be observed.
-        stored = simulated[0]
-        finite = np.isfinite(stored)
-        order = np.argsort(stored[finite], kind="stable")
-        points = stored[finite][order]
-        mass = own[:, finite][:, order]
-        mass = mass / mass.sum(axis=1, keepdims=True)
-        middles = np.cumsum(mass, axis=1) - mass / 2
         ranked = np.argsort(values, kind="stable")
-        at = values[ranked]
         w = weights[:, ranked]
         below = np.cumsum(w, axis=1) - w / 2
-        expected = np.array([np.interp(at, points, row) for row in middles])
+        expected = populations.below(k, x, values[ranked])
         squares = w * (below - expected) ** 2
         inside = np.clip(expected, _BEYOND, 1 - _BEYOND)
         in_the_middle = squares.sum(axis=1)
@@ -104,6 +148,27 @@ def _distances(sampling: SamplingDistribution, x: Floats, sets: DataSets) -> Flo
         columns += [in_the_middle, in_the_tails]
     stacked = np.maximum(np.stack(columns, axis=1), 1e-300)
     return np.asarray(np.log(stacked))
+
+
+def probability_there(sampling: SamplingDistribution, n_sets: int, seed: int) -> float:
+    """Return how probable a distance as the data's from the population at theta itself is.
+
+    Without refits: for an optimum that is no minimiser, as a prior holds it.
+    """
+    sets = simulated_sets(sampling.evaluator, sampling.theta, n_sets, seed)
+    there = np.zeros((n_sets, sampling.stderr.size))
+    return probability_of_fit(sampling, there[0], sets, there, np.ones(n_sets, dtype=bool))
+
+
+def of_held_away(probability: float) -> list[str]:
+    """Say so where the data cannot have come from the population that the prior holds."""
+    if not probability < UNLIKELY:
+        return []
+    return [
+        f"the data are farther from the population at this optimum than {1 - probability:.1%} of "
+        "data sets drawn there: the prior, which is part of its objective, and the data contradict "
+        "each other, or the inputs have another family; look at prb.minimize without the prior"
+    ]
 
 
 def of_another_family(probability: float) -> list[str]:

@@ -349,6 +349,18 @@ def overlap(evaluator: Evaluator, values: list[Floats], weights: list[Floats]) -
     return np.min([np.ones(len(values[0])), *overlaps], axis=0)
 
 
+def apart_from_data(evaluator: Evaluator, theta: Floats) -> bool:
+    """Return whether stored responses, with the weights of theta, are nowhere near any data.
+
+    False where that would compute responses, and where a metric compares no densities.
+    """
+    if not all(node.bound.stored for node in evaluator.nodes):
+        return False
+    values, weights = _populations(evaluator, theta[None])
+    every = zip(evaluator.nodes, values, weights, strict=True)
+    return all(node.target.overlap(v, w)[0] < _OVERLAP for node, v, w in every)
+
+
 def _populations(evaluator: Evaluator, thetas: Floats) -> tuple[list[Floats], list[Floats]]:
     """Return responses and weights, (P, n) each, by simulator."""
     found = [evaluator.populations(thetas, k) for k in range(len(evaluator.nodes))]

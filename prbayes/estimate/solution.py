@@ -11,7 +11,7 @@ from prbayes.estimate.caveats import no_information
 from prbayes.estimate.differences import cross, slopes
 from prbayes.estimate.optimum import Optimum, plain
 from prbayes.estimate.rivals import Rival
-from prbayes.estimate.search import Run, Search
+from prbayes.estimate.search import Run, Search, apart_from_data
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import identity_of
 
@@ -46,13 +46,17 @@ def assemble(
     """
     evaluator, theta, scales = search.evaluator, run.best, run.scales
     point, stderr = point_and_stderr(evaluator, theta, covariance)
+    affordable = not (stopped and evaluator.responses_per_theta)
     nowhere = _nowhere(evaluator, theta, covariance)
     lost = ""
     if nowhere:
         lost = (
             " No hyperparameter changes the discrepancy here, far from the data: try another start."
         )
-    affordable = not (stopped and evaluator.responses_per_theta)
+    elif affordable and not search.prior and apart_from_data(evaluator, theta):
+        # Such a minimum is one of the mass beyond the grid, and no fit.
+        nowhere = True
+        lost = " The population here hardly overlaps, far from the data: try another start."
     if affordable:
         values = evaluator(theta[None]).discrepancies[0]
     else:

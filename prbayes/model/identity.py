@@ -33,7 +33,8 @@ class Level(IntEnum):
 
     POPULATIONS
         Hyperparameters, data, inputs and responses, so that a population of one is a population of
-        the other.
+        the other. Responses at the same points are compared; `require_same_responses` goes on
+        where the points are others.
     PRIORS
         And priors and other likelihood terms.
     OPTIMUM
@@ -84,6 +85,9 @@ class SimulatorIdentity:
         The first responses that are known anyway.
     discrepancies : tuple of float
         At the fixed thetas; empty where that would cost responses.
+    points : tuple of tuple of float
+        The aleatory inputs of the first two of the responses, one after the other; empty where the
+        response has others.
     """
 
     name: str
@@ -98,6 +102,7 @@ class SimulatorIdentity:
     epsilon: float
     responses: tuple[float, ...]
     discrepancies: tuple[float, ...] = ()
+    points: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -207,7 +212,20 @@ def _simulator(node: Node, discrepancies: Floats) -> SimulatorIdentity:
         epsilon=node.epsilon_value,
         responses=_numbers(node.bound.known_responses[:8]),
         discrepancies=_numbers(discrepancies),
+        points=_points(node),
     )
+
+
+# Responses by which another one is known: one alone may agree by chance, as at zero.
+_POINTS = 2
+
+
+def _points(node: Node) -> tuple[tuple[float, ...], ...]:
+    """Return the aleatory inputs of the first known responses, a row for each."""
+    if node.bound.inputs.epistemic:
+        return ()
+    columns = [x[:_POINTS].reshape(min(_POINTS, len(x)), -1) for x in node.bound.known_points]
+    return tuple(map(_numbers, np.concatenate(columns, axis=1)))
 
 
 def _inputs(node: Node) -> str:
@@ -256,6 +274,7 @@ def from_text(text: str) -> Identity:
     for fields in found.pop("simulators"):
         for key in ("responses", "discrepancies"):
             fields[key] = tuple(fields[key])
+        fields["points"] = tuple(tuple(point) for point in fields.get("points", ()))
         simulators.append(SimulatorIdentity(**fields))
     shapes = found.pop("shapes")
     shapes = {name: tuple(shape) for name, shape in shapes.items()}
@@ -315,6 +334,39 @@ def require_same(
         raise ValueError(
             f"{caller}: got a result of another problem: {'; '.join(found)}; {_REMEDIES[level]}"
         )
+
+
+def require_same_responses(got: Identity | None, model: pm.Model, caller: str) -> None:
+    """Raise unless the responses of a model are those of a result, also at points of its own.
+
+    `differences` compares those that are known at the same points, which are drawn through the
+    priors. With other priors, or another propagation, two responses of each simulator are computed.
+
+    Raises
+    ------
+    ValueError
+        If one has another value.
+    """
+    known = {} if got is None else {each.name: each for each in got.simulators}
+    for node in nodes(model).values():
+        before = known.get(node.name)
+        if before is None or not before.points or before.points == _points(node):
+            continue
+        values = _at_points(node, np.array(before.points))
+        if not _close(values, before.responses[: len(values)]):
+            raise ValueError(
+                f"{caller}: got a result of another problem: the response of {node.name} has other "
+                f"values at the same points; {_REMEDIES[Level.POPULATIONS]}"
+            )
+
+
+def _at_points(node: Node, points: Floats) -> Floats:
+    """Return a simulator's responses at points, rows of its aleatory inputs."""
+    shapes = node.bound.inputs.event_shapes
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
+    columns = np.split(points, ends[:-1], axis=1)
+    aleatory = [x.reshape(-1, *shape) for x, shape in zip(columns, shapes, strict=True)]
+    return node.bound.responses(aleatory, [])
 
 
 def require_together(

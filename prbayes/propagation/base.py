@@ -105,11 +105,17 @@ class Bound(ABC):
     # Of the populations that were looked at last.
     _missing: Missing | None = None
     _probed: Floats = np.empty(0)
+    _probed_at: Sequence[Floats] = ()
 
     @property
     def known_responses(self) -> Floats:
         """Responses computed when the simulator was made; the first of them stay the first."""
         return self._probed
+
+    @property
+    def known_points(self) -> Sequence[Floats]:
+        """The aleatory inputs of the same, shapes (n, *event)."""
+        return self._probed_at
 
     @property
     def is_line(self) -> bool:
@@ -312,6 +318,8 @@ def probe(bound: Bound, sampler: PopulationSampler, seed: int) -> tuple[Any, ...
     values = bound.responses(aleatory, epistemic)
     refuse_all_nan(bound.name, values)
     bound._probed = values.ravel()
+    shapes = bound.inputs.event_shapes
+    bound._probed_at = [x.reshape(-1, *own) for x, own in zip(aleatory, shapes, strict=True)]
     return values, aleatory, epistemic
 
 

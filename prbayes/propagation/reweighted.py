@@ -267,6 +267,11 @@ class Design(Bound):
         return self.values
 
     @property
+    def known_points(self) -> Sequence[Floats]:
+        """Their points."""
+        return self.batches.points
+
+    @property
     def _dimensions(self) -> int:
         """Number of aleatory numbers that make one specimen."""
         sizes = [int(np.prod(shape)) for shape in self.inputs.event_shapes]

@@ -105,7 +105,7 @@ def _capital(label: str) -> str:
 def _sentences(diagnosis: Diagnosis | None) -> tuple[str, ...]:
     if diagnosis is None:
         return ("not looked at, because that needs the model, which was not given.",)
-    return diagnosis.messages or ("no problem was found.",)
+    return (*(diagnosis.messages or ("no problem was found.",)), *diagnosis.notes)
 
 
 def _support(label: str, support: xr.Dataset) -> list[dict[str, Any]]:

@@ -10,7 +10,12 @@ from four_metrics import METRICS, R256, same
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.estimate.goodness import UNLIKELY, fit_probability, of_another_family
+from prbayes.estimate.goodness import (
+    UNLIKELY,
+    fit_probability,
+    of_another_family,
+    of_held_away,
+)
 
 Draw = Callable[[np.random.Generator, int], Floats]
 FAMILIES: dict[str, Draw] = {
@@ -103,12 +108,86 @@ def test_repeated_measurements_of_a_specimen_are_drawn_together() -> None:
     assert p > 0.05
 
 
-def test_what_is_not_stored_is_not_known() -> None:
+def resimulated(family: str, metric: prb.Metric, n: int = 50) -> prb.Optimum:
+    observed = FAMILIES[family](np.random.default_rng([7, 0, n]), n)
     with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
         prb.Simulator(
-            "y", same, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0],
-            propagation=prb.Resimulated(64),
+            "y", same, x, metric=metric, observed=observed, propagation=prb.Resimulated(256)
+        )
+    return prb.minimize(model, starts=0)
+
+
+@pytest.mark.parametrize("name", ["kl", pytest.param("area", marks=pytest.mark.slow)])
+def test_what_is_not_stored_is_known_to_first_order(name: str) -> None:
+    right, wrong = (resimulated(f, METRICS[name]).sampling() for f in ("normal", "bimodal"))
+    before = right.evaluator.n_responses
+    p = fit_probability(right, 200, 0)
+    # The population that data sets are drawn from, and to either side of it along two axes.
+    assert right.evaluator.n_responses <= before + 6 * 256
+    stored = fit_probability(optimum(name, "normal", 0).sampling(), 200, 0)
+    assert p == pytest.approx(stored, abs=0.15)
+    assert fit_probability(wrong, 200, 0) < 0.02
+
+
+def test_draws_under_other_propagations_tell_as_well() -> None:
+    wrong = resimulated("bimodal", METRICS["kl"], 80)
+    keywords = {"model": wrong.model, "optimum": wrong, "progressbar": False}
+    idata = prb.sample_smc(100, chains=2, **keywords)
+    assert idata.posterior.attrs["fit_probability"] < UNLIKELY
+    assert "the inputs probably have another family" in str(prb.diagnose(idata))
+    assert not any("family was not" in note for note in prb.diagnose(idata).notes)
+
+
+def test_where_it_is_not_looked_at_a_line_says_why() -> None:
+    found = resimulated("normal", METRICS["kl"])
+    before = found.evaluator.n_responses
+    diagnosis = prb.diagnose(found)
+    assert found.evaluator.n_responses == before
+    assert diagnosis.ok
+    said = "No problem was found.\nWhether the inputs have the right family was not looked at: "
+    assert str(diagnosis) == f"{said}it would take responses; draws of prb.sample_smc tell of it."
+    keywords = {"model": found.model, "optimum": found, "progressbar": False}
+    plain = prb.sample_smc(60, chains=2, adjust=False, **keywords)
+    (note,) = prb.diagnose(plain).notes
+    assert "refits tell of it, and there was no adjustment; look at prb.diagnose of an op" in note
+    (note,) = prb.diagnose(found.to_datatree()).notes
+    assert "refits need the model; pass the Optimum itself" in note
+    assert prb.diagnose(optimum("pr", "normal", 0)).notes == ()
+
+
+def test_why_it_is_not_looked_at_with_other_terms() -> None:
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, 2)
+        prb.Simulator(
+            "y", same, pm.Normal.dist(mu, 1.0), metric=METRICS["kl"],
+            observed=FAMILIES["normal"](np.random.default_rng(1), 30), propagation=R256,
         )  # fmt: skip
-    assert np.isnan(fit_probability(prb.minimize(model).sampling(), 50, 0))
+        pm.Normal("other", mu, 1.0, observed=1.0)
+    (note,) = prb.diagnose(prb.minimize(model, starts=0)).notes
+    assert "the model has likelihood terms or potentials besides its simulators" in note
+
+
+def test_an_optimum_that_the_prior_holds_away_from_the_data_is_told() -> None:
+    """The residual is flat there: from the draws around it nothing could be seen."""
+
+    def held(away: float) -> prb.Optimum:
+        data = np.random.default_rng(1).normal(2.0, 1.0, 20)
+        with pm.Model() as model:
+            x = pm.Normal.dist(pm.Normal("mu", 2.0 - away, 0.2), pm.HalfNormal("sigma", 1))
+            prb.Simulator(
+                "y", same, x, metric=METRICS["pr"], observed=data, epsilon=1.0, propagation=R256
+            )
+        return prb.minimize(model, prior=True)
+
+    assert "the prior, which is part of its objective, and the data contr" in str(
+        prb.diagnose(held(3.0))
+    )
+    agreeing = prb.diagnose(held(0.0))
+    assert agreeing.ok
+    assert agreeing.notes == ()
+
+
+def test_where_nothing_is_known_nothing_is_said() -> None:
     assert of_another_family(np.nan) == []
+    assert of_held_away(np.nan) == []

@@ -338,6 +338,24 @@ def test_predict_takes_a_model_with_another_prior_metric_or_epsilon() -> None:
         assert found.shape == (1, 1, 500)
 
 
+@pytest.mark.parametrize("propagation", [prb.Reweighted(64), prb.Resimulated(64)])
+def test_predict_refuses_another_prior_and_another_response_together(propagation: Any) -> None:
+    """Their design points are others, so that no two known responses can be compared."""
+    same, wrong = (
+        Problem(prior=(1.5, 1.0), slope=slope, propagation=propagation).model()
+        for slope in (2.0, 2.01)
+    )
+    (count,) = (node.bound.responses for node in nodes(same).values())
+    for result in (optimum(), posterior()):
+        before = count.count
+        x = pm.Normal.dist(same["mu"], 1.0)
+        prb.predict(result, np.positive, x, model=same, stored=False)
+        assert count.count == before + 2
+        x = pm.Normal.dist(wrong["mu"], 1.0)
+        with pytest.raises(ValueError, match="the response of y has other values at the same poi"):
+            prb.predict(result, np.positive, x, model=wrong, stored=False)
+
+
 def test_compare_refuses_results_of_different_data() -> None:
     other = prb.minimize(CHANGES["data"][0].model(), starts=0, **QUIET)
     with pytest.raises(
