@@ -87,7 +87,7 @@ class Runs:
 
     def note(self, given: list[Floats], found: Floats) -> None:
         """Keep a call for the simulator that comes next; of one simulator only a small one."""
-        if self.several or found.size <= _OF_A_TRIAL:
+        if self.several or found.size <= _TRIAL:
             self.last = [x.copy() for x in given], found.copy()
         else:
             self.last = None
@@ -95,7 +95,7 @@ class Runs:
 
 # Responses of a call that is kept before another simulator is there: the trial at some points of
 # the prior, which both of them make.
-_OF_A_TRIAL = 64
+_TRIAL = 64
 
 
 class Responses:

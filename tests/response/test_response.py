@@ -126,5 +126,7 @@ def test_two_responses_are_the_same_by_function_inputs_and_constants() -> None:
     assert not same(weighted, PAIR, 2.0, other)
     assert not same(weighted, PAIR, 2.0)
     assert not same(weighted, PAIR, X, X)
+    # A variable that is common to all specimens is the same input if it is the same variable.
     epistemic = Responses("y", weighted, inputs(X, MU))
-    assert not epistemic.same_as(Responses("y", weighted, inputs(X, MU)))
+    assert epistemic.same_as(Responses("y", weighted, inputs(X, MU)))
+    assert not epistemic.same_as(Responses("y", weighted, inputs(X, 2.0)))
