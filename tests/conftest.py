@@ -7,7 +7,9 @@ are left out by the marker ``exact``.
 """
 
 import gc
+import logging
 import os
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -34,6 +36,16 @@ def pytest_configure(config: pytest.Config) -> None:
         return np.where(np.isfinite(digits), found * (1 + 1e-12 * digits), found)
 
     Responses.__call__ = perturbed  # type: ignore[method-assign, assignment]
+
+
+@pytest.fixture(autouse=True)
+def _logging() -> Iterator[None]:
+    """Leave the package's logger as it was: the command line sets it up for its process."""
+    log = logging.getLogger("prbayes")
+    handlers, propagate, level = log.handlers[:], log.propagate, log.level
+    yield
+    log.handlers[:], log.propagate = handlers, propagate
+    log.setLevel(level)
 
 
 def pytest_collection_finish() -> None:

@@ -750,10 +750,14 @@ def results() -> dict[str, Any]:
 def cases() -> Iterator[Any]:
     for name, row in TABLE.items():
         for argument, values in row.bad.items():
-            for value in values:
+            for place, value in enumerate(values):
                 # Without addresses, which differ between processes.
                 label = " ".join(re.sub(r" at 0x\w+", "", repr(value))[:40].split())
-                yield pytest.param(name, argument, value, id=f"{name} {argument}={label}")
+                # By default the first ones of each argument.
+                marks = [pytest.mark.slow] if place >= 3 else []
+                yield pytest.param(
+                    name, argument, value, id=f"{name} {argument}={label}", marks=marks
+                )
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -4,7 +4,6 @@ import logging
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,16 +15,6 @@ import xarray as xr
 
 import prbayes as prb
 from prbayes.__main__ import main
-
-
-@pytest.fixture(autouse=True)
-def _logging() -> Iterator[None]:
-    """Leave the package's logger as it was."""
-    log = logging.getLogger("prbayes")
-    before = log.handlers[:], log.propagate, log.level
-    yield
-    log.handlers[:], log.propagate = before[:2]
-    log.setLevel(before[2])
 
 
 def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -93,6 +93,7 @@ def test_five_hundred_calls_grow_by_less_than_twenty_mib(what: str) -> None:
 
 
 @linux
+@pytest.mark.slow
 def test_ten_calls_of_minimize_grow_little() -> None:
     # Each evaluator that were kept would be 2 MiB.
     assert grown("minimize_one", 10) < 10

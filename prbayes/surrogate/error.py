@@ -45,7 +45,9 @@ class CrossValidation:
 
     @property
     def relative(self) -> float:
-        """Root mean square in units of the population's standard deviation."""
+        """Root mean square in units of the population's standard deviation; of a constant too."""
+        if self.population_sd == 0:
+            return np.inf if self.rms else 0.0
         return self.rms / self.population_sd
 
     def __str__(self) -> str:

@@ -219,7 +219,9 @@ def test_rivals_stand_where_the_optimum_does_along_unidentified_directions() -> 
     assert len(optimum.warnings) == 2
 
 
-@pytest.mark.parametrize(("slope", "comparable"), [(0.25, False), (0.0, True)])
+@pytest.mark.parametrize(
+    ("slope", "comparable"), [(0.25, False), pytest.param(0.0, True, marks=pytest.mark.slow)]
+)
 def test_one_output_of_many_excludes_a_mirror(slope: float, comparable: bool) -> None:
     """Five outputs are the same for either sign; what one tells is not lost in their noise."""
     inputs = np.random.default_rng(0).normal(1.0, 0.4, 30)

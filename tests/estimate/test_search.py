@@ -203,8 +203,8 @@ print(begun, peak())
 @pytest.mark.parametrize(
     ("metric", "n"),
     [
-        # A fifth of a million says as much of what each response takes, in less time.
-        ("ProbabilityResidual", 200_000),
+        # A tenth of a million says as much of what each response takes, in less time.
+        ("ProbabilityResidual", 100_000),
         pytest.param("ProbabilityResidual", 1_000_000, marks=pytest.mark.slow),
         pytest.param("AreaMetric", 1_000_000, marks=pytest.mark.slow),
     ],

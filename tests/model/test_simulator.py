@@ -150,7 +150,7 @@ def draws_of(name: str, sampler: str) -> Any:
         ("black box", "stock SMC"),
         ("black box", "batched kernel"),
         ("black box", "prbayes SMC"),
-        ("Fresh", "stock SMC"),
+        pytest.param("Fresh", "stock SMC", marks=pytest.mark.slow),
         ("Fresh", "batched kernel"),
         ("Fresh", "prbayes SMC"),
     ],

@@ -181,7 +181,8 @@ def with_prior(name: str, shift: float, tightness: float) -> tuple[Any, xr.Datas
     return model, sample(model)["posterior"].to_dataset()
 
 
-@pytest.mark.parametrize("name", ["pr", slow("kl")])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pr", "kl"])
 def test_the_posterior_changes_smoothly_as_the_prior_gets_as_tight_as_the_data(name: str) -> None:
     found = [with_prior(name, 1.0, t)[1] for t in (0.7, 0.9, 1.1, 1.4)]
     for variable, most in (("mu", 0.15), ("sigma", 0.08)):
@@ -199,8 +200,9 @@ def test_a_prior_far_tighter_than_the_data_is_a_constant(name: str) -> None:
     assert float(loose.std()) == pytest.approx(float(fixed.std()), rel=0.2)
 
 
-@pytest.mark.parametrize("sigma", [0.35, pytest.param(0.5, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", ["kl", slow("pr"), slow("area")])
+@pytest.mark.parametrize("sigma", [0.35, 0.5])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["kl", "pr", "area"])
 def test_a_standard_deviation_near_zero(name: str, sigma: float) -> None:
     """Scatter known to be the gauge's hides some of the specimens': a third of the refits find next to none."""
     n, gauge = 40, 0.5

@@ -335,7 +335,12 @@ def test_a_likelihood_counts_specimens_and_not_observations(metric: prb.Metric) 
 
 
 @pytest.mark.parametrize(
-    "metric", [prb.KullbackLeibler(), prb.ProbabilityResidual(), prb.AreaMetric()]
+    "metric",
+    [
+        prb.KullbackLeibler(),
+        pytest.param(prb.ProbabilityResidual(), marks=pytest.mark.slow),
+        pytest.param(prb.AreaMetric(), marks=pytest.mark.slow),
+    ],
 )
 def test_two_simulators_that_say_the_same_count_once(metric: prb.Metric) -> None:
     numbers = np.arange(30)

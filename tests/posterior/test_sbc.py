@@ -82,7 +82,12 @@ def executors() -> Iterator[dict[str, Executor]]:
             "threads", lambda x: x + 0.1 * x**2, id="threads-lambda", marks=pytest.mark.slow
         ),
         # Other processes do not perturb last digits.
-        pytest.param("processes", bent, id="processes-module", marks=pytest.mark.exact),
+        pytest.param(
+            "processes",
+            bent,
+            id="processes-module",
+            marks=[pytest.mark.exact, pytest.mark.slow],
+        ),
         pytest.param(
             "processes", lambda x: x + 0.1 * x**2, id="processes-lambda", marks=pytest.mark.exact
         ),

@@ -392,6 +392,7 @@ def test_two_designs_agree_in_the_optimum_of_the_hard_case(metric: prb.Metric) -
             ).all()
 
 
+@pytest.mark.slow
 def test_the_error_of_a_design_is_measured() -> None:
     """Eight blocks tell how far the optima of independent designs are apart, and points are added until it is small."""
 

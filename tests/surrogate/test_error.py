@@ -105,3 +105,10 @@ def test_points_needed_leave_enough_for_every_fold(degree: int) -> None:
     sizes = [len(fold) for fold in np.array_split(np.arange(n), FOLDS)]
     assert n - max(sizes) > terms
     assert n - 1 - -(-(n - 1) // FOLDS) <= terms
+
+
+@pytest.mark.parametrize(("residual", "relative"), [(0.0, 0.0), (0.1, np.inf)])
+def test_the_error_beside_a_response_that_is_a_constant(residual: float, relative: float) -> None:
+    error = CrossValidation(np.full(4, residual), 0.0)
+    assert error.relative == relative
+    assert str(error).startswith(f"rms {residual:.3g} (")
