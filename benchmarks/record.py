@@ -25,7 +25,9 @@ def about() -> dict[str, Any]:
     """Return how, on what and when this process runs."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     module = f"-m {spec.name}" if spec is not None else sys.argv[0]
-    status = _git("status", "--porcelain", "--untracked-files=no", "--", ".", f":!{RESULTS}")
+    # What the benchmarks themselves write is no change of what they measure.
+    code = [".", f":!{RESULTS}", ":!docs/images"]
+    status = _git("status", "--porcelain", "--untracked-files=no", "--", *code)
     changed = " with changes" if status else ""
     versions = {"python": platform.python_version()}
     for name in PACKAGES:
