@@ -89,7 +89,10 @@ def executors() -> Iterator[dict[str, Executor]]:
             marks=[pytest.mark.exact, pytest.mark.slow],
         ),
         pytest.param(
-            "processes", lambda x: x + 0.1 * x**2, id="processes-lambda", marks=pytest.mark.exact
+            "processes",
+            lambda x: x + 0.1 * x**2,
+            id="processes-lambda",
+            marks=[pytest.mark.exact, pytest.mark.slow],
         ),
     ],
 )
