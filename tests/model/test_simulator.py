@@ -138,7 +138,7 @@ def draws_of(name: str, sampler: str) -> Any:
     ("name", "sampler"),
     [
         ("Reweighted", "NUTS"),
-        ("Reweighted", "stock SMC, two cores"),
+        pytest.param("Reweighted", "stock SMC, two cores", marks=pytest.mark.slow),
         ("Reweighted", "batched kernel, two cores"),
         ("Reweighted", "prbayes SMC"),
         ("strong prior", "batched kernel"),
@@ -147,7 +147,7 @@ def draws_of(name: str, sampler: str) -> Any:
         ("Resimulated", "stock SMC"),
         ("Resimulated", "batched kernel"),
         ("Resimulated", "prbayes SMC"),
-        ("black box", "stock SMC"),
+        pytest.param("black box", "stock SMC", marks=pytest.mark.slow),
         ("black box", "batched kernel"),
         ("black box", "prbayes SMC"),
         pytest.param("Fresh", "stock SMC", marks=pytest.mark.slow),

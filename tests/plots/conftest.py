@@ -20,6 +20,11 @@ from prbayes.propagation.base import Propagation
 Array = np.ndarray[Any, Any]
 
 
+def same(x: Any) -> Any:
+    """Return the input; of NumPy's own functions older versions do not tell what theirs is called."""
+    return np.positive(x)
+
+
 @pytest.fixture(autouse=True)
 def _close() -> Iterator[None]:
     yield
@@ -40,9 +45,7 @@ def known() -> SimpleNamespace:
 def build(known: SimpleNamespace) -> Callable[..., pm.Model]:
     """How to build a normal population of unknown mean and standard deviation."""
 
-    def model_of(
-        propagation: Propagation, response: Any = np.positive, **keywords: Any
-    ) -> pm.Model:
+    def model_of(propagation: Propagation, response: Any = same, **keywords: Any) -> pm.Model:
         how = {"metric": prb.AreaMetric(), "observed": known.observed} | keywords
         with pm.Model() as model:
             x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
