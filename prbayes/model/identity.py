@@ -222,7 +222,8 @@ _POINTS = 2
 
 def _points(node: Node) -> tuple[tuple[float, ...], ...]:
     """Return the aleatory inputs of the first known responses, a row for each."""
-    if node.bound.inputs.epistemic:
+    # A propagation of a user's own may know none.
+    if node.bound.inputs.epistemic or not len(node.bound.known_points):
         return ()
     columns = [x[:_POINTS].reshape(min(_POINTS, len(x)), -1) for x in node.bound.known_points]
     return tuple(map(_numbers, np.concatenate(columns, axis=1)))

@@ -620,3 +620,12 @@ def that_may_change() -> tuple[Optimum, pm.Model]:
         x = pm.Normal.dist(mu, 1.0)
         prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=OBSERVED)
     return prb.minimize(model, starts=0, **QUIET), model
+
+
+def test_a_propagation_that_knows_no_responses_has_an_identity_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model = base()
+    bound = next(iter(nodes(model).values())).bound
+    monkeypatch.setattr(type(bound), "known_points", ())
+    assert not identity_of_model(model).simulators[0].points
