@@ -114,7 +114,7 @@ class Bound(ABC):
 
     @property
     def known_points(self) -> Sequence[Floats]:
-        """The aleatory inputs of the same, shapes (n, *event)."""
+        """The aleatory inputs of the same, shapes ``(n, *event)``."""
         return self._probed_at
 
     @property
