@@ -82,6 +82,7 @@ def test_a_program_that_fails_says_what_it_wrote_and_keeps_its_files(tmp_path: P
     assert (kept / "stderr.txt").read_text() == "singular matrix 2.0\n"
 
 
+@pytest.mark.exact
 def test_a_result_that_cannot_be_read_is_a_failure_of_that_point() -> None:
     code = "x = {x}; print(x if x < 1 else 'diverged')"
     run = prb.command([*PYTHON, code], inputs=["x"], read=printed)

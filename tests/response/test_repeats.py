@@ -34,6 +34,7 @@ def responses_of(function: Any, n_inputs: int = 1) -> Responses:
         return Responses("y", function, read_inputs("y", inputs, model))
 
 
+@pytest.mark.exact
 def test_each_different_point_is_computed_once_and_four_of_them_twice_at_first() -> None:
     response = Counted(lambda a, b: 10 * a + b)
     responses = responses_of(response, 2)
@@ -75,6 +76,7 @@ def test_a_response_with_scatter_of_its_own_is_computed_everywhere() -> None:
     assert response.asked[-1] == 400
 
 
+@pytest.mark.exact
 def test_failed_points_fail_again() -> None:
     responses = responses_of(lambda x: np.where(x > 1, np.nan, x))
     found = once_each(responses, [np.array([0, 2, 2, 1, 0])], None)
@@ -82,6 +84,7 @@ def test_failed_points_fail_again() -> None:
     assert responses.scatters is False
 
 
+@pytest.mark.exact
 def test_a_design_of_a_discrete_input_computes_a_value_once_also_after_refinement() -> None:
     response = Counted(lambda x: 2.0 * x)
     with pm.Model() as model:
