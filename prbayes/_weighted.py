@@ -48,16 +48,26 @@ def ranked(
     return order, below
 
 
-def cumulated(weights: Any, order: NDArray[np.intp], xp: Any = np) -> Any:
+def cumulated(weights: Floats, order: NDArray[np.intp]) -> Floats:
     """Return the sums of the first 0, 1, ... n weights in an order, (..., n), (n,) -> (..., n + 1).
 
     With the order and the counts of `ranked`, ``cumulated(weights, order)[..., below]`` is the
-    distribution function. ``xp`` is `numpy` or `pytensor.tensor`.
+    distribution function.
+    """
+    total = np.cumsum(weights[..., order], axis=-1)
+    nothing = np.zeros((*total.shape[:-1], 1))
+    return np.concatenate([nothing, total], axis=-1)
+
+
+def summed_below(weights: Any, order: NDArray[np.intp], below: Any, xp: Any = np) -> Any:
+    """Return the sums of the first ``below`` weights in an order, (..., n), (n,), (m,) -> (..., m).
+
+    ``cumulated(weights, order)[..., below]``, by operations whose derivative JAX takes too: it
+    splits no array into parts of unknown length. ``xp`` is `numpy` or `pytensor.tensor`.
     """
     total = xp.cumsum(xp.take(weights, order, axis=-1), axis=-1)
-    # Of a length that is known, which JAX asks for.
-    nothing = xp.zeros((*total.shape[:-1], 1))
-    return xp.concatenate([nothing, total], axis=-1)
+    last = xp.maximum(below - 1, 0)
+    return xp.where(below > 0, xp.take(total, last, axis=-1), 0.0)
 
 
 def distribution_function(

@@ -8,7 +8,14 @@ import pytensor.tensor as pt
 import pytest
 
 from prbayes._checks import Floats
-from prbayes._weighted import cumulated, distribution_function, quantile, ranked, reached
+from prbayes._weighted import (
+    cumulated,
+    distribution_function,
+    quantile,
+    ranked,
+    reached,
+    summed_below,
+)
 
 INF, NAN = np.inf, np.nan
 VALUES = np.array([3.0, 1.0, 2.0, 1.0])
@@ -80,9 +87,10 @@ def test_both_steps_work_on_symbols_too() -> None:
     at = np.linspace(-2, 2, 9)
     order, below = ranked(x, at)
     symbol = pt.matrix("w")
-    graph = pt.take(cumulated(symbol, order, pt), below, axis=-1)
+    graph = summed_below(symbol, order, below, pt)
     found = pytensor.function([symbol], graph, mode=pytensor.compile.mode.Mode(linker="py"))(w)
     np.testing.assert_array_equal(found, distribution_function(x, w, at))
+    np.testing.assert_array_equal(cumulated(w, order)[..., below], found)
     assert cumulated(w, order).shape == (2, x.size + 1)
     assert (cumulated(w, order)[:, 0] == 0).all()
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
-from prbayes._weighted import cumulated, ranked
+from prbayes._weighted import ranked, summed_below
 from prbayes.metrics.base import Discrepancy, Metric, Minimum
 
 
@@ -87,10 +87,8 @@ class AreaDiscrepancy(Discrepancy):
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return F - S_N on each interval between knots, and the interval's length."""
         order, below, own, own_below, lengths = basis
-        total = cumulated(weights, order, xp)
-        own_total = cumulated(self.weights, own, xp)
-        simulated = xp.take(total, below, axis=-1)
-        observed = xp.take(own_total, own_below, axis=-1)
+        simulated = summed_below(weights, order, below, xp)
+        observed = summed_below(self.weights, own, own_below, xp)
         return simulated - observed, lengths
 
     def outer(self, *features: Any, xp: Any) -> Any:

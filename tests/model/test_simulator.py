@@ -391,7 +391,9 @@ def test_a_reweighted_log_density_is_the_same_compiled_by_jax(metric: prb.Metric
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         found = model.compile_logp(mode="JAX")(point)
+        gradient = model.compile_dlogp(mode="JAX")(point)
     assert float(found) == pytest.approx(float(model.compile_logp(mode=PLAIN)(point)), rel=1e-10)
+    np.testing.assert_allclose(gradient, model.compile_dlogp(mode=PLAIN)(point), rtol=1e-8)
 
 
 # Labels of specimens.
