@@ -20,6 +20,8 @@ from prbayes.response.calling import scalar
 
 # Characters of what a program wrote that an error repeats: its last lines say what went wrong.
 _REPEATED = 1000
+# Seconds for a program without a time limit: 46 days, the longest that Windows waits for.
+_LONGEST = 4e6
 
 
 def command(
@@ -186,11 +188,14 @@ class Program:
                 start_new_session=True,
             ) as process,
         ):
+            limit = _LONGEST if self.timeout is None else self.timeout
             try:
-                code = process.wait(self.timeout)
+                # With a limit it looks again and again, so that what is raised in a worker's thread
+                # arrives; without one, only when the program has ended.
+                code = process.wait(limit)
             except subprocess.TimeoutExpired:
                 raise TimeoutError(
-                    f"{self.__name__}: no result within timeout = {self.timeout:g} s"
+                    f"{self.__name__}: no result within timeout = {limit:g} s"
                     f"{self._last_words(here)}"
                 ) from None
             finally:

@@ -16,7 +16,11 @@ import pytest
 
 import prbayes as prb
 from prbayes.model.node import nodes
+from prbayes.response.time_limit import limited
 
+SEES_PROCESSES = pytest.mark.skipif(
+    not Path("/proc/self/stat").exists(), reason="no /proc to see processes in"
+)
 PYTHON = [sys.executable, "-S", "-c"]
 SQUARE = "print(float(open('in.txt').read()) ** 2)"
 
@@ -114,7 +118,33 @@ def alive(pid: int) -> bool:
         return False
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc to see processes in")
+def ended(pids: list[int]) -> bool:
+    """Return whether processes are gone within ten seconds."""
+    until = time.monotonic() + 10
+    while any(map(alive, pids)) and time.monotonic() < until:
+        time.sleep(0.05)
+    return not any(map(alive, pids))
+
+
+@SEES_PROCESSES
+def test_the_time_limit_of_a_worker_s_thread_ends_the_program(tmp_path: Path) -> None:
+    code = "import os, time; print(os.getpid(), {x}, flush=True); time.sleep(600)"
+    run = prb.command([*PYTHON, code], inputs=["x"], read=printed, folder=tmp_path)
+
+    def late() -> None:
+        with limited(1.5):
+            run(1.0)
+
+    clock = time.monotonic()
+    with ThreadPoolExecutor(1) as pool:
+        error = pool.submit(late).exception()
+    assert isinstance(error, TimeoutError)
+    assert time.monotonic() - clock < 60
+    (kept,) = tmp_path.iterdir()
+    assert ended([int((kept / "stdout.txt").read_text().split()[0])])
+
+
+@SEES_PROCESSES
 def test_a_time_limit_ends_the_program_and_what_it_started(tmp_path: Path) -> None:
     code = (
         "import os, subprocess, sys, time;"
@@ -128,10 +158,7 @@ def test_a_time_limit_ends_the_program_and_what_it_started(tmp_path: Path) -> No
     assert time.monotonic() - clock < 60
     (kept,) = tmp_path.iterdir()
     pids = [int(pid) for pid in (kept / "stdout.txt").read_text().split()[:2]]
-    until = time.monotonic() + 10
-    while any(map(alive, pids)) and time.monotonic() < until:
-        time.sleep(0.05)
-    assert not any(map(alive, pids))
+    assert ended(pids)
 
 
 def test_the_program_is_looked_up_once_and_called_by_its_name(
