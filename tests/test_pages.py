@@ -22,6 +22,15 @@ def test_tables_are_what_the_benchmarks_found(path: Path) -> None:
     assert pages.written(page) == page, "run python -m benchmarks.pages"
 
 
+@pytest.mark.parametrize(
+    "path", [ROOT / "README.md", *sorted(pages.PAGES.glob("*.md"))], ids=lambda path: path.stem
+)
+def test_files_that_a_page_names_are_there(path: Path) -> None:
+    page = path.read_text(encoding="utf-8")
+    named = re.findall(r"\b(?:tests|benchmarks|examples|prbayes)/[\w/]+\.(?:py|json|csv)\b", page)
+    assert not [name for name in named if not (ROOT / name).exists()]
+
+
 def test_every_table_is_on_a_page() -> None:
     told = "".join(path.read_text(encoding="utf-8") for path in pages.PAGES.glob("*.md"))
     assert set(re.findall(r"<!-- table: (.+) -->", told)) == set(pages.TABLES)

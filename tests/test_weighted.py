@@ -84,8 +84,9 @@ def test_the_order_of_the_values_does_not_matter() -> None:
 
 def test_both_steps_work_on_symbols_too() -> None:
     x, w = sample(6, 2)
-    at = np.linspace(-2, 2, 9)
+    at = np.linspace(-9, 2, 23)  # the first ones below all values
     order, below = ranked(x, at)
+    assert below[0] == 0
     symbol = pt.matrix("w")
     graph = summed_below(symbol, order, below, pt)
     found = pytensor.function([symbol], graph, mode=pytensor.compile.mode.Mode(linker="py"))(w)
