@@ -84,6 +84,7 @@ def test_the_order_of_the_values_does_not_matter() -> None:
 
 def test_both_steps_work_on_symbols_too() -> None:
     x, w = sample(6, 2)
+    w = w + 0.01  # the smallest value's too
     at = np.linspace(-9, 2, 23)  # the first ones below all values
     order, below = ranked(x, at)
     assert below[0] == 0
