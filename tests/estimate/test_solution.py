@@ -1,8 +1,15 @@
 """Standard errors carried to the user's units."""
 
-import numpy as np
+from typing import Any
 
+import numpy as np
+import pymc as pm
+import pytest
+
+import prbayes as prb
+from prbayes.estimate.search import apart_from_data
 from prbayes.estimate.solution import _stderr
+from prbayes.model.evaluator import Evaluator
 
 COVARIANCE = np.array([[4.0, 1.0], [1.0, 9.0]])
 
@@ -21,3 +28,43 @@ def test_what_depends_on_an_element_that_is_not_identified_is_infinite() -> None
 
 def test_nothing_known_is_nan() -> None:
     assert np.isnan(_stderr(np.ones((1, 2)), np.full((2, 2), np.nan))).all()
+
+
+def _normal(metric: prb.Metric, propagation: Any) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 3), pm.HalfNormal("sigma", 1))
+        prb.Simulator(
+            "y", np.positive, x, metric=metric, observed=[0.0, 0.4, 1.0], propagation=propagation
+        )
+    return model
+
+
+@pytest.mark.parametrize(
+    ("metric", "propagation", "far"),
+    [
+        (prb.ProbabilityResidual(), prb.Reweighted(256), True),
+        (prb.KullbackLeibler(), prb.Reweighted(256), True),
+        (prb.AreaMetric(), prb.Reweighted(256), False),  # compares no densities
+        (prb.ProbabilityResidual(), prb.Resimulated(256), False),  # would cost responses
+    ],
+)
+def test_a_population_far_from_all_data_is_known_by_its_overlap(
+    metric: prb.Metric, propagation: Any, far: bool
+) -> None:
+    evaluator = Evaluator(_normal(metric, propagation))
+    there = evaluator.unconstrained({"mu": 6.0, "sigma": 0.3})
+    here = evaluator.unconstrained({"mu": 0.5, "sigma": 0.4})
+    assert apart_from_data(evaluator, there) is far
+    assert apart_from_data(evaluator, here) is False
+
+
+@pytest.mark.parametrize("prior", [False, True])
+def test_a_minimum_apart_from_the_data_is_no_convergence_unless_the_prior_holds_it_there(
+    prior: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("prbayes.estimate.solution.apart_from_data", lambda *_: True)
+    model = _normal(prb.ProbabilityResidual(), prb.Reweighted(256))
+    prb.set_epsilon(model, {"y": 0.1})
+    optimum = prb.minimize(model, prior=prior, progressbar=False)
+    assert optimum.converged is prior
+    assert ("hardly overlaps" in optimum.message) is not prior
