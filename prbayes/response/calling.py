@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -23,6 +23,7 @@ from prbayes._progress import progress
 from prbayes.response.budget import BudgetError, budget
 from prbayes.response.executors import Pool, capacity, failure_of, is_loss, told
 from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
+from prbayes.response.outputs import ONE, Outputs, lacking, outputs_of_result
 from prbayes.response.store import Store, StoreError
 from prbayes.response.time_limit import limited
 
@@ -41,7 +42,8 @@ class scalar:  # noqa: N801 (reads as a function in a model)
     Parameters
     ----------
     function : callable
-        ``function(*inputs) -> float``; a scalar input is a float, a multivariate one an array.
+        ``function(*inputs)``; a scalar input is a float, a multivariate one an array. It returns a
+        number, or for several outputs an array, shape (m,), or a mapping of such.
 
     Raises
     ------
@@ -61,7 +63,7 @@ class scalar:  # noqa: N801 (reads as a function in a model)
            [ 0., 16.]])
     """
 
-    def __init__(self, function: Callable[..., float]) -> None:
+    def __init__(self, function: Callable[..., Any]) -> None:
         if not callable(function):
             got = type(function).__name__
             raise TypeError(f"scalar: got {got}, expected a function of one specimen's inputs")
@@ -71,8 +73,9 @@ class scalar:  # noqa: N801 (reads as a function in a model)
         """Call the function for each element of arrays that broadcast against each other."""
         arrays = np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in inputs))
         specimens = zip(*(a.ravel() for a in arrays), strict=True)
-        values = [float(self.function(*specimen)) for specimen in specimens]
-        return np.array(values).reshape(arrays[0].shape)
+        values = [_of_one(self.function(*specimen), None) for specimen in specimens]
+        event = np.shape(values[0]) if values else ()
+        return np.array(values).reshape(arrays[0].shape + event)
 
 
 @dataclass(frozen=True)
@@ -131,7 +134,7 @@ class Points:
 class Chunk:
     """What a worker gives back for the points of a chunk."""
 
-    # (m,): NaN where the response raised, or was not called since an earlier point raised.
+    # (m, *event): NaN where the response raised, or was not called since an earlier point raised.
     values: Floats
     raised: dict[int, str]  # what was raised, in words, by position
     seconds: float  # how long it took
@@ -148,6 +151,7 @@ class Calling:
     on_failure: OnFailure = field(default_factory=Abort)
     retry_failed: bool = False  # whether points that are stored as failed are computed again
     timeout: float | None = None  # seconds that a response may take, where workers keep it
+    outputs: Outputs | None = ONE  # what a run gives; None where the first one tells
 
     @property
     def takes_failures(self) -> bool:
@@ -192,7 +196,7 @@ class Tally:
 
 
 def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
-    """Return the responses at points, shape (n,), from the store or computed and then stored.
+    """Return responses at points, shape (n, *event), from the store or computed and then stored.
 
     Raises
     ------
@@ -211,20 +215,28 @@ def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
         tolerant = policy.final.goes_on or not last
         raised = {}
         for rows, chunk in chunks(calling, points, missing, tolerant, tally):
-            values[rows] = chunk.values
+            values = _filled_in(values, rows, chunk.values)
             raised.update({int(rows[i]): text for i, text in chunk.raised.items()})
             if calling.store is not None:
                 # NaN is a result, too, after the last try, but not where a chunk broke off.
                 whole = tolerant or not chunk.raised
-                keep = ~np.isnan(chunk.values) | (last and whole)
+                keep = ~lacking(chunk.values) | (last and whole)
                 _keep(calling.store, keys[rows], chunk, keep)
         if raised and not tolerant:
             tally.note(points, raised)
             raise _failed(calling, raised)
-        missing = missing[np.isnan(values[missing])]
+        missing = missing[lacking(values[missing])]
         if not missing.size:
             break
     return _settled(calling, points, values, failed | raised, tally)
+
+
+def _filled_in(values: Floats, rows: Rows, some: Floats) -> Floats:
+    """Return responses with those of some rows, of which the first tell how many outputs a run has."""
+    if values.ndim == 1 and some.ndim > 1:
+        values = np.repeat(values[:, None], some.shape[1], axis=1)
+    values[rows] = some
+    return values
 
 
 def _verify(calling: Calling, points: Points, tally: Tally) -> None:
@@ -236,43 +248,57 @@ def _verify(calling: Calling, points: Points, tally: Tally) -> None:
     if store is None or store.verified:
         return
     keys, values = store.known()
-    usable = np.flatnonzero(np.isfinite(values) & points.with_same_constants(keys))
+    columns = values if values.ndim > 1 else values[:, None]
+    finite = np.isfinite(columns).all(axis=1)
+    usable = np.flatnonzero(finite & points.with_same_constants(keys))
     if usable.size:
         first = usable[:1]
-        expected = float(values[first[0]])
-        size = max(abs(expected), float(np.median(np.abs(values[usable]))))
+        expected = columns[first[0]]
+        size = np.maximum(np.abs(expected), np.median(np.abs(columns[usable]), axis=0))
         got, told = _again(calling, points.read(keys[first]), tally)
-        if not abs(got - expected) <= _ROUNDING * size:
+        same_number = got.size == expected.size
+        if not same_number or not (np.abs(got - expected) <= _ROUNDING * size).all():
             at = ", ".join(f"{x:.6g}" for x in keys[first[0]])
             raise StoreError(
                 f"{calling.name}: store: got a response that gives {told} at ({at}), expected "
-                f"{expected:.10g}, which is stored in {store.path}: it is of another function, or "
+                f"{_numbers_told(expected)}, which is stored in {store.path}: it is of another function, or "
                 "its variables have changed; nothing was changed: pass another folder, or version= "
                 "with a name for the response as it is now, whose runs are then kept apart"
             )
     store.verified = True
 
 
-def _again(calling: Calling, point: Points, tally: Tally) -> tuple[float, str]:
+def _again(calling: Calling, point: Points, tally: Tally) -> tuple[Floats, str]:
     """Return the response at one point, and what came of it in words."""
     chunk = Chunk(np.array([np.nan]), {}, 0.0)
     for _ in range(calling.on_failure.tries):
         for _, chunk in chunks(calling, point, np.arange(1), True, tally):
             if not chunk.raised:
-                value = float(chunk.values[0])
-                return value, f"{value:.10g}"
-    return np.nan, f"nothing ({next(iter(chunk.raised.values()), 'it was lost')})"
+                found = chunk.values.ravel()
+                return found, _numbers_told(found)
+    return np.array([np.nan]), f"nothing ({next(iter(chunk.raised.values()), 'it was lost')})"
+
+
+def _numbers_told(values: Floats) -> str:
+    """Return outputs of a run in words, shape (m,)."""
+    text = ", ".join(f"{value:.10g}" for value in values[:6])  # what fits a line
+    if values.size == 1:
+        return text
+    return f"({text}, ...)" if values.size > 6 else f"({text})"
 
 
 def _stored(calling: Calling, keys: Floats) -> tuple[Floats, Rows, dict[int, str]]:
-    """Return responses that are stored, (n,), rows that are to be computed, and what failed.
+    """Return responses that are stored, rows that are to be computed, and what failed.
 
     A point that is stored as failed is no result: it stays one that failed, where the policy goes
     on after failures, and else is computed again.
     """
     if calling.store is None:
-        return np.full(len(keys), np.nan), np.arange(len(keys)), {}
+        event = () if calling.outputs is None else calling.outputs.event
+        return np.full((len(keys), *event), np.nan), np.arange(len(keys)), {}
     values, known = calling.store.find(keys)
+    if calling.outputs is not None:
+        values = values.reshape(len(keys), *calling.outputs.event)
     failed = calling.store.failed(keys)
     if not calling.takes_failures:
         known[list(failed)] = False
@@ -296,7 +322,7 @@ def _settled(
 ) -> Floats:
     """Return responses with what the policy puts in the place of those that are NaN."""
     tally.note(points, raised)
-    bad = np.isnan(values)
+    bad = lacking(values)
     policy = calling.on_failure.final
     n_bad = int(bad.sum())
     if not n_bad:
@@ -458,34 +484,46 @@ def _raise_lost(name: str, error: BaseException) -> None:
 
 def _work(calling: Calling) -> Callable[[Points, bool], Chunk]:
     """Return what is done with points; to other processes the function travels packed."""
+    outputs = calling.outputs
     if calling.executor is None or isinstance(calling.executor, ThreadPoolExecutor):
-        return partial(compute, calling.function)
-    return partial(compute_packed, packed(calling.function), timeout=calling.timeout)
+        return partial(compute, calling.function, outputs=outputs)
+    payload = packed(calling.function)
+    return partial(compute_packed, payload, timeout=calling.timeout, outputs=outputs)
 
 
 # -- at work ---------------------------------------------------------------------------------------
 
 
 def compute(
-    function: Callable[..., Any], points: Points, tolerant: bool, timeout: float | None = None
+    function: Callable[..., Any],
+    points: Points,
+    tolerant: bool,
+    timeout: float | None = None,
+    outputs: Outputs | None = ONE,
 ) -> Chunk:
     """Return the responses at points; unless failures are tolerated, those up to the first one."""
     clock = time.perf_counter()
     if isinstance(function, scalar):
-        values, raised = _one_by_one(function, points, tolerant, timeout)
+        values, raised = _one_by_one(function, points, tolerant, timeout, outputs)
     else:
-        values, raised = _at_once(function, points, tolerant, timeout)
+        values, raised = _at_once(function, points, tolerant, timeout, outputs)
     return Chunk(values, raised, time.perf_counter() - clock)
 
 
 def _one_by_one(
-    function: scalar, points: Points, tolerant: bool, timeout: float | None
+    function: scalar,
+    points: Points,
+    tolerant: bool,
+    timeout: float | None,
+    outputs: Outputs | None,
 ) -> tuple[Floats, dict[int, str]]:
-    values, raised = np.full(len(points), np.nan), {}
+    event = () if outputs is None else outputs.event
+    values, raised = np.full((len(points), *event), np.nan), {}
     for i in range(len(points)):
         try:
             with np.errstate(all="ignore"), limited(timeout):
-                values[i] = float(function.function(*points.at(i).handed_out()))
+                result = function.function(*points.at(i).handed_out())
+            values = _filled_in(values, np.array([i]), _of_one(result, outputs)[None])
         except (Exception, SystemExit) as error:
             raised[i] = _said(error)
             if not tolerant:
@@ -493,8 +531,20 @@ def _one_by_one(
     return values, raised
 
 
+def _of_one(result: Any, outputs: Outputs | None) -> Floats:
+    """Return what a function of one specimen returned, shape (*event)."""
+    if (outputs is None or not outputs.event) and not isinstance(result, Mapping):
+        if outputs is not None or np.ndim(result) == 0:
+            return np.asarray(float(result))
+    return checked(result, (), (), outputs)
+
+
 def _at_once(
-    function: Callable[..., Any], points: Points, tolerant: bool, timeout: float | None
+    function: Callable[..., Any],
+    points: Points,
+    tolerant: bool,
+    timeout: float | None,
+    outputs: Outputs | None,
 ) -> tuple[Floats, dict[int, str]]:
     size = len(points)
     try:
@@ -502,13 +552,15 @@ def _at_once(
             result = function(*points.handed_out())
     except (Exception, SystemExit) as error:
         if not tolerant or size == 1:
-            return np.full(size, np.nan), {0: _said(error)}
+            event = () if outputs is None else outputs.event
+            return np.full((size, *event), np.nan), {0: _said(error)}
     else:
-        return checked(result, (size,), points.arguments), {}
+        return checked(result, (size,), points.arguments, outputs), {}
     # Halve until the points that fail are alone.
     values, raised = np.full(size, np.nan), {}
     for half in (np.arange(size // 2), np.arange(size // 2, size)):
-        values[half], said = _at_once(function, points.at(half), tolerant, timeout)
+        some, said = _at_once(function, points.at(half), tolerant, timeout, outputs)
+        values = _filled_in(values, half, some)
         raised.update({int(half[i]): text for i, text in said.items()})
     return values, raised
 
@@ -526,10 +578,22 @@ def _said(error: BaseException) -> str:
     return f"it raised {type(error).__name__}: {text:.1000}"
 
 
-def checked(result: Any, batch: tuple[int, ...], arguments: Sequence[Any]) -> Floats:
-    """Return a response's result as floats; it has to be real numbers in the batch shape."""
+def checked(
+    result: Any,
+    batch: tuple[int, ...],
+    arguments: Sequence[Any],
+    outputs: Outputs | None = ONE,
+) -> Floats:
+    """Return a response's result as floats, shape (*batch, *event); it has to be real numbers.
+
+    A point at which one output is NaN has no response: all of them are.
+    """
     try:
+        if isinstance(result, Mapping):
+            result = (outputs or outputs_of_result(result, len(batch))).assembled(result)
         array = np.asarray(result)
+    except KeyError as error:
+        raise ResponseError(str(error.args[0])) from None
     except Exception as error:
         raise ResponseError(
             f"the response returned {type(result).__name__} of which no array can be made "
@@ -540,13 +604,22 @@ def checked(result: Any, batch: tuple[int, ...], arguments: Sequence[Any]) -> Fl
         if array.dtype.kind == "c":
             got = "complex numbers"
         raise ResponseError(f"the response returned {got}, expected an array of real numbers")
-    if array.shape != batch:
+    event = array.shape[len(batch) :]
+    wanted = event[:1] if outputs is None else outputs.event
+    if array.shape != batch + wanted:
         raise ResponseError(
             f"the response returned shape {array.shape} for inputs of shapes {shapes(arguments)}, "
-            f"expected {batch}: one response per specimen; reduce over the event axis only (the "
+            f"expected {batch + wanted}: {_each(wanted)}; reduce over the event axis only (the "
             "last one), or wrap a function of one specimen in prb.scalar"
         )
-    return array.astype(np.float64)
+    values = array.astype(np.float64)
+    if wanted:
+        values[np.isnan(values).any(axis=-1)] = np.nan
+    return values
+
+
+def _each(event: tuple[int, ...]) -> str:
+    return f"{event[0]} outputs per specimen" if event else "one response per specimen"
 
 
 def shapes(arguments: Sequence[Any]) -> str:
@@ -569,7 +642,11 @@ def _unpacked(payload: bytes) -> Callable[..., Any]:
 
 
 def compute_packed(
-    payload: bytes, points: Points, tolerant: bool, timeout: float | None = None
+    payload: bytes,
+    points: Points,
+    tolerant: bool,
+    timeout: float | None = None,
+    outputs: Outputs | None = ONE,
 ) -> Chunk:
     """Unpack the function, once for all chunks of a worker, and compute."""
-    return compute(_unpacked(payload), points, tolerant, timeout)
+    return compute(_unpacked(payload), points, tolerant, timeout, outputs)

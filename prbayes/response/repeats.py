@@ -26,11 +26,11 @@ class Known:
     """Points whose responses are known."""
 
     points: Sequence[Floats]  # (m, *event): one for each aleatory input
-    values: Floats  # (m,)
+    values: Floats  # (m,), or (m, outputs)
 
 
 def once_each(responses: Responses, points: Sequence[Floats], known: Known | None) -> Floats:
-    """Return the responses at points, shape (n,), of which none is computed twice; all count.
+    """Return the responses at points, (n,) or (n, m), of which none is computed twice; all count.
 
     A response that gives different values at the same point has scatter of its own, and is computed
     at all of them.
@@ -45,7 +45,7 @@ def once_each(responses: Responses, points: Sequence[Floats], known: Known | Non
     """
     n = len(points[0])
     before = np.empty(0) if known is None else known.values
-    m = before.size
+    m = len(before)
     keys = _keys(points)
     if known is not None:
         keys = np.concatenate([_keys([x[:m] for x in known.points]), keys])
@@ -55,14 +55,16 @@ def once_each(responses: Responses, points: Sequence[Floats], known: Known | Non
     if own.all() or responses.scatters:
         return responses(points, [])
 
-    values = np.concatenate([before, np.full(n, np.nan)])
     fresh = np.flatnonzero(own)
     repeated = np.flatnonzero(~own)
     again = repeated[:0] if responses.scatters is False else _first_of_each(earliest[m:], repeated)
     asked = np.concatenate([fresh, again])
     rest = np.setdiff1d(repeated, again)
+    found = responses([x[asked] for x in points], []) if asked.size else before[:0]
+    event = found.shape[1:]
+    values = np.full((m + n, *event), np.nan)
+    values[:m] = before.reshape(m, *event)
     if asked.size:
-        found = responses([x[asked] for x in points], [])
         values[m + fresh] = found[: fresh.size]
         second = found[fresh.size :]
         if again.size:
@@ -96,6 +98,7 @@ def _first_of_each(earliest: NDArray[np.intp], repeated: NDArray[np.intp]) -> ND
 
 def _same(values: Floats, again: Floats) -> bool:
     """Return whether values are the same but for rounding."""
-    known = values[np.isfinite(values)]
-    size = float(np.abs(known).max()) if known.size else 0.0
+    # Of each output by itself: they may be of different units.
+    finite = np.where(np.isfinite(values), np.abs(values), 0.0)
+    size = finite.max(axis=0, initial=0.0)
     return np.allclose(values, again, rtol=_SAME, atol=_SAME * size, equal_nan=True)

@@ -26,6 +26,7 @@ from prbayes.response.calling import (
 )
 from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
 from prbayes.response.inputs import Inputs
+from prbayes.response.outputs import ONE, Outputs
 from prbayes.response.store import Store
 
 
@@ -66,7 +67,8 @@ def refuse_version(version: object) -> None:
 class Runs:
     """Runs of a response that several simulators share, which have the same inputs and settings."""
 
-    # Batches of stored points, each (n, *event) for each aleatory input, and their responses.
+    # Batches of stored points, each (n, *event) for each aleatory input, and their responses,
+    # (n,) or (n, m).
     stored: list[tuple[list[Floats], Floats]] = field(default_factory=list)
     # What the response was called with last, and what it gave.
     last: tuple[list[Floats], Floats] | None = None
@@ -76,7 +78,7 @@ class Runs:
         return {**vars(self), "last": None}
 
     def at(self, points: Sequence[Floats]) -> Floats | None:
-        """Return the responses of a batch that is stored, shape (n,), None if it is not."""
+        """Return the responses of a batch that is stored, (n,) or (n, m), None if it is not."""
         return next((values for known, values in self.stored if _alike(known, points)), None)
 
     def repeated(self, given: list[Floats]) -> Floats | None:
@@ -121,11 +123,13 @@ class Responses:
     retry_failed : bool
     timeout : float, optional
         Seconds.
+    outputs : Outputs, optional
+        What a run gives; one number by default, and with None whatever it does.
 
     Attributes
     ----------
     count : int
-        Scalar responses that were needed so far, whether computed here or found in the store.
+        Runs that were needed so far, whether computed here or found in the store.
     scatters : bool or None
         Whether the response has different values at the same point; None while it is not known.
     """
@@ -142,11 +146,16 @@ class Responses:
         on_failure: OnFailure | None = None,
         retry_failed: bool = False,
         timeout: float | None = None,
+        outputs: Outputs | None = ONE,
     ) -> None:
         refuse_uncallable(name, function)
         policy = Abort() if on_failure is None else on_failure
-        kept = None if store is None else Store(store, name, _columns(inputs), version=version)
+        kept = None
+        if store is not None:
+            size = None if outputs is None else max(1, len(outputs.labels))
+            kept = Store(store, name, _columns(inputs), version=version, outputs=size)
         self.name = name
+        self.outputs = outputs
         self.function = function
         self.inputs = inputs
         self.plain = (
@@ -159,7 +168,9 @@ class Responses:
         self.scatters: bool | None = None
         self._found = 0
         self.runs = Runs()
-        self._calling = Calling(name, function, executor, kept, policy, retry_failed, timeout)
+        self._calling = Calling(
+            name, function, executor, kept, policy, retry_failed, timeout, outputs
+        )
         self._tally = Tally()
         self._event_ndims = [*inputs.event_ndims, *(e.type.ndim for e in inputs.epistemic)]
 
@@ -205,7 +216,7 @@ class Responses:
         return all(_same(self.inputs, x, other.inputs, y) for x, y in pairs)
 
     def __call__(self, aleatory: Sequence[Floats], epistemic: Sequence[Floats]) -> Floats:
-        """Return responses, shape (...), for values of the inputs, shapes (..., *event).
+        """Return responses, (...) or (..., m), for values of the inputs, shapes (..., *event).
 
         Raises
         ------
@@ -233,7 +244,7 @@ class Responses:
         varying = [isinstance(a, int | Variable) for a in self.inputs.arguments]
         self.count += n
         found = respond(self._calling, Points(self._filled(flat), varying), self._tally)
-        return found.reshape(batch)
+        return found.reshape(batch + found.shape[1:])
 
     def count_symbolic(self, size: int) -> None:
         """Count responses that are computed in a graph."""
@@ -265,7 +276,7 @@ class Responses:
             ) from error
         self.count += size
         try:
-            return checked(result, batch, arguments)
+            return checked(result, batch, arguments, self.outputs)
         except ResponseError as error:
             raise ResponseError(f"{self.name}: {error}") from None
 

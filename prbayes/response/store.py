@@ -67,7 +67,7 @@ class _Session:
         Process, and device and number of the file.
     entry : _Entry
     known : dict
-        Values of the store's response by keys, both as bytes.
+        Values of the store's response, all outputs of a run together, by keys, both as bytes.
     failed : dict
         Why there is no value, by the keys of those that failed.
     seen : int
@@ -102,6 +102,8 @@ class Store:
         responses; there must be some, then.
     version : str, optional
         Of the response; those of each version are kept apart, as are those without one.
+    outputs : int, optional
+        Number of outputs of a run. By default that of the stored responses, or one.
 
     Attributes
     ----------
@@ -133,6 +135,7 @@ class Store:
         columns: int | None = None,
         *,
         version: str | None = None,
+        outputs: int | None = None,
     ) -> None:
         self.folder = stated_path(folder, "folder", "folder")
         self.name = plain_text(name, "name")
@@ -141,13 +144,14 @@ class Store:
         if version is not None:
             plain_text(version, "version")
         self.columns = columns
+        self.outputs = outputs
         self.version = version
         self.verified = version is not None
         self._local = threading.local()
         self._read()
 
     def __getstate__(self) -> dict[str, Any]:
-        keys = ("folder", "name", "columns", "version")
+        keys = ("folder", "name", "columns", "version", "outputs")
         return {key: vars(self)[key] for key in keys}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -164,11 +168,27 @@ class Store:
         return len(self._read().known)
 
     def find(self, inputs: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return stored responses of inputs (n, columns), and which were found, shapes (n,)."""
-        known = self._read().known
+        """Return stored responses of inputs (n, columns), and which were found, shape (n,).
+
+        Of several outputs the responses have shape (n, m).
+        """
+        session = self._read()
+        known = session.known
         found = [known.get(key) for key in _keys(inputs)]
         present = np.array([value is not None for value in found], dtype=bool)
-        return _numbers(_NAN if value is None else value for value in found), present
+        nothing = _NAN * self._width(session)
+        return self._values(session, (nothing if v is None else v for v in found)), present
+
+    def _width(self, session: _Session) -> int:
+        """Return how many outputs a run has."""
+        first = next(iter(session.known.values()), None)
+        return self.outputs or (1 if first is None else len(first) // len(_NAN))
+
+    def _values(self, session: _Session, values: Iterable[bytes]) -> Floats:
+        """Return responses as numbers, (n,), or (n, m) of several outputs."""
+        width = self._width(session)
+        numbers = _numbers(values)
+        return numbers if width == 1 else numbers.reshape(-1, width)
 
     def failed(self, inputs: Floats) -> dict[int, str]:
         """Return which of the inputs, (n, columns), are stored as failed, and why, by row."""
@@ -179,13 +199,13 @@ class Store:
         return {row: failed[key] for row, key in keys if key in failed}
 
     def known(self) -> tuple[Floats, Floats]:
-        """Return the inputs, (n, columns), and values, (n,), in the order in which they came.
+        """Return inputs, (n, columns), and values, (n,) or (n, m), in the order in which they came.
 
         NaN is a result, or a response that failed; `failed` tells.
         """
         session = self._read()
         inputs = _numbers(session.known).reshape(-1, session.entry.columns)
-        return inputs, _numbers(session.known.values())
+        return inputs, self._values(session, session.known.values())
 
     def add(self, inputs: Floats, values: Floats, reasons: Mapping[int, str] | None = None) -> None:
         """Append responses, safe on disk when this returns.
@@ -193,7 +213,7 @@ class Store:
         Parameters
         ----------
         inputs : ndarray, shape (n, columns)
-        values : ndarray, shape (n,)
+        values : ndarray, shape (n,) or (n, m)
         reasons : mapping, optional
             Of those that failed: why, by row.
         """
@@ -208,8 +228,9 @@ class Store:
         Returns
         -------
         Dataset
-            ``inputs``, dims (point, column), ``response`` and ``reason``, dim (point), in the order
-            in which they came; a reason is empty where the response did not fail.
+            ``inputs``, dims (point, column), ``response``, dim (point) or dims (point, output), and
+            ``reason``, dim (point), in the order in which they came; a reason is empty where the
+            response did not fail.
         """
         inputs, values = self.known()
         failed = self.failed(inputs)
@@ -217,7 +238,7 @@ class Store:
         return xr.Dataset(
             {
                 "inputs": (["point", "column"], inputs),
-                "response": ("point", values),
+                "response": (["point", "output"][: values.ndim], values),
                 "reason": ("point", reasons.astype(str)),
             },
             attrs={"simulator": self.name},
@@ -323,12 +344,21 @@ class Store:
                     raise self._refusal(damaged(f"run {number} does not match its checksum"))
                 response, key, state, reason, value = row
                 if response == session.entry.number:
+                    self._refuse_other_outputs(session, value)
                     session.known[key] = value
                     # The last run of a point counts: one that failed may have been tried again.
                     session.failed.pop(key, None)
                     if state == FAILED:
                         session.failed[key] = reason
                 session.seen = number
+
+    def _refuse_other_outputs(self, session: _Session, value: bytes) -> None:
+        """Raise if a stored run has another number of outputs."""
+        found, width = len(value) // len(_NAN), self._width(session)
+        if session.known and found != width or self.outputs not in (None, found):
+            got = f"which holds runs with {found} outputs for simulator {self.name!r}"
+            todo = "nothing was changed: pass version= with a name for the response as it is now"
+            raise self._refusal(Complaint(got, f"{width}", todo))
 
     @contextmanager
     def _explained(self) -> Iterator[None]:

@@ -1,0 +1,179 @@
+"""What one run of a response gives: a number, or several outputs of the same specimen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prbayes._checks import Floats, real_array
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """The outputs of one specimen, in the order of the columns of what was observed.
+
+    Attributes
+    ----------
+    labels : tuple
+        Of each output: a text, or a number where the outputs are a curve over it; none if a run
+        gives one number.
+    dim : str
+        Name of their dimension in results.
+    keys : tuple of (str, int or None)
+        Keys of a response that returns a mapping, and how many outputs each has; None for one
+        number without an axis. Empty where outputs have no names.
+    units : tuple of str
+        Of each output, where they are known.
+    """
+
+    labels: tuple[Any, ...] = ()
+    dim: str = "output"
+    keys: tuple[tuple[str, int | None], ...] = ()
+    units: tuple[str, ...] = ()
+
+    @property
+    def event(self) -> tuple[int, ...]:
+        """The shape of one specimen's outputs: () or (m,)."""
+        return (len(self.labels),) if self.labels else ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The labels as text."""
+        return tuple(f"{x:g}" if isinstance(x, float) else str(x) for x in self.labels)
+
+    def assembled(self, result: Mapping[str, Any]) -> Any:
+        """Return a mapping's arrays as one, outputs in the last axis.
+
+        Raises
+        ------
+        KeyError
+            If the mapping has other keys.
+        """
+        if not self.keys:
+            raise KeyError(
+                f"the response returned a mapping with the keys {list(result)}, expected an array; "
+                "outputs have no names: pass observed= as a mapping, or as a DataFrame, with these"
+            )
+        wanted = [key for key, _ in self.keys]
+        if set(result) != set(wanted):
+            raise KeyError(
+                f"the response returned a mapping with the keys {list(result)}, expected {wanted}, "
+                "those of observed"
+            )
+        columns = []
+        for key, size in self.keys:
+            column = np.asarray(result[key])
+            columns.append(column[..., None] if size is None else column)
+        return np.concatenate(columns, axis=-1)
+
+
+ONE = Outputs()
+
+
+def outputs_of_result(result: Mapping[str, Any], batch_ndim: int) -> Outputs:
+    """Return the outputs that a response's mapping has."""
+    sizes: list[tuple[str, int | None]] = []
+    for key, column in result.items():
+        array = np.asarray(column)
+        sizes.append((str(key), array.shape[-1] if array.ndim > batch_ndim else None))
+    return Outputs(_labels(sizes), keys=tuple(sizes))
+
+
+def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
+    """Return observed responses, (N,) or (N, m), and what their columns are.
+
+    Parameters
+    ----------
+    name : str
+        Of the simulator, for messages.
+    observed : array_like, DataFrame, DataArray or mapping
+        One dimension for one output. With two, the first are specimens and the second outputs: a
+        DataFrame's columns and a DataArray's coordinate name them. A mapping has an array for each
+        output, or group of outputs.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is none of these.
+    """
+    label = f"{name}: observed"
+    if isinstance(observed, Mapping):
+        return _of_mapping(label, observed)
+    if np.ma.is_masked(observed) and np.ndim(observed) == 2:
+        observed = np.ma.filled(np.ma.asarray(observed, dtype=np.float64), np.nan)
+    values = observed if np.ma.is_masked(observed) else real_array(observed, label)
+    if np.ndim(values) != 2:
+        return values, ONE
+    if not values.shape[1]:
+        raise ValueError(f"{label}: got shape {values.shape}, expected one output at least")
+    return values, _of_columns(observed, values.shape[1])
+
+
+def _of_columns(observed: Any, m: int) -> Outputs:
+    """Return what the columns of an array, DataFrame or DataArray say of themselves."""
+    if hasattr(observed, "dims") and hasattr(observed, "coords"):
+        dim = str(observed.dims[1])
+        known = dim in observed.coords
+        labels = tuple(observed.coords[dim].values.tolist()) if known else tuple(range(m))
+        units = _units(observed, m)
+        return Outputs(labels, dim, _keys(labels), units)
+    if hasattr(observed, "columns"):
+        labels = tuple(np.asarray(observed.columns).tolist())
+        named = getattr(observed.columns, "name", None)
+        return Outputs(labels, str(named or "output"), _keys(labels))
+    return Outputs(tuple(range(m)))
+
+
+def _keys(labels: Sequence[Any]) -> tuple[tuple[str, int | None], ...]:
+    """Return the keys of a response whose outputs are named one by one, if they are by texts."""
+    if all(isinstance(label, str) for label in labels):
+        return tuple((label, None) for label in labels)
+    return ()
+
+
+def _units(observed: Any, m: int) -> tuple[str, ...]:
+    """Return the units that a DataArray states: one for all, or a coordinate of them."""
+    if "units" in observed.coords:
+        stated: NDArray[Any] = np.broadcast_to(observed.coords["units"].values, m)
+        return tuple(map(str, stated.tolist()))
+    unit = observed.attrs.get("units")
+    return (str(unit),) * m if unit else ()
+
+
+def _of_mapping(label: str, observed: Mapping[Any, Any]) -> tuple[Floats, Outputs]:
+    columns, sizes = [], []
+    for key, column in observed.items():
+        if not isinstance(key, str):
+            raise TypeError(f"{label}: got the key {key!r:.60}, expected names of outputs")
+        values = real_array(column, f"{label}[{key!r}]")
+        if values.ndim not in (1, 2):
+            raise ValueError(
+                f"{label}[{key!r}]: got shape {values.shape}, expected (N,), or (N, k) for k "
+                "outputs of one name"
+            )
+        sizes.append((key, None if values.ndim == 1 else values.shape[1]))
+        columns.append(values[:, None] if values.ndim == 1 else values)
+    lengths = [len(column) for column in columns]
+    if len(set(lengths)) != 1:
+        raise ValueError(
+            f"{label}: got arrays of {lengths} values, expected one value for each specimen in "
+            "every output; NaN where it was not measured"
+        )
+    return np.concatenate(columns, axis=1), Outputs(_labels(sizes), keys=tuple(sizes))
+
+
+def _labels(sizes: Sequence[tuple[str, int | None]]) -> tuple[str, ...]:
+    labels = []
+    for key, size in sizes:
+        labels += [key] if size is None else [f"{key}[{i}]" for i in range(size)]
+    return tuple(labels)
+
+
+def lacking(values: Floats) -> NDArray[np.bool_]:
+    """Return which points have no response, (n,) or (n, m) -> (n,): an output of theirs is NaN."""
+    nan = np.isnan(values)
+    return nan.any(axis=-1) if nan.ndim > 1 else nan
