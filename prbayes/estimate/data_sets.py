@@ -29,7 +29,9 @@ SETS = 200
 class DataSets:
     """Data sets for all simulators of a model, as weights on fixed values."""
 
-    values: list[Floats]  # (n_k,): by simulator: all values that occur
+    # (n_k,), or (n_k, m) of several outputs: by simulator: all values that occur. NaN is an output
+    # that was not measured.
+    values: list[Floats]
     # (n_sets, n_k): by simulator: the weight of each value in each data set; they sum to one.
     weights: list[Floats]
 
@@ -55,7 +57,7 @@ def _labels(node: Node, k: int) -> list[object]:
     labels = node.specimens
     if labels is not None:
         return list(labels.tolist())
-    size = node.target.observed.size
+    size = len(node.target.observed)
     return [(k, i) for i in range(size)]
 
 
@@ -169,8 +171,7 @@ def simulated_points(
         members = [nodes[k] for k in group]
         _refuse_unlike(members)
         # All that share specimens have the same points, with the same weights.
-        responses = [populations[k][0][0] for k in group]
-        finite = np.isfinite(responses).all(axis=0)
+        finite = np.all([observable(populations[k][0][0]) for k in group], axis=0)
         _, weights = populations[group[0]]
         drawn = _draw(weights[0], finite, size, rng)
         draws |= dict.fromkeys(group, drawn)
@@ -186,18 +187,59 @@ def sets_at(
     weights = []
     for k, node in enumerate(evaluator.nodes):
         responses = populations[k][0][0]
-        finite = np.isfinite(responses)
+        finite = observable(responses)
         # The place of each point among those that can be observed.
         place = np.cumsum(finite) - 1
-        measured = points[k][:, numbers[k]]
-        values.append(responses[finite])
+        measured = place[points[k][:, numbers[k]]]
+        seen = responses[finite]
+        patterns, own = _patterns(node.target.observed)
+        if len(patterns) > 1:
+            measured, seen = _seen(measured, seen, patterns, own)
         counted = _counted(
-            place[measured],
+            measured,
             node.target.weights,
-            size=int(finite.sum()),
+            size=len(seen),
         )
+        values.append(seen)
         weights.append(counted)
     return DataSets(values, weights)
+
+
+def _seen(
+    measured: NDArray[np.intp],
+    values: Floats,
+    patterns: NDArray[np.bool_],
+    own: NDArray[np.intp],
+) -> tuple[NDArray[np.intp], Floats]:
+    """Return places, (n_sets, N), and the values there, with NaN for outputs not measured.
+
+    Each specimen shows the outputs that the observed one in its place shows.
+    """
+    size = len(values)
+    cells, places = np.unique(measured + size * own, return_inverse=True)
+    shown = np.where(patterns[cells // size], values[cells % size], np.nan)
+    return places.reshape(measured.shape), shown
+
+
+def observable(responses: Floats) -> NDArray[np.bool_]:
+    """Return which points can be observed, (n,) or (n, m) -> (n,).
+
+    Where specimens have several outputs, one that failed is observed as such.
+    """
+    if responses.ndim == 1:
+        return np.isfinite(responses)
+    return ~np.isnan(responses).any(axis=1)
+
+
+def _patterns(observed: Floats) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+    """Return which outputs are measured together, (p, m), and the pattern of each specimen, (N,).
+
+    Of one output there is one pattern.
+    """
+    if observed.ndim == 1:
+        return np.ones((1, 1), dtype=bool), np.zeros(len(observed), dtype=np.intp)
+    patterns, own = np.unique(~np.isnan(observed), axis=0, return_inverse=True)
+    return patterns, own.ravel()
 
 
 def _counted(places: NDArray[np.intp], own: Floats, *, size: int) -> Floats:
@@ -213,7 +255,7 @@ def _counted(places: NDArray[np.intp], own: Floats, *, size: int) -> Floats:
 
 def thinned(values: Floats, weights: Floats, node: Node) -> tuple[Floats, Floats]:
     """Return the first 2^15 points, of equal weights, of resimulated populations, (k, n) each."""
-    if node.bound.stored or values.shape[-1] <= _MOST_POINTS:
+    if node.bound.stored or values.shape[1] <= _MOST_POINTS:
         return values, weights
     equal = np.broadcast_to(1 / _MOST_POINTS, (len(values), _MOST_POINTS))
     return values[:, :_MOST_POINTS], equal
@@ -260,19 +302,19 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
             column = _responses(evaluator, theta, k, 4 * total, generator)
             columns.append(column)
         # What one simulator of a specimen cannot measure, none of them has.
-        finite = np.isfinite(columns).all(axis=0)
+        finite = np.all([observable(column) for column in columns], axis=0)
         for k, column in zip(group, columns, strict=True):
             node = nodes[k]
             _refuse_few(node, finite, total)
-            observable = column[finite]
-            data[node.name] = observable[numbers[k]]
+            drawn = column[finite][numbers[k]]
+            data[node.name] = np.where(np.isnan(node.target.observed), np.nan, drawn)
     return {node.name: data[node.name] for node in nodes}
 
 
 def _responses(
     evaluator: Evaluator, theta: Floats, k: int, size: int, generator: np.random.Generator
 ) -> Floats:
-    """Return responses of new specimens, the same ones for the same generator, shape (size,)."""
+    """Return responses of new specimens, the same ones for the same generator, (size,) or (size, m)."""
     bound = evaluator.nodes[k].bound
     sampler = PopulationSampler(bound.inputs)
     roots = evaluator.roots(theta[None], k)

@@ -76,13 +76,17 @@ def identified_by_area(information: Information) -> Floats:
     deviation along it changes the area by less than half the noise floor, or if two halves of the
     points do not agree on the change: then it is the points' own error.
     """
-    area = information.area(*information.data_set)
-    slopes = _in_prior_sd(area, information)
-    gram = (slopes * area.lengths) @ slopes.T
+    areas = information.areas(*information.data_set)
+    gram: Any = 0
+    for area in areas:
+        slopes = _in_prior_sd(area, information)
+        gram = gram + (slopes * area.lengths) @ slopes.T
     _, vectors = np.linalg.eigh(gram)
     # The change of the area over one prior standard deviation along each direction.
-    changes = np.abs(vectors.T @ slopes)
-    change = (changes * area.lengths).sum(axis=-1)
+    change: Any = 0
+    for area in areas:
+        changes = np.abs(vectors.T @ _in_prior_sd(area, information))
+        change = change + (changes * area.lengths).sum(axis=-1)
     found = change > _CHANGE * information.noise_floor
     points = information.node.bound.blocks
     if points.size >= _HALVED:
@@ -93,18 +97,16 @@ def identified_by_area(information: Information) -> Floats:
 def _halves_agree(information: Information, vectors: Floats) -> NDArray[np.bool_]:
     """Return along which directions both halves of the points change alike, shape (d,)."""
     blocks = information.node.bound.blocks
-    changes = []
-    for half in (0, 1):
-        own = blocks % 2 == half
-        area = information.area(*information.data_set, own)
-        slopes = _in_prior_sd(area, information)
-        changes.append(vectors.T @ slopes)
-    first, second = changes
-    # The knots are the same: they are values that occur, and both halves know all of them.
-    lengths = area.lengths
-    both = (first * second * lengths).sum(axis=-1)
-    one = (first**2 * lengths).sum(axis=-1)
-    other = (second**2 * lengths).sum(axis=-1)
+    halves = [
+        information.areas(*information.data_set, blocks % 2 == half) for half in (0, 1)
+    ]
+    both = one = other = np.zeros(vectors.shape[1])
+    for area, again in zip(*halves, strict=True):
+        first, second = (vectors.T @ _in_prior_sd(own, information) for own in (area, again))
+        # The knots are the same: they are values that occur, and both halves know all of them.
+        both = both + (first * second * area.lengths).sum(axis=-1)
+        one = one + (first**2 * area.lengths).sum(axis=-1)
+        other = other + (second**2 * area.lengths).sum(axis=-1)
     least = _AGREEMENT * np.sqrt(one * other)
     return np.asarray(both > least)
 

@@ -76,10 +76,10 @@ def _expanded(
             hessian = directions.T @ one.hessian
             curvature += hessian @ directions / scale
         else:
-            area = one.area(observed, weights)
-            slopes = directions.T @ area.slopes
-            lengths = area.lengths / scale
-            areas.append(LinearArea(area.gaps, slopes, lengths))
+            for area in one.areas(observed, weights):
+                slopes = directions.T @ area.slopes
+                lengths = area.lengths / scale
+                areas.append(LinearArea(area.gaps, slopes, lengths))
     return _Expansion(force, curvature, areas)
 
 

@@ -6,7 +6,7 @@ is computed. Derivatives are central differences of stored weights, exact to rou
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -16,9 +16,16 @@ from numpy.typing import NDArray
 from prbayes._checks import AT_ONCE, Floats
 from prbayes._weighted import distribution_function, quantile, reached
 from prbayes.estimate.curvature import hessian_of, stencil
-from prbayes.estimate.data_sets import SETS, DataSets, dependent, simulated_sets, thinned
+from prbayes.estimate.data_sets import (
+    SETS,
+    DataSets,
+    dependent,
+    observable,
+    simulated_sets,
+    thinned,
+)
 from prbayes.estimate.differences import slopes
-from prbayes.metrics.base import Discrepancy
+from prbayes.metrics.base import Discrepancy, one_dimensional
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node
 
@@ -58,20 +65,26 @@ class Stencil:
 
     share: float  # the step that was meant, in prior standard deviations
     step: Floats  # (d,): the step, shorter where the prior is wide beside the population
-    values: Floats  # (s, n)
+    values: Floats  # (s, n), or (s, n, m) of several outputs
     weights: Floats  # (s, n)
+    target: Discrepancy
 
     @cached_property
     def moves(self) -> Floats:
-        """How far a step along each element moves the distribution function, at most, (d,)."""
+        """How far a step along each element moves a distribution function, at most, (d,)."""
+        parts = [self._moves_of(values) for values in one_dimensional(self.target, self.values)]
+        return np.max(parts, axis=0)
+
+    def _moves_of(self, values: Floats) -> Floats:
+        """Return the same for numbers of each specimen, shape (s, n)."""
         d = self.step.size
-        known = np.isfinite(self.values[0]) & (self.weights[0] > 0)
+        known = np.isfinite(values[0]) & (self.weights[0] > 0)
         if not known.any():
             return np.zeros(d)
         mass = self.weights[0][known] / self.weights[0][known].sum()
-        knots = quantile(self.values[0][known], mass, np.linspace(0.05, 0.95, 19))
+        knots = quantile(values[0][known], mass, np.linspace(0.05, 0.95, 19))
         across = slice(1 + 2 * d)
-        below = distribution_function(self.values[across], self.weights[across], knots)
+        below = distribution_function(values[across], self.weights[across], knots)
         gaps = np.abs(below[1:] - below[0]).max(axis=-1)
         return np.asarray(np.nan_to_num(gaps).reshape(2, d).max(axis=0))
 
@@ -117,6 +130,7 @@ class Information:
             return self._around(self.widened * _WIDE_STEP if moves else _NARROW_STEP)
         if self._target.differentiable:
             narrow = self._around(_NARROW_STEP)
+            # Of several outputs one that failed is at the end of its scale, and moves no more.
             finite = np.isfinite(narrow.values)
             # Unless a point gains or loses its response within the step.
             unchanged = finite == finite[0]
@@ -144,7 +158,7 @@ class Information:
         """Return the populations within given steps."""
         thetas = self.theta + stencil(step.size) * step
         values, weights = self.evaluator.populations(thetas, self.k)
-        return Stencil(share, step, values, weights)
+        return Stencil(share, step, values, weights, self._target)
 
     @property
     def _step(self) -> Floats:
@@ -159,7 +173,7 @@ class Information:
     def _center(self) -> tuple[Floats, Floats]:
         """The population at theta that could be observed: finite, with weights that sum to one."""
         values = self._stencil.values[0]
-        finite = np.isfinite(values)
+        finite = observable(values)
         weights = self._stencil.weights[0]
         observable = weights[finite]
         return values[finite], observable / observable.sum()
@@ -238,7 +252,7 @@ class Information:
     @cached_property
     def sampling_covariance(self) -> Floats:
         """J: the covariance of the gradient over data sets of the observed size, shape (d, d)."""
-        if not self.node.metric.additive or dependent([self.node]):
+        if not self._target.additive or dependent([self.node]):
             gradients = self.gradients(*self.data_set)
             covariance = np.cov(gradients, rowvar=False)
             return np.atleast_2d(covariance)
@@ -250,9 +264,12 @@ class Information:
         return np.atleast_2d(covariance) / self._target.n_effective
 
     def _quantiles(self, n: int) -> Floats:
-        """Return values of the population at theta at n equal steps of probability."""
+        """Return values of the population at theta at n equal steps of probability.
+
+        Specimens of several outputs in the order of the first.
+        """
         values, weights = self._center
-        order = np.argsort(values)
+        order = np.argsort(values.reshape(len(values), -1)[:, 0])
         levels = (np.arange(n) + 0.5) / n
         places = reached(weights[order], levels)
         ordered = values[order]
@@ -266,26 +283,43 @@ class Information:
         differences = hessian_of(values, step.size)
         return differences / np.outer(step, step)
 
-    def area(
+    def areas(
         self, observed: Floats, weights: Floats, among: NDArray[np.bool_] | None = None
-    ) -> LinearArea:
-        """Return a linear model of the area metric around theta.
+    ) -> list[LinearArea]:
+        """Return a linear model around theta of each area that the metric is a sum of.
 
         Parameters
         ----------
-        observed : ndarray, shape (n,)
+        observed : ndarray, shape (n,) or (n, m)
         weights : ndarray, shape (n_sets, n)
         among : ndarray of bool, optional
             The points of the population that count; all by default.
         """
-        values = self._stencil.values
+        found = []
+        for part in self._target.parts:
+            seen, rows = part.observed_of(observed)
+            some = weights[:, rows]
+            if len(seen) < len(observed):
+                some = some / some.sum(axis=1, keepdims=True)
+            area = self._area(part.of(self._stencil.values), seen, some, among)
+            found.append(replace(area, lengths=part.share * area.lengths))
+        return found
+
+    def _area(
+        self,
+        values: Floats,
+        observed: Floats,
+        weights: Floats,
+        among: NDArray[np.bool_] | None,
+    ) -> LinearArea:
+        """Return the same for numbers of each specimen: simulated (s, n), observed (n,)."""
         own = self._stencil.weights
         if among is not None:
             counted = own * among
             total = counted.sum(axis=-1, keepdims=True)
             # Points that a population does not reach tell nothing of it: a function of zeros.
             own = counted / np.where(total > 0, total, 1.0)
-        knots = self._knots(observed)
+        knots = self._knots(values[0], observed)
         # Stored responses are the same at all points of the stencil: they are sorted once.
         if np.array_equal(values[0], values[-1], equal_nan=True):
             values = values[0]
@@ -301,9 +335,8 @@ class Information:
             lengths=np.diff(knots),
         )
 
-    def _knots(self, observed: Floats) -> Floats:
+    def _knots(self, values: Floats, observed: Floats) -> Floats:
         """Return values that occur, where distribution functions are exact, some hundred of all."""
-        values = self._stencil.values[0]
         finite = values[np.isfinite(values)]
         occurring = np.concatenate([finite, observed])
         knots = np.unique(occurring)

@@ -30,6 +30,7 @@ from prbayes._checks import Floats, called
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Design, design_of
+from prbayes.response.outputs import ONE, Outputs
 
 _log = logging.getLogger("prbayes")
 
@@ -47,6 +48,7 @@ class Node:
     specimens: NDArray[Any] | None
     # Names of the simulators before it in the model that have a ``.dist()`` of its inputs.
     same_inputs: tuple[str, ...] = ()
+    outputs: Outputs = ONE  # of a run
 
     @property
     def metric(self) -> Metric:
@@ -66,7 +68,7 @@ class Node:
     @property
     def epsilon_is_default(self) -> bool:
         """Whether nobody gave epsilon: it is the 1/N of a metric on a likelihood's scale."""
-        return self.metric.likelihood and self.epsilon_value == 1 / self.n_specimens
+        return self.target.likelihood and self.epsilon_value == 1 / self.n_specimens
 
     @property
     def n_specimens(self) -> float:
@@ -161,21 +163,27 @@ class SimulatorRV(RandomVariable):
         self._warn_of_independence()
         *params, size = arguments
         bound = self.node.bound
+        event = self.node.target.event
         batches = []
         for root, param in zip(bound.inputs.roots, params, strict=True):
             leading = param.ndim - root.type.ndim
             batches.append(param.shape[:leading])
         batch = np.broadcast_shapes(*batches)
-        values = np.empty(batch if size is None else size)
+        values = np.empty((*(batch if size is None else size), *event))
         # One population for each element of a batch of parameters: commonly there is one.
         for index in np.ndindex(batch):
             pairs = zip(params, batches, strict=True)
             at = [param[_own_index(index, own)] for param, own in pairs]
             places = _places(index, batch)
             there = values[places]
-            drawn = bound.draw(rng, there.size, at)
+            n = there.size // int(np.prod(event, dtype=int))
+            drawn = bound.draw(rng, n, at)
             values[places] = drawn.reshape(there.shape)
         return values
+
+    def _supp_shape_from_params(self, dist_params: Any, param_shapes: Any = None) -> Any:
+        """Return how many outputs a specimen has."""
+        return [pt.constant(n, dtype="int64") for n in self.node.target.event]
 
     def _warn_of_independence(self) -> None:
         """Say once that PyMC draws each variable by itself."""
@@ -224,7 +232,11 @@ def _log_density(
         _require_own_data(node, value.data)
         return density
     observed = node.target.observed.astype(value.dtype)
-    same = pt.eq(value.shape[0], observed.size) & pt.all(pt.eq(value[: observed.size], observed))
+    first = value[: len(observed)]
+    equal = pt.eq(first, observed)
+    if np.isnan(observed).any():
+        equal = equal | (pt.isnan(first) & np.isnan(observed))
+    same = pt.eq(value.shape[0], len(observed)) & pt.all(equal)
     return CheckParameterValue(_other_data(node))(density, same)
 
 
@@ -238,7 +250,7 @@ def _require_own_data(node: Node, value: Any) -> None:
     """
     given = np.asarray(value)
     own = node.target.observed.astype(given.dtype)
-    if given.shape != own.shape or not np.array_equal(given, own):
+    if not np.array_equal(given, own, equal_nan=True):
         raise ValueError(_other_data(node))
 
 
@@ -258,7 +270,8 @@ class SimulatorDistribution(pm.Distribution):
     @classmethod
     def rv_op(cls, *params: Any, node: Node, size: Any = None, rng: Any = None) -> TensorVariable:
         """Return a random variable that carries a node."""
-        op = SimulatorRV(signature=_signature([p.type.ndim for p in params]), node=node)
+        signature = _signature([p.type.ndim for p in params], len(node.target.event))
+        op = SimulatorRV(signature=signature, node=node)
         generator = pt.random.shared_rng(seed=None) if rng is None else rng
         _, rv = op(*params, size=size, rng=generator, return_next_rng=True)
         return rv
@@ -274,13 +287,13 @@ class SimulatorDistribution(pm.Distribution):
         return pt.zeros_like(rv)
 
 
-def _signature(ndims: Sequence[int]) -> str:
-    """Return the signature of a random variable of scalar support, such as '(),(i10,i11)->()'."""
+def _signature(ndims: Sequence[int], ndim_supp: int) -> str:
+    """Return the signature of a random variable, such as '(),(i10,i11)->()', or '->(o)'."""
     groups = []
     for k, ndim in enumerate(ndims):
         axes = ",".join(f"i{k}{axis}" for axis in range(ndim))
         groups.append(f"({axes})")
-    return ",".join(groups) + "->()"
+    return ",".join(groups) + ("->(o)" if ndim_supp else "->()")
 
 
 def nodes(model: pm.Model) -> dict[Any, Node]:

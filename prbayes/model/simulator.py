@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import pymc as pm
+import pytensor.tensor as pt
 from numpy.typing import ArrayLike, NDArray
 from pytensor import config
 from pytensor.tensor.variable import TensorVariable
@@ -34,6 +35,7 @@ from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.response.compilation import PLAIN
 from prbayes.response.inputs import Inputs, read_inputs
+from prbayes.response.outputs import Outputs, read_observed
 from prbayes.response.response import Responses, refuse_uncallable
 
 _log = logging.getLogger("prbayes")
@@ -44,11 +46,11 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     response: Callable[..., Any],
     *inputs: Any,
     metric: Metric,
-    observed: ArrayLike,
+    observed: Any,
     epsilon: float | None = None,
     weights: ArrayLike | None = None,
     specimens: ArrayLike | None = None,
-    dims: str | None = None,
+    dims: str | Sequence[str] | None = None,
     propagation: Propagation | None = None,
     progressbar: bool = True,
 ) -> TensorVariable:
@@ -61,8 +63,9 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     response : callable
         ``response(*inputs)``, a NumPy-style function: one array per input, any leading batch shape,
         a multivariate input with its event axis last; returns an array of the batch shape, in units
-        of the observed values. NaN is a point at which it could not be computed, +inf a specimen
-        that failed. It is a function of its inputs: where these repeat, as discrete ones do, a
+        of the observed values; for m outputs of each specimen an array with them in a last axis, or
+        a mapping of arrays with the keys of ``observed``. NaN is a point at which it could not be
+        computed, all outputs of it, +inf a specimen that failed. It is a function of its inputs: where these repeat, as discrete ones do, a
         design computes it once, unless four that are computed again differ. Scatter of its own is
         best an input, as ``pm.Normal.dist(0, 1)``. Simulators with the same response object,
         inputs and propagation share its runs.
@@ -72,8 +75,11 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         same specimens.
     metric : Metric
         How simulated and observed responses are compared.
-    observed : array_like, shape (N,)
-        Measured responses, one per specimen, at least two.
+    observed : array_like, shape (N,) or (N, m), DataFrame, DataArray or mapping
+        Measured responses, of at least two specimens. Several outputs of each, (N, m), go with a
+        metric that sees them together, such as `Joint`: an array, a DataFrame whose columns are
+        outputs, a DataArray with specimens first, or a mapping of arrays. NaN is an output that was
+        not measured, +inf a specimen that had failed.
     epsilon : float, optional
         Scale of the discrepancy. 1/N for metrics on the scale of a likelihood, N the effective
         number of specimens; unset for the others, until `calibrate_epsilon` and `set_epsilon`, or
@@ -85,8 +91,8 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         belong together: data sets are drawn specimen by specimen. Each simulator's default epsilon
         counts its specimens, so that those that several share count several times under
         `pymc.sample`, until `calibrate_epsilon` corrects for it; a warning says so.
-    dims : str, optional
-        Name of the observed dimension.
+    dims : str or sequence of str, optional
+        Names of the observed dimensions.
     propagation : Propagation, optional
         How populations become responses; ``Reweighted(1024)`` by default.
     progressbar : bool
@@ -129,24 +135,24 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     # A model within another one puts its own name before those of its variables.
     name = pm.modelcontext(None).name_for(plain_text(name, "prb.Simulator: name"))
     _refuse_name(name, model)
-    target = _target(name, metric, observed, weights)
+    values, outputs = read_observed(name, observed)
+    target = _target(name, metric, values, weights)
     propagation = _propagation(name, propagation)
-    size = target.observed.size
+    size = len(target.observed)
     labels = None if specimens is None else sample_labels(specimens, size, f"{name}: specimens")
     before = list(nodes(model).values())
     others = [other for other in before if other.specimens is not None]
     if labels is not None:
         _refuse_alike_labels(name, labels, others)
-    _refuse_dims(name, dims, size, model)
+    dims = _checked_dims(name, dims, target.observed.shape, model)
     if epsilon is not None:
         positive_number(epsilon, f"{name}: epsilon")
     refuse_uncallable(name, response)
     sorted_inputs = read_inputs(name, inputs, model)
     with shown(progressbar):
-        bound = _bound(name, response, sorted_inputs, target, propagation, before)
+        bound = _bound(name, response, sorted_inputs, target, propagation, before, outputs)
     if epsilon is None:
-        likelihood = metric.likelihood
-        epsilon = 1 / effective_specimens(target, labels) if likelihood else np.nan
+        epsilon = 1 / effective_specimens(target, labels) if target.likelihood else np.nan
     node = Node(
         name,
         target,
@@ -155,11 +161,14 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         shared_epsilon(name, epsilon),
         labels,
         _with_inputs(bound, before),
+        outputs,
     )
     _warn_of_shared_specimens(node, others)
-    rv = SimulatorDistribution(
-        name, *sorted_inputs.roots, node=node, observed=target.observed, dims=dims
-    )
+    # As a constant, in which PyMC does not look for missing values to impute.
+    data: Any = target.observed
+    if np.isnan(target.observed).any():
+        data = pt.constant(target.observed)
+    rv = SimulatorDistribution(name, *sorted_inputs.roots, node=node, observed=data, dims=dims)
     rv.owner.op.own_node(rv.owner)
     return rv
 
@@ -183,6 +192,7 @@ def _bound(
     target: Discrepancy,
     propagation: Propagation,
     others: list[Node],
+    outputs: Outputs,
 ) -> Bound:
     """Return the propagation at work, with the responses that it needs at first.
 
@@ -198,6 +208,7 @@ def _bound(
         on_failure=propagation.on_failure,
         retry_failed=propagation.retry_failed,
         timeout=propagation.timeout,
+        outputs=outputs,
     )
     for other in others:
         if other.propagation == propagation and responses.same_as(other.bound.responses):
@@ -220,8 +231,13 @@ def _target(
             "prb.FunctionMetric(f)"
         )
     try:
-        values = observed_sample(observed, minimum=2)
-        return metric.against(values, weights)
+        if np.ndim(observed) != 2:
+            observed = observed_sample(observed, minimum=2)
+        elif len(observed) < 2:
+            raise ValueError(
+                f"observed: got {len(observed)} specimen(s), expected at least 2 of them"
+            )
+        return metric.against(observed, weights)
     except (TypeError, ValueError) as error:
         raise type(error)(f"{name}: {error}") from None
 
@@ -236,26 +252,35 @@ def _refuse_name(name: object, model: pm.Model) -> None:
         )
 
 
-def _refuse_dims(name: str, dims: object, size: int, model: pm.Model) -> None:
-    """Raise if dims are not the name of one dimension of the model, as long as the data."""
+def _checked_dims(
+    name: str, dims: object, shape: tuple[int, ...], model: pm.Model
+) -> tuple[str, ...] | None:
+    """Return names of the observed dimensions, which have to be the model's, as long as the data.
+    """
     if dims is None:
-        return
+        return None
     names = [dims] if isinstance(dims, str) else dims
-    if not isinstance(names, list | tuple) or [type(one) for one in names] != [str]:
+    if not isinstance(names, list | tuple) or {type(one) for one in names} != {str}:
         raise TypeError(f"{name}: dims: got {called(dims)}, expected the name of one dimension")
-    (dim,) = names
+    if len(names) != len(shape):
+        raise ValueError(
+            f"{name}: dims: got {names}, expected {len(shape)} names, one for each dimension of "
+            f"observed, {shape}"
+        )
     lengths = model.dim_lengths
-    if dim not in lengths:
-        raise ValueError(
-            f"{name}: dims: got {dim!r}, expected one of the model's dimensions, {list(lengths)}; "
-            f"add it with pm.Model(coords={{{dim!r}: ...}})"
-        )
-    length = int(lengths[dim].eval(mode=PLAIN))
-    if length != size:
-        raise ValueError(
-            f"{name}: dims: got {dim!r} of length {length}, expected {size}, as many as there are "
-            "observed values"
-        )
+    for dim, size in zip(names, shape, strict=True):
+        if dim not in lengths:
+            raise ValueError(
+                f"{name}: dims: got {dim!r}, expected one of the model's dimensions, "
+                f"{list(lengths)}; add it with pm.Model(coords={{{dim!r}: ...}})"
+            )
+        length = int(lengths[dim].eval(mode=PLAIN))
+        if length != size:
+            raise ValueError(
+                f"{name}: dims: got {dim!r} of length {length}, expected {size}, as many as there "
+                "are observed values"
+            )
+    return tuple(names)
 
 
 def _with_inputs(bound: Bound, others: list[Node]) -> tuple[str, ...]:

@@ -138,7 +138,7 @@ def _dependence(optimum: Optimum, group: list[int], epsilon: Floats) -> float:
 
 def _epsilon(information: Information) -> float:
     node = information.node
-    if node.metric.likelihood:
+    if node.target.likelihood:
         return 1 / node.n_specimens
     obstacle = simulator_obstacle(information.evaluator, information.k)
     if obstacle is not None:
@@ -220,18 +220,21 @@ class _Cloud:
     distances: Floats  # (n_sets, M)
 
     @classmethod
-    def around(cls, area: LinearArea, directions: Floats, seed: int) -> _Cloud:
+    def around(cls, areas: Sequence[LinearArea], directions: Floats, seed: int) -> _Cloud:
         """Draw the thetas; directions, (d, r), are one standard error long."""
         rng = np.random.default_rng(seed)
         z = rng.standard_normal((_CLOUD, directions.shape[1]))
         shifts = _WIDER * (z @ directions.T)
-        change = shifts @ area.slopes
-        distances = []
-        for gap in area.gaps:
-            gaps = np.abs(gap + change)
-            distance = (gaps * area.lengths).sum(axis=-1)
-            distances.append(distance)
-        return cls(z, np.array(distances))
+        total: Any = 0
+        for area in areas:
+            change = shifts @ area.slopes
+            distances = []
+            for gap in area.gaps:
+                gaps = np.abs(gap + change)
+                distance = (gaps * area.lengths).sum(axis=-1)
+                distances.append(distance)
+            total = total + np.array(distances)
+        return cls(z, total)
 
     def coverage(self, epsilon: float) -> float:
         """Return how often the data sets' posterior intervals contain the optimum, on average."""
@@ -252,10 +255,12 @@ class _Cloud:
 
 def _by_coverage(information: Information) -> float:
     """Solve for the epsilon whose posteriors cover, the features taken as linear in theta."""
-    area = information.area(*information.data_set)
+    areas = information.areas(*information.data_set)
     # Strongest last. What a sample of one response tells beyond two directions, close to its
-    # location and its spread, is of the order of the error of derivatives of stored weights.
-    basis = identified_by_area(information)[:, -2:]
+    # location and its spread, is of the order of the error of derivatives of stored weights; m
+    # outputs have as many locations, spreads and correlations.
+    (m,) = information.node.target.event or (1,)
+    basis = identified_by_area(information)[:, -m * (m + 3) // 2 :]
     _refuse_unidentified(information, basis.shape[1])
     sets = information.data_sets
     shifts = first_order_shifts([information], np.ones(1), basis, sets)
@@ -265,7 +270,7 @@ def _by_coverage(information: Information) -> float:
     errors = np.sqrt(np.maximum(variances, 0))
     axes = basis @ (vectors * errors)
     directions = axes * information.prior_sd[:, None]
-    cloud = _Cloud.around(area, directions, information.seed)
+    cloud = _Cloud.around(areas, directions, information.seed)
     # Coverage grows with epsilon.
     low, high = (information.noise_floor * factor for factor in (1e-3, 10.0))
     # To rounding.

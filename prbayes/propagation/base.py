@@ -28,6 +28,7 @@ from prbayes.response.distributions import PopulationSampler, prior_draws, valid
 from prbayes.response.executors import refuse_timeout
 from prbayes.response.failures import Abort, OnFailure, ResponseError
 from prbayes.response.inputs import Inputs
+from prbayes.response.outputs import lacking
 from prbayes.response.response import Responses, refuse_calling
 
 # Parts of a population's points whose differences tell its error: few enough that each is a design
@@ -52,9 +53,15 @@ class Missing:
 
     @classmethod
     def of(cls, values: Floats, weights: Floats) -> Missing:
-        """Return the shares of responses and weights, shapes (k, n)."""
-        lost = np.where(np.isnan(values), weights, 0.0).sum(axis=-1)
-        failed = np.where(np.isposinf(values), weights, 0.0).sum(axis=-1)
+        """Return the shares of responses, (k, n) or (k, n, m), and their weights, (k, n).
+
+        A specimen failed if an output of it did.
+        """
+        unknown, broken = np.isnan(values), np.isposinf(values)
+        if values.ndim > weights.ndim:
+            unknown, broken = unknown.any(axis=-1), broken.any(axis=-1)
+        lost = np.where(unknown, weights, 0.0).sum(axis=-1)
+        failed = np.where(broken, weights, 0.0).sum(axis=-1)
         known = np.maximum(1 - lost, np.finfo(float).tiny)
         return cls(lost, failed / known)
 
@@ -166,7 +173,10 @@ class Bound(ABC):
 
     @abstractmethod
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
-        """Return responses and weights of the populations at given roots, each of shape (k, n)."""
+        """Return responses and weights of the populations at given roots, each of shape (k, n).
+
+        Responses of several outputs have shape (k, n, m).
+        """
 
     def discrepancies(self, params: Sequence[Any], target: Discrepancy) -> Floats:
         """Return the discrepancies of the populations at given roots, shape (k,).
@@ -248,19 +258,19 @@ class Bound(ABC):
         return [p[ok] for p in params]
 
     def draw(self, rng: np.random.Generator, size: int, params: Sequence[Any]) -> Floats:
-        """Draw responses of ``size`` specimens at one value of the roots.
+        """Draw responses of ``size`` specimens at one value of the roots, (size,) or (size, m).
 
         They are specimens of the population's points, by weight and with replacement.
         """
         at = [np.asarray(p)[None] for p in params]
         if not self.valid(at).all():
-            return np.full(size, np.nan)
+            return np.full((size, *self.target.event), np.nan)
         values, weights = self.populations(at)
-        known = ~np.isnan(values[0])
+        known = ~lacking(values[0])
         mass = np.where(known, weights[0], 0.0)
         total = mass.sum()
         if not total > 0:
-            return np.full(size, np.nan)
+            return np.full((size, *self.target.event), np.nan)
         return rng.choice(values[0], size=size, p=mass / total)
 
 
@@ -317,7 +327,7 @@ def probe(bound: Bound, sampler: PopulationSampler, seed: int) -> tuple[Any, ...
     aleatory, epistemic = sampler(two, 8, np.random.default_rng(seed))
     values = bound.responses(aleatory, epistemic)
     refuse_all_nan(bound.name, values)
-    bound._probed = values.ravel()
+    bound._probed = values.reshape(-1, *bound.target.event)
     shapes = bound.inputs.event_shapes
     bound._probed_at = [x.reshape(-1, *own) for x, own in zip(aleatory, shapes, strict=True)]
     return values, aleatory, epistemic

@@ -91,14 +91,14 @@ class FreshBound(Bound):
         rng = np.random.default_rng([self._seed, self.stream, self.draws, _digest_of(params)])
         aleatory, epistemic = self._sampler(params, self.n_per_theta, rng)
         values = self.responses(aleatory, epistemic)
-        equal = np.broadcast_to(1 / self.n_per_theta, values.shape)
+        equal = np.broadcast_to(1 / self.n_per_theta, (len(values), self.n_per_theta))
         return values, equal
 
     def draw(self, rng: np.random.Generator, size: int, params: Sequence[Any]) -> Floats:
         """Draw responses of new specimens at one value of the roots."""
         at = [np.asarray(p)[None] for p in params]
         if not self.valid(at).all():
-            return np.full(size, np.nan)
+            return np.full((size, *self.target.event), np.nan)
         aleatory, epistemic = self._sampler(at, size, rng)
         return np.asarray(self.responses(aleatory, epistemic)[0])
 

@@ -77,6 +77,8 @@ class ResponseOp(OwnOp):
 
     def __init__(self, responses: Responses) -> None:
         self.responses = responses
+        outputs = responses.outputs
+        self.event_shape = () if outputs is None else outputs.event
         inputs = responses.inputs
         common = [e.type.ndim for e in inputs.epistemic]
         self.event_ndims = [*inputs.event_ndims, *common]
@@ -101,7 +103,7 @@ class ResponseOp(OwnOp):
         if valid.all():
             outputs[0][0] = self.responses(inputs[:k], inputs[k:])
             return
-        values = np.full(batch, np.nan)
+        values = np.full(batch + tuple(self.event_shape), np.nan)
         if valid.any():
             valid_aleatory = [x[valid] for x in aleatory]
             valid_epistemic = [x[valid] for x in epistemic]
@@ -180,11 +182,15 @@ class OpaqueOp(OwnOp):
 
     def __init__(self, target: Discrepancy) -> None:
         self.target = target
+        self.event_ndims = [1 + len(target.event), 1]
 
     def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
         """Call the user's function."""
-        sample, weights = np.broadcast_arrays(*inputs)
-        outputs[0][0] = np.asarray(self.target.of(sample, weights))
+        sample, weights = inputs
+        event = self.target.event
+        shape = np.broadcast_shapes(sample.shape[: sample.ndim - len(event)], weights.shape)
+        full = np.broadcast_to(sample, shape + event)
+        outputs[0][0] = np.asarray(self.target.of(full, np.broadcast_to(weights, shape)))
 
     def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
         """Refuse: nothing is known about the function."""
@@ -195,9 +201,20 @@ class OpaqueOp(OwnOp):
 
 
 def symbolic_discrepancy(target: Discrepancy, sample: Any, weights: Any) -> Any:
-    """Return the graph of a discrepancy for a sample that depends on theta: (n,), (n,) -> ()."""
+    """Return the graph of a discrepancy for a sample that depends on theta.
+
+    Shapes (n,), or (n, m) of several outputs, (n,) -> ().
+    """
     if not target.symbolic:
         return OpaqueOp(target)(sample, weights)
+    parts = target.parts
+    if parts[0].target is not target:
+        values = [part.of(sample, pt) for part in parts]
+        graphs = [
+            part.share * symbolic_discrepancy(part.target, own, weights)
+            for part, own in zip(parts, values, strict=True)
+        ]
+        return sum(graphs[1:], start=graphs[0])
     if target.density_cells is not None:
         density = DensityOp(target.density_cells)(sample, weights)
         return target.outer(density, xp=pt)

@@ -179,5 +179,5 @@ class ResimulatedBound(Bound):
         """Return the responses at the base points, with equal weights."""
         (values,) = self._values(*params)
         if self.symbolic:
-            self.responses.count_symbolic(values.size)
-        return values, np.broadcast_to(1 / self.n_per_theta, values.shape)
+            self.responses.count_symbolic(values.shape[0] * self.n_per_theta)
+        return values, np.broadcast_to(1 / self.n_per_theta, values.shape[:2])

@@ -49,6 +49,7 @@ from prbayes.response.distributions import (
     refuse_without_density,
 )
 from prbayes.response.inputs import Inputs
+from prbayes.response.outputs import lacking
 from prbayes.response.repeats import Known, once_each
 from prbayes.response.response import Responses
 
@@ -153,7 +154,7 @@ class Batches:
     """The points of a design, batch after batch, and the mixture that they were drawn from."""
 
     points: tuple[Floats, ...]  # (n, *event): one for each aleatory input
-    values: Floats  # (n,): their responses; NaN where there is none
+    values: Floats  # (n,) or (n, m): their responses; NaN where there is none
     # (k, *shape): the roots' values of the mixture's components, one array for each root.
     components: tuple[Floats, ...]
     counts: Floats  # (k,): how many points came from each component
@@ -243,7 +244,7 @@ class Design(Bound):
 
     @property
     def values(self) -> Floats:
-        """The stored responses, shape (n,)."""
+        """The stored responses, (n,) or (n, m)."""
         return self.batches.values
 
     @property
@@ -254,7 +255,7 @@ class Design(Bound):
     @property
     def n_points(self) -> int:
         """Number of stored responses."""
-        return self.values.size
+        return len(self.values)
 
     @property
     def max_points(self) -> int:
@@ -323,7 +324,7 @@ class Design(Bound):
         return [points[i] for i in places]
 
     def values_of(self, responses: Responses) -> Floats:
-        """Return another response of the design's specimens, shape (n,).
+        """Return another response of the design's specimens, (n,) or (n, m).
 
         None that is known is computed again.
         """
@@ -331,11 +332,11 @@ class Design(Bound):
             return self.values
         before = [pair for pair in self._others if responses.same_as(pair[0])]
         known = before[0][1] if before else np.empty(0)
-        if known.size < self.n_points:
+        if len(known) < self.n_points:
             points = self.points_of(responses.inputs)
-            missing = [p[known.size :] for p in points]
+            missing = [p[len(known) :] for p in points]
             more = once_each(responses, missing, Known(points, known))
-            known = np.concatenate([known, more])
+            known = np.concatenate([known.reshape(-1, *more.shape[1:]), more])
             # Instead of the fewer that were known before.
             if before:
                 self._others.remove(before[0])
@@ -404,7 +405,7 @@ class Design(Bound):
         runs = self.responses.runs
         shared = runs.at(points)
         if shared is not None:
-            self.responses.find(shared.size)
+            self.responses.find(len(shared))
             return shared
         stored = self._stored
         own = None if stored is None else Known(stored.points, stored.values)
@@ -644,7 +645,7 @@ class Design(Bound):
         total = weights.sum(axis=-1, keepdims=True)
         with np.errstate(invalid="ignore"):
             weights = weights / total
-        return np.broadcast_to(self.values, weights.shape), weights
+        return np.broadcast_to(self.values, weights.shape + self.values.shape[1:]), weights
 
     def discrepancies(self, params: Sequence[Any], target: Discrepancy) -> Floats:
         """Return the discrepancies of the populations at given roots, shape (k,).
@@ -677,9 +678,10 @@ class Design(Bound):
         (logs,) = self._log_weights(*params)
         total = _log_sum(logs, axis=-1)
         squares = _log_sum(2 * logs, axis=-1)
-        failed = np.isnan(self.values)
+        failed = lacking(self.values)
+        broken_ones = np.isposinf(self.values).reshape(self.n_points, -1).any(axis=1)
         without_response = _log_sum(logs[..., failed], axis=-1)
-        broken = _log_sum(logs[..., np.isposinf(self.values)], axis=-1)
+        broken = _log_sum(logs[..., broken_ones], axis=-1)
         known = _log_sum(logs[..., ~failed], axis=-1)
         with np.errstate(invalid="ignore"):
             ess = np.exp(2 * total - squares)
@@ -687,7 +689,7 @@ class Design(Bound):
             broken_share = np.exp(broken - known)
         return {
             "weight_ess": np.nan_to_num(ess),
-            "mean_weight": np.exp(total - np.log(self.values.size)),
+            "mean_weight": np.exp(total - np.log(self.n_points)),
             "lost_mass": np.nan_to_num(lost, nan=1.0),
             "failed_mass": np.nan_to_num(broken_share),
         }
