@@ -22,6 +22,7 @@ from prbayes.metrics.base import Metric
 from prbayes.metrics.density import GaussianKDE, Histogram
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.function import FunctionMetric
+from prbayes.metrics.joint import Joint
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual
 from prbayes.model.epsilon import set_epsilon
@@ -58,6 +59,7 @@ __all__ = [
     "FunctionMetric",
     "GaussianKDE",
     "Histogram",
+    "Joint",
     "KullbackLeibler",
     "LogLikelihood",
     "Metric",

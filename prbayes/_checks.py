@@ -101,7 +101,7 @@ def observed_sample(values: ArrayLike, name: str = "observed", *, minimum: int =
     if array.ndim != 1:
         raise ValueError(
             f"{name}: got an array of shape {array.shape}, expected one dimension, (N,); "
-            "several responses of a specimen go to one Simulator each"
+            "several outputs of a specimen, (N, m), take prb.Joint(metric), or one Simulator each"
         )
     if array.size < minimum:
         few = "no values" if array.size == 0 else f"{array.size} value"
@@ -115,11 +115,69 @@ def observed_sample(values: ArrayLike, name: str = "observed", *, minimum: int =
     return array
 
 
-def simulated_sample(values: ArrayLike, name: str = "simulated") -> Floats:
-    """Check simulated responses, shape (..., n): no NaN or -inf; +inf is a failed specimen."""
+def observed_outputs(values: ArrayLike, name: str = "observed") -> Floats:
+    """Check measured responses of several outputs: (N, m), no row and no column without a number.
+
+    Parameters
+    ----------
+    values : array_like, shape (N, m)
+        NaN, or a mask, is an output that was not measured; +inf a specimen that failed there.
+    name : str
+
+    Returns
+    -------
+    ndarray, shape (N, m)
+
+    Raises
+    ------
+    TypeError
+        If the values are not real numbers.
+    ValueError
+        If they have another shape, or an output or a specimen has no value, or no finite one.
+    """
+    masked = np.ma.getmaskarray(values) if isinstance(values, np.ma.MaskedArray) else None
+    array = real_array(np.ma.getdata(values) if masked is not None else values, name)
+    if array.ndim != 2 or 0 in array.shape:
+        raise ValueError(
+            f"{name}: got an array of shape {array.shape}, expected (N, m), a row for each "
+            "specimen and a column for each output"
+        )
+    if masked is not None:
+        array = np.where(masked, np.nan, array)
+    if np.isneginf(array).any():
+        raise ValueError(
+            f"{name}: got -inf, expected numbers; NaN is an output that was not measured, +inf a "
+            "specimen that failed"
+        )
+    missing = np.isnan(array)
+    _refuse_empty(missing.all(axis=1), name, "specimens", "row", "without any output")
+    _refuse_empty(missing.all(axis=0), name, "outputs", "column", "that no specimen has")
+    without = ~np.isfinite(array).any(axis=0)
+    _refuse_empty(without, name, "outputs", "column", "in which every specimen failed")
+    return array
+
+
+def _refuse_empty(empty: NDArray[np.bool_], name: str, what: str, place: str, without: str) -> None:
+    """Raise if there are rows or columns that hold nothing."""
+    where = np.flatnonzero(empty)
+    if where.size:
+        raise ValueError(
+            f"{name}: got {where.size} {what} {without} ({place} {where[0]} is one, counted from "
+            "0), expected a number in each; leave them out"
+        )
+
+
+def simulated_sample(
+    values: ArrayLike, name: str = "simulated", *, event: tuple[int, ...] = ()
+) -> Floats:
+    """Check simulated responses, (..., n, *event): no NaN or -inf; +inf is a failed specimen."""
     array = real_array(values, name)
-    if array.ndim == 0 or array.shape[-1] == 0:
-        raise ValueError(f"{name}: got shape {array.shape}, expected (..., n) with n >= 1")
+    before = array.shape[: max(0, array.ndim - len(event))]
+    if not before or before[-1] == 0 or array.shape[len(before) :] != event:
+        expected = "".join(f", {size}" for size in event)
+        raise ValueError(
+            f"{name}: got shape {array.shape}, expected (..., n{expected}) with n >= 1"
+        )
     if np.isnan(array).any() or np.isneginf(array).any():
         raise ValueError(
             f"{name}: got NaN or -inf, expected numbers; a specimen that failed is +inf, "

@@ -19,7 +19,13 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from prbayes._checks import Floats, observed_sample, sample_weights, simulated_sample
+from prbayes._checks import (
+    Floats,
+    observed_outputs,
+    observed_sample,
+    sample_weights,
+    simulated_sample,
+)
 from prbayes.metrics.cells import Cells, product
 
 # Share of the uniform density that is mixed into densities before a logarithm is taken. Any value
@@ -52,6 +58,53 @@ class Minimum(Enum):
 
 
 @dataclass(frozen=True, eq=False)
+class View:
+    """What a part of a discrepancy sees of a response: all of it, unless it is a special view."""
+
+    def of(self, simulated: Any, xp: Any = np) -> Any:
+        """Return what is seen of simulated responses, a specimen's along the last axes."""
+        return simulated
+
+    def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
+        """Return what is seen of observed values, and of which rows."""
+        return values, np.arange(len(values))
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One term of a discrepancy that is a sum: ``share`` times what ``target`` says.
+
+    Attributes
+    ----------
+    target : Discrepancy
+        Of one output, or of something that stands for one; where it needs several outputs at a
+        time, ``target.event`` says so.
+    share : float
+        Its factor in the sum.
+    label : str
+        What a reader calls it.
+    view : View
+        What it sees of a response.
+    """
+
+    target: Discrepancy
+    share: float
+    label: str
+    view: View = View()
+
+    def of(self, simulated: Any, xp: Any = np) -> Any:
+        """Return what the target compares, (..., n, m) -> (..., n); NaN where an output is NaN."""
+        return self.view.of(simulated, xp)
+
+    def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
+        """Return what the target compares of observed values, and of which rows.
+
+        Rows that lack an output that is needed are left out: (n, m) -> (n',), (n',).
+        """
+        return self.view.observed_of(values)
+
+
+@dataclass(frozen=True, eq=False)
 class Discrepancy(ABC):
     """A metric with its observed side prepared; call it with simulated responses.
 
@@ -64,8 +117,8 @@ class Discrepancy(ABC):
     ----------
     metric : Metric
         The configuration that prepared it.
-    observed : ndarray, shape (N,)
-        Measured responses.
+    observed : ndarray, shape (N,) or (N, m)
+        Measured responses, of one output or of m.
     weights : ndarray, shape (N,) or (..., N)
         Weights of the observed values; they sum to one. Several rows stand for as many data sets.
     """
@@ -88,13 +141,33 @@ class Discrepancy(ABC):
             Equal by default. With several rows, each a data set, `outer` broadcasts the data sets
             against the features.
         """
-        w = sample_weights(weights, observed.size)
+        w = sample_weights(weights, len(observed))
         return replace(self, observed=observed, weights=w)
 
     def rows(self, index: Any) -> Self:
         """Return some of the data sets of which there are several; nothing is computed anew."""
         chosen = {name: getattr(self, name)[index] for name in self._by_data_set}
         return replace(self, **chosen)
+
+    @property
+    def event(self) -> tuple[int, ...]:
+        """The shape of one specimen's response: () for one output, (m,) for several."""
+        return self.observed.shape[1:]
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The terms that it is the sum of: itself, unless it is made of several."""
+        return (Part(self, 1.0, ""),)
+
+    @property
+    def likelihood(self) -> bool:
+        """Whether N times the discrepancy is on the scale of a log-likelihood."""
+        return self.metric.likelihood
+
+    @property
+    def additive(self) -> bool:
+        """Whether its gradient in the hyperparameters is a mean over observations."""
+        return self.metric.additive
 
     @property
     def n_effective(self) -> float:
@@ -163,7 +236,8 @@ class Discrepancy(ABC):
 
     def overlap(self, simulated: Floats, weights: Floats) -> Floats:
         """Return the overlap of both densities, (..., n) -> (...); one where there are none."""
-        batch = np.shape(simulated)[:-1]
+        shape = np.shape(simulated)
+        batch = shape[: len(shape) - 1 - len(self.event)]
         return np.ones(batch)
 
     def of(self, simulated: Floats, weights: Floats) -> Any:
@@ -176,7 +250,7 @@ class Discrepancy(ABC):
 
         Parameters
         ----------
-        simulated : array_like, shape (..., n)
+        simulated : array_like, shape (..., n), or (..., n, m) for several outputs
             In units of the observed values; +inf is a specimen that failed.
         weights : array_like, shape (..., n), optional
             Equal by default.
@@ -185,10 +259,11 @@ class Discrepancy(ABC):
         -------
         float or ndarray, shape (...)
         """
-        values = simulated_sample(simulated)
-        w = sample_weights(weights, values.shape[-1])
-        shape = np.broadcast_shapes(values.shape, w.shape)
-        values = np.broadcast_to(values, shape)
+        values = simulated_sample(simulated, event=self.event)
+        before = values.shape[: values.ndim - len(self.event)]
+        w = sample_weights(weights, before[-1])
+        shape = np.broadcast_shapes(before, w.shape)
+        values = np.broadcast_to(values, (*shape, *self.event))
         result = self.of(values, w)
         return float(result) if np.ndim(result) == 0 else result
 
@@ -237,6 +312,18 @@ class Metric(ABC):
         """Whether simulated responses may have unequal weights, as under `Reweighted`."""
         return True
 
+    @property
+    def takes_outputs(self) -> bool:
+        """Whether it compares several outputs at a time, (N, m), as `Joint` does."""
+        return False
+
+    def like(self, metric: Metric) -> Metric:
+        """Return the metric that compares the same outputs in the same way, but by another metric.
+
+        ``metric`` itself, unless this one lifts a metric of one output to several.
+        """
+        return metric
+
     @abstractmethod
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         """Return the discrepancy from these observed values, both of shape (N,) and checked."""
@@ -247,7 +334,7 @@ class Metric(ABC):
         Parameters
         ----------
         observed : array_like, shape (N,)
-            Measured responses.
+            Measured responses; (N, m) where the metric takes several outputs.
         weights : array_like, shape (N,), optional
             Weights of the measured responses; equal by default.
 
@@ -262,10 +349,11 @@ class Metric(ABC):
             If the observed values are not one-dimensional, real and finite, or if the metric needs
             a bandwidth or bins and they are all equal.
         """
-        sample = observed_sample(observed)
-        w = sample_weights(weights, sample.size, "observed weights")
-        if w.shape != sample.shape:
-            raise ValueError(f"observed weights: got shape {w.shape}, expected {sample.shape}")
+        several = self.takes_outputs and np.ndim(observed) > 1
+        sample = observed_outputs(observed) if several else observed_sample(observed)
+        w = sample_weights(weights, len(sample), "observed weights")
+        if w.ndim > 1:
+            raise ValueError(f"observed weights: got shape {w.shape}, expected ({len(sample)},)")
         return self._prepare(sample, w)
 
     def __call__(

@@ -1,0 +1,322 @@
+"""Discrepancies that are a sum of others, each of which sees several outputs in its own way."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prbayes._checks import Floats, sample_weights
+from prbayes.metrics.base import Discrepancy, Minimum, Part, View
+from prbayes.metrics.cells import product
+
+
+@dataclass(frozen=True, eq=False)
+class Outputs(View):
+    """Some of the outputs, all at a time."""
+
+    outputs: NDArray[np.intp]  # (p,): which ones
+    caps: Floats  # (p,): what a specimen counts as that failed there
+
+    def of(self, simulated: Any, xp: Any = np) -> Any:
+        """Return the outputs (..., n, p), a failure as the cap; NaN stays."""
+        chosen = simulated[..., self.outputs]
+        return xp.where(chosen >= np.inf, self.caps, chosen)
+
+    def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
+        """Return what the target compares of the rows that have all these outputs."""
+        index = np.flatnonzero(~np.isnan(values[:, self.outputs]).any(axis=-1))
+        return self.of(values[index]), index
+
+
+@dataclass(frozen=True, eq=False)
+class Projection(Outputs):
+    """One linear combination of outputs."""
+
+    center: Floats  # (p,)
+    direction: Floats  # (p,)
+
+    def of(self, simulated: Any, xp: Any = np) -> Any:
+        """Return (outputs - center) @ direction, shape (..., n)."""
+        return (super().of(simulated, xp) - self.center) @ self.direction
+
+
+@dataclass(frozen=True, eq=False)
+class OnlyOutput(View):
+    """The only output there is, as it is."""
+
+    def of(self, simulated: Any, xp: Any = np) -> Any:
+        """Return the output, (..., n, 1) -> (..., n)."""
+        return simulated[..., 0]
+
+    def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
+        """Return the output, of all rows."""
+        return self.of(values), np.arange(len(values))
+
+
+@dataclass(frozen=True, eq=False)
+class CompositeDiscrepancy(Discrepancy):
+    """A sum of discrepancies, its parts, against fixed observed values of several outputs."""
+
+    members: tuple[Part, ...]
+    # (K,) or (..., K): by part, those of the data set, which may lack all specimens that a part
+    # needs.
+    shares: Floats
+    _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "shares")
+
+    @classmethod
+    def of_parts(
+        cls, metric: Any, observed: Floats, weights: Floats, parts: Sequence[Part]
+    ) -> Self:
+        """Return the sum of parts that have been prepared against these values, (N, m) and (N,)."""
+        shares = np.array([part.share for part in parts])
+        return cls(metric, observed, weights, tuple(parts), shares)
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The terms of the sum."""
+        return self.members
+
+    @property
+    def targets(self) -> list[Discrepancy]:
+        """The discrepancies of the parts."""
+        return [part.target for part in self.members]
+
+    def with_observed(self, observed: Floats, weights: Floats | None = None) -> Self:
+        """Return the same metric, on the same cells and slices, against other values.
+
+        Parameters
+        ----------
+        observed : ndarray, shape (n, m)
+            NaN is an output that was not measured.
+        weights : ndarray, shape (n,) or (..., n), optional
+            Equal by default. A part sees the rows that have the outputs that it needs. If none of
+            these has weight in a data set, the other parts take its share there.
+        """
+        w = sample_weights(weights, len(observed))
+        parts = []
+        seen = np.zeros((*w.shape[:-1], len(self.members)), dtype=bool)
+        for k, part in enumerate(self.members):
+            values, index = part.observed_of(observed)
+            own = w[..., index]
+            seen[..., k] = own.sum(axis=-1) > 0
+            if not index.size:  # any values do, as they do not count
+                values = part.target.observed
+                own = np.zeros((*w.shape[:-1], len(values)))
+            own = np.where(seen[..., k, None], own, 1.0)
+            target = part.target.with_observed(values, own)
+            parts.append(replace(part, target=target))
+        nominal = np.array([part.share for part in parts])
+        shares = nominal * seen
+        shares = shares * (nominal.sum() / shares.sum(axis=-1, keepdims=True))
+        if seen.all():
+            shares = np.broadcast_to(nominal, seen.shape)
+        return replace(self, observed=observed, weights=w, members=tuple(parts), shares=shares)
+
+    def rows(self, index: Any) -> Self:
+        """Return some of the data sets of which there are several; nothing is computed anew."""
+        parts = tuple(replace(p, target=p.target.rows(index)) for p in self.members)
+        return replace(super().rows(index), members=parts)
+
+    @property
+    def likelihood(self) -> bool:
+        """Whether N times it is on the scale of a log-likelihood: not a mean over directions."""
+        return len(self.members) == 1 and self.targets[0].likelihood
+
+    @property
+    def additive(self) -> bool:
+        """Whether the gradient is a mean over observations: not where some see fewer outputs."""
+        complete = not np.isnan(self.observed).any()
+        return complete and self.metric.additive
+
+    @property
+    def symbolic(self) -> bool:
+        """Whether all parts can be written as a graph."""
+        return all(target.symbolic for target in self.targets)
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether all parts have second derivatives."""
+        return all(target.differentiable for target in self.targets)
+
+    @property
+    def scale(self) -> float:
+        """The sum of the typical sizes of the parts."""
+        return float(sum(part.share * part.target.scale for part in self.members))
+
+    def overlap(self, simulated: Floats, weights: Floats) -> Floats:
+        """Return the smallest overlap of any part, (..., n, m) -> (...)."""
+        overlaps = [part.target.overlap(part.of(simulated), weights) for part in self.members]
+        return np.min(overlaps, axis=0)
+
+    @cached_property
+    def _groups(self) -> tuple[_Group, ...]:
+        """The parts by how they are evaluated together; the last has any number of arrays."""
+        several = [k for k, t in enumerate(self.targets) if t.event]
+        single = [k for k, t in enumerate(self.targets) if not t.event]
+        groups: list[_Group] = [_Each((k,), (self.members[k],)) for k in several]
+        if single:
+            parts = tuple(self.members[k] for k in single)
+            kind: type[_Group] = _Each
+            if all(part.target.density_cells is not None for part in parts):
+                kind = _Densities
+            elif any(part.target.metric.minimum is not Minimum.QUADRATIC for part in parts):
+                kind = _Values
+            groups.append(kind(tuple(single), parts))
+        return tuple(groups)
+
+    def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
+        """Return the features of the parts."""
+        found = [group.features(simulated, weights, xp) for group in self._groups]
+        return sum(found, ())
+
+    def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
+        """Return arrays that turn weights of stored values, (n, m), into features."""
+        if not self.symbolic:
+            return (simulated,)
+        return sum((group.basis(simulated) for group in self._groups), ())
+
+    def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
+        """Return the features of the values that the basis was made for."""
+        if not self.symbolic:
+            (values,) = basis
+            values = np.broadcast_to(values, (*weights.shape, *self.event))
+            return self.features(values, weights, xp)
+        divided = self._divided(basis)
+        found = [g.from_basis(weights, own, xp) for g, own in zip(self._groups, divided)]
+        return sum(found, ())
+
+    def outer(self, *features: Any, xp: Any) -> Any:
+        """Return the sum of the parts, each times its share."""
+        total: Any = 0.0
+        for group, own in zip(self._groups, self._divided(features), strict=True):
+            shares = self.shares[..., list(group.places)]
+            total = total + group.outer(own, shares, xp)
+        return total
+
+    def _divided(self, arrays: tuple[Any, ...]) -> list[tuple[Any, ...]]:
+        """Return the arrays of each group: one each, and for the last all others."""
+        last = len(self._groups) - 1
+        return [arrays[i : i + 1] if i < last else arrays[i:] for i in range(last + 1)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Group(ABC):
+    """Parts that are evaluated together."""
+
+    places: tuple[int, ...]  # of the parts in the sum
+    parts: tuple[Part, ...]
+
+    @abstractmethod
+    def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
+        """Return the features of all parts."""
+
+    @abstractmethod
+    def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
+        """Return the arrays that turn weights into features."""
+
+    @abstractmethod
+    def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
+        """Return the features."""
+
+    @abstractmethod
+    def outer(self, features: tuple[Any, ...], shares: Floats, xp: Any) -> Any:
+        """Return the sum of the parts, each times its share, shape (..., K)."""
+
+    def _of_each(self, arrays: tuple[Any, ...]) -> list[tuple[Any, ...]]:
+        """Return the arrays of each part, of which all have as many."""
+        size = len(arrays) // len(self.parts)
+        return [arrays[k * size : (k + 1) * size] for k in range(len(self.parts))]
+
+
+class _Each(_Group):
+    """Parts one after the other, each with features of its own."""
+
+    def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
+        """Return the features of all parts."""
+        found = [part.target.features(part.of(simulated, xp), weights, xp) for part in self.parts]
+        return sum(found, ())
+
+    def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
+        """Return the arrays of all parts."""
+        return sum((part.target.basis(part.of(simulated)) for part in self.parts), ())
+
+    def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
+        """Return the features of all parts."""
+        every = zip(self.parts, self._of_each(basis), strict=True)
+        return sum((part.target.from_basis(weights, own, xp) for part, own in every), ())
+
+    def outer(self, features: tuple[Any, ...], shares: Floats, xp: Any) -> Any:
+        """Return the sum of the parts."""
+        total: Any = 0.0
+        for k, (part, own) in enumerate(zip(self.parts, self._of_each(features), strict=True)):
+            total = total + shares[..., k] * part.target.outer(*own, xp=xp)
+        return total
+
+
+class _Values(_Each):
+    """Parts whose only features are their values: what they are made of is not kept."""
+
+    def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
+        """Return the values of all parts, (..., K)."""
+        found = []
+        for part in self.parts:
+            own = part.target.features(part.of(simulated, xp), weights, xp)
+            found.append(part.target.outer(*own, xp=xp))
+        return (xp.stack(found, axis=-1),)
+
+    def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
+        """Return the values of all parts, (..., K)."""
+        found = []
+        for part, own in zip(self.parts, self._of_each(basis), strict=True):
+            features = part.target.from_basis(weights, own, xp)
+            found.append(part.target.outer(*features, xp=xp))
+        return (xp.stack(found, axis=-1),)
+
+    def outer(self, features: tuple[Any, ...], shares: Floats, xp: Any) -> Any:
+        """Return their sum."""
+        return (features[0] * shares).sum(axis=-1)
+
+
+class _Densities(_Group):
+    """Parts that compare densities: those lie side by side, so that one product gives them all."""
+
+    @cached_property
+    def _slices(self) -> list[slice]:
+        """Where the cells of each part are."""
+        ends = np.cumsum([part.target.density_cells.widths.size for part in self.parts])
+        starts = np.concatenate([[0], ends[:-1]])
+        return [slice(int(a), int(b)) for a, b in zip(starts, ends, strict=True)]
+
+    def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
+        """Return the densities side by side, (..., cells)."""
+        found = []
+        for part in self.parts:
+            found += part.target.features(part.of(simulated, xp), weights, xp)
+        return (xp.concatenate(found, axis=-1),)
+
+    def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
+        """Return one matrix, (n, cells)."""
+        out = np.empty((len(simulated), self._slices[-1].stop))
+        for part, cells in zip(self.parts, self._slices, strict=True):
+            (out[:, cells],) = part.target.basis(part.of(simulated))
+        return (out,)
+
+    def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
+        """Return the densities side by side, (..., cells)."""
+        (matrix,) = basis
+        return (product(weights, matrix) if xp is np else weights @ matrix,)
+
+    def outer(self, features: tuple[Any, ...], shares: Floats, xp: Any) -> Any:
+        """Return the sum of the parts."""
+        (densities,) = features
+        total: Any = 0.0
+        for k, (part, cells) in enumerate(zip(self.parts, self._slices, strict=True)):
+            own = densities[..., cells]
+            total = total + shares[..., k] * part.target.outer(own, xp=xp)
+        return total
