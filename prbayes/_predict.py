@@ -38,6 +38,7 @@ from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, quantiles
 from prbayes.response.failures import Abort, ResponseError
 from prbayes.response.inputs import Inputs, read_inputs
+from prbayes.response.outputs import Outputs, lacking
 from prbayes.response.response import Responses, refuse_calling, refuse_uncallable
 
 _log = logging.getLogger("prbayes")
@@ -109,7 +110,9 @@ def predict(
     Returns
     -------
     xarray.DataArray
-        Dims (chain, draw, sample). Attributes: ``source`` (how specimens were made), ``responses``
+        Dims (chain, draw, sample), and for several outputs a last one, with their names where they
+        are known: those of the simulator with this response, or the keys of a mapping. Attributes:
+        ``source`` (how specimens were made), ``responses``
         (how many were computed), ``nan`` (how many values are NaN), ``specimens_id`` (equal for
         predictions with the same specimens), ``calibration_data`` and ``calibration_specimens``
         (digests of the data, and specimen labels, of the calibration, by which `area_test` knows
@@ -162,24 +165,34 @@ def predict(
         require_same_responses(identity_in(result), model, "prb.predict")
     points, coords = populations_of(result, model, draws, "prb.predict")
     sorted_inputs = read_inputs(label, inputs, model)
+    found = list(nodes(model).values())
     responses = Responses(
-        label, response, sorted_inputs, executor=executor, store=store, version=version
+        label,
+        response,
+        sorted_inputs,
+        executor=executor,
+        store=store,
+        version=version,
+        outputs=_known_outputs(found, response),
     )
     seed = None if random_seed is None else seed_number(random_seed)
     rng = np.random.default_rng(seed)
-    node = serving(list(nodes(model).values()), responses) if stored else None
+    node = serving(found, responses) if stored else None
     with shown(progressbar):
         if node is None:
             drawn = _new_responses(label, responses, points, n_samples, rng)
         else:
             drawn = _resampled_responses(node, responses, points, n_samples, rng)
     if max_lost is None:
-        max_lost = max((node.bound.max_lost for node in nodes(model).values()), default=MAX_LOST)
+        max_lost = max((node.bound.max_lost for node in found), default=MAX_LOST)
     missing = _count_missing(label, drawn.values, max_lost)
+    event = drawn.values.shape[2:]
+    outputs = responses.outputs or Outputs(tuple(range(*event)))
+    last = {outputs.dim: list(outputs.labels)} if event else {}
     return xr.DataArray(
-        drawn.values.reshape(len(coords["chain"]), len(coords["draw"]), n_samples),
-        dims=("chain", "draw", "sample"),
-        coords={**coords, "sample": np.arange(n_samples)},
+        drawn.values.reshape(len(coords["chain"]), len(coords["draw"]), n_samples, *event),
+        dims=("chain", "draw", "sample", *last),
+        coords={**coords, "sample": np.arange(n_samples), **last},
         name=label,
         attrs={
             "source": drawn.source,
@@ -198,7 +211,7 @@ def predict(
 class _Drawn:
     """Responses of specimens."""
 
-    values: Floats  # (k, n): by population
+    values: Floats  # (k, n), or (k, n, m) of several outputs: by population
     specimens: list[Floats]  # (k, n, *event): aleatory inputs
     source: str  # how specimens were made
 
@@ -216,21 +229,22 @@ def _label(response: Callable[..., Any], name: str | None, store: object) -> str
 
 def _count_missing(label: str, values: Floats, max_lost: float) -> int:
     """Return how many responses are NaN, said in the log; raise if too many are."""
-    missing = int(np.isnan(values).sum())
-    if missing == values.size:
+    nan = lacking(values.reshape(-1, *values.shape[2:]))
+    missing = int(nan.sum())
+    if missing == nan.size:
         raise ResponseError(
             f"{label}: got NaN at all {missing} specimens, expected numbers; +inf is a specimen "
             "that fails"
         )
-    if missing > max_lost * values.size:
+    if missing > max_lost * nan.size:
         raise DesignError(
-            f"{label}: lost mass: got {missing / values.size:.1%} NaN among the predicted "
+            f"{label}: lost mass: got {missing / nan.size:.1%} NaN among the predicted "
             f"responses, expected at most max_lost = {max_lost:.1%}: the prediction would rest on "
             "the specimens that have a response; repair it, return +inf for specimens that fail, "
             "or pass a larger max_lost"
         )
     if missing:
-        _log.warning("%s: %d of %d predicted responses are NaN", label, missing, values.size)
+        _log.warning("%s: %d of %d predicted responses are NaN", label, missing, nan.size)
     return missing
 
 
@@ -291,6 +305,14 @@ def _refuse_incomplete(known: Any, names: list[str], caller: str) -> None:
         raise KeyError(
             f"{caller}: got a result without {missing}, expected the model's free variables {names}"
         )
+
+
+def _known_outputs(among: Sequence[Node], response: Callable[..., Any]) -> Outputs | None:
+    """Return the outputs of a response that is a simulator's; None where its runs tell."""
+    for node in among:
+        if node.bound.responses.function is response:
+            return node.outputs
+    return None
 
 
 def serving(among: Sequence[Node], responses: Responses) -> Node | None:
@@ -429,8 +451,15 @@ def specimen_names(labels: ArrayLike) -> list[str]:
 
 
 def data_digest(observed: Floats) -> str:
-    """Return what identifies a set of measured values, in any order."""
-    return _digest(np.sort(observed))
+    """Return what identifies a set of measured values, (n,) or (n, m), in any order."""
+    return _digest(observed[in_order(observed)])
+
+
+def in_order(observed: Floats) -> NDArray[np.intp]:
+    """Return the order of measured values, of several outputs by the first, then by the others."""
+    if observed.ndim == 1:
+        return np.argsort(observed, kind="stable")
+    return np.lexsort(observed.T[::-1])
 
 
 def _digest(*arrays: Floats) -> str:

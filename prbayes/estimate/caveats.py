@@ -11,6 +11,7 @@ from prbayes._weighted import distribution_function, quantile
 from prbayes.estimate.differences import cross
 from prbayes.estimate.identifiability import unidentified_directions
 from prbayes.estimate.refinement import AGREE
+from prbayes.estimate.projections import one_dimensional
 from prbayes.estimate.rivals import Rival
 from prbayes.estimate.sampling import Local
 from prbayes.metrics.base import Minimum
@@ -157,12 +158,13 @@ def _apart(evaluator: Evaluator, a: Floats, b: Floats) -> float:
     """Return the largest distance between the populations' distribution functions at two thetas."""
     largest = 0.0
     both = np.array([a, b])
-    for k in range(len(evaluator.nodes)):
+    for k, node in enumerate(evaluator.nodes):
         values, weights = evaluator.populations(both, k)
-        occurring = np.unique(values[np.isfinite(values)])
-        below = distribution_function(values, weights, occurring)
-        gaps = np.abs(below[0] - below[1])
-        largest = max(largest, float(gaps.max(initial=0.0)))
+        for seen in one_dimensional(node.target, values):
+            occurring = np.unique(seen[np.isfinite(seen)])
+            below = distribution_function(seen, weights, occurring)
+            gaps = np.abs(below[0] - below[1])
+            largest = max(largest, float(gaps.max(initial=0.0)))
     return largest
 
 
@@ -176,7 +178,8 @@ def heavy_tails(evaluator: Evaluator, theta: Floats) -> list[str]:
         if node.metric.minimum is not Minimum.ABSOLUTE or not node.bound.stored:
             continue
         values, weights = evaluator.populations(theta[None], k)
-        index = _tail_index(values[0], weights[0])
+        seen = one_dimensional(node.target, values[0])
+        index = min(_tail_index(numbers, weights[0]) for numbers in seen)
         if index < _NO_MEAN:
             lines.append(
                 f"{node.name}: the tail of the simulated responses is so long (tail index "

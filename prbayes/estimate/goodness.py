@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 from prbayes.estimate.data_sets import DataSets, observed_set, simulated_sets
 from prbayes.estimate.obstacles import refit_obstacle
+from prbayes.estimate.projections import number_parts
 from prbayes.estimate.refit import ARRIVED, SamplingDistribution
+from prbayes.metrics.base import Part
 
 # Probability below which the data are said not to come from the family. By convention; 200 refits
 # tell one of half as much.
@@ -99,14 +101,17 @@ class _Populations:
                 around[k] = evaluator.populations(sampling.thetas(center + cross), k)
         return cls(sampling, center, around)
 
-    def below(self, k: int, x: Floats, at: Floats) -> Floats:
+    def below(self, k: int, part: Part, x: Floats, at: Floats) -> Floats:
         """Return distribution functions at values, (m,), of populations at x, (n_sets, r).
 
-        Shape (n_sets, m); of responses that are not stored to first order, as refits are.
+        Of what a part of the metric sees of them. Shape (n_sets, m); of responses that are not
+        stored to first order, as refits are.
         """
         if k not in self.around:
-            return _middles(*self.sampling.evaluator.populations(self.sampling.thetas(x), k), at)
-        found = _middles(*self.around[k], at)
+            values, weights = self.sampling.evaluator.populations(self.sampling.thetas(x), k)
+            return _middles(part.of(values), weights, at)
+        values, weights = self.around[k]
+        found = _middles(part.of(values), weights, at)
         r = self.center.size
         slopes = (found[1 : 1 + r] - found[1 + r :]) / 2
         linear = found[0] + (x - self.center) @ slopes
@@ -130,24 +135,37 @@ def _middles(values: Floats, weights: Floats, at: Floats) -> Floats:
 
 
 def _distances(populations: _Populations, x: Floats, sets: DataSets) -> Floats:
-    """Return logarithms of two distances of each data set from its fit, by simulator.
+    """Return logarithms of two distances of each data set from its fit, by simulator and part.
 
     Those of Cramer and von Mises, which sees the middle of a distribution, and of Anderson and
     Darling, which sees its tails; shape (n_sets, 2 K).
     """
     columns = []
-    for k, (values, weights) in enumerate(zip(sets.values, sets.weights, strict=True)):
-        ranked = np.argsort(values, kind="stable")
-        w = weights[:, ranked]
-        below = np.cumsum(w, axis=1) - w / 2
-        expected = populations.below(k, x, values[ranked])
-        squares = w * (below - expected) ** 2
-        inside = np.clip(expected, _BEYOND, 1 - _BEYOND)
-        in_the_middle = squares.sum(axis=1)
-        in_the_tails = (squares / (inside * (1 - inside))).sum(axis=1)
-        columns += [in_the_middle, in_the_tails]
+    nodes = populations.sampling.evaluator.nodes
+    for k, (node, values, weights) in enumerate(zip(nodes, sets.values, sets.weights, strict=True)):
+        for part in number_parts(node.target):
+            seen, rows = part.observed_of(values)
+            own = weights[:, rows]
+            if len(seen) < len(values):
+                own = own / own.sum(axis=1, keepdims=True)
+            columns += _distances_of(populations, k, part, x, seen, own)
     stacked = np.maximum(np.stack(columns, axis=1), 1e-300)
     return np.asarray(np.log(stacked))
+
+
+def _distances_of(
+    populations: _Populations, k: int, part: Part, x: Floats, values: Floats, weights: Floats
+) -> list[Floats]:
+    """Return the two distances of what a part sees, values (n,) with weights (n_sets, n)."""
+    ranked = np.argsort(values, kind="stable")
+    w = weights[:, ranked]
+    below = np.cumsum(w, axis=1) - w / 2
+    expected = populations.below(k, part, x, values[ranked])
+    squares = w * (below - expected) ** 2
+    inside = np.clip(expected, _BEYOND, 1 - _BEYOND)
+    in_the_middle = squares.sum(axis=1)
+    in_the_tails = (squares / (inside * (1 - inside))).sum(axis=1)
+    return [in_the_middle, in_the_tails]
 
 
 def probability_there(sampling: SamplingDistribution, n_sets: int, seed: int) -> float:

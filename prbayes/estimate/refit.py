@@ -150,7 +150,7 @@ class SamplingDistribution:
         """Return how many data sets fit into memory."""
         points = 0
         for node, values in zip(self.evaluator.nodes, sets.values, strict=True):
-            here = node.bound.n_points + values.size
+            here = len(node.target.parts) * node.bound.n_points + len(values)
             points = max(points, here)
         # Gradients by differences take theta and two neighbours along each axis.
         stencil = 2 * self.stderr.size + 1

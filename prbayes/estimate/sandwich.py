@@ -25,7 +25,8 @@ from prbayes.estimate.data_sets import (
     thinned,
 )
 from prbayes.estimate.differences import slopes
-from prbayes.metrics.base import Discrepancy, one_dimensional
+from prbayes.estimate.projections import one_dimensional
+from prbayes.metrics.base import Discrepancy
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node
 
@@ -130,8 +131,9 @@ class Information:
             return self._around(self.widened * _WIDE_STEP if moves else _NARROW_STEP)
         if self._target.differentiable:
             narrow = self._around(_NARROW_STEP)
-            # Of several outputs one that failed is at the end of its scale, and moves no more.
-            finite = np.isfinite(narrow.values)
+            # Of several outputs one that failed is at the end of its scale, and does not jump.
+            event = self._target.event
+            finite = ~np.isnan(narrow.values) if event else np.isfinite(narrow.values)
             # Unless a point gains or loses its response within the step.
             unchanged = finite == finite[0]
             if unchanged.all():
@@ -175,8 +177,8 @@ class Information:
         values = self._stencil.values[0]
         finite = observable(values)
         weights = self._stencil.weights[0]
-        observable = weights[finite]
-        return values[finite], observable / observable.sum()
+        mass = weights[finite]
+        return values[finite], mass / mass.sum()
 
     @cached_property
     def data_sets(self) -> DataSets:

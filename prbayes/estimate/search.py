@@ -221,7 +221,10 @@ def jumps(search: Search, theta: Floats) -> bool:
         return False
     near = cross(theta, _STEP * search.prior_sd)
     values, _ = _populations(search.evaluator, near)
-    lost = [~np.isfinite(v) for v in values]
+    lost = [
+        np.isnan(v) if n.target.event else ~np.isfinite(v)
+        for n, v in zip(search.evaluator.nodes, values, strict=True)
+    ]
     return any((rows != rows[0]).any() for rows in lost)
 
 
@@ -315,7 +318,9 @@ class _Guide:
     def __init__(self, evaluator: Evaluator, scales: Floats) -> None:
         nodes = evaluator.nodes
         self.evaluator, self.scales = evaluator, scales
-        self.areas = [AreaMetric().against(n.target.observed, n.target.weights) for n in nodes]
+        self.areas = [
+            n.metric.like(AreaMetric()).against(n.target.observed, n.target.weights) for n in nodes
+        ]
         self._known: dict[bytes, tuple[float, float]] = {}
 
     def __call__(self, thetas: Floats) -> Floats:

@@ -250,7 +250,7 @@ class Evaluator:
         for node in self.nodes:
             observed = data[node.name]
             before = node.target
-            same_size = np.size(observed) == before.observed.size
+            same_size = np.shape(observed) == before.observed.shape
             weights = before.weights if same_size else None
             chosen = metric or node.metric
             targets.append(chosen.against(observed, weights))

@@ -194,7 +194,7 @@ def _identity(model: pm.Model, simulators: Sequence[SimulatorIdentity], **others
 
 def _simulator(node: Node, discrepancies: Floats) -> SimulatorIdentity:
     observed, weights = node.target.observed, node.target.weights
-    order = np.lexsort((weights, observed))
+    order = np.lexsort((weights, *observed.reshape(len(observed), -1).T[::-1]))
     labels = []
     if node.specimens is not None:
         labels = node.specimens[order].tolist()
@@ -210,7 +210,7 @@ def _simulator(node: Node, discrepancies: Floats) -> SimulatorIdentity:
         n_points=node.bound.n_points,
         batches=1 if node.design is None else node.design.n_batches,
         epsilon=node.epsilon_value,
-        responses=_numbers(node.bound.known_responses[:8]),
+        responses=_numbers(node.bound.known_responses[:8].ravel()),
         discrepancies=_numbers(discrepancies),
         points=_points(node),
     )
@@ -353,8 +353,8 @@ def require_same_responses(got: Identity | None, model: pm.Model, caller: str) -
         before = known.get(node.name)
         if before is None or not before.points or before.points == _points(node):
             continue
-        values = _at_points(node, np.array(before.points))
-        if not _close(values, before.responses[: len(values)]):
+        values = _at_points(node, np.array(before.points)).ravel()
+        if not _close(values, before.responses[: values.size]):
             raise ValueError(
                 f"{caller}: got a result of another problem: the response of {node.name} has other "
                 f"values at the same points; {_REMEDIES[Level.POPULATIONS]}"

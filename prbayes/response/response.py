@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,7 +26,7 @@ from prbayes.response.calling import (
 )
 from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
 from prbayes.response.inputs import Inputs
-from prbayes.response.outputs import ONE, Outputs
+from prbayes.response.outputs import ONE, Outputs, outputs_of_result
 from prbayes.response.store import Store
 
 
@@ -275,6 +275,8 @@ class Responses:
                 "leading shape, or to be wrapped in prb.scalar"
             ) from error
         self.count += size
+        if self.outputs is None and isinstance(result, Mapping):
+            self.outputs = outputs_of_result(result, len(batch))
         try:
             return checked(result, batch, arguments, self.outputs)
         except ResponseError as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,12 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats, Seed, flag, real_array, sample_labels, seed_number
 from prbayes._predict import specimen_names
+from prbayes.metrics.base import View
 from prbayes.model.identity import Identity, Level, from_attributes, require_together
+from prbayes.response.outputs import read_observed
 from prbayes.validation.predictive import Predictive
+from prbayes.validation.statistic import area
+from prbayes.validation.views import views
 
 Predicted = xr.DataArray | NDArray[Any]
 
@@ -25,10 +29,15 @@ class Condition:
     name: str
     observed: Floats  # (n,)
     predicted: Floats  # (D, S): one row per draw
+    measured: Floats  # (n,), or (n, m) of several outputs, of which the view shows what is observed
     labels: tuple[str, ...] | None  # of the specimens
     numbers: NDArray[np.intp]  # (n,): the specimens, over all conditions
     # Of the prediction, as `predict` notes them.
     attributes: Mapping[Any, Any] = field(default_factory=dict)
+    view: View = field(default_factory=View)
+    # Of the values together with which it is held against the identity, and its share there.
+    group: int = 0
+    share: float = 1.0
 
     @property
     def identity(self) -> Identity | None:
@@ -40,7 +49,8 @@ class Condition:
         """Names of the specimens: labels, or else the condition and a number."""
         if self.labels is not None:
             return self.labels
-        return tuple(f"{self.name}, {i}" for i in range(self.observed.size))
+        of = self.name.split(_DIRECTION)[0]
+        return tuple(f"{of}, {i}" for i in range(self.observed.size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +80,28 @@ class Case:
     def dependent(self) -> bool:
         """Whether a specimen was measured several times."""
         return self.n_specimens < self.size
+
+    def statistic(self, u: Floats) -> Floats:
+        """Return the statistic of u-values, (..., n) -> (...).
+
+        The area of all values together. Of several outputs the mean over the directions in which
+        they are seen, and of two areas, that of u and that of abs(2u - 1): a wrong correlation is a
+        wrong spread in some of them.
+        """
+        tested = self.tested(u)
+        groups = np.repeat(
+            [c.group for c in self.conditions], [c.observed.size for c in self.conditions]
+        )
+        shares = {c.group: c.share for c in self.conditions}
+        if list(shares) == [0]:
+            return area(tested)
+        areas = []
+        for group, share in shares.items():
+            own = tested[..., groups == group]
+            both = group > 0 and not self.folded
+            mean = (area(own) + area(np.abs(2 * own - 1))) / 2 if both else area(own)
+            areas.append(share * mean)
+        return np.sum(areas, axis=0)
 
     def rng(self, stream: int) -> np.random.Generator | None:
         """Return a generator for the choice within ties, or None for the mid-transform."""
@@ -112,35 +144,73 @@ def read_case(
     flag(folded, "folded")
     flag(randomize, "randomize")
     numbers: dict[object, int] = {}
-    conditions = []
+    conditions: list[Condition] = []
     for name, measured, simulated, labels in _by_condition(observed, predicted, specimens):
         y = _measured(name, measured)
-        named = _labels(name, labels, y.size)
+        named = _labels(name, labels, len(y))
         # Without labels every value is of a specimen of its own.
-        keys: Sequence[object] = [(name, i) for i in range(y.size)] if named is None else named
+        keys: Sequence[object] = [(name, i) for i in range(len(y))] if named is None else named
         own = [numbers.setdefault(key, len(numbers)) for key in keys]
+        pool = _simulated(name, simulated, y.shape[1:])
         condition = Condition(
             name=name,
             observed=y,
-            predicted=_simulated(name, simulated),
+            predicted=pool,
+            measured=y,
             labels=named,
             numbers=np.array(own, dtype=np.intp),
             attributes=simulated.attrs if isinstance(simulated, xr.DataArray) else {},
         )
-        conditions.append(condition)
+        conditions += [condition] if y.ndim == 1 else _in_directions(condition)
+    conditions = _with_shares(conditions)
     _refuse_other_draws(conditions)
     identities = {f"{c.name}: predicted": c.identity for c in conditions}
     identity = require_together(identities, "area_test", level=Level.OPTIMUM)
-    distinct = sum(np.unique(c.numbers).size for c in conditions)
+    # The directions of one condition are of the same predictions.
+    by_name = {c.name.split(_DIRECTION)[0]: np.unique(c.numbers).size for c in conditions}
     return Case(
         conditions=tuple(conditions),
         n_specimens=len(numbers),
-        shared=distinct > len(numbers),
+        shared=sum(by_name.values()) > len(numbers),
         randomize=randomize,
         random_seed=seed,
         folded=folded,
         identity=identity,
     )
+
+
+# Between the name of a condition and that of a direction in which its outputs are seen.
+_DIRECTION = ", direction "
+
+
+def _in_directions(condition: Condition) -> list[Condition]:
+    """Return what is seen of several outputs in each of some directions of the predicted ones."""
+    pool = condition.predicted
+    found = []
+    for k, view in enumerate(views(pool)):
+        found.append(
+            replace(
+                condition,
+                name=f"{condition.name}{_DIRECTION}{k + 1}",
+                observed=view.of(condition.measured),
+                predicted=view.of(pool),
+                view=view,
+                group=k + 1,
+            )
+        )
+    return found
+
+
+def _with_shares(conditions: list[Condition]) -> list[Condition]:
+    """Return conditions with the shares that groups of them have in the statistic.
+
+    Directions share alike; a condition of one output counts by its number of values.
+    """
+    total = sum(c.observed.size for c in conditions)
+    sizes: dict[int, int] = {}
+    for c in conditions:
+        sizes[c.group] = sizes.get(c.group, 0) + c.observed.size
+    return [replace(c, share=sizes[c.group] / total) for c in conditions]
 
 
 def _refuse_other_draws(conditions: list[Condition]) -> None:
@@ -223,11 +293,12 @@ def _labels(name: str, labels: Any, n: int) -> tuple[str, ...] | None:
 
 
 def _measured(name: str, values: Any) -> Floats:
-    """Return measured values, shape (n,)."""
-    y = real_array(values, f"{name}: observed")
-    if y.ndim != 1 or y.size == 0:
+    """Return measured values, shape (n,), or (n, m) of several outputs."""
+    y, _ = read_observed(name, values)
+    if y.ndim not in (1, 2) or y.size == 0:
         raise ValueError(
-            f"{name}: observed: got shape {y.shape}, expected (n,) with n >= 1 measured responses"
+            f"{name}: observed: got shape {y.shape}, expected (n,), or (n, m) for m outputs, with "
+            "n >= 1 measured responses"
         )
     bad = int((np.isnan(y) | np.isneginf(y)).sum())
     if bad:
@@ -238,23 +309,28 @@ def _measured(name: str, values: Any) -> Floats:
     return y
 
 
-def _simulated(name: str, values: Any) -> Floats:
-    """Return predicted values, shape (D, S)."""
+def _simulated(name: str, values: Any, event: tuple[int, ...]) -> Floats:
+    """Return predicted values, shape (D, S, *event)."""
     if isinstance(values, xr.DataArray):
-        if set(values.dims) != {"chain", "draw", "sample"}:
+        own = ("chain", "draw", "sample")
+        if not set(own) <= set(values.dims) or len(values.dims) != 3 + len(event):
+            also = ", and one for the outputs" if event else ""
             raise ValueError(
                 f"{name}: predicted: got a DataArray with dims {values.dims}, expected (chain, "
-                "draw, sample), as prb.predict returns"
+                f"draw, sample){also}, as prb.predict returns"
             )
-        values = values.transpose("chain", "draw", "sample").values
+        values = values.transpose(*own, ...).values
     y = real_array(values, f"{name}: predicted")
-    if y.ndim == 0 or y.size == 0:
+    n_axes = 1 + len(event)
+    if y.ndim < n_axes or y.size == 0 or y.shape[y.ndim - len(event) :] != event:
+        where = f"{event[0]} outputs in the last axis, specimens before" if event else ""
         raise ValueError(
-            f"{name}: predicted: got shape {y.shape}, expected (..., S): specimens in the last axis"
+            f"{name}: predicted: got shape {y.shape}, expected (..., S{''.join(f', {n}' for n in event)}): "
+            f"{where or 'specimens in the last axis'}"
         )
     if np.isneginf(y).any() or np.isnan(y).all():
         raise ValueError(
             f"{name}: predicted: got -inf, or nothing but NaN, expected numbers; +inf is a failed "
             "specimen"
         )
-    return np.asarray(y.reshape(-1, y.shape[-1]))
+    return np.asarray(y.reshape(-1, *y.shape[y.ndim - n_axes :]))

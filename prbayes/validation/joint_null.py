@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats, called, positive_integer
-from prbayes._predict import data_digest, serving, specimen_names
+from prbayes._predict import data_digest, in_order, serving, specimen_names
 from prbayes.estimate.data_sets import groups, sets_at, simulated_points, specimens
 from prbayes.estimate.optimum import Optimum, require_refits
 from prbayes.model.identity import Level, require_same
@@ -96,7 +96,8 @@ class JointNull(SimulatedNull):
         populations = [evaluator.populations(theta[None], k) for k in simulators]
         for one in served:
             values, weights = populations[one.simulator]
-            _refuse_other(one.condition, one.values_or(values[0]), weights[0])
+            seen = one.condition.view.of(one.values_or(values[0]))
+            _refuse_other(one.condition, seen, weights[0])
 
         # Draw specimens, and calibrate the model to what is measured on them.
         points = simulated_points(
@@ -111,7 +112,9 @@ class JointNull(SimulatedNull):
             drawn = points[one.simulator][converged][:, number]
             measured = one.values_or(at_optimum[0])[drawn]
             refitted, weights = evaluator.populations(thetas, one.simulator)
-            values = np.broadcast_to(one.values_or(refitted), weights.shape)
+            see = one.condition.view.of
+            measured = see(measured)
+            values = np.broadcast_to(see(one.values_or(refitted)), weights.shape)
             found = []
             for row, weight, y in zip(values, weights, measured, strict=True):
                 found.append(Predictive(row, weight).transform(y, ties))
@@ -159,7 +162,7 @@ class JointNull(SimulatedNull):
         response, *inputs = given
         refuse_uncallable(condition.name, response)
         sorted_inputs = read_inputs(condition.name, inputs, self.optimum.model)
-        called = Responses(condition.name, response, sorted_inputs)
+        called = Responses(condition.name, response, sorted_inputs, outputs=None)
         nodes = self.optimum.evaluator.nodes
         node = serving(_measuring_first(nodes, condition), called)
         if node is None:
@@ -241,8 +244,8 @@ def _specimen_numbers(
         condition = one.condition
         node = nodes[one.simulator]
         measured = node.target.observed
-        if data_digest(condition.observed) == data_digest(measured):
-            numbers.append(_matched(condition.observed, measured, own[one.simulator]))
+        if data_digest(condition.measured) == data_digest(measured):
+            numbers.append(_matched(condition.measured, measured, own[one.simulator]))
             continue
         group = group_of[one.simulator]
         # Without labels every value is of a new specimen.
@@ -283,9 +286,8 @@ def _known_specimens(nodes: list[Node], own: list[NDArray[np.intp]]) -> dict[str
 
 def _matched(observed: Floats, measured: Floats, numbers: NDArray[np.intp]) -> NDArray[np.intp]:
     """Return the specimens of values that are those of a simulator in another order."""
-    found = np.empty(observed.size, dtype=np.intp)
-    by_size = np.argsort(measured, kind="stable")
-    found[np.argsort(observed, kind="stable")] = numbers[by_size]
+    found = np.empty(len(observed), dtype=np.intp)
+    found[in_order(observed)] = numbers[in_order(measured)]
     return found
 
 

@@ -19,7 +19,6 @@ from prbayes._progress import progress
 from prbayes.validation.conditions import Case, Condition
 from prbayes.validation.envelope import ENVELOPED, envelope
 from prbayes.validation.predictive import Predictive, between
-from prbayes.validation.statistic import area
 
 # The fewest replicates that can reject at 5%: p is at least 1 / 20.
 LEAST_REPLICATES = 19
@@ -91,7 +90,7 @@ class SimulatedNull(Null):
                 tested = case.tested(u)
                 if some is None:
                     some = tested[:ENVELOPED]
-                areas.append(area(tested))
+                areas.append(case.statistic(u))
                 report(len(tested), "")
         assert some is not None
         return np.sort(np.concatenate(areas)), some

@@ -18,7 +18,6 @@ from prbayes.model.turns import in_turn
 from prbayes.validation.conditions import Case, Condition, Predicted, read_case
 from prbayes.validation.exact_model import ExactModel
 from prbayes.validation.nulls import Null, PosteriorNull
-from prbayes.validation.statistic import area
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -132,11 +131,14 @@ def area_test(
 
     Parameters
     ----------
-    observed : array_like, shape (n,); or a mapping or list of such, by condition
+    observed : array_like, shape (n,) or (n, m); or a mapping or list of such, by condition
         Measured on specimens that were not used in the calibration, but with `JointNull`. +inf is a
-        specimen that had failed.
+        specimen that had failed. Several outputs of a specimen, (n, m), are seen in directions of
+        the whitened predicted ones; the statistic is the mean over these of the areas of u and
+        ``|2u - 1|``, since a wrong correlation is a wrong spread in some of them.
     predicted : DataArray from `predict`, or ndarray of shape (..., S); or a mapping or list of such
-        Leading axes are draws of the posterior, the last one specimens. NaN are left out.
+        Leading axes are draws of the posterior, the last one specimens, (..., S, m) with m outputs.
+        NaN are left out.
     level : float
         Probability of rejecting a right model.
     null : Null, optional
@@ -203,7 +205,7 @@ def area_test(
         _refuse_unlike(case)
 
     u = case.u_values()
-    statistic = float(area(case.tested(u)))
+    statistic = float(case.statistic(u))
     with shown(progressbar):
         judged = null.judge(case, statistic, level)
 
@@ -245,7 +247,7 @@ def _refuse_own(condition: Condition) -> None:
     own = set(condition.labels or ()) & set(calibrated)
     if own:
         got = f"{len(own)} specimens of the calibration, such as {min(own)!r}"
-    elif data_digest(condition.observed) in np.atleast_1d(notes.get("calibration_data", [])):
+    elif data_digest(condition.measured) in np.atleast_1d(notes.get("calibration_data", [])):
         got = "the very data of the calibration"
     else:
         return

@@ -1,0 +1,36 @@
+"""Directions in which several outputs are held against their prediction, one number at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from prbayes._checks import Floats
+from prbayes.metrics.composite import Projection
+from prbayes.metrics.directions import default_number, directions
+from prbayes.metrics.joint import failure_caps
+from prbayes.metrics.whitening import whitening
+
+# Specimens of the prediction that tell its coordinates: their correlations are then known to .02,
+# and any directions give a test of the right size.
+_ENOUGH = 4096
+
+
+def views(pool: Floats) -> list[Projection]:
+    """Return the directions for predicted outputs of all draws, shape (D, S, m).
+
+    They are well spread in coordinates in which the predicted outputs are white: what is measured
+    has no part in the choice, so that replicates are seen in the same ones.
+    """
+    m = pool.shape[-1]
+    rows = pool.reshape(-1, m)
+    rows = rows[~np.isnan(rows).any(axis=1)]
+    caps = failure_caps(rows)
+    finite = rows[np.isfinite(rows).all(axis=1)]
+    step = -(-len(finite) // _ENOUGH)
+    some = finite[::step]
+    white = whitening(some, np.full(len(some), 1 / len(some)))
+    every = np.arange(m)
+    return [
+        Projection(every, caps, white.center, white.axes @ u)
+        for u in directions(m, default_number(m), 0)
+    ]
