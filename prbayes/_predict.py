@@ -187,7 +187,7 @@ def predict(
         max_lost = max((node.bound.max_lost for node in found), default=MAX_LOST)
     missing = _count_missing(label, drawn.values, max_lost)
     event = drawn.values.shape[2:]
-    outputs = responses.outputs or Outputs(tuple(range(*event)))
+    outputs = responses.outputs or Outputs(tuple(range(event[0] if event else 0)))
     last = {outputs.dim: list(outputs.labels)} if event else {}
     return xr.DataArray(
         drawn.values.reshape(len(coords["chain"]), len(coords["draw"]), n_samples, *event),

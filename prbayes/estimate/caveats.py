@@ -10,8 +10,8 @@ from prbayes._checks import Floats
 from prbayes._weighted import distribution_function, quantile
 from prbayes.estimate.differences import cross
 from prbayes.estimate.identifiability import unidentified_directions
-from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.projections import one_dimensional
+from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.rivals import Rival
 from prbayes.estimate.sampling import Local
 from prbayes.metrics.base import Minimum

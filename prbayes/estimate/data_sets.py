@@ -314,7 +314,7 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
 def _responses(
     evaluator: Evaluator, theta: Floats, k: int, size: int, generator: np.random.Generator
 ) -> Floats:
-    """Return responses of new specimens, the same ones for the same generator, (size,) or (size, m)."""
+    """Return responses of new specimens, (size,) or (size, m); the same for the same generator."""
     bound = evaluator.nodes[k].bound
     sampler = PopulationSampler(bound.inputs)
     roots = evaluator.roots(theta[None], k)

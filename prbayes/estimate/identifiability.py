@@ -99,9 +99,7 @@ def identified_by_area(information: Information) -> Floats:
 def _halves_agree(information: Information, vectors: Floats) -> NDArray[np.bool_]:
     """Return along which directions both halves of the points change alike, shape (d,)."""
     blocks = information.node.bound.blocks
-    halves = [
-        information.areas(*information.data_set, blocks % 2 == half) for half in (0, 1)
-    ]
+    halves = [information.areas(*information.data_set, blocks % 2 == half) for half in (0, 1)]
     both = one = other = np.zeros(vectors.shape[1])
     for area, again in zip(*halves, strict=True):
         first, second = (vectors.T @ _in_prior_sd(own, information) for own in (area, again))

@@ -14,6 +14,7 @@ from pytensor import config
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import (
+    Floats,
     called,
     observed_sample,
     plain_text,
@@ -217,9 +218,7 @@ def _bound(
     return propagation.bind(name, inputs, target, responses)
 
 
-def _target(
-    name: str, metric: Metric, observed: ArrayLike, weights: ArrayLike | None
-) -> Discrepancy:
+def _target(name: str, metric: Metric, observed: Floats, weights: ArrayLike | None) -> Discrepancy:
     """Return the metric, prepared against the observed responses.
 
     Mistakes are told with the name.
@@ -255,8 +254,7 @@ def _refuse_name(name: object, model: pm.Model) -> None:
 def _checked_dims(
     name: str, dims: object, shape: tuple[int, ...], model: pm.Model
 ) -> tuple[str, ...] | None:
-    """Return names of the observed dimensions, which have to be the model's, as long as the data.
-    """
+    """Return names of the observed dimensions, which have to be the model's, as long as the data."""
     if dims is None:
         return None
     names = [dims] if isinstance(dims, str) else dims

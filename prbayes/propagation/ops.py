@@ -78,7 +78,8 @@ class ResponseOp(OwnOp):
     def __init__(self, responses: Responses) -> None:
         self.responses = responses
         outputs = responses.outputs
-        self.event_shape = () if outputs is None else outputs.event
+        self._event = () if outputs is None else outputs.event
+        self.event_shape = self._event
         inputs = responses.inputs
         common = [e.type.ndim for e in inputs.epistemic]
         self.event_ndims = [*inputs.event_ndims, *common]
@@ -103,7 +104,7 @@ class ResponseOp(OwnOp):
         if valid.all():
             outputs[0][0] = self.responses(inputs[:k], inputs[k:])
             return
-        values = np.full(batch + tuple(self.event_shape), np.nan)
+        values = np.full(batch + self._event, np.nan)
         if valid.any():
             valid_aleatory = [x[valid] for x in aleatory]
             valid_epistemic = [x[valid] for x in epistemic]

@@ -533,9 +533,9 @@ def _one_by_one(
 
 def _of_one(result: Any, outputs: Outputs | None) -> Floats:
     """Return what a function of one specimen returned, shape (*event)."""
-    if (outputs is None or not outputs.event) and not isinstance(result, Mapping):
-        if outputs is not None or np.ndim(result) == 0:
-            return np.asarray(float(result))
+    one = outputs == ONE or (outputs is None and np.ndim(result) == 0)
+    if one and not isinstance(result, Mapping):
+        return np.asarray(float(result))
     return checked(result, (), (), outputs)
 
 

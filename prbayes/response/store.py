@@ -355,7 +355,7 @@ class Store:
     def _refuse_other_outputs(self, session: _Session, value: bytes) -> None:
         """Raise if a stored run has another number of outputs."""
         found, width = len(value) // len(_NAN), self._width(session)
-        if session.known and found != width or self.outputs not in (None, found):
+        if (session.known and found != width) or self.outputs not in (None, found):
             got = f"which holds runs with {found} outputs for simulator {self.name!r}"
             todo = "nothing was changed: pass version= with a name for the response as it is now"
             raise self._refusal(Complaint(got, f"{width}", todo))

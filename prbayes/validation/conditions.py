@@ -21,6 +21,9 @@ from prbayes.validation.views import views
 
 Predicted = xr.DataArray | NDArray[Any]
 
+# Between the name of a condition and that of a direction in which its outputs are seen.
+_DIRECTION = ", direction "
+
 
 @dataclass(frozen=True, eq=False)
 class Condition:
@@ -40,6 +43,11 @@ class Condition:
     share: float = 1.0
 
     @property
+    def of(self) -> str:
+        """The name of the condition, of which this may be one direction."""
+        return self.name.split(_DIRECTION)[0]
+
+    @property
     def identity(self) -> Identity | None:
         """Of the problem that was calibrated, where the prediction tells."""
         return from_attributes(self.attributes)
@@ -49,8 +57,7 @@ class Condition:
         """Names of the specimens: labels, or else the condition and a number."""
         if self.labels is not None:
             return self.labels
-        of = self.name.split(_DIRECTION)[0]
-        return tuple(f"{of}, {i}" for i in range(self.observed.size))
+        return tuple(f"{self.of}, {i}" for i in range(self.observed.size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +174,7 @@ def read_case(
     identities = {f"{c.name}: predicted": c.identity for c in conditions}
     identity = require_together(identities, "area_test", level=Level.OPTIMUM)
     # The directions of one condition are of the same predictions.
-    by_name = {c.name.split(_DIRECTION)[0]: np.unique(c.numbers).size for c in conditions}
+    by_name = {c.of: np.unique(c.numbers).size for c in conditions}
     return Case(
         conditions=tuple(conditions),
         n_specimens=len(numbers),
@@ -177,10 +184,6 @@ def read_case(
         folded=folded,
         identity=identity,
     )
-
-
-# Between the name of a condition and that of a direction in which its outputs are seen.
-_DIRECTION = ", direction "
 
 
 def _in_directions(condition: Condition) -> list[Condition]:
@@ -323,11 +326,10 @@ def _simulated(name: str, values: Any, event: tuple[int, ...]) -> Floats:
     y = real_array(values, f"{name}: predicted")
     n_axes = 1 + len(event)
     if y.ndim < n_axes or y.size == 0 or y.shape[y.ndim - len(event) :] != event:
-        where = f"{event[0]} outputs in the last axis, specimens before" if event else ""
-        raise ValueError(
-            f"{name}: predicted: got shape {y.shape}, expected (..., S{''.join(f', {n}' for n in event)}): "
-            f"{where or 'specimens in the last axis'}"
-        )
+        expected = "(..., S): specimens in the last axis"
+        if event:
+            expected = f"(..., S, {event[0]}): as many outputs as observed in the last axis"
+        raise ValueError(f"{name}: predicted: got shape {y.shape}, expected {expected}")
     if np.isneginf(y).any() or np.isnan(y).all():
         raise ValueError(
             f"{name}: predicted: got -inf, or nothing but NaN, expected numbers; +inf is a failed "

@@ -155,7 +155,7 @@ class JointNull(SimulatedNull):
             )
         given = self.responses
         if isinstance(given, Mapping):
-            given = given.get(condition.name)
+            given = given.get(condition.of)
         if given is None:
             return _Served(condition, self._own_simulator(case, condition), None)
 
@@ -177,13 +177,14 @@ class JointNull(SimulatedNull):
     def _own_simulator(self, case: Case, condition: Condition) -> int:
         """Return the simulator that a condition without a response stands for."""
         names = [node.name for node in self.optimum.evaluator.nodes]
-        if len(case.conditions) == len(names) == 1:
+        tested = {one.of for one in case.conditions}
+        if len(tested) == len(names) == 1:
             return 0
-        if condition.name in names:
-            return names.index(condition.name)
+        if condition.of in names:
+            return names.index(condition.of)
         raise ValueError(
-            f"JointNull: got the condition {condition.name!r}, expected the name of a simulator, "
-            f"{names}; or pass responses={{{condition.name!r}: (response, *inputs)}}"
+            f"JointNull: got the condition {condition.of!r}, expected the name of a simulator, "
+            f"{names}; or pass responses={{{condition.of!r}: (response, *inputs)}}"
         )
 
 

@@ -121,7 +121,7 @@ def test_mean_and_spread_of_a_normal_population_are_orthogonal() -> None:
 
 def test_the_area_is_linear_in_a_shift_of_the_population() -> None:
     # dF / dmu = -f: the slopes add up to minus the shift of the mean.
-    area = mean_and_sd(AREA).area(*mean_and_sd(AREA).data_set)
+    (area,) = mean_and_sd(AREA).areas(*mean_and_sd(AREA).data_set)
     np.testing.assert_allclose(area.slopes[0] @ area.lengths, -1, rtol=0.02)
     # And of one interval's gap, the distance between data set and population is the sum.
     floor = mean_and_sd(AREA).noise_floor
@@ -177,7 +177,7 @@ def test_one_prior_however_wide_leaves_the_other_s_error_as_it_is() -> None:
 def test_points_that_no_population_reaches_tell_nothing_of_it() -> None:
     information = known_sd(AREA)
     nowhere = np.zeros(256, dtype=bool)
-    found = information.area(*information.data_set, nowhere)
+    (found,) = information.areas(*information.data_set, nowhere)
     assert (found.slopes == 0).all()
     assert (found.gaps <= 0).all()
 

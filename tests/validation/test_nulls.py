@@ -44,7 +44,7 @@ def test_p_values_of_replicates_count_the_observed_data_in() -> None:
             return ""
 
     case = Case(
-        (Condition("a", np.zeros(1), np.zeros((1, 1)), None, np.zeros(1, dtype=int)),),
+        (Condition("a", np.zeros(1), np.zeros((1, 1)), np.zeros(1), None, np.zeros(1, dtype=int)),),
         1,
         False,
     )

@@ -137,7 +137,7 @@ def test_the_result_is_readable_and_saved(tmp_path: Path, posterior: Posterior) 
     ("observed", "predicted", "keywords", "match"),
     [
         ([1.0, np.nan], GRID, {}, "observed: got 1 NaN or -inf among 2 values.*leave missing"),
-        ([[1.0]], GRID, {}, r"observed: got shape \(1, 1\), expected \(n,\)"),
+        ([[[1.0]]], GRID, {}, r"observed: got shape \(1, 1, 1\), expected \(n,\)"),
         ([], GRID, {}, "observed: got shape"),
         ([1.0], np.full(20, np.nan), {}, "nothing but NaN"),
         ([1.0], np.array(1.0), {}, r"predicted: got shape \(\)"),

@@ -1,0 +1,351 @@
+"""Several outputs of one run, from the call of the response to the tests of validity."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+
+import prbayes as prb
+from prbayes.estimate.data_sets import simulated_sets
+from prbayes.model.evaluator import Evaluator
+
+N = 40
+JOINT = prb.Joint(prb.ProbabilityResidual())
+
+
+def two(a, b):
+    """Return two outputs of specimens with two inputs."""
+    return np.stack([a + b, a - 2 * b], axis=-1)
+
+
+def specimens(n=N, seed=1):
+    """Draw two inputs of n specimens."""
+    return np.random.default_rng(seed).normal([1.0, 2.0], [0.3, 0.2], (n, 2))
+
+
+def observed(n=N, seed=1):
+    """Return two outputs of n specimens."""
+    return two(*specimens(n, seed).T)
+
+
+def model_of(response=two, data=None, *, metric=JOINT, propagation=None):
+    """Return a model with one unknown for each input, and priors close to the truth."""
+    with pm.Model() as model:
+        m = pm.Normal("m", [1.0, 2.0], 0.2, shape=2)
+        a = pm.Normal.dist(m[0], 0.3)
+        b = pm.Normal.dist(m[1], 0.2)
+        prb.Simulator(
+            "y",
+            response,
+            a,
+            b,
+            metric=metric,
+            observed=observed() if data is None else data,
+            propagation=propagation or prb.Reweighted(1024),
+        )
+    return model
+
+
+def node_of(model):
+    """Return the only simulator."""
+    return Evaluator(model).nodes[0]
+
+
+# -- one run ---------------------------------------------------------------------------------------
+
+
+def as_mapping(a, b):
+    """Return the same outputs by name."""
+    return {"sum": a + b, "difference": a - 2 * b}
+
+
+def as_groups(a, b):
+    """Return the same outputs as one group of two."""
+    return {"both": two(a, b)}
+
+
+def of_one(a, b):
+    """Return the outputs of one specimen."""
+    return [a + b, a - 2 * b]
+
+
+def of_one_by_name(a, b):
+    """Return the outputs of one specimen by name, in another order."""
+    return {"difference": a - 2 * b, "sum": a + b}
+
+
+NAMED = {"sum": observed()[:, 0], "difference": observed()[:, 1]}
+
+
+@pytest.mark.parametrize(
+    ("response", "data"),
+    [
+        (as_mapping, NAMED),
+        (as_groups, {"both": observed()}),
+        (prb.scalar(of_one), observed()),
+        (prb.scalar(of_one_by_name), NAMED),
+    ],
+)
+@pytest.mark.parametrize("way", ["here", "stored", "threads"])
+def test_every_way_to_give_outputs_is_the_same_run(response, data, way, tmp_path):
+    expected = node_of(model_of(propagation=prb.Reweighted(64))).design.values
+    with ThreadPoolExecutor(2) as pool:
+        ways = {"here": {}, "stored": {"store": tmp_path}, "threads": {"executor": pool}}
+        node = node_of(model_of(response, data, propagation=prb.Reweighted(64, **ways[way])))
+    np.testing.assert_allclose(node.design.values, expected, rtol=1e-12)
+    assert node.bound.responses.count == 64
+
+
+def test_a_run_with_two_outputs_is_one_entry_of_the_store(tmp_path):
+    propagation = prb.Reweighted(64, store=tmp_path, version="1")
+    first = node_of(model_of(propagation=propagation)).design.values
+    store = prb.response.Store(tmp_path, "y", version="1")
+    assert len(store) == 64
+    assert store.to_dataset()["response"].dims == ("point", "output")
+
+    def never(a, b):
+        raise AssertionError("computed again")
+
+    again = node_of(model_of(never, propagation=propagation)).design.values
+    np.testing.assert_array_equal(again, first)
+
+
+def test_a_store_of_other_outputs_is_refused(tmp_path):
+    model_of(propagation=prb.Reweighted(64, store=tmp_path, version="1"))
+
+    def three(a, b):
+        return np.stack([a, b, a], axis=-1)
+
+    data = np.column_stack([observed(), observed()[:, 0]])
+    with pytest.raises(RuntimeError, match="2 outputs .* expected 3; .* pass version="):
+        model_of(three, data, propagation=prb.Reweighted(64, store=tmp_path, version="1"))
+
+
+def test_two_simulators_of_a_response_with_outputs_share_its_runs():
+    calls = []
+
+    def counted(a, b):
+        calls.append(np.size(a))
+        return two(a, b)
+
+    with pm.Model():
+        a = pm.Normal.dist(pm.Normal("m", 1, 0.2), 0.3)
+        b = pm.Normal.dist(2.0, 0.2)
+        for name, seed in (("y", 1), ("z", 2)):
+            data = observed(seed=seed)
+            prb.Simulator(
+                name, counted, a, b, metric=JOINT, observed=data, propagation=prb.Reweighted(64)
+            )
+    assert sum(calls) == 64
+
+
+def test_an_output_that_is_nan_costs_the_point_all_of_them():
+    def partly(a, b):
+        values = two(a, b)
+        values[..., 1] = np.where(a > 1.5, np.nan, values[..., 1])
+        return values
+
+    node = node_of(model_of(partly, propagation=prb.Reweighted(256)))
+    lost = np.isnan(node.design.values)
+    assert 0 < lost[:, 0].sum() < 64
+    np.testing.assert_array_equal(lost[:, 0], lost[:, 1])
+
+
+@pytest.mark.parametrize(
+    ("response", "expected"),
+    [
+        (lambda a, b: a + b, r"shape \(64,\) .* expected \(64, 2\): 2 outputs per specimen"),
+        (lambda a, b: np.stack([a, b, a], -1), r"shape \(64, 3\) .* expected \(64, 2\)"),
+        (as_mapping, "keys .*sum.* outputs have no names"),
+    ],
+)
+def test_a_response_with_other_outputs_than_observed_is_refused(response, expected):
+    with pytest.raises(prb.response.ResponseError, match=expected):
+        model_of(response, propagation=prb.Reweighted(64))
+
+
+def test_other_keys_than_those_observed_are_refused():
+    with pytest.raises(prb.response.ResponseError, match=r"keys \['sum', 'difference'\], expected \['a'"):
+        model_of(as_mapping, {"a": observed()[:, 0], "b": observed()[:, 1]})
+
+
+@pytest.mark.parametrize(
+    ("data", "metric", "expected"),
+    [
+        (observed(), prb.AreaMetric(), r"shape \(40, 2\).*prb.Joint"),
+        (observed()[:1], JOINT, "1 specimen"),
+        (observed()[:, :0], JOINT, r"shape \(40, 0\), expected one output"),
+        (observed()[None], JOINT, r"shape \(1, 40, 2\)"),
+        (np.where(np.arange(N)[:, None] == 3, np.nan, observed()), JOINT, "without any output"),
+        ({"a": observed()[:, 0], "b": observed()[1:, 1]}, JOINT, r"\[40, 39\] values"),
+    ],
+)
+def test_bad_data_are_refused_before_any_run(data, metric, expected):
+    def never(a, b):
+        raise AssertionError("computed")
+
+    with pytest.raises(ValueError, match=expected):
+        model_of(never, data, metric=metric)
+
+
+# -- in a model ------------------------------------------------------------------------------------
+
+
+def test_outputs_are_named_by_frames_and_data_arrays():
+    pd = pytest.importorskip("pandas")
+    frame = pd.DataFrame(observed(), columns=["sum", "difference"])
+    assert node_of(model_of(data=frame)).outputs.names == ("sum", "difference")
+    array = xr.DataArray(
+        observed(), dims=("specimen", "hour"), coords={"hour": [0.5, 2.0]}, attrs={"units": "mm"}
+    )
+    outputs = node_of(model_of(data=array)).outputs
+    assert (outputs.dim, outputs.labels, outputs.units) == ("hour", (0.5, 2.0), ("mm", "mm"))
+
+
+def test_an_output_that_was_not_measured_is_not_imputed():
+    data = observed()
+    data[:10, 1] = np.nan
+    model = model_of(data=data)
+    assert [rv.name for rv in model.free_RVs] == ["m"]
+    prb.set_epsilon(model, {"y": 0.1})
+    assert np.isfinite(model.compile_logp()(model.initial_point()))
+
+
+def test_the_log_density_is_that_of_the_metric_and_its_gradient_exact():
+    model = model_of()
+    prb.set_epsilon(model, {"y": 0.1})
+    node = node_of(model)
+    values, weights = node.bound.populations([np.array([[1.0, 2.0]])])
+    value = model.compile_logp(vars=model.observed_RVs)({"m": np.array([1.0, 2.0])})
+    assert value == pytest.approx(-node.target.of(values, weights)[0] / 0.1)
+    gradient = model.compile_dlogp(vars=model.free_RVs, jacobian=False)
+    logp = model.compile_logp()
+    at = np.array([1.05, 1.9])
+    total = model.compile_dlogp()({"m": at})
+    for i, step in enumerate(1e-5 * np.eye(2)):
+        difference = (logp({"m": at + step}) - logp({"m": at - step})) / 2e-5
+        assert total[i] == pytest.approx(difference, rel=1e-5)
+    assert gradient is not None
+
+
+def test_predictive_draws_have_the_shape_of_the_data():
+    model = model_of()
+    drawn = pm.draw(model["y"], draws=3, random_seed=1)
+    assert drawn.shape == (3, N, 2)
+    # The outputs of a specimen belong together: a = (2 y0 + y1) / 3.
+    inputs = (2 * drawn[..., 0] + drawn[..., 1]) / 3
+    assert inputs.std() == pytest.approx(0.36, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    "metric", [prb.ProbabilityResidual(), prb.KullbackLeibler(), prb.AreaMetric()]
+)
+def test_the_optimum_and_its_errors_are_those_of_the_exact_estimate(metric):
+    found = prb.minimize(model_of(metric=prb.Joint(metric)))
+    exact = specimens().mean(axis=0)
+    errors = np.array([0.3, 0.2]) / np.sqrt(N)
+    np.testing.assert_allclose(found.point["m"], exact, atol=0.6 * errors.max())
+    np.testing.assert_allclose(found.stderr["m"], errors, rtol=0.25)
+
+
+def graph(a, b):
+    """Return the outputs by operations that PyTensor variables have, too."""
+    return a[..., None] * np.ones(2) + b[..., None] * np.array([1.0, -2.0])
+
+
+@pytest.mark.parametrize("propagation", [prb.Resimulated(1024), prb.Resimulated(256)])
+@pytest.mark.parametrize("response", [two, graph])
+def test_resimulated_outputs_give_the_same_optimum(response, propagation):
+    if response is not two and propagation.n == 1024:
+        pytest.skip("one size is enough for graphs")
+    expected = prb.minimize(model_of())
+    found = prb.minimize(model_of(response, propagation=propagation))
+    gap = np.abs(found.point["m"] - expected.point["m"]) / expected.stderr["m"]
+    assert (gap < 0.2).all()
+
+
+def test_data_sets_lack_the_outputs_that_the_observed_ones_lack():
+    data = observed()
+    data[:10, 1] = np.nan
+    data[10:15, 0] = np.nan
+    evaluator = Evaluator(model_of(data=data))
+    theta = evaluator.initial
+    sets = simulated_sets(evaluator, theta, 30)
+    (values,), (weights,) = sets.values, sets.weights
+    first, second = ~np.isnan(values).T
+    for row in weights:
+        assert row[first & ~second].sum() == pytest.approx(10 / N)
+        assert row[second & ~first].sum() == pytest.approx(5 / N)
+
+
+def test_specimens_with_missing_outputs_make_the_estimate_better_than_without_them():
+    data = observed()
+    data[20:, 1] = np.nan
+    every = prb.minimize(model_of(data=data))
+    complete = prb.minimize(model_of(data=data[:20]))
+    assert every.stderr["m"][0] < 0.95 * complete.stderr["m"][0]
+
+
+# -- predictions, and tests of them ----------------------------------------------------------------
+
+
+def test_predictions_have_the_outputs_as_a_dimension():
+    optimum = prb.minimize(model_of(as_mapping, NAMED))
+    a, b = node_of(optimum.model).bound.inputs.aleatory
+    found = prb.predict(optimum, as_mapping, a, b, random_seed=1)
+    assert found.dims == ("chain", "draw", "sample", "output")
+    assert found.output.values.tolist() == ["sum", "difference"]
+    assert float(found.sel(output="sum").mean()) == pytest.approx(observed()[:, 0].mean(), abs=0.1)
+
+    def others(a, b):
+        return {"product": a * b, "ratio": a / b, "a": a}
+
+    other = prb.predict(optimum, others, a, b, random_seed=1)
+    assert other.output.values.tolist() == ["product", "ratio", "a"]
+    assert other.attrs["specimens_id"] == found.attrs["specimens_id"]
+
+
+def calibrated_predictions(rng, draws=100, size=400):
+    """Return predicted populations of two outputs with correlation .9."""
+    root = np.linalg.cholesky([[1.0, 0.9], [0.9, 1.0]])
+    means = 0.2 * rng.standard_normal((draws, 1, 2)) @ root.T
+    return means + rng.standard_normal((draws, size, 2)) @ root.T
+
+
+def test_the_area_test_sees_a_wrong_correlation_with_right_marginals():
+    rng = np.random.default_rng(4)
+    predicted = calibrated_predictions(rng)
+    null = prb.validation.PosteriorNull(999)
+    right = rng.standard_normal((30, 2)) @ np.linalg.cholesky([[1.0, 0.9], [0.9, 1.0]]).T
+    assert not prb.area_test(right, predicted, null=null).rejected
+    wrong = rng.standard_normal((30, 2))
+    assert prb.area_test(wrong, predicted, null=null).rejected
+    for k in range(2):
+        assert not prb.area_test(wrong[:, k], predicted[..., k], null=null).rejected
+
+
+def test_the_area_test_of_outputs_does_not_see_their_units():
+    rng = np.random.default_rng(5)
+    predicted = calibrated_predictions(rng)
+    data = rng.standard_normal((20, 2))
+    null = prb.validation.PosteriorNull(199)
+    mixed = np.array([[1e3, 0.0], [-2.0, 1e-3]])
+    one = prb.area_test(data, predicted, null=null)
+    other = prb.area_test(data @ mixed + 5.0, predicted @ mixed + 5.0, null=null)
+    assert other.statistic == pytest.approx(one.statistic, rel=1e-6)
+    assert other.p_value == one.p_value
+
+
+def test_own_specimens_of_several_outputs_are_tested_by_recalibration():
+    data = observed(seed=3)
+    optimum = prb.minimize(model_of(data=data))
+    a, b = node_of(optimum.model).bound.inputs.aleatory
+    predicted = prb.predict(optimum, two, a, b, random_seed=1)
+    with pytest.raises(ValueError, match="very data of the calibration"):
+        prb.area_test(data, predicted)
+    null = prb.validation.JointNull(optimum, replicates=99)
+    found = prb.area_test(data, predicted, null=null)
+    assert not found.rejected
+    assert prb.area_test(data[::-1], predicted, null=null).p_value == found.p_value
