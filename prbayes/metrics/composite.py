@@ -6,14 +6,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats, sample_weights
-from prbayes.metrics.base import Discrepancy, Minimum, Part, View
-from prbayes.metrics.cells import product
+from prbayes.metrics.base import CellwiseDiscrepancy, Discrepancy, Minimum, Part, View
+from prbayes.metrics.cells import Cells, product
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +188,9 @@ class CompositeDiscrepancy(Discrepancy):
             values = np.broadcast_to(values, (*weights.shape, *self.event))
             return self.features(values, weights, xp)
         divided = self._divided(basis)
-        found = [g.from_basis(weights, own, xp) for g, own in zip(self._groups, divided)]
+        found = [
+            g.from_basis(weights, own, xp) for g, own in zip(self._groups, divided, strict=True)
+        ]
         return sum(found, ())
 
     def outer(self, *features: Any, xp: Any) -> Any:
@@ -287,22 +289,43 @@ class _Densities(_Group):
     """Parts that compare densities: those lie side by side, so that one product gives them all."""
 
     @cached_property
+    def _sizes(self) -> list[int]:
+        """How many cells each part has."""
+        return [cast(Cells, part.target.density_cells).widths.size for part in self.parts]
+
+    @cached_property
     def _slices(self) -> list[slice]:
         """Where the cells of each part are."""
-        ends = np.cumsum([part.target.density_cells.widths.size for part in self.parts])
-        starts = np.concatenate([[0], ends[:-1]])
-        return [slice(int(a), int(b)) for a, b in zip(starts, ends, strict=True)]
+        ends = np.cumsum(self._sizes).tolist()
+        return [slice(end - size, end) for end, size in zip(ends, self._sizes, strict=True)]
+
+    @cached_property
+    def _cellwise(self) -> bool:
+        """Whether all parts are sums over cells, and so are one sum over all cells."""
+        return all(type(part.target).outer is CellwiseDiscrepancy.outer for part in self.parts)
+
+    @cached_property
+    def _constants(self) -> tuple[Floats, ...]:
+        """What the sum over cells takes beside the density, of all parts side by side."""
+        by_part = [cast(CellwiseDiscrepancy, part.target).constants for part in self.parts]
+        return tuple(self._side_by_side(each) for each in zip(*by_part, strict=True))
+
+    def _side_by_side(self, each: Sequence[Any]) -> Floats:
+        """Return numbers by cell, (..., m_k) or one for all of a part, as (..., all cells)."""
+        batch = np.broadcast_shapes(*(np.shape(one)[:-1] for one in each))
+        pairs = zip(each, self._sizes, strict=True)
+        return np.concatenate([np.broadcast_to(c, (*batch, n)) for c, n in pairs], axis=-1)
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
         """Return the densities side by side, (..., cells)."""
-        found = []
+        found: list[Any] = []
         for part in self.parts:
             found += part.target.features(part.of(simulated, xp), weights, xp)
         return (xp.concatenate(found, axis=-1),)
 
     def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
         """Return one matrix, (n, cells)."""
-        out = np.empty((len(simulated), self._slices[-1].stop))
+        out = np.empty((len(simulated), sum(self._sizes)))
         for part, cells in zip(self.parts, self._slices, strict=True):
             (out[:, cells],) = part.target.basis(part.of(simulated))
         return (out,)
@@ -313,10 +336,17 @@ class _Densities(_Group):
         return (product(weights, matrix) if xp is np else weights @ matrix,)
 
     def outer(self, features: tuple[Any, ...], shares: Floats, xp: Any) -> Any:
-        """Return the sum of the parts."""
+        """Return the sum of the parts, in one pass over all cells where that can be."""
         (densities,) = features
+        if not self._cellwise:
+            return self._one_by_one(densities, shares, xp)
+        first = cast(CellwiseDiscrepancy, self.parts[0].target)
+        terms = first.terms(densities, self._constants, xp)
+        return (terms * np.repeat(shares, self._sizes, axis=-1)).sum(axis=-1)
+
+    def _one_by_one(self, densities: Any, shares: Floats, xp: Any) -> Any:
+        """Return the sum of parts with an outer function of their own."""
         total: Any = 0.0
         for k, (part, cells) in enumerate(zip(self.parts, self._slices, strict=True)):
-            own = densities[..., cells]
-            total = total + shares[..., k] * part.target.outer(own, xp=xp)
+            total = total + shares[..., k] * part.target.outer(densities[..., cells], xp=xp)
         return total

@@ -95,9 +95,8 @@ class Joint(Metric):
     ) -> list[Part]:
         """Return the parts that compare some outputs of all specimens that have them."""
         chosen = observed[:, outputs]
-        has = ~np.isnan(chosen).any(axis=-1)
         whole = np.isfinite(chosen).all(axis=-1)
-        white = whitening(chosen[whole], weights[whole] / weights[whole].sum())
+        white = whitening(chosen[whole], weights[whole], outputs)
         m = outputs.size
         number = 1 if m == 1 else self.directions or default_number(m)
         parts: list[Part] = []
