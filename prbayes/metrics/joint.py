@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from prbayes._checks import Floats, called, positive_integer
 from prbayes.metrics.base import Discrepancy, Metric, Minimum, Part
 from prbayes.metrics.composite import CompositeDiscrepancy, OnlyOutput, Projection
-from prbayes.metrics.directions import default_number, directions
+from prbayes.metrics.directions import directions, enough
 from prbayes.metrics.whitening import whitening
 
 # Patterns of missing outputs that are compared by themselves.
@@ -98,7 +98,7 @@ class Joint(Metric):
         whole = np.isfinite(chosen).all(axis=-1)
         white = whitening(chosen[whole], weights[whole], outputs)
         m = outputs.size
-        number = 1 if m == 1 else self.directions or default_number(m)
+        number = 1 if m == 1 else self.directions or enough(m)
         parts: list[Part] = []
         for k, u in enumerate(directions(m, number, self.seed)):
             label = f"direction {k + 1}"
