@@ -30,11 +30,11 @@ from prbayes.metrics.whitening import whitening
 
 # Outputs, and numbers of directions.
 NUMBERS = {
-    2: (3, 4, 6, 8),
-    3: (6, 7, 9, 12),
-    4: (10, 12, 16, 24),
-    6: (21, 28, 36, 50),
-    8: (36, 48, 64, 90),
+    2: (3, 4, 6),
+    3: (6, 8, 10, 14),
+    4: (10, 14, 18, 24),
+    6: (21, 30, 40, 50),
+    8: (36, 54, 70, 90),
 }
 MANY = {2: 40, 3: 90, 4: 160, 6: 300, 8: 400}
 CORRELATIONS = (0.0, 0.8, -0.995)  # the last of the first two outputs alone

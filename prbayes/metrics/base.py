@@ -220,6 +220,19 @@ class Discrepancy(ABC):
         Written with ``xp`` (``numpy`` or ``pytensor.tensor``), by functions that both have.
         """
 
+    @staticmethod
+    def stacked(bases: Sequence[tuple[NDArray[Any], ...]]) -> tuple[NDArray[Any], ...] | None:
+        """Return the bases of several discrepancies as one, for `side_by_side`; None if it cannot.
+
+        The graph of many slices is then no larger than that of one.
+        """
+        return None
+
+    @staticmethod
+    def side_by_side(targets: Any, weights: Any, basis: tuple[Any, ...], xp: Any) -> Any:
+        """Return the values of several discrepancies from a stacked basis, (..., K), or None."""
+        return None
+
     @property
     def symbolic(self) -> bool:
         """Whether `outer` can be written as a graph; else it is an operation without gradient."""

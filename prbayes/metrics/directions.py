@@ -13,12 +13,12 @@ _STEPS = 2000
 
 
 def enough(m: int) -> int:
-    """Return how many directions are enough for m outputs.
+    """Return how many directions are enough for m outputs, at least two.
 
-    Errors of all means, standard deviations and correlations are then those of ten times as many,
-    to 3% (`benchmarks/directions.py`). Fewer than m (m + 1) / 2 do not tell all correlations.
+    Twice as many as a scatter's shape has parameters. Errors of means, standard deviations and
+    correlations are then those of ten times as many, to 3% (`benchmarks/directions.py`).
     """
-    return m**2
+    return (m - 1) * (m + 2)
 
 
 @cache

@@ -69,7 +69,7 @@ class ProbabilityResidual(Metric):
         cells = self.density.cells(observed, weights)
         return ResidualDiscrepancy.on_cells(self, observed, weights, cells)
 
-    def on_one_scale(self, slices: Sequence[Discrepancy]) -> Sequence[Discrepancy]:
+    def on_one_scale(self, slices: Sequence[Any]) -> Sequence[Any]:
         """Return the residuals with one factor S, the smallest: that of the highest peak."""
         smallest = min(one.scale_factor for one in slices)
         return [replace(one, scale_factor=smallest) for one in slices]

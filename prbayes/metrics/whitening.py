@@ -78,19 +78,22 @@ def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> Whi
     n, m = sample.shape
     if n < m + 2:
         raise ValueError(
-            f"observed: got {n} specimens that have outputs {_listed(outputs)} (counted from 0), "
+            f"observed: got {n} specimens with finite outputs {_listed(outputs)} (counted from 0), "
             f"expected at least {m + 2} for {m} outputs; leave outputs out, or compare them by "
             "prb.MarginalCorrelation(metric)"
         )
-    center, unit = _units(sample, weights, outputs)
+    center, unit = units(sample, weights, outputs)
     z = (sample - center) / unit
     middle, root = _robust_scatter(z, weights, outputs)
     root = root @ _turn((z - middle) @ root, weights)
     return Whitening(center + middle * unit, root / unit[:, None])
 
 
-def _units(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Return a median and a spread of each output, or raise for one without spread."""
+def units(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Return a median and a robust spread of each output, or raise for one without spread.
+
+    Arguments are those of `whitening`.
+    """
     center = np.array([quantile(y, weights, 0.5) for y in sample.T])
     # In parts of the range, whose squares are numbers in any unit.
     length = np.ptp(sample, axis=0)
