@@ -19,6 +19,7 @@ from prbayes.estimate.minimization import minimize, refine
 from prbayes.estimate.optimum import Optimum
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
+from prbayes.metrics.correlation import MarginalCorrelation
 from prbayes.metrics.density import GaussianKDE, Histogram
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.function import FunctionMetric
@@ -62,6 +63,7 @@ __all__ = [
     "Joint",
     "KullbackLeibler",
     "LogLikelihood",
+    "MarginalCorrelation",
     "Metric",
     "Optimum",
     "ProbabilityResidual",

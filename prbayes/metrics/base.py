@@ -12,6 +12,7 @@ measured side and is called with simulated responses. It works in two steps:
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, ClassVar, Self
@@ -219,6 +220,19 @@ class Discrepancy(ABC):
         Written with ``xp`` (``numpy`` or ``pytensor.tensor``), by functions that both have.
         """
 
+    @staticmethod
+    def stacked(bases: Sequence[tuple[NDArray[Any], ...]]) -> tuple[NDArray[Any], ...] | None:
+        """Return the bases of several discrepancies as one, for `side_by_side`; None if it cannot.
+
+        The graph of many slices is then no larger than that of one.
+        """
+        return None
+
+    @staticmethod
+    def side_by_side(targets: Any, weights: Any, basis: tuple[Any, ...], xp: Any) -> Any:
+        """Return the values of several discrepancies from a stacked basis, (..., K), or None."""
+        return None
+
     @property
     def symbolic(self) -> bool:
         """Whether `outer` can be written as a graph; else it is an operation without gradient."""
@@ -327,6 +341,13 @@ class Metric(ABC):
     @abstractmethod
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         """Return the discrepancy from these observed values, both of shape (N,) and checked."""
+
+    def on_one_scale(self, slices: Sequence[Discrepancy]) -> Sequence[Discrepancy]:
+        """Return discrepancies from slices of one sample, in units in which their mean is meant.
+
+        They are as they are, unless the metric takes a factor from the data.
+        """
+        return slices
 
     def against(self, observed: ArrayLike, weights: ArrayLike | None = None) -> Discrepancy:
         """Prepare the observed side.
@@ -461,8 +482,42 @@ class DensityDiscrepancy(Discrepancy):
         It bounds logarithms where a population leaves the observed values alone, at
         log(1e-9 / length).
         """
+        return raised(density, self.least)
+
+    @property
+    def least(self) -> Any:
+        """What the floor adds to a density in each cell."""
         length = self.cells.widths.sum()
-        return (1 - _FLOOR) * density + _FLOOR / length
+        return _FLOOR / length
+
+
+def raised(density: Any, least: Any) -> Any:
+    """Return a density with its floor, which has 1e-9 of the mass."""
+    return (1 - _FLOOR) * density + least
+
+
+class CellwiseDiscrepancy(DensityDiscrepancy):
+    """A discrepancy of two densities that is a sum over the cells.
+
+    Several of them, on cells of their own, are then one sum over all cells.
+    """
+
+    @property
+    @abstractmethod
+    def constants(self) -> tuple[Any, ...]:
+        """What `terms` takes beside the density: by cell, (m,) or (..., m), or one number."""
+
+    @abstractmethod
+    def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
+        """Return what each cell adds, shape (..., m); nothing else of the record than its metric.
+
+        The constants are given, since they may be those of several records side by side.
+        """
+
+    def outer(self, *features: Any, xp: Any) -> Any:
+        """Return the sum over the cells."""
+        (density,) = features
+        return self.terms(density, self.constants, xp).sum(axis=-1)
 
 
 def observed_density(cells: Cells, observed: Floats, weights: Floats) -> Floats:

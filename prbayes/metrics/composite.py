@@ -3,47 +3,60 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats, sample_weights
-from prbayes.metrics.base import Discrepancy, Minimum, Part, View
-from prbayes.metrics.cells import product
+from prbayes.metrics.base import CellwiseDiscrepancy, Discrepancy, Minimum, Part, View
+from prbayes.metrics.cells import Cells, product
 
 
 @dataclass(frozen=True, eq=False)
-class Outputs(View):
-    """Some of the outputs, all at a time."""
+class Centered(View):
+    """Some of the outputs, less a center; those of one record share it in several projections."""
 
     outputs: NDArray[np.intp]  # (p,): which ones
     caps: Floats  # (p,): what a specimen counts as that failed there
+    center: Floats  # (p,)
 
     def of(self, simulated: Any, xp: Any = np) -> Any:
         """Return the outputs (..., n, p), a failure as the cap; NaN stays."""
         chosen = simulated[..., self.outputs]
-        return xp.where(chosen >= np.inf, self.caps, chosen)
+        return xp.where(chosen >= np.inf, self.caps, chosen) - self.center
+
+
+@dataclass(frozen=True, eq=False)
+class Projection(View):
+    """One linear combination of outputs."""
+
+    centered: Centered
+    direction: Floats  # (p,)
+
+    def of(self, simulated: Any, xp: Any = np) -> Any:
+        """Return the combination, shape (..., n)."""
+        return self.centered.of(simulated, xp) @ self.direction
 
     def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
-        """Return what the target compares of the rows that have all these outputs."""
-        index = np.flatnonzero(~np.isnan(values[:, self.outputs]).any(axis=-1))
+        """Return the combination, of the rows that have all outputs that it needs."""
+        index = np.flatnonzero(~np.isnan(values[:, self.centered.outputs]).any(axis=-1))
         return self.of(values[index]), index
 
 
 @dataclass(frozen=True, eq=False)
-class Projection(Outputs):
-    """One linear combination of outputs."""
+class Standardized(View):
+    """Several outputs, each in a unit of its own; rows that lack some of them count as well."""
 
-    center: Floats  # (p,)
-    direction: Floats  # (p,)
+    centered: Centered
+    unit: Floats  # (p,)
 
     def of(self, simulated: Any, xp: Any = np) -> Any:
-        """Return (outputs - center) @ direction, shape (..., n)."""
-        return (super().of(simulated, xp) - self.center) @ self.direction
+        """Return the outputs, shape (..., n, p)."""
+        return self.centered.of(simulated, xp) / self.unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +67,21 @@ class OnlyOutput(View):
         """Return the output, (..., n, 1) -> (..., n)."""
         return simulated[..., 0]
 
-    def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
-        """Return the output, of all rows."""
-        return self.of(values), np.arange(len(values))
+
+def seen_by(
+    parts: Sequence[Part], simulated: Any, xp: Any = np
+) -> Iterator[tuple[Discrepancy, Any]]:
+    """Yield the target of each part and what it compares; outputs are centered once for many."""
+    shared: Centered | None = None
+    outputs: Any = None
+    for part in parts:
+        view = part.view
+        if not isinstance(view, Projection):
+            yield part.target, part.of(simulated, xp)
+            continue
+        if view.centered is not shared:
+            shared, outputs = view.centered, view.centered.of(simulated, xp)
+        yield part.target, outputs @ view.direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +176,7 @@ class CompositeDiscrepancy(Discrepancy):
 
     def overlap(self, simulated: Floats, weights: Floats) -> Floats:
         """Return the smallest overlap of any part, (..., n, m) -> (...)."""
-        overlaps = [part.target.overlap(part.of(simulated), weights) for part in self.members]
+        overlaps = [target.overlap(y, weights) for target, y in seen_by(self.members, simulated)]
         return np.min(overlaps, axis=0)
 
     @cached_property
@@ -188,7 +213,9 @@ class CompositeDiscrepancy(Discrepancy):
             values = np.broadcast_to(values, (*weights.shape, *self.event))
             return self.features(values, weights, xp)
         divided = self._divided(basis)
-        found = [g.from_basis(weights, own, xp) for g, own in zip(self._groups, divided)]
+        found = [
+            g.from_basis(weights, own, xp) for g, own in zip(self._groups, divided, strict=True)
+        ]
         return sum(found, ())
 
     def outer(self, *features: Any, xp: Any) -> Any:
@@ -239,12 +266,12 @@ class _Each(_Group):
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
         """Return the features of all parts."""
-        found = [part.target.features(part.of(simulated, xp), weights, xp) for part in self.parts]
-        return sum(found, ())
+        seen = seen_by(self.parts, simulated, xp)
+        return sum((target.features(y, weights, xp) for target, y in seen), ())
 
     def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
         """Return the arrays of all parts."""
-        return sum((part.target.basis(part.of(simulated)) for part in self.parts), ())
+        return sum((target.basis(y) for target, y in seen_by(self.parts, simulated)), ())
 
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return the features of all parts."""
@@ -265,18 +292,28 @@ class _Values(_Each):
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
         """Return the values of all parts, (..., K)."""
         found = []
-        for part in self.parts:
-            own = part.target.features(part.of(simulated, xp), weights, xp)
-            found.append(part.target.outer(*own, xp=xp))
+        for target, seen in seen_by(self.parts, simulated, xp):
+            own = target.features(seen, weights, xp)
+            found.append(target.outer(*own, xp=xp))
         return (xp.stack(found, axis=-1),)
+
+    def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
+        """Return the arrays of all parts, stacked where the targets can."""
+        bases = [target.basis(seen) for target, seen in seen_by(self.parts, simulated)]
+        stacked = self.parts[0].target.stacked(bases)
+        return sum(bases, ()) if stacked is None else stacked
 
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return the values of all parts, (..., K)."""
-        found = []
-        for part, own in zip(self.parts, self._of_each(basis), strict=True):
-            features = part.target.from_basis(weights, own, xp)
-            found.append(part.target.outer(*features, xp=xp))
-        return (xp.stack(found, axis=-1),)
+        targets = [part.target for part in self.parts]
+        values = targets[0].side_by_side(targets, weights, basis, xp)
+        if values is None:
+            found = []
+            for target, own in zip(targets, self._of_each(basis), strict=True):
+                features = target.from_basis(weights, own, xp)
+                found.append(target.outer(*features, xp=xp))
+            values = xp.stack(found, axis=-1)
+        return (values,)
 
     def outer(self, features: tuple[Any, ...], shares: Floats, xp: Any) -> Any:
         """Return their sum."""
@@ -287,24 +324,46 @@ class _Densities(_Group):
     """Parts that compare densities: those lie side by side, so that one product gives them all."""
 
     @cached_property
+    def _sizes(self) -> list[int]:
+        """How many cells each part has."""
+        return [cast(Cells, part.target.density_cells).widths.size for part in self.parts]
+
+    @cached_property
     def _slices(self) -> list[slice]:
         """Where the cells of each part are."""
-        ends = np.cumsum([part.target.density_cells.widths.size for part in self.parts])
-        starts = np.concatenate([[0], ends[:-1]])
-        return [slice(int(a), int(b)) for a, b in zip(starts, ends, strict=True)]
+        ends = np.cumsum(self._sizes).tolist()
+        return [slice(end - size, end) for end, size in zip(ends, self._sizes, strict=True)]
+
+    @cached_property
+    def _cellwise(self) -> bool:
+        """Whether all parts are sums over cells, and so are one sum over all cells."""
+        return all(type(part.target).outer is CellwiseDiscrepancy.outer for part in self.parts)
+
+    @cached_property
+    def _constants(self) -> tuple[Floats, ...]:
+        """What the sum over cells takes beside the density, of all parts side by side."""
+        by_part = [cast(CellwiseDiscrepancy, part.target).constants for part in self.parts]
+        return tuple(self._side_by_side(each) for each in zip(*by_part, strict=True))
+
+    def _side_by_side(self, each: Sequence[Any]) -> Floats:
+        """Return numbers by cell, (..., m_k) or one for all of a part, as (..., all cells)."""
+        batch = np.broadcast_shapes(*(np.shape(one)[:-1] for one in each))
+        pairs = zip(each, self._sizes, strict=True)
+        return np.concatenate([np.broadcast_to(c, (*batch, n)) for c, n in pairs], axis=-1)
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
         """Return the densities side by side, (..., cells)."""
-        found = []
-        for part in self.parts:
-            found += part.target.features(part.of(simulated, xp), weights, xp)
+        found: list[Any] = []
+        for target, seen in seen_by(self.parts, simulated, xp):
+            found += target.features(seen, weights, xp)
         return (xp.concatenate(found, axis=-1),)
 
     def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
         """Return one matrix, (n, cells)."""
-        out = np.empty((len(simulated), self._slices[-1].stop))
-        for part, cells in zip(self.parts, self._slices, strict=True):
-            (out[:, cells],) = part.target.basis(part.of(simulated))
+        out = np.empty((len(simulated), sum(self._sizes)))
+        seen_by_part = seen_by(self.parts, simulated)
+        for (target, seen), cells in zip(seen_by_part, self._slices, strict=True):
+            (out[:, cells],) = target.basis(seen)
         return (out,)
 
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
@@ -313,10 +372,17 @@ class _Densities(_Group):
         return (product(weights, matrix) if xp is np else weights @ matrix,)
 
     def outer(self, features: tuple[Any, ...], shares: Floats, xp: Any) -> Any:
-        """Return the sum of the parts."""
+        """Return the sum of the parts, in one pass over all cells where that can be."""
         (densities,) = features
+        if not self._cellwise:
+            return self._one_by_one(densities, shares, xp)
+        first = cast(CellwiseDiscrepancy, self.parts[0].target)
+        terms = first.terms(densities, self._constants, xp)
+        return (terms * np.repeat(shares, self._sizes, axis=-1)).sum(axis=-1)
+
+    def _one_by_one(self, densities: Any, shares: Floats, xp: Any) -> Any:
+        """Return the sum of parts with an outer function of their own."""
         total: Any = 0.0
         for k, (part, cells) in enumerate(zip(self.parts, self._slices, strict=True)):
-            own = densities[..., cells]
-            total = total + shares[..., k] * part.target.outer(own, xp=xp)
+            total = total + shares[..., k] * part.target.outer(densities[..., cells], xp=xp)
         return total

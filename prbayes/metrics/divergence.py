@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from prbayes._checks import Floats, flag
-from prbayes.metrics.base import DensityDiscrepancy, Discrepancy, Metric, Minimum
+from prbayes.metrics.base import CellwiseDiscrepancy, Discrepancy, Metric, Minimum, raised
 from prbayes.metrics.density import DensityEstimator, GaussianKDE, density_estimator
 
 
@@ -60,16 +60,21 @@ class KullbackLeibler(Metric):
         return DivergenceDiscrepancy.on_cells(self, observed, weights, cells)
 
 
-class DivergenceDiscrepancy(DensityDiscrepancy):
+class DivergenceDiscrepancy(CellwiseDiscrepancy):
     """The Kullback-Leibler divergence against fixed observed values."""
 
     metric: KullbackLeibler
 
-    def outer(self, *features: Any, xp: Any) -> Any:
+    @property
+    def constants(self) -> tuple[Any, ...]:
+        """The observed density and the floor of the other, and the widths."""
+        return self.floored(self.density), self.least, self.cells.widths
+
+    def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
         """Return the integral of a log(a / b), (a, b) = (q, p) forward, (p, q) in reverse."""
-        p = self.floored(features[0])
-        q = self.floored(self.density)
+        q, least, widths = constants
+        p = raised(density, least)
         a, b = (p, q) if self.metric.reverse else (q, p)
         ratio = xp.log(a / b)
         integrand = a * ratio
-        return (integrand * self.cells.widths).sum(axis=-1)
+        return integrand * widths

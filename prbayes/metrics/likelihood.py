@@ -7,11 +7,12 @@ from typing import Any, ClassVar, Self
 
 from prbayes._checks import Floats
 from prbayes.metrics.base import (
-    DensityDiscrepancy,
+    CellwiseDiscrepancy,
     Discrepancy,
     Metric,
     Minimum,
     observed_density,
+    raised,
 )
 from prbayes.metrics.cells import Cells
 from prbayes.metrics.density import (
@@ -62,7 +63,7 @@ class LogLikelihood(Metric):
 
 
 @dataclass(frozen=True, eq=False)
-class LikelihoodDiscrepancy(DensityDiscrepancy):
+class LikelihoodDiscrepancy(CellwiseDiscrepancy):
     """The mean log-likelihood of fixed observed values."""
 
     # (m,) or (..., m): ``reading @ g`` is the weighted mean of g, given on the cells, at the
@@ -83,9 +84,13 @@ class LikelihoodDiscrepancy(DensityDiscrepancy):
         reading = self.cells.reading(other.observed, other.weights)
         return replace(other, reading=reading)
 
-    def outer(self, *features: Any, xp: Any) -> Any:
-        """Return minus the weighted mean of log p at the observed values."""
-        (p,) = features
-        logs = xp.log(self.floored(p))
-        mean = (logs * self.reading).sum(axis=-1)
-        return -mean
+    @property
+    def constants(self) -> tuple[Any, ...]:
+        """The floor of the density, and how it is read at the observed values."""
+        return self.least, self.reading
+
+    def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
+        """Return what each cell adds to minus the weighted mean of log p at the observed values."""
+        least, reading = constants
+        logs = xp.log(raised(density, least))
+        return -(logs * reading)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from prbayes._checks import Floats, positive_number
 from prbayes.metrics.base import (
-    DensityDiscrepancy,
+    CellwiseDiscrepancy,
     Discrepancy,
     Metric,
     Minimum,
@@ -68,9 +69,14 @@ class ProbabilityResidual(Metric):
         cells = self.density.cells(observed, weights)
         return ResidualDiscrepancy.on_cells(self, observed, weights, cells)
 
+    def on_one_scale(self, slices: Sequence[Any]) -> Sequence[Any]:
+        """Return the residuals with one factor S, the smallest: that of the highest peak."""
+        smallest = min(one.scale_factor for one in slices)
+        return [replace(one, scale_factor=smallest) for one in slices]
+
 
 @dataclass(frozen=True, eq=False)
-class ResidualDiscrepancy(DensityDiscrepancy):
+class ResidualDiscrepancy(CellwiseDiscrepancy):
     """The probability residual against fixed observed values; ``scale_factor`` is S of eq. 10."""
 
     metric: ProbabilityResidual
@@ -107,9 +113,12 @@ class ResidualDiscrepancy(DensityDiscrepancy):
         integrand = (self._root * self.density) ** 2 * self._measure
         return float(integrand.sum())
 
-    def outer(self, *features: Any, xp: Any) -> Any:
-        """Return S times the integral (or sum) of (p - q)^2: eq. 6, 8, 9."""
-        (p,) = features
-        q = self.density
-        integrand = (self._root * (p - q)) ** 2 * self._measure
-        return integrand.sum(axis=-1)
+    @property
+    def constants(self) -> tuple[Any, ...]:
+        """The root of S, the observed density, and what a cell counts for."""
+        return self._root, self.density, self._measure
+
+    def terms(self, density: Any, constants: tuple[Any, ...], xp: Any) -> Any:
+        """Return S times (p - q)^2, times the width of the cell: eq. 6, 8, 9."""
+        root, observed, measure = constants
+        return (root * (density - observed)) ** 2 * measure
