@@ -116,10 +116,10 @@ def test_a_store_of_other_outputs_is_refused(tmp_path):
     model_of(propagation=prb.Reweighted(64, store=tmp_path, version="1"))
 
     def three(a, b):
-        return np.stack([a, b, a], axis=-1)
+        return np.stack([a, b, a * b], axis=-1)
 
-    data = np.column_stack([observed(), observed()[:, 0]])
-    with pytest.raises(RuntimeError, match="2 outputs .* expected 3; .* pass version="):
+    data = np.column_stack([observed(), specimens().prod(axis=1)])
+    with pytest.raises(RuntimeError, match=r"2 outputs .* expected 3; .* pass version="):
         model_of(three, data, propagation=prb.Reweighted(64, store=tmp_path, version="1"))
 
 
@@ -167,7 +167,9 @@ def test_a_response_with_other_outputs_than_observed_is_refused(response, expect
 
 
 def test_other_keys_than_those_observed_are_refused():
-    with pytest.raises(prb.response.ResponseError, match=r"keys \['sum', 'difference'\], expected \['a'"):
+    with pytest.raises(
+        prb.response.ResponseError, match=r"keys \['sum', 'difference'\], expected \['a'"
+    ):
         model_of(as_mapping, {"a": observed()[:, 0], "b": observed()[:, 1]})
 
 

@@ -66,10 +66,10 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         a multivariate input with its event axis last; returns an array of the batch shape, in units
         of the observed values; for m outputs of each specimen an array with them in a last axis, or
         a mapping of arrays with the keys of ``observed``. NaN is a point at which it could not be
-        computed, all outputs of it, +inf a specimen that failed. It is a function of its inputs: where these repeat, as discrete ones do, a
-        design computes it once, unless four that are computed again differ. Scatter of its own is
-        best an input, as ``pm.Normal.dist(0, 1)``. Simulators with the same response object,
-        inputs and propagation share its runs.
+        computed, all outputs of it, +inf a specimen that failed. It is a function of its inputs:
+        where these repeat, as discrete ones do, a design computes it once, unless four that are
+        computed again differ. Scatter of its own is best an input, as ``pm.Normal.dist(0, 1)``.
+        Simulators with the same response object, inputs and propagation share its runs.
     *inputs
         Each is a ``.dist()`` (aleatory: varies between specimens), a model variable (epistemic:
         common to all specimens) or a constant. The same ``.dist()`` in two simulators means the
@@ -254,7 +254,7 @@ def _refuse_name(name: object, model: pm.Model) -> None:
 def _checked_dims(
     name: str, dims: object, shape: tuple[int, ...], model: pm.Model
 ) -> tuple[str, ...] | None:
-    """Return names of the observed dimensions, which have to be the model's, as long as the data."""
+    """Return names of the observed dimensions, the model's own ones, as long as the data."""
     if dims is None:
         return None
     names = [dims] if isinstance(dims, str) else dims

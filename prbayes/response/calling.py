@@ -232,7 +232,7 @@ def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
 
 
 def _filled_in(values: Floats, rows: Rows, some: Floats) -> Floats:
-    """Return responses with those of some rows, of which the first tell how many outputs a run has."""
+    """Return responses with those of some rows; the first tell how many outputs a run has."""
     if values.ndim == 1 and some.ndim > 1:
         values = np.repeat(values[:, None], some.shape[1], axis=1)
     values[rows] = some
@@ -261,9 +261,10 @@ def _verify(calling: Calling, points: Points, tally: Tally) -> None:
             at = ", ".join(f"{x:.6g}" for x in keys[first[0]])
             raise StoreError(
                 f"{calling.name}: store: got a response that gives {told} at ({at}), expected "
-                f"{_numbers_told(expected)}, which is stored in {store.path}: it is of another function, or "
-                "its variables have changed; nothing was changed: pass another folder, or version= "
-                "with a name for the response as it is now, whose runs are then kept apart"
+                f"{_numbers_told(expected)}, which is stored in {store.path}: it is of another "
+                "function, or its variables have changed; nothing was changed: pass another "
+                "folder, or version= with a name for the response as it is now, whose runs are "
+                "then kept apart"
             )
     store.verified = True
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes.metrics.composite import Projection
-from prbayes.metrics.directions import default_number, directions
-from prbayes.metrics.joint import failure_caps
+from prbayes.metrics.composite import Centered, Projection
+from prbayes.metrics.directions import directions, enough
+from prbayes.metrics.lifted import failure_caps
 from prbayes.metrics.whitening import whitening
 
 # Specimens of the prediction that tell its coordinates: their correlations are then known to .02,
 # and any directions give a test of the right size.
-_ENOUGH = 4096
+_SEEN_BY = 4096
 
 
 def views(pool: Floats) -> list[Projection]:
@@ -26,11 +26,10 @@ def views(pool: Floats) -> list[Projection]:
     rows = rows[~np.isnan(rows).any(axis=1)]
     caps = failure_caps(rows)
     finite = rows[np.isfinite(rows).all(axis=1)]
-    step = -(-len(finite) // _ENOUGH)
+    step = -(-len(finite) // _SEEN_BY)
     some = finite[::step]
-    white = whitening(some, np.full(len(some), 1 / len(some)))
     every = np.arange(m)
-    return [
-        Projection(every, caps, white.center, white.axes @ u)
-        for u in directions(m, default_number(m), 0)
-    ]
+    white = whitening(some, np.full(len(some), 1 / len(some)), every)
+    centered = Centered(every, caps, white.center)
+    number = max(1, enough(m))
+    return [Projection(centered, white.axes @ u) for u in directions(m, number, 0)]
