@@ -5,7 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pymc as pm
 import pytest
-import xarray as xr
 
 import prbayes as prb
 from prbayes.estimate.data_sets import simulated_sets
@@ -195,15 +194,10 @@ def test_bad_data_are_refused_before_any_run(data, metric, expected):
 # -- in a model ------------------------------------------------------------------------------------
 
 
-def test_outputs_are_named_by_frames_and_data_arrays():
+def test_outputs_are_named_by_frames():
     pd = pytest.importorskip("pandas")
     frame = pd.DataFrame(observed(), columns=["sum", "difference"])
     assert node_of(model_of(data=frame)).outputs.names == ("sum", "difference")
-    array = xr.DataArray(
-        observed(), dims=("specimen", "hour"), coords={"hour": [0.5, 2.0]}, attrs={"units": "mm"}
-    )
-    outputs = node_of(model_of(data=array)).outputs
-    assert (outputs.dim, outputs.labels, outputs.units) == ("hour", (0.5, 2.0), ("mm", "mm"))
 
 
 def test_an_output_that_was_not_measured_is_not_imputed():
