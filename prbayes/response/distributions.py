@@ -19,7 +19,12 @@ from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats
-from prbayes.response.compilation import PLAIN, compile_batched, with_leading_axis
+from prbayes.response.compilation import (
+    PLAIN,
+    compile_batched,
+    interpreted,
+    with_leading_axis,
+)
 from prbayes.response.inputs import Inputs, event_shape, is_random
 
 
@@ -70,6 +75,32 @@ def _mvnormal_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
     for i, z_i in enumerate(z):
         logp = logp + (-0.5 * z_i**2 - pt.log(root[i, i]) - 0.5 * np.log(2 * np.pi))
     return pt.switch(pt.isnan(logp), -np.inf, logp)
+
+
+def refuse_lopsided(name: str, inputs: Inputs, params: Sequence[Floats]) -> None:
+    """Raise if the covariance of a multivariate normal is not symmetric, at values of the roots.
+
+    Its density and its draws read one half of the matrix, as if the other were alike.
+    """
+    symbols = inputs.placeholders()
+    dists, _ = inputs.rebuilt(symbols)
+    covariances = []
+    for dist in filter(is_mvnormal, dists):
+        _, covariance = dist.owner.op.dist_params(dist.owner)
+        covariances.append(covariance)
+    if not covariances:
+        return
+    for covariance in compile_batched(symbols, covariances)(*params):
+        mirrored = np.swapaxes(covariance, -1, -2)
+        gap = np.abs(covariance - mirrored)
+        size = np.abs(covariance).max(axis=(-2, -1), keepdims=True)
+        # Products of the same numbers in another order differ by rounding, 1e-16 of them.
+        if np.any(gap > 1e-8 * size):
+            raise ValueError(
+                f"{name}: got a pm.MvNormal whose covariance is not symmetric, expected a "
+                "covariance matrix; pm.LKJCorr is no correlation matrix but its Cholesky factor L: "
+                "pass chol=sds[:, None] * L instead of cov="
+            )
 
 
 def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
@@ -168,11 +199,13 @@ class PriorSampler:
                 if not any(a in roots for a in ancestors([root]) if a is not root):
                     batches[root] = change_dist_size(root, (n,), expand=True)
             outputs = vectorize_graph(list(roots), batches)
-            self._function = pm.compile([n], outputs, mode=PLAIN)
+            with interpreted():
+                self._function = pm.compile([n], outputs, mode=PLAIN)
             self._batched = True
         except (NotImplementedError, ValueError, MissingInputError):
             # Not vectorized, or not resized: one draw at a time.
-            self._function = pm.compile([n], list(roots), mode=PLAIN, on_unused_input="ignore")
+            with interpreted():
+                self._function = pm.compile([n], list(roots), mode=PLAIN, on_unused_input="ignore")
             self._batched = False
         self._generators = _generators(self._function)
 
@@ -259,13 +292,14 @@ class PopulationSampler:
             common = epistemic
         self._event_shapes = inputs.event_shapes
         self._epistemic_ndims = [e.type.ndim for e in epistemic]
-        self._function = pm.compile(
-            [n, *batched],
-            [*specimens, *common],
-            mode=PLAIN,
-            on_unused_input="ignore",
-            allow_input_downcast=True,
-        )
+        with interpreted():
+            self._function = pm.compile(
+                [n, *batched],
+                [*specimens, *common],
+                mode=PLAIN,
+                on_unused_input="ignore",
+                allow_input_downcast=True,
+            )
         self._generators = _generators(self._function)
 
     def __call__(

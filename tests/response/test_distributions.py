@@ -20,6 +20,7 @@ from prbayes.response.distributions import (
     log_density,
     prior_draws,
     quantiles,
+    refuse_lopsided,
     refuse_without_density,
     valid,
 )
@@ -62,6 +63,17 @@ def test_an_impossible_covariance_has_no_density() -> None:
     graph = log_density(inputs, inputs.rebuilt(symbols)[0], [pt.constant(np.zeros((1, 2)))])
     (found,) = compile_batched(symbols, [graph])(np.array([0.5, 1.5]))
     assert list(np.isneginf(found[:, 0])) == [False, True]
+
+
+def test_a_covariance_that_is_not_symmetric_is_refused() -> None:
+    def lopsided(mu: Any, sigma: Any) -> list[Any]:
+        return [pm.MvNormal.dist(np.zeros(2), pt.stacklists([[1.0, mu], [0.0, sigma]]))]
+
+    inputs, _ = inputs_of(lopsided)
+    refuse_lopsided("y", inputs, [np.zeros(3), np.ones(3)])
+    refuse_lopsided("y", inputs, [np.full(3, np.nan), np.ones(3)])  # what is invalid is no matrix
+    with pytest.raises(ValueError, match=r"y: got a pm.MvNormal whose .* not symmetric, .*LKJCorr"):
+        refuse_lopsided("y", inputs, [np.array([0.0, 0.1, 0.0]), np.ones(3)])
 
 
 @pytest.mark.parametrize(
