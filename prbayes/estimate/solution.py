@@ -11,8 +11,10 @@ from prbayes.estimate.caveats import no_information
 from prbayes.estimate.differences import cross, slopes
 from prbayes.estimate.optimum import Optimum, plain
 from prbayes.estimate.rivals import Rival
+from prbayes.estimate.sampling import Local
 from prbayes.estimate.search import Run, Search, apart_from_data
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.hyperparameters import THETAS
 from prbayes.model.identity import identity_of
 
 
@@ -21,6 +23,7 @@ def assemble(
     run: Run,
     *,
     covariance: Floats,
+    functions: Local | None = None,
     remark: str,
     screened: int,
     responses_before: int,
@@ -35,6 +38,8 @@ def assemble(
         The last one.
     covariance : ndarray, shape (d, d)
         Sampling covariance in unconstrained space; infinite along what is not identified, or NaN.
+    functions : Local, optional
+        The same by directions, faint ones among them, which tells more of deterministics.
     remark : str
         What is added to the message.
     screened : int
@@ -45,7 +50,7 @@ def assemble(
         Which budget ended the search; no response is computed then.
     """
     evaluator, theta, scales = search.evaluator, run.best, run.scales
-    point, stderr = point_and_stderr(evaluator, theta, covariance)
+    point, stderr = point_and_stderr(evaluator, theta, covariance, functions)
     affordable = not (stopped and evaluator.responses_per_theta)
     nowhere = _nowhere(evaluator, theta, covariance)
     lost = ""
@@ -91,15 +96,43 @@ def assemble(
 
 
 def point_and_stderr(
-    evaluator: Evaluator, theta: Floats, covariance: Floats
+    evaluator: Evaluator, theta: Floats, covariance: Floats, functions: Local | None = None
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return variables and deterministics in the user's units, and their standard errors."""
     # Any small step serves: transforms are smooth.
     step = 1e-4 * evaluator.prior_sd
     values = evaluator.constrained(cross(theta, step))
     point = {name: plain(v[0]) for name, v in values.items()}
-    stderr = {name: plain(_stderr(slopes(v, step), covariance)) for name, v in values.items()}
-    return point, stderr
+    stderr = {name: _stderr(slopes(v, step), covariance) for name, v in values.items()}
+    for variable in evaluator.model.deterministics:
+        name = str(variable.name)
+        stderr[name] = _of_function(evaluator, name, values[name], stderr[name], step, functions)
+    return point, {name: plain(error) for name, error in stderr.items()}
+
+
+def _of_function(
+    evaluator: Evaluator,
+    name: str,
+    values: Floats,
+    stderr: Floats,
+    step: Floats,
+    functions: Local | None,
+) -> Floats:
+    """Return the standard error of a deterministic, values (1 + 2d, *shape) around theta.
+
+    Zero of what is the same at all hyperparameters, as a correlation's diagonal. Where elements of
+    theta are not identified, a function of them is if it is known better than by its prior.
+    """
+    prior = evaluator.constrained(evaluator.prior_thetas(THETAS, seed=0))[name]
+    both = np.concatenate([values, prior])
+    # Up to rounding, of which a few operations make a few units in the last place.
+    fixed = np.ptp(both, axis=0) <= 1e-12 * np.abs(values[0])
+    if functions is not None and np.isinf(stderr).any():
+        found = np.sqrt(functions.variance(slopes(values, step)))
+        upper, lower = np.quantile(prior, [0.84, 0.16], axis=0)
+        better = np.isinf(stderr) & (found < (upper - lower) / 2)
+        stderr = np.where(better, found, stderr)
+    return np.where(fixed, 0.0, stderr)
 
 
 def _stderr(gradients: Floats, covariance: Floats) -> Floats:
