@@ -103,36 +103,36 @@ def point_and_stderr(
     step = 1e-4 * evaluator.prior_sd
     values = evaluator.constrained(cross(theta, step))
     point = {name: plain(v[0]) for name, v in values.items()}
-    stderr = {name: _stderr(slopes(v, step), covariance) for name, v in values.items()}
-    for variable in evaluator.model.deterministics:
-        name = str(variable.name)
-        stderr[name] = _of_function(evaluator, name, values[name], stderr[name], step, functions)
-    return point, {name: plain(error) for name, error in stderr.items()}
+    prior = evaluator.constrained(evaluator.prior_thetas(THETAS, seed=0))
+    deterministic = {str(variable.name) for variable in evaluator.model.deterministics}
+    stderr = {}
+    for name, v in values.items():
+        gradients = slopes(v, step)
+        found = _stderr(gradients, covariance)
+        if functions is not None and name in deterministic:
+            found = _of_functions(found, gradients, prior[name], functions)
+        fixed = _same_everywhere(v, prior[name])
+        stderr[name] = plain(np.where(fixed, 0.0, found))
+    return point, stderr
 
 
-def _of_function(
-    evaluator: Evaluator,
-    name: str,
-    values: Floats,
-    stderr: Floats,
-    step: Floats,
-    functions: Local | None,
-) -> Floats:
-    """Return the standard error of a deterministic, values (1 + 2d, *shape) around theta.
+def _of_functions(stderr: Floats, gradients: Floats, prior: Floats, functions: Local) -> Floats:
+    """Return standard errors, (*shape), of deterministics of elements that are not identified.
 
-    Zero of what is the same at all hyperparameters, as a correlation's diagonal. Where elements of
-    theta are not identified, a function of them is if it is known better than by its prior.
+    They are if they are known better than by their own prior, of which there are draws,
+    (P, *shape).
     """
-    prior = evaluator.constrained(evaluator.prior_thetas(THETAS, seed=0))[name]
+    found = np.sqrt(functions.variance(gradients))
+    upper, lower = np.quantile(prior, [0.84, 0.16], axis=0)
+    better = np.isinf(stderr) & (found < (upper - lower) / 2)
+    return np.where(better, found, stderr)
+
+
+def _same_everywhere(values: Floats, prior: Floats) -> Any:
+    """Return which elements no hyperparameter changes, as a correlation's diagonal, (*shape)."""
     both = np.concatenate([values, prior])
     # Up to rounding, of which a few operations make a few units in the last place.
-    fixed = np.ptp(both, axis=0) <= 1e-12 * np.abs(values[0])
-    if functions is not None and np.isinf(stderr).any():
-        found = np.sqrt(functions.variance(slopes(values, step)))
-        upper, lower = np.quantile(prior, [0.84, 0.16], axis=0)
-        better = np.isinf(stderr) & (found < (upper - lower) / 2)
-        stderr = np.where(better, found, stderr)
-    return np.where(fixed, 0.0, stderr)
+    return np.ptp(both, axis=0) <= 1e-12 * np.abs(values[0])
 
 
 def _stderr(gradients: Floats, covariance: Floats) -> Floats:

@@ -130,6 +130,9 @@ class Hyperparameters:
     def constrained(self, thetas: Floats) -> dict[str, Floats]:
         """Return variables and deterministics, shapes (P, *shape), in the user's own units."""
         size = len(thetas)
+        if not size:  # PyTensor has no transform of nothing for matrices
+            one = self.constrained(self.initial[None])
+            return {name: value[:0] for name, value in one.items()}
         values = self._constrain(np.ascontiguousarray(thetas))
         found = {}
         for variable, value in zip(self.model.unobserved_RVs, values, strict=True):
