@@ -24,12 +24,15 @@ from prbayes.model.elements import (
     single_elements,
     split_elements,
     stacked_draws,
+    told_elements,
+    told_of,
 )
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import as_attributes, require_together
 from prbayes.model.node import nodes
 from prbayes.model.support import shortcomings
 from prbayes.model.turns import in_turn
+from prbayes.response.inputs import event_shape
 
 _METRICS = (ProbabilityResidual(), KullbackLeibler(), AreaMetric(), LogLikelihood())
 
@@ -49,8 +52,8 @@ def compare(
         `Optimum` objects, their DataTrees, and DataTrees with a ``posterior`` group, by the label
         they get.
     model : pymc.Model, optional
-        Restricts the table to the model's free variables; by default all that the results share.
-        Its data, and its populations, score the results.
+        Restricts the table to the model's variables, its deterministics among them; by default all
+        that the results share. Its data, and its populations, score the results.
     metrics : sequence of Metric, optional
         Under which each estimate is scored, whatever it was made with. By default all four where
         that costs no response (`Reweighted`); under the other propagations each result costs n
@@ -97,14 +100,15 @@ def compare(
     identities = {label: identity_in(result) for label, result in results.items()}
     identity = require_together(identities, "compare", model=model)
     columns = {label: _column(label, result) for label, result in results.items()}
-    names = _shared(list(columns.values()), model)
+    every = _shared(list(columns.values()), model)
+    told = set.intersection(*(column.told for column in columns.values()))
+    names = [name for name in every if name in told]
     if not names:
         raise ValueError(
             f"compare: got results {list(results)} that share no hyperparameter, "
             "expected the same model"
         )
-    # Estimate, sd, lower and upper: shape (results, elements, 4)
-    table = np.array([[column.elements[name] for name in names] for column in columns.values()])
+    table = _table(columns, names)
     estimates, sds = table[..., 0], table[..., 1]
     with np.errstate(divide="ignore", invalid="ignore"):  # a result without spread
         shift = (estimates - estimates[0]) / sds
@@ -118,7 +122,8 @@ def compare(
     data["n_responses"] = ("result", [column.n_responses for column in columns.values()])
     data["seconds"] = ("result", [column.seconds for column in columns.values()])
     if model is not None and nodes(model):
-        for key, scores in _scores(model, names, estimates, metrics).items():
+        scored = _table(columns, every)[..., 0]
+        for key, scores in _scores(model, every, scored, metrics).items():
             data[key] = ("result", scores)
     coords = {"result": list(columns), "hyperparameter": names}
     attrs = {"interval": INTERVAL, **as_attributes(identity)}
@@ -150,22 +155,28 @@ class _Column:
     """What a result tells: estimates by element, and its cost."""
 
     elements: dict[str, _Estimate]
+    told: set[str]  # those of them that a table has
     n_responses: float
     seconds: float
+
+
+def _table(columns: Mapping[str, _Column], names: Sequence[str]) -> Floats:
+    """Return estimate, sd, lower and upper, shape (results, elements, 4)."""
+    return np.array([[column.elements[name] for name in names] for column in columns.values()])
 
 
 def _column(label: str, result: Any) -> _Column:
     """Read a result of any kind."""
     if isinstance(result, Optimum):
-        elements = _normal(result.point, result.stderr)
-        return _Column(elements, float(result.n_responses), result.seconds)
+        cost = float(result.n_responses), result.seconds
+        return _of_optimum(result.point, result.stderr, cost)
     if isinstance(result, xr.DataTree) and "posterior" in result.children:
         posterior = result["posterior"]
-        return _Column(_of_draws(posterior), *_cost(posterior.attrs))
+        told = told_elements(stacked_draws(posterior))
+        return _Column(_of_draws(posterior), set(told), *_cost(posterior.attrs))
     if isinstance(result, xr.DataTree) and "optimum" in result.children:
         optimum = result["optimum"]
-        elements = _normal(optimum.data_vars, result["stderr"].data_vars)
-        return _Column(elements, *_cost(optimum.attrs))
+        return _of_optimum(optimum.data_vars, result["stderr"].data_vars, _cost(optimum.attrs))
     raise TypeError(
         f"compare: results: {label}: got {type(result).__name__}, "
         "expected an Optimum or a DataTree with a posterior group"
@@ -180,6 +191,12 @@ def _of_draws(posterior: Any) -> dict[str, _Estimate]:
         lower, upper = np.quantile(x, tails)
         found[element] = _Estimate(float(x.mean()), float(x.std(ddof=1)), lower, upper)
     return found
+
+
+def _of_optimum(
+    point: Mapping[Any, Any], stderr: Mapping[Any, Any], cost: tuple[float, float]
+) -> _Column:
+    return _Column(_normal(point, stderr), set(told_of(point, stderr)), *cost)
 
 
 def _normal(point: Mapping[Any, Any], stderr: Mapping[Any, Any]) -> dict[str, _Estimate]:
@@ -200,13 +217,13 @@ def _cost(attrs: Mapping[Any, Any]) -> tuple[float, float]:
 
 
 def _shared(columns: list[_Column], model: pm.Model | None) -> list[str]:
-    """Return the elements that all results have, of the model's free variables if it is given."""
+    """Return the elements that all results have, of the model's variables if it is given."""
     first = columns[0].elements
     names = [name for name in first if all(name in column.elements for column in columns)]
     if model is None:
         return names
-    free = {rv.name for rv in model.free_RVs}
-    return [name for name in names if name.partition("[")[0] in free]
+    own = {variable.name for variable in model.unobserved_RVs}
+    return [name for name in names if name.partition("[")[0] in own]
 
 
 def _scores(
@@ -238,7 +255,7 @@ def _thetas(evaluator: Evaluator, names: list[str], estimates: Floats) -> Floats
     """Return the estimates as thetas, shape (results, d); None where one lacks an element."""
     values = []
     for rv in evaluator.model.free_RVs:
-        shape = tuple(map(int, rv.shape.eval()))
+        shape = event_shape(rv)
         elements = element_names(str(rv.name), shape)
         if not set(elements) <= set(names):
             return None

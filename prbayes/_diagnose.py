@@ -22,7 +22,12 @@ from prbayes.estimate.goodness import (
 from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, require_of_model
 from prbayes.estimate.refit import SamplingDistribution
-from prbayes.model.elements import finite_draws, single_elements
+from prbayes.model.elements import (
+    finite_draws,
+    single_elements,
+    stacked_draws,
+    told_elements,
+)
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level
 from prbayes.model.node import model_on_context
@@ -300,7 +305,9 @@ def _by_element(statistic: str, posterior: xr.Dataset) -> dict[str, float]:
     stats: Any = import_module("arviz_stats")  # heavy, and partly annotated
     with np.errstate(all="ignore"):  # a variable that never moves
         found = getattr(stats, statistic)(posterior)
-    return single_elements(found.data_vars)
+    every = single_elements(found.data_vars)
+    # Of what is the same in all draws, up to rounding, they are the chains' rounding errors.
+    return {name: every[name] for name in told_elements(stacked_draws(posterior))}
 
 
 def _listed(values: Mapping[str, float], form: str) -> str:

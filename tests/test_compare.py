@@ -51,11 +51,12 @@ def test_compare_sets_optimum_and_posterior_side_by_side(
 ) -> None:
     table = prb.compare({"optimum": optimum, "ABC": idata}, model=model)
     assert list(table["result"].values) == ["optimum", "ABC"]
-    assert list(table["hyperparameter"].values) == ["mean[0]", "mean[1]", "sigma"]
+    names = ["mean[0]", "mean[1]", "sigma", "variance"]
+    assert list(table["hyperparameter"].values) == names
     z = norm.ppf(0.945)
     best = table.sel(result="optimum")
-    estimates = [*optimum.point["mean"], optimum.point["sigma"]]
-    errors = [*optimum.stderr["mean"], optimum.stderr["sigma"]]
+    estimates = [*optimum.point["mean"], optimum.point["sigma"], optimum.point["variance"]]
+    errors = [*optimum.stderr["mean"], optimum.stderr["sigma"], optimum.stderr["variance"]]
     np.testing.assert_allclose(best["estimate"], estimates)
     np.testing.assert_allclose(best["sd"], errors)
     np.testing.assert_allclose(
@@ -66,8 +67,12 @@ def test_compare_sets_optimum_and_posterior_side_by_side(
     abc = table.sel(result="ABC")
     posterior = idata["posterior"]
     draws = np.stack(
-        [*np.moveaxis(posterior["mean"].values, -1, 0), posterior["sigma"].values]
-    ).reshape(3, -1)
+        [
+            *np.moveaxis(posterior["mean"].values, -1, 0),
+            posterior["sigma"].values,
+            posterior["variance"].values,
+        ]
+    ).reshape(4, -1)
     np.testing.assert_allclose(abc["estimate"], draws.mean(axis=1))
     np.testing.assert_allclose(abc["sd"], draws.std(axis=1, ddof=1))
     np.testing.assert_allclose(

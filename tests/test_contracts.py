@@ -22,7 +22,7 @@ import pytest
 from arviz_stats.ecdf_utils import ecdf_pit
 from pymc.distributions.censored import CensoredRV
 from pymc.distributions.distribution import SymbolicRandomVariable
-from pymc.distributions.multivariate import MvNormal
+from pymc.distributions.multivariate import MvNormal, MvStudentT
 from pymc.distributions.shape_utils import change_dist_size
 from pymc.logprob.abstract import _logprob
 from pymc.logprob.utils import CheckParameterValue
@@ -270,6 +270,13 @@ def test_a_multivariate_normal_is_known_by_its_operation() -> None:
     assert isinstance(x.owner.op, type(MvNormal.rv_op))
     mean, covariance = x.owner.op.dist_params(x.owner)
     assert (mean.type.ndim, covariance.type.ndim) == (1, 2)
+
+
+def test_a_multivariate_t_is_known_by_its_operation() -> None:
+    x = pm.MvStudentT.dist(nu=5.0, mu=np.zeros(2), scale=np.eye(2))
+    assert isinstance(x.owner.op, MvStudentT.rv_type)
+    nu, mean, scale = x.owner.op.dist_params(x.owner)
+    assert (nu.type.ndim, mean.type.ndim, scale.type.ndim) == (0, 1, 2)
 
 
 def test_a_censored_distribution_is_known_by_its_operation() -> None:

@@ -453,6 +453,7 @@ INNER = {
     },
     "response.distributions": {
         "pymc.distributions.multivariate.MvNormal",
+        "pymc.distributions.multivariate.MvStudentT",
         "pymc.distributions.shape_utils.change_dist_size",
         "pymc.logprob.utils.CheckParameterValue",
         "pytensor.graph.basic.Variable",

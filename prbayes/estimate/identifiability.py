@@ -71,12 +71,12 @@ _AGREEMENT = 0.35
 _CHANGE = 0.5
 
 
-def identified_by_area(information: Information) -> Floats:
+def identified_by_area(information: Information, weakest: float = 1.0) -> Floats:
     """Return the directions that an area metric identifies, the strongest last, shape (d, r).
 
-    Orthonormal in units of the prior's spread. A direction is not identified if one prior standard
-    deviation along it changes the area by less than half the noise floor, or if two halves of the
-    points do not agree on the change: then it is the points' own error.
+    Orthonormal in units of the prior's spread. A direction is not identified if ``weakest`` prior
+    standard deviations along it change the area by less than half the noise floor, or if two halves
+    of the points do not agree on the change: then it is the points' own error.
     """
     areas = information.areas(*information.data_set)
     gram: Any = 0
@@ -89,7 +89,7 @@ def identified_by_area(information: Information) -> Floats:
     for area in areas:
         changes = np.abs(vectors.T @ _in_prior_sd(area, information))
         change = change + (changes * area.lengths).sum(axis=-1)
-    found = change > _CHANGE * information.noise_floor
+    found = weakest * change > _CHANGE * information.noise_floor
     points = information.node.bound.blocks
     if points.size >= _HALVED:
         found &= _halves_agree(information, vectors)

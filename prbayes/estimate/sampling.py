@@ -130,6 +130,19 @@ class Local:
         covariance[:, hidden] = np.inf
         return np.asarray(covariance)
 
+    def variance(self, gradients: Floats) -> Floats:
+        """Return the variance of functions of theta with gradients (..., d).
+
+        Infinite for those with a share not identified. A function of elements that are not
+        identified may be, such as the standard deviation of an input whose correlation is not.
+        """
+        unit = gradients * self.prior_sd
+        along = unit @ self.identified
+        across = unit @ self.unidentified
+        variance = np.einsum("...i,ij,...j->...", along, self.covariance, along)
+        hidden = (across**2).sum(axis=-1) > _LOADING * (unit**2).sum(axis=-1)
+        return np.asarray(np.where(hidden, np.inf, np.maximum(variance, 0)))
+
 
 def local_sampling(information: list[Information], scales: Floats, weakest: float = 1.0) -> Local:
     """Return the sampling distribution of the minimiser of sum of d_k / scale_k, to first order.
@@ -200,7 +213,7 @@ def _by_data_sets(information: list[Information], scales: Floats, weakest: float
 def _identified(information: Information, weakest: float) -> Floats:
     """Return the directions that one simulator identifies, shape (d, r)."""
     if information.node.metric.minimum is not Minimum.QUADRATIC:
-        return identified_by_area(information)
+        return identified_by_area(information, weakest)
     prior_sd = information.prior_sd
     unit = np.outer(prior_sd, prior_sd)
     hessian = information.hessian * unit

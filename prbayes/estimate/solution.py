@@ -11,8 +11,10 @@ from prbayes.estimate.caveats import no_information
 from prbayes.estimate.differences import cross, slopes
 from prbayes.estimate.optimum import Optimum, plain
 from prbayes.estimate.rivals import Rival
+from prbayes.estimate.sampling import Local
 from prbayes.estimate.search import Run, Search, apart_from_data
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.hyperparameters import THETAS
 from prbayes.model.identity import identity_of
 
 
@@ -21,6 +23,7 @@ def assemble(
     run: Run,
     *,
     covariance: Floats,
+    functions: Local | None = None,
     remark: str,
     screened: int,
     responses_before: int,
@@ -35,6 +38,8 @@ def assemble(
         The last one.
     covariance : ndarray, shape (d, d)
         Sampling covariance in unconstrained space; infinite along what is not identified, or NaN.
+    functions : Local, optional
+        The same by directions, faint ones among them, which tells more of deterministics.
     remark : str
         What is added to the message.
     screened : int
@@ -45,7 +50,7 @@ def assemble(
         Which budget ended the search; no response is computed then.
     """
     evaluator, theta, scales = search.evaluator, run.best, run.scales
-    point, stderr = point_and_stderr(evaluator, theta, covariance)
+    point, stderr = point_and_stderr(evaluator, theta, covariance, functions)
     affordable = not (stopped and evaluator.responses_per_theta)
     nowhere = _nowhere(evaluator, theta, covariance)
     lost = ""
@@ -91,15 +96,43 @@ def assemble(
 
 
 def point_and_stderr(
-    evaluator: Evaluator, theta: Floats, covariance: Floats
+    evaluator: Evaluator, theta: Floats, covariance: Floats, functions: Local | None = None
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return variables and deterministics in the user's units, and their standard errors."""
     # Any small step serves: transforms are smooth.
     step = 1e-4 * evaluator.prior_sd
     values = evaluator.constrained(cross(theta, step))
     point = {name: plain(v[0]) for name, v in values.items()}
-    stderr = {name: plain(_stderr(slopes(v, step), covariance)) for name, v in values.items()}
+    prior = evaluator.constrained(evaluator.prior_thetas(THETAS, seed=0))
+    deterministic = {str(variable.name) for variable in evaluator.model.deterministics}
+    stderr = {}
+    for name, v in values.items():
+        gradients = slopes(v, step)
+        found = _stderr(gradients, covariance)
+        if functions is not None and name in deterministic:
+            found = _of_functions(found, gradients, prior[name], functions)
+        fixed = _same_everywhere(v, prior[name])
+        stderr[name] = plain(np.where(fixed, 0.0, found))
     return point, stderr
+
+
+def _of_functions(stderr: Floats, gradients: Floats, prior: Floats, functions: Local) -> Floats:
+    """Return standard errors, (*shape), of deterministics of elements that are not identified.
+
+    They are if they are known better than by their own prior, of which there are draws,
+    (P, *shape).
+    """
+    found = np.sqrt(functions.variance(gradients))
+    upper, lower = np.quantile(prior, [0.84, 0.16], axis=0)
+    better = np.isinf(stderr) & (found < (upper - lower) / 2)
+    return np.where(better, found, stderr)
+
+
+def _same_everywhere(values: Floats, prior: Floats) -> Any:
+    """Return which elements no hyperparameter changes, as a correlation's diagonal, (*shape)."""
+    both = np.concatenate([values, prior])
+    # Up to rounding, of which a few operations make a few units in the last place.
+    return np.ptp(both, axis=0) <= 1e-12 * np.abs(values[0])
 
 
 def _stderr(gradients: Floats, covariance: Floats) -> Floats:

@@ -43,6 +43,49 @@ def single_elements(values: Mapping[Any, Any]) -> dict[str, float]:
     return {name: float(row[0]) for name, row in split_elements(rows).items()}
 
 
+def told_elements(values: Mapping[Any, Any]) -> list[str]:
+    """Return the elements that a table has, of arrays (n, *shape) by variable.
+
+    Of a symmetric matrix, such as a correlation, each pair once; and no element of a square matrix
+    that is the same everywhere, such as its diagonal, or the zeros of a Cholesky factor.
+    """
+    found = []
+    for name, value in values.items():
+        array = np.asarray(value)
+        told = _told(array)
+        own = split_elements({name: array})
+        found += [element for element, kept in zip(own, told.ravel(), strict=True) if kept]
+    return found
+
+
+def told_of(point: Mapping[Any, Any], stderr: Mapping[Any, Any]) -> list[str]:
+    """Return the same of an optimum, with the standard error of each element."""
+    values = {}
+    for name, value in point.items():
+        at = np.asarray(value)
+        error = np.asarray(stderr[name])
+        # Any number stands for an error that is not known: it is not zero.
+        known = np.where(np.isfinite(error), error, 1.0)
+        values[name] = np.stack([at - known, at + known])
+    return told_elements(values)
+
+
+def _told(array: Floats) -> Any:
+    """Return which elements of arrays (n, *shape) say something of their own, (*shape)."""
+    shape = array.shape[1:]
+    told = np.ones(shape, dtype=bool)
+    if len(shape) != 2 or shape[0] != shape[1] or not len(array):
+        return told
+    size = np.abs(array).max(axis=0)
+    # Up to rounding, of which a few operations make a few units in the last place.
+    rounding = 1e-12 * size
+    fixed = np.ptp(array, axis=0) <= rounding
+    if fixed.all():  # nothing moved: that is to be seen
+        return told
+    symmetric = np.abs(array - array.swapaxes(1, 2)) <= rounding
+    return np.triu(~fixed) if symmetric.all() else ~fixed
+
+
 def finite_draws(posterior: Any, names: Sequence[str]) -> dict[str, Floats]:
     """Return the draws of free variables, by which populations are known.
 

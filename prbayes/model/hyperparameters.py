@@ -18,7 +18,7 @@ from pytensor.graph.replace import graph_replace, vectorize_graph
 from prbayes._checks import Floats, called, real_array, refuse_single_precision
 from prbayes.model.elements import element_names
 from prbayes.propagation.points import sobol
-from prbayes.response.compilation import compiled, ninf_for_invalid
+from prbayes.response.compilation import compiled, interpreted, ninf_for_invalid
 from prbayes.response.distributions import PriorPoints, PriorSampler
 from prbayes.response.inputs import event_shape
 
@@ -60,7 +60,8 @@ class Hyperparameters:
             )
         for v in model.value_vars:
             refuse_single_precision(f"model: {v.name}", v.dtype)
-        self._point = model.initial_point(random_seed=0)
+        with interpreted():
+            self._point = model.initial_point(random_seed=0)
         values = [self._point[v.name] for v in model.value_vars]
         names = [str(v.name) for v in model.value_vars]
         shapes = [np.shape(value) for value in values]
@@ -129,6 +130,9 @@ class Hyperparameters:
     def constrained(self, thetas: Floats) -> dict[str, Floats]:
         """Return variables and deterministics, shapes (P, *shape), in the user's own units."""
         size = len(thetas)
+        if not size:  # PyTensor has no transform of nothing for matrices
+            one = self.constrained(self.initial[None])
+            return {name: value[:0] for name, value in one.items()}
         values = self._constrain(np.ascontiguousarray(thetas))
         found = {}
         for variable, value in zip(self.model.unobserved_RVs, values, strict=True):
@@ -158,7 +162,7 @@ class Hyperparameters:
         draws = []
         for name, rv in free.items():
             value = real_array(point[name], f"start: {name}")
-            shape = tuple(map(int, rv.shape.eval()))
+            shape = event_shape(rv)
             if value.shape not in ((), shape):
                 raise ValueError(f"start: {name}: got shape {value.shape}, expected {shape}")
             draws.append(np.broadcast_to(value, shape)[None])

@@ -24,6 +24,7 @@ from prbayes._checks import Floats
 from prbayes.model.description import describe, fits_attribute, without_addresses
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node, nodes
+from prbayes.response.compilation import interpreted
 
 
 class Level(IntEnum):
@@ -174,7 +175,8 @@ def identity_of_model(model: pm.Model) -> Identity:
         value = model.rvs_to_values[rv]
         shapes[str(value.name)] = value.type.shape
     if any(None in shape for shape in shapes.values()):
-        point = model.initial_point(random_seed=0)
+        with interpreted():
+            point = model.initial_point(random_seed=0)
         shapes = {name: np.shape(point[name]) for name in shapes}
     return _identity(model, simulators, shapes=shapes)
 

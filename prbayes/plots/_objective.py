@@ -8,7 +8,7 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
-from prbayes.model.elements import split_elements
+from prbayes.model.elements import split_elements, told_of
 from prbayes.model.evaluator import Evaluator
 
 # What a reader calls a metric of the package; any other one goes by the name of its class.
@@ -51,3 +51,10 @@ def free_elements(evaluator: Evaluator, thetas: Floats) -> dict[str, Floats]:
     values = evaluator.constrained(thetas)
     names = [str(rv.name) for rv in evaluator.model.free_RVs]
     return split_elements({name: values[name] for name in names})
+
+
+def free_names(optimum: Optimum) -> list[str]:
+    """Return the names of the same, without what is the same everywhere, as zeros of a factor."""
+    names = [str(rv.name) for rv in optimum.model.free_RVs]
+    point, stderr = optimum.point, optimum.stderr
+    return told_of({n: point[n] for n in names}, {n: stderr[n] for n in names})

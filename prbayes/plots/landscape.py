@@ -16,7 +16,7 @@ from prbayes.model.turns import in_turn
 from prbayes.plots._canvas import BLUE, CROSS, DIAMOND, INK, VERMILION, Canvas, Panel, refuse_look
 from prbayes.plots._grid import Landscape, landscape, rooted
 from prbayes.plots._names import named
-from prbayes.plots._objective import check_optimum, free_elements, objective_label
+from prbayes.plots._objective import check_optimum, free_names, objective_label
 
 # Points along each axis, by the number of hyperparameters: contours of 41 look smooth, and as many
 # evaluations are drawn in about a second; a curve can have more. By judgement.
@@ -93,7 +93,7 @@ def plot_landscape(
     positive_integer(responses, "responses", minimum=0)
     check_optimum(optimum, "plot_landscape")
     evaluator = _evaluator_of(optimum, model)
-    known = list(free_elements(optimum.evaluator, optimum.theta[None]))
+    known = free_names(optimum)
     names = _chosen(pair, known)
     if points is None:
         points = _ALONG_AXIS[len(names)]

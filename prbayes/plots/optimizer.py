@@ -11,7 +11,13 @@ from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
 from prbayes.plots._canvas import BLUE, DASHED, GREY, VERMILION, Canvas, Panel, refuse_look
 from prbayes.plots._names import named
-from prbayes.plots._objective import check_optimum, free_elements, objective, objective_label
+from prbayes.plots._objective import (
+    check_optimum,
+    free_elements,
+    free_names,
+    objective,
+    objective_label,
+)
 from prbayes.plots._ticks import log_ticks, spans_decades
 
 
@@ -68,12 +74,14 @@ def plot_optimizer(
     check_optimum(optimum, "plot_optimizer")
     path = free_elements(optimum.evaluator, optimum.trace["theta"])
     final = free_elements(optimum.evaluator, optimum.theta[None])
-    names = ["discrepancy", *path]
+    hyperparameters = free_names(optimum)
+    names = ["discrepancy", *hyperparameters]
     canvas = Canvas(names, size=(4.6, 3.4), backend=backend, pc_kwargs=pc_kwargs)
     evaluations = optimum.trace["evaluations"].astype(np.float64)
     _draw_objective(canvas.panel("discrepancy"), optimum, evaluations)
     ends = evaluations[[0, -1]]
-    for name, values in path.items():
+    for name in hyperparameters:
+        values = path[name]
         panel = canvas.panel(name)
         at = np.repeat(final[name], 2)
         panel.line("path", evaluations, values, GREY, width=0.8)

@@ -13,7 +13,12 @@ from scipy.stats import norm
 
 from prbayes._checks import Floats, share
 from prbayes.estimate.optimum import Optimum, identity_in, require_of_model
-from prbayes.model.elements import single_elements, split_elements, stacked_draws
+from prbayes.model.elements import (
+    single_elements,
+    split_elements,
+    stacked_draws,
+    told_elements,
+)
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level, require_together
 from prbayes.plots._canvas import (
@@ -29,7 +34,6 @@ from prbayes.plots._canvas import (
 )
 from prbayes.plots._curves import bounded_density, central_levels
 from prbayes.plots._names import named
-from prbayes.plots._objective import free_elements
 from prbayes.plots._ticks import round_ticks
 
 
@@ -56,8 +60,8 @@ def plot_posterior(
     optimum : Optimum, optional
         From `minimize`.
     model : pymc.Model, optional
-        Restricts the picture to the model's free variables and adds their prior; by default all
-        variables that posterior and optimum share.
+        Restricts the picture to the model's variables, its deterministics among them, and adds
+        their prior; by default all variables that posterior and optimum share.
     level : float
         Probability of the intervals.
     labels : mapping, optional
@@ -151,8 +155,9 @@ def _read_hyperparameters(
     posterior: xr.DataTree, optimum: Optimum | None, model: pm.Model | None
 ) -> dict[str, _Hyperparameter]:
     """Return by element what posterior, optimum and model share."""
-    draws = split_elements(stacked_draws(posterior["posterior"]))
-    shared = {name for name, x in draws.items() if np.ptp(x) > 0}
+    stacked = stacked_draws(posterior["posterior"])
+    draws = split_elements(stacked)
+    shared = {name for name in told_elements(stacked) if np.ptp(draws[name]) > 0}
 
     best, errors = {}, {}
     if optimum is not None:
@@ -164,7 +169,7 @@ def _read_hyperparameters(
         evaluator = Evaluator(model)
         # So many tell a normal density's peak within 2%.
         thetas = evaluator.prior_thetas(4000, 0)
-        prior = free_elements(evaluator, thetas)
+        prior = split_elements(evaluator.constrained(thetas))
         shared &= set(prior)
 
     found = {}

@@ -24,7 +24,12 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._checks import Floats, flag, positive_number
 from prbayes.metrics.base import Discrepancy
 from prbayes.response.compilation import compile_batched
-from prbayes.response.distributions import PopulationSampler, prior_draws, valid
+from prbayes.response.distributions import (
+    PopulationSampler,
+    prior_draws,
+    refuse_lopsided,
+    valid,
+)
 from prbayes.response.executors import refuse_timeout
 from prbayes.response.failures import Abort, OnFailure, ResponseError
 from prbayes.response.inputs import Inputs
@@ -247,6 +252,7 @@ class Bound(ABC):
 
     def valid_only(self, params: Sequence[Floats]) -> list[Floats]:
         """Leave out the roots that give no valid distributions, or raise if none does."""
+        refuse_lopsided(self.name, self.inputs, params)
         ok = self.valid(params)
         if not ok.any():
             names = ", ".join(str(r.name) for r in self.inputs.roots)

@@ -20,7 +20,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats
 from prbayes.response.compilation import compile_batched, with_leading_axis
-from prbayes.response.distributions import is_mvnormal
+from prbayes.response.distributions import is_elliptical
 from prbayes.response.inputs import Inputs
 
 # Probability of a cell below which it is the density at the point times the width: the difference
@@ -68,7 +68,7 @@ def moving_inputs(
     given = with_leading_axis(inputs.aleatory)
     outside = []
     for dist, x in zip(dists, given, strict=True):
-        everywhere_positive = is_mvnormal(dist)
+        everywhere_positive = is_elliptical(dist)
         log = pt.zeros(x.shape[0]) if everywhere_positive else pm.logp(dist, x, warn_rvs=False)
         outside.append(pt.isneginf(log))
     compiled = compile_batched(symbols, outside, given)

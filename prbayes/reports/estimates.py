@@ -11,7 +11,13 @@ import numpy as np
 import xarray as xr
 
 from prbayes._weighted import INTERVAL
-from prbayes.model.elements import single_elements, split_elements, stacked_draws
+from prbayes.model.elements import (
+    single_elements,
+    split_elements,
+    stacked_draws,
+    told_elements,
+    told_of,
+)
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import NOTHING, alike, counted, number, places
 from prbayes.reports.section import Section
@@ -37,8 +43,8 @@ def _optimum_rows(tree: xr.DataTree) -> list[dict[str, Any]]:
     point = single_elements(tree["optimum"].data_vars)
     stderr = single_elements(tree["stderr"].data_vars)
     rows = []
-    for name, value in point.items():
-        estimate, error = alike((value, stderr[name]), stderr[name])
+    for name in told_of(tree["optimum"].data_vars, tree["stderr"].data_vars):
+        estimate, error = alike((point[name], stderr[name]), stderr[name])
         rows.append({"hyperparameter": name, "estimate": estimate, "standard error": error})
     return rows
 
@@ -86,10 +92,14 @@ def _posterior_rows(tree: xr.DataTree) -> list[dict[str, Any]]:
     with np.errstate(all="ignore"):  # a variable that never moves
         table = arviz.summary(tree, kind="all", ci_prob=INTERVAL, ci_kind="eti", round_to="none")
     # ArviZ names elements by their coordinates; all else in a report does by their place.
-    names = list(split_elements(stacked_draws(tree["posterior"])))
+    draws = stacked_draws(tree["posterior"])
+    names = list(split_elements(draws))
+    told = told_elements(draws)
     percent = f"{100 * INTERVAL:.0f}"
     rows = []
     for name, (_, found) in zip(names, table.iterrows(), strict=True):
+        if name not in told:
+            continue
         in_units = [found[k] for k in ("mean", "sd", f"eti{percent}_lb", f"eti{percent}_ub")]
         mean, sd, lower, upper = alike(in_units, float(found["sd"]))
         rows.append(

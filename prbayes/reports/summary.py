@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
+
 import numpy as np
 
-from prbayes.model.elements import single_elements, split_elements, stacked_draws
+from prbayes.model.elements import (
+    single_elements,
+    split_elements,
+    stacked_draws,
+    told_elements,
+    told_of,
+)
 from prbayes.plots._objective import METRIC_LABELS
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import counted, number, percentage, plus_minus
@@ -96,18 +104,31 @@ def _estimates(m: Material, label: str) -> dict[str, tuple[float, float]]:
     """Return estimate and spread of each element of the hyperparameters, by a result."""
     found: dict[str, tuple[float, float]] = {}
     if label in m.posteriors:
-        draws = split_elements(stacked_draws(m.posteriors[label]["posterior"]))
-        for name, values in draws.items():
-            mean, sd = values.mean(), values.std(ddof=1)
+        stacked = stacked_draws(m.posteriors[label]["posterior"])
+        draws = split_elements(stacked)
+        for name in told_elements(stacked):
+            mean, sd = draws[name].mean(), draws[name].std(ddof=1)
             found[name] = (float(mean), float(sd))
     else:
         tree = m.optima[label]
         point = single_elements(tree["optimum"].data_vars)
         stderr = single_elements(tree["stderr"].data_vars)
-        for name, value in point.items():
-            found[name] = (value, stderr[name])
-    known = m.hyperparameters
+        for name in told_of(tree["optimum"].data_vars, tree["stderr"].data_vars):
+            found[name] = (point[name], stderr[name])
+    known = _read(m.hyperparameters, {name.partition("[")[0] for name in found})
     return {name: pair for name, pair in found.items() if name.partition("[")[0] in known}
+
+
+def _read(hyperparameters: Sequence[str], among: Collection[str]) -> list[str]:
+    """Return the variables that are read for hyperparameters.
+
+    For a `pymc.LKJCholeskyCov`, a packed factor, its standard deviations and correlations.
+    """
+    read = []
+    for name in hyperparameters:
+        instead = [f"{name}_stds", f"{name}_corr"]
+        read += instead if set(instead) <= set(among) else [name]
+    return read
 
 
 def _agreement(m: Material) -> str:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Hashable, Sequence
-from threading import Lock
+from collections.abc import Hashable, Iterator, Sequence
+from contextlib import contextmanager
+from threading import Lock, RLock
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,19 @@ _LARGEST = 1 << 16  # bytes of constants
 
 _known: OrderedDict[Hashable, Any] = OrderedDict()
 _lock = Lock()
+_flags = RLock()
+
+
+@contextmanager
+def interpreted() -> Iterator[None]:
+    """Compile what is inside without a C++ compiler, loops of PyTensor's too.
+
+    It calls one for the inside of a loop, whatever the mode: ten seconds for a prior of
+    correlations, and a warning where there is no BLAS to link to.
+    """
+    # The flag is one for all threads: each has to find it as it was.
+    with _flags, pytensor.config.change_flags(cxx=""):
+        yield
 
 
 class _NotKeptError(Exception):
@@ -69,13 +83,14 @@ def _function(
     outputs: Sequence[TensorVariable],
     allow_input_downcast: bool | None,
 ) -> Any:
-    return pytensor.function(
-        list(inputs),
-        list(outputs),
-        mode=PLAIN,
-        on_unused_input="ignore",
-        allow_input_downcast=allow_input_downcast,
-    )
+    with interpreted():
+        return pytensor.function(
+            list(inputs),
+            list(outputs),
+            mode=PLAIN,
+            on_unused_input="ignore",
+            allow_input_downcast=allow_input_downcast,
+        )
 
 
 def _structure(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
-from pymc.distributions.multivariate import MvNormal
+from pymc.distributions.multivariate import MvNormal, MvStudentT
 from pymc.distributions.shape_utils import change_dist_size
 from pytensor.graph.basic import Variable
 from pytensor.graph.replace import graph_replace, vectorize_graph
@@ -19,7 +19,12 @@ from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats
-from prbayes.response.compilation import PLAIN, compile_batched, with_leading_axis
+from prbayes.response.compilation import (
+    PLAIN,
+    compile_batched,
+    interpreted,
+    with_leading_axis,
+)
 from prbayes.response.inputs import Inputs, event_shape, is_random
 
 
@@ -38,8 +43,8 @@ def log_density(
     for i, (dist, x, shape) in enumerate(triples):
         if instead and i in instead:
             logp = instead[i](dist, x)
-        elif is_mvnormal(dist):
-            logp = _mvnormal_logp(dist, x, shape[0])
+        elif is_elliptical(dist):
+            logp = _elliptical_logp(dist, x, shape[-1])
         else:
             logp = pm.logp(dist, x, warn_rvs=False)
         # Elements of a vector of independent inputs.
@@ -54,22 +59,67 @@ def is_mvnormal(dist: TensorVariable) -> bool:
     return isinstance(dist.owner.op, type(MvNormal.rv_op))
 
 
-def _mvnormal_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
+def is_elliptical(dist: TensorVariable) -> bool:
+    """Whether a distribution is a multivariate normal or Student's t: positive everywhere."""
+    return is_mvnormal(dist) or isinstance(dist.owner.op, MvStudentT.rv_type)
+
+
+def _elliptical_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
     """Return log p(x) by forward substitution, elementwise.
 
     PyMC's own density solves once for each theta and point of a batch.
     """
-    mean, covariance = dist.owner.op.dist_params(dist.owner)
+    *freedom, mean, covariance = dist.owner.op.dist_params(dist.owner)
     root = pt.linalg.cholesky(covariance, on_error="nan")
     # Solve root z = x - mean.
     z: list[Any] = []
     for i in range(size):
-        above = sum(root[i, j] * z[j] for j in range(i))
-        z.append((x[..., i] - mean[i] - above) / root[i, i])
+        above = sum(root[..., i, j] * z[j] for j in range(i))
+        z.append((x[..., i] - mean[..., i] - above) / root[..., i, i])
     logp: Any = 0
-    for i, z_i in enumerate(z):
-        logp = logp + (-0.5 * z_i**2 - pt.log(root[i, i]) - 0.5 * np.log(2 * np.pi))
+    if freedom:
+        logp = _studentt_logp(freedom[0], z)
+        for i in range(size):
+            logp = logp - pt.log(root[..., i, i])
+    else:
+        for i, z_i in enumerate(z):
+            logp = logp + (-0.5 * z_i**2 - pt.log(root[..., i, i]) - 0.5 * np.log(2 * np.pi))
     return pt.switch(pt.isnan(logp), -np.inf, logp)
+
+
+def _studentt_logp(nu: Any, z: Sequence[Any]) -> Any:
+    """Return the log-density of Student's t with a unit matrix, at coordinates z."""
+    size = len(z)
+    distance = sum(z_i**2 for z_i in z)
+    norm = pt.gammaln((nu + size) / 2) - pt.gammaln(nu / 2) - 0.5 * size * pt.log(nu * np.pi)
+    logp = norm - (nu + size) / 2 * pt.log1p(distance / nu)
+    return pt.switch(nu > 0, logp, -np.inf)
+
+
+def refuse_lopsided(name: str, inputs: Inputs, params: Sequence[Floats]) -> None:
+    """Raise if a covariance is not symmetric, at values of the roots, (k, *shape).
+
+    Its density and its draws read one half of the matrix, as if the other were alike.
+    """
+    symbols = inputs.placeholders()
+    dists, _ = inputs.rebuilt(symbols)
+    covariances = []
+    for dist in filter(is_elliptical, dists):
+        *_, covariance = dist.owner.op.dist_params(dist.owner)
+        covariances.append(covariance)
+    if not covariances:
+        return
+    for covariance in compile_batched(symbols, covariances)(*params):
+        mirrored = np.swapaxes(covariance, -1, -2)
+        gap = np.abs(covariance - mirrored)
+        size = np.abs(covariance).max(axis=(-2, -1), keepdims=True)
+        # Products of the same numbers in another order differ by rounding, 1e-16 of them.
+        if np.any(gap > 1e-8 * size):
+            raise ValueError(
+                f"{name}: got an input whose covariance is not symmetric, expected a covariance "
+                "matrix; pm.LKJCorr is no correlation matrix but its Cholesky factor L: "
+                "pass chol=sds[:, None] * L instead of cov="
+            )
 
 
 def quantiles(name: str, dist: TensorVariable, u: Any) -> TensorVariable:
@@ -118,7 +168,7 @@ def refuse_without_density(name: str, inputs: Inputs) -> None:
     # With symbols for the roots: a sum of two random variables has no density that PyMC knows.
     dists, _ = inputs.rebuilt(inputs.placeholders())
     for dist in dists:
-        if not is_mvnormal(dist) and _density(dist) is None:
+        if not is_elliptical(dist) and _density(dist) is None:
             raise TypeError(
                 f"{name}: got {dist.owner.op}, of which PyMC has no density, expected one that it "
                 "has, since responses are stored and weighed by it; give a pm.CustomDist its "
@@ -168,11 +218,13 @@ class PriorSampler:
                 if not any(a in roots for a in ancestors([root]) if a is not root):
                     batches[root] = change_dist_size(root, (n,), expand=True)
             outputs = vectorize_graph(list(roots), batches)
-            self._function = pm.compile([n], outputs, mode=PLAIN)
+            with interpreted():
+                self._function = pm.compile([n], outputs, mode=PLAIN)
             self._batched = True
         except (NotImplementedError, ValueError, MissingInputError):
             # Not vectorized, or not resized: one draw at a time.
-            self._function = pm.compile([n], list(roots), mode=PLAIN, on_unused_input="ignore")
+            with interpreted():
+                self._function = pm.compile([n], list(roots), mode=PLAIN, on_unused_input="ignore")
             self._batched = False
         self._generators = _generators(self._function)
 
@@ -259,13 +311,14 @@ class PopulationSampler:
             common = epistemic
         self._event_shapes = inputs.event_shapes
         self._epistemic_ndims = [e.type.ndim for e in epistemic]
-        self._function = pm.compile(
-            [n, *batched],
-            [*specimens, *common],
-            mode=PLAIN,
-            on_unused_input="ignore",
-            allow_input_downcast=True,
-        )
+        with interpreted():
+            self._function = pm.compile(
+                [n, *batched],
+                [*specimens, *common],
+                mode=PLAIN,
+                on_unused_input="ignore",
+                allow_input_downcast=True,
+            )
         self._generators = _generators(self._function)
 
     def __call__(

@@ -17,7 +17,7 @@ from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import real_array
-from prbayes.response.compilation import PLAIN
+from prbayes.response.compilation import PLAIN, interpreted
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,4 +235,6 @@ def event_shape(dist: TensorVariable) -> tuple[int, ...]:
     shape = dist.type.shape
     if None not in shape:
         return tuple(int(s) for s in shape if s is not None)
-    return tuple(int(s) for s in pm.draw(dist, random_seed=0, mode=PLAIN).shape)
+    with interpreted():
+        drawn = pm.draw(dist, random_seed=0, mode=PLAIN)
+    return tuple(int(s) for s in drawn.shape)

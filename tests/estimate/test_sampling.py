@@ -138,3 +138,19 @@ def test_of_a_sum_of_two_means_only_the_sum_is_identified(metric: prb.Metric) ->
     # The sum has the standard error of a mean.
     variance_of_sum = local.covariance[0, 0] * (sd @ sd)
     assert variance_of_sum == pytest.approx(SPREAD**2 / N, rel=0.02 if metric is KL else 0.6)
+
+
+def test_the_variance_of_functions_agrees_with_that_of_elements() -> None:
+    prior_sd = np.array([2.0, 0.5])
+    covariance = np.array([[0.04, 0.01], [0.01, 0.09]])
+    local = Local(prior_sd, np.eye(2), np.empty((2, 0)), covariance)
+    gradients = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, -2.0], [0.0, 0.0]])
+    expected = np.einsum("ki,ij,kj->k", gradients, local.in_theta, gradients)
+    np.testing.assert_allclose(local.variance(gradients), expected)
+
+
+def test_the_variance_of_a_function_across_what_is_identified_is_infinite() -> None:
+    direction = np.array([[0.6], [0.8]])
+    local = Local(np.ones(2), direction, np.array([[-0.8], [0.6]]), np.array([[0.25]]))
+    found = local.variance(np.array([[0.6, 0.8], [1.0, 0.0], [-0.8, 0.6]]))
+    np.testing.assert_allclose(found, [0.25, np.inf, np.inf])

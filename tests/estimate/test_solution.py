@@ -7,8 +7,9 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
+from prbayes.estimate.sampling import Local
 from prbayes.estimate.search import apart_from_data
-from prbayes.estimate.solution import _stderr
+from prbayes.estimate.solution import _stderr, point_and_stderr
 from prbayes.model.evaluator import Evaluator
 
 COVARIANCE = np.array([[4.0, 1.0], [1.0, 9.0]])
@@ -28,6 +29,35 @@ def test_what_depends_on_an_element_that_is_not_identified_is_infinite() -> None
 
 def test_nothing_known_is_nan() -> None:
     assert np.isnan(_stderr(np.ones((1, 2)), np.full((2, 2), np.nan))).all()
+
+
+def _factor() -> Evaluator:
+    """Return a model of a Cholesky factor with elements a and b, and what is read off it."""
+    with pm.Model() as model:
+        a, b = pm.Normal("a"), pm.Normal("b")
+        pm.Deterministic("length", pm.math.sqrt(a**2 + b**2))
+        pm.Deterministic("angle", pm.math.stack([1.0 + 0 * a, a / b]))
+        x = pm.Normal.dist(a, pm.math.exp(b))
+        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 1.0])
+    return Evaluator(model)
+
+
+def test_a_function_of_what_is_not_identified_may_be_identified() -> None:
+    evaluator = _factor()
+    unit = evaluator.prior_sd
+    theta = np.array([3.0, 4.0])
+    # The length is known, to a tenth, and the place on the circle is not.
+    outwards = theta / unit / np.linalg.norm(theta / unit)
+    on_circle = np.array([-4.0, 3.0]) / unit
+    on_circle /= np.linalg.norm(on_circle)
+    outwards -= (outwards @ on_circle) * on_circle
+    outwards /= np.linalg.norm(outwards)
+    local = Local(unit, outwards[:, None], on_circle[:, None], np.array([[0.01]]))
+    _, stderr = point_and_stderr(evaluator, theta, local.in_theta, local)
+    assert np.isinf([stderr["a"], stderr["b"]]).all()
+    along = (theta / 5 * unit) @ outwards
+    assert stderr["length"] == pytest.approx(0.1 * abs(along), rel=1e-3)
+    np.testing.assert_array_equal(stderr["angle"], [0.0, np.inf])  # one is the same everywhere
 
 
 def _normal(metric: prb.Metric, propagation: Any) -> pm.Model:

@@ -11,6 +11,8 @@ from prbayes.model.elements import (
     single_elements,
     split_elements,
     stacked_draws,
+    told_elements,
+    told_of,
 )
 
 
@@ -59,3 +61,36 @@ def test_draws_that_are_no_numbers_are_refused(value: float) -> None:
     assert list(finite_draws(group, ["mu"])) == ["mu"]
     with pytest.raises(ValueError, match=r"posterior: w: got NaN or infinite values in 1 of 6 dra"):
         finite_draws(group, ["mu", "w"])
+
+
+def correlations(size: int) -> np.ndarray:
+    """Return correlation matrices of three variables, shape (size, 3, 3), with rounding errors."""
+    factors = np.random.default_rng(0).normal(size=(size, 3, 3))
+    factors /= np.sqrt((factors**2).sum(axis=-1, keepdims=True))
+    return factors @ factors.swapaxes(1, 2)
+
+
+def test_of_a_correlation_each_pair_is_told_once_and_no_diagonal() -> None:
+    values = {"mu": np.zeros((50, 2)), "r": correlations(50)}
+    assert told_elements(values) == ["mu[0]", "mu[1]", "r[0,1]", "r[0,2]", "r[1,2]"]
+
+
+def test_of_a_cholesky_factor_no_zeros_are_told() -> None:
+    factors = np.linalg.cholesky(correlations(50))
+    told = ["l[1,0]", "l[1,1]", "l[2,0]", "l[2,1]", "l[2,2]"]
+    assert told_elements({"l": factors}) == told
+
+
+def test_matrices_of_other_kinds_are_told_as_they_are() -> None:
+    draws = np.random.default_rng(0).normal(size=(50, 2, 2))
+    assert len(told_elements({"any": draws})) == 4
+    assert len(told_elements({"oblong": draws.reshape(25, 2, 4)})) == 8
+    stuck = np.broadcast_to([[1.0, 0.5], [0.5, 1.0]], (50, 2, 2))
+    assert len(told_elements({"stuck": stuck})) == 4  # chains that never moved are to be seen
+
+
+@pytest.mark.parametrize("error", [0.1, np.inf, np.nan])
+def test_of_an_optimum_the_standard_errors_tell_what_is_constant(error: float) -> None:
+    point = {"r": np.array([[1.0, 0.5], [0.5, 1.0]]), "mu": 2.0}
+    stderr = {"r": np.array([[0.0, error], [error, 0.0]]), "mu": 0.0}
+    assert told_of(point, stderr) == ["r[0,1]", "mu"]

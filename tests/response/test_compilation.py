@@ -23,6 +23,7 @@ from prbayes.response.compilation import (
     ninf_for_invalid,
     with_leading_axis,
 )
+from prbayes.response.distributions import PriorSampler
 
 
 def test_a_batch_gives_what_single_calls_do() -> None:
@@ -183,3 +184,29 @@ def test_a_model_that_is_built_again_has_its_functions(compilations: list[Any]) 
     assert log_prior(0.0) == first == pytest.approx(-0.5 * np.log(2 * np.pi))
     assert len(compilations) - before < before / 2
     assert log_prior(1.0) == pytest.approx(first - 0.5)
+
+
+def test_no_compiler_is_called_for_a_prior_of_correlations(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("C++ was to be compiled")
+
+    monkeypatch.setattr("pytensor.link.c.cmodule.ModuleCache.module_from_key", refuse)
+    before = pytensor.config.cxx
+    with pm.Model() as model:
+        deviations = pm.HalfNormal.dist(1.0, shape=3)
+        pm.LKJCholeskyCov("chol", n=3, eta=2, sd_dist=deviations)
+    (packed,) = PriorSampler(model.free_RVs)(4, 0)
+    assert packed.shape == (4, 6)
+    assert pytensor.config.cxx == before
+
+
+def test_threads_leave_the_compiler_as_they_found_it() -> None:
+    before = pytensor.config.cxx
+
+    def compile_one(k: int) -> float:
+        x = pt.dscalar("x")
+        return float(compiled([x], [x + k + 0.125])(1.0)[0])
+
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(compile_one, range(8))) == [k + 1.125 for k in range(8)]
+    assert pytensor.config.cxx == before

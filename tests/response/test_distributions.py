@@ -20,6 +20,7 @@ from prbayes.response.distributions import (
     log_density,
     prior_draws,
     quantiles,
+    refuse_lopsided,
     refuse_without_density,
     valid,
 )
@@ -54,6 +55,27 @@ def test_log_densities_are_summed_over_the_inputs_and_their_elements() -> None:
         np.testing.assert_allclose(row, expected, rtol=1e-12)
 
 
+def test_densities_of_correlated_inputs_agree_with_others() -> None:
+    scale = pt.constant(COVARIANCE)
+    inputs, _ = inputs_of(
+        lambda mu, sigma: [
+            pm.MvStudentT.dist(nu=sigma, mu=pt.stack([mu, 0.5]), scale=scale),
+            pm.MvNormal.dist(pt.stack([mu, 0.5]), scale, shape=(3, 2)),
+        ]
+    )
+    rng = np.random.default_rng(1)
+    values = [rng.normal(size=(5, 2)), rng.normal(size=(5, 3, 2))]
+    symbols = inputs.placeholders()
+    graph = log_density(inputs, inputs.rebuilt(symbols)[0], [pt.constant(v) for v in values])
+    at = {"mu": np.array([2.0, -1.0]), "sigma": np.array([4.0, -1.0])}
+    (found,) = compile_batched(symbols, [graph])(*[at[str(symbol.name)] for symbol in symbols])
+    expected = stats.multivariate_t([2.0, 0.5], COVARIANCE, df=4.0).logpdf(values[0])
+    normal = stats.multivariate_normal([2.0, 0.5], COVARIANCE)
+    expected = expected + normal.logpdf(values[1]).sum(axis=1)
+    np.testing.assert_allclose(found[0], expected, rtol=1e-12)
+    assert np.isneginf(found[1]).all()  # no degrees of freedom below zero
+
+
 def test_an_impossible_covariance_has_no_density() -> None:
     inputs, _ = inputs_of(
         lambda mu, sigma: [pm.MvNormal.dist(np.zeros(2), pt.stacklists([[1.0, mu], [mu, 1.0]]))]
@@ -62,6 +84,17 @@ def test_an_impossible_covariance_has_no_density() -> None:
     graph = log_density(inputs, inputs.rebuilt(symbols)[0], [pt.constant(np.zeros((1, 2)))])
     (found,) = compile_batched(symbols, [graph])(np.array([0.5, 1.5]))
     assert list(np.isneginf(found[:, 0])) == [False, True]
+
+
+def test_a_covariance_that_is_not_symmetric_is_refused() -> None:
+    def lopsided(mu: Any, sigma: Any) -> list[Any]:
+        return [pm.MvNormal.dist(np.zeros(2), pt.stacklists([[1.0, mu], [0.0, sigma]]))]
+
+    inputs, _ = inputs_of(lopsided)
+    refuse_lopsided("y", inputs, [np.zeros(3), np.ones(3)])
+    refuse_lopsided("y", inputs, [np.full(3, np.nan), np.ones(3)])  # what is invalid is no matrix
+    with pytest.raises(ValueError, match=r"y: got an input whose .* not symmetric, .*LKJCorr"):
+        refuse_lopsided("y", inputs, [np.array([0.0, 0.1, 0.0]), np.ones(3)])
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,188 @@
+"""Correlated inputs: standard deviations and correlation, with standard errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+from scipy import stats
+
+import prbayes as prb
+from prbayes._checks import Floats
+from prbayes.estimate.data_sets import DataSets
+from prbayes.estimate.refit import SamplingDistribution
+from prbayes.estimate.solution import point_and_stderr
+from prbayes.model.evaluator import Evaluator
+
+MEAN = np.array([1.0, 2.0])
+SDS = np.array([1.0, 0.7])
+RHO = 0.6
+COVARIANCE = np.outer(SDS, SDS) * np.array([[1.0, RHO], [RHO, 1.0]])
+N = 50
+# What is measured, each of specimens of its own: y = a @ x.
+MIXED = {"sum": (1.0, 1.0), "difference": (1.0, -1.0), "first": (1.0, 0.0), "second": (0.0, 1.0)}
+
+# Of these three are enough.
+ENOUGH = {name: MIXED[name] for name in ("sum", "first", "second")}
+
+
+def response(a: tuple[float, float]) -> Callable[[Any], Any]:
+    return lambda x: x[..., 0] * a[0] + x[..., 1] * a[1]
+
+
+def population(a: tuple[float, float]) -> Any:
+    """Return the exact distribution of a response."""
+    return stats.norm(MEAN @ a, np.sqrt(np.array(a) @ COVARIANCE @ a))
+
+
+def by_factor(mean: Any, width: float) -> Any:
+    deviations = pm.HalfNormal.dist(width, shape=2)
+    chol, _, _ = pm.LKJCholeskyCov("chol", n=2, eta=2, sd_dist=deviations)
+    return pm.MvNormal.dist(mean, chol=chol)
+
+
+def model_of(
+    measured: dict[str, tuple[float, float]],
+    metric: prb.Metric,
+    *,
+    width: float = 1.0,
+    **keywords: Any,
+) -> pm.Model:
+    """Return a model of data at the quantiles of the truth, which it fits best."""
+    levels = (np.arange(N) + 0.5) / N
+    with pm.Model() as model:
+        x = by_factor(pm.Normal("mean", MEAN, width, shape=2), width)
+        for name, a in measured.items():
+            observed = population(a).ppf(levels)
+            propagation = prb.Reweighted(**keywords)
+            prb.Simulator(
+                name, response(a), x, metric=metric, observed=observed, propagation=propagation
+            )
+    return model
+
+
+def theta_of_truth(evaluator: Evaluator) -> Floats:
+    factor = np.linalg.cholesky(COVARIANCE)
+    return evaluator.unconstrained({"mean": MEAN, "chol": factor[np.tril_indices(2)]})
+
+
+def exact_errors() -> tuple[Floats, float]:
+    """Return the standard errors of sds and correlation by maximum likelihood, from Fisher's."""
+    information = np.zeros((3, 3))
+    first, second = SDS
+    for a, b in ENOUGH.values():
+        variance = population((a, b)).var()
+        # Of a^2 s1^2 + 2 a b r s1 s2 + b^2 s2^2.
+        slope = [
+            2 * a**2 * first + 2 * a * b * RHO * second,
+            2 * b**2 * second + 2 * a * b * RHO * first,
+            2 * a * b * first * second,
+        ]
+        information += N * np.outer(slope, slope) / (2 * variance**2)
+    *sds, correlation = np.sqrt(np.diag(np.linalg.inv(information)))
+    return np.array(sds), float(correlation)
+
+
+@pytest.fixture(scope="module")
+def optimum() -> prb.Optimum:
+    model = model_of(ENOUGH, prb.KullbackLeibler(), max_points=2048)
+    return prb.minimize(model, starts=0, progressbar=False)
+
+
+def test_standard_deviations_and_correlation_are_found_with_their_standard_errors(
+    optimum: prb.Optimum,
+) -> None:
+    assert optimum.converged
+    sds, correlation = exact_errors()
+    for name, truth, exact in (("chol_stds", SDS, sds), ("chol_corr", RHO, correlation)):
+        found, error = optimum.point[name], optimum.stderr[name]
+        if name == "chol_corr":
+            np.testing.assert_array_equal(np.diag(error), 0.0)
+            found, error = found[0, 1], error[0, 1]
+        # The data are the truth's own quantiles; its bandwidth makes a sd a little smaller.
+        np.testing.assert_array_less(np.abs(found - truth), 0.5 * exact)
+        np.testing.assert_allclose(error, exact, rtol=0.25)
+
+
+def test_tables_have_the_correlation_once(optimum: prb.Optimum) -> None:
+    table = prb.compare({"optimum": optimum}, model=optimum.model)
+    names = list(table["hyperparameter"].values)
+    assert names[-3:] == ["chol_corr[0,1]", "chol_stds[0]", "chol_stds[1]"]
+    # What is read off the factor is known, and not all of its own elements.
+    assert np.isfinite(table["sd"].sel(hyperparameter=names[-3:])).all()
+    assert np.isinf(table["sd"].sel(hyperparameter="chol[2]")).all()
+    row = table.sel(result="optimum", hyperparameter="chol_corr[0,1]")
+    assert float(row["sd"]) == optimum.stderr["chol_corr"][0, 1]
+
+
+@pytest.mark.parametrize(
+    "propagation", [prb.Reweighted(64), prb.Resimulated(64), prb.Fresh(64)], ids=repr
+)
+def test_a_cholesky_factor_is_no_covariance_and_refused_before_any_response(
+    propagation: Any,
+) -> None:
+    def never(x: Any) -> Any:
+        raise AssertionError("no response is to be computed")
+
+    with pm.Model():
+        deviations = pm.HalfNormal("sds", 2.0, shape=2)
+        factor = pm.LKJCorr("factor", n=2, eta=2)
+        x = pm.MvNormal.dist(np.zeros(2), factor * np.ones((2, 1)) * deviations)
+        with pytest.raises(ValueError, match=r"y: got an input whose covariance is not symm"):
+            prb.Simulator(
+                "y",
+                never,
+                x,
+                metric=prb.AreaMetric(),
+                observed=[0.0, 1.0],
+                propagation=propagation,
+            )
+
+
+def test_marginal_responses_tell_the_standard_deviations_and_no_correlation() -> None:
+    alone = {name: MIXED[name] for name in ("first", "second")}
+    evaluator = Evaluator(model_of(alone, prb.KullbackLeibler(), n=2048))
+    theta = theta_of_truth(evaluator)
+    sampling = SamplingDistribution.of(evaluator, theta, np.ones(2))
+    covariance = sampling.local.in_theta
+    _, stderr = point_and_stderr(evaluator, theta, covariance, sampling.of_functions)
+    # Each is a sample of its own: sd / sqrt(2 N).
+    np.testing.assert_allclose(stderr["chol_stds"], SDS / np.sqrt(2 * N), rtol=0.25)
+    np.testing.assert_array_equal(stderr["chol_corr"], [[0.0, np.inf], [np.inf, 0.0]])
+
+
+SETS = 200
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "metric",
+    [prb.ProbabilityResidual(), prb.AreaMetric(), prb.KullbackLeibler()],
+    ids=lambda metric: type(metric).__name__,
+)
+def test_standard_errors_are_the_spread_over_data_sets(metric: prb.Metric) -> None:
+    model = model_of(MIXED, metric, width=2.0)
+    optimum = prb.minimize(model, starts=0, progressbar=False)
+    rng = np.random.default_rng(7)
+    values, weights = [], []
+    for a in MIXED.values():
+        drawn = population(a).rvs((SETS, N), random_state=rng)
+        values.append(drawn.ravel())
+        weights.append(np.kron(np.eye(SETS), np.full(N, 1 / N)))
+    sampling = optimum.sampling()
+    x, arrived = sampling.refit(DataSets(values, weights))
+    assert arrived.mean() > 0.95
+    fits = optimum.evaluator.constrained(sampling.thetas(x[arrived]))
+    correlation = fits["chol_corr"][:, 0, 1]
+    error = optimum.stderr["chol_corr"][0, 1]
+    # A standard deviation of 200 has an error of 5%; four of them, and the curvature of theta.
+    assert error == pytest.approx(correlation.std(ddof=1), rel=0.25)
+    np.testing.assert_allclose(
+        optimum.stderr["chol_stds"], fits["chol_stds"].std(axis=0, ddof=1), rtol=0.25
+    )
+    # Nominal 95%; 200 data sets tell it to 1.5%.
+    covered = np.abs(correlation - RHO) < 1.96 * error
+    assert covered.mean() > 0.88
