@@ -68,7 +68,7 @@ class View:
 
     def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
         """Return what is seen of observed values, and of which rows."""
-        return values, np.arange(len(values))
+        return self.of(values), np.arange(len(values))
 
 
 @dataclass(frozen=True, eq=False)

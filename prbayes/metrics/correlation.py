@@ -16,9 +16,9 @@ from prbayes.metrics.composite import Centered, Projection, Standardized
 from prbayes.metrics.lifted import LiftedMetric, failure_caps
 from prbayes.metrics.whitening import units
 
-# Least variance, in units of an observed output's spread squared: of a population that is one
-# number, correlations are zero. Any value far below one does.
-_LEAST_VARIANCE = 1e-24
+# Least variance, in units of an observed output's spread squared: a population that is one number
+# has no correlations. Any value does that is far below one, and far above rounding.
+_LEAST_VARIANCE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ def _correlations(moments: Any, m: int, xp: Any) -> Any:
     variance = second[..., np.diag(place)] - mean**2
     sd = xp.sqrt(xp.maximum(variance, _LEAST_VARIANCE))
     covariance = second[..., place[i, j]] - mean[..., i] * mean[..., j]
-    return covariance / (sd[..., i] * sd[..., j])
+    return xp.clip(covariance / (sd[..., i] * sd[..., j]), -1.0, 1.0)
 
 
 def _observed_correlations(values: Floats, weights: Floats) -> Floats:
