@@ -148,7 +148,7 @@ def test_missing_outputs_are_compared_with_all_specimens_that_have_the_others() 
         (0.25, np.delete(last_two, np.s_[6:12], axis=0), x[:, 1:]),
     )
     expected = sum(share * Joint(AreaMetric()).against(z)(v) for share, z, v in parts)
-    alone = [part for part in whole.parts if part.label == "direction 1 of 0"]
+    alone = [part for part in whole.parts if part.label == "direction 1 of outputs 0"]
     np.testing.assert_allclose(alone[0].share, 0.25)
     np.testing.assert_array_equal(alone[0].observed_of(y)[1], np.r_[6:24])
     expected += 0.25 * alone[0].target(alone[0].of(x))
@@ -207,9 +207,10 @@ def test_observed_values_are_refused_for_a_reason() -> None:
         (column, r"1 outputs that no specimen has \(column 1"),
         (failed, r"1 outputs in which every specimen failed \(column 1"),
         (below, "got -inf, expected numbers; NaN is an output that was not measured"),
+        ([[1.0, 2.0], [3.0]], "ragged sequence"),
         (y[:3], "3 specimens with finite outputs 0, 1"),
     ):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises((TypeError, ValueError), match=message):
             joint.against(observed)
     with pytest.raises(
         ValueError, match=r"observed weights: got shape \(2, 20\), expected \(20,\)"
