@@ -23,6 +23,7 @@ import prbayes as prb
 from prbayes.model.node import nodes
 
 OBSERVED = np.random.default_rng(1).normal(2.0, 1.0, 30)
+OUTPUTS = np.stack([OBSERVED, OBSERVED**2 - OBSERVED], axis=-1)
 FRESH_DATA = OBSERVED[:9] + 0.3
 QUIET = {"progressbar": False}
 called = 0
@@ -145,6 +146,7 @@ EXECUTOR: Sequence[Any] = (4, map, "processes", object())
 STORE: Sequence[Any] = (4, True, b"folder", "")
 VERSION: Sequence[Any] = (2, 1.5, True, "")
 TEXT: Sequence[Any] = (3, b"text", [], True)
+NO_METRIC: Sequence[Any] = (None, "area", 3, np.mean, prb.AreaMetric)
 NO_MODEL: Sequence[Any] = (3, "model", Name("bare"), pm.Model, Name("optimum"))
 NO_OPTIMUM: Sequence[Any] = (None, 3, "optimum", Name("posterior"), Name("model"), {"mu": 1.0})
 NO_RESULT: Sequence[Any] = (None, 3, "result", xr.DataTree(), Name("comparison"), [])
@@ -212,6 +214,11 @@ def simulator(**given: Any) -> Any:
 def metric_called(**given: Any) -> Any:
     simulated, observed = given.pop("simulated", OBSERVED), given.pop("observed", OBSERVED)
     return prb.AreaMetric()(simulated, observed, **given)
+
+
+def joint_called(**given: Any) -> Any:
+    simulated, observed = given.pop("simulated", OUTPUTS), given.pop("observed", OUTPUTS)
+    return prb.Joint(prb.AreaMetric())(simulated, observed, **given)
 
 
 def predict(**given: Any) -> Any:
@@ -327,6 +334,49 @@ TABLE: dict[str, Row] = {
     "FunctionMetric": Row(
         prb.FunctionMetric, {"function": (3, "f", None), "weighted": FLAG}, {"function": np.mean}
     ),
+    "Joint": Row(
+        prb.Joint,
+        {
+            "metric": (*NO_METRIC, prb.Joint(prb.AreaMetric())),
+            "directions": but_none(COUNT),
+            "seed": (-1, 1.5, "a", None, True),
+        },
+        {"metric": prb.AreaMetric()},
+    ),
+    "MarginalCorrelation": Row(
+        prb.MarginalCorrelation,
+        {
+            "metric": (*NO_METRIC, prb.Joint(prb.AreaMetric())),
+            "weights": (
+                1.0,
+                "ab",
+                None,
+                [1.0, 1.0],
+                (1.0,),
+                (1.0, 0.0),
+                (1.0, -2.0),
+                (np.nan, 1.0),
+            ),
+        },
+        {"metric": prb.AreaMetric()},
+    ),
+    "a metric of several outputs": Row(
+        joint_called,
+        {
+            "simulated": (np.full((9, 2), np.nan), np.ones((9, 3)), OUTPUTS[:, 0], "a", None, []),
+            "observed": (
+                OUTPUTS[None],
+                OUTPUTS[:3],
+                OUTPUTS * [1, 0],
+                OUTPUTS * [1, np.nan],
+                OUTPUTS * [1, -np.inf],
+                OUTPUTS * np.nan,
+                OUTPUTS[:, [0, 0]],
+                OUTPUTS > 2,
+            ),
+            "weights": (np.ones(3), -np.ones(30), np.zeros(30), "abc", OBSERVED > 2),
+        },
+    ),
     "GaussianKDE": Row(prb.GaussianKDE, {"bandwidth": POSITIVE}),
     "Histogram": Row(prb.Histogram, {"bins": (0, -3, 1.5, "a", True, [3.0, 2.0, 1.0], np.nan)}),
     "a metric": Row(
@@ -337,7 +387,7 @@ TABLE: dict[str, Row] = {
             "weights": (np.ones(3), -np.ones(30), np.zeros(30), "abc", OBSERVED > 2),
         },
     ),
-    "abc_distance": Row(prb.abc_distance, {"metric": (None, "area", 3, np.mean, prb.AreaMetric)}),
+    "abc_distance": Row(prb.abc_distance, {"metric": NO_METRIC}),
     "minimize": Row(
         with_model(prb.minimize),
         {

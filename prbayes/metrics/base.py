@@ -68,7 +68,7 @@ class View:
 
     def observed_of(self, values: Floats) -> tuple[Floats, NDArray[np.intp]]:
         """Return what is seen of observed values, and of which rows."""
-        return values, np.arange(len(values))
+        return self.of(values), np.arange(len(values))
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +189,7 @@ class Discrepancy(ABC):
 
         Parameters
         ----------
-        simulated : array, shape (..., n)
+        simulated : array, shape (..., n), or (..., n, m) for several outputs
             In units of the observed values. +inf is a specimen that failed and counts above all
             others; NaN is a point without a response and counts nowhere.
         weights : array, shape (n,) or (..., n)
@@ -370,8 +370,8 @@ class Metric(ABC):
             If the observed values are not one-dimensional, real and finite, or if the metric needs
             a bandwidth or bins and they are all equal.
         """
-        several = self.takes_outputs and np.ndim(observed) > 1
-        sample = observed_outputs(observed) if several else observed_sample(observed)
+        checked = observed_outputs if self.takes_outputs else observed_sample
+        sample = checked(observed)
         w = sample_weights(weights, len(sample), "observed weights")
         if w.ndim > 1:
             raise ValueError(f"observed weights: got shape {w.shape}, expected ({len(sample)},)")

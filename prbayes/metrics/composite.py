@@ -190,7 +190,7 @@ class CompositeDiscrepancy(Discrepancy):
             kind: type[_Group] = _Each
             if all(part.target.density_cells is not None for part in parts):
                 kind = _Densities
-            elif any(part.target.metric.minimum is not Minimum.QUADRATIC for part in parts):
+            elif all(part.target.metric.minimum is Minimum.ABSOLUTE for part in parts):
                 kind = _Values
             groups.append(kind(tuple(single), parts))
         return tuple(groups)
@@ -287,7 +287,10 @@ class _Each(_Group):
 
 
 class _Values(_Each):
-    """Parts whose only features are their values: what they are made of is not kept."""
+    """Parts whose only features are their values.
+
+    What they are made of has a number for each point and part, and depends on the observed side.
+    """
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
         """Return the values of all parts, (..., K)."""

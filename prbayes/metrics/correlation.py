@@ -16,9 +16,9 @@ from prbayes.metrics.composite import Centered, Projection, Standardized
 from prbayes.metrics.lifted import LiftedMetric, failure_caps
 from prbayes.metrics.whitening import units
 
-# Least variance, in units of an observed output's spread squared: of a population that is one
-# number, correlations are zero. Any value far below one does.
-_LEAST_VARIANCE = 1e-24
+# Least variance, in units of an observed output's spread squared: a population that is one number
+# has no correlations. Any value does that is far below one, and far above rounding.
+_LEAST_VARIANCE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class MarginalCorrelation(LiftedMetric):
     r"""Several outputs of a specimen: marginal discrepancies, and residuals of correlations.
 
     :math:`w_1 \sum_j d_j / s_j + w_2 \sum_{i<j} (\rho_{ij} - r_{ij})^2`, with :math:`d_j` the
-    metric of output j in units of its observed spread, :math:`s_j` its typical size, which is
-    its value for a population without any density or, under the area metric, the observed mean
-    deviation, and :math:`\rho` and :math:`r` the simulated and observed Pearson correlations. The
+    metric of output j in units of its observed spread, :math:`s_j` its typical size
+    (``Discrepancy.scale``: for the probability residual its value without any density, for the area
+    metric the observed mean deviation, or else one), and :math:`\rho` and :math:`r` the simulated and observed Pearson correlations. The
     idea is that of [1]_: a joint distribution is told by its marginals and correlations, and each
     is given a residual that is normalised. This is a reading of it from the paper's summary: the
     paper's own norms of the two residuals, which are for its probability residual, are not claimed
@@ -195,7 +195,7 @@ def _correlations(moments: Any, m: int, xp: Any) -> Any:
     variance = second[..., np.diag(place)] - mean**2
     sd = xp.sqrt(xp.maximum(variance, _LEAST_VARIANCE))
     covariance = second[..., place[i, j]] - mean[..., i] * mean[..., j]
-    return covariance / (sd[..., i] * sd[..., j])
+    return xp.clip(covariance / (sd[..., i] * sd[..., j]), -1.0, 1.0)
 
 
 def _observed_correlations(values: Floats, weights: Floats) -> Floats:

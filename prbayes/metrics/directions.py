@@ -9,7 +9,7 @@ import numpy as np
 from prbayes._checks import Floats
 
 # Steps of the repulsion. With twice as many the largest cosine is the same to .03 (test).
-_STEPS = 2000
+_REPULSIONS = 2000
 
 
 def enough(m: int) -> int:
@@ -37,7 +37,7 @@ def directions(m: int, number: int, seed: int) -> Floats:
     return repelled(start)
 
 
-def repelled(u: Floats, steps: int = _STEPS) -> Floats:
+def repelled(u: Floats, steps: int = _REPULSIONS) -> Floats:
     """Return unit vectors at a low energy, the sum of -log(1 - cosine^2) over their pairs."""
     u = _of_unit_length(u)
     number, m = u.shape

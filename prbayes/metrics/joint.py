@@ -107,7 +107,9 @@ class Joint(LiftedMetric):
         centered = Centered(outputs, caps[outputs], white.center)
         m = outputs.size
         number = 1 if m == 1 else self.directions or enough(m)
-        of = "" if m == observed.shape[1] else f" of {', '.join(map(str, outputs.tolist()))}"
+        of = (
+            "" if m == observed.shape[1] else f" of outputs {', '.join(map(str, outputs.tolist()))}"
+        )
         parts = []
         for k, direction in enumerate(directions(m, number, self.seed)):
             view = Projection(centered, white.axes @ direction)

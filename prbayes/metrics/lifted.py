@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from prbayes._checks import Floats, called
+from prbayes._checks import Floats, called, real_array
 from prbayes.metrics.base import Discrepancy, Metric, Minimum, Part
 from prbayes.metrics.composite import CompositeDiscrepancy, OnlyOutput
 
@@ -88,7 +88,7 @@ class LiftedMetric(Metric):
             If the observed values are not real, if a specimen has no output, an output no specimen,
             or too few for a comparison.
         """
-        if np.ndim(observed) < 2:
+        if real_array(observed, "observed").ndim < 2:
             return self.metric.against(observed, weights)
         return super().against(observed, weights)
 

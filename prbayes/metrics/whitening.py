@@ -19,11 +19,11 @@ _DEGREES = (1.0, 3.0, np.inf)
 
 # From 50 values of 2 to 8 outputs 40 to 150 steps reach the bound below, which leaves coordinates
 # the same to 1e-10 after an affine map (test); more steps than that mean that there is no scatter.
-_STEPS = 2000
+_MOST_STEPS = 2000
 _CONVERGED = 1e-12
 
 # A ratio of singular values that is made of rounding errors alone.
-_ROUNDING = 1e-13
+_SINGULAR = 1e-13
 
 # Least variance of a combination of outputs, each in units of its own spread. Below it two sides
 # would be told apart by 1e-5 of an output's spread, which measurement and rounding make.
@@ -86,7 +86,9 @@ def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> Whi
     z = (sample - center) / unit
     middle, root = _robust_scatter(z, weights, outputs)
     root = root @ _turn((z - middle) @ root, weights)
-    return Whitening(center + middle * unit, root / unit[:, None])
+    squares = (((z - middle) @ root) ** 2).sum(axis=-1)
+    size = quantile(squares, weights, 0.5) / chi2(m).median()
+    return Whitening(center + middle * unit, root / np.sqrt(size) / unit[:, None])
 
 
 def units(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tuple[Floats, Floats]:
@@ -112,13 +114,9 @@ def _robust_scatter(z: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tu
     """Return location and a root of the inverse scatter, of as few degrees as there is one for."""
     for degrees in _DEGREES:
         try:
-            middle, root = _scatter(z, weights, degrees)
+            return _scatter(z, weights, degrees)
         except _NoScatterError as error:
             along = np.abs(error.along)
-        else:
-            squares = (((z - middle) @ root) ** 2).sum(axis=-1)
-            size = quantile(squares, weights, 0.5) / chi2(z.shape[1]).median()
-            return middle, root / np.sqrt(size)
     several = outputs[along > 0.1 * along.max()]
     raise ValueError(
         f"observed: got outputs {_listed(several)} (counted from 0) that depend on each other "
@@ -134,11 +132,11 @@ def _scatter(z: Floats, weights: Floats, degrees: float) -> tuple[Floats, Floats
     """
     middle, root = np.zeros(z.shape[1]), np.eye(z.shape[1])
     w = weights
-    for _ in range(_STEPS):
+    for _ in range(_MOST_STEPS):
         x = (z - middle) @ root
         shift = w @ x
         size, axes = _singular(x - shift, w)
-        if not size[-1] > _ROUNDING * max(size[0], np.abs(root).max()):
+        if not size[-1] > _SINGULAR * max(size[0], np.abs(root).max()):
             raise _NoScatterError(root @ axes[-1])
         middle = middle + np.linalg.solve(root.T, shift)
         root = root @ (axes.T / size)

@@ -1,0 +1,90 @@
+"""Coordinates that no affine map of the outputs changes, and outliers little."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from prbayes._checks import Floats
+from prbayes.metrics.whitening import whitening
+
+
+def coordinates(y: Floats, weights: Floats | None = None) -> Floats:
+    u = np.full(len(y), 1 / len(y)) if weights is None else weights
+    white = whitening(y, u, np.arange(y.shape[1]))
+    return (y - white.center) @ white.axes
+
+
+def correlated(rho: float, n: int = 50, m: int = 2, seed: int = 0) -> Floats:
+    y = np.random.default_rng(seed).standard_normal((n, m))
+    y[:, 1] = rho * y[:, 0] + np.sqrt(1 - rho**2) * y[:, 1]
+    return y
+
+
+@pytest.mark.parametrize(
+    ("m", "n", "rho"), [(2, 50, 0.95), (2, 9, -0.995), (4, 40, 0.9999), (8, 60, 0)]
+)
+def test_an_affine_map_of_the_outputs_changes_nothing(m: int, n: int, rho: float) -> None:
+    rng = np.random.default_rng(m)
+    y = correlated(rho, n, m)
+    before = coordinates(y)
+    maps = [rng.standard_normal((m, m)) for _ in range(3)]
+    maps += [np.eye(m)[rng.permutation(m)], -np.eye(m), np.diag(10.0 ** rng.integers(-150, 150, m))]
+    for matrix in maps:
+        np.testing.assert_allclose(coordinates(y @ matrix.T), before, rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(coordinates(y + 1e3), before, rtol=1e-7, atol=1e-8)
+
+
+def test_a_normal_sample_has_unit_spread_in_all_directions() -> None:
+    z = coordinates(correlated(0.9, 4000, 3))
+    np.testing.assert_allclose(np.cov(z.T), np.eye(3), atol=0.1)
+
+
+def test_weights_are_repetitions_and_weight_zero_is_not_there() -> None:
+    y = correlated(0.8, 20)
+    k = np.arange(20) % 4
+    repeated = np.repeat(coordinates(y, k / k.sum()), k, axis=0)
+    ratio = repeated / coordinates(np.repeat(y, k, axis=0))
+    np.testing.assert_allclose(ratio, ratio[0, 0], rtol=1e-7, err_msg="up to the median's size")
+    assert ratio[0, 0] == pytest.approx(1, abs=0.1)
+    y[k == 0] = 1e5
+    np.testing.assert_allclose(
+        np.repeat(coordinates(y, k / k.sum()), k, axis=0), repeated, rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize("distance", [8.0, 1e3])
+def test_gross_outliers_move_it_little(distance: float) -> None:
+    y = correlated(0.9, 400)
+    white = whitening(y, np.full(400, 1 / 400), np.arange(2))
+    y[:20] = distance
+    other = whitening(y, np.full(400, 1 / 400), np.arange(2))
+    # Scatter of the one in coordinates of the other; mean and covariance would be 8 or 1e5 off.
+    back = np.linalg.inv(other.axes) @ white.axes
+    np.testing.assert_allclose(np.linalg.svd(back)[1], 1, atol=0.2)
+    assert np.abs((other.center - white.center) @ white.axes).max() < 0.15
+
+
+def test_equal_specimens_that_have_no_robust_scatter_are_whitened_all_the_same() -> None:
+    y = correlated(0.5, 60)
+    y[:30] = 0.0  # more than a third: a t distribution of one degree would shrink to them
+    assert np.isfinite(coordinates(y)).all()
+    np.testing.assert_allclose(coordinates(y @ [[2.0, 1.0], [0.0, 3.0]]), coordinates(y), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (
+            lambda y: y[:3],
+            r"3 specimens with finite outputs 0, 2 .*at least 4 for 2 outputs; leave",
+        ),
+        (lambda y: y * [1, 0], "equal values of output 2 .*leave that output out"),
+        (lambda y: y[:, [0, 0]], "outputs 0, 2 .*depend on each other linearly.*leave one of them"),
+        (lambda y: y[:, [0, 0]] + 1e-7 * y, "outputs 0, 2 .*depend on each other linearly"),
+    ],
+)
+def test_what_cannot_be_whitened_is_told_by_outputs(spoil: object, message: str) -> None:
+    y = spoil(correlated(0.5))  # type: ignore[operator]
+    with pytest.raises(ValueError, match=message):
+        whitening(y, np.full(len(y), 1 / len(y)), np.array([0, 2]))
