@@ -160,6 +160,13 @@ class Discrepancy(ABC):
         """The terms that it is the sum of: itself, unless it is made of several."""
         return (Part(self, 1.0, ""),)
 
+    def beside(self, design: Floats) -> Discrepancy:
+        """Return the same comparison, now that the first simulated responses are known.
+
+        Itself, unless the metric chooses what it compares by the data and them together.
+        """
+        return self
+
     @property
     def likelihood(self) -> bool:
         """Whether N times the discrepancy is on the scale of a log-likelihood."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats, sample_weights
 from prbayes.metrics.base import CellwiseDiscrepancy, Discrepancy, Minimum, Part, View
 from prbayes.metrics.cells import Cells, product
+from prbayes.metrics.components import Components
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,15 +93,29 @@ class CompositeDiscrepancy(Discrepancy):
     # (K,) or (..., K): by part, those of the data set, which may lack all specimens that a part
     # needs.
     shares: Floats
+    # Of sets of outputs that are compared by principal components.
+    components: tuple[Components, ...] = ()
     _by_data_set: ClassVar[tuple[str, ...]] = ("weights", "shares")
 
     @classmethod
     def of_parts(
-        cls, metric: Any, observed: Floats, weights: Floats, parts: Sequence[Part]
+        cls,
+        metric: Any,
+        observed: Floats,
+        weights: Floats,
+        parts: Sequence[Part],
+        components: tuple[Components, ...] = (),
     ) -> Self:
         """Return the sum of parts that have been prepared against these values, (N, m) and (N,)."""
         shares = np.array([part.share for part in parts])
-        return cls(metric, observed, weights, tuple(parts), shares)
+        return cls(metric, observed, weights, tuple(parts), shares, components)
+
+    def beside(self, design: Floats) -> Discrepancy:
+        """Return the same with the principal components of data and design together."""
+        if not self.components:
+            return self
+        found: Discrepancy = self.metric.against_beside(self.observed, self.weights, design)
+        return found
 
     @property
     def parts(self) -> tuple[Part, ...]:

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
-from prbayes.metrics.base import Part
-from prbayes.metrics.composite import Centered, Projection
+from prbayes.metrics.base import Discrepancy, Part
+from prbayes.metrics.components import MOST_OUTPUTS, Components, principal_components
+from prbayes.metrics.composite import CompositeDiscrepancy, Centered, Projection
 from prbayes.metrics.directions import directions, enough
 from prbayes.metrics.lifted import LiftedMetric, failure_caps
-from prbayes.metrics.whitening import whitening
+from prbayes.metrics.whitening import Whitening, whitening
 
 # By judgement: sets of measured outputs that are compared by themselves, each with directions of
 # its own.
@@ -42,6 +43,11 @@ class Joint(LiftedMetric):
         Their number, (m - 1) (m + 2) for m outputs by default: errors of estimated means, standard
         deviations and correlations are then those of ten times as many, to 3%
         (``benchmarks/directions.py``). Below m (m + 1) / 2 they do not tell all correlations.
+    components : int, optional
+        Outputs that are too many for it, more than eight or as many as there are specimens, such
+        as curves, are replaced by their scores on principal components of data and design
+        together: this many, or as many as leave out a hundredth of the variance of either. All
+        outputs are then to be in one unit.
     seed : int
         Of the directions; those of two outputs do without.
 
@@ -76,21 +82,40 @@ class Joint(LiftedMetric):
     """
 
     directions: int | None = None
+    components: int | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.directions is not None:
             positive_integer(self.directions, "directions")
+        if self.components is not None:
+            positive_integer(self.components, "components")
         positive_integer(self.seed, "seed", minimum=0)
 
-    def _parts(self, observed: Floats, weights: Floats) -> Sequence[Part]:
+    def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
+        return self.against_beside(observed, weights, None)
+
+    def against_beside(
+        self, observed: Floats, weights: Floats, design: Floats | None
+    ) -> Discrepancy:
+        """Prepare the observed side, (N, m), with components of a design, (k, m), as well."""
+        if observed.shape[1] == 1:
+            return super()._prepare(observed, weights)
         caps = failure_caps(observed)
         parts: list[Part] = []
+        components: list[Components] = []
         for outputs, share in patterns(observed, weights):
-            parts += self._slices(observed, weights, outputs, caps, share)
+            known = None if design is None else _known(design[:, outputs], caps[outputs])
+            slices, found = self._slices(observed, weights, outputs, caps, share, known)
+            parts += slices
+            components += found
         targets = self.metric.on_one_scale([part.target for part in parts])
-        return [replace(p, target=target) for p, target in zip(parts, targets, strict=True)]
+        parts = [replace(p, target=target) for p, target in zip(parts, targets, strict=True)]
+        return CompositeDiscrepancy.of_parts(self, observed, weights, parts, tuple(components))
+
+    def _parts(self, observed: Floats, weights: Floats) -> Sequence[Part]:
+        return self.against_beside(observed, weights, None).parts
 
     def _slices(
         self,
@@ -99,24 +124,54 @@ class Joint(LiftedMetric):
         outputs: NDArray[np.intp],
         caps: Floats,
         share: float,
-    ) -> list[Part]:
+        design: Floats | None,
+    ) -> tuple[list[Part], list[Components]]:
         """Return the parts that compare some outputs, of all specimens that have them."""
         chosen = observed[:, outputs]
-        finite = np.isfinite(chosen).all(axis=-1)
-        white = whitening(chosen[finite], weights[finite], outputs)
+        white, found = self._white(chosen, weights, outputs, caps[outputs], design)
         centered = Centered(outputs, caps[outputs], white.center)
-        m = outputs.size
+        m = white.axes.shape[1]
         number = 1 if m == 1 else self.directions or enough(m)
-        of = (
-            "" if m == observed.shape[1] else f" of outputs {', '.join(map(str, outputs.tolist()))}"
-        )
+        every = outputs.size == observed.shape[1]
+        of = "" if every else f" of outputs {', '.join(map(str, outputs.tolist()))}"
         parts = []
         for k, direction in enumerate(directions(m, number, self.seed)):
             view = Projection(centered, white.axes @ direction)
             values, index = view.observed_of(observed)
             target = self.metric.against(values, weights[index])
             parts.append(Part(target, share / number, f"direction {k + 1}{of}", view))
-        return parts
+        return parts, found
+
+    def _white(
+        self,
+        chosen: Floats,
+        weights: Floats,
+        outputs: NDArray[np.intp],
+        caps: Floats,
+        design: Floats | None,
+    ) -> tuple[Whitening, list[Components]]:
+        """Return white coordinates of some outputs, or of their principal components."""
+        finite = np.isfinite(chosen).all(axis=-1)
+        many = outputs.size > MOST_OUTPUTS or finite.sum() < outputs.size + 2
+        if outputs.size < 2 or not (many or self.components):
+            return whitening(chosen[finite], weights[finite], outputs), []
+        has = ~np.isnan(chosen).any(axis=-1)
+        sample, own = _capped(chosen[has], caps), weights[has] / weights[has].sum()
+        found = principal_components(sample, own, self.components, design)
+        scores = (sample - found.center) @ found.axes
+        white = whitening(scores, own, np.arange(found.number))
+        center = found.center + found.axes @ white.center
+        return Whitening(center, found.axes @ white.axes), [found]
+
+
+def _capped(outputs: Floats, caps: Floats) -> Floats:
+    """Return outputs (n, m) with a failure as the cap."""
+    return np.where(np.isposinf(outputs), caps, outputs)
+
+
+def _known(design: Floats, caps: Floats) -> Floats:
+    """Return the runs of a design that have outputs, failures as the cap."""
+    return _capped(design[~np.isnan(design).any(axis=1)], caps)
 
 
 def patterns(observed: Floats, weights: Floats) -> list[tuple[NDArray[np.intp], float]]:

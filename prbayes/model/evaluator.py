@@ -253,7 +253,8 @@ class Evaluator:
             same_size = np.shape(observed) == before.observed.shape
             weights = before.weights if same_size else None
             chosen = metric or node.metric
-            targets.append(chosen.against(observed, weights))
+            target = chosen.against(observed, weights)
+            targets.append(target.beside(node.bound.first_responses))
         return self._with_targets(targets)
 
     def _with_targets(self, targets: list[Discrepancy]) -> Evaluator:

@@ -125,6 +125,15 @@ class Bound(ABC):
         return self._probed
 
     @property
+    def first_responses(self) -> Floats:
+        """Those that are there before any other is asked for."""
+        return self._probed
+
+    def aim(self, target: Discrepancy) -> None:
+        """Compare with the same data in another way from here on."""
+        self.target = target
+
+    @property
     def known_points(self) -> Sequence[Floats]:
         """The aleatory inputs of the same, shapes ``(n, *event)``."""
         return self._probed_at

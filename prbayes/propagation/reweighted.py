@@ -268,6 +268,21 @@ class Design(Bound):
         return self.values
 
     @property
+    def first_responses(self) -> Floats:
+        """Those of the first batch."""
+        return self.values[: self.batches.sizes[0]]
+
+    def aim(self, target: Discrepancy) -> None:
+        """Compare with the same data in another way from here on; before anything is compiled."""
+        if target is self.target:
+            return
+        before = len(self._shared) - len(self.target.basis(self.values[:1]))
+        self.target = target
+        kept = [shared.get_value() for shared in self._shared[:before]]
+        self._shared = []
+        self._share([*kept, *target.basis(self.values)])
+
+    @property
     def known_points(self) -> Sequence[Floats]:
         """Their points."""
         return self.batches.points

@@ -1,0 +1,113 @@
+"""Principal components of outputs that are too many to be compared one with the other: curves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from prbayes._checks import Floats
+from prbayes._weighted import quantile
+
+# More outputs than this are compared by their principal components; of as many the directions that
+# are enough are seventy.
+MOST_OUTPUTS = 8
+# Share of the variance, of the data and of the design, that components may leave out. By judgement:
+# a tenth of a standard deviation.
+_LEFT_OUT = 0.01
+# Specimens for each component: scatters of fewer are hardly known.
+_SPECIMENS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """Scores ``(y - center) @ axes`` of outputs y, and what they leave out."""
+
+    center: Floats  # (m,)
+    axes: Floats  # (m, r): orthonormal
+    left_out: float  # share of the observed variance
+    design_left_out: float  # share of the design's variance; NaN where none was looked at
+    # Correlation of what is left out of the observed outputs, between neighbours: near zero, or
+    # below, if it is noise.
+    rest_correlation: float
+
+    @property
+    def number(self) -> int:
+        """How many there are."""
+        return self.axes.shape[1]
+
+
+def principal_components(
+    sample: Floats, weights: Floats, number: int | None = None, design: Floats | None = None
+) -> Components:
+    """Return principal components of observed outputs and of a design together.
+
+    Of both scatters, each in units of its own variance, the mean: so the components span what the
+    data vary in, and what populations like them could vary in and they do not. Specimens count the
+    less the farther they are from the middle of the data, in units of the data's own distances.
+
+    Parameters
+    ----------
+    sample, weights : ndarray, shapes (n, m), (n,)
+        Finite, of outputs in one unit.
+    number : int, optional
+        As many as leave out a hundredth of either variance, by default, and at most eight, or one
+        for five specimens.
+    design : ndarray, shape (k, m), optional
+        Simulated outputs, finite.
+    """
+    n, m = sample.shape
+    middle = np.array([quantile(y, weights, 0.5) for y in sample.T])
+    squares = ((sample - middle) ** 2).sum(axis=1)
+    typical = float(quantile(squares, weights, 0.5))
+    center, scatter = _scatter(sample, weights, middle, typical)
+    scatters = [scatter]
+    if design is not None and len(design) > 1:
+        equal = np.full(len(design), 1 / len(design))
+        _, simulated = _scatter(design, equal, middle, typical)
+        scatters.append(simulated)
+    unit = [s / max(float(np.trace(s)), np.finfo(float).tiny) for s in scatters]
+    _, vectors = np.linalg.eigh(np.mean(unit, axis=0))
+    axes = vectors[:, ::-1]
+    # What the first components explain of each.
+    explained = np.array([np.cumsum(np.einsum("ij,ik,kj->j", axes, s, axes)) for s in unit])
+    most = max(1, min(m, MOST_OUTPUTS, n // _SPECIMENS))
+    if number is None:
+        enough = (explained >= 1 - _LEFT_OUT).all(axis=0)
+        number = min(int(np.argmax(enough)) + 1 if enough.any() else m, most)
+    # Signs that do not hang on the algorithm.
+    signs = np.sign(axes[np.abs(axes).argmax(axis=0), np.arange(m)])
+    axes = (axes * signs)[:, :number]
+    left_out = 1 - explained[:, number - 1].clip(0, 1)
+    scores = (sample - center) @ axes
+    rest = sample - center - scores @ axes.T
+    return Components(
+        center,
+        axes,
+        float(left_out[0]),
+        float(left_out[1]) if len(left_out) > 1 else np.nan,
+        _between_neighbours(rest - rest.mean(axis=0)),
+    )
+
+
+def _scatter(
+    sample: Floats, weights: Floats, middle: Floats, typical: float
+) -> tuple[Floats, Floats]:
+    """Return the mean and the scatter of a sample in which specimens far out hardly count.
+
+    Far from a middle, in units of a typical squared distance: a weight falls with the fourth power.
+    """
+    squares = ((sample - middle) ** 2).sum(axis=1)
+    w = weights / (1 + squares / typical) ** 2 if typical > 0 else weights
+    w = w / w.sum()
+    center = w @ sample
+    away = sample - center
+    return center, (w[:, None] * away).T @ away
+
+
+def _between_neighbours(rest: Floats) -> float:
+    """Return the correlation of neighbouring outputs in what is left, shape (n, m)."""
+    size = float((rest**2).mean())
+    if rest.shape[1] < 2 or not size > 0:
+        return 0.0
+    return float((rest[:, 1:] * rest[:, :-1]).mean()) / size
