@@ -118,6 +118,17 @@ def test_tables_have_the_correlation_once(optimum: prb.Optimum) -> None:
     assert float(row["sd"]) == optimum.stderr["chol_corr"][0, 1]
 
 
+@pytest.mark.parametrize("faint", [3.0, 30.0])
+def test_how_faint_a_direction_may_be_changes_nothing_of_what_is_known(
+    faint: float, optimum: prb.Optimum, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("prbayes.estimate.refit._FAINT", faint)
+    functions = optimum.sampling().of_functions
+    _, stderr = point_and_stderr(optimum.evaluator, optimum.theta, optimum.covariance, functions)
+    for name in ("chol_stds", "chol_corr"):
+        np.testing.assert_allclose(stderr[name], optimum.stderr[name], rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     "propagation", [prb.Reweighted(64), prb.Resimulated(64), prb.Fresh(64)], ids=repr
 )

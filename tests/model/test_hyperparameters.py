@@ -127,3 +127,14 @@ def test_fixed_points_follow_names_and_not_order(prior: type) -> None:
             found.append(points[:, np.argsort(hyperparameters.names)])
     for other in found[1:]:
         np.testing.assert_array_equal(found[0], other)
+
+
+def test_a_batch_of_no_thetas_has_no_values_of_any_variable() -> None:
+    with pm.Model() as model:
+        factor = pm.LKJCorr("factor", n=2, eta=2)
+        pm.Deterministic("correlation", factor @ factor.T)
+    found = Hyperparameters(model).constrained(np.empty((0, 1)))
+    assert {name: value.shape for name, value in found.items()} == {
+        "factor": (0, 2, 2),
+        "correlation": (0, 2, 2),
+    }
