@@ -78,10 +78,13 @@ def test_outputs_that_nearly_depend_on_each_other_are_told_apart() -> None:
     np.testing.assert_allclose(coordinates(near), coordinates(y), rtol=1e-4, atol=1e-5)
 
 
-def test_signs_are_those_of_the_data() -> None:
+def test_signs_are_those_of_the_data_in_any_order() -> None:
     y = np.random.default_rng(0).exponential(size=(50, 2))
     for signs in ([1, -1], [-1, 1], [-1, -1]):
         np.testing.assert_allclose(coordinates(y * signs), coordinates(y), rtol=1e-7, atol=1e-8)
+    for seed in range(8):
+        order = np.random.default_rng(seed).permutation(50)
+        np.testing.assert_allclose(coordinates(y[order]), coordinates(y)[order], atol=1e-8)
     # The longer tail of each coordinate is on its positive side.
     z = coordinates(y)
     assert (z.max(axis=0) > -z.min(axis=0)).all()
