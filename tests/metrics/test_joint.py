@@ -159,7 +159,7 @@ def test_missing_outputs_are_compared_with_all_specimens_that_have_the_others() 
     np.testing.assert_allclose(unit, unit[0], err_msg="in robust units")
     assert 0.5 < abs(unit[0]) < 2
     assert whole(x) == pytest.approx(expected, rel=1e-9)
-    with pytest.raises(ValueError, match="lack outputs which every part .* of 'direction 1'"):
+    with pytest.raises(ValueError, match=r"lack outputs which every part .* of 'direction 1'"):
         Joint(AreaMetric()).against(y[12:]).with_observed(y[:6])
     masked = np.ma.masked_invalid(y)
     assert Joint(AreaMetric()).against(masked)(x) == whole(x)
