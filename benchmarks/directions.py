@@ -256,7 +256,7 @@ def main() -> None:
     """Fit all cells, print a table, write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=record.RESULTS / "directions.json")
-    parser.add_argument("--replicates", type=int, default=200)
+    parser.add_argument("--replicates", type=int, default=100)
     arguments = parser.parse_args()
     out: dict[str, Any] = {}
     cases = [(m, n, metric, name) for m in NUMBERS for n in (50,) for name in SHAPES

@@ -151,6 +151,12 @@ class CompositeDiscrepancy(Discrepancy):
             own = np.where(seen[..., k, None], own, 1.0)
             target = part.target.with_observed(values, own)
             parts.append(replace(part, target=target))
+        if not seen.any(axis=-1).all():
+            raise ValueError(
+                "observed: got specimens that lack outputs which every part of the metric needs, "
+                f"expected some that have those of {self.members[0].label!r} or another part; "
+                "prepare the metric against them by Metric.against"
+            )
         nominal = np.array([part.share for part in parts])
         shares = nominal * seen
         shares = shares * (nominal.sum() / shares.sum(axis=-1, keepdims=True))

@@ -28,11 +28,11 @@ class MarginalCorrelation(LiftedMetric):
     :math:`w_1 \sum_j d_j / s_j + w_2 \sum_{i<j} (\rho_{ij} - r_{ij})^2`, with :math:`d_j` the
     metric of output j in units of its observed spread, :math:`s_j` its typical size
     (``Discrepancy.scale``: for the probability residual its value without any density, for the area
-    metric the observed mean deviation, or else one), and :math:`\rho` and :math:`r` the simulated and observed Pearson correlations. The
-    idea is that of [1]_: a joint distribution is told by its marginals and correlations, and each
-    is given a residual that is normalised. This is a reading of it from the paper's summary: the
-    paper's own norms of the two residuals, which are for its probability residual, are not claimed
-    here.
+    metric the observed mean deviation, or else one), and :math:`\rho` and :math:`r` the simulated
+    and observed Pearson correlations. The idea is that of [1]_: a joint distribution is told by its
+    marginals and correlations, and each is given a residual that is normalised. This is a reading
+    of it from the paper's summary: the paper's own norms of the two residuals, which are for its
+    probability residual, are not claimed here.
 
     Only correlations tie the outputs together: dependence of other kinds is not seen, and moments
     are not robust. Under the area metric estimates of strong correlations scatter more than with

@@ -18,9 +18,9 @@ from prbayes.metrics.density import spread
 _DEGREES = (1.0, 3.0, np.inf)
 
 # From 50 values of 2 to 8 outputs 40 to 150 steps reach the bound below, which leaves coordinates
-# the same to 1e-10 after an affine map (test); more steps than that mean that there is no scatter.
+# the same to 1e-8 after an affine map (test); more steps than that mean that there is no scatter.
 _MOST_STEPS = 2000
-_CONVERGED = 1e-12
+_CONVERGED = 1e-9
 
 # A ratio of singular values that is made of rounding errors alone.
 _SINGULAR = 1e-13

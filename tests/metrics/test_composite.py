@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -145,6 +146,14 @@ def test_rows_of_weights_are_as_many_data_sets(metric: Metric, draw: Any) -> Non
     alone = several.with_observed(z[:8], sets[1, 0, :8])
     assert alone(x, w[::-1]) == pytest.approx(expected[1], rel=1e-9)
     assert found.shape == (2, 1)
+    shares = several.shares.sum(axis=-1)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(shares, sum(part.share for part in several.parts))
+
+
+def test_it_comes_back_from_pickle(metric: Metric, draw: Any) -> None:
+    x, w, z, u = draw
+    d = metric.against(z, u)
+    assert pickle.loads(pickle.dumps(d))(x, w) == d(x, w)
 
 
 def test_other_observed_values_keep_the_slices(metric: Metric, draw: Any) -> None:

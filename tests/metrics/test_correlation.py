@@ -72,6 +72,17 @@ def test_a_correlation_has_the_specimens_that_have_both() -> None:
     assert np.isfinite(MarginalCorrelation(AreaMetric()).against(y[:, 1:])(x[:, 1:]))
 
 
+def test_a_data_set_without_a_pair_leaves_its_correlation_out() -> None:
+    x, y = sample(40, 0), sample(30, 1)
+    y[:10, 0] = NAN
+    part = MarginalCorrelation(AreaMetric()).against(y).parts[-1]
+    seen, _ = part.observed_of(y)
+    target = part.target.with_observed(seen[:10])
+    r = np.corrcoef(y[:10, 1:].T)[0, 1]
+    rho = np.corrcoef(x[:, 1:].T)[0, 1]
+    assert target.of(part.of(x), np.full(40, 1 / 40)) == pytest.approx((rho - r) ** 2)
+
+
 def test_a_population_that_is_one_number_has_no_correlation() -> None:
     d = MarginalCorrelation(AreaMetric()).against(sample(30, 1)).parts[-1]
     constant = np.ones((9, 3))

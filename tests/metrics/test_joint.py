@@ -142,7 +142,10 @@ def test_missing_outputs_are_compared_with_all_specimens_that_have_the_others() 
     y[:6, 0] = NAN
     y[6:12, 1:] = NAN
     whole, last_two, first = Joint(AreaMetric()).against(y), y[:, 1:], y[:, 0]
-    assert not whole.additive
+    residual = Joint(ProbabilityResidual())
+    assert residual.additive
+    assert residual.against(y[12:]).additive
+    assert not residual.against(y).additive
     parts = (
         (0.5, y[12:], x),
         (0.25, np.delete(last_two, np.s_[6:12], axis=0), x[:, 1:]),
@@ -156,6 +159,8 @@ def test_missing_outputs_are_compared_with_all_specimens_that_have_the_others() 
     np.testing.assert_allclose(unit, unit[0], err_msg="in robust units")
     assert 0.5 < abs(unit[0]) < 2
     assert whole(x) == pytest.approx(expected, rel=1e-9)
+    with pytest.raises(ValueError, match=r"lack outputs which every part .* of 'direction 1'"):
+        Joint(AreaMetric()).against(y[12:]).with_observed(y[:6])
     masked = np.ma.masked_invalid(y)
     assert Joint(AreaMetric()).against(masked)(x) == whole(x)
 

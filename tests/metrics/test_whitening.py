@@ -72,6 +72,24 @@ def test_equal_specimens_that_have_no_robust_scatter_are_whitened_all_the_same()
     np.testing.assert_allclose(coordinates(y @ [[2.0, 1.0], [0.0, 3.0]]), coordinates(y), rtol=1e-6)
 
 
+def test_outputs_that_nearly_depend_on_each_other_are_told_apart() -> None:
+    y = correlated(0.0, 400)
+    near = y @ [[1.0, 1.0], [0.0, 2e-5]]
+    np.testing.assert_allclose(coordinates(near), coordinates(y), rtol=1e-4, atol=1e-5)
+
+
+def test_signs_are_those_of_the_data_in_any_order() -> None:
+    y = np.random.default_rng(0).exponential(size=(50, 2))
+    for signs in ([1, -1], [-1, 1], [-1, -1]):
+        np.testing.assert_allclose(coordinates(y * signs), coordinates(y), rtol=1e-7, atol=1e-8)
+    for seed in range(8):
+        order = np.random.default_rng(seed).permutation(50)
+        np.testing.assert_allclose(coordinates(y[order]), coordinates(y)[order], atol=1e-8)
+    # The longer tail of each coordinate is on its positive side.
+    z = coordinates(y)
+    assert (z.max(axis=0) > -z.min(axis=0)).all()
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
@@ -81,10 +99,16 @@ def test_equal_specimens_that_have_no_robust_scatter_are_whitened_all_the_same()
         ),
         (lambda y: y * [1, 0], "equal values of output 2 .*leave that output out"),
         (lambda y: y[:, [0, 0]], "outputs 0, 2 .*depend on each other linearly.*leave one of them"),
-        (lambda y: y[:, [0, 0]] + 1e-7 * y, "outputs 0, 2 .*depend on each other linearly"),
+        (lambda y: y[:, [0, 0]] + 3e-6 * y, "outputs 0, 2 .*depend on each other linearly"),
     ],
 )
 def test_what_cannot_be_whitened_is_told_by_outputs(spoil: object, message: str) -> None:
     y = spoil(correlated(0.5))  # type: ignore[operator]
     with pytest.raises(ValueError, match=message):
         whitening(y, np.full(len(y), 1 / len(y)), np.array([0, 2]))
+
+
+def test_specimens_without_weight_are_not_counted() -> None:
+    weights = np.r_[np.ones(3), np.zeros(47)] / 3
+    with pytest.raises(ValueError, match="3 specimens with finite outputs"):
+        whitening(correlated(0.5), weights, np.arange(2))
