@@ -345,6 +345,10 @@ class Metric(ABC):
         """
         return metric
 
+    def beside(self, observed: Floats, weights: Floats, design: Floats) -> Discrepancy:
+        """Return the discrepancy from checked values, now that a design's responses are known."""
+        return self._prepare(observed, weights)
+
     @abstractmethod
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         """Return the discrepancy from these observed values, both of shape (N,) and checked."""

@@ -17,6 +17,8 @@ MOST_OUTPUTS = 8
 _LEFT_OUT = 0.01
 # Specimens for each component: scatters of fewer are hardly known.
 _SPECIMENS = 5
+# Specimens from which two components can be had.
+FEWEST = 2 * _SPECIMENS
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,7 @@ class Components:
     @property
     def number(self) -> int:
         """How many there are."""
-        return self.axes.shape[1]
+        return int(self.axes.shape[1])
 
 
 def principal_components(

@@ -114,8 +114,7 @@ class CompositeDiscrepancy(Discrepancy):
         """Return the same with the principal components of data and design together."""
         if not self.components:
             return self
-        found: Discrepancy = self.metric.against_beside(self.observed, self.weights, design)
-        return found
+        return self.metric.beside(self.observed, self.weights, design)
 
     @property
     def parts(self) -> tuple[Part, ...]:

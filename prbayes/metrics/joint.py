@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.metrics.base import Discrepancy, Part
-from prbayes.metrics.components import MOST_OUTPUTS, Components, principal_components
-from prbayes.metrics.composite import CompositeDiscrepancy, Centered, Projection
+from prbayes.metrics.components import FEWEST, MOST_OUTPUTS, Components, principal_components
+from prbayes.metrics.composite import Centered, CompositeDiscrepancy, Projection
 from prbayes.metrics.directions import directions, enough
 from prbayes.metrics.lifted import LiftedMetric, failure_caps
 from prbayes.metrics.whitening import Whitening, whitening
@@ -93,15 +93,19 @@ class Joint(LiftedMetric):
             positive_integer(self.components, "components")
         positive_integer(self.seed, "seed", minimum=0)
 
-    def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
-        return self.against_beside(observed, weights, None)
+    def beside(self, observed: Floats, weights: Floats, design: Floats) -> Discrepancy:
+        """Return the discrepancy with principal components of a design, (k, m), as well."""
+        return self._made(observed, weights, design)
 
-    def against_beside(
-        self, observed: Floats, weights: Floats, design: Floats | None
-    ) -> Discrepancy:
-        """Prepare the observed side, (N, m), with components of a design, (k, m), as well."""
+    def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         if observed.shape[1] == 1:
             return super()._prepare(observed, weights)
+        return self._made(observed, weights, None)
+
+    def _parts(self, observed: Floats, weights: Floats) -> Sequence[Part]:
+        return self._made(observed, weights, None).parts
+
+    def _made(self, observed: Floats, weights: Floats, design: Floats | None) -> Discrepancy:
         caps = failure_caps(observed)
         parts: list[Part] = []
         components: list[Components] = []
@@ -113,9 +117,6 @@ class Joint(LiftedMetric):
         targets = self.metric.on_one_scale([part.target for part in parts])
         parts = [replace(p, target=target) for p, target in zip(parts, targets, strict=True)]
         return CompositeDiscrepancy.of_parts(self, observed, weights, parts, tuple(components))
-
-    def _parts(self, observed: Floats, weights: Floats) -> Sequence[Part]:
-        return self.against_beside(observed, weights, None).parts
 
     def _slices(
         self,
@@ -200,8 +201,9 @@ def _order(key: frozenset[int]) -> tuple[int, list[int]]:
 
 
 def _is_thin(key: frozenset[int], has: NDArray[np.bool_]) -> bool:
-    """Return whether too few specimens have these outputs to whiten them."""
-    return int(has[:, list(key)].all(axis=-1).sum()) < len(key) + 2
+    """Return whether too few specimens have these outputs to whiten them, or their components."""
+    needed = len(key) + 2 if len(key) <= MOST_OUTPUTS else FEWEST
+    return int(has[:, list(key)].all(axis=-1).sum()) < needed
 
 
 def _divide(shares: dict[frozenset[int], float], thin: frozenset[int]) -> None:
