@@ -44,10 +44,9 @@ class Joint(LiftedMetric):
         deviations and correlations are then those of ten times as many, to 3%
         (``benchmarks/directions.py``). Below m (m + 1) / 2 they do not tell all correlations.
     components : int, optional
-        Outputs that are too many for it, more than eight or as many as there are specimens, such
-        as curves, are replaced by their scores on principal components of data and design
-        together: this many, or as many as leave out a hundredth of the variance of either. All
-        outputs are then to be in one unit.
+        More than eight outputs, such as curves, are replaced by their scores on principal
+        components of data and design together: as many as leave out a hundredth of the variance of
+        either. Fewer outputs are if a number is given. All are then to be in one unit.
     seed : int
         Of the directions; those of two outputs do without.
 
@@ -153,8 +152,8 @@ class Joint(LiftedMetric):
     ) -> tuple[Whitening, list[Components]]:
         """Return white coordinates of some outputs, or of their principal components."""
         finite = np.isfinite(chosen).all(axis=-1)
-        many = outputs.size > MOST_OUTPUTS or finite.sum() < outputs.size + 2
-        if outputs.size < 2 or not (many or self.components):
+        many = outputs.size > MOST_OUTPUTS or self.components is not None
+        if outputs.size < 2 or not many:
             return whitening(chosen[finite], weights[finite], outputs), []
         has = ~np.isnan(chosen).any(axis=-1)
         sample, own = _capped(chosen[has], caps), weights[has] / weights[has].sum()
