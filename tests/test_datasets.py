@@ -70,3 +70,17 @@ def test_the_docstring_example_runs():
     result = doctest.testmod(datasets)
     assert result.attempted > 0
     assert result.failed == 0
+
+
+def test_the_virkler_data_are_those_of_their_publications():
+    data = datasets.virkler()
+    lengths = data.half_crack_length_mm
+    assert lengths.shape == (68, 12)
+    assert np.isnan(lengths).sum(axis=0).values.tolist() == [0] * 10 + [12, 55]
+    assert np.nanmax(lengths) < data.attrs["end_mm"]
+    later = np.diff(lengths, axis=1)
+    assert np.nanmin(later) > 0
+    for kilocycles, mean, sd in ((100, 13.892, 0.671), (200, 27.61, 3.01)):
+        column = lengths.sel(kilocycles=kilocycles)
+        assert float(column.mean()) == pytest.approx(mean, abs=0.005)
+        assert float(column.std(ddof=1)) == pytest.approx(sd, abs=0.005)
