@@ -1,4 +1,4 @@
-"""How do the two coefficients of Paris' law vary together? 68 crack growth curves, seen at four times.
+"""How do the coefficients of Paris' law vary together? 68 crack growth curves, seen at four times.
 
 Half crack lengths of aluminium specimens after 60, 120, 180 and 220 thousand cycles calibrate the
 population of growth rate and exponent, with their correlation: four outputs of one run. Some
@@ -64,9 +64,9 @@ def reference(lengths):
 def calibrate(observed):
     """Return the model, its input, its optimum and its posterior."""
     with pm.Model() as model:
-        mean = pm.Normal("mean", [-2.0, 3.5], 0.5, shape=2)  # of log rate and exponent
-        chol, corr, sds = pm.LKJCholeskyCov(
-            "chol", n=2, eta=1, sd_dist=pm.HalfNormal.dist(0.3, shape=2)
+        mean = pm.Normal("mean", [-2.0, 3.5], [0.2, 0.5], shape=2)  # of log rate and exponent
+        chol, _, sds = pm.LKJCholeskyCov(
+            "chol", n=2, eta=1, sd_dist=pm.HalfNormal.dist([0.1, 0.3], shape=2)
         )
         # The same population in terms of log C.
         log_c = np.array([1.0, -LEVER])

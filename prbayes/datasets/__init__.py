@@ -122,8 +122,8 @@ def virkler() -> xr.Dataset:
         },
         attrs={
             "description": (
-                "Fatigue crack growth in 2024-T3 aluminium: half crack length of 68 specimens every "
-                "20 000 cycles, from 9 mm at the beginning; NaN beyond 36.6 mm"
+                "Fatigue crack growth in 2024-T3 aluminium: half crack length of 68 specimens "
+                "every 20 000 cycles, from 9 mm at the beginning; NaN beyond 36.6 mm"
             ),
             "source": (
                 "D. A. Virkler, B. M. Hillberry and P. K. Goel (1979), The statistical nature of "
