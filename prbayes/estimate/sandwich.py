@@ -197,19 +197,21 @@ class Information:
         around = self._stencil
         return self._target.features(around.values, around.weights, np)
 
-    def _along_stencil(self, observed: Floats, weights: Floats) -> Floats:
-        """Return discrepancies at the stencil, (s,) or (n_sets, s), some data sets at a time."""
-        features = self._features
-        at_once = len(weights)
-        if weights.ndim > 1:
-            size = sum(f.size for f in features)
-            at_once = max(1, AT_ONCE // size)
+    def _along_stencil(
+        self, observed: Floats, weights: Floats, points: slice = slice(None)
+    ) -> Floats:
+        """Return discrepancies at points of the stencil, (s,) or (n_sets, s), some sets at a time."""
+        features = [feature[points] for feature in self._features]
+        target = self._target.with_observed(observed, weights)
+        n_sets = len(weights) if weights.ndim > 1 else 1
+        size = sum(feature.size for feature in features)
+        at_once = max(1, AT_ONCE // size)
+        if n_sets <= at_once:
+            return np.atleast_1d(target.outer(*features, xp=np))
         found = []
-        for i in range(0, len(weights), at_once):
-            some = weights[i : i + at_once]
-            target = self._target.with_observed(observed, some)
-            values = target.outer(*features, xp=np)
-            found.append(np.atleast_1d(values))
+        for i in range(0, n_sets, at_once):
+            some = target.rows(slice(i, i + at_once))
+            found.append(some.outer(*features, xp=np))
         return np.concatenate(found)
 
     @cached_property
@@ -247,9 +249,8 @@ class Information:
         observed : ndarray, shape (n,)
         weights : ndarray, shape (n_sets, n)
         """
-        values = self._along_stencil(observed, weights[:, None])
-        across = values.T[: self._n_cross]
-        return slopes(across, self._step)
+        across = self._along_stencil(observed, weights[:, None], slice(self._n_cross))
+        return slopes(across.T, self._step)
 
     @cached_property
     def sampling_covariance(self) -> Floats:
