@@ -40,7 +40,8 @@ class Axis:
         finite = np.where(np.isfinite(observed), observed, np.nan)
         spread = np.nanstd(finite, axis=0)
         unit = np.where(spread > 0, spread, 1.0)
-        return cls(output, np.arange(m) + 0.0, np.arange(m), np.nanmean(finite, axis=0), unit)
+        places = np.arange(m, dtype=np.float64)
+        return cls(output, places, np.arange(m), np.nanmean(finite, axis=0), unit)
 
     def scaled(self, values: Floats) -> Floats:
         """Return values, (..., m), as they are drawn, from left to right."""

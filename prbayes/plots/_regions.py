@@ -74,7 +74,8 @@ def outlines(points: Floats, weights: Floats, shares: tuple[float, ...]) -> list
 
     # Weights in cells, smoothed
     edges = np.linspace(-_REACH, _REACH, _CELLS + 1)
-    masses, *_ = np.histogram2d(*coordinates.T, bins=(edges, edges), weights=w)
+    x, y = coordinates.T
+    masses, *_ = np.histogram2d(x, y, bins=[edges, edges], weights=w)
     bandwidth = np.sum(w**2) ** (1 / 6)  # n ** (-1 / 6)
     step = edges[1] - edges[0]
     density = gaussian_filter(masses, bandwidth / step, mode="constant")

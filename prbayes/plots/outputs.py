@@ -100,16 +100,18 @@ def plot_outputs(
     Examples
     --------
     >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> def response(a, b):
+    ...     return {"load": a + b, "life": a * b}
     >>> rng = np.random.default_rng(1)
-    >>> x = rng.normal(2.0, 1.0, 20)
-    >>> data = {"load": 2 * x, "life": x**2 + rng.normal(0, 0.2, 20)}
-    >>> def response(x, noise):
-    ...     return {"load": 2 * x, "life": x**2 + noise}
+    >>> data = response(*rng.normal([[2.0], [3.0]], 0.2, (2, 20)))
     >>> with pm.Model() as model:
-    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+    ...     a = pm.Normal.dist(pm.Normal("mu", 2.0, 0.5), 0.2)
+    ...     b = pm.Normal.dist(3.0, 0.2)
     ...     metric = prb.Joint(prb.ProbabilityResidual())
-    ...     noise = pm.Normal.dist(0.0, 0.2)
-    ...     y = prb.Simulator("y", response, x, noise, metric=metric, observed=data)
+    ...     cheap = prb.Resimulated(256)
+    ...     y = prb.Simulator(
+    ...         "y", response, a, b, metric=metric, observed=data, propagation=cheap
+    ...     )
     >>> list(prb.plot_outputs(prb.minimize(model), backend="none").viz["measured"])
     ['life, load']
     """
@@ -281,7 +283,7 @@ def _draw_measured(panel: Panel, x: Output, y: Output) -> float:
     points = np.column_stack([x.of(observed), y.of(observed)])
     known = np.isfinite(points).all(axis=1)
     points = points[known]
-    panel.points("measured", *points.T, INK, size=14, legend="measured")
+    panel.points("measured", points[:, 0], points[:, 1], INK, size=14, legend="measured")
     return correlation(points, weights[known])
 
 
@@ -300,7 +302,8 @@ def _draw_regions(
         return np.nan
     for share, line in zip(_SHARES, outlines(points, weights, _SHARES), strict=True):
         name = f"{visual}_{100 * share:.0f}"
-        panel.line(name, *line, color, style=style, width=1.5, legend=text)
+        x, y = line
+        panel.line(name, x, y, color, style=style, width=1.5, legend=text)
     return correlation(points, weights)
 
 
