@@ -9,15 +9,13 @@ import numpy as np
 from prbayes._checks import Floats
 from prbayes._weighted import distribution_function
 from prbayes.estimate.data_sets import DataSets, observed_set
-from prbayes.estimate.goodness import UNLIKELY, Refitted
+from prbayes.estimate.goodness import BEYOND, UNLIKELY, Refitted
 from prbayes.metrics.lifted import failure_caps
 from prbayes.model.node import Node
 
 # Outputs that are looked at; of more, as of a curve, some from the first to the last: neighbours
 # agree or disagree together.
-_MOST = 12
-# Probability that a population has beyond its ends at least, as in the goodness of fit.
-_BEYOND = 1e-4
+_MOST_OUTPUTS = 12
 
 
 def disagreement(refitted: Refitted) -> list[str]:
@@ -110,7 +108,7 @@ class _Seen:
         known = ~np.isnan(simulated[0]).any(axis=1)
         masses = masses[:, known]
         m = observed.shape[1]
-        places = np.linspace(0, m - 1, min(m, _MOST)).round()
+        places = np.linspace(0, m - 1, min(m, _MOST_OUTPUTS)).round()
         return cls(
             np.minimum(sets.values[k], caps),
             sets.weights[k],
@@ -133,7 +131,7 @@ class _Seen:
         under = distribution_function(column, self.masses, np.nextafter(at, -np.inf))
         expected = (up_to + under) / 2
         squares = w * (below - expected) ** 2
-        inside = np.clip(expected, _BEYOND, 1 - _BEYOND)
+        inside = np.clip(expected, BEYOND, 1 - BEYOND)
         sums = [squares.sum(axis=1), (squares / (inside * (1 - inside))).sum(axis=1)]
         return np.asarray(np.log(np.maximum(np.stack(sums, axis=1), 1e-300)))
 

@@ -25,7 +25,7 @@ from prbayes.metrics.base import Part
 UNLIKELY = 0.01
 # Probability that a population has below its least and above its greatest value at least, so that
 # one observation outside weighs as one in ten thousand, and not without bound.
-_BEYOND = 1e-4
+BEYOND = 1e-4
 
 
 def fit_probability(sampling: SamplingDistribution, n_sets: int, seed: int) -> float:
@@ -190,7 +190,7 @@ def _distances_of(
     below = np.cumsum(w, axis=1) - w / 2
     expected = populations.below(k, part, x, values[ranked])
     squares = w * (below - expected) ** 2
-    inside = np.clip(expected, _BEYOND, 1 - _BEYOND)
+    inside = np.clip(expected, BEYOND, 1 - BEYOND)
     in_the_middle = squares.sum(axis=1)
     in_the_tails = (squares / (inside * (1 - inside))).sum(axis=1)
     return [in_the_middle, in_the_tails]

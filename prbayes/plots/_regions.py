@@ -14,10 +14,10 @@ from prbayes._checks import Floats
 _CELLS = 160
 # How far the plane reaches, in standard deviations of the points: 1.8e-4 of a normal population are
 # beyond, and those of a longer tail are outside any region that is drawn.
-_REACH = 4.2
+_PLANE = 4.2
 # Part of the largest spread that the narrowest one is taken for, so that points on a line have a
 # region: thinner than the line it is drawn with.
-_THIN = 1e-3
+_NARROWEST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class White:
         unit = np.where(spread > 0, spread, 1.0)
         scaled = deviations / unit
         variances, vectors = np.linalg.eigh(scaled.T @ (weights[:, None] * scaled))
-        least = max(float(variances[-1]), 1e-300) * _THIN**2
+        least = max(float(variances[-1]), 1e-300) * _NARROWEST**2
         steps = np.sqrt(np.maximum(variances, least))
         return cls(center, unit[:, None] * vectors * steps)
 
@@ -73,7 +73,7 @@ def outlines(points: Floats, weights: Floats, shares: tuple[float, ...]) -> list
     coordinates = white.of_points(points)
 
     # Weights in cells, smoothed
-    edges = np.linspace(-_REACH, _REACH, _CELLS + 1)
+    edges = np.linspace(-_PLANE, _PLANE, _CELLS + 1)
     x, y = coordinates.T
     masses, *_ = np.histogram2d(x, y, bins=[edges, edges], weights=w)
     bandwidth = np.sum(w**2) ** (1 / 6)  # n ** (-1 / 6)

@@ -22,10 +22,8 @@ from prbayes.plots._canvas import (
     refuse_look,
 )
 from prbayes.plots._curves import steps
+from prbayes.validation.conditions import DIRECTION
 from prbayes.validation.validity import ValidityTest
-
-# In names of conditions, before the number of a direction in which several outputs are seen.
-_DIRECTION = ", direction "
 
 
 def plot_validity(
@@ -119,7 +117,7 @@ def _draw(panel: Panel, test: ValidityTest, title: str) -> None:
 
 def in_directions(test: ValidityTest) -> list[Floats]:
     """Return the u-values of several outputs by direction; none if all conditions have one."""
-    numbers = np.array([name.rpartition(_DIRECTION)[2] for name in test.conditions.tolist()])
+    numbers = np.array([name.rpartition(DIRECTION)[2] for name in test.conditions.tolist()])
     seen = _is_seen(test)
     known = dict.fromkeys(numbers[seen].tolist())
     return [test.u_values[seen & (numbers == number)] for number in known]
@@ -127,7 +125,7 @@ def in_directions(test: ValidityTest) -> list[Floats]:
 
 def _is_seen(test: ValidityTest) -> NDArray[np.bool_]:
     """Return which u-values are of several outputs, in a direction."""
-    return np.array([_DIRECTION in name for name in test.conditions.tolist()], dtype=bool)
+    return np.array([DIRECTION in name for name in test.conditions.tolist()], dtype=bool)
 
 
 def _draw_directions(panel: Panel, test: ValidityTest, title: str) -> None:
