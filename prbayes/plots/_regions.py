@@ -18,6 +18,9 @@ _PLANE = 4.2
 # Part of the largest spread that the narrowest one is taken for, so that points on a line have a
 # region: thinner than the line it is drawn with.
 _NARROWEST = 1e-3
+# Part of a population, at either end, that does not tell how wide it is: where responses diverge, a
+# few specimens would decide the kernel's width. A normal spread is then known to 3%.
+_TAIL = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +32,8 @@ class White:
 
     @classmethod
     def of(cls, points: Floats, weights: Floats) -> White:
-        """Return the coordinates of points, (n, 2), with weights of sum 1."""
+        """Return the coordinates of points, (n, 2), with weights of sum 1; without far tails."""
+        points = _within(points, weights)
         center = weights @ points
         deviations = points - center
         spread = np.sqrt(weights @ deviations**2)
@@ -47,6 +51,18 @@ class White:
     def points(self, coordinates: Floats) -> Floats:
         """Return the points of coordinates, (n, 2)."""
         return self.center + coordinates @ self.axes.T
+
+
+def _within(points: Floats, weights: Floats) -> Floats:
+    """Return points with what is far out moved to where few are, in each coordinate."""
+    moved = []
+    for column in points.T:
+        order = np.argsort(column, kind="stable")
+        below = np.cumsum(weights[order])
+        low, high = np.searchsorted(below, [_TAIL, 1 - _TAIL])
+        ends = column[order[[low, min(high, column.size - 1)]]]
+        moved.append(np.clip(column, ends[0], ends[1]))
+    return np.column_stack(moved)
 
 
 def outlines(points: Floats, weights: Floats, shares: tuple[float, ...]) -> list[Floats]:
@@ -91,10 +107,12 @@ def outlines(points: Floats, weights: Floats, shares: tuple[float, ...]) -> list
 
 
 def _threshold(density: Floats, share: float) -> float:
-    """Return the density above which a share of all is."""
+    """Return the density above which a share is, where all sums to one, or less on the plane."""
+    # What is beyond the plane is thinner than all on it
     descending = np.sort(density.ravel())[::-1]
     total = np.cumsum(descending)
-    return float(descending[np.searchsorted(total, share * total[-1])])
+    last = np.count_nonzero(descending) - 1
+    return float(descending[min(np.searchsorted(total, share), last)])
 
 
 def _contour(middles: Floats, density: Floats, level: float) -> list[Floats]:

@@ -53,7 +53,7 @@ def plot_outputs(
     Points are the specimens of which both outputs were measured. The solid lines hold 50% and 89%
     of the calibrated population, in the smallest regions that do: of the posterior predictive
     distribution, or the optimum's population. Dashed ones are those before the calibration. A
-    title has the correlation of the points, and that of the calibrated population.
+    title has the correlation of the points' ranks, and that of the calibrated population's.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def plot_outputs(
         Name of a simulator with several outputs; the first one by default.
     outputs : sequence, optional
         Two to seven outputs by label, such as ``["first", "third"]``, or by number if they have no
-        names; by default all, but of more than five four, from the first to the last.
+        names; by default all that vary, but of more than five four, from the first to the last.
     before : dict or bool, optional
         As in `plot_responses`.
     draws : int, optional
@@ -160,7 +160,7 @@ def plot_outputs(
         panel.axes(
             x=x.text(labels) if i == size - 1 else "",
             y=y.text(labels) if j == 0 else "",
-            title=f"correlation {_written(measured)}, calibrated {_written(calibrated)}",
+            title=f"rank correlation\nmeasured {_written(measured)}, calibrated {_written(calibrated)}",
             xlim=across,
             ylim=up,
             xticks=round_ticks(*across),
@@ -192,6 +192,8 @@ def _chosen(evaluator: Evaluator, k: int, wanted: Sequence[Any] | None) -> list[
     node = evaluator.nodes[k]
     every = outputs_of(node, alone=len(evaluator.nodes) == 1)
     if wanted is None:
+        varying = [output for output in every if _varies(output)]
+        every = varying if len(varying) > 1 else every
         if len(every) <= _SHOWN:
             return every
         places = np.linspace(0, len(every) - 1, _OF_MANY)
@@ -208,6 +210,13 @@ def _chosen(evaluator: Evaluator, k: int, wanted: Sequence[Any] | None) -> list[
     if len({output.column for output in found}) < len(found):
         raise ValueError(f"outputs: got {list(wanted)!r:.200}, expected different ones")
     return found
+
+
+def _varies(output: Output) -> bool:
+    """Whether specimens differ in an output, by more than rounding."""
+    observed, _ = output.measured()
+    finite = observed[np.isfinite(observed)]
+    return bool(np.ptp(finite) > 1e-9 * np.abs(finite).max())
 
 
 def _place(node: Node, label: Any) -> int:
@@ -284,7 +293,7 @@ def _draw_measured(panel: Panel, x: Output, y: Output) -> float:
     known = np.isfinite(points).all(axis=1)
     points = points[known]
     panel.points("measured", points[:, 0], points[:, 1], INK, size=14, legend="measured")
-    return correlation(points, weights[known])
+    return _of_ranks(points, weights[known])
 
 
 def _draw_regions(
@@ -304,7 +313,19 @@ def _draw_regions(
         name = f"{visual}_{100 * share:.0f}"
         x, y = line
         panel.line(name, x, y, color, style=style, width=1.5, legend=text)
-    return correlation(points, weights)
+    return _of_ranks(points, weights)
+
+
+def _of_ranks(points: Floats, weights: Floats) -> float:
+    """Return the correlation of the ranks of weighted points: a few far out do not decide it."""
+    return correlation(np.column_stack([_ranks(column, weights) for column in points.T]), weights)
+
+
+def _ranks(values: Floats, weights: Floats) -> Floats:
+    """Return the weight below each value, and half of that of equal ones."""
+    _, place = np.unique(values, return_inverse=True)
+    mass = np.bincount(place, weights)
+    return (np.cumsum(mass) - mass / 2)[place]
 
 
 def _written(r: float) -> str:

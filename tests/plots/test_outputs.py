@@ -8,8 +8,11 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from scipy import stats
 
 import prbayes as prb
+from prbayes.plots.outputs import _chosen
+from prbayes.response.outputs import Outputs
 
 
 @pytest.mark.parametrize(("share", "visual"), [(0.5, "after_50"), (0.89, "after_89")])
@@ -41,8 +44,9 @@ def test_axes_have_the_names_and_units_and_the_title_both_correlations(
     axis = pc.viz["plot"]["second, first"].item()
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("first (Hz)", "second (Hz)")
     both = pair.observed[np.isfinite(pair.observed).all(axis=1)]
-    r = np.corrcoef(both.T)[0, 1]
-    assert axis.get_title().startswith(f"correlation {r:.2f}, calibrated 0.8")
+    r = stats.spearmanr(both).statistic
+    # Of normal values 6 / pi arcsin(.8 / 2) = .786
+    assert axis.get_title().startswith(f"rank correlation\nmeasured {r:.2f}, calibrated 0.7")
     assert read.texts(pc) == [
         "before: prior's initial point",
         "calibrated: posterior predictive, 50% and 89%",
@@ -92,6 +96,15 @@ def several() -> SimpleNamespace:
         prb.Simulator("curve", curve, *inputs, observed=lines, **how)
     draws = xr.Dataset({"m": (("chain", "draw"), rng.normal(0, 0.2, (2, 20)))})
     return SimpleNamespace(model=model, posterior=xr.DataTree.from_dict({"posterior": draws}))
+
+
+def test_by_default_an_output_that_does_not_vary_is_left_out() -> None:
+    data = np.column_stack([np.full(5, 0.1), np.arange(5.0), np.arange(5.0) ** 2])
+    outputs = Outputs(("none", "one", "two"))
+    target = SimpleNamespace(observed=data, weights=np.full(5, 0.2))
+    node: Any = SimpleNamespace(name="y", outputs=outputs, target=target)
+    evaluator: Any = SimpleNamespace(nodes=[node])
+    assert [output.name for output in _chosen(evaluator, 0, None)] == ["y[one]", "y[two]"]
 
 
 def pairs(pc: Any) -> list[str]:
