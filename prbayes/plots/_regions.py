@@ -20,7 +20,7 @@ _PLANE = 4.2
 _NARROWEST = 1e-3
 # Part of a population, at either end, that does not tell how wide it is: where responses diverge, a
 # few specimens would decide the kernel's width. A normal spread is then known to 3%.
-_TAIL = 0.01
+_FAR_TAIL = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ def _within(points: Floats, weights: Floats) -> Floats:
     for column in points.T:
         order = np.argsort(column, kind="stable")
         below = np.cumsum(weights[order])
-        low, high = np.searchsorted(below, [_TAIL, 1 - _TAIL])
+        low, high = np.searchsorted(below, [_FAR_TAIL, 1 - _FAR_TAIL])
         ends = column[order[[low, min(high, column.size - 1)]]]
         moved.append(np.clip(column, ends[0], ends[1]))
     return np.column_stack(moved)
