@@ -160,7 +160,7 @@ def plot_outputs(
         panel.axes(
             x=x.text(labels) if i == size - 1 else "",
             y=y.text(labels) if j == 0 else "",
-            title=f"rank correlation\nmeasured {_written(measured)}, calibrated {_written(calibrated)}",
+            title=_title(measured, calibrated),
             xlim=across,
             ylim=up,
             xticks=round_ticks(*across),
@@ -326,6 +326,11 @@ def _ranks(values: Floats, weights: Floats) -> Floats:
     _, place = np.unique(values, return_inverse=True)
     mass = np.bincount(place, weights)
     return (np.cumsum(mass) - mass / 2)[place]
+
+
+def _title(measured: float, calibrated: float) -> str:
+    both = f"measured {_written(measured)}, calibrated {_written(calibrated)}"
+    return f"rank correlation\n{both}"
 
 
 def _written(r: float) -> str:
