@@ -32,6 +32,7 @@ from prbayes.model.stock import abc_distance
 from prbayes.plots.comparison import plot_comparison
 from prbayes.plots.landscape import plot_landscape
 from prbayes.plots.optimizer import plot_optimizer
+from prbayes.plots.outputs import plot_outputs
 from prbayes.plots.population import plot_population
 from prbayes.plots.posterior import plot_posterior
 from prbayes.plots.responses import plot_responses
@@ -86,6 +87,7 @@ __all__ = [
     "plot_comparison",
     "plot_landscape",
     "plot_optimizer",
+    "plot_outputs",
     "plot_population",
     "plot_posterior",
     "plot_responses",

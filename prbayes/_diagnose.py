@@ -13,12 +13,8 @@ import xarray as xr
 
 from prbayes._checks import Floats
 from prbayes.estimate.data_sets import SETS
-from prbayes.estimate.goodness import (
-    fit_probability,
-    of_another_family,
-    of_held_away,
-    probability_there,
-)
+from prbayes.estimate.disagreement import disagreement
+from prbayes.estimate.goodness import UNLIKELY, Refitted, of_another_family, of_held_away
 from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, require_of_model
 from prbayes.estimate.refit import SamplingDistribution
@@ -60,7 +56,7 @@ class Diagnosis:
     support : xarray.Dataset
         ``weight_ess``, ``mean_weight`` and ``lost_mass`` by simulator and draw, for `Reweighted`.
     notes : tuple of str
-        What was not looked at, and why.
+        What was not looked at, and why; and which of several outputs disagree.
     """
 
     messages: tuple[str, ...]
@@ -84,7 +80,8 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     sample size of draws, by ArviZ; how many of them differ; how far the particles of `sample_smc`
     moved in its last stage; whether the stored responses of `Reweighted` supported the answer; and,
     of optima on stored responses and of adjusted draws, whether the data can have come from the
-    best population, by refits (p < .01). No response is computed; what was not looked at is said.
+    best population, by refits (p < .01). If they cannot, notes tell which of several outputs, and
+    which correlations of two, disagree. No response is computed; what was not looked at is said.
 
     Parameters
     ----------
@@ -173,11 +170,19 @@ def _of_family(optimum: Optimum) -> tuple[list[str], tuple[str, ...]]:
     if optimum.prior:
         scales = np.array(list(optimum.scales.values()))
         held = SamplingDistribution.of(evaluator, optimum.theta, scales)
-        return of_held_away(probability_there(held, SETS, 0)), ()
-    probability = fit_probability(optimum.sampling(), SETS, 0)
-    if np.isnan(probability):
+        there = Refitted.there(held, SETS, 0)
+        probability = there.probability
+        return of_held_away(probability), _by_output(there, probability)
+    refitted = Refitted.of(optimum.sampling(), SETS, 0)
+    probability = np.nan if refitted is None else refitted.probability
+    if refitted is None or np.isnan(probability):
         return [], _not_looked_at("the data tell too little, or too few refits converge")
-    return of_another_family(probability), ()
+    return of_another_family(probability), _by_output(refitted, probability)
+
+
+def _by_output(refitted: Refitted, probability: float) -> tuple[str, ...]:
+    """Say which of several outputs disagree, where the data are too far from the population."""
+    return tuple(disagreement(refitted)) if probability < UNLIKELY else ()
 
 
 def _not_looked_at(reason: str) -> tuple[str, ...]:
@@ -238,12 +243,26 @@ def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
         *_failed_in(result),
         *_unsupported(designs),
     ]
-    return Diagnosis(tuple(messages), designs.support, _of_refits(posterior.attrs))
+    notes = _of_refits(posterior.attrs, several=_has_several_outputs(result))
+    return Diagnosis(tuple(messages), designs.support, notes)
 
 
-def _of_refits(attrs: Mapping[Any, Any]) -> tuple[str, ...]:
-    """Say why draws do not tell whether the data can have come from the best population."""
-    if np.isfinite(attrs.get("fit_probability", np.nan)):
+def _has_several_outputs(result: xr.DataTree) -> bool:
+    """Return whether a simulator of a result has several outputs."""
+    if "observed_data" not in result:
+        return False
+    return any(values.ndim > 1 for values in result["observed_data"].data_vars.values())
+
+
+def _of_refits(attrs: Mapping[Any, Any], *, several: bool) -> tuple[str, ...]:
+    """Say why draws do not tell whether the data can have come from the best population.
+
+    Or which of several outputs disagree.
+    """
+    probability = attrs.get("fit_probability", np.nan)
+    if probability < UNLIKELY and several:
+        return ("Which outputs disagree is told by prb.diagnose of an optimum.",)
+    if np.isfinite(probability):
         return ()
     said = str(attrs.get("adjustment", ""))
     why = said.removeprefix("none").removeprefix(": ") or "there was no adjustment"

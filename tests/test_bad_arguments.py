@@ -738,6 +738,18 @@ TABLE: dict[str, Row] = {
             (prb.plot_optimizer, "optimum", "optimum", ("backend", "labels"), {}),
         )
     },
+    "plot_outputs": Row(
+        prb.plot_outputs,
+        {
+            **PICTURE,
+            "result": NO_RESULT,
+            "simulator": (3, "zz", ["y"]),
+            "outputs": (3, "zz", [], [3], ["zz", "y"]),
+            "before": ("prior", 3, {"zz": 1.0}),
+            "draws": (0, 1.5, "a", True),
+        },
+        {"result": Name("posterior"), "model": Name("model")},
+    ),
     "plot_population": Row(
         prb.plot_population,
         {

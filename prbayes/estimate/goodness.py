@@ -25,7 +25,7 @@ from prbayes.metrics.base import Part
 UNLIKELY = 0.01
 # Probability that a population has below its least and above its greatest value at least, so that
 # one observation outside weighs as one in ten thousand, and not without bound.
-_BEYOND = 1e-4
+BEYOND = 1e-4
 
 
 def fit_probability(sampling: SamplingDistribution, n_sets: int, seed: int) -> float:
@@ -38,12 +38,40 @@ def fit_probability(sampling: SamplingDistribution, n_sets: int, seed: int) -> f
         Data sets that are drawn and refitted.
     seed : int
     """
-    if not sampling.stderr.size or refit_obstacle(sampling.evaluator) is not None:
-        return np.nan
-    (center,), _ = sampling.refit(observed_set(sampling.evaluator))
-    sets = simulated_sets(sampling.evaluator, sampling.thetas(center), n_sets, seed)
-    x, converged = sampling.refit(sets)
-    return probability_of_fit(sampling, center, sets, x, converged)
+    refitted = Refitted.of(sampling, n_sets, seed)
+    return np.nan if refitted is None else refitted.probability
+
+
+@dataclass(frozen=True, eq=False)
+class Refitted:
+    """Data sets drawn from the model at the minimiser of the observed data, and their own."""
+
+    sampling: SamplingDistribution
+    center: Floats  # (r,): that of the observed data, in coordinates
+    sets: DataSets
+    x: Floats  # (n_sets, r): those of the data sets
+    converged: NDArray[np.bool_]  # (n_sets,)
+
+    @classmethod
+    def of(cls, sampling: SamplingDistribution, n_sets: int, seed: int) -> Refitted | None:
+        """Draw and refit data sets; None where nothing tells."""
+        if not sampling.stderr.size or refit_obstacle(sampling.evaluator) is not None:
+            return None
+        (center,), _ = sampling.refit(observed_set(sampling.evaluator))
+        sets = simulated_sets(sampling.evaluator, sampling.thetas(center), n_sets, seed)
+        return cls(sampling, center, sets, *sampling.refit(sets))
+
+    @classmethod
+    def there(cls, sampling: SamplingDistribution, n_sets: int, seed: int) -> Refitted:
+        """Draw data sets at theta itself, which all keep: no minimiser, as a prior holds it."""
+        sets = simulated_sets(sampling.evaluator, sampling.theta, n_sets, seed)
+        x = np.zeros((n_sets, sampling.stderr.size))
+        return cls(sampling, x[0], sets, x, np.ones(n_sets, dtype=bool))
+
+    @property
+    def probability(self) -> float:
+        """How probable a distance as the data's from their fit is; NaN where too few converged."""
+        return probability_of_fit(self.sampling, self.center, self.sets, self.x, self.converged)
 
 
 def probability_of_fit(
@@ -162,7 +190,7 @@ def _distances_of(
     below = np.cumsum(w, axis=1) - w / 2
     expected = populations.below(k, part, x, values[ranked])
     squares = w * (below - expected) ** 2
-    inside = np.clip(expected, _BEYOND, 1 - _BEYOND)
+    inside = np.clip(expected, BEYOND, 1 - BEYOND)
     in_the_middle = squares.sum(axis=1)
     in_the_tails = (squares / (inside * (1 - inside))).sum(axis=1)
     return [in_the_middle, in_the_tails]
@@ -173,9 +201,7 @@ def probability_there(sampling: SamplingDistribution, n_sets: int, seed: int) ->
 
     Without refits: for an optimum that is no minimiser, as a prior holds it.
     """
-    sets = simulated_sets(sampling.evaluator, sampling.theta, n_sets, seed)
-    there = np.zeros((n_sets, sampling.stderr.size))
-    return probability_of_fit(sampling, there[0], sets, there, np.ones(n_sets, dtype=bool))
+    return Refitted.there(sampling, n_sets, seed).probability
 
 
 def of_held_away(probability: float) -> list[str]:

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from prbayes.model.evaluator import Evaluator
+from prbayes.response.outputs import Outputs
 
 
 def versions() -> dict[str, str]:
@@ -65,6 +67,40 @@ def failures_dataset(evaluator: Evaluator) -> xr.Dataset:
 
 
 def observed_dataset(evaluator: Evaluator) -> xr.Dataset:
-    """Return the observed responses of all simulators, labelled."""
+    """Return the observed responses of all simulators, labelled; several outputs by their names."""
     observed = {node.name: node.target.observed for node in evaluator.nodes}
-    return labelled(evaluator, observed, {})
+    data = labelled(evaluator, observed, {})
+    for node in evaluator.nodes:
+        if node.outputs.event:
+            data = _with_outputs(data, node.name, node.outputs)
+    return data
+
+
+def _with_outputs(data: xr.Dataset, name: str, outputs: Outputs) -> xr.Dataset:
+    """Return observed responses with one simulator's outputs named, unless the model does that."""
+    last = str(data[name].dims[-1])
+    if last == f"{name}_dim_1":
+        labels = _coordinate(outputs)
+        dim = outputs.dim
+        if not _is_free(data, dim, labels):
+            dim = f"{name}_{dim}"  # another simulator has other outputs
+        renamed = data[name].rename({last: dim})
+        data = data.drop_vars(name).assign({name: renamed}).assign_coords({dim: labels})
+    if outputs.units:
+        different = list(dict.fromkeys(outputs.units))
+        units = different[0] if len(different) == 1 else list(outputs.units)
+        data[name].attrs["units"] = units
+    return data
+
+
+def _coordinate(outputs: Outputs) -> NDArray[Any]:
+    """Return the labels of outputs as an array that a file can hold: numbers, or else texts."""
+    labels = np.asarray(outputs.labels)
+    return labels if labels.dtype.kind in "iuf" else np.array(outputs.names)
+
+
+def _is_free(data: xr.Dataset, dim: str, labels: NDArray[Any]) -> bool:
+    """Whether a dimension can have these labels."""
+    if dim in data.coords:
+        return np.array_equal(data.coords[dim].values, labels)
+    return dim not in data.dims and dim not in data.data_vars

@@ -134,6 +134,7 @@ class Canvas:
         self._collection: Any = arviz.PlotCollection.wrap(data, **settings)
         self._calls: dict[str, dict[str, _Call]] = {}
         self._legend: set[str] = set()
+        self._empty: list[str] = []
 
     def panel(self, name: str) -> Panel:
         """Return the panel of a name, to draw on."""
@@ -156,10 +157,16 @@ class Canvas:
         by_panel = self._calls.setdefault(visual, {})
         by_panel[panel] = _Call(function, data, keywords)
 
+    def leave_empty(self, panel: str) -> None:
+        """Plan to show nothing of a panel, not even its axes."""
+        self._empty.append(panel)
+
     def finish(self) -> Any:
         """Draw everything, with a legend below the panels, and return the `PlotCollection`."""
         for visual, by_panel in self._calls.items():
             self._draw(visual, by_panel)
+        for name in self._empty:
+            _hide(self.backend, self._collection.get_target(name, {}))
         if self._legend and self.backend != "none":
             variables = self._collection.data.data_vars
             targets = [self._collection.get_target(name, {}) for name in variables]
@@ -180,6 +187,18 @@ class Canvas:
             subset_info=True,
             store_artist=visual not in _OF_AXES,
         )
+
+
+def _hide(backend: str, target: Any) -> None:
+    """Take the axes of a panel away; its place stays empty."""
+    if backend == "matplotlib":
+        target.set_axis_off()
+    elif backend == "bokeh":
+        target.visible = False
+    elif backend == "plotly":
+        axes = target.figure.get_subplot(target.row, target.col)
+        for axis in (axes.xaxis, axes.yaxis):
+            target.figure.layout[axis.plotly_name] = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,6 +297,10 @@ class Panel:
             color=GREY,
             alpha=0.6,
         )
+
+    def blank(self) -> None:
+        """Leave the panel empty, without axes: a place that holds the others apart."""
+        self.canvas.leave_empty(self.name)
 
     def axes(
         self,

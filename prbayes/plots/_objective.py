@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,21 @@ METRIC_LABELS = {
     "LogLikelihood": "log-likelihood",
     "ProbabilityResidual": "probability residual",
 }
+# Of several outputs, by a metric of one.
+_LIFTED_LABELS = {
+    "Joint": "joint {}",
+    "MarginalCorrelation": "{} of marginals, with correlations",
+}
+_LIFTED = re.compile(r"(\w+)\((?:metric=)?(\w+)\(")
+
+
+def metric_label(representation: str) -> str:
+    """Return what a reader calls the metric of a representation, such as 'Joint(AreaMetric())'."""
+    found = _LIFTED.match(representation)
+    if found and found[1] in _LIFTED_LABELS:
+        return _LIFTED_LABELS[found[1]].format(METRIC_LABELS.get(found[2], found[2]))
+    name = representation.partition("(")[0]
+    return METRIC_LABELS.get(name, name)
 
 
 def check_optimum(optimum: Any, caller: str) -> None:
@@ -35,9 +51,9 @@ def objective_label(optimum: Optimum) -> str:
     """Return what a reader calls the objective."""
     if len(optimum.scales) > 1:
         return "sum of d / s"
-    name = type(optimum.evaluator.nodes[0].metric).__name__
-    label = METRIC_LABELS.get(name, name)
-    return f"discrepancy ({label})"
+    metric = optimum.evaluator.nodes[0].metric
+    known = repr(metric) if metric.takes_outputs else type(metric).__name__
+    return f"discrepancy ({metric_label(known)})"
 
 
 def objective(optimum: Optimum, evaluator: Evaluator, thetas: Floats) -> Floats:

@@ -14,7 +14,6 @@ import xarray as xr
 from prbayes._checks import Floats, flag, positive_integer, share
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.node import Node
 from prbayes.model.turns import in_turn
 from prbayes.plots._canvas import DASHED, INK, VERMILION, Canvas, Panel, refuse_look
 from prbayes.plots._curves import (
@@ -25,8 +24,9 @@ from prbayes.plots._curves import (
     smooth_densities,
     staircase,
 )
-from prbayes.plots._ensemble import read_before, read_result, supported
-from prbayes.plots._names import named
+from prbayes.plots._ensemble import Ensemble, read_before, read_result, supported
+from prbayes.plots._lines import LEVELS, Axis, draw_lines, quantiles
+from prbayes.plots._panels import Output, in_one_panel, panels_of
 from prbayes.plots._populations import calibrated, draw_calibrated
 
 _log = logging.getLogger("prbayes")
@@ -52,6 +52,12 @@ def plot_responses(
     share ``level`` of the populations at each response: those of the posterior's draws, or of the
     optimum's sampling distribution where it is known.
 
+    Of several outputs each has a panel, with those that were measured. A curve, of which the
+    outputs' labels are numbers, and more than eight outputs have one panel: a line for each
+    specimen, with 89% of the calibrated population at each place, and its median in the band.
+    Those of the population before are dashed. More than eight outputs with names are in standard
+    deviations of each.
+
     Parameters
     ----------
     result : Optimum or xarray.DataTree
@@ -63,14 +69,15 @@ def plot_responses(
         the optimiser's first point, if it was given a start or did not look for one, and else the
         prior's initial point; the legend says which.
     ecdf : bool
-        Draw distribution functions, which need no bandwidth, in place of densities.
+        Draw distribution functions, which need no bandwidth, in place of densities; of no effect
+        on lines.
     level : float
     draws : int, optional
         Number of populations in the band; 200 where they cost no response (`Reweighted`), 40
         elsewhere, where each costs n responses per simulator.
     labels : mapping, optional
-        What a reader calls a simulator, by its name, with units: ``{"crack": "relative crack
-        length"}``.
+        What a reader calls a simulator, or an output, by its name, with units: ``{"crack":
+        "relative crack length"}``.
     backend : {"matplotlib", "bokeh", "plotly"}, optional
         That of ArviZ's settings by default.
     **pc_kwargs
@@ -80,7 +87,8 @@ def plot_responses(
     -------
     arviz.PlotCollection
         Its ``viz`` has the artists ``measured``, ``rug`` (densities only), ``before``, ``band`` and
-        ``after``.
+        ``after``; with lines, ``population``. The panel of an output is called as an element of the
+        simulator, ``"frame[first]"``.
 
     Raises
     ------
@@ -119,45 +127,94 @@ def plot_responses(
             what,
         )
         start = start[:0]
-    nodes = shown.evaluator.nodes
-    names = [node.name for node in nodes]
-    canvas = Canvas(names, size=(5.4, 4.2), backend=backend, pc_kwargs=pc_kwargs)
-    for k, node in enumerate(nodes):
-        panel = canvas.panel(node.name)
+    by_simulator = panels_of(shown.evaluator.nodes)
+    names = [output.name for panels in by_simulator for output in panels]
+    lines = any(in_one_panel(node.outputs) for node in shown.evaluator.nodes)
+    size = (7.2, 4.8) if lines else (5.4, 4.2)
+    canvas = Canvas(names, size=size, backend=backend, pc_kwargs=pc_kwargs)
+    drawing = _Drawing(shown, what, level, labels, ecdf=ecdf)
+    for k, panels in enumerate(by_simulator):
         earlier = None
         if len(start):
             earlier = _simulate(shown.evaluator, start, k)
         after = _simulate(shown.evaluator, shown.every, k)
-        covered = _covered(node, after, earlier)
-        grid = np.linspace(*covered, GRID_POINTS)
-
-        # From the data to what explains them, one over the other
-        curves = after.curves(grid, ecdf=ecdf)
-        found = calibrated(curves, shown, level)
-        data_top = _draw_measured(panel, node, covered, ecdf=ecdf)
-        ylim = None
-        if earlier is not None:
-            (y,) = earlier.curves(grid, ecdf=ecdf)
-            text = f"before: {what}"
-            panel.line("before", grid, y, VERMILION, style=DASHED, legend=text)
-            ylim = _cut(y, max(data_top, found.top))
-        draw_calibrated(panel, grid, found, shown, level)
-        panel.axes(
-            x=named(node.name, labels),
-            y="share of specimens" if ecdf else "density",
-            title=f"{node.target.observed.size} measured values",
-            xlim=covered,
-            ylim=ylim,
-        )
+        for output in panels:
+            panel = canvas.panel(output.name)
+            if after.values.ndim > 2 and output.column is None:
+                drawing.lines(panel, output, after, earlier)
+            else:
+                before_it = None if earlier is None else earlier.of(output)
+                drawing.distribution(panel, output, after.of(output), before_it)
     return canvas.finish()
 
 
 @dataclass(frozen=True, eq=False)
+class _Drawing:
+    """What the panels have in common."""
+
+    shown: Ensemble
+    what: str  # is before
+    level: float
+    labels: Mapping[str, str] | None
+    ecdf: bool
+
+    def distribution(
+        self, panel: Panel, output: Output, after: _Simulated, earlier: _Simulated | None
+    ) -> None:
+        """Draw the distribution of one output, from the data to what explains them."""
+        observed, weights = output.measured()
+        covered = _covered(observed, after, earlier)
+        grid = np.linspace(*covered, GRID_POINTS)
+
+        curves = after.curves(grid, ecdf=self.ecdf)
+        found = calibrated(curves, self.shown, self.level)
+        data_top = _draw_measured(panel, observed, weights, covered, ecdf=self.ecdf)
+        ylim = None
+        if earlier is not None:
+            (y,) = earlier.curves(grid, ecdf=self.ecdf)
+            text = f"before: {self.what}"
+            panel.line("before", grid, y, VERMILION, style=DASHED, legend=text)
+            ylim = _cut(y, max(data_top, found.top))
+        draw_calibrated(panel, grid, found, self.shown, self.level)
+        failed = np.count_nonzero(np.isinf(observed))
+        panel.axes(
+            x=output.text(self.labels),
+            y="share of specimens" if self.ecdf else "density",
+            title=f"{observed.size} measured values" + (f", {failed} failed" if failed else ""),
+            xlim=covered,
+            ylim=ylim,
+        )
+
+    def lines(
+        self, panel: Panel, output: Output, after: _Simulated, earlier: _Simulated | None
+    ) -> None:
+        """Draw all outputs, a line for each specimen."""
+        axis = Axis.of(output)
+        start = None
+        if earlier is not None:
+            (start,) = quantiles(earlier.values, earlier.weights, LEVELS)
+        found = quantiles(after.values, after.weights, LEVELS)
+        ylim = draw_lines(panel, axis, self.shown, found, start, self.level, self.what)
+        observed = output.node.target.observed
+        incomplete = np.count_nonzero(np.isnan(observed).any(axis=1))
+        failed = np.count_nonzero(np.isinf(observed).any(axis=1))
+        title = f"{len(observed)} measured specimens"
+        title += f", {incomplete} incomplete" if incomplete else ""
+        title += f", {failed} failed" if failed else ""
+        x, y = axis.texts(self.labels)
+        panel.axes(x=x, y=y, title=title, ylim=ylim, xticks=axis.ticks())
+
+
+@dataclass(frozen=True, eq=False)
 class _Simulated:
-    """Responses and weights of populations, shape (P, n) each."""
+    """Responses and weights of populations, shape (P, n) each; of outputs, values (P, n, m)."""
 
     values: Floats
     weights: Floats
+
+    def of(self, output: Output) -> _Simulated:
+        """Return what is simulated of one output."""
+        return _Simulated(output.of(self.values), self.weights)
 
     def curves(self, grid: Floats, *, ecdf: bool) -> Floats:
         """Return distribution functions or densities on a grid, shape (P, g)."""
@@ -171,9 +228,10 @@ def _simulate(evaluator: Evaluator, thetas: Floats, k: int) -> _Simulated:
     return _Simulated(*evaluator.populations(thetas, k))
 
 
-def _covered(node: Node, after: _Simulated, earlier: _Simulated | None) -> tuple[float, float]:
+def _covered(
+    observed: Floats, after: _Simulated, earlier: _Simulated | None
+) -> tuple[float, float]:
     """Return what the axis covers: data and populations, the earlier one unless it is far off."""
-    observed = node.target.observed
     finite = observed[np.isfinite(observed)]
     # Hardly any of the calibrated population is beyond the axis; of the one before, which is there
     # to be compared, more, and it widens the axis by at most half on each side.
@@ -197,9 +255,10 @@ def _cut(before: Floats, top: float) -> tuple[float, float] | None:
     return -0.05 * top, tallest
 
 
-def _draw_measured(panel: Panel, node: Node, covered: tuple[float, float], *, ecdf: bool) -> float:
+def _draw_measured(
+    panel: Panel, observed: Floats, weights: Floats, covered: tuple[float, float], *, ecdf: bool
+) -> float:
     """Draw the data; return how high they reach."""
-    observed, weights = node.target.observed, node.target.weights
     if ecdf:
         x, y = staircase(observed, weights, *covered)
         panel.line("measured", x, y, INK, width=1.4, legend="measured")

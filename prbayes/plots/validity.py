@@ -6,10 +6,23 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from prbayes._checks import Floats
-from prbayes.plots._canvas import BLUE, DASHED, INK, PALE, VERMILION, Canvas, Panel, refuse_look
+from prbayes.plots._canvas import (
+    BLUE,
+    DASHED,
+    DOTTED,
+    INK,
+    PALE,
+    SOLID,
+    VERMILION,
+    Canvas,
+    Panel,
+    refuse_look,
+)
 from prbayes.plots._curves import steps
+from prbayes.validation.conditions import DIRECTION
 from prbayes.validation.validity import ValidityTest
 
 
@@ -25,6 +38,9 @@ def plot_validity(
     holds the whole ECDF with probability 1 - level if the null is true, calibration uncertainty
     included.
 
+    Of several outputs there is a thin line for each direction in which they are seen, dotted ones
+    of ``|2u - 1|``, without a band: the statistic is the mean of their areas, and the title has it.
+
     Parameters
     ----------
     tests : ValidityTest or mapping
@@ -38,7 +54,7 @@ def plot_validity(
     -------
     arviz.PlotCollection
         With ``savefig``; its ``viz`` has the artists ``area``, ``envelope``, ``identity`` and
-        ``ecdf``.
+        ``ecdf``; of several outputs ``identity``, ``ecdf`` and ``folded``.
 
     Raises
     ------
@@ -61,7 +77,10 @@ def plot_validity(
     canvas = Canvas(panels, size=(4.6, 4.8), backend=backend, pc_kwargs=pc_kwargs)
     for name, test in by_name.items():
         panel = canvas.panel(name or "u")
-        _draw(panel, test, _title(name, test))
+        if in_directions(test):
+            _draw_directions(panel, test, _title(name, test))
+        else:
+            _draw(panel, test, _title(name, test))
     return canvas.finish()
 
 
@@ -96,6 +115,51 @@ def _draw(panel: Panel, test: ValidityTest, title: str) -> None:
     panel.axes(x=name, y=f"share of {values.size} values", title=title)
 
 
+def in_directions(test: ValidityTest) -> list[Floats]:
+    """Return the u-values of several outputs by direction; none if all conditions have one."""
+    numbers = np.array([name.rpartition(DIRECTION)[2] for name in test.conditions.tolist()])
+    seen = _is_seen(test)
+    known = dict.fromkeys(numbers[seen].tolist())
+    return [test.u_values[seen & (numbers == number)] for number in known]
+
+
+def _is_seen(test: ValidityTest) -> NDArray[np.bool_]:
+    """Return which u-values are of several outputs, in a direction."""
+    return np.array([DIRECTION in name for name in test.conditions.tolist()], dtype=bool)
+
+
+def _draw_directions(panel: Panel, test: ValidityTest, title: str) -> None:
+    """Draw a line for each direction in which outputs are seen."""
+    directions = in_directions(test)
+    # Conditions of one output are held against the identity by themselves
+    others = test.u_values[~_is_seen(test)]
+    alone = [others] if others.size else []
+    color = VERMILION if test.rejected else BLUE
+    diagonal = np.array([0.0, 1.0])
+    panel.line("identity", diagonal, diagonal, INK, style=DASHED, width=None)
+    name = "|2u - 1|"
+    if not test.folded:
+        name = "u-value; dotted: |2u - 1|"
+        x, y = _several([*alone, *directions])
+        panel.line("ecdf", x, y, color, width=0.8)
+    both = [*alone, *directions] if test.folded else directions
+    x, y = _several([np.abs(2 * u - 1) for u in both])
+    style = SOLID if test.folded else DOTTED
+    panel.line("folded", x, y, color, style=style, width=0.8)
+    panel.axes(x=name, y=f"share of values in each of {len(directions)} directions", title=title)
+
+
+def _several(directions: list[Floats]) -> tuple[Floats, Floats]:
+    """Return the corners of several ECDFs, with a gap between any two."""
+    gap = np.array([np.nan])
+    xs, ys = [], []
+    for values in directions:
+        x, y = _ecdf(np.sort(values))
+        xs += [x, gap]
+        ys += [y, gap]
+    return np.concatenate(xs[:-1]), np.concatenate(ys[:-1])
+
+
 def _title(name: str, test: ValidityTest) -> str:
     if name:
         first = f"{name}, p = {test.p_value:.2g}"
@@ -104,7 +168,8 @@ def _title(name: str, test: ValidityTest) -> str:
     sign, verdict = "<", "not rejected"
     if test.rejected:
         sign, verdict = ">", "rejected"
-    area = f"area {test.statistic:.3f}"
+    what = "mean area" if in_directions(test) else "area"
+    area = f"{what} {test.statistic:.3f}"
     critical = f"critical {test.critical_value:.3f}"
     return f"{first}\n{area} {sign} {critical}: {verdict}"
 

@@ -11,6 +11,7 @@ import xarray as xr
 
 from prbayes._diagnose import Diagnosis
 from prbayes._weighted import INTERVAL
+from prbayes.plots.validity import in_directions
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import alike, number, percentage, plus_minus, shown, span
 from prbayes.reports.section import Section
@@ -205,16 +206,27 @@ def validity(m: Material) -> list[Section]:
         "Of u the area sees a wrong mean, of |2u - 1| a wrong spread. "
         "That a model is not rejected does not prove it."
     )
+    if any(in_directions(test) for test in m.tests.values()):
+        about += (
+            " Several outputs of a specimen are seen in some directions of the predicted ones, in "
+            "which a wrong correlation is a wrong spread; the statistic is the mean over these of "
+            "the areas of u and of |2u - 1|."
+        )
     verdicts = [verdict(label, test, m) for label, test in m.tests.items()]
     assumed = dict.fromkeys(f"Held to be true: {test.null}." for test in m.tests.values())
     return [Section("Validity", (*verdicts, about, *assumed), rows_table(rows))]
 
 
 def _tested(test: ValidityTest) -> dict[str, Any]:
+    directions = len(in_directions(test))
+    of = "|2u - 1|" if test.folded else "u"
+    if directions and not test.folded:
+        of = "u and |2u - 1|"
     return {
         "values": test.u_values.size,
         "specimens": np.unique(test.specimens).size,
-        "of": "|2u - 1|" if test.folded else "u",
+        "directions": str(directions) if directions else "",
+        "of": of,
         "area": f"{test.statistic:.4f}",
         "critical value": f"{test.critical_value:.4f}",
         "p-value": f"{test.p_value:.3f}",
@@ -232,8 +244,8 @@ def origin(m: Material) -> list[Section]:
         return []
     rows = [_cost(m, label) for label in m.results]
     text = [
-        "Responses are scalar evaluations of the simulated response, "
-        "those of a common design counted in each."
+        "Responses are evaluations of the simulated response for one specimen, whatever the number "
+        "of its outputs; those of a common design are counted in each."
     ]
     versions: dict[str, str] = {}
     for label in m.results:

@@ -64,7 +64,8 @@ def _how_it_ended(attrs: Mapping[Any, Any]) -> str:
 
 def _other_optimum(rival: Mapping[str, Any]) -> str:
     scalars = {name: value for name, value in rival["point"].items() if np.ndim(value) == 0}
-    at = ", ".join(f"{name} = {number(value)}" for name, value in scalars.items())
+    shown = scalars or single_elements(rival["point"])
+    at = ", ".join(f"{name} = {number(value)}" for name, value in shown.items())
     discrepancy = number(float(rival["discrepancy"]))
     if rival["comparable"]:
         judged = "the data could as well come from there"

@@ -15,6 +15,7 @@ from prbayes.model.node import nodes
 from prbayes.plots.comparison import plot_comparison
 from prbayes.plots.landscape import plot_landscape
 from prbayes.plots.optimizer import plot_optimizer
+from prbayes.plots.outputs import plot_outputs
 from prbayes.plots.population import plot_population
 from prbayes.plots.posterior import plot_posterior
 from prbayes.plots.responses import plot_responses
@@ -85,6 +86,13 @@ def _responses(m: Material) -> Request:
     return _population(m)
 
 
+def _outputs(m: Material) -> Request:
+    several = any(y.ndim > 1 and y.shape[1] > 1 for y in m.observed.values())
+    request = _responses(m) if several else None
+    # That it computes responses is said once, of the picture before
+    return None if isinstance(request, NotDrawn) else request
+
+
 def _posterior(m: Material) -> Request:
     if not m.posteriors:
         return None
@@ -126,8 +134,18 @@ ILLUSTRATIONS = (
         request=_responses,
         title="Measured and calibrated responses",
         alt="Distribution of the measured responses with that of the calibrated population, "
-        "one panel per simulator.",
+        "one panel per simulator or output.",
         caption="Measured responses and the calibrated population.",
+    ),
+    Illustration(
+        after="Data",
+        function=plot_outputs,
+        request=_outputs,
+        title="Pairs of outputs",
+        alt="Measured specimens as points, one panel per pair of outputs, with outlines of the "
+        "calibrated population.",
+        caption="Measured specimens, and regions that hold 50% and 89% of the calibrated "
+        "population.",
     ),
     Illustration(
         after="Optimum",
@@ -187,7 +205,8 @@ ILLUSTRATIONS = (
         "with the area between them and an acceptance band.",
         caption="Where the measured responses stand in the predicted distribution. "
         "A right model keeps near the diagonal; the shaded area is the statistic, "
-        "and the band holds the whole curve with the stated probability.",
+        "and the band holds the whole curve with the stated probability. "
+        "Of several outputs there is a line for each direction in which they are seen.",
     ),
 )
 

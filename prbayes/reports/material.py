@@ -17,6 +17,7 @@ from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.model.description import describe, from_attributes
 from prbayes.model.identity import Level, differences, identity_of_model, require_together
 from prbayes.model.node import nodes
+from prbayes.response.outputs import ONE, Outputs, read_observed
 from prbayes.validation.validity import ValidityTest
 
 
@@ -31,7 +32,8 @@ class Material:
     posteriors: dict[str, xr.DataTree]
     tests: dict[str, ValidityTest]
     comparison: xr.Dataset | None
-    observed: dict[str, Floats]  # measured responses by simulator
+    observed: dict[str, Floats]  # measured responses by simulator; of several outputs (N, m)
+    outputs: dict[str, Outputs]  # of a run, by simulator
     diagnoses: dict[str, Diagnosis | None]
 
     @property
@@ -105,6 +107,7 @@ def gather(model: Any, optimum: Any, posterior: Any, validity: Any, comparison: 
     description = _stored_description(results) if model is None else describe(model)
     if comparison is None and len(results) > 1:
         comparison = _free_only(compare(results | found, model=model), description)
+    observed, outputs = _observed(model, results)
     diagnoses = {}
     for label, result in (results | found).items():
         diagnoses[label] = _diagnosis(result, model)
@@ -116,7 +119,8 @@ def gather(model: Any, optimum: Any, posterior: Any, validity: Any, comparison: 
         posteriors=posteriors,
         tests=tests,
         comparison=comparison,
-        observed=_observed(model, results),
+        observed=observed,
+        outputs=outputs,
         diagnoses=diagnoses,
     )
 
@@ -214,14 +218,33 @@ def _free_only(comparison: xr.Dataset, description: dict[str, Any] | None) -> xr
     return comparison.sel(hyperparameter=kept or names)
 
 
-def _observed(model: pm.Model | None, results: dict[str, xr.DataTree]) -> dict[str, Floats]:
+def _observed(
+    model: pm.Model | None, results: dict[str, xr.DataTree]
+) -> tuple[dict[str, Floats], dict[str, Outputs]]:
+    """Return the measured responses, and what their columns are, by simulator."""
     if model is not None:
-        return {node.name: node.target.observed for node in nodes(model).values()}
+        known = nodes(model).values()
+        observed = {node.name: node.target.observed for node in known}
+        return observed, {node.name: node.outputs for node in known}
     for tree in results.values():
         if "observed_data" in tree:
             stored = tree["observed_data"].data_vars.items()
-            return {str(name): np.ravel(values.values) for name, values in stored}
-    return {}
+            found = {str(name): _stored_observed(str(name), values) for name, values in stored}
+            return (
+                {name: values for name, (values, _) in found.items()},
+                {name: outputs for name, (_, outputs) in found.items()},
+            )
+    return {}, {}
+
+
+def _stored_observed(name: str, values: xr.DataArray) -> tuple[Floats, Outputs]:
+    """Return the measured responses of a simulator, and what their columns are, from a result."""
+    if values.ndim != 2:
+        return np.ravel(values.values), ONE
+    units = values.attrs.get("units")
+    if units is not None and not isinstance(units, str):  # of each output
+        values = values.assign_coords(units=(values.dims[1], np.asarray(units)))
+    return read_observed(name, values)
 
 
 def _diagnosis(result: Optimum | xr.DataTree, model: pm.Model | None) -> Diagnosis | None:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from prbayes._checks import Floats
+from prbayes.plots.outputs import correlation
 from prbayes.reports.material import Material
-from prbayes.reports.numbers import alike
+from prbayes.reports.numbers import NOTHING, alike
 from prbayes.reports.section import Section
 from prbayes.reports.tables import rows_table
+from prbayes.response.outputs import ONE
 
 
 def model(m: Material) -> list[Section]:
@@ -40,20 +43,94 @@ def _named(described: dict[str, Any], kind: str, *keys: str) -> dict[str, Any]:
 
 
 def data(m: Material) -> list[Section]:
-    """Return what the measured responses are like."""
+    """Return what the measured responses are like, and how outputs depend on each other."""
     if not m.observed:
         return []
-    rows = [{"simulator": name} | _described(y) for name, y in m.observed.items()]
+    rows = [row for name in m.observed for row in _rows_of(name, m)]
+    for key in ("failed", "missing"):
+        if any(row[key] for row in rows):
+            rows = [row | {key: row[key] or "0"} for row in rows]
     known = [] if m.description is None else m.description["simulators"]
     specimens = [f"{s['name']}: {s['specimens']}." for s in known if s["specimens"]]
-    text = ("Measured responses, in the units of the response.", *specimens)
-    return [Section("Data", text, rows_table(rows))]
+    several = [name for name, y in m.observed.items() if y.ndim > 1]
+    untold = [_untold(name, m) for name in several]
+    text = ("Measured responses, in the units of the response.", *specimens, *filter(None, untold))
+    correlations = [_correlations(name, m) for name in several if m.observed[name].shape[1] > 1]
+    return [Section("Data", text, rows_table(rows)), *correlations]
+
+
+# Outputs of a simulator that have a row: half a page; of more, as of a curve, some from the first
+# to the last.
+_MOST_ROWS = 12
+
+
+def _rows_of(name: str, m: Material) -> list[dict[str, Any]]:
+    """Return a row for each output of a simulator."""
+    y, outputs = m.observed[name], m.outputs.get(name, ONE)
+    if y.ndim == 1:
+        return [{"simulator": name, "output": "", "units": ""} | _described(y)]
+    rows = []
+    for j in _told(y):
+        units = outputs.units[j] if outputs.units else ""
+        about = {"simulator": name, "output": outputs.names[j], "units": units}
+        rows.append(about | _described(y[:, j]))
+    return rows
+
+
+def _told(y: Floats) -> list[int]:
+    """Return the outputs that are told of."""
+    m = y.shape[1]
+    places = np.linspace(0, m - 1, min(m, _MOST_ROWS))
+    return [round(place) for place in places.tolist()]
+
+
+def _untold(name: str, m: Material) -> str:
+    """Say so where not all outputs are told of."""
+    all_of_them = m.observed[name].shape[1]
+    told = len(_told(m.observed[name]))
+    return f"{name}: {told} of {all_of_them} outputs are told." if told < all_of_them else ""
 
 
 def _described(y: Floats) -> dict[str, Any]:
-    sd = float(y.std(ddof=1)) if y.size > 1 else math.nan
-    low, high, mean, spread = alike((y.min(), y.max(), y.mean(), sd), sd)
-    return {"N": y.size, "smallest": low, "largest": high, "mean": mean, "sd": spread}
+    """Describe one output: NaN was not measured, +inf has failed."""
+    measured = y[~np.isnan(y)]
+    finite = measured[np.isfinite(measured)]
+    failed, missing = measured.size - finite.size, y.size - measured.size
+    sd = float(finite.std(ddof=1)) if finite.size > 1 else math.nan
+    low, high, mean, spread = alike((finite.min(), finite.max(), finite.mean(), sd), sd)
+    return {
+        "N": measured.size,
+        "failed": str(failed) if failed else "",
+        "missing": str(missing) if missing else "",
+        "smallest": low,
+        "largest": high,
+        "mean": mean,
+        "sd": spread,
+    }
+
+
+def _correlations(name: str, m: Material) -> Section:
+    """Return the correlations of outputs, each of the specimens that have both."""
+    y, names = m.observed[name], m.outputs[name].names
+    told = _told(y)
+    rows = []
+    for i in told:
+        row = {"": names[i]}
+        for j in told:
+            row[names[j]] = "1" if i == j else _correlation(y[:, [i, j]])
+        rows.append(row)
+    about = (
+        f"Correlations of the measured outputs of {name}, each of the specimens that have both; "
+        "those that failed are in none."
+    )
+    return Section(f"Correlations of {name}", about, rows_table(rows), level=3)
+
+
+def _correlation(pairs: Floats) -> str:
+    """Return the correlation of two outputs as text."""
+    known = pairs[np.isfinite(pairs).all(axis=1)]
+    r = correlation(known, np.ones(len(known))) if len(known) > 2 else math.nan
+    return NOTHING if math.isnan(r) else f"{r + 0.0:.3f}"
 
 
 def metric(m: Material) -> list[Section]:

@@ -6,6 +6,7 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
+from prbayes._checks import Floats
 from prbayes.model.elements import (
     single_elements,
     split_elements,
@@ -13,7 +14,8 @@ from prbayes.model.elements import (
     told_elements,
     told_of,
 )
-from prbayes.plots._objective import METRIC_LABELS
+from prbayes.plots._objective import metric_label
+from prbayes.plots.validity import in_directions
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import counted, number, percentage, plus_minus
 from prbayes.validation.validity import ValidityTest
@@ -35,13 +37,17 @@ def verdict(label: str, test: ValidityTest, m: Material) -> str:
     who = f"{label}: " if len(m.tests) > 1 else ""
     aspect = "the spread of the responses" if test.folded else "the responses"
     specimens = counted(int(np.unique(test.specimens).size), "specimen")
+    directions = len(in_directions(test))
     values = counted(test.u_values.size, "value")
+    if directions:
+        values = f"several outputs, seen in {counted(directions, 'direction')}"
+    area = "mean area" if directions else "area"
     found = "is rejected" if test.rejected else "is not rejected"
     sign = ">" if test.statistic > test.critical_value else "≤"
     return (
         f"{who}On {aspect} of {specimens} ({values}), the calibrated model {found} "
         f"at level {percentage(test.level)} "
-        f"(area {test.statistic:.3f} {sign} critical {test.critical_value:.3f}, "
+        f"({area} {test.statistic:.3f} {sign} critical {test.critical_value:.3f}, "
         f"p = {test.p_value:.2g})."
     )
 
@@ -56,11 +62,19 @@ def _what_was_calibrated(m: Material) -> str:
     if not m.results:
         return f"The model has {hyperparameters}. No result of a calibration was given."
     were = "was" if len(names) == 1 else "were"
-    data = [f"{counted(y.size, 'measured response')} of {name}" for name, y in m.observed.items()]
+    data = [_measured(name, y) for name, y in m.observed.items()]
     on = f" on {_enumerated(data)}" if data else ""
     metrics = _metrics(m)
     by = f", by the {_enumerated(metrics)}" if metrics else ""
     return f"{hyperparameters} of the model {were} calibrated{on}{by}."
+
+
+def _measured(name: str, y: Floats) -> str:
+    """Return how much was measured of a simulator's responses."""
+    if y.ndim == 1:
+        return f"{counted(y.size, 'measured response')} of {name}"
+    n, outputs = y.shape
+    return f"{counted(n, 'specimen')} with {counted(outputs, 'output')} of {name}"
 
 
 def _metrics(m: Material) -> list[str]:
@@ -71,8 +85,7 @@ def _metrics(m: Material) -> list[str]:
     elif m.calibrations:
         first = next(iter(m.calibrations.values()))
         described = list(map(str, first["metric"].values.tolist()))
-    classes = [description.partition("(")[0] for description in described]
-    in_words = [METRIC_LABELS.get(name, name) for name in classes]
+    in_words = [metric_label(description) for description in described]
     return list(dict.fromkeys(in_words))
 
 

@@ -22,7 +22,7 @@ from prbayes.validation.views import views
 Predicted = xr.DataArray | NDArray[Any]
 
 # Between the name of a condition and that of a direction in which its outputs are seen.
-_DIRECTION = ", direction "
+DIRECTION = ", direction "
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class Condition:
     @property
     def of(self) -> str:
         """The name of the condition, of which this may be one direction."""
-        return self.name.split(_DIRECTION)[0]
+        return self.name.split(DIRECTION)[0]
 
     @property
     def identity(self) -> Identity | None:
@@ -194,7 +194,7 @@ def _in_directions(condition: Condition) -> list[Condition]:
         found.append(
             replace(
                 condition,
-                name=f"{condition.name}{_DIRECTION}{k + 1}",
+                name=f"{condition.name}{DIRECTION}{k + 1}",
                 observed=view.of(condition.measured),
                 predicted=view.of(pool),
                 view=view,

@@ -81,6 +81,57 @@ def posterior(known: SimpleNamespace) -> xr.DataTree:
 
 
 @pytest.fixture(scope="session")
+def pair() -> SimpleNamespace:
+    """Two normal outputs with correlation .8, whose population is known; one picture of each kind.
+
+    Of 25 specimens two lack the second output, and one has failed there.
+    """
+    calls = []
+
+    def response(a: Any, b: Any) -> Any:
+        calls.append(np.size(a))
+        return np.stack([a, 0.8 * a + 0.6 * b + 5], axis=-1)
+
+    rng = np.random.default_rng(3)
+    a, b = rng.normal([[2.0], [0.0]], 1.0, (2, 25))
+    observed = np.column_stack([a, 0.8 * a + 0.6 * b + 5])
+    observed[:2, 1], observed[2, 1] = np.nan, np.inf
+    data = xr.DataArray(
+        observed,
+        dims=("specimen", "frequency"),
+        coords={"frequency": ["first", "second"]},
+        attrs={"units": "Hz"},
+    )
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 1.9, 1.0)
+        prb.Simulator(
+            "frame",
+            response,
+            pm.Normal.dist(mu, 1.0),
+            pm.Normal.dist(0.0, 1.0),
+            metric=prb.Joint(prb.ProbabilityResidual()),
+            observed=data,
+            propagation=prb.Reweighted(4096),
+        )
+    draws = xr.Dataset({"mu": (("chain", "draw"), rng.normal(2.0, 0.01, (2, 50)))})
+    tree = xr.DataTree.from_dict({"posterior": draws})
+
+    @cache
+    def drawn(backend: str) -> Any:
+        return prb.plot_outputs(tree, model=model, backend=backend)
+
+    return SimpleNamespace(
+        model=model,
+        posterior=tree,
+        observed=observed,
+        mean=np.array([2.0, 6.6]),
+        covariance=np.array([[1.0, 0.8], [0.8, 1.0]]),
+        drawn=drawn,
+        calls=lambda: sum(calls),
+    )
+
+
+@pytest.fixture(scope="session")
 def comparison(optimum: prb.Optimum, posterior: xr.DataTree) -> xr.Dataset:
     return prb.compare({"optimum": optimum, "draws": posterior}, model=optimum.model)
 
@@ -118,13 +169,14 @@ def read() -> SimpleNamespace:
 
 @pytest.fixture(scope="session")
 def pictures(
-    optimum: prb.Optimum, posterior: xr.DataTree, comparison: xr.Dataset
+    optimum: prb.Optimum, posterior: xr.DataTree, comparison: xr.Dataset, pair: SimpleNamespace
 ) -> dict[str, Callable[..., Any]]:
     """Return every plot with a legend or a panel for each result, by name."""
     model = optimum.model
     return {
         "responses": lambda **k: prb.plot_responses(posterior, model=model, **k),
         "ecdf": lambda **k: prb.plot_responses(optimum, ecdf=True, **k),
+        "outputs": lambda **k: prb.plot_outputs(pair.posterior, model=pair.model, **k),
         "population": lambda **k: prb.plot_population(posterior, model=model, **k),
         "posterior": lambda **k: prb.plot_posterior(posterior, optimum, model=model, **k),
         "optimizer": lambda **k: prb.plot_optimizer(optimum, **k),

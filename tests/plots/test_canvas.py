@@ -17,6 +17,7 @@ import prbayes as prb
 PICTURES = (
     "responses",
     "ecdf",
+    "outputs",
     "population",
     "posterior",
     "optimizer",
@@ -85,6 +86,7 @@ def test_labels_reach_the_axes(picture: str, pictures: dict[str, Callable[..., A
         "accept_rate": "RATE",
         "AreaMetric": "AREA",
         "sigma": "SD",
+        "first": "FIRST",
     }
     pc = pictures[picture](backend="none", labels=labels)
     panels = [pc.get_target(name, {}) for name in pc.data.data_vars]

@@ -7,7 +7,13 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
-from prbayes.plots._objective import check_optimum, free_elements, objective, objective_label
+from prbayes.plots._objective import (
+    check_optimum,
+    free_elements,
+    metric_label,
+    objective,
+    objective_label,
+)
 
 
 def test_the_objective_is_the_discrepancy_over_its_scale(optimum: prb.Optimum) -> None:
@@ -38,3 +44,14 @@ def test_what_has_no_trace_is_refused(optimum: prb.Optimum, posterior: xr.DataTr
     for plot in (prb.plot_optimizer, prb.plot_landscape):
         with pytest.raises(TypeError, match=f"{plot.__name__}: got DataTree"):
             plot(posterior)  # type: ignore[arg-type]
+
+
+def test_metrics_of_several_outputs_are_called_by_that_of_one() -> None:
+    area = prb.AreaMetric()
+    assert metric_label(repr(area)) == "area metric"
+    assert metric_label(repr(prb.Joint(area))) == "joint area metric"
+    other = prb.MarginalCorrelation(prb.KullbackLeibler())
+    assert (
+        metric_label(repr(other)) == "Kullback-Leibler divergence of marginals, with correlations"
+    )
+    assert metric_label("Mine(Other(3))") == "Mine"

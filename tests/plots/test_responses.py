@@ -151,3 +151,22 @@ def test_wrong_arguments_are_refused(optimum: prb.Optimum) -> None:
         prb.plot_responses(3, model=optimum.model)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"level: got 1\.5"):
         prb.plot_responses(optimum, level=1.5)
+
+
+def test_each_output_has_a_panel_with_what_was_measured_of_it(
+    pair: SimpleNamespace, read: SimpleNamespace
+) -> None:
+    pc = prb.plot_responses(pair.posterior, model=pair.model, backend="matplotlib")
+    for column, mean in (("first", 2.0), ("second", 6.6)):
+        x, y = read.xy(pc, "after", f"frame[{column}]")
+        np.testing.assert_allclose(y, stats.norm.pdf(x, mean, 1), atol=0.025)
+    axes = [pc.viz["plot"][f"frame[{name}]"].item() for name in ("first", "second")]
+    assert [axis.get_title() for axis in axes] == [
+        "25 measured values",
+        "23 measured values, 1 failed",
+    ]
+    assert [axis.get_xlabel() for axis in axes] == ["first (Hz)", "second (Hz)"]
+    finite = np.sort(pair.observed[:, 1][np.isfinite(pair.observed[:, 1])])
+    np.testing.assert_array_equal(np.sort(read.xy(pc, "rug", "frame[second]")[0]), finite)
+    area = np.trapezoid(*read.xy(pc, "measured", "frame[second]")[::-1])
+    assert area == pytest.approx(22 / 23)

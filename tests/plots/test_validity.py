@@ -10,6 +10,7 @@ import pytest
 from matplotlib.image import imread
 
 import prbayes as prb
+from prbayes.plots.validity import _between, in_directions
 
 RNG = np.random.default_rng(1)
 PREDICTED = RNG.normal(RNG.normal(0, 0.25, (200, 1)), 1.0, (200, 500))
@@ -119,3 +120,50 @@ def test_refusals() -> None:
     for bad in (3, {}, {"a": 3}):
         with pytest.raises(TypeError, match=r"expected a ValidityTest from prb\.area_test"):
             prb.plot_validity(bad)  # type: ignore[arg-type]
+
+
+# -- several outputs -------------------------------------------------------------------------------
+
+
+@cache
+def of_outputs(folded: bool = False) -> prb.validation.ValidityTest:
+    rng = np.random.default_rng(1)
+    predicted = rng.normal(rng.normal(0, 0.25, (100, 1, 2)), 1.0, (100, 200, 2))
+    observed = {"a": rng.normal(0, 1, (12, 2)), "b": rng.normal(0, 1, 9)}
+    both = {"a": predicted, "b": predicted[..., 0]}
+    return prb.area_test(observed, both, null=prb.validation.PosteriorNull(99), folded=folded)
+
+
+@pytest.mark.parametrize("folded", [False, True])
+def test_outputs_have_a_line_for_each_direction_and_no_band_of_another_statistic(
+    folded: bool,
+) -> None:
+    test = of_outputs(folded)
+    pc = prb.plot_validity(test, backend="matplotlib")
+    expected = {"identity", "folded"} if folded else {"identity", "folded", "ecdf"}
+    assert set(pc.viz.children) & {"area", "envelope", "identity", "ecdf", "folded"} == expected
+    # The areas of the lines make the statistic, shared by numbers of values
+    directions = in_directions(test)
+    assert [u.size for u in directions] == [12] * len(directions)
+    alone = test.u_values[test.conditions == "b"]
+    mean = 0.0
+    for line in expected - {"identity"}:
+        x, y = pc.viz[line]["u"].item().get_data()
+        parts = np.split(np.arange(x.size), np.flatnonzero(np.isnan(x)))
+        # Of one output the area of u alone
+        drawn = [alone, *directions] if folded or line == "ecdf" else directions
+        for part, u in zip(parts, drawn, strict=True):
+            known = part[~np.isnan(x[part])]
+            at, (low, high) = _between(x[known], y[known])
+            area = np.trapezoid(high - low, at)
+            share = 1.0 if folded or u is alone else 0.5
+            mean += area * share * u.size / test.u_values.size
+    assert mean == pytest.approx(test.statistic, rel=1e-9)
+
+
+def test_the_title_of_outputs_has_the_mean_area_and_p() -> None:
+    test = of_outputs()
+    axis = prb.plot_validity(test, backend="matplotlib").viz["plot"]["u"].item()
+    assert axis.get_title().startswith(f"p = {test.p_value:.2g}, level 5%\nmean area 0.")
+    assert axis.get_ylabel() == f"share of values in each of {len(in_directions(test))} directions"
+    assert in_directions(validity()) == []

@@ -101,6 +101,10 @@ def test_other_optima_are_told(calibrated: Any, section: Any) -> None:
         "the data could as well come from there."
     )
     assert text[2].endswith("at mu = 3.000, with discrepancy 0.2500: the data speak against it.")
+    vector = ({"point": {"w": np.array([1.0, 2.0])}, "discrepancy": 0.25, "comparable": True},)
+    optimum = dataclasses.replace(optimum, rivals=vector)
+    text = section(prb.Report("x", optimum=optimum, pictures=False), "Optimum").text
+    assert "is at w[0] = 1.000, w[1] = 2.000, with" in text[1]
 
 
 def test_a_variable_that_never_moves_is_shown() -> None:

@@ -14,9 +14,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pymc as pm
 import pytest
+import xarray as xr
 
 import prbayes as prb
 from prbayes.reports import illustrations
+from prbayes.reports.material import gather
 
 
 def drawn_by(monkeypatch: pytest.MonkeyPatch, functions: dict[str, Any]) -> None:
@@ -89,7 +91,7 @@ def test_each_illustration_gets_what_it_needs(
     names = {i.function.__name__ for i in illustrations.ILLUSTRATIONS}
     drawn_by(monkeypatch, {name: drawn(name) for name in names})
     full = prb.Report("x", model=model, optimum=optimum, posterior=posterior, validity=test)
-    assert set(called) == names
+    assert set(called) == names - {"plot_outputs"}  # for several outputs
     assert called["plot_responses"] == called["plot_population"] == (posterior, model)
     assert called["plot_posterior"] == (posterior, optimum, model)
     assert called["plot_optimizer"] == (optimum, 2)
@@ -97,6 +99,8 @@ def test_each_illustration_gets_what_it_needs(
     assert called["plot_validity"] == (test,)
     titles = [s.title for s in full.sections]
     for illustration in illustrations.ILLUSTRATIONS:
+        if illustration.function.__name__ not in called:
+            continue
         before = full.sections[: titles.index(illustration.title)]
         chapters = [s.title for s in before if s.level == 2]
         assert chapters[-1] == illustration.after
@@ -216,3 +220,42 @@ def test_the_graph_is_the_same_in_every_process(monkeypatch: pytest.MonkeyPatch)
     illustrations._svg(model)
     assert sources[0] == sources[1]
     assert sources[0][0] == [["z", "b", "y", "a"], ["s"]]
+
+
+def test_pairs_of_outputs_are_drawn_where_responses_are_stored(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """And else one sentence says that they are not, for all pictures of responses."""
+    asked = []
+
+    class Picture:
+        def savefig(self, path: Path, **_: Any) -> None:
+            path.write_bytes(b"<svg/>")
+
+    def draw(*arguments: Any, **_: Any) -> Any:
+        asked.append(arguments)
+        return Picture()
+
+    drawn_by(monkeypatch, {"plot_outputs": draw, "plot_responses": draw})
+    data = np.random.default_rng(1).normal(size=(10, 2))
+    draws = xr.Dataset({"mu": (("chain", "draw"), np.zeros((2, 20)))})
+    posterior = xr.DataTree.from_dict({"posterior": draws})
+    for propagation, count in ((prb.Reweighted(256), 2), (prb.Resimulated(64), 0)):
+        with pm.Model() as model:
+            a = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
+            b = pm.Normal.dist(0.0, 1.0)
+            prb.Simulator(
+                "y",
+                lambda a, b: np.stack([a, b], axis=-1),
+                *(a, b),
+                metric=prb.Joint(prb.AreaMetric()),
+                observed=data,
+                propagation=propagation,
+            )
+        asked.clear()
+        material = gather(model, None, posterior, None, None)
+        made = illustrations.illustrate((prb.reports.Section("Data"),), material)
+        assert len(asked) == count
+        assert [section.title for section in made[1:]] == (
+            ["Measured and calibrated responses", "Pairs of outputs"][: max(count, 1)]
+        )

@@ -4,12 +4,15 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+import pymc as pm
 import pytest
+import xarray as xr
 
 import prbayes as prb
 from prbayes.reports.material import gather
 from prbayes.reports.problem import data, metric
 from prbayes.reports.tables import cells
+from prbayes.response.outputs import Outputs
 
 
 def test_model_and_data(
@@ -67,3 +70,82 @@ def test_one_measured_value_has_no_spread(calibrated: Any) -> None:
     m = dataclasses.replace(gather(**nothing), observed={"y": np.array([2.5])})
     (row,) = cells(data(m)[0].table).rows
     assert row == ("y", "1", "2.500", "2.500", "2.500", "\u2013")
+
+
+# -- several outputs -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def measured() -> Any:
+    """Two outputs of 20 specimens: of the second two were not measured, and one has failed."""
+    y = np.random.default_rng(1).normal([5.0, 70.0], [0.5, 3.0], (20, 2))
+    y[:2, 1], y[2, 1] = np.nan, np.inf
+    return y
+
+
+@pytest.fixture(scope="module")
+def frame(measured: Any) -> pm.Model:
+    data = xr.DataArray(
+        measured,
+        dims=("i", "mode"),
+        coords={"mode": ["first", "second"], "units": ("mode", ["Hz", "mm"])},
+    )
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("mu", 5, 1), 0.5)
+        b = pm.Normal.dist(70, 3.0)
+        prb.Simulator(
+            "frame",
+            lambda a, b: np.stack([a, b], axis=-1),
+            *(a, b),
+            metric=prb.Joint(prb.ProbabilityResidual()),
+            observed=data,
+            propagation=prb.Resimulated(128),
+        )
+    return model
+
+
+def test_each_output_has_a_row_and_pairs_have_correlations(frame: Any, measured: Any) -> None:
+    about, correlations = data(gather(frame, None, None, None, None))
+    table = cells(about.table)
+    assert table.header == (
+        *("simulator", "output", "units", "N", "failed", "missing"),
+        *("smallest", "largest", "mean", "sd"),
+    )
+    first, second = table.rows
+    assert first[:6] == ("frame", "first", "Hz", "20", "0", "0")
+    assert second[:6] == ("frame", "second", "mm", "18", "1", "2")
+    known = measured[3:, 1]
+    assert float(second[8]) == pytest.approx(known.mean(), abs=0.01)
+    assert float(second[9]) == pytest.approx(known.std(ddof=1), abs=0.01)
+    r = np.corrcoef(measured[3:].T)[0, 1]
+    assert correlations.title == "Correlations of frame"
+    assert cells(correlations.table).rows[0][1:] == ("1", f"{r:.3f}")
+
+
+def test_a_result_alone_tells_the_same_of_outputs(frame: Any) -> None:
+    optimum = prb.minimize(frame)
+    told = [section.table for section in data(gather(frame, None, None, None, None))]
+    tree = optimum.to_datatree()
+    stored = data(gather(None, tree, None, None, None))
+    for one, other in zip(told, stored, strict=True):
+        assert cells(other.table) == cells(one)
+    report = prb.Report("Frame", optimum=optimum, model=frame, pictures=False)
+    assert (
+        "on 20 specimens with 2 outputs of frame, by the joint probability residual"
+        in (report.sections[0].text[0])
+    )
+
+
+def test_of_a_curve_some_outputs_have_a_row(calibrated: Any) -> None:
+    nothing = dict.fromkeys(("model", "optimum", "posterior", "validity", "comparison"))
+    rng = np.random.default_rng(1)
+    m = dataclasses.replace(
+        gather(**nothing),
+        observed={"y": rng.normal(size=(5, 40))},
+        outputs={"y": Outputs(tuple(np.arange(40) / 2), "hour")},
+    )
+    about, correlations = data(m)
+    rows = cells(about.table).rows
+    assert len(rows) == len(cells(correlations.table).rows) == 12
+    assert [rows[0][1], rows[-1][1]] == ["0", "19.5"]
+    assert "y: 12 of 40 outputs are told." in about.text

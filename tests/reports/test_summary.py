@@ -100,3 +100,19 @@ def test_for_a_packed_factor_its_standard_deviations_and_correlations_are_read()
         "chol_corr",
     ]
     assert _read(["mu", "chol"], {"mu", "chol", "chol_corr"}) == ["mu", "chol"]
+
+
+def test_a_verdict_on_several_outputs_counts_directions() -> None:
+    rng = np.random.default_rng(1)
+    predicted = rng.normal(rng.normal(0, 0.25, (50, 1, 2)), 1.0, (50, 100, 2))
+    null = prb.validation.PosteriorNull(99)
+    test = prb.area_test(rng.normal(size=(12, 2)), predicted, null=null)
+    text = verdict("a", test, material(validity=test))
+    assert text.startswith(
+        "On the responses of 12 specimens (several outputs, seen in 4 directions), the"
+    )
+    assert "(mean area 0." in text
+    made = prb.Report("x", validity=test, pictures=False)
+    table = made.sections[-1].table
+    assert table["of"].tolist() == ["u and |2u - 1|"]
+    assert table["directions"].tolist() == ["4"]

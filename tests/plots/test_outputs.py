@@ -1,0 +1,158 @@
+"""Pairs of outputs: measured specimens, and regions of the calibrated population."""
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+from scipy import stats
+
+import prbayes as prb
+from prbayes.plots.outputs import _chosen
+from prbayes.response.outputs import Outputs
+
+
+@pytest.mark.parametrize(("share", "visual"), [(0.5, "after_50"), (0.89, "after_89")])
+def test_regions_are_the_ellipses_of_a_normal_population(
+    pair: SimpleNamespace, read: SimpleNamespace, share: float, visual: str
+) -> None:
+    x, y = read.xy(pair.drawn("matplotlib"), visual, "second, first")
+    known = np.isfinite(x)
+    points = np.column_stack([x, y])[known] - pair.mean
+    squares = np.einsum("ij,jk,ik->i", points, np.linalg.inv(pair.covariance), points)
+    expected = -2 * np.log(1 - share)
+    assert squares.mean() == pytest.approx(expected, rel=0.06)
+    np.testing.assert_allclose(squares, expected, rtol=0.35)
+
+
+def test_points_are_the_specimens_that_have_both_outputs(
+    pair: SimpleNamespace, read: SimpleNamespace
+) -> None:
+    points = read.xy(pair.drawn("matplotlib"), "measured", "second, first")
+    both = np.isfinite(pair.observed).all(axis=1)
+    np.testing.assert_allclose(points.T, pair.observed[both])
+    assert both.sum() == len(both) - 3
+
+
+def test_axes_have_the_names_and_units_and_the_title_both_correlations(
+    pair: SimpleNamespace, read: SimpleNamespace
+) -> None:
+    pc = pair.drawn("matplotlib")
+    axis = pc.viz["plot"]["second, first"].item()
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("first (Hz)", "second (Hz)")
+    both = pair.observed[np.isfinite(pair.observed).all(axis=1)]
+    r = stats.spearmanr(both).statistic
+    # Of normal values 6 / pi arcsin(.8 / 2) = .786
+    assert axis.get_title().startswith(f"rank correlation\nmeasured {r:.2f}, calibrated 0.7")
+    assert read.texts(pc) == [
+        "before: prior's initial point",
+        "calibrated: posterior predictive, 50% and 89%",
+        "measured",
+    ]
+    named = prb.plot_outputs(
+        pair.posterior, model=pair.model, before=False, labels={"first": "F"}, backend="matplotlib"
+    )
+    assert named.viz["plot"]["second, first"].item().get_xlabel() == "F"
+    assert "before_50" not in named.viz
+
+
+def test_a_picture_of_stored_responses_computes_none(pair: SimpleNamespace) -> None:
+    count = pair.calls()
+    pair.drawn("none")
+    assert pair.calls() == count
+
+
+@pytest.fixture(scope="module")
+def several() -> SimpleNamespace:
+    """Five outputs of a simulator that draws anew, a curve, and one output."""
+    rng = np.random.default_rng(2)
+    turn = rng.standard_normal((3, 5))
+
+    def five(a: Any, b: Any, c: Any) -> Any:
+        return np.stack([a, b, c], axis=-1) @ turn
+
+    def curve(a: Any, b: Any, c: Any) -> Any:
+        return a[..., None] + np.arange(12) * b[..., None] + c[..., None]
+
+    names = ["p", "q", "r/s", "t", "u"]
+    data = xr.DataArray(five(*rng.normal(size=(3, 20))), dims=("i", "name"), coords={"name": names})
+    lines = xr.DataArray(
+        curve(*rng.normal(size=(3, 20))),
+        dims=("i", "hour"),
+        coords={"hour": np.arange(12) / 2},
+    )
+    metric = prb.MarginalCorrelation(prb.AreaMetric())
+    how: dict[str, Any] = {"metric": metric, "propagation": prb.Resimulated(64)}
+    with pm.Model() as model:
+        m = pm.Normal("m", 0, 1)
+        inputs = [pm.Normal.dist(m, 1.0), pm.Normal.dist(0.0, 1.0), pm.Normal.dist(0.0, 1.0)]
+        prb.Simulator(
+            "one", np.positive, inputs[0], metric=prb.AreaMetric(), observed=data.values[:, 0]
+        )
+        prb.Simulator("five", five, *inputs, observed=data, **how)
+        prb.Simulator("curve", curve, *inputs, observed=lines, **how)
+    draws = xr.Dataset({"m": (("chain", "draw"), rng.normal(0, 0.2, (2, 20)))})
+    return SimpleNamespace(model=model, posterior=xr.DataTree.from_dict({"posterior": draws}))
+
+
+def test_by_default_an_output_that_does_not_vary_is_left_out() -> None:
+    data = np.column_stack([np.full(5, 0.1), np.arange(5.0), np.arange(5.0) ** 2])
+    outputs = Outputs(("none", "one", "two"))
+    target = SimpleNamespace(observed=data, weights=np.full(5, 0.2))
+    node: Any = SimpleNamespace(name="y", outputs=outputs, target=target)
+    evaluator: Any = SimpleNamespace(nodes=[node])
+    assert [output.name for output in _chosen(evaluator, 0, None)] == ["y[one]", "y[two]"]
+
+
+def pairs(pc: Any) -> list[str]:
+    """Return the pairs that are drawn."""
+    return list(pc.viz["measured"].data_vars)
+
+
+def test_pairs_are_a_triangle(several: SimpleNamespace) -> None:
+    how: dict[str, Any] = {"model": several.model, "before": False, "draws": 4}
+    pc = prb.plot_outputs(several.posterior, outputs=["p", "r/s", "u"], backend="matplotlib", **how)
+    assert pairs(pc) == ["r\u2215s, p", "u, p", "u, r\u2215s"]
+    axes = np.array(pc.viz["figure"].item().axes, dtype=object).reshape(2, 2)
+    assert [axis.axison for axis in axes.ravel()] == [True, False, True, True]
+    assert axes[0, 0].get_xlabel() == axes[1, 1].get_ylabel() == ""
+    assert (axes[1, 0].get_xlabel(), axes[1, 0].get_ylabel()) == ("five: p", "five: u")
+    every = prb.plot_outputs(several.posterior, backend="none", **how)
+    assert len(pairs(every)) == 10
+
+
+def test_of_a_curve_some_places_are_drawn(several: SimpleNamespace) -> None:
+    how: dict[str, Any] = {"model": several.model, "before": False, "draws": 4, "backend": "none"}
+    pc = prb.plot_outputs(several.posterior, simulator="curve", **how)
+    assert pairs(pc)[-1] == "5.5, 3.5"
+    assert len(pairs(pc)) == 6
+    chosen = prb.plot_outputs(several.posterior, simulator="curve", outputs=[0.5, "5"], **how)
+    assert pairs(chosen) == ["5, 0.5"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "match"),
+    [
+        ({"simulator": "one"}, KeyError, r"'one', expected one of \['five', 'curve'\]"),
+        ({"simulator": 3}, TypeError, "got int 3, expected a name"),
+        ({"outputs": ["p"]}, ValueError, "got 1 outputs, expected two to 7"),
+        ({"outputs": ["p", "p"]}, ValueError, "expected different ones"),
+        ({"outputs": ["p", "z"]}, KeyError, "got 'z', expected some of"),
+        ({"outputs": "pq"}, TypeError, "got str 'pq', expected a list"),
+    ],
+)
+def test_what_is_not_there_is_refused(
+    several: SimpleNamespace, arguments: dict[str, Any], error: type[Exception], match: str
+) -> None:
+    with pytest.raises(error, match=match):
+        prb.plot_outputs(several.posterior, model=several.model, **arguments)
+
+
+def test_a_model_of_single_outputs_is_told_of_another_picture(
+    posterior: xr.DataTree, build: Callable[..., pm.Model]
+) -> None:
+    with pytest.raises(ValueError, match=r"got simulators \['y'\] of one .* prb.plot_responses"):
+        prb.plot_outputs(posterior, model=build(prb.Resimulated(64)), draws=4)
