@@ -52,12 +52,11 @@ class Joint(LiftedMetric):
 
     Notes
     -----
-    A specimen that failed (+inf) counts as the largest observed value of that output if some of
-    those observed have failed, and else as that and the range of them beyond it. Where outputs are
-    missing (NaN), specimens are taken together by the outputs that they have: each set of outputs
-    is compared with all specimens that have them, with a share as large as that of the specimens
-    that have no others. More than eight sets, and sets that few specimens have, are replaced by
-    what they have in common with others.
+    A specimen that failed (+inf) counts as the largest observed value of that output, and the
+    range of them beyond it. Where outputs are missing (NaN), specimens are taken together by the
+    outputs that they have: each set of outputs is compared with all specimens that have them, with
+    a share as large as that of the specimens that have no others. More than eight sets, and sets
+    that few specimens have, are replaced by what they have in common with others.
 
     Data that are symmetric have several frames of invariant coordinates, among which rounding
     decides.

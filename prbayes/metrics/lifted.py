@@ -106,13 +106,8 @@ class LiftedMetric(Metric):
 
 
 def failure_caps(observed: Floats) -> Floats:
-    """Return what a failure counts as in each output, (n, m) -> (m,).
-
-    The largest value where some specimens have failed, at about that value: responses then go on
-    without a jump. Elsewhere the range of the values beyond it.
-    """
+    """Return what a failure counts as in each output: the largest value, and the range beyond."""
     finite = np.where(np.isfinite(observed), observed, np.nan)
     highest = np.nanmax(finite, axis=0)
     lowest = np.nanmin(finite, axis=0)
-    seen = np.isposinf(observed).any(axis=0)
-    return np.asarray(np.where(seen, highest, highest + (highest - lowest)))
+    return np.asarray(highest + (highest - lowest))

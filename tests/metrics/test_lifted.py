@@ -73,7 +73,10 @@ def test_every_metric_declares_what_its_inner_one_does() -> None:
     assert Joint(AreaMetric(), 5).like(KullbackLeibler()) == Joint(KullbackLeibler(), 5)
     assert AreaMetric().like(KullbackLeibler()) == KullbackLeibler()
     assert hash(Joint(AreaMetric(), 5)) != hash(Joint(AreaMetric(), 6))
-    assert repr(Joint(AreaMetric(), 5)) == "Joint(metric=AreaMetric(), directions=5, components=None, seed=0)"
+    assert (
+        repr(Joint(AreaMetric(), 5))
+        == "Joint(metric=AreaMetric(), directions=5, components=None, seed=0)"
+    )
 
 
 @both
