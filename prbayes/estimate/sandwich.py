@@ -200,7 +200,7 @@ class Information:
     def _along_stencil(
         self, observed: Floats, weights: Floats, points: slice = slice(None)
     ) -> Floats:
-        """Return discrepancies at points of the stencil, (s,) or (n_sets, s), some sets at a time."""
+        """Return discrepancies at points of the stencil, (s,) or (n_sets, s), some at a time."""
         features = [feature[points] for feature in self._features]
         target = self._target.with_observed(observed, weights)
         n_sets = len(weights) if weights.ndim > 1 else 1
