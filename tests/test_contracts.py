@@ -37,8 +37,10 @@ from pytensor.gradient import NullTypeGradError, disconnected_grad, grad_undefin
 from pytensor.graph.basic import Apply, Constant, Variable
 from pytensor.graph.op import Op
 from pytensor.graph.replace import _vectorize_node, graph_replace, vectorize_graph
+from pytensor.graph.rewriting.basic import node_rewriter, out2in
 from pytensor.graph.traversal import ancestors, toposort, walk
 from pytensor.graph.utils import MissingInputError
+from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.variable import TensorVariable
@@ -55,6 +57,19 @@ def two_normals() -> pm.Model:
 
 
 # Graphs.
+
+
+def test_terms_of_a_sum_come_into_one_operation_that_a_late_rewriting_sees() -> None:
+    seen: list[tuple[bool, int]] = []
+
+    @node_rewriter([Elemwise])
+    def look(fgraph: object, node: Apply) -> bool:
+        seen.append((node.op.scalar_op.associative, len(node.inputs)))
+        return False
+
+    xs = [pt.dvector() for _ in range(5)]
+    function(xs, sum(xs[1:], start=xs[0]), mode=PLAIN.register((out2in(look), 1000)))
+    assert (True, 5) in seen
 
 
 def test_variables_of_models_are_tensors_made_by_applications_of_operations() -> None:

@@ -423,6 +423,7 @@ INNER = {
     },
     "propagation.fresh": {"pytensor.tensor.variable.TensorVariable"},
     "propagation.ops": {
+        "pytensor.gradient.grad_undefined",
         "pytensor.graph.basic.Apply",
         "pytensor.graph.basic.Variable",
         "pytensor.graph.op.Op",
@@ -448,8 +449,11 @@ INNER = {
         "pytensor.graph.op.Op",
         "pytensor.graph.replace.graph_replace",
         "pytensor.graph.replace.vectorize_graph",
+        "pytensor.graph.rewriting.basic.node_rewriter",
+        "pytensor.graph.rewriting.basic.out2in",
         "pytensor.graph.traversal.ancestors",
         "pytensor.graph.traversal.toposort",
+        "pytensor.tensor.elemwise.Elemwise",
         "pytensor.tensor.variable.TensorVariable",
     },
     "response.distributions": {

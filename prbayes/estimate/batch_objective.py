@@ -51,7 +51,7 @@ class BatchObjective:
             weights = sets.weights[k][rows, None]
             values = sets.values[k]
             target = node.target.with_observed(values, weights)
-            basis = target.basis(design.values)
+            basis = target.stored(design.values)
             targets.append(target)
             bases.append(basis)
         return cls(evaluator, scales, chosen, targets, bases, blocks)

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import (
+    AT_ONCE,
     Floats,
     observed_outputs,
     observed_sample,
@@ -211,6 +212,27 @@ class Discrepancy(ABC):
 
         They are made once for the values; `from_basis` then serves any weights.
         """
+
+    @property
+    def columns(self) -> int:
+        """How many numbers the basis has for each value, where `compact` has fewer; else zero."""
+        return 0
+
+    def compact(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
+        """Return arrays that serve as the basis does with NumPy, and take less memory."""
+        return self.basis(simulated)
+
+    def stored(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
+        """Return the basis where it is small, and else what is compact."""
+        small = len(simulated) * self.columns <= AT_ONCE
+        return self.basis(simulated) if small else self.compact(simulated)
+
+    def pulled_back(self, compact: Floats, cotangent: Floats) -> Floats:
+        """Return the derivatives for the weights, (..., n), of a sum over features, (..., columns).
+
+        Of the sum of the features times the cotangent; where there are columns.
+        """
+        raise NotImplementedError
 
     @abstractmethod
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:

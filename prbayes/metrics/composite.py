@@ -226,6 +226,20 @@ class CompositeDiscrepancy(Discrepancy):
             return (simulated,)
         return sum((group.basis(simulated) for group in self._groups), ())
 
+    @property
+    def columns(self) -> int:
+        """How many numbers the basis has for each value, if all parts compare densities."""
+        first, *others = self._groups
+        return 0 if others or not self.symbolic else first.columns
+
+    def compact(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
+        """Return what each part sees, (n, K), instead of densities of it, (n, cells)."""
+        return self._groups[0].compact(simulated) if self.columns else self.basis(simulated)
+
+    def pulled_back(self, compact: Floats, cotangent: Floats) -> Floats:
+        """Return the derivatives for the weights, (..., n), of a sum over densities."""
+        return self._groups[0].pulled_back(compact, cotangent)
+
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return the features of the values that the basis was made for."""
         if not self.symbolic:
@@ -266,6 +280,19 @@ class _Group(ABC):
     @abstractmethod
     def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
         """Return the arrays that turn weights into features."""
+
+    @property
+    def columns(self) -> int:
+        """As of a discrepancy."""
+        return 0
+
+    def compact(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
+        """As of a discrepancy."""
+        return self.basis(simulated)
+
+    def pulled_back(self, compact: Floats, cotangent: Floats) -> Floats:
+        """As of a discrepancy."""
+        raise NotImplementedError
 
     @abstractmethod
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
@@ -389,10 +416,40 @@ class _Densities(_Group):
             (out[:, cells],) = target.basis(seen)
         return (out,)
 
+    @property
+    def columns(self) -> int:
+        """How many cells there are, if there are several parts."""
+        return sum(self._sizes) if len(self.parts) > 1 else 0
+
+    def compact(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
+        """Return what each part sees, (n, K)."""
+        return (np.stack([seen for _, seen in seen_by(self.parts, simulated)], axis=-1),)
+
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return the densities side by side, (..., cells)."""
         (matrix,) = basis
-        return (product(weights, matrix) if xp is np else weights @ matrix,)
+        if xp is not np:
+            return (weights @ matrix,)
+        # Each part has several cells.
+        if self.columns and matrix.shape[-1] == len(self.parts):
+            return (self._binned(matrix, weights),)
+        return (product(weights, matrix),)
+
+    def pulled_back(self, compact: Floats, cotangent: Floats) -> Floats:
+        """Return the derivatives for the weights of a sum over the densities."""
+        total: Any = 0.0
+        for part, values, cells in zip(self.parts, compact.T, self._slices, strict=True):
+            own = cast(Cells, part.target.density_cells)
+            total = total + own.value(values, cotangent[..., cells])
+        return np.asarray(total)
+
+    def _binned(self, seen: Floats, weights: Floats) -> Floats:
+        """Return the densities side by side of what each part sees, (n, K), (..., n)."""
+        found: list[Any] = []
+        for part, values in zip(self.parts, seen.T, strict=True):
+            sample = np.broadcast_to(values, weights.shape)
+            found += part.target.features(sample, weights, np)
+        return np.concatenate(found, axis=-1)
 
     def outer(self, features: tuple[Any, ...], shares: Floats, xp: Any) -> Any:
         """Return the sum of the parts, in one pass over all cells where that can be."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytensor.tensor as pt
+from pytensor.gradient import grad_undefined
 from pytensor.graph.basic import Apply, Variable
 from pytensor.graph.op import Op
 from pytensor.graph.replace import _vectorize_node
@@ -22,7 +23,7 @@ from prbayes.response.response import Responses
 warnings.filterwarnings(
     "ignore",
     message="Numba will use object mode to run "
-    "(prbayes_Simulator|FreshOp|ResponseOp|DensityOp|CotangentOp|OpaqueOp|abc_d)",
+    "(prbayes_Simulator|FreshOp|ResponseOp|DensityOp|CotangentOp|Compact|OpaqueOp|abc_d)",
 )
 
 
@@ -172,6 +173,65 @@ class CotangentOp(OwnOp):
         """Refuse second derivatives."""
         raise NotImplementedError(
             "second derivatives of a density of simulated values are not implemented as a graph"
+        )
+
+
+class OfCompactOp(OwnOp):
+    """An operation on many stored values in their compact form, and what goes with their points."""
+
+    __props__ = ("target",)
+    event_ndims = (2, 1)
+
+    def __str__(self) -> str:
+        """Return the name, and what to do where a backend has no form of it."""
+        return (
+            f"{type(self).__name__}, which is computed by NumPy: PyTensor's JAX mode and NumPyro "
+            "take several outputs of smaller designs alone; pass prb.Reweighted(max_points=...), "
+            "or nuts_sampler='nutpie' or 'pymc'"
+        )
+
+
+class CompactOp(OfCompactOp):
+    """The features of stored values in their compact form, (n, K), (..., n) -> (..., m)."""
+
+    __props__ = ("target",)
+    __str__ = OfCompactOp.__str__
+
+    def __init__(self, target: Discrepancy) -> None:
+        self.target = target
+        self.event_shape = (target.columns,)
+
+    def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
+        """Bin and smooth."""
+        compact, weights = inputs
+        (outputs[0][0],) = self.target.from_basis(weights, (compact,), np)
+
+    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
+        """Return the derivatives for the weights by another operation; values are stored."""
+        compact, _ = inputs
+        (cotangent,) = cotangents
+        stored = grad_undefined(self, 0, compact, "stored values do not change")
+        return [stored, CompactCotangentOp(self.target)(compact, cotangent)]
+
+
+class CompactCotangentOp(OfCompactOp):
+    """A cotangent of such features at the weights, (n, K), (..., m) -> (..., n)."""
+
+    __props__ = ("target",)
+    __str__ = OfCompactOp.__str__
+    event_shape = (None,)
+
+    def __init__(self, target: Discrepancy) -> None:
+        self.target = target
+
+    def perform(self, node: Any, inputs: Any, outputs: Any) -> None:
+        """Gather."""
+        outputs[0][0] = self.target.pulled_back(*inputs)
+
+    def pullback(self, inputs: Any, outputs: Any, cotangents: Any) -> Any:
+        """Refuse second derivatives."""
+        raise NotImplementedError(
+            "second derivatives are not implemented as a graph for so many stored responses"
         )
 
 

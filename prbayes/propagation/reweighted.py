@@ -38,7 +38,7 @@ from prbayes.propagation.edges import (
     moving_inputs,
     refuse_moving_atoms,
 )
-from prbayes.propagation.ops import OpaqueOp
+from prbayes.propagation.ops import CompactOp, OpaqueOp
 from prbayes.propagation.points import base_points
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import (
@@ -58,6 +58,9 @@ _log = logging.getLogger("prbayes")
 # Components of a batch's mixture density: as many as there are points would be as good, and cost
 # their square.
 _COMPONENTS = 512
+# Numbers of a basis in a compiled graph, 1 GiB, when the design has grown to its largest. Graphs
+# without it are as fast (benchmarks/joint_speed.py), but JAX does not know their operations.
+_MOST_NUMBERS = 1 << 27
 # Neighbours on either side in the cells of an input whose support moves, beside other inputs: its
 # points then pass an edge some at a time, as their weights differ. On a line the cells meet.
 _ABREAST = 8
@@ -276,11 +279,11 @@ class Design(Bound):
         """Compare with the same data in another way from here on; before anything is compiled."""
         if target is self.target:
             return
-        before = len(self._shared) - len(self.target.basis(self.values[:1]))
+        before = len(self._shared) - len(self._basis_of(self.values[:1]))
         self.target = target
         kept = [shared.get_value() for shared in self._shared[:before]]
         self._shared = []
-        self._share([*kept, *target.basis(self.values)])
+        self._share([*kept, *self._basis_of(self.values)])
 
     @property
     def known_points(self) -> Sequence[Floats]:
@@ -400,13 +403,26 @@ class Design(Bound):
         if self._moving is None:
             self._moving = moving_inputs(self.name, self.inputs, components, points)
             self.support_moves = bool(self._moving)
-        basis = self.target.basis(self.values)
+        basis = self._basis_of(self.values)
         ends = self._cell_ends()
         self._share([*stored.points, log_g, *ends, *basis])
         log_ess = 2 * sums[0] - sums[1]
         ess = np.exp(log_ess)
         of_these = ess[-len(counts) :]
         return float(np.median(of_these))
+
+    @property
+    def _too_many(self) -> bool:
+        """Whether graphs do without a basis, as it would take too much memory.
+
+        That does not change while the design grows.
+        """
+        return self.target.columns * self.max_points > _MOST_NUMBERS
+
+    def _basis_of(self, values: Floats) -> tuple[NDArray[Any], ...]:
+        """Return what graphs make features of."""
+        target = self.target
+        return target.compact(values) if self._too_many else target.basis(values)
 
     def _responses_at(self, points: Sequence[Floats]) -> Floats:
         """Return the responses at points: none is computed that this or another design had."""
@@ -644,7 +660,10 @@ class Design(Bound):
         weights = raw / raw.sum()
         before_the_basis = len(self.inputs.aleatory) + 1 + 2 * len(self._moving or ())
         basis = tuple(self._shared[before_the_basis:])
-        if self.target.symbolic:
+        if self._too_many:
+            features = CompactOp(self.target)(*basis, weights)
+            value = self.target.outer(features, xp=pt)
+        elif self.target.symbolic:
             features = self.target.from_basis(weights, basis, pt)
             value = self.target.outer(*features, xp=pt)
         else:
@@ -669,7 +688,7 @@ class Design(Bound):
         """
         wanted = (target, self.n_points)
         if self._basis[:2] != wanted:
-            made = target.basis(self.values)
+            made = target.stored(self.values)
             self._basis = (*wanted, made)
         *_, basis = self._basis
         _, weights = self.populations(params)

@@ -15,14 +15,32 @@ from pytensor.compile.mode import Mode
 from pytensor.graph.basic import Constant, Variable
 from pytensor.graph.op import Op
 from pytensor.graph.replace import graph_replace, vectorize_graph
+from pytensor.graph.rewriting.basic import node_rewriter, out2in
 from pytensor.graph.traversal import ancestors, toposort
+from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.variable import TensorVariable
+
+# Operands of a sum: NumPy has 32 for one operation, the result among them, and PyTensor puts all
+# terms of a sum into one.
+_OPERANDS = 30
+
+
+def _sums_of_sums(fgraph: Any, node: Any) -> Any:
+    """Divide what has too many terms, or factors, into several of as many as there may be."""
+    op, terms = node.op, node.inputs
+    if len(terms) <= _OPERANDS or not op.scalar_op.associative:
+        return False
+    parts = [terms[i : i + _OPERANDS] for i in range(0, len(terms), _OPERANDS)]
+    return [op(*(op(*part) if len(part) > 1 else part[0] for part in parts))]
+
 
 # Batched NumPy calls: nothing here runs often enough to repay a heavy compilation. Without fusion
 # every elementwise operation is one NumPy ufunc; with it, the Python linker would loop over
-# scalars.
-PLAIN = Mode(linker="py", optimizer="fast_run").excluding(
-    "fusion", "inplace", "BlasOpt", "c_blas", "symbolic_op_recognition"
+# scalars. Sums are divided last, lest they be put together again.
+PLAIN = (
+    Mode(linker="py", optimizer="fast_run")
+    .excluding("fusion", "inplace", "BlasOpt", "c_blas", "symbolic_op_recognition")
+    .register((out2in(node_rewriter([Elemwise])(_sums_of_sums)), 1000))
 )
 
 # Functions that are kept, the oldest of which goes: a model has about ten. What they hold beside

@@ -14,6 +14,7 @@ from pytensor.graph.replace import vectorize_graph
 import prbayes as prb
 from prbayes.metrics.base import Discrepancy
 from prbayes.propagation.ops import (
+    CompactOp,
     CotangentOp,
     DensityOp,
     OpaqueOp,
@@ -165,3 +166,30 @@ def test_jax_refuses_densities_of_simulated_values(propagation: Any) -> None:
         NotImplementedError, match=r"JAX mode and NumPyro take prb\.Reweighted alon"
     ):
         model.compile_logp(mode="JAX")(model.initial_point())
+
+
+@pytest.mark.parametrize("name", ["PR", "KLD", "bins"])
+def test_features_of_compact_values_are_those_of_a_basis_and_so_are_their_derivatives(
+    name: str,
+) -> None:
+    rng = np.random.default_rng(3)
+    joint = prb.Joint(METRICS[name]).against(rng.standard_normal((20, 2)))
+    values = rng.standard_normal((30, 2))
+    values[4, 1] = np.nan
+    (matrix,), (compact,) = joint.basis(values), joint.compact(values)
+    assert matrix.shape == (30, joint.columns)
+    assert compact.shape == (30, 4)
+    seen, weights, cotangent = pt.dmatrix(), pt.dvector(), pt.dvector()
+    features = CompactOp(joint)(seen, weights)
+    slopes = pt.grad((features * cotangent).sum(), weights)
+    function = pytensor.function([seen, weights, cotangent], [features, slopes])
+    w, c = rng.dirichlet(np.ones(30)), rng.standard_normal(joint.columns)
+    found, derivatives = function(compact, w, c)
+    np.testing.assert_allclose(found, w @ matrix, atol=1e-14)
+    np.testing.assert_allclose(derivatives, matrix @ c, atol=1e-12)
+    # Batches of weights share the values.
+    many = pt.dmatrix()
+    batched = vectorize_graph(features, {weights: many})
+    rows = rng.dirichlet(np.ones(30), 3)
+    found = pytensor.function([seen, many], batched)(compact, rows)
+    np.testing.assert_allclose(found, rows @ matrix, atol=1e-14)

@@ -710,3 +710,38 @@ def test_data_that_were_set_anew_are_refused_where_points_are_added() -> None:
     model.set_data("shift", 0.0)
     design.add(components)
     assert design.n_points == 128
+
+
+@pytest.mark.parametrize("metric", [prb.ProbabilityResidual(), prb.KullbackLeibler()])
+def test_where_a_basis_would_be_too_large_nothing_else_changes(
+    metric: prb.Metric, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = np.random.default_rng(1).normal(1.0, 0.5, (30, 2))
+
+    def found() -> tuple[Any, Any, list[int]]:
+        with pm.Model() as model:
+            x = pm.Normal.dist(pm.Normal("mu", 1, 0.3), 0.5, shape=2)
+            prb.Simulator(
+                "y",
+                same,
+                x,
+                metric=prb.Joint(metric),
+                observed=data,
+                propagation=prb.Reweighted(64),
+            )
+        own = design(model)
+        own.add([np.array([0.9, 1.1])])
+        evaluator = Evaluator(model)
+        at = evaluator.objective(prior=False, gradient=True)(np.array([0.9]), np.ones(1))
+        sizes = [s.get_value().size for s in own._shared]
+        return at, evaluator(np.array([[0.9], [1.2]])).discrepancies, sizes
+
+    at, many, sizes = found()
+    assert max(sizes) > 128 * 100
+    monkeypatch.setattr("prbayes.propagation.reweighted._MOST_NUMBERS", 100)
+    monkeypatch.setattr("prbayes.metrics.base.AT_ONCE", 100)
+    compact_at, compact_many, compact_sizes = found()
+    assert max(compact_sizes) == 128 * 4
+    np.testing.assert_allclose(compact_at[0], at[0], rtol=1e-10)
+    np.testing.assert_allclose(compact_at[1], at[1], rtol=1e-9)
+    np.testing.assert_allclose(compact_many, many, rtol=1e-10)

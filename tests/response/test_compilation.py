@@ -46,6 +46,22 @@ def test_an_invalid_row_is_minus_infinity_and_leaves_the_others_alone() -> None:
     np.testing.assert_allclose(found[[0, 3]], expected, rtol=1e-12)
 
 
+def test_a_sum_may_have_more_terms_than_an_operation_of_numpy_has_operands() -> None:
+    xs = [pt.dvector() for _ in range(95)]
+    total = sum(xs[1:], start=xs[0])
+    product = xs[0]
+    for x in xs[1:]:
+        product = product * x
+    (slope,) = pt.grad(sum((x * xs[0]).sum() for x in xs), [xs[0]])
+    function = compiled(xs, [total, product, slope])
+    values = np.random.default_rng(0).uniform(0.9, 1.1, (95, 3))
+    found = function(*values)
+    slopes = values.sum(axis=0) + values[0]
+    expected = [values.sum(axis=0), values.prod(axis=0), slopes]
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
 def test_a_graph_without_checks_stays_as_it_is() -> None:
     x = pt.dscalar("x")
     graph = 2 * x
