@@ -11,7 +11,7 @@ Kolmogorov-Smirnov, Cramer-von Mises, Anderson-Darling and ArviZ's tests of unif
 same u-values in the posterior's pool (in closed form, Student's t), and all with critical values
 from the same simulation of a right model, so that each has the nominal size.
 
-    uv run python -m benchmarks.validity [--parts size pipeline power]
+    uv run python -m benchmarks.validity [--parts size pipeline power outputs]
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 from scipy.special import ndtr, ndtri, stdtr
+from scipy.stats import invwishart
 
 import prbayes as prb
 from benchmarks import record
@@ -37,6 +38,10 @@ POWER_AT = (30, 20)  # n0 and n
 ALTERNATIVES = {f"mean + {d:g} sd": (d, 1.0) for d in (0.5, 0.75, 1.0)} | {
     f"sd x {r:g}": (0.0, r) for r in (0.5, 1.5, 2.0)
 }
+# Of four outputs with correlation .9 between any two: n0 and n; and correlations that are wrong.
+OUTPUTS, CORRELATION = 4, 0.9
+OUTPUTS_AT = (15, 20)
+WRONG = (0.8, 0.6, 0.0)
 ARVIZ = ("pot_c", "prit_c", "piet_c")
 
 
@@ -48,6 +53,45 @@ def posterior_populations(
     sd = data.std(ddof=1) * np.sqrt((n - 1) / rng.chisquare(n - 1, (draws, 1)))
     mean = data.mean() + sd / np.sqrt(n) * rng.normal(size=(draws, 1))
     return mean + sd * ndtri((np.arange(n_samples) + rng.random((draws, 1))) / n_samples)
+
+
+def correlated(rho: float) -> Any:
+    """Return a root of the covariance of outputs with equal correlations."""
+    return np.linalg.cholesky(np.full((OUTPUTS, OUTPUTS), rho) + (1 - rho) * np.eye(OUTPUTS))
+
+
+def populations_of_outputs(data: Any, rng: np.random.Generator, draws: int = 200) -> Any:
+    """Return one population per draw of the exact posterior under Jeffreys' prior, (draws, 200, m)."""
+    n, m = data.shape
+    scatter = np.cov(data.T) * (n - 1)
+    found = []
+    for covariance in invwishart.rvs(n - 1, scatter, size=draws, random_state=rng):
+        root = np.linalg.cholesky(covariance)
+        mean = data.mean(axis=0) + rng.standard_normal(m) @ root.T / np.sqrt(n)
+        found.append(mean + rng.standard_normal((200, m)) @ root.T)
+    return np.array(found)
+
+
+def outputs(replicates: int) -> dict[str, list[float]]:
+    """Return p-values of tests of several outputs, by the fresh data's correlation."""
+    n0, n = OUTPUTS_AT
+    found: dict[str, list[float]] = {f"{rho:g}": [] for rho in (CORRELATION, *WRONG)}
+    found["mean + 0.75 sd"] = []
+    for i in range(replicates):
+        rng = np.random.default_rng([9, n0, i])
+        predicted = populations_of_outputs(
+            rng.normal(size=(n0, OUTPUTS)) @ correlated(CORRELATION).T, rng
+        )
+        null = prb.validation.PosteriorNull(999, random_seed=i)
+        for name, p_values in found.items():
+            shift = 0.75 if "mean" in name else 0.0
+            rho = CORRELATION if "mean" in name else float(name)
+            # Power is known well enough from a third of the data sets.
+            if name != f"{CORRELATION:g}" and 3 * i >= replicates:
+                continue
+            fresh = shift + rng.normal(size=(n, OUTPUTS)) @ correlated(rho).T
+            p_values.append(prb.area_test(fresh, predicted, null=null).p_value)
+    return found
 
 
 def sizes(n0: int, replicates: int) -> dict[str, dict[str, Any]]:
@@ -171,11 +215,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--replicates", type=int, default=5000)
     parser.add_argument("--pipeline", type=int, default=300)
+    parser.add_argument("--outputs", type=int, default=1000)
     parser.add_argument(
         "--parts",
         nargs="+",
-        choices=("size", "pipeline", "power"),
-        default=("size", "pipeline", "power"),
+        choices=tuple(PARTS),
+        default=tuple(PARTS),
     )
     parser.add_argument(
         "--out",
@@ -188,7 +233,7 @@ def main() -> None:
     result: dict[str, Any] = record.load(arguments.out, {})
     for part in arguments.parts:
         clock = time.perf_counter()
-        {"size": run_sizes, "pipeline": run_pipeline, "power": run_power}[part](result, arguments)
+        PARTS[part](result, arguments)
         result[f"{part}_seconds"] = round(time.perf_counter() - clock)
         print(f"{result[f'{part}_seconds']} s\n", flush=True)
         record.save(arguments.out, result)
@@ -237,6 +282,17 @@ def run_power(result: dict[str, Any], arguments: argparse.Namespace) -> None:
     print(f"{'test':20s} " + " ".join(f"{label:>13s}" for label in labels))
     for name, row in table.items():
         print(f"{name:20s} " + " ".join(f"{row[label]:13.3f}" for label in labels))
+
+
+def run_outputs(result: dict[str, Any], arguments: argparse.Namespace) -> None:
+    """Size and power of the test of several outputs."""
+    table = result["outputs"] = {}
+    print(f"{OUTPUTS} outputs, {arguments.outputs} replicates\n{HEADER}")
+    result["outputs_replicates"] = arguments.outputs
+    report(table, *OUTPUTS_AT, outputs(arguments.outputs))
+
+
+PARTS = {"size": run_sizes, "pipeline": run_pipeline, "power": run_power, "outputs": run_outputs}
 
 
 if __name__ == "__main__":

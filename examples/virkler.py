@@ -80,8 +80,9 @@ def calibrate(observed):
         metric = prb.Joint(prb.ProbabilityResidual(), components=2)
         prb.Simulator("half length", at_times, x, metric=metric, observed=observed)
     optimum = prb.minimize(model)
+    print(optimum)
     posterior = prb.sample_smc(
-        1000, chains=4, model=model, optimum=optimum, random_seed=1, progressbar=False
+        500, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False
     )
     return model, x, optimum, posterior
 
