@@ -131,6 +131,7 @@ def main(out):
         f"{float(predicted.mean()):.2f} +- {float(predicted.std()):.2f} mm"
     )
     print(prb.area_test(fresh.values, predicted))
+    # The population has no reading error: all four lengths of a specimen lie on its curve.
     curves = prb.predict(posterior, at_times, x, model=model, random_seed=1)
     print(prb.area_test(at.isel(specimen=kept_back).values, curves))
     if out is not None:
