@@ -161,10 +161,11 @@ class Discrepancy(ABC):
         """The terms that it is the sum of: itself, unless it is made of several."""
         return (Part(self, 1.0, ""),)
 
-    def beside(self, design: Floats) -> Discrepancy:
+    def beside(self, design: Floats, inputs: int) -> Discrepancy:
         """Return the same comparison, now that the first simulated responses are known.
 
-        Itself, unless the metric chooses what it compares by the data and them together.
+        Itself, unless the metric chooses what it compares by the data and them together, or by how
+        many numbers a specimen's inputs are.
         """
         return self
 
@@ -367,7 +368,7 @@ class Metric(ABC):
         """
         return metric
 
-    def beside(self, observed: Floats, weights: Floats, design: Floats) -> Discrepancy:
+    def beside(self, observed: Floats, weights: Floats, design: Floats, inputs: int) -> Discrepancy:
         """Return the discrepancy from checked values, now that a design's responses are known."""
         return self._prepare(observed, weights)
 

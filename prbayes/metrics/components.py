@@ -14,7 +14,7 @@ from prbayes._weighted import quantile
 MOST_OUTPUTS = 8
 # Share of the variance, of the data and of the design, that components may leave out. By judgement:
 # a tenth of a standard deviation.
-_LEFT_OUT = 0.01
+LEFT_OUT = 0.01
 # Specimens for each component: scatters of fewer are hardly known.
 _SPECIMENS = 5
 # Specimens from which two components can be had.
@@ -75,7 +75,7 @@ def principal_components(
     explained = np.array([np.cumsum(np.einsum("ij,ik,kj->j", axes, s, axes)) for s in unit])
     most = max(1, min(m, MOST_OUTPUTS, n // _SPECIMENS))
     if number is None:
-        enough = (explained >= 1 - _LEFT_OUT).all(axis=0)
+        enough = (explained >= 1 - LEFT_OUT).all(axis=0)
         number = min(int(np.argmax(enough)) + 1 if enough.any() else m, most)
     # Signs that do not hang on the algorithm.
     signs = np.sign(axes[np.abs(axes).argmax(axis=0), np.arange(m)])

@@ -110,11 +110,14 @@ class CompositeDiscrepancy(Discrepancy):
         shares = np.array([part.share for part in parts])
         return cls(metric, observed, weights, tuple(parts), shares, components)
 
-    def beside(self, design: Floats) -> Discrepancy:
-        """Return the same with the principal components of data and design together."""
-        if not self.components:
+    def beside(self, design: Floats, inputs: int) -> Discrepancy:
+        """Return the same with the principal components of data and design together.
+
+        Fewer inputs than outputs matter as well.
+        """
+        if not self.components and inputs >= self.observed.shape[1]:
             return self
-        return self.metric.beside(self.observed, self.weights, design)
+        return self.metric.beside(self.observed, self.weights, design, inputs)
 
     @property
     def parts(self) -> tuple[Part, ...]:

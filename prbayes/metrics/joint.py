@@ -10,11 +10,17 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.metrics.base import Discrepancy, Part
-from prbayes.metrics.components import FEWEST, MOST_OUTPUTS, Components, principal_components
+from prbayes.metrics.components import (
+    FEWEST,
+    LEFT_OUT,
+    MOST_OUTPUTS,
+    Components,
+    principal_components,
+)
 from prbayes.metrics.composite import Centered, CompositeDiscrepancy, Projection
 from prbayes.metrics.directions import directions, enough
 from prbayes.metrics.lifted import LiftedMetric, failure_caps
-from prbayes.metrics.whitening import Whitening, whitening
+from prbayes.metrics.whitening import Whitening, units, whitening
 
 # By judgement: sets of measured outputs that are compared by themselves, each with directions of
 # its own.
@@ -52,6 +58,11 @@ class Joint(LiftedMetric):
 
     Notes
     -----
+    Outputs of fewer inputs lie on a surface, or a curve. Beside a simulator's inputs only as many
+    coordinates are compared as it has dimensions, where these leave out less than a hundredth of
+    the outputs' variance, each in units of its spread; what is left out is how it is bent, of which
+    whitening would make as much as of all else. Nothing depends on the outputs' units still.
+
     A specimen that failed (+inf) counts as the largest observed value of that output, and the
     range of them beyond it. Where outputs are missing (NaN), specimens are taken together by the
     outputs that they have: each set of outputs is compared with all specimens that have them, with
@@ -92,25 +103,27 @@ class Joint(LiftedMetric):
             positive_integer(self.components, "components")
         positive_integer(self.seed, "seed", minimum=0)
 
-    def beside(self, observed: Floats, weights: Floats, design: Floats) -> Discrepancy:
+    def beside(self, observed: Floats, weights: Floats, design: Floats, inputs: int) -> Discrepancy:
         """Return the discrepancy with principal components of a design, (k, m), as well."""
-        return self._made(observed, weights, design)
+        return self._made(observed, weights, design, inputs)
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         if observed.shape[1] == 1:
             return super()._prepare(observed, weights)
-        return self._made(observed, weights, None)
+        return self._made(observed, weights, None, None)
 
     def _parts(self, observed: Floats, weights: Floats) -> Sequence[Part]:
-        return self._made(observed, weights, None).parts
+        return self._made(observed, weights, None, None).parts
 
-    def _made(self, observed: Floats, weights: Floats, design: Floats | None) -> Discrepancy:
+    def _made(
+        self, observed: Floats, weights: Floats, design: Floats | None, inputs: int | None
+    ) -> Discrepancy:
         caps = failure_caps(observed)
         parts: list[Part] = []
         components: list[Components] = []
         for outputs, share in patterns(observed, weights):
             known = None if design is None else _known(design[:, outputs], caps[outputs])
-            slices, found = self._slices(observed, weights, outputs, caps, share, known)
+            slices, found = self._slices(observed, weights, outputs, caps, share, known, inputs)
             parts += slices
             components += found
         targets = self.metric.on_one_scale([part.target for part in parts])
@@ -125,10 +138,11 @@ class Joint(LiftedMetric):
         caps: Floats,
         share: float,
         design: Floats | None,
+        inputs: int | None,
     ) -> tuple[list[Part], list[Components]]:
         """Return the parts that compare some outputs, of all specimens that have them."""
         chosen = observed[:, outputs]
-        white, found = self._white(chosen, weights, outputs, caps[outputs], design)
+        white, found = self._white(chosen, weights, outputs, caps[outputs], design, inputs)
         centered = Centered(outputs, caps[outputs], white.center)
         m = white.axes.shape[1]
         number = 1 if m == 1 else self.directions or enough(m)
@@ -149,12 +163,16 @@ class Joint(LiftedMetric):
         outputs: NDArray[np.intp],
         caps: Floats,
         design: Floats | None,
+        inputs: int | None,
     ) -> tuple[Whitening, list[Components]]:
         """Return white coordinates of some outputs, or of their principal components."""
         finite = np.isfinite(chosen).all(axis=-1)
         many = outputs.size > MOST_OUTPUTS or self.components is not None
         if outputs.size < 2 or not many:
-            return whitening(chosen[finite], weights[finite], outputs), []
+            white = whitening(chosen[finite], weights[finite], outputs)
+            if inputs is not None and inputs < outputs.size:
+                white = _flat(chosen[finite], weights[finite], outputs, inputs) or white
+            return white, []
         has = ~np.isnan(chosen).any(axis=-1)
         sample, own = _capped(chosen[has], caps), weights[has] / weights[has].sum()
         found = principal_components(sample, own, self.components, design)
@@ -162,6 +180,27 @@ class Joint(LiftedMetric):
         white = whitening(scores, own, np.arange(found.number))
         center = found.center + found.axes @ white.center
         return Whitening(center, found.axes @ white.axes), [found]
+
+
+def _flat(
+    sample: Floats, weights: Floats, outputs: NDArray[np.intp], inputs: int
+) -> Whitening | None:
+    """Return white coordinates of a surface that outputs of fewer inputs lie on; None if too bent.
+
+    Whitening makes as much of how a surface is bent as of where on it specimens are, which tells
+    more of the population.
+    """
+    own = weights / weights.sum()
+    center, unit = units(sample, own, outputs)
+    standard = (sample - center) / unit
+    for number in range(max(1, inputs), outputs.size):
+        found = principal_components(standard, own, number)
+        if found.left_out <= LEFT_OUT:
+            scores = (standard - found.center) @ found.axes
+            white = whitening(scores, own, np.arange(number))
+            middle = center + unit * (found.center + found.axes @ white.center)
+            return Whitening(middle, (found.axes @ white.axes) / unit[:, None])
+    return None
 
 
 def _capped(outputs: Floats, caps: Floats) -> Floats:

@@ -254,7 +254,8 @@ class Evaluator:
             weights = before.weights if same_size else None
             chosen = metric or node.metric
             target = chosen.against(observed, weights)
-            targets.append(target.beside(node.bound.first_responses))
+            bound = node.bound
+            targets.append(target.beside(bound.first_responses, bound.dimensions))
         return self._with_targets(targets)
 
     def _with_targets(self, targets: list[Discrepancy]) -> Evaluator:

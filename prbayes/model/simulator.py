@@ -152,7 +152,7 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     sorted_inputs = read_inputs(name, inputs, model)
     with shown(progressbar):
         bound = _bound(name, response, sorted_inputs, target, propagation, before, outputs)
-        bound.aim(target.beside(bound.first_responses))
+        bound.aim(target.beside(bound.first_responses, bound.dimensions))
         target = bound.target
     if epsilon is None:
         epsilon = 1 / effective_specimens(target, labels) if target.likelihood else np.nan

@@ -129,6 +129,11 @@ class Bound(ABC):
         """Those that are there before any other is asked for."""
         return self._probed
 
+    @property
+    def dimensions(self) -> int:
+        """Number of aleatory numbers that make one specimen."""
+        return sum(int(np.prod(shape)) for shape in self.inputs.event_shapes)
+
     def aim(self, target: Discrepancy) -> None:
         """Compare with the same data in another way from here on."""
         self.target = target

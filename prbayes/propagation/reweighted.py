@@ -223,8 +223,8 @@ class Design(Bound):
         advice = (
             "prb.minimize and prb.sample_smc refine it themselves, "
             "before pm.sample call prb.refine(model)"
-            if self._dimensions <= 4
-            else f"{self._dimensions} inputs are many for stored responses: rather use "
+            if self.dimensions <= 4
+            else f"{self.dimensions} inputs are many for stored responses: rather use "
             "propagation=prb.Resimulated(n), which has no design"
         )
         _log.warning(
@@ -291,12 +291,6 @@ class Design(Bound):
         return self.batches.points
 
     @property
-    def _dimensions(self) -> int:
-        """Number of aleatory numbers that make one specimen."""
-        sizes = [int(np.prod(shape)) for shape in self.inputs.event_shapes]
-        return sum(sizes)
-
-    @property
     def required_ess(self) -> float:
         """The weight effective sample size that keeps design error well below sampling error.
 
@@ -304,7 +298,7 @@ class Design(Bound):
         n^(-3/4); the size follows from asking that error to be a fraction of 1/sqrt(N).
         """
         root = np.sqrt(self.target.n_effective)
-        if self._dimensions == 1:
+        if self.dimensions == 1:
             return float(max(50.0, 6 * root))
         return float(max(100.0, (15 * root) ** (4 / 3)))
 

@@ -227,3 +227,33 @@ def test_observed_values_are_refused_for_a_reason() -> None:
         joint.against(y)(np.ones((5, 3)))
     with pytest.raises(ValueError, match="simulated: got NaN"):
         joint.against(y)(np.full((5, 2), NAN))
+
+
+# -- fewer inputs than outputs ---------------------------------------------------------------------
+
+
+def bent(size: int, bend: float, seed: int = 0) -> Floats:
+    """Return three outputs of two inputs: a plane, and something across it."""
+    a, b = np.random.default_rng(seed).standard_normal((2, size))
+    return np.stack([a + b, a - b, a + 0.5 * b + bend * (a**2 - 1)], axis=-1)
+
+
+def test_a_surface_is_compared_on_itself() -> None:
+    y, other = bent(60, 0.05), bent(40, 0.05, 1)
+    beside = Joint(ProbabilityResidual()).against(y).beside(other, 2)
+    assert len(beside.parts) == 4
+    # As the plane alone, and in any units.
+    plane = Joint(ProbabilityResidual()).against(y[:, :2])
+    assert beside(other) == pytest.approx(plane(other[:, :2]), rel=0.15)
+    scale = np.array([1e3, 1.0, 1e-6])
+    scaled = Joint(ProbabilityResidual()).against(y * scale).beside(other * scale, 2)
+    assert scaled(other * scale) == pytest.approx(beside(other), rel=1e-6)
+
+
+@pytest.mark.parametrize(("bend", "inputs"), [(0.05, 3), (0.05, 8), (0.5, 2)])
+def test_what_is_no_surface_is_compared_as_it_is(bend: float, inputs: int) -> None:
+    y, other = bent(60, bend), bent(40, bend, 1)
+    target = Joint(ProbabilityResidual()).against(y)
+    beside = target.beside(other, inputs)
+    assert len(beside.parts) == len(target.parts) == 10
+    assert beside(other) == target(other)
