@@ -54,7 +54,8 @@ class Problem:
 
     mean: Any  # (p,): of the inputs
     covariance: Any  # (p, p)
-    model: Callable[[int], list[Any]]  # N -> inputs; priors stand in the model
+    # N, and whether marginals are all that is compared -> inputs; priors stand in the model.
+    model: Callable[[int, bool], list[Any]]
     response: Callable[[Any], Any]  # (..., p) -> (..., m)
     moments: Callable[[dict[str, Any]], tuple[Any, Any]]  # values -> (P, p), (P, p, p)
     values: Callable[[Any, Any], dict[str, Any]]  # mean, covariance -> values near them
@@ -83,16 +84,18 @@ def _covariance(sd: Any, rho: Any, m: int) -> Any:
 
 
 def _normal(m: int, rho: float, points: int) -> Problem:
-    def model(size: int) -> list[Any]:
+    def model(size: int, marginal: bool) -> list[Any]:
         import pymc as pm
 
         mu = pm.Normal("mu", 0, 3, shape=m)
         sd = pm.HalfNormal("sd", 3, shape=m)
-        rho = pm.Uniform("rho", -1 / (m - 1), 1)
-        return [pm.MvNormal.dist(mu, cov=_covariance(sd, rho, m))]
+        # Marginals tell nothing of it: there it is known.
+        common = rho if marginal else pm.Uniform("rho", -1 / (m - 1), 1)
+        return [pm.MvNormal.dist(mu, cov=_covariance(sd, common, m))]
 
     def moments(values: dict[str, Any]) -> tuple[Any, Any]:
-        return values["mu"], _covariance(values["sd"], values["rho"][..., None, None], m)
+        common = values.get("rho", np.full(len(values["mu"]), rho))
+        return values["mu"], _covariance(values["sd"], common[:, None, None], m)
 
     def values(mean: Any, covariance: Any) -> dict[str, Any]:
         sd = np.sqrt(np.diag(covariance))
@@ -138,7 +141,7 @@ _SCATTER = np.array([80.0, 60.0])
 
 
 def _frame() -> Problem:
-    def model(size: int) -> list[Any]:
+    def model(size: int, marginal: bool) -> list[Any]:
         import pymc as pm
 
         # A hundred standard errors, of a mean and of a standard deviation.
@@ -211,7 +214,7 @@ class Cell:
         n = p.points * (2 if self.size > 50 else 1)
         stored = prb.Reweighted(16, max_points=n + 16)
         with pm.Model() as model:
-            inputs = p.model(self.size)
+            inputs = p.model(self.size, separate)
             if separate:
                 for k in range(some.shape[1]):
                     one = _Chosen(p.response.response, k)
@@ -283,7 +286,8 @@ class Cell:
         from prbayes.posterior.epsilon import calibrate_epsilon
 
         evaluator = self._observing(method, self.problem.response(x))
-        truth = {key: value[0] for key, value in self._values_of_truth().items()}
+        free = {rv.name for rv in evaluator.model.free_RVs}
+        truth = {k: value[0] for k, value in self._values_of_truth().items() if k in free}
         optimum = find_optimum(evaluator, Minimisation(starts=0, refine=False, start=truth))
         calibrated = calibrate_epsilon(optimum)
         epsilon = np.array([calibrated[node.name] for node in evaluator.nodes])
@@ -434,6 +438,16 @@ def summarise(store: Path, name: str, size: int, method: str) -> dict[str, Any] 
     }
 
 
+FIGURES = ("rmse over likelihood", "rmse over posterior", "coverage", "off", "sd over exact")
+
+
+def grouped(name: str, values: list[float]) -> list[float]:
+    """Return the means of a figure over means, standard deviations and, if told, correlations."""
+    p = len(PROBLEMS[name].mean)
+    groups = [values[:p], values[p : 2 * p], values[2 * p :]]
+    return [float(np.mean(group)) for group in groups if group]
+
+
 def table(store: Path) -> dict[str, Any]:
     """Summarise what is stored, and print it; numbers alike are taken together."""
     cells: dict[str, Any] = {}
@@ -449,14 +463,9 @@ def table(store: Path) -> dict[str, Any]:
     )
     for key, cell in cells.items():
         name, size, method = key.split("/")
-        p = len(PROBLEMS[name].mean)
-        groups = [slice(0, p), slice(p, 2 * p), slice(2 * p, None)]
-        groups = groups[: 2 + (len(cell["off"]) > 2 * p)]
         shown = [
-            "/".join(f"{np.mean(cell[figure][g]):.2f}" for g in groups)
-            for figure in ("rmse over likelihood", "rmse over posterior", "coverage", "off",
-                           "sd over exact")
-        ]  # fmt: skip
+            "/".join(f"{value:.2f}" for value in grouped(name, cell[figure])) for figure in FIGURES
+        ]
         print(
             f"{name:10s} {size:>3s} {method:16s} {cell['data sets']:4d} {cell['failed']:4d} "
             f"{cell['seconds']:5.1f}  " + "  ".join(s.rjust(15) for s in shown)

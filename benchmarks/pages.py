@@ -234,6 +234,61 @@ def surrogates() -> Iterator[Row]:
         ]
 
 
+def joint() -> Iterator[Row]:
+    """Return the rows of joint calibration."""
+    from benchmarks.joint import grouped
+
+    schools = {
+        "joint": "`Joint`",
+        "correlation": "`MarginalCorrelation`",
+        "separate": "separate marginals",
+    }
+    problems = {
+        "normal 0": "two normal outputs, correlation 0",
+        "normal .6": "the same, .6",
+        "normal .95": "the same, .95",
+        "frame": "frame",
+        "four .9": "four normal outputs, .9",
+    }
+    for key, cell in found("joint")["cells"].items():
+        name, size, method = key.split("/")
+        if method == "exact":
+            label = "exact posterior"
+        else:
+            school, metric = method.split()
+            label = f"{schools[school]}, {metric}"
+        columns = [
+            " / ".join(short(round(value, 2) + 0.0) for value in grouped(name, cell[figure]))
+            for figure in ("rmse over likelihood", "coverage", "off", "sd over exact")
+        ]
+        yield [problems[name], size, label, str(cell["data sets"]), *columns]
+
+
+def joint_time() -> Iterator[Row]:
+    """Return the rows of the time of two outputs."""
+    for key, cell in found("joint_speed")["time"].items():
+        metric, points, unknown = key.split("/")
+        seconds = [" + ".join(f"{value:.1f}" for value in cell[n]) for n in ("one", "two")]
+        yield [metric, points, unknown, *seconds, f"{cell['ratio']:.1f}"]
+
+
+def joint_memory() -> Iterator[Row]:
+    """Return the rows of the memory of many directions."""
+    for key, cell in found("joint_speed")["memory"].items():
+        metric, outputs, points = key.split("/")
+        basis = f"{cell['basis']:,}" if cell["basis"] else ""
+        seconds = [f"{cell[name]:.2f}" for name in ("objective", "batch")]
+        yield [
+            metric,
+            outputs,
+            str(cell["directions"]),
+            points,
+            f"{cell['peak']:,}",
+            basis,
+            *seconds,
+        ]
+
+
 # Where the rows of each table are from; the first two lines of it are the page's.
 TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "coverage, pooled": pooled,
@@ -252,6 +307,9 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "wrong families, few data": lambda: families((20, 50)),
     "ties": ties,
     "surrogates": surrogates,
+    "joint": joint,
+    "joint, time": joint_time,
+    "joint, memory": joint_memory,
 }
 _MARKED = re.compile(
     r"(<!-- table: (?P<name>[^>]+) -->\n\n(?:\|[^\n]*\n){2})(?:\|[^\n]*\n)*(\n<!-- end -->)"
