@@ -5,7 +5,7 @@ specimens under `Joint`, with the same inputs, hyperparameters, observations and
 process, and the median of their ratios. *memory*: a process of its own for each number of outputs
 and of points; what the objective with its gradient and a batch of eight thetas add to a model whose
 responses are stored. The basis, a number for each point and each cell of each direction, would take
-what is told beside it.
+what is told beside it. What the file of results has is not measured again.
 
     uv run python -m benchmarks.joint_speed
 """
@@ -162,10 +162,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=record.RESULTS / "joint_speed.json")
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
-    out: dict[str, Any] = {"time": {}, "memory": {}}
+    out: dict[str, Any] = record.load(arguments.out, {"time": {}, "memory": {}})
     for metric in ("PR", "area"):  # KLD has the densities of PR
         for outputs in OUTPUTS:
             for points in SIZES:
+                if f"{metric}/{outputs}/{points}" in out["memory"]:
+                    continue
                 found = child("benchmarks.joint_speed", metric, str(outputs), str(points))
                 out["memory"][f"{metric}/{outputs}/{points}"] = found
                 print(f"{metric:5s} m = {outputs} {points:7d} points  {found}", flush=True)
@@ -173,6 +175,8 @@ def main() -> None:
     for metric in METRICS:
         for points in POINTS[metric]:
             for unknown in UNKNOWN:
+                if f"{metric}/{points}/{unknown}" in out["time"]:
+                    continue
                 found = ratios(metric, points, unknown, arguments.repeats)
                 out["time"][f"{metric}/{points}/{unknown}"] = found
                 print(f"{metric:5s} {points:5d} points, {unknown} unknown  {found}", flush=True)
