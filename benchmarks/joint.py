@@ -56,7 +56,7 @@ class Problem:
     covariance: Any  # (p, p)
     # N, and whether marginals are all that is compared -> inputs; priors stand in the model.
     model: Callable[[int, bool], list[Any]]
-    response: Callable[[Any], Any]  # (..., p) -> (..., m)
+    response: _Chosen  # (..., p) -> (..., m)
     moments: Callable[[dict[str, Any]], tuple[Any, Any]]  # values -> (P, p), (P, p, p)
     values: Callable[[Any, Any], dict[str, Any]]  # mean, covariance -> values near them
     correlated: bool  # whether there is a correlation among the hyperparameters
@@ -462,12 +462,12 @@ def table(store: Path) -> dict[str, Any]:
         "/posterior (mean, log sd, corr)   coverage 89%   off   sd/exact"
     )
     for key, cell in cells.items():
-        name, size, method = key.split("/")
+        name, of, method = key.split("/")
         shown = [
             "/".join(f"{value:.2f}" for value in grouped(name, cell[figure])) for figure in FIGURES
         ]
         print(
-            f"{name:10s} {size:>3s} {method:16s} {cell['data sets']:4d} {cell['failed']:4d} "
+            f"{name:10s} {of:>3s} {method:16s} {cell['data sets']:4d} {cell['failed']:4d} "
             f"{cell['seconds']:5.1f}  " + "  ".join(s.rjust(15) for s in shown)
         )
     return {"cells": cells, "pooled": pooled(cells)}

@@ -154,8 +154,8 @@ def memory(metric: str, outputs: int, points: int) -> dict[str, Any]:
 def main() -> None:
     """Measure, print tables, write JSON."""
     if "--child" in sys.argv:
-        metric, outputs, points = sys.argv[2:]
-        print(json.dumps(memory(metric, int(outputs), int(points))))
+        name, m, n = sys.argv[2:]
+        print(json.dumps(memory(name, int(m), int(n))))
         return
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=5)
@@ -172,14 +172,14 @@ def main() -> None:
                 out["memory"][f"{metric}/{outputs}/{points}"] = found
                 print(f"{metric:5s} m = {outputs} {points:7d} points  {found}", flush=True)
                 record.save(arguments.out, out)
-    for metric in METRICS:
-        for points in POINTS[metric]:
+    for metric, sizes in POINTS.items():
+        for size in sizes:
             for unknown in UNKNOWN:
-                if f"{metric}/{points}/{unknown}" in out["time"]:
+                if f"{metric}/{size}/{unknown}" in out["time"]:
                     continue
-                found = ratios(metric, points, unknown, arguments.repeats)
-                out["time"][f"{metric}/{points}/{unknown}"] = found
-                print(f"{metric:5s} {points:5d} points, {unknown} unknown  {found}", flush=True)
+                pairs = ratios(metric, size, unknown, arguments.repeats)
+                out["time"][f"{metric}/{size}/{unknown}"] = pairs
+                print(f"{metric:5s} {size:5d} points, {unknown} unknown  {pairs}", flush=True)
                 record.save(arguments.out, out)
 
 
