@@ -140,6 +140,20 @@ def test_two_simulators_of_a_response_with_outputs_share_its_runs():
     assert sum(calls) == 64
 
 
+def test_simulators_that_observe_a_mapping_in_another_order_do_not_share_its_columns():
+    swapped = {"difference": NAMED["difference"], "sum": NAMED["sum"]}
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("m", 1, 0.2), 0.3)
+        b = pm.Normal.dist(2.0, 0.2)
+        for name, data in (("y", NAMED), ("z", swapped)):
+            propagation = prb.Reweighted(64)
+            prb.Simulator(
+                name, as_mapping, a, b, metric=JOINT, observed=data, propagation=propagation
+            )
+    first, second = (node.design.values for node in Evaluator(model).nodes)
+    np.testing.assert_array_equal(second, first[:, ::-1])
+
+
 def test_an_output_that_is_nan_costs_the_point_all_of_them():
     def partly(a, b):
         values = two(a, b)

@@ -208,10 +208,14 @@ class Responses:
         return None if self._calling.store is None else self._calling.store.folder
 
     def same_as(self, other: Responses) -> bool:
-        """Return whether another has the same function, inputs and constants."""
+        """Return whether another has the same function, inputs and constants, and output order."""
         mine, others = self.inputs.arguments, other.inputs.arguments
         if self.function is not other.function or len(mine) != len(others):
             return False
+        if self.outputs is not None and other.outputs is not None:
+            # A mapping's arrays are put together in the order of what was observed.
+            if self.outputs.keys != other.outputs.keys:
+                return False
         pairs = zip(mine, others, strict=True)
         return all(_same(self.inputs, x, other.inputs, y) for x, y in pairs)
 
