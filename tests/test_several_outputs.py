@@ -154,6 +154,14 @@ def test_simulators_that_observe_a_mapping_in_another_order_do_not_share_its_col
     np.testing.assert_array_equal(second, first[:, ::-1])
 
 
+def test_a_version_keeps_runs_of_another_order_of_outputs_apart(tmp_path):
+    swapped = {"difference": NAMED["difference"], "sum": NAMED["sum"]}
+    propagation = prb.Reweighted(64, store=tmp_path, version="1")
+    first = node_of(model_of(as_mapping, NAMED, propagation=propagation)).design.values
+    second = node_of(model_of(as_mapping, swapped, propagation=propagation)).design.values
+    np.testing.assert_array_equal(second, first[:, ::-1])
+
+
 def test_an_output_that_is_nan_costs_the_point_all_of_them():
     def partly(a, b):
         values = two(a, b)

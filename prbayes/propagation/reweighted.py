@@ -91,8 +91,9 @@ class Reweighted(Propagation):
         the same one: code, or variables of a closure, may have changed, which is refused.
     version : str, optional
         Names the response as it is, such as ``"2"`` or ``"mesh 3"``: runs of different versions are
-        kept apart in the store, and none is computed again. You then answer for a new name whenever
-        the response changes; needed for one that is random, or minutes long.
+        kept apart in the store, as are those of other names or another order of several outputs,
+        and none is computed again. You then answer for a new name whenever the response changes;
+        needed for one that is random, or minutes long.
     on_failure : Abort, Replace or Retry
         What to do with a response that raises or is NaN.
     retry_failed : bool

@@ -153,7 +153,8 @@ class Responses:
         kept = None
         if store is not None:
             size = None if outputs is None else max(1, len(outputs.labels))
-            kept = Store(store, name, _columns(inputs), version=version, outputs=size)
+            named = _with_names(version, outputs)
+            kept = Store(store, name, _columns(inputs), version=named, outputs=size)
         self.name = name
         self.outputs = outputs
         self.function = function
@@ -212,10 +213,10 @@ class Responses:
         mine, others = self.inputs.arguments, other.inputs.arguments
         if self.function is not other.function or len(mine) != len(others):
             return False
-        if self.outputs is not None and other.outputs is not None:
-            # A mapping's arrays are put together in the order of what was observed.
-            if self.outputs.keys != other.outputs.keys:
-                return False
+        # A mapping's arrays are put together in the order of what was observed.
+        known = [each.outputs.keys for each in (self, other) if each.outputs is not None]
+        if len(set(known)) > 1:
+            return False
         pairs = zip(mine, others, strict=True)
         return all(_same(self.inputs, x, other.inputs, y) for x, y in pairs)
 
@@ -285,6 +286,16 @@ class Responses:
             return checked(result, batch, arguments, self.outputs)
         except ResponseError as error:
             raise ResponseError(f"{self.name}: {error}") from None
+
+
+def _with_names(version: str | None, outputs: Outputs | None) -> str | None:
+    """Return a version with the names of the outputs: in another order they are other numbers.
+
+    Without a version a stored response is computed again, and tells.
+    """
+    if version is None or outputs is None or not outputs.keys:
+        return version
+    return f"{version} ({', '.join(outputs.names)})"
 
 
 def _columns(inputs: Inputs) -> int:
