@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pymc as pm
 import pytest
+import xarray as xr
 
 import prbayes as prb
 from prbayes.estimate.data_sets import simulated_sets
@@ -354,6 +355,25 @@ def test_the_area_test_of_outputs_does_not_see_their_units():
     other = prb.area_test(data @ mixed + 5.0, predicted @ mixed + 5.0, null=null)
     assert other.statistic == pytest.approx(one.statistic, rel=1e-6)
     assert other.p_value == one.p_value
+
+
+def test_tested_outputs_are_taken_by_their_names():
+    rng = np.random.default_rng(6)
+    values = calibrated_predictions(rng)[None] + np.array([0.0, 3.0])
+    predicted = xr.DataArray(
+        values,
+        dims=("chain", "draw", "sample", "output"),
+        coords={"output": ["low", "high"]},
+        name="y",
+    )
+    data = rng.standard_normal((20, 2)) + np.array([0.0, 3.0])
+    null = prb.validation.PosteriorNull(199)
+    expected = prb.area_test(data, predicted, null=null)
+    swapped = {"high": data[:, 1], "low": data[:, 0]}
+    found = prb.area_test({"y": swapped}, {"y": predicted}, null=null)
+    assert found.statistic == expected.statistic
+    with pytest.raises(ValueError, match=r"outputs \['a', 'b'\], expected \['low', 'high'\]"):
+        prb.area_test({"y": {"a": data[:, 0], "b": data[:, 1]}}, {"y": predicted}, null=null)
 
 
 def test_own_specimens_of_several_outputs_are_tested_by_recalibration():

@@ -14,7 +14,7 @@ from prbayes._checks import Floats, Seed, flag, real_array, sample_labels, seed_
 from prbayes._predict import specimen_names
 from prbayes.metrics.base import View
 from prbayes.model.identity import Identity, Level, from_attributes, require_together
-from prbayes.response.outputs import read_observed
+from prbayes.response.outputs import Outputs, read_observed
 from prbayes.validation.predictive import Predictive
 from prbayes.validation.statistic import area
 from prbayes.validation.views import views
@@ -153,7 +153,7 @@ def read_case(
     numbers: dict[object, int] = {}
     conditions: list[Condition] = []
     for name, measured, simulated, labels in _by_condition(observed, predicted, specimens):
-        y = _measured(name, measured)
+        y = _measured(name, measured, simulated)
         named = _labels(name, labels, len(y))
         # Without labels every value is of a specimen of its own.
         keys: Sequence[object] = [(name, i) for i in range(len(y))] if named is None else named
@@ -295,9 +295,9 @@ def _labels(name: str, labels: Any, n: int) -> tuple[str, ...] | None:
     return tuple(specimen_names(sample_labels(labels, n, f"{name}: specimens")))
 
 
-def _measured(name: str, values: Any) -> Floats:
+def _measured(name: str, values: Any, simulated: Any) -> Floats:
     """Return measured values, shape (n,), or (n, m) of several outputs."""
-    y, _ = read_observed(name, values)
+    y, outputs = read_observed(name, values)
     if y.ndim not in (1, 2) or y.size == 0:
         raise ValueError(
             f"{name}: observed: got shape {y.shape}, expected (n,), or (n, m) for m outputs, with "
@@ -309,7 +309,26 @@ def _measured(name: str, values: Any) -> Floats:
             f"{name}: observed: got {bad} NaN or -inf among {y.size} values, expected numbers; "
             "leave missing specimens out, and give those that had failed as +inf"
         )
-    return y
+    return _in_order_of(name, y, outputs, simulated) if y.ndim > 1 else y
+
+
+def _in_order_of(name: str, y: Floats, outputs: Outputs, simulated: Any) -> Floats:
+    """Return measured outputs, (n, m), in the order of predicted ones, where both have names."""
+    default = tuple(range(len(outputs.labels)))
+    if not isinstance(simulated, xr.DataArray) or outputs.labels == default:
+        return y
+    named = [dim for dim in simulated.dims if dim not in ("chain", "draw", "sample")]
+    if len(named) != 1 or named[0] not in simulated.coords:
+        return y
+    labels = tuple(simulated.coords[named[0]].values.tolist())
+    if labels in (default, outputs.labels):
+        return y
+    if set(labels) != set(outputs.labels):
+        raise ValueError(
+            f"{name}: observed: got the outputs {list(outputs.labels)}, expected {list(labels)}, "
+            "those of predicted"
+        )
+    return y[:, [outputs.labels.index(label) for label in labels]]
 
 
 def _simulated(name: str, values: Any, event: tuple[int, ...]) -> Floats:
