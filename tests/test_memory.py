@@ -77,10 +77,9 @@ def alive() -> int:
 
 def test_an_evaluator_goes_with_its_last_user() -> None:
     model = build()
-    for _ in range(3):
-        prb.minimize(model, progressbar=False)
+    prb.minimize(model, progressbar=False)
     before = alive()
-    for _ in range(6):
+    for _ in range(2):
         prb.minimize(model, progressbar=False)
     assert alive() <= before
 
