@@ -109,14 +109,20 @@ class AreaDiscrepancy(Discrepancy):
     ) -> Any:
         """Return the areas from a stacked basis, (..., K); in a graph all at a time."""
         if xp is np:  # one after the other, as it takes less memory
-            every = zip(targets, zip(*basis, strict=True), strict=True)
-            return np.stack([t.outer(*t.from_basis(weights, b, np), xp=np) for t, b in every], -1)
-        order, below, own, own_below, lengths = basis
+            areas = []
+            for target, own in zip(targets, zip(*basis, strict=True), strict=True):
+                features = target.from_basis(weights, own, np)
+                areas.append(target.outer(*features, xp=np))
+            return np.stack(areas, -1)
+        order, below, own_order, own_below, lengths = basis
+        ordered = xp.take(weights, order)
+        simulated = _rows_summed_below(ordered, below, xp)
         observed = _padded([target.weights for target in targets])
-        simulated = _rows_summed_below(xp.take(weights, order), below, xp)
         rows = np.arange(len(targets))[:, None]
-        of_data = _rows_summed_below(xp.as_tensor(observed)[rows, own], own_below, xp)
-        return (xp.abs(simulated - of_data) * lengths).sum(axis=-1)
+        own_ordered = xp.as_tensor(observed)[rows, own_order]
+        of_data = _rows_summed_below(own_ordered, own_below, xp)
+        gaps = xp.abs(simulated - of_data)
+        return (gaps * lengths).sum(axis=-1)
 
 
 def _padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:

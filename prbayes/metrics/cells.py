@@ -111,11 +111,14 @@ class KernelCells(Cells):
 
         Below and above, shape (2, g + 2 before).
         """
-        at = np.arange(self.centers.size + 2 * self._before) - self._before
+        nodes = self.centers.size + 2 * self._before
+        at = np.arange(nodes) - self._before
         # The mass of a kernel up to each of its nodes, and none before the first of them.
-        mass = np.concatenate([[0.0], np.cumsum(self.kernel * self.step)])
+        up_to = np.cumsum(self.kernel * self.step)
+        mass = np.concatenate([[0.0], up_to])
         half = self.kernel.size // 2
-        below = mass[np.clip(half - at, 0, mass.size - 1)]
+        off = np.clip(half - at, 0, mass.size - 1)
+        below = mass[off]
         return np.stack([below, below[::-1]])
 
     def density(self, sample: Floats, weights: Floats) -> Floats:
@@ -227,9 +230,10 @@ class KernelCells(Cells):
         The transpose of the smoothing, shapes (..., g + 2) -> (..., g + 2 before).
         """
         nodes = self.centers.size
-        inner = np.ascontiguousarray(cotangent[..., :nodes]).reshape(-1, nodes)
-        spread = np.zeros((len(inner), nodes + 2 * self._before))
-        smooth(inner, self.kernel, self._before, spread)
+        inner = np.ascontiguousarray(cotangent[..., :nodes])
+        rows = inner.reshape(-1, nodes)
+        spread = np.zeros((len(rows), nodes + 2 * self._before))
+        smooth(rows, self.kernel, self._before, spread)
         outer = cotangent[..., -2:] / self.widths[-1]
         spread = spread.reshape(*cotangent.shape[:-1], -1)
         for side, beyond in enumerate(self._beyond):

@@ -68,28 +68,33 @@ def principal_components(
         equal = np.full(len(design), 1 / len(design))
         _, simulated = _scatter(design, equal, middle, typical)
         scatters.append(simulated)
-    unit = [s / max(float(np.trace(s)), np.finfo(float).tiny) for s in scatters]
+    unit = []
+    for scatter in scatters:
+        variance = max(float(np.trace(scatter)), np.finfo(float).tiny)
+        unit.append(scatter / variance)
     _, vectors = np.linalg.eigh(np.mean(unit, axis=0))
     axes = vectors[:, ::-1]
     # What the first components explain of each.
-    explained = np.array([np.cumsum(np.einsum("ij,ik,kj->j", axes, s, axes)) for s in unit])
-    most = max(1, min(m, MOST_OUTPUTS, n // _SPECIMENS))
+    shares = [np.einsum("ij,ik,kj->j", axes, scatter, axes) for scatter in unit]
+    explained = np.array([np.cumsum(share) for share in shares])
     if number is None:
+        most = max(1, min(m, MOST_OUTPUTS, n // _SPECIMENS))
         enough = (explained >= 1 - LEFT_OUT).all(axis=0)
-        number = min(int(np.argmax(enough)) + 1 if enough.any() else m, most)
+        number = int(np.argmax(enough)) + 1 if enough.any() else m
+        number = min(number, most)
     # Signs that do not hang on the algorithm.
-    signs = np.sign(axes[np.abs(axes).argmax(axis=0), np.arange(m)])
+    largest = np.abs(axes).argmax(axis=0)
+    signs = np.sign(axes[largest, np.arange(m)])
     axes = (axes * signs)[:, :number]
+    # What is left out: as a share of either variance, and of the data themselves.
     left_out = 1 - explained[:, number - 1].clip(0, 1)
-    scores = (sample - center) @ axes
-    rest = sample - center - scores @ axes.T
-    return Components(
-        center,
-        axes,
-        float(left_out[0]),
-        float(left_out[1]) if len(left_out) > 1 else np.nan,
-        _between_neighbours(rest - rest.mean(axis=0)),
-    )
+    of_data = float(left_out[0])
+    of_design = float(left_out[1]) if len(left_out) > 1 else np.nan
+    centered = sample - center
+    scores = centered @ axes
+    rest = centered - scores @ axes.T
+    rest = rest - rest.mean(axis=0)
+    return Components(center, axes, of_data, of_design, _between_neighbours(rest))
 
 
 def _scatter(

@@ -161,7 +161,8 @@ class CompositeDiscrepancy(Discrepancy):
             )
         nominal = np.array([part.share for part in parts])
         shares = nominal * seen
-        shares = shares * (nominal.sum() / shares.sum(axis=-1, keepdims=True))
+        left = shares.sum(axis=-1, keepdims=True)
+        shares = shares * (nominal.sum() / left)
         if seen.all():
             shares = np.broadcast_to(nominal, seen.shape)
         return replace(self, observed=observed, weights=w, members=tuple(parts), shares=shares)
@@ -205,9 +206,13 @@ class CompositeDiscrepancy(Discrepancy):
     @cached_property
     def _groups(self) -> tuple[_Group, ...]:
         """The parts by how they are evaluated together; the last has any number of arrays."""
-        several = [k for k, t in enumerate(self.targets) if t.event]
-        single = [k for k, t in enumerate(self.targets) if not t.event]
-        groups: list[_Group] = [_Each((k,), (self.members[k],)) for k in several]
+        groups: list[_Group] = []
+        single = []
+        for k, part in enumerate(self.members):
+            if part.target.event:
+                groups.append(_Each((k,), (part,)))
+            else:
+                single.append(k)
         if single:
             parts = tuple(self.members[k] for k in single)
             kind: type[_Group] = _Each
@@ -401,8 +406,10 @@ class _Densities(_Group):
     def _side_by_side(self, each: Sequence[Any]) -> Floats:
         """Return numbers by cell, (..., m_k) or one for all of a part, as (..., all cells)."""
         batch = np.broadcast_shapes(*(np.shape(one)[:-1] for one in each))
-        pairs = zip(each, self._sizes, strict=True)
-        return np.concatenate([np.broadcast_to(c, (*batch, n)) for c, n in pairs], axis=-1)
+        columns = []
+        for one, size in zip(each, self._sizes, strict=True):
+            columns.append(np.broadcast_to(one, (*batch, size)))
+        return np.concatenate(columns, axis=-1)
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
         """Return the densities side by side, (..., cells)."""

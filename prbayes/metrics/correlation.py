@@ -93,21 +93,28 @@ class MarginalCorrelation(LiftedMetric):
     def _parts(self, observed: Floats, weights: Floats) -> Sequence[Part]:
         caps = failure_caps(observed)
         m = observed.shape[1]
+        of_marginals, of_correlations = self.weights
         parts: list[Part] = []
         center, unit = np.empty(m), np.empty(m)
         for j in range(m):
             only = np.array([j])
             finite = np.isfinite(observed[:, j])
-            own = weights[finite] / weights[finite].sum()
-            center[only], unit[only] = units(observed[finite][:, only], own, only)
-            view = Projection(Centered(only, caps[only], center[only]), 1 / unit[only])
+            column = observed[finite][:, only]
+            own = weights[finite]
+            own = own / own.sum()
+            center[only], unit[only] = units(column, own, only)
+            centered = Centered(only, caps[only], center[only])
+            view = Projection(centered, 1 / unit[only])
             values, index = view.observed_of(observed)
             target = self.metric.against(values, weights[index])
-            parts.append(Part(target, self.weights[0] / target.scale, f"output {j}", view))
-        together = Standardized(Centered(np.arange(m), caps, center), unit)
+            share = of_marginals / target.scale
+            parts.append(Part(target, share, f"output {j}", view))
+        centered = Centered(np.arange(m), caps, center)
+        together = Standardized(centered, unit)
         values, _ = together.observed_of(observed)
         target = CorrelationDiscrepancy.between(self, values, weights)
-        return [*parts, Part(target, self.weights[1], "correlations", together)]
+        parts.append(Part(target, of_correlations, "correlations", together))
+        return parts
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,10 +154,13 @@ class CorrelationDiscrepancy(Discrepancy):
         values = xp.where(known[..., None], simulated, 0.0)
         counted = xp.where(known, weights, 0.0)
         weighted = values * counted[..., None]
-        second = xp.swapaxes(weighted, -1, -2) @ values
-        i, j = np.tril_indices(self.event[0])
         total = counted.sum(axis=-1)[..., None]
-        return (xp.concatenate([total, weighted.sum(axis=-2), second[..., i, j]], axis=-1),)
+        first = weighted.sum(axis=-2)
+        products = xp.swapaxes(weighted, -1, -2) @ values
+        i, j = np.tril_indices(self.event[0])
+        second = products[..., i, j]
+        moments = xp.concatenate([total, first, second], axis=-1)
+        return (moments,)
 
     def basis(self, simulated: Floats) -> tuple[NDArray[Any], ...]:
         """Return the powers of the values whose weighted sums are moments, (n, M)."""
@@ -180,7 +190,8 @@ def _powers(values: Floats) -> Floats:
     known = ~np.isnan(values).any(axis=-1, keepdims=True)
     values = np.where(known, values, 0.0)
     i, j = np.tril_indices(values.shape[-1])
-    return np.concatenate([known, values, values[:, i] * values[:, j]], axis=-1, dtype=np.float64)
+    products = values[:, i] * values[:, j]
+    return np.concatenate([known, values, products], axis=-1, dtype=np.float64)
 
 
 def _correlations(moments: Any, m: int, xp: Any) -> Any:
@@ -189,13 +200,16 @@ def _correlations(moments: Any, m: int, xp: Any) -> Any:
     place = np.zeros((m, m), dtype=int)
     place[rows, columns] = np.arange(rows.size)
     i, j = _pairs(m)
-    total = xp.maximum(moments[..., 0], 1e-300)[..., None]
-    mean = moments[..., 1 : m + 1] / total
-    second = moments[..., m + 1 :] / total
-    variance = second[..., np.diag(place)] - mean**2
+    total = xp.maximum(moments[..., 0], 1e-300)
+    mean = moments[..., 1 : m + 1] / total[..., None]
+    second = moments[..., m + 1 :] / total[..., None]
+    squares = second[..., np.diag(place)]
+    variance = squares - mean**2
     sd = xp.sqrt(xp.maximum(variance, _LEAST_VARIANCE))
-    covariance = second[..., place[i, j]] - mean[..., i] * mean[..., j]
-    return xp.clip(covariance / (sd[..., i] * sd[..., j]), -1.0, 1.0)
+    products = second[..., place[i, j]]
+    covariance = products - mean[..., i] * mean[..., j]
+    unit = sd[..., i] * sd[..., j]
+    return xp.clip(covariance / unit, -1.0, 1.0)
 
 
 def _observed_correlations(values: Floats, weights: Floats) -> Floats:
@@ -203,9 +217,13 @@ def _observed_correlations(values: Floats, weights: Floats) -> Floats:
     i, j = _pairs(values.shape[-1])
     found = np.full((*weights.shape[:-1], i.size), np.nan)
     for k, pair in enumerate(zip(i, j, strict=True)):
-        moments = product(weights, _powers(values[:, pair]))
-        mean = moments[..., 1:3] / np.where(moments[..., :1] > 0, moments[..., :1], 1.0)
-        variance = moments[..., [3, 5]] - moments[..., :1] * mean**2
+        powers = _powers(values[:, pair])
+        moments = product(weights, powers)
+        total = moments[..., :1]
+        mean = moments[..., 1:3] / np.where(total > 0, total, 1.0)
+        squares = moments[..., [3, 5]]
+        variance = squares - total * mean**2
         known = (variance > _LEAST_VARIANCE).all(axis=-1)
-        found[known, k] = _correlations(moments[known], 2, np)[..., 0]
+        correlations = _correlations(moments[known], 2, np)
+        found[known, k] = correlations[..., 0]
     return found

@@ -98,7 +98,8 @@ class FunctionDiscrepancy(Discrepancy):
         simulated = np.broadcast_to(simulated, (n_sets, *simulated.shape[1:]))
         weights = np.broadcast_to(weights, (n_sets, *weights.shape[1:]))
         found = np.empty(simulated.shape[:-1])
-        for i, own in enumerate(self.weights.reshape(n_sets, -1)):
+        own_weights = self.weights.reshape(n_sets, -1)
+        for i, own in enumerate(own_weights):
             observed = repeated(self.observed, own, self.size)
             found[i] = self._checked(simulated[i], observed, weights[i])
         return found

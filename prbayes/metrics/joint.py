@@ -122,7 +122,9 @@ class Joint(LiftedMetric):
         parts: list[Part] = []
         components: list[Components] = []
         for outputs, share in patterns(observed, weights):
-            known = None if design is None else _known(design[:, outputs], caps[outputs])
+            known = None
+            if design is not None:
+                known = _known(design[:, outputs], caps[outputs])
             slices, found = self._slices(observed, weights, outputs, caps, share, known, inputs)
             parts += slices
             components += found
@@ -146,14 +148,17 @@ class Joint(LiftedMetric):
         centered = Centered(outputs, caps[outputs], white.center)
         m = white.axes.shape[1]
         number = 1 if m == 1 else self.directions or enough(m)
-        every = outputs.size == observed.shape[1]
-        of = "" if every else f" of outputs {', '.join(map(str, outputs.tolist()))}"
+        of = ""
+        if outputs.size < observed.shape[1]:
+            listed = ", ".join(map(str, outputs.tolist()))
+            of = f" of outputs {listed}"
         parts = []
         for k, direction in enumerate(directions(m, number, self.seed)):
             view = Projection(centered, white.axes @ direction)
             values, index = view.observed_of(observed)
             target = self.metric.against(values, weights[index])
-            parts.append(Part(target, share / number, f"direction {k + 1}{of}", view))
+            label = f"direction {k + 1}{of}"
+            parts.append(Part(target, share / number, label, view))
         return parts, found
 
     def _white(
@@ -166,20 +171,25 @@ class Joint(LiftedMetric):
         inputs: int | None,
     ) -> tuple[Whitening, list[Components]]:
         """Return white coordinates of some outputs, or of their principal components."""
-        finite = np.isfinite(chosen).all(axis=-1)
         many = outputs.size > MOST_OUTPUTS or self.components is not None
         if outputs.size < 2 or not many:
-            white = whitening(chosen[finite], weights[finite], outputs)
+            finite = np.isfinite(chosen).all(axis=-1)
+            sample = chosen[finite]
+            own = weights[finite]
+            white = whitening(sample, own, outputs)
             if inputs is not None and inputs < outputs.size:
-                white = _flat(chosen[finite], weights[finite], outputs, inputs) or white
+                white = _flat(sample, own, outputs, inputs) or white
             return white, []
         has = ~np.isnan(chosen).any(axis=-1)
-        sample, own = _capped(chosen[has], caps), weights[has] / weights[has].sum()
+        sample = _capped(chosen[has], caps)
+        own = weights[has]
+        own = own / own.sum()
         found = principal_components(sample, own, self.components, design)
         scores = (sample - found.center) @ found.axes
         white = whitening(scores, own, np.arange(found.number))
         center = found.center + found.axes @ white.center
-        return Whitening(center, found.axes @ white.axes), [found]
+        axes = found.axes @ white.axes
+        return Whitening(center, axes), [found]
 
 
 def _flat(
@@ -198,8 +208,9 @@ def _flat(
         if found.left_out <= LEFT_OUT:
             scores = (standard - found.center) @ found.axes
             white = whitening(scores, own, np.arange(number))
-            middle = center + unit * (found.center + found.axes @ white.center)
-            return Whitening(middle, (found.axes @ white.axes) / unit[:, None])
+            middle = found.center + found.axes @ white.center
+            axes = found.axes @ white.axes
+            return Whitening(center + unit * middle, axes / unit[:, None])
     return None
 
 
@@ -219,9 +230,10 @@ def patterns(observed: Floats, weights: Floats) -> list[tuple[NDArray[np.intp], 
     They are those that specimens have, or what these have in common where there are too many, or
     too few specimens that have them.
     """
-    has = ~np.isnan(observed[weights > 0])
+    counted = weights > 0
+    has = ~np.isnan(observed[counted])
     shares: dict[frozenset[int], float] = {}
-    for row, weight in zip(has, weights[weights > 0], strict=True):
+    for row, weight in zip(has, weights[counted], strict=True):
         key = frozenset(np.flatnonzero(row).tolist())
         shares[key] = shares.get(key, 0.0) + float(weight)
     while len(shares) > 1:
@@ -230,7 +242,11 @@ def patterns(observed: Floats, weights: Floats) -> list[tuple[NDArray[np.intp], 
             _divide(shares, min(thin, key=_order))
         elif len(shares) <= _PATTERNS or not _merge(shares):
             break
-    return [(np.array(sorted(key)), shares[key]) for key in sorted(shares, key=_order)]
+    found = []
+    for key in sorted(shares, key=_order):
+        outputs = np.array(sorted(key))
+        found.append((outputs, shares[key]))
+    return found
 
 
 def _order(key: frozenset[int]) -> tuple[int, list[int]]:
@@ -247,18 +263,25 @@ def _is_thin(key: frozenset[int], has: NDArray[np.bool_]) -> bool:
 def _divide(shares: dict[frozenset[int], float], thin: frozenset[int]) -> None:
     """Give the share of a set to the largest that it has in common with another, or its members."""
     share = shares.pop(thin)
-    common = [thin & other for other in shares if thin & other and thin & other != thin]
-    largest = max(map(len, common), default=0)
-    heirs = [min((c for c in common if len(c) == largest), key=_order)] if common else thin
+    common = []
+    for other in shares:
+        both = thin & other
+        if both and both != thin:
+            common.append(both)
+    heirs = [frozenset([output]) for output in thin]
+    if common:
+        most = max(map(len, common))
+        largest = [both for both in common if len(both) == most]
+        heirs = [min(largest, key=_order)]
     for heir in heirs:
-        key = heir if isinstance(heir, frozenset) else frozenset([heir])
-        shares[key] = shares.get(key, 0.0) + share / len(heirs)
+        shares[heir] = shares.get(heir, 0.0) + share / len(heirs)
 
 
 def _merge(shares: dict[frozenset[int], float]) -> bool:
     """Merge the rarest set with that with which it has most in common; whether there is one."""
     rarest = min(shares, key=lambda key: (shares[key], _order(key)))
-    others = sorted((key for key in shares if key != rarest), key=_order)
+    others = [key for key in shares if key != rarest]
+    others.sort(key=_order)
     nearest = max(others, key=lambda key: (len(key & rarest), shares[key]))
     common = nearest & rarest
     if not common:

@@ -74,7 +74,9 @@ def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> Whi
        selection, J. R. Statist. Soc. B 71, 549-592, doi:10.1111/j.1467-9868.2009.00706.x.
     """
     seen = weights > 0
-    sample, weights = sample[seen], weights[seen] / weights[seen].sum()
+    sample = sample[seen]
+    weights = weights[seen]
+    weights = weights / weights.sum()
     n, m = sample.shape
     if n < m + 2:
         raise ValueError(
@@ -85,10 +87,13 @@ def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> Whi
     center, unit = units(sample, weights, outputs)
     z = (sample - center) / unit
     middle, root = _robust_scatter(z, weights, outputs)
-    root = root @ _turn((z - middle) @ root, weights)
-    squares = (((z - middle) @ root) ** 2).sum(axis=-1)
+    turn = _turn((z - middle) @ root, weights)
+    root = root @ turn
+    white = (z - middle) @ root
+    squares = (white**2).sum(axis=-1)
     size = quantile(squares, weights, 0.5) / chi2(m).median()
-    return Whitening(center + middle * unit, root / np.sqrt(size) / unit[:, None])
+    axes = root / np.sqrt(size)
+    return Whitening(center + middle * unit, axes / unit[:, None])
 
 
 def units(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> tuple[Floats, Floats]:
@@ -130,26 +135,31 @@ def _scatter(z: Floats, weights: Floats, degrees: float) -> tuple[Floats, Floats
 
     It starts with mean and covariance, so that an affine map changes no step.
     """
-    middle, root = np.zeros(z.shape[1]), np.eye(z.shape[1])
+    middle = np.zeros(z.shape[1])
+    root = np.eye(z.shape[1])
     w = weights
     for _ in range(_MOST_STEPS):
         x = (z - middle) @ root
         shift = w @ x
         size, axes = _singular(x - shift, w)
-        if not size[-1] > _SINGULAR * max(size[0], np.abs(root).max()):
+        largest = max(size[0], np.abs(root).max())
+        if not size[-1] > _SINGULAR * largest:
             raise _NoScatterError(root @ axes[-1])
         middle = middle + np.linalg.solve(root.T, shift)
         root = root @ (axes.T / size)
-        if max(np.abs(size - 1).max(), np.abs(shift).max()) < _CONVERGED:
+        stretch = np.abs(size - 1).max()
+        if max(stretch, np.abs(shift).max()) < _CONVERGED:
             break
-        squares = (((z - middle) @ root) ** 2).sum(axis=-1)
+        white = (z - middle) @ root
+        squares = (white**2).sum(axis=-1)
         w = weights / (1 + squares / degrees)
         w = w / w.sum()
     # The least variance of a combination of outputs in units of their own spread.
     back = np.linalg.inv(root)
     own = np.sqrt((back**2).sum(axis=0))
     _, least, combinations = np.linalg.svd(back / own)
-    if least[-1] ** 2 < _DEPENDENT or np.abs(size - 1).max() > _CONVERGED:
+    dependent = least[-1] ** 2 < _DEPENDENT
+    if dependent or stretch > _CONVERGED:
         raise _NoScatterError(combinations[-1])
     return middle, root
 
@@ -164,8 +174,10 @@ def _turn(x: Floats, weights: Floats) -> Floats:
     """Return the rotation to the axes of a second scatter, with signs by a third moment."""
     squares = (x**2).sum(axis=-1)
     _, axes = _singular(x, weights / (1 + squares) ** 2)
-    third = (weights / (1 + squares) ** 1.5) @ (x @ axes.T) ** 3
-    return np.asarray(axes.T * np.where(third < 0, -1.0, 1.0))
+    cubes = (x @ axes.T) ** 3
+    third = (weights / (1 + squares) ** 1.5) @ cubes
+    signs = np.where(third < 0, -1.0, 1.0)
+    return np.asarray(axes.T * signs)
 
 
 def _listed(outputs: NDArray[np.intp]) -> str:
