@@ -194,16 +194,20 @@ def heavy_tails(evaluator: Evaluator, theta: Floats) -> list[str]:
 def _tail_index(values: Floats, weights: Floats) -> float:
     """Return Hill's index of the longer tail of a weighted population, from its middle."""
     known = np.isfinite(values) & (weights > 0)
-    values, weights = values[known], weights[known] / weights[known].sum()
+    values = values[known]
+    weights = weights[known]
+    weights = weights / weights.sum()
     away = values - quantile(values, weights, 0.5)
     found = [np.inf]
     for side in (away, -away):
         start = float(quantile(side, weights, 1 - _TAIL))
         beyond = side > start
-        if start > 0 and weights[beyond].sum() > 0:
-            mass = weights[beyond]
-            length = float(mass @ np.log(side[beyond] / start))
-            found.append(float(mass.sum()) / max(length, 1e-300))
+        mass = weights[beyond]
+        total = float(mass.sum())
+        if start > 0 and total > 0:
+            logs = np.log(side[beyond] / start)
+            length = float(mass @ logs)
+            found.append(total / max(length, 1e-300))
     return min(found)
 
 

@@ -41,21 +41,26 @@ def prior_probabilities(
     known = np.isfinite(np.diag(sampling.local.in_theta))
     bias = np.median(shifts, axis=0)
     estimate = sampling.thetas(center - bias)[known]
-    errors = (sampling.thetas(shifts - bias) - sampling.theta)[:, known]
+    refitted = sampling.thetas(shifts - bias)
+    errors = (refitted - sampling.theta)[:, known]
     prior = evaluator.prior_thetas(_ESTIMATES, seed)[:, known]
-    prior = prior[np.isfinite(prior).all(axis=1)]
+    finite = np.isfinite(prior).all(axis=1)
+    prior = prior[finite]
     if not (known.any() and len(prior)):
         return {}
     rng = np.random.default_rng([seed, 5])
-    expected = prior + errors[rng.integers(len(errors), size=len(prior))]
+    chosen = rng.integers(len(errors), size=len(prior))
+    expected = prior + errors[chosen]
     below = _share(expected <= estimate)
     above = _share(expected >= estimate)
-    two_sided = np.minimum(1.0, 2 * np.minimum(below, above))
+    tail = np.minimum(below, above)
+    two_sided = np.minimum(1.0, 2 * tail)
     names = [name for name, one in zip(evaluator.readable_names, known, strict=True) if one]
     found = dict(zip(names, two_sided.tolist(), strict=True))
     if len(names) > 1:
         distances = _distances(np.vstack([expected, estimate]))
-        found[""] = float(_share(distances[:-1] >= distances[-1]))
+        farther = distances[:-1] >= distances[-1]
+        found[""] = float(_share(farther))
     return found
 
 
@@ -68,11 +73,14 @@ def _distances(points: Floats) -> Floats:
     """Return Mahalanobis distances of points (n, d) from their middle, by robust spreads."""
     middle = np.median(points, axis=0)
     upper, lower = np.quantile(points, [0.84, 0.16], axis=0)
-    away = (points - middle) / np.maximum((upper - lower) / 2, 1e-300)
+    spread = np.maximum((upper - lower) / 2, 1e-300)
+    away = (points - middle) / spread
     # Ranks stand for places far out, of which a few decide a covariance.
     within = np.clip(away, -3.0, 3.0)
     covariance = np.atleast_2d(np.cov(within, rowvar=False))
-    turned = np.linalg.solve(covariance + 1e-9 * np.eye(len(covariance)), away.T)
+    # A little is added, so that there is an inverse.
+    ridge = 1e-9 * np.eye(len(covariance))
+    turned = np.linalg.solve(covariance + ridge, away.T)
     return np.asarray(np.einsum("nd,dn->n", away, turned))
 
 

@@ -81,9 +81,11 @@ def _probability(here: Floats, drawn: Floats, *, both_sides: bool = False) -> fl
     rows = drawn[known]
     middle = rows.mean(axis=0)
     spread = np.maximum(rows.std(axis=0), 1e-300)
-    out, own = (rows - middle) / spread, (here - middle) / spread
+    out = (rows - middle) / spread
+    own = (here - middle) / spread
     if both_sides:
-        out, own = np.abs(out), np.abs(own)
+        out = np.abs(out)
+        own = np.abs(own)
     farther = np.count_nonzero(out.max(axis=1) >= own.max())
     return float((1 + farther) / (1 + len(rows)))
 
@@ -122,7 +124,8 @@ class _Seen:
         has = ~np.isnan(self.values[:, j])
         values = self.values[has, j]
         order = np.argsort(values, kind="stable")
-        w = _normalised(self.weights[:, has][:, order])
+        weights = self.weights[:, has]
+        w = _normalised(weights[:, order])
         below = np.cumsum(w, axis=1) - w / 2
         at = values[order]
         # In the middle of a step
@@ -132,15 +135,21 @@ class _Seen:
         expected = (up_to + under) / 2
         squares = w * (below - expected) ** 2
         inside = np.clip(expected, BEYOND, 1 - BEYOND)
-        sums = [squares.sum(axis=1), (squares / (inside * (1 - inside))).sum(axis=1)]
-        return np.asarray(np.log(np.maximum(np.stack(sums, axis=1), 1e-300)))
+        variance = inside * (1 - inside)
+        # Of Cramer and von Mises, and of Anderson and Darling
+        of_middle = squares.sum(axis=1)
+        of_tails = (squares / variance).sum(axis=1)
+        both = np.stack([of_middle, of_tails], axis=1)
+        return np.asarray(np.log(np.maximum(both, 1e-300)))
 
     def correlations(self, i: int, j: int) -> tuple[Floats, Floats]:
         """Return the correlations of two outputs in data sets and in populations, (S,) each."""
         pair = [i, j]
         has = ~np.isnan(self.values[:, pair]).any(axis=1)
-        measured = _correlation(self.values[has][:, pair], _normalised(self.weights[:, has]))
-        return measured, _correlation(self.simulated[:, pair], self.masses)
+        weights = _normalised(self.weights[:, has])
+        measured = _correlation(self.values[has][:, pair], weights)
+        calibrated = _correlation(self.simulated[:, pair], self.masses)
+        return measured, calibrated
 
 
 def _normalised(weights: Floats) -> Floats:
@@ -153,10 +162,15 @@ def _correlation(values: Floats, weights: Floats) -> Floats:
     """Return correlations, (n, 2), (S, n) -> (S,); NaN where one of both does not vary."""
     center = values.mean(axis=0)
     spread = values.std(axis=0)
-    a, b = ((values - center) / np.where(spread > 0, spread, 1.0)).T
-    moments = weights @ np.column_stack([a, b, a * a, b * b, a * b])
+    unit = np.where(spread > 0, spread, 1.0)
+    a, b = ((values - center) / unit).T
+    powers = np.column_stack([a, b, a * a, b * b, a * b])
+    moments = weights @ powers
     mean_a, mean_b, square_a, square_b, product = moments.T
-    variances = (square_a - mean_a**2) * (square_b - mean_b**2)
+    variance_a = square_a - mean_a**2
+    variance_b = square_b - mean_b**2
+    variances = variance_a * variance_b
     known = variances > 1e-20  # of rounding, in units of the spread
     root = np.sqrt(np.where(known, variances, 1.0))
-    return np.where(known, (product - mean_a * mean_b) / root, np.nan)
+    covariance = product - mean_a * mean_b
+    return np.where(known, covariance / root, np.nan)

@@ -136,13 +136,16 @@ class _Populations:
         stored to first order, as refits are.
         """
         if k not in self.around:
-            values, weights = self.sampling.evaluator.populations(self.sampling.thetas(x), k)
+            thetas = self.sampling.thetas(x)
+            values, weights = self.sampling.evaluator.populations(thetas, k)
             return _middles(part.of(values), weights, at)
         values, weights = self.around[k]
         found = _middles(part.of(values), weights, at)
         r = self.center.size
-        slopes = (found[1 : 1 + r] - found[1 + r :]) / 2
-        linear = found[0] + (x - self.center) @ slopes
+        ahead, behind = found[1 : 1 + r], found[1 + r :]
+        slopes = (ahead - behind) / 2
+        away = x - self.center
+        linear = found[0] + away @ slopes
         return np.asarray(np.clip(linear, 0.0, 1.0))
 
 

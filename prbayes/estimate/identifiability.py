@@ -99,14 +99,17 @@ def identified_by_area(information: Information, weakest: float = 1.0) -> Floats
 def _halves_agree(information: Information, vectors: Floats) -> NDArray[np.bool_]:
     """Return along which directions both halves of the points change alike, shape (d,)."""
     blocks = information.node.bound.blocks
-    halves = [information.areas(*information.data_set, blocks % 2 == half) for half in (0, 1)]
+    of_even = information.areas(*information.data_set, blocks % 2 == 0)
+    of_odd = information.areas(*information.data_set, blocks % 2 == 1)
     both = one = other = np.zeros(vectors.shape[1])
-    for area, again in zip(*halves, strict=True):
-        first, second = (vectors.T @ _in_prior_sd(own, information) for own in (area, again))
+    for even, odd in zip(of_even, of_odd, strict=True):
+        first = vectors.T @ _in_prior_sd(even, information)
+        second = vectors.T @ _in_prior_sd(odd, information)
         # The knots are the same: they are values that occur, and both halves know all of them.
-        both = both + (first * second * area.lengths).sum(axis=-1)
-        one = one + (first**2 * area.lengths).sum(axis=-1)
-        other = other + (second**2 * area.lengths).sum(axis=-1)
+        lengths = even.lengths
+        both = both + (first * second * lengths).sum(axis=-1)
+        one = one + (first**2 * lengths).sum(axis=-1)
+        other = other + (second**2 * lengths).sum(axis=-1)
     least = _AGREEMENT * np.sqrt(one * other)
     return np.asarray(both > least)
 

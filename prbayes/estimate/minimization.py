@@ -547,10 +547,14 @@ def _against_rivals(plan: _Plan, state: _State) -> _State:
     others = _rivals(plan, state)
     if not others or not others[0].better:
         return replace(state, others=tuple(others))
-    run = minimise(plan.search, others[0].theta, state.scales, state.run.trace)
+    better = others[0].theta
+    run = minimise(plan.search, better, state.scales, state.run.trace)
     sampling = _sampling(plan.evaluator, run.best, state.scales)
     state = replace(state, theta=run.best, run=run, sampling=sampling)
-    return state if sampling is None else replace(state, others=tuple(_rivals(plan, state)))
+    if sampling is None:
+        return state
+    others = _rivals(plan, state)
+    return replace(state, others=tuple(others))
 
 
 def _rivals(plan: _Plan, state: _State) -> list[Rival]:

@@ -118,13 +118,15 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
     for _ in range(2 * MAX_ROUNDS):
         # Keep the best.
         found = evaluator(thetas)
-        value = (found.discrepancies / scales).sum(axis=-1) - found.log_other
+        total = (found.discrepancies / scales).sum(axis=-1)
+        value = total - found.log_other
         value = np.where(np.isfinite(found.log_prior), value, np.inf)
         order = np.argsort(value)[:THETAS]
         best = thetas[order]
         # Let the designs reach them.
         thin = _thin(evaluator, best)
-        _add(evaluator, best, {n for n in thin if evaluator.designs[n].n_batches <= MAX_ROUNDS})
+        growing = {name for name in thin if evaluator.designs[name].n_batches <= MAX_ROUNDS}
+        _add(evaluator, best, growing)
         # Stop where sampling explains the differences that are left.
         spread = value[order[-1]] - value[order[0]]
         noise = sum(noise_floors(evaluator, best[0], FEW_SETS) / scales)
@@ -133,10 +135,12 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         # Step on, from each of them at random.
         covariance = np.atleast_2d(np.cov(best, rowvar=False))
         # A share of each variance is added, so that there is a root.
-        root = np.linalg.cholesky(covariance + 1e-12 * np.diag(np.diag(covariance)))
-        parents = best[rng.integers(len(best), size=4 * THETAS)]
-        steps = _PILOT_STEP * rng.standard_normal(parents.shape) @ root.T
-        thetas = parents + steps
+        share = 1e-12 * np.diag(np.diag(covariance))
+        root = np.linalg.cholesky(covariance + share)
+        chosen = rng.integers(len(best), size=4 * THETAS)
+        parents = best[chosen]
+        z = rng.standard_normal(parents.shape)
+        thetas = parents + _PILOT_STEP * z @ root.T
     return best
 
 
@@ -194,10 +198,13 @@ def spread_around(center: Floats, covariance: Floats, prior_sd: Floats, *, seed:
     Along elements of which nothing is known they are as wide as the prior.
     """
     unit = np.outer(prior_sd, prior_sd)
-    known = np.where(np.isfinite(covariance), covariance / unit, 0.0)
-    variances = np.diag(covariance)
-    known[np.diag_indices_from(known)] = np.where(np.isfinite(variances), np.diag(known), 1.0)
-    values, vectors = np.linalg.eigh(known)
+    relative = np.where(np.isfinite(covariance), covariance / unit, 0.0)
+    known = np.isfinite(np.diag(covariance))
+    variances = np.where(known, np.diag(relative), 1.0)
+    np.fill_diagonal(relative, variances)
+    values, vectors = np.linalg.eigh(relative)
     sd = np.sqrt(np.clip(values, 0, 1))
-    z = np.random.default_rng(seed).standard_normal((THETAS, center.size))
-    return np.asarray(center + (z * sd) @ vectors.T * prior_sd)
+    rng = np.random.default_rng(seed)
+    z = rng.standard_normal((THETAS, center.size))
+    steps = (z * sd) @ vectors.T
+    return np.asarray(center + steps * prior_sd)

@@ -79,15 +79,19 @@ class Stencil:
     def _moves_of(self, values: Floats) -> Floats:
         """Return the same for numbers of each specimen, shape (s, n)."""
         d = self.step.size
-        known = np.isfinite(values[0]) & (self.weights[0] > 0)
+        center, own = values[0], self.weights[0]
+        known = np.isfinite(center) & (own > 0)
         if not known.any():
             return np.zeros(d)
-        mass = self.weights[0][known] / self.weights[0][known].sum()
-        knots = quantile(values[0][known], mass, np.linspace(0.05, 0.95, 19))
+        mass = own[known]
+        mass = mass / mass.sum()
+        levels = np.linspace(0.05, 0.95, 19)
+        knots = quantile(center[known], mass, levels)
         across = slice(1 + 2 * d)
         below = distribution_function(values[across], self.weights[across], knots)
         gaps = np.abs(below[1:] - below[0]).max(axis=-1)
-        return np.asarray(np.nan_to_num(gaps).reshape(2, d).max(axis=0))
+        either_side = np.nan_to_num(gaps).reshape(2, d)
+        return np.asarray(either_side.max(axis=0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -86,8 +86,10 @@ class Search:
         """Return a typical size of the objective; of a user's metric it is the value at theta."""
         nodes = self.evaluator.nodes
         if not any(n.metric.minimum is Minimum.UNKNOWN for n in nodes):
-            return float(sum(n.target.scale / s for n, s in zip(nodes, scales, strict=True)))
-        first = float(np.abs(self.evaluator.total(theta[None], scales)[0]))
+            sizes = [n.target.scale / scale for n, scale in zip(nodes, scales, strict=True)]
+            return float(sum(sizes))
+        (total,) = self.evaluator.total(theta[None], scales)
+        first = float(np.abs(total))
         return first if 0 < first < np.inf else 1.0
 
     def best_of(self, thetas: Floats, scales: Floats) -> Floats:
@@ -326,13 +328,17 @@ class _Guide:
     def __call__(self, thetas: Floats) -> Floats:
         """Return the sum of the areas, in units of their typical sizes; thetas (P, d) -> (P,)."""
         values, weights = _populations(self.evaluator, thetas)
-        by_node = list(zip(self.evaluator.nodes, self.scales, values, weights, strict=True))
-        areas = [a.of(v, w) / a.scale for a, v, w in zip(self.areas, values, weights, strict=True)]
+        areas = []
+        for area, v, w in zip(self.areas, values, weights, strict=True):
+            areas.append(area.of(v, w) / area.scale)
         inside = self.evaluator.in_support(thetas)
         total = np.where(inside, np.sum(areas, axis=0), np.inf)
         # What is known of them besides: the overlap, and the model's own objective.
         overlaps = overlap(self.evaluator, values, weights)
-        objective = sum(n.target.of(v, w) / s for n, s, v, w in by_node)
+        objective: Any = 0
+        nodes = self.evaluator.nodes
+        for node, scale, v, w in zip(nodes, self.scales, values, weights, strict=True):
+            objective = objective + node.target.of(v, w) / scale
         for theta, one, other in zip(thetas, overlaps, objective, strict=True):
             self._known[theta.tobytes()] = one, other
         return np.asarray(np.nan_to_num(total, nan=np.inf, posinf=np.inf))
