@@ -143,7 +143,8 @@ def _table(name: str) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np
     NaN where there is no line.
     """
     with files(__package__).joinpath(name).open(encoding="utf-8") as file:
-        specimens, abscissas, values = np.loadtxt(file, delimiter=",", skiprows=1, unpack=True)
+        columns = np.loadtxt(file, delimiter=",", skiprows=1, unpack=True)
+    specimens, abscissas, values = columns
     specimen, row = np.unique(specimens.astype(int), return_inverse=True)
     abscissa, column = np.unique(abscissas, return_inverse=True)
     table = np.full((specimen.size, abscissa.size), np.nan)

@@ -175,19 +175,21 @@ class Evaluator:
 
     def __call__(self, thetas: Floats) -> Evaluation:
         """Evaluate a batch, shape (P, d); invalid thetas leave the others alone."""
-        size, k = len(thetas), len(self.nodes)
+        size = len(thetas)
         points = max((node.bound.n_points for node in self.nodes), default=1)
         step = max(1, AT_ONCE // max(1, points))
-        log_prior, log_other = np.empty(size), np.empty(size)
-        discrepancies, lost = np.empty((size, k)), np.empty((size, k))
+        log_prior = np.empty(size)
+        log_other = np.empty(size)
+        discrepancies = np.empty((size, len(self.nodes)))
+        lost = np.empty_like(discrepancies)
         for first in range(0, size, step):
             rows = slice(first, first + step)
             block = np.ascontiguousarray(thetas[rows])
             log_prior[rows] = self.hyperparameters.log_prior(block)
             log_other[rows] = self.log_other(block)
-            for i in range(k):
+            for i, node in enumerate(self.nodes):
                 discrepancies[rows, i] = self.discrepancies(block, i)
-                lost[rows, i] = self.nodes[i].bound.lost
+                lost[rows, i] = node.bound.lost
         log_prior[np.isnan(log_prior)] = -np.inf
         log_other[np.isnan(log_other)] = -np.inf
         discrepancies[np.isnan(discrepancies)] = np.inf

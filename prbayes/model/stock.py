@@ -66,8 +66,10 @@ class abc_distance(Op):  # noqa: N801 (reads as a function in a model)
         epsilon, observed, simulated = inputs
         if self._prepared is None or not np.array_equal(self._prepared[0], observed):
             self._prepared = (np.array(observed), self.metric.against(observed))
+        _, target = self._prepared
         value = -np.inf
-        if not (np.isnan(simulated).any() or np.isneginf(simulated).any()):
-            discrepancy = self._prepared[1](simulated)
+        lacking = np.isnan(simulated) | np.isneginf(simulated)
+        if not lacking.any():
+            discrepancy = target(simulated)
             value = log_kernel(discrepancy, epsilon)
         outputs[0][0] = np.asarray(value, dtype=np.float64)

@@ -283,15 +283,17 @@ class Bound(ABC):
         They are specimens of the population's points, by weight and with replacement.
         """
         at = [np.asarray(p)[None] for p in params]
+        nowhere = np.full((size, *self.target.event), np.nan)
         if not self.valid(at).all():
-            return np.full((size, *self.target.event), np.nan)
+            return nowhere
         values, weights = self.populations(at)
-        known = ~lacking(values[0])
+        points = values[0]
+        known = ~lacking(points)
         mass = np.where(known, weights[0], 0.0)
         total = mass.sum()
         if not total > 0:
-            return np.full((size, *self.target.event), np.nan)
-        return rng.choice(values[0], size=size, p=mass / total)
+            return nowhere
+        return rng.choice(points, size=size, p=mass / total)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -344,12 +346,15 @@ def probe(bound: Bound, sampler: PopulationSampler, seed: int) -> tuple[Any, ...
     """
     draws = prior_draws(bound.inputs.roots, 64, seed)  # of which a few at least are valid
     two = [draw[:2] for draw in bound.valid_only(draws)]
-    aleatory, epistemic = sampler(two, 8, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    aleatory, epistemic = sampler(two, 8, rng)
     values = bound.responses(aleatory, epistemic)
     refuse_all_nan(bound.name, values)
     bound._probed = values.reshape(-1, *bound.target.event)
-    shapes = bound.inputs.event_shapes
-    bound._probed_at = [x.reshape(-1, *own) for x, own in zip(aleatory, shapes, strict=True)]
+    probed_at = []
+    for x, shape in zip(aleatory, bound.inputs.event_shapes, strict=True):
+        probed_at.append(x.reshape(-1, *shape))
+    bound._probed_at = probed_at
     return values, aleatory, epistemic
 
 

@@ -151,10 +151,13 @@ def _share_of_own_atoms(column: Floats, which: NDArray[np.intp]) -> float:
     Zero if these are of few populations.
     """
     _, value, repeated = np.unique(column, return_inverse=True, return_counts=True)
-    pairs = np.unique(value * (which.max() + 1) + which)
-    n_populations = np.bincount(pairs // (which.max() + 1))
+    number = which.max() + 1
+    pairs = np.unique(value * number + which)
+    n_populations = np.bincount(pairs // number)
     own = (repeated > 1) & (n_populations == 1)
-    return float(repeated[own].sum() / column.size) if own.sum() >= _FEW else 0.0
+    if own.sum() < _FEW:
+        return 0.0
+    return float(repeated[own].sum() / column.size)
 
 
 def cells_around(points: Floats, reach: int) -> Cells:

@@ -498,7 +498,8 @@ class Design(Bound):
         log_g, _ = self._log_mixture(components, counts, [grid], summed=False)
         # Values that have probability themselves, such as the bounds of a censored input, are there
         # more often than two design points stand for, and their density is finite.
-        if np.any((repeated > 2 * n_draft / n) & np.isfinite(log_g)):
+        often = repeated > 2 * n_draft / n
+        if np.any(often & np.isfinite(log_g)):
             places = (levels * finite.size).astype(int)
             points = np.sort(finite)[places]
         else:
@@ -633,7 +634,8 @@ class Design(Bound):
         dists, _ = self.inputs.rebuilt(params)
         averaged = {}
         for place, i in enumerate(self._moving or ()):
-            lower, upper = self._shared[k + 1 + 2 * place :][:2]
+            first = k + 1 + 2 * place
+            lower, upper = self._shared[first : first + 2]
             averaged[i] = partial(averaged_log_density, lower=lower, upper=upper)
         log_p = log_density(self.inputs, dists, points, averaged)
         return log_p - log_g

@@ -72,7 +72,8 @@ class scalar:  # noqa: N801 (reads as a function in a model)
     def __call__(self, *inputs: Any) -> Floats:
         """Call the function for each element of arrays that broadcast against each other."""
         arrays = np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in inputs))
-        specimens = zip(*(a.ravel() for a in arrays), strict=True)
+        columns = [array.ravel() for array in arrays]
+        specimens = zip(*columns, strict=True)
         values = [_of_one(self.function(*specimen), None) for specimen in specimens]
         event = np.shape(values[0]) if values else ()
         return np.array(values).reshape(arrays[0].shape + event)
@@ -554,11 +555,14 @@ def _at_once(
     except (Exception, SystemExit) as error:
         if not tolerant or size == 1:
             event = () if outputs is None else outputs.event
-            return np.full((size, *event), np.nan), {0: _said(error)}
+            failed = np.full((size, *event), np.nan)
+            return failed, {0: _said(error)}
     else:
-        return checked(result, (size,), points.arguments, outputs), {}
+        values = checked(result, (size,), points.arguments, outputs)
+        return values, {}
     # Halve until the points that fail are alone.
-    values, raised = np.full(size, np.nan), {}
+    values = np.full(size, np.nan)
+    raised = {}
     for half in (np.arange(size // 2), np.arange(size // 2, size)):
         some, said = _at_once(function, points.at(half), tolerant, timeout, outputs)
         values = _filled_in(values, half, some)

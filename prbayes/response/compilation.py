@@ -30,8 +30,11 @@ def _sums_of_sums(fgraph: Any, node: Any) -> Any:
     op, terms = node.op, node.inputs
     if len(terms) <= _OPERANDS or not op.scalar_op.associative:
         return False
-    parts = [terms[i : i + _OPERANDS] for i in range(0, len(terms), _OPERANDS)]
-    return [op(*(op(*part) if len(part) > 1 else part[0] for part in parts))]
+    parts = []
+    for first in range(0, len(terms), _OPERANDS):
+        part = terms[first : first + _OPERANDS]
+        parts.append(op(*part) if len(part) > 1 else part[0])
+    return [op(*parts)]
 
 
 # Batched NumPy calls: nothing here runs often enough to repay a heavy compilation. Without fusion

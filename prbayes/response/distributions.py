@@ -71,19 +71,23 @@ def _elliptical_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
     """
     *freedom, mean, covariance = dist.owner.op.dist_params(dist.owner)
     root = pt.linalg.cholesky(covariance, on_error="nan")
+    diagonal = [root[..., i, i] for i in range(size)]
     # Solve root z = x - mean.
     z: list[Any] = []
     for i in range(size):
+        away = x[..., i] - mean[..., i]
         above = sum(root[..., i, j] * z[j] for j in range(i))
-        z.append((x[..., i] - mean[..., i] - above) / root[..., i, i])
+        z.append((away - above) / diagonal[i])
     logp: Any = 0
     if freedom:
         logp = _studentt_logp(freedom[0], z)
-        for i in range(size):
-            logp = logp - pt.log(root[..., i, i])
+        for scale in diagonal:
+            logp = logp - pt.log(scale)
     else:
-        for i, z_i in enumerate(z):
-            logp = logp + (-0.5 * z_i**2 - pt.log(root[..., i, i]) - 0.5 * np.log(2 * np.pi))
+        constant = 0.5 * np.log(2 * np.pi)
+        for z_i, scale in zip(z, diagonal, strict=True):
+            normal = -0.5 * z_i**2 - pt.log(scale) - constant
+            logp = logp + normal
     return pt.switch(pt.isnan(logp), -np.inf, logp)
 
 
@@ -91,8 +95,10 @@ def _studentt_logp(nu: Any, z: Sequence[Any]) -> Any:
     """Return the log-density of Student's t with a unit matrix, at coordinates z."""
     size = len(z)
     distance = sum(z_i**2 for z_i in z)
-    norm = pt.gammaln((nu + size) / 2) - pt.gammaln(nu / 2) - 0.5 * size * pt.log(nu * np.pi)
-    logp = norm - (nu + size) / 2 * pt.log1p(distance / nu)
+    power = (nu + size) / 2
+    gammas = pt.gammaln(power) - pt.gammaln(nu / 2)
+    norm = gammas - 0.5 * size * pt.log(nu * np.pi)
+    logp = norm - power * pt.log1p(distance / nu)
     return pt.switch(nu > 0, logp, -np.inf)
 
 

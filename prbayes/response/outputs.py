@@ -108,17 +108,19 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
     values = observed if np.ma.is_masked(observed) else real_array(observed, label)
     if np.ndim(values) != 2:
         return values, ONE
-    if not values.shape[1]:
+    _, m = values.shape
+    if not m:
         raise ValueError(f"{label}: got shape {values.shape}, expected one output at least")
-    return values, _of_columns(observed, values.shape[1])
+    return values, _of_columns(observed, m)
 
 
 def _of_columns(observed: Any, m: int) -> Outputs:
     """Return what the columns of an array, DataFrame or DataArray say of themselves."""
     if hasattr(observed, "dims") and hasattr(observed, "coords"):
         dim = str(observed.dims[1])
-        known = dim in observed.coords
-        labels = tuple(observed.coords[dim].values.tolist()) if known else tuple(range(m))
+        labels = tuple(range(m))
+        if dim in observed.coords:
+            labels = tuple(observed.coords[dim].values.tolist())
         units = _units(observed, m)
         return Outputs(labels, dim, _keys(labels), units)
     if hasattr(observed, "columns"):

@@ -48,7 +48,8 @@ def once_each(responses: Responses, points: Sequence[Floats], known: Known | Non
     m = len(before)
     keys = _keys(points)
     if known is not None:
-        keys = np.concatenate([_keys([x[:m] for x in known.points]), keys])
+        earlier = [x[:m] for x in known.points]
+        keys = np.concatenate([_keys(earlier), keys])
     _, first, which = np.unique(keys, return_index=True, return_inverse=True)
     earliest = first[which]  # where each point came first
     own = earliest[m:] == np.arange(m, m + n)
@@ -57,10 +58,14 @@ def once_each(responses: Responses, points: Sequence[Floats], known: Known | Non
 
     fresh = np.flatnonzero(own)
     repeated = np.flatnonzero(~own)
-    again = repeated[:0] if responses.scatters is False else _first_of_each(earliest[m:], repeated)
+    again = repeated[:0]
+    if responses.scatters is not False:
+        again = _first_of_each(earliest[m:], repeated)
     asked = np.concatenate([fresh, again])
     rest = np.setdiff1d(repeated, again)
-    found = responses([x[asked] for x in points], []) if asked.size else before[:0]
+    found = before[:0]
+    if asked.size:
+        found = responses([x[asked] for x in points], [])
     event = found.shape[1:]
     values = np.full((m + n, *event), np.nan)
     values[:m] = before.reshape(m, *event)
@@ -68,7 +73,8 @@ def once_each(responses: Responses, points: Sequence[Floats], known: Known | Non
         values[m + fresh] = found[: fresh.size]
         second = found[fresh.size :]
         if again.size:
-            responses.scatters = not _same(values[earliest[m + again]], second)
+            first_time = values[earliest[m + again]]
+            responses.scatters = not _same(first_time, second)
     if responses.scatters:
         values[m + again] = second
         if rest.size:

@@ -103,7 +103,8 @@ class Ranges:
             if not wrong.size:
                 continue
             got = f"{wrong.min():.6g} to {wrong.max():.6g}"
-            expected = f"{np.min(one.low):.6g} to {np.max(one.high):.6g}"
+            lowest, highest = np.min(one.low), np.max(one.high)
+            expected = f"{lowest:.6g} to {highest:.6g}"
             said.append(f"{one.name} from {got}, expected {expected}")
         bad = out.any(axis=1).sum()
         return f"got {bad} of {len(columns)} points outside its design: {'; '.join(said)}"
