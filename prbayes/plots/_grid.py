@@ -139,11 +139,14 @@ def _standard_error(optimum: Optimum, name: str, bulk: Floats) -> float:
 
 def _ends(center: Floats, error: float, marked: Floats) -> tuple[float, float]:
     """Return where an axis should end: beyond some standard errors, and beyond what is marked."""
-    first, last = center[0] + _STANDARD_ERRORS * error * np.array([-1, 1])
+    reach = _STANDARD_ERRORS * error
+    first, last = center[0] - reach, center[0] + reach
     lowest, highest = marked.min(), marked.max()
     # About the size of a marker.
     margin = 0.04 * (max(last, highest) - min(first, lowest))
-    return min(first, lowest - margin), max(last, highest + margin)
+    low = min(first, lowest - margin)
+    high = max(last, highest + margin)
+    return low, high
 
 
 def _columns(elements: dict[str, Floats], names: list[str]) -> Floats:

@@ -35,13 +35,15 @@ class Axis:
         m = len(outputs.labels)
         if is_curve(outputs):
             places = np.array(outputs.labels, dtype=np.float64)
-            return cls(output, places, np.argsort(places), np.zeros(m), np.ones(m))
+            order = np.argsort(places)
+            return cls(output, places, order, np.zeros(m), np.ones(m))
         observed = output.node.target.observed
         finite = np.where(np.isfinite(observed), observed, np.nan)
+        center = np.nanmean(finite, axis=0)
         spread = np.nanstd(finite, axis=0)
         unit = np.where(spread > 0, spread, 1.0)
         places = np.arange(m, dtype=np.float64)
-        return cls(output, places, np.arange(m), np.nanmean(finite, axis=0), unit)
+        return cls(output, places, np.arange(m), center, unit)
 
     def scaled(self, values: Floats) -> Floats:
         """Return values, (..., m), as they are drawn, from left to right."""
@@ -159,13 +161,16 @@ def _limits(measured: Floats, after: Floats, before: Floats | None) -> Limits:
     typical = np.median(after, axis=0)
     together = np.concatenate([measured.ravel(), typical.ravel()])
     finite = together[np.isfinite(together)]
-    low, high = float(finite.min()), float(finite.max())
+    low = float(finite.min())
+    high = float(finite.max())
     if before is not None:
         # It widens the axis by at most half on each side
         room = 0.5 * (high - low)
         known = before[np.isfinite(before)]
-        low = min(low, max(float(known.min(initial=low)), low - room))
-        high = max(high, min(float(known.max(initial=high)), high + room))
+        first = float(known.min(initial=low))
+        last = float(known.max(initial=high))
+        low = min(low, max(first, low - room))
+        high = max(high, min(last, high + room))
     margin = 0.03 * (high - low)
     return low - margin, high + margin
 

@@ -93,6 +93,8 @@ def in_one_panel(outputs: Outputs) -> bool:
 def is_curve(outputs: Outputs) -> bool:
     """Whether outputs are a curve: their labels are different numbers that somebody gave."""
     labels = outputs.labels
+    m = len(labels)
     numbers = all(isinstance(x, int | float) and not isinstance(x, bool) for x in labels)
-    counted = labels == tuple(range(len(labels))) and outputs.dim == Outputs.dim
-    return len(labels) > 2 and numbers and not counted and len(set(labels)) == len(labels)
+    counted = labels == tuple(range(m)) and outputs.dim == Outputs.dim
+    different = len(set(labels)) == m
+    return m > 2 and numbers and different and not counted

@@ -39,8 +39,10 @@ class White:
         spread = np.sqrt(weights @ deviations**2)
         unit = np.where(spread > 0, spread, 1.0)
         scaled = deviations / unit
-        variances, vectors = np.linalg.eigh(scaled.T @ (weights[:, None] * scaled))
-        least = max(float(variances[-1]), 1e-300) * _NARROWEST**2
+        covariance = scaled.T @ (weights[:, None] * scaled)
+        variances, vectors = np.linalg.eigh(covariance)
+        largest = max(float(variances[-1]), 1e-300)
+        least = largest * _NARROWEST**2
         steps = np.sqrt(np.maximum(variances, least))
         return cls(center, unit[:, None] * vectors * steps)
 

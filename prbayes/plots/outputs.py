@@ -276,12 +276,16 @@ def _covered(output: Output, after: _Population, earlier: _Population | None) ->
     finite = observed[np.isfinite(observed)]
     # A normal population's region of 89% reaches as far as all but 1.8% of one output
     low, high = after.range_of(output, tail=0.01)
-    low, high = min(low, float(finite.min())), max(high, float(finite.max()))
+    low = min(low, float(finite.min()))
+    high = max(high, float(finite.max()))
     if earlier is not None:
+        # It widens the axis by at most half on each side
         first, last = earlier.range_of(output, tail=0.02)
         room = 0.5 * (high - low)
-        low = min(low, max(first, low - room))
-        high = max(high, min(last, high + room))
+        first = max(first, low - room)
+        last = min(last, high + room)
+        low = min(low, first)
+        high = max(high, last)
     margin = 0.04 * (high - low) or 0.01 * max(abs(low), 1.0)
     return low - margin, high + margin
 

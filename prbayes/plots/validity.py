@@ -100,9 +100,11 @@ def _by_name(tests: ValidityTest | Mapping[str, ValidityTest]) -> dict[str, Vali
 
 def _draw(panel: Panel, test: ValidityTest, title: str) -> None:
     """Draw the ECDF of a test's values, and its distance from the identity."""
-    values, name = test.u_values, "u-value"
+    values = test.u_values
+    name = "u-value"
     if test.folded:
-        values, name = np.abs(2 * values - 1), "|2u - 1|"
+        values = np.abs(2 * values - 1)
+        name = "|2u - 1|"
     color = VERMILION if test.rejected else BLUE
     at, sides = _envelope(test)
     panel.band("envelope", at, sides, PALE, alpha=0.4)

@@ -124,9 +124,12 @@ class _Told:
         for _ in range(_RESAMPLES):
             chosen = rng.integers(n, size=n)
             center, spread = self.combined(self.shifts[chosen])
+            width = np.sqrt(np.diag(spread))
             centers.append(center / sd)
-            widths.append(np.sqrt(np.diag(spread)) / sd)
-        return float(np.std(centers, axis=0).max()), float(np.std(widths, axis=0).max())
+            widths.append(width / sd)
+        of_center = np.std(centers, axis=0).max()
+        of_width = np.std(widths, axis=0).max()
+        return float(of_center), float(of_width)
 
 
 @dataclass(frozen=True)
@@ -321,8 +324,9 @@ _UNADJUSTED = "the draws are not adjusted: {}; their width is epsilon's"
 
 def _moves(before: Floats, after: Floats) -> Floats:
     """Return how far the medians of draws, (n, d), moved, in standard deviations, (d,)."""
-    spreads = [drawn_in(draws, _REACH).std(axis=0) for draws in (before, after)]
-    narrower = np.maximum(np.min(spreads, axis=0), 1e-300)
+    sd_before = drawn_in(before, _REACH).std(axis=0)
+    sd_after = drawn_in(after, _REACH).std(axis=0)
+    narrower = np.maximum(np.minimum(sd_before, sd_after), 1e-300)
     shift = np.median(after, axis=0) - np.median(before, axis=0)
     return np.asarray(np.abs(shift) / narrower)
 

@@ -199,15 +199,18 @@ def _analyse(
 
 def _one(evaluator: Evaluator, job: _Job, rng: np.random.Generator) -> dict[str, Floats]:
     """Draw hyperparameters, and data from their population, and rank them among the draws."""
-    theta = evaluator.prior_thetas(1, int(rng.integers(2**31)))[0]
+    theta_seed = int(rng.integers(2**31))
+    theta = evaluator.prior_thetas(1, theta_seed)[0]
     data = fresh_data(evaluator, theta, rng)
-    asked = Sampling(draws=job.draws, adjust=job.adjust, random_seed=int(rng.integers(2**31)))
-    tree = sample(evaluator.observing(data), asked)
+    draws_seed = int(rng.integers(2**31))
+    asked = Sampling(draws=job.draws, adjust=job.adjust, random_seed=draws_seed)
+    posterior = sample(evaluator.observing(data), asked)["posterior"]
     row = {}
     for name, (truth,) in evaluator.constrained(theta[None]).items():
-        found = np.asarray(tree["posterior"][name])[0]
+        found = np.asarray(posterior[name])[0]
         below = (found < truth).sum(axis=0)
         # Somewhere between the two neighbours, so that ranks are uniform and not discrete.
-        rank = (below + rng.random(np.shape(below))) / (job.draws + 1)
+        between = rng.random(np.shape(below))
+        rank = (below + between) / (job.draws + 1)
         row[name] = np.stack([rank, truth, found.std(axis=0)])
     return row

@@ -158,14 +158,16 @@ def _discrepancies_again(evaluator: Evaluator, thetas: Floats, before: Floats) -
 
 def _sample_stats(stats: list[dict[str, list[float]]]) -> xr.Dataset:
     """Return statistics by chain and stage, NaN after the last one of a chain."""
+    n_chains = len(stats)
     n_stages = max(len(chain["beta"]) for chain in stats)
     variables = {}
     for name in stats[0]:
-        table = np.full((len(stats), n_stages), np.nan)
+        table = np.full((n_chains, n_stages), np.nan)
         for row, chain in zip(table, stats, strict=True):
-            row[: len(chain[name])] = chain[name]
+            known = chain[name]
+            row[: len(known)] = known
         variables[name] = (["chain", "stage"], table)
-    coords = {"chain": np.arange(len(stats)), "stage": np.arange(n_stages)}
+    coords = {"chain": np.arange(n_chains), "stage": np.arange(n_stages)}
     return xr.Dataset(variables, coords=coords)
 
 
@@ -178,7 +180,7 @@ def _support(
     """
     chains, draws, d = thetas.shape
     found = evaluator.support(thetas.reshape(-1, d))
-    variables = {}
+    variables: dict[str, Any] = {}
     for key in ("weight_ess", "mean_weight", "lost_mass", "failed_mass"):
         columns = np.full((chains * draws, len(evaluator.nodes)), np.nan)
         for k, node in enumerate(evaluator.nodes):
@@ -189,9 +191,12 @@ def _support(
         variables[key] = (_EACH_DRAW, columns.reshape(chains, draws, -1))
     too_much = []
     for k, node in enumerate(evaluator.nodes):
-        own = found[node.name]["lost_mass"] if node.name in found else lost[:, :, k]
+        own = lost[:, :, k]
+        if node.name in found:
+            own = found[node.name]["lost_mass"]
         too_much.append(share_of_lossy(own, node.bound.max_lost))
-    return variables | {"lossy_draws": ("simulator", too_much)}
+    variables["lossy_draws"] = ("simulator", too_much)
+    return variables
 
 
 def share_of_lossy(lost: Floats, max_lost: float) -> float:

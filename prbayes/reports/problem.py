@@ -46,17 +46,27 @@ def data(m: Material) -> list[Section]:
     """Return what the measured responses are like, and how outputs depend on each other."""
     if not m.observed:
         return []
-    rows = [row for name in m.observed for row in _rows_of(name, m)]
+    rows = []
+    for name in m.observed:
+        rows += _rows_of(name, m)
     for key in ("failed", "missing"):
         if any(row[key] for row in rows):
             rows = [row | {key: row[key] or "0"} for row in rows]
+    text = ["Measured responses, in the units of the response."]
     known = [] if m.description is None else m.description["simulators"]
-    specimens = [f"{s['name']}: {s['specimens']}." for s in known if s["specimens"]]
-    several = [name for name, y in m.observed.items() if y.ndim > 1]
-    untold = [_untold(name, m) for name in several]
-    text = ("Measured responses, in the units of the response.", *specimens, *filter(None, untold))
-    correlations = [_correlations(name, m) for name in several if m.observed[name].shape[1] > 1]
-    return [Section("Data", text, rows_table(rows)), *correlations]
+    for simulator in known:
+        if simulator["specimens"]:
+            text.append(f"{simulator['name']}: {simulator['specimens']}.")
+    correlations = []
+    for name, y in m.observed.items():
+        if y.ndim == 1:
+            continue
+        untold = _untold(name, m)
+        if untold:
+            text.append(untold)
+        if y.shape[1] > 1:
+            correlations.append(_correlations(name, m))
+    return [Section("Data", tuple(text), rows_table(rows)), *correlations]
 
 
 # Outputs of a simulator that have a row: half a page; of more, as of a curve, some from the first
@@ -66,7 +76,8 @@ _MOST_ROWS = 12
 
 def _rows_of(name: str, m: Material) -> list[dict[str, Any]]:
     """Return a row for each output of a simulator."""
-    y, outputs = m.observed[name], m.outputs.get(name, ONE)
+    y = m.observed[name]
+    outputs = m.outputs.get(name, ONE)
     if y.ndim == 1:
         return [{"simulator": name, "output": "", "units": ""} | _described(y)]
     rows = []

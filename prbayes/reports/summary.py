@@ -120,16 +120,21 @@ def _estimates(m: Material, label: str) -> dict[str, tuple[float, float]]:
         stacked = stacked_draws(m.posteriors[label]["posterior"])
         draws = split_elements(stacked)
         for name in told_elements(stacked):
-            mean, sd = draws[name].mean(), draws[name].std(ddof=1)
-            found[name] = (float(mean), float(sd))
+            values = draws[name]
+            mean = float(values.mean())
+            sd = float(values.std(ddof=1))
+            found[name] = (mean, sd)
     else:
         tree = m.optima[label]
-        point = single_elements(tree["optimum"].data_vars)
-        stderr = single_elements(tree["stderr"].data_vars)
-        for name in told_of(tree["optimum"].data_vars, tree["stderr"].data_vars):
-            found[name] = (point[name], stderr[name])
-    known = _read(m.hyperparameters, {name.partition("[")[0] for name in found})
-    return {name: pair for name, pair in found.items() if name.partition("[")[0] in known}
+        optimum = tree["optimum"].data_vars
+        stderr = tree["stderr"].data_vars
+        points = single_elements(optimum)
+        errors = single_elements(stderr)
+        for name in told_of(optimum, stderr):
+            found[name] = (points[name], errors[name])
+    variables = {name: name.partition("[")[0] for name in found}
+    known = _read(m.hyperparameters, set(variables.values()))
+    return {name: pair for name, pair in found.items() if variables[name] in known}
 
 
 def _read(hyperparameters: Sequence[str], among: Collection[str]) -> list[str]:

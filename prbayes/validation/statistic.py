@@ -32,5 +32,7 @@ def area(u: Floats) -> Floats:
     above = ends[..., 1:] - height
     below = ends[..., :-1] - height
     # The integral of |v| is v |v| / 2.
-    doubled = above * np.abs(above) - below * np.abs(below)
+    upper = above * np.abs(above)
+    lower = below * np.abs(below)
+    doubled = upper - lower
     return np.asarray(doubled.sum(axis=-1) / 2)

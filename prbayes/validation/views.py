@@ -29,7 +29,8 @@ def views(pool: Floats) -> list[Projection]:
     step = -(-len(finite) // _SEEN_BY)
     some = finite[::step]
     every = np.arange(m)
-    white = whitening(some, np.full(len(some), 1 / len(some)), every)
+    equal = np.full(len(some), 1 / len(some))
+    white = whitening(some, equal, every)
     centered = Centered(every, caps, white.center)
     number = max(1, enough(m))
     return [Projection(centered, white.axes @ u) for u in directions(m, number, 0)]
