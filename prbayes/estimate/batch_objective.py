@@ -37,8 +37,12 @@ class BatchObjective:
         *,
         simulators: Sequence[int] | None = None,
         blocks: Sequence[NDArray[np.intp]] = (),
+        stored: Sequence[Floats | None] = (),
     ) -> BatchObjective:
-        """Prepare the observed sides of all data sets; of all simulators by default."""
+        """Prepare the observed sides of all data sets; of all simulators by default.
+
+        With other responses at the designs' points, ``stored``, by simulator, where they are given.
+        """
         every = range(len(evaluator.nodes))
         chosen = tuple(every if simulators is None else simulators)
         # Copied row by row: sums over rows then do not depend on how the weights lie in memory.
@@ -51,7 +55,8 @@ class BatchObjective:
             weights = sets.weights[k][rows, None]
             values = sets.values[k]
             target = node.target.with_observed(values, weights)
-            basis = target.stored(design.values)
+            other = stored[k] if stored else None
+            basis = target.stored(design.values if other is None else other)
             targets.append(target)
             bases.append(basis)
         return cls(evaluator, scales, chosen, targets, bases, blocks)

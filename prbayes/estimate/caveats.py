@@ -229,11 +229,11 @@ def caveats(
 
 
 def _of_design(evaluator: Evaluator, error: float) -> str:
-    points = max(d.n_points for d in evaluator.designs.values())
+    points = max(d.n_runs for d in evaluator.designs.values())
     return (
         f"the optimum of another design would differ by about {error:.2f} standard errors, "
         f"expected at most {AGREE}; pass a larger n or max_points to prb.Reweighted (now {points} "
-        "points)"
+        "runs)"
     )
 
 

@@ -125,7 +125,7 @@ def refine(
                 if not refine_at(evaluator, wanted):
                     break
             refuse(shortcomings(evaluator, wanted), evaluator)
-    return {name: design.n_points for name, design in evaluator.designs.items()}
+    return {name: design.n_runs for name, design in evaluator.designs.items()}
 
 
 def _thetas(evaluator: Evaluator, thetas: Any) -> Floats:
@@ -396,7 +396,7 @@ def _planned(evaluator: Evaluator, asked: Minimisation) -> _Plan:
     """Return what is to be done."""
     clock = time.perf_counter()
     _refuse_random(evaluator, asked.method)
-    stored = sum(d.n_points for d in evaluator.designs.values())
+    stored = sum(d.n_runs for d in evaluator.designs.values())
     free = not evaluator.responses_per_theta
     return _Plan(
         search=Search(

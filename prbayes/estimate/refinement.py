@@ -14,6 +14,7 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
 from prbayes.model.support import Shortcoming, shortcomings
 from prbayes.propagation.base import DesignError
+from prbayes.propagation.reweighted import Design
 
 _log = logging.getLogger("prbayes")
 # Batches added before a design is refused: by judgement; half or twice changes no answer
@@ -50,7 +51,10 @@ def refine_at(evaluator: Evaluator, thetas: Floats) -> dict[str, Shortcoming]:
                 f"{name}: {what}; repair the response there, return +inf for specimens that fail, "
                 "narrow the priors, or raise max_lost"
             )
-    _add(evaluator, thetas, set(short))
+    _reach(evaluator, thetas, set(short))
+    # What a cloud cannot reach needs runs.
+    thin = {name: what for name, what in shortcomings(evaluator, thetas).items() if name in short}
+    _add(evaluator, thetas, set(thin))
     return short
 
 
@@ -91,14 +95,15 @@ def _add(evaluator: Evaluator, thetas: Floats, names: set[str], factor: float = 
         design = node.design
         if design is None or node.name not in names:
             continue
-        first, now = design.config.n, design.n_points
+        now = design.n_runs
+        first = design.batch_size
         batches = max(1, round((factor - 1) * now / first))
         room = design.max_points - now
         size = min(batches * first, room)
         if size > 0:
             design.add(evaluator.roots(thetas, k), size)
             added = True
-            _log.info("%s: refined to %d responses", node.name, design.n_points)
+            _log.info("%s: refined to %d responses", node.name, design.n_runs)
     return added
 
 
@@ -125,7 +130,8 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         best = thetas[order]
         # Let the designs reach them.
         thin = _thin(evaluator, best)
-        growing = {name for name in thin if evaluator.designs[name].n_batches <= MAX_ROUNDS}
+        _reach(evaluator, best, thin)
+        growing = {name for name in thin if _has_room(evaluator.designs[name])}
         _add(evaluator, best, growing)
         # Stop where sampling explains the differences that are left.
         spread = value[order[-1]] - value[order[0]]
@@ -142,6 +148,19 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         z = rng.standard_normal(parents.shape)
         thetas = parents + _PILOT_STEP * z @ root.T
     return best
+
+
+def _reach(evaluator: Evaluator, thetas: Floats, names: set[str]) -> None:
+    """Let the clouds of designs that have one reach the populations at thetas."""
+    for k, node in enumerate(evaluator.nodes):
+        design = node.design
+        if design is not None and design.contents.cloud is not None and node.name in names:
+            design.reach(evaluator.roots(thetas, k))
+
+
+def _has_room(design: Design) -> bool:
+    """Return whether runs are added to a design on the way: a cloud needs none."""
+    return design.contents.cloud is None and design.n_batches <= MAX_ROUNDS
 
 
 def _thin(evaluator: Evaluator, thetas: Floats) -> set[str]:
@@ -171,7 +190,7 @@ def refuse(short: Mapping[str, Shortcoming], evaluator: Evaluator) -> None:
     )
     design = evaluator.designs[next(iter(short))]
     raise DesignError(
-        f"{what}; narrow the priors, pass a larger prb.Reweighted(n) (now {design.n_points} points "
+        f"{what}; narrow the priors, pass a larger prb.Reweighted(n) (now {design.n_runs} runs "
         f"in all, of at most {design.max_points}), or use prb.Resimulated(n), which has no design"
     )
 

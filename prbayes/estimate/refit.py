@@ -175,14 +175,47 @@ class SamplingDistribution:
     def design_error(self) -> float:
         """Return how far the optimum of an independent design would be; NaN if not known.
 
-        In standard errors, along the worst axis. The design is taken apart into blocks, each a
-        coarser design of the same kind, and the minimum of each is found: their spread, as if they
-        were independent, bounds the error of the whole. Points on a line, which cut it into parts
-        of equal mass, are far better together than their parts tell: they count as exact.
+        In standard errors, along the worst axis: of its points, and of emulators.
+        """
+        if not self._stored:
+            return np.nan
+        found = [self._error_of_points(), self._error_of_emulators()]
+        known = [error for error in found if not np.isnan(error).all()]
+        if not known:
+            return np.nan
+        variance = np.sum(np.square(known), axis=0)
+        # Two designs differ by the root of two of one's error.
+        return float(np.sqrt(2 * variance.max(initial=0.0)))
+
+    def _error_of_emulators(self) -> Floats:
+        """Return how far the optimum is off by the emulators' error, (r,); NaN without emulators.
+
+        The minimum of each emulator that lacks a block of the runs is found.
+        """
+        each = [node.design.left_out() if node.design else [] for node in self.evaluator.nodes]
+        number = max(map(len, each))
+        if not number:
+            return np.full(self.stderr.size, np.nan)
+        observed = observed_set(self.evaluator)
+        found = []
+        for b in range(number):
+            stored = [values[b] if values else None for values in each]
+            objective = BatchObjective.of(self.evaluator, self.scales, observed, stored=stored)
+            x, converged = self._minimise(objective)
+            found.append(x[0] if converged[0] else np.full(self.stderr.size, np.inf))
+        return np.asarray(np.sqrt(np.square(found).sum(axis=0)))
+
+    def _error_of_points(self) -> Floats:
+        """Return how far the optimum is off by the design's points, (r,); NaN if not known.
+
+        The design is taken apart into blocks, each a coarser design of the same kind, and the
+        minimum of each is found: their spread, as if they were independent, bounds the error of the
+        whole. Points on a line, which cut it into parts of equal mass, are far better together than
+        their parts tell: they count as exact.
         """
         blocks = self._blocks()
         if not any(block.any() for block in blocks):
-            return np.nan
+            return np.full(self.stderr.size, np.nan)
         # The observed responses against each block.
         observed = observed_set(self.evaluator)
         every = np.zeros(N_BLOCKS, dtype=int)
@@ -191,11 +224,9 @@ class SamplingDistribution:
         objective = BatchObjective.of(self.evaluator, self.scales, sets, blocks=blocks)
         x, converged = self._minimise(objective)
         if converged.sum() < N_BLOCKS / 2:
-            return np.inf
-        # Two designs differ by the root of two of one's error.
+            return np.full(self.stderr.size, np.inf)
         spread = x[converged].std(axis=0, ddof=1)
-        error = spread / np.sqrt(N_BLOCKS)
-        return float(np.sqrt(2) * error.max(initial=0.0))
+        return np.asarray(spread / np.sqrt(N_BLOCKS))
 
     @property
     def _stored(self) -> bool:

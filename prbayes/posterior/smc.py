@@ -204,13 +204,13 @@ class Sampling:
 def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     """Do what `sample_smc` does, for an evaluator."""
     clock = time.perf_counter()
-    in_designs = sum(design.n_points for design in evaluator.designs.values())
+    in_designs = sum(design.n_runs for design in evaluator.designs.values())
     before = evaluator.n_responses - in_designs
     with _epsilons_restored(evaluator), designs_as_before(evaluator):
         adjustment, optimum = _prepared(evaluator, asked)
         rounds = _rounds(evaluator, asked, adjustment, optimum)
         found = rounds.until_supported(asked.progressbar)
-        grown = sum(design.n_points for design in evaluator.designs.values()) > in_designs
+        grown = sum(design.n_runs for design in evaluator.designs.values()) > in_designs
         if found.particles.stopped and grown:
             raise BudgetError(found.particles.stopped)
         if found.reason is not None:

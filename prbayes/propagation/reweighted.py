@@ -21,6 +21,7 @@ from pytensor.gradient import disconnected_grad
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import AT_ONCE, Floats, positive_integer
+from prbayes.emulators.emulator import MOST_RUNS
 from prbayes.metrics.base import Discrepancy
 from prbayes.propagation.base import (
     MAX_LOST,
@@ -31,6 +32,15 @@ from prbayes.propagation.base import (
     refuse_all_nan,
     refuse_max_lost,
     refuse_nested,
+)
+from prbayes.propagation.cloud import (
+    CLOUD,
+    LARGEST_CLOUD,
+    Cloud,
+    Emulation,
+    Table,
+    candidates_of,
+    some_of,
 )
 from prbayes.propagation.edges import (
     averaged_log_density,
@@ -61,6 +71,8 @@ _COMPONENTS = 512
 # Numbers of a basis in a compiled graph, 1 GiB, when the design has grown to its largest. Graphs
 # without it are as fast (benchmarks/joint_speed.py), but JAX does not know their operations.
 _MOST_NUMBERS = 1 << 27
+# Populations whose weights tell how far an emulator is trusted.
+_WEIGHED = 32
 # Neighbours on either side in the cells of an input whose support moves, beside other inputs: its
 # points then pass an edge some at a time, as their weights differ. On a line the cells meet.
 _ABREAST = 8
@@ -119,6 +131,7 @@ class Reweighted(Propagation):
     random_seed: int = 0
     max_lost: float = MAX_LOST
     max_points: int | None = None
+    emulator: Any = "auto"
 
     def __post_init__(self) -> None:
         self.check()
@@ -181,10 +194,23 @@ class Batches:
 
 
 @dataclass(frozen=True, eq=False)
+class Contents:
+    """What is in a design: its runs, and the points that weights are taken of."""
+
+    batches: Batches
+    # Populations for which points were drawn: each group has one array for each root, (k, *shape).
+    groups: tuple[tuple[Floats, ...], ...]
+    table: Table
+    cloud: Cloud | None = None
+    emulation: Emulation | None = None
+    clouds: int = 0  # how many were drawn
+
+
+@dataclass(frozen=True, eq=False)
 class Mark:
     """A design as it was at some time."""
 
-    batches: Batches
+    contents: Contents
     shared: tuple[Any, ...]  # what its compiled graphs read
     runs: tuple[Any, ...]  # what other designs of the response may take from it
 
@@ -205,9 +231,9 @@ class Design(Bound):
         super().__init__(name, inputs, target, responses)
         self.config = config
         self.max_lost = config.max_lost
-        self._stored: Batches | None = None
+        self._contents: Contents | None = None
         self._shared: list[Any] = []
-        self._basis: tuple[Any, int, Any] = (None, 0, None)
+        self._basis: tuple[Any, Any, Any] = (None, None, None)
         # More conditions than a study has, fewer than fill the memory.
         self._others: deque[tuple[Responses, Floats]] = deque(maxlen=32)
         self._taken_back: Batches | None = None  # all that there were when some were forgotten
@@ -241,25 +267,54 @@ class Design(Bound):
     # -- What the design is --
 
     @property
+    def contents(self) -> Contents:
+        """All of it; there is always at least one batch of runs."""
+        assert self._contents is not None
+        return self._contents
+
+    @property
     def batches(self) -> Batches:
-        """The points so far; there is always at least one batch."""
-        assert self._stored is not None
-        return self._stored
+        """The runs so far."""
+        return self.contents.batches
 
     @property
     def values(self) -> Floats:
-        """The stored responses, (n,) or (n, m)."""
-        return self.batches.values
+        """The responses that have weights, (n,) or (n, m): those of runs, or emulated."""
+        return self.contents.table.values
 
     @property
     def n_batches(self) -> int:
-        """How often points were added."""
-        return 0 if self._stored is None else len(self._stored.sizes)
+        """How often runs were added."""
+        return 0 if self._contents is None else len(self._contents.batches.sizes)
 
     @property
     def n_points(self) -> int:
-        """Number of stored responses."""
+        """Number of points that have weights."""
         return len(self.values)
+
+    @property
+    def n_runs(self) -> int:
+        """Number of stored responses."""
+        return len(self.batches.values)
+
+    @property
+    def emulates(self) -> bool:
+        """Whether responses between the runs are emulated."""
+        emulator = self.config.emulator
+        if emulator is None:
+            return False
+        if not isinstance(emulator, str):
+            return True
+        continuous = all(x.dtype.startswith("float") for x in self.inputs.aleatory)
+        few = self._contents is None or self.n_runs <= MOST_RUNS
+        return continuous and few and self.dimensions > 1
+
+    @property
+    def batch_size(self) -> int:
+        """How many runs are added at a time, at least."""
+        if self.contents.cloud is None:
+            return self.config.n
+        return max(self.config.n // 4, self.responses.workers)
 
     @property
     def max_points(self) -> int:
@@ -269,12 +324,12 @@ class Design(Bound):
     @property
     def known_responses(self) -> Floats:
         """The stored responses."""
-        return self.values
+        return self.batches.values
 
     @property
     def first_responses(self) -> Floats:
         """Those of the first batch."""
-        return self.values[: self.batches.sizes[0]]
+        return self.batches.values[: self.batches.sizes[0]]
 
     def aim(self, target: Discrepancy) -> None:
         """Compare with the same data in another way from here on; before anything is compiled."""
@@ -318,10 +373,14 @@ class Design(Bound):
         Consecutive points of a Sobol sequence, of which each stretch is a net of its own; on a line
         every eighth.
         """
+        return self.contents.table.blocks
+
+    def _blocks_of(self, sizes: Sequence[int]) -> NDArray[np.intp]:
+        """Return the block of each run, of batches of some sizes."""
         if self.is_line:
-            return np.arange(self.n_points) % N_BLOCKS
+            return np.arange(sum(sizes)) % N_BLOCKS
         found = []
-        for size in self.batches.sizes:
+        for size in sizes:
             place = np.arange(size) * N_BLOCKS
             found.append(place // size)
         return np.concatenate(found)
@@ -330,7 +389,10 @@ class Design(Bound):
 
     def points_of(self, inputs: Inputs) -> list[Floats]:
         """Return the points of some of the design's aleatory inputs, shapes (n, *event)."""
-        points = self.batches.points
+        return self._ordered(inputs, self.contents.table.points)
+
+    def _ordered(self, inputs: Inputs, points: Sequence[Floats]) -> list[Floats]:
+        """Return points of some of the design's aleatory inputs, in the order of these."""
         own = list(map(id, self.inputs.aleatory))
         wanted = map(id, inputs.aleatory)
         places = map(own.index, wanted)
@@ -345,8 +407,8 @@ class Design(Bound):
             return self.values
         before = [pair for pair in self._others if responses.same_as(pair[0])]
         known = before[0][1] if before else np.empty(0)
-        if len(known) < self.n_points:
-            points = self.points_of(responses.inputs)
+        if len(known) < self.n_runs:
+            points = self._ordered(responses.inputs, self.batches.points)
             missing = [p[len(known) :] for p in points]
             more = once_each(responses, missing, Known(points, known))
             known = np.concatenate([known.reshape(-1, *more.shape[1:]), more])
@@ -354,13 +416,21 @@ class Design(Bound):
             if before:
                 self._others.remove(before[0])
             self._others.append((responses, known))
-        return known
+        return self._tabulated(known)
+
+    def _tabulated(self, known: Floats) -> Floats:
+        """Return another response of the points that have weights, of that of the runs."""
+        contents = self.contents
+        if contents.cloud is None or contents.emulation is None:
+            return known
+        said = contents.emulation.with_values(known).at(contents.cloud)
+        return np.concatenate([said, known]) if contents.emulation.share else said
 
     def same_points(self, other: Bound) -> bool:
         """Return whether another design has the same points, whose responses belong together."""
         if not isinstance(other, Design):
             return False
-        pairs = zip(self.batches.points, other.batches.points, strict=True)
+        pairs = zip(self.contents.table.points, other.contents.table.points, strict=True)
         return all(np.array_equal(a, b) for a, b in pairs)
 
     # -- Adding points --
@@ -390,21 +460,110 @@ class Design(Bound):
         points = self._off_the_edges(points, components, counts)
         values = self._responses_at(points)
         batch = Batches(tuple(points), values, tuple(components), counts, (n,))
-        self._stored = batch if self._stored is None else self._stored.followed_by(batch)
-
-        # The mixture is that of all batches, so its density changes at the old points too.
-        stored = self.batches
-        log_g, sums = self._log_mixture(stored.components, stored.counts, stored.points)
+        before = self._contents
+        batches = batch if before is None else before.batches.followed_by(batch)
         if self._moving is None:
             self._moving = moving_inputs(self.name, self.inputs, components, points)
             self.support_moves = bool(self._moving)
-        basis = self._basis_of(self.values)
-        ends = self._cell_ends()
-        self._share([*stored.points, log_g, *ends, *basis])
-        log_ess = 2 * sums[0] - sums[1]
-        ess = np.exp(log_ess)
-        of_these = ess[-len(counts) :]
-        return float(np.median(of_these))
+        return self._drawn(batches, components, len(counts))
+
+    def reach(self, components: Sequence[Floats]) -> float:
+        """Let the cloud reach populations, without a run.
+
+        Returns
+        -------
+        float
+            The median weight effective sample size over these populations.
+        """
+        components = self.valid_only(components)
+        return self._drawn(self.batches, components)
+
+    def _drawn(self, batches: Batches, components: Sequence[Floats], fresh: int = 0) -> float:
+        """Make the table of points anew, of batches and for populations that matter."""
+        # The mixture is that of all batches, so its density changes at the old points too.
+        log_g, sums = self._log_mixture(batches.components, batches.counts, batches.points)
+        table = Table(batches.points, batches.values, log_g, self._blocks_of(batches.sizes))
+        before = self._contents
+        groups = () if before is None else before.groups
+        # The prior, and where it was last.
+        groups = (*groups[:1], *groups[1:][-1:], tuple(components))
+        contents = Contents(batches, groups, table, clouds=0 if before is None else before.clouds)
+        self._contents = contents
+        if self.emulates:
+            contents = self._emulated(contents)
+        self._contents = contents
+        self._share(self._arrays())
+        if fresh and contents.cloud is None:
+            log_ess = 2 * sums[0] - sums[1]
+            ess = np.exp(log_ess)
+            of_these = ess[-fresh:]
+            return float(np.median(of_these))
+        return self._median_ess(some_of([components]))
+
+    def _emulated(self, contents: Contents) -> Contents:
+        """Return the same with a cloud whose responses are emulated, where that is better."""
+        runs = contents.table
+        near = some_of([contents.groups[-1]])
+        few = np.linspace(0, len(near[0]) - 1, min(_WEIGHED, len(near[0]))).astype(int)
+        near = [values[few] for values in near]
+        emulation = Emulation.of(
+            candidates_of(self.config.emulator),
+            runs.points,
+            runs.values,
+            self._weights_at(near, runs),
+            runs.blocks,
+        )
+        if emulation is None:
+            return contents
+        components = some_of(contents.groups)
+        size = CLOUD
+        place = self._equal_mass if self.is_line else self._place
+        while True:
+            # Another prime, so that no cloud shares points with a batch.
+            seed = self.config.random_seed + 104_729 * (1 + contents.clouds)
+            points, counts = place(components, size, seed)
+            points = self._off_the_edges(points, components, counts)
+            log_g, _ = self._log_mixture(components, counts, points, summed=False)
+            cloud = Cloud(tuple(points), log_g)
+            table = emulation.joined(cloud, emulation.at(cloud), runs)
+            found = Contents(
+                contents.batches, contents.groups, table, cloud, emulation, contents.clouds + 1
+            )
+            self._contents = found
+            enough = self._median_ess(near) > self.required_ess
+            if enough or emulation.share or size >= LARGEST_CLOUD:
+                return found
+            size *= 2
+
+    def left_out(self) -> list[Floats]:
+        """Return the responses as emulators say that lack a block of runs each; none without one."""
+        contents = self.contents
+        if contents.cloud is None or contents.emulation is None:
+            return []
+        found = []
+        for said in contents.emulation.without_each_block(contents.cloud):
+            own = contents.table.values[len(said) :]
+            found.append(np.concatenate([said, own]))
+        return found
+
+    def _arrays(self) -> list[Any]:
+        """Return what compiled graphs read."""
+        table = self.contents.table
+        return [*table.points, table.log_g, *self._cell_ends(), *self._basis_of(table.values)]
+
+    def _weights_at(self, components: Sequence[Floats], table: Table) -> Floats:
+        """Return weights of a table's points in some populations, (T, n): they sum to one."""
+        (logs,) = self._log_density(*components, *table.points)
+        logs = logs - table.log_g
+        top = logs.max(axis=1, keepdims=True)
+        weights = np.exp(logs - np.where(np.isfinite(top), top, 0.0))
+        total = weights.sum(axis=1, keepdims=True)
+        even = 1 / weights.shape[1]
+        return np.asarray(np.where(total > 0, weights / np.where(total > 0, total, 1.0), even))
+
+    def _median_ess(self, components: Sequence[Floats]) -> float:
+        weights = self._weights_at(components, self.contents.table)
+        return float(np.median(1 / (weights**2).sum(axis=1)))
 
     @property
     def _too_many(self) -> bool:
@@ -433,8 +592,8 @@ class Design(Bound):
         if shared is not None:
             self.responses.find(len(shared))
             return shared
-        stored = self._stored
-        own = None if stored is None else Known(stored.points, stored.values)
+        stored = self._contents
+        own = None if stored is None else Known(stored.batches.points, stored.batches.values)
         values = once_each(self.responses, points, own)
         runs.stored.append((list(points), values))
         return values
@@ -457,7 +616,7 @@ class Design(Bound):
         reach = 1 if self.is_line else _ABREAST
         found = []
         for i in self._moving or ():
-            cells = cells_around(self.batches.points[i], reach)
+            cells = cells_around(self.contents.table.points[i], reach)
             found += [cells.lower, cells.upper]
         return found
 
@@ -578,7 +737,7 @@ class Design(Bound):
     def mark(self) -> Mark:
         """Return what brings the design back to what it is now."""
         runs = tuple(self.responses.runs.stored)
-        return Mark(self.batches, tuple(s.get_value() for s in self._shared), runs)
+        return Mark(self.contents, tuple(s.get_value() for s in self._shared), runs)
 
     def go_back(self, mark: Mark, *, remember: bool = False) -> None:
         """Forget the batches since a mark; their responses may be remembered for the next time."""
@@ -586,10 +745,10 @@ class Design(Bound):
             self._taken_back = self.batches
         else:
             self.responses.runs.stored[:] = mark.runs
-        self._stored = mark.batches
-        kept = [(responses, known[: self.n_points]) for responses, known in self._others]
+        self._contents = mark.contents
+        kept = [(responses, known[: self.n_runs]) for responses, known in self._others]
         self._others = deque(kept, maxlen=self._others.maxlen)
-        self._basis = (None, 0, None)
+        self._basis = (None, None, None)
         self._share(mark.shared)
 
     def _share(self, arrays: Sequence[Any]) -> None:
@@ -683,8 +842,8 @@ class Design(Bound):
 
         +inf where none has support.
         """
-        wanted = (target, self.n_points)
-        if self._basis[:2] != wanted:
+        wanted = (target, self.contents.table)
+        if any(a is not b for a, b in zip(self._basis, wanted, strict=False)):
             made = target.stored(self.values)
             self._basis = (*wanted, made)
         *_, basis = self._basis

@@ -24,6 +24,7 @@ from prbayes.response.calling import (
     scalar,
     shapes,
 )
+from prbayes.response.executors import capacity
 from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import ONE, Outputs, outputs_of_result
@@ -202,6 +203,11 @@ class Responses:
     def failed(self) -> tuple[Failure, ...]:
         """The points that failed, each once, with their reasons; the first ten thousand."""
         return tuple(self._tally.failed.values())
+
+    @property
+    def workers(self) -> int:
+        """How many compute at a time."""
+        return capacity(self._calling.executor).workers
 
     @property
     def folder(self) -> Path | None:

@@ -1,6 +1,6 @@
 """Response surfaces that stand for a response within the ranges of their runs."""
 
 from prbayes.surrogate.error import CrossValidation
-from prbayes.surrogate.surfaces import Polynomial, RadialBasis, Surface
+from prbayes.emulators.surfaces import Polynomial, RadialBasis, Surface
 
 __all__ = ["CrossValidation", "Polynomial", "RadialBasis", "Surface"]

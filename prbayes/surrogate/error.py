@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes.surrogate.surfaces import Surface, fitted
+from prbayes.emulators.surfaces import Surface, fitted
 
 # Tenfold: Kohavi (1995), A study of cross-validation and bootstrap for accuracy estimation and
 # model selection, IJCAI. More folds are nearer to the surface through all points, and cost as many

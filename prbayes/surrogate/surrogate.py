@@ -32,7 +32,7 @@ from prbayes.surrogate.error import CrossValidation, cross_validated, points_nee
 from prbayes.surrogate.files import Kept, read, write
 from prbayes.surrogate.noise import hashed_rows
 from prbayes.surrogate.ranges import Ranges, read_ranges
-from prbayes.surrogate.surfaces import Predict, RadialBasis, Surface, fitted, settings_of, shipped
+from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted, settings_of, shipped
 
 _log = logging.getLogger("prbayes")
 

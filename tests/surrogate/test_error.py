@@ -7,7 +7,7 @@ import pytest
 
 import prbayes as prb
 from prbayes.surrogate.error import FOLDS, CrossValidation, cross_validated, points_needed
-from prbayes.surrogate.surfaces import Surface
+from prbayes.emulators.surfaces import Surface
 
 BOX = {"x": (0.0, 3.0), "y": (1.0, 2.0)}
 

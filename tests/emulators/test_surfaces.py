@@ -8,7 +8,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF
 
 import prbayes as prb
-from prbayes.surrogate.surfaces import Surface, fitted, settings_of, shipped
+from prbayes.emulators.surfaces import Surface, fitted, settings_of, shipped
 
 BOX = {"x": (0.0, 3.0), "y": (1.0, 2.0)}
 

@@ -214,27 +214,47 @@ def fitted(model: Any, x: Floats, y: Floats) -> Predict:
     model : Surface or regressor
         A regressor has ``fit(X, y)`` and ``predict(X)``.
     x : ndarray, shape (n, d)
-        In the unit cube.
-    y : ndarray, shape (n,)
-        In units of the response.
+        In the unit cube, or in units of their spread.
+    y : ndarray, shape (n,) or (n, m)
+        In units of the response; of several outputs each has a surface of its own.
 
     Returns
     -------
     callable
-        From points, shape (k, d), to responses, shape (k,).
+        From points, shape (k, d), to responses, shape (k,) or (k, m).
     """
-    center = y.mean()
+    center = y.mean(axis=0)
+    spread = y.std(axis=0)
     # A response that is constant has no spread to divide by.
-    spread = y.std() or 1.0
+    spread = np.where(spread > 0, spread, 1.0)
     z = (y - center) / spread
-    if isinstance(model, Surface):
-        predict = model.through(x, z)
+    if z.ndim == 1 or isinstance(model, RadialBasis | Polynomial):
+        predict = _through(model, x, z)
     else:
-        regressor = copy.deepcopy(model)
-        regressor.fit(x, z)
-        predict = regressor.predict
-
+        predict = _SideBySide(tuple(_through(model, x, column) for column in z.T))
     return _InUnits(predict, center, spread)
+
+
+def _through(model: Any, x: Floats, z: Floats) -> Predict:
+    """Return a surface, or what a regressor that was fitted predicts."""
+    if isinstance(model, Surface):
+        return model.through(x, z)
+    regressor = copy.deepcopy(model)
+    regressor.fit(x, z)
+    predict: Predict = regressor.predict
+    return predict
+
+
+@dataclass(frozen=True, eq=False)
+class _SideBySide:
+    """Surfaces of several outputs."""
+
+    surfaces: tuple[Predict, ...]
+
+    def __call__(self, at: Floats) -> Floats:
+        # Some regressors give a column.
+        columns = [np.asarray(surface(at)).reshape(len(at)) for surface in self.surfaces]
+        return np.stack(columns, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,10 +262,11 @@ class _InUnits:
     """A surface through responses of unit spread, in the response's own units."""
 
     predict: Predict
-    center: float
-    spread: float
+    center: Any
+    spread: Any
 
     def __call__(self, at: Floats) -> Floats:
         values = np.asarray(self.predict(at), dtype=np.float64)
         # Some regressors give a column.
-        return np.asarray(self.center + self.spread * values.reshape(len(at)))
+        values = values.reshape(len(at), *np.shape(self.center))
+        return np.asarray(self.center + self.spread * values)

@@ -1,0 +1,169 @@
+"""Points that a design's weights are taken of: its runs, or a cloud whose responses are emulated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prbayes._checks import Floats
+from prbayes.emulators.emulator import CANDIDATES, Runs, chosen, each_block, emulated
+from prbayes.emulators.share import share_of_runs
+from prbayes.propagation.base import N_BLOCKS
+
+# Points of a cloud at first, and at most: they cost no run.
+CLOUD = 8192
+LARGEST_CLOUD = 65536
+# Populations whose mixture a cloud is drawn from; more would cost time and add nothing.
+_POPULATIONS = 384
+# Share of the runs in a population from which on it is theirs alone, and to which it is the
+# emulator's: what is in between has the least error.
+_ALONE, _LITTLE = 0.95, 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Points with their responses and density, of which weights are taken.
+
+    Attributes
+    ----------
+    points : tuple of ndarray, shapes (n, *event)
+        Of each aleatory input.
+    values : ndarray, shape (n,) or (n, m)
+        Their responses.
+    log_g : ndarray, shape (n,)
+        Log density of the mixture that they were drawn from.
+    blocks : ndarray, shape (n,)
+        Which of eight coarser tables each point belongs to.
+    """
+
+    points: tuple[Floats, ...]
+    values: Floats
+    log_g: Floats
+    blocks: NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points without runs, and how their responses are emulated."""
+
+    points: tuple[Floats, ...]  # (M, *event): of each aleatory input
+    log_g: Floats  # (M,)
+
+    def __len__(self) -> int:
+        return len(self.log_g)
+
+
+@dataclass(frozen=True, eq=False)
+class Emulation:
+    """An emulator of one response on the runs of a design, with a cloud to say it of.
+
+    Attributes
+    ----------
+    runs : Runs
+    model : object
+        The surface that was chosen.
+    share : float
+        The share of a population that the runs are.
+    event : tuple of int
+        Shape of one response: () or (m,).
+    """
+
+    runs: Runs
+    model: Any
+    share: float
+    event: tuple[int, ...]
+
+    @classmethod
+    def of(
+        cls,
+        candidates: Sequence[Any],
+        points: Sequence[Floats],
+        values: Floats,
+        weights: Floats,
+        blocks: NDArray[np.intp],
+    ) -> Emulation | None:
+        """Choose an emulator; None where runs alone are as good.
+
+        Parameters
+        ----------
+        candidates : sequence of Surface or regressor
+        points : sequence of ndarray, shapes (n, *event)
+        values : ndarray, shape (n,) or (n, m)
+        weights : ndarray, shape (T, n)
+            Of the runs in the populations that matter.
+        blocks : ndarray, shape (n,)
+        """
+        x, y = columns(points), values.reshape(len(values), -1)
+        runs = Runs(x, y, weights.mean(axis=0), blocks)
+        try:
+            model, said = chosen(candidates, runs)
+        except np.linalg.LinAlgError:
+            return None
+        share = share_of_runs(weights, y, said, blocks)
+        if share > _ALONE:
+            return None
+        return cls(runs, model, 0.0 if share < _LITTLE else share, values.shape[1:])
+
+    def at(self, cloud: Cloud) -> Floats:
+        """Return the responses at the cloud's points, (M,) or (M, m)."""
+        found = emulated(self.model, self.runs, columns(cloud.points))
+        return found.reshape(-1, *self.event)
+
+    def without_each_block(self, cloud: Cloud) -> list[Floats]:
+        """Return the same from emulators that were fitted without a block of the runs each."""
+        at = columns(cloud.points)
+        found = []
+        for block, _ in each_block(self.runs):
+            values = emulated(self.model, self.runs, at, ~block)
+            found.append(values.reshape(-1, *self.event))
+        return found
+
+    def joined(self, cloud: Cloud, said: Floats, runs: Table) -> Table:
+        """Return cloud and runs as one table, in which the runs have their share."""
+        m, n = len(cloud), len(runs.log_g)
+        blocks = np.arange(m) * N_BLOCKS // m
+        if not self.share:
+            return Table(cloud.points, said, cloud.log_g, blocks)
+        # Weights are p / g: that of all points together is on average one.
+        of_cloud = cloud.log_g - np.log((1 - self.share) * (m + n) / m)
+        of_runs = runs.log_g - np.log(self.share * (m + n) / n)
+        pairs = zip(cloud.points, runs.points, strict=True)
+        return Table(
+            points=tuple(np.concatenate([a, b]) for a, b in pairs),
+            values=np.concatenate([said, runs.values]),
+            log_g=np.concatenate([of_cloud, of_runs]),
+            blocks=np.concatenate([blocks, runs.blocks]),
+        )
+
+    def with_values(self, values: Floats) -> Emulation:
+        """Return the same emulator of another response of the runs."""
+        runs = replace(self.runs, y=values.reshape(len(values), -1))
+        return replace(self, runs=runs, event=values.shape[1:])
+
+
+def candidates_of(emulator: Any) -> tuple[Any, ...]:
+    """Return the surfaces that are tried: several by default, or the user's own."""
+    return CANDIDATES if isinstance(emulator, str) else (emulator,)
+
+
+def columns(points: Sequence[Floats]) -> Floats:
+    """Return inputs as columns, (n, d)."""
+    flat = [x.reshape(len(x), -1).astype(float) for x in points]
+    return np.concatenate(flat, axis=1)
+
+
+def some_of(groups: Sequence[Sequence[Floats]]) -> list[Floats]:
+    """Return the populations of a cloud's mixture, of groups of them: half are of the last group."""
+    *before, last = groups
+    shares = [*(_POPULATIONS // 2 // len(before) for _ in before), _POPULATIONS // 2]
+    if not before:
+        shares = [_POPULATIONS]
+    found = []
+    for group, most in zip(groups, shares, strict=True):
+        places = np.linspace(0, len(group[0]) - 1, min(most, len(group[0]))).astype(int)
+        found.append([values[places] for values in group])
+    return [np.concatenate(same) for same in zip(*found, strict=True)]
