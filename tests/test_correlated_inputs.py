@@ -88,7 +88,8 @@ def exact_errors() -> tuple[Floats, float]:
 
 @pytest.fixture(scope="module")
 def optimum() -> prb.Optimum:
-    model = model_of(ENOUGH, prb.KullbackLeibler(), max_points=2048)
+    # The runs alone leave an element of the factor just not identified.
+    model = model_of(ENOUGH, prb.KullbackLeibler(), max_points=2048, emulator=None)
     return prb.minimize(model, starts=0, progressbar=False)
 
 

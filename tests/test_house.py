@@ -27,7 +27,7 @@ README_SCRIPT = re.findall(r"^```python\n(.*?)^```", README, re.MULTILINE | re.D
 # Each floor may import from those before it; rooms of one floor do not import each other.
 LAYERS = (
     ("_checks", "_progress", "_weighted", "datasets"),
-    ("metrics", "response"),
+    ("metrics", "response", "emulators"),
     ("propagation",),
     ("model",),
     ("estimate", "surrogate"),

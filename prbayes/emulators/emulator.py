@@ -5,27 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import comb
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
+from prbayes.emulators.gaussian_process import MOST_TUNED, GaussianProcess
 from prbayes.emulators.surfaces import RadialBasis, Surface, fitted
 
 # Runs that a surface goes through at most: its cost grows with their cube. More are left to the
 # weights, which are then good enough.
 MOST_RUNS = 2000
-# Surfaces that are tried. Splines that bend little beside those that bend much: what is best
-# depends on the response (benchmarks/emulators.py).
-CANDIDATES: tuple[Surface, ...] = (
-    RadialBasis("linear"),
-    RadialBasis("cubic"),
-    RadialBasis("cubic", degree=2),
-    RadialBasis("quintic"),
-)
-
-
 @dataclass(frozen=True, eq=False)
 class Runs:
     """Runs that an emulator is fitted on.
@@ -71,25 +63,46 @@ class Runs:
     def among(self, kept: NDArray[np.bool_]) -> NDArray[np.intp]:
         """Return which of the runs kept a surface goes through: different, good, and not too many.
 
-        Those that matter least are left out first.
+        Of too many, half are those that matter most, and half some of the others.
         """
         rows = np.flatnonzero(kept & self.good)
         _, first = np.unique(self.x[rows], axis=0, return_index=True)
         rows = rows[np.sort(first)]
         if rows.size > MOST_RUNS:
             order = np.argsort(-self.importance[rows], kind="stable")
-            rows = np.sort(rows[order[:MOST_RUNS]])
+            first = order[: MOST_RUNS // 2]
+            rest = np.linspace(first.size, rows.size - 1, MOST_RUNS - first.size).astype(int)
+            rows = np.sort(rows[np.concatenate([first, order[rest]])])
         return rows
+
+
+def candidates(n: int, dimensions: int) -> list[Surface]:
+    """Return the surfaces that are tried on so many runs.
+
+    Processes with a length for each input are best on nearly all responses, and a spline around a
+    polynomial on responses that are almost polynomials (`python -m benchmarks.emulators`).
+    """
+    degree = 2
+    # A third as many terms as there are runs.
+    while degree < 8 and 3 * comb(dimensions + degree + 1, dimensions) <= n:
+        degree += 1
+    return [
+        GaussianProcess("squared_exponential"),
+        GaussianProcess("matern"),
+        RadialBasis("quintic", degree=degree),
+    ]
 
 
 def enough(model: Any, n: int, dimensions: int) -> bool:
     """Return whether so many runs determine a surface, and leave some to tell its error."""
     terms = model.terms(dimensions) if isinstance(model, Surface) else 1
-    # Twice the terms: else its polynomial takes up what tells the error.
-    return n >= 2 * terms
+    # Else its polynomial takes up what tells the error.
+    return 2 * n >= 3 * terms
 
 
-def emulated(model: Any, runs: Runs, at: Floats, kept: NDArray[np.bool_] | None = None) -> Floats:
+def emulated(
+    models: Sequence[Any], runs: Runs, at: Floats, kept: NDArray[np.bool_] | None = None
+) -> Floats:
     """Return what the outputs are about at points.
 
     Where the nearest run failed, the outputs are those of that run. Nothing is said to be further
@@ -97,7 +110,8 @@ def emulated(model: Any, runs: Runs, at: Floats, kept: NDArray[np.bool_] | None 
 
     Parameters
     ----------
-    model : Surface or regressor
+    models : sequence of Surface or regressor
+        Of each output.
     runs : Runs
     at : ndarray, shape (k, d)
     kept : ndarray of bool, shape (n,), optional
@@ -109,11 +123,12 @@ def emulated(model: Any, runs: Runs, at: Floats, kept: NDArray[np.bool_] | None 
     """
     kept = np.ones(len(runs.x), dtype=bool) if kept is None else kept
     rows = runs.among(kept)
-    y = runs.y[rows]
-    values = fitted(model, runs.scaled(runs.x[rows]), y)(runs.scaled(at))
+    x, y = runs.scaled(runs.x[rows]), runs.y[rows]
+    points = runs.scaled(at)
+    each = [fitted(model, x, own)(points) for model, own in zip(models, y.T, strict=True)]
     lowest, highest = y.min(axis=0), y.max(axis=0)
     reach = highest - lowest
-    values = np.clip(values, lowest - reach, highest + reach)
+    values = np.clip(np.stack(each, axis=1), lowest - reach, highest + reach)
     if not runs.good[kept].all():
         nearest = _nearest(runs, kept, at)
         failed = ~runs.good[nearest]
@@ -131,48 +146,73 @@ def _nearest(runs: Runs, kept: NDArray[np.bool_], at: Floats) -> NDArray[np.intp
     return np.asarray(rows[which])
 
 
-def left_out(model: Any, runs: Runs) -> Floats:
+def left_out(models: Sequence[Any], runs: Runs) -> Floats:
     """Return what surfaces say at the runs that were fitted without the block of each, (n, m)."""
     found = np.empty_like(runs.y)
-    for block, _ in each_block(runs):
-        found[block] = emulated(model, runs, runs.x[block], ~block)
+    for block in each_block(runs):
+        found[block] = emulated(models, runs, runs.x[block], ~block)
     return found
 
 
-def each_block(runs: Runs) -> Iterator[tuple[NDArray[np.bool_], int]]:
-    """Yield which runs are in each block, and its number."""
+def each_block(runs: Runs) -> Iterator[NDArray[np.bool_]]:
+    """Yield which runs are in each block."""
     for number in np.unique(runs.blocks).tolist():
-        yield runs.blocks == number, number
+        yield runs.blocks == number
 
 
-def chosen(candidates: Sequence[Any], runs: Runs) -> tuple[Any, Floats]:
-    """Return the candidate whose left-out errors are smallest, and what it says of runs left out.
+def chosen(tried: Sequence[Any], runs: Runs) -> tuple[tuple[Any, ...], Floats]:
+    """Return for each output the surface whose left-out errors are smallest, and what it says.
 
-    Errors are squared, in units of each output's spread, where the populations that matter live.
+    Errors are squared, and count where the populations that matter live.
+
+    Returns
+    -------
+    models : tuple of Surface or regressor
+        Of each output.
+    said : ndarray, shape (n, m)
+        What they say of runs that were left out.
 
     Raises
     ------
     numpy.linalg.LinAlgError
         If none can be fitted.
     """
-    rows = runs.among(np.ones(len(runs.x), dtype=bool))
-    spread = runs.y[rows].std(axis=0)
-    spread = np.where(spread > 0, spread, 1.0)
-    least, best = np.inf, None
-    # Half of the importance is the same for all: that of a few would be luck.
-    importance = 0.5 * runs.importance + 0.5 / len(runs.x)
-    for model in candidates:
-        smallest = rows.size - rows.size // np.unique(runs.blocks).size - 1
+    n, m = runs.y.shape
+    rows = runs.among(np.ones(n, dtype=bool))
+    least, models = np.full(m, np.inf), [None] * m
+    best = np.empty_like(runs.y)
+    # Some of the importance is the same for all: that of a few would be luck.
+    importance = runs.importance[rows] + 0.1 / n
+    smallest = rows.size - rows.size // np.unique(runs.blocks).size - 1
+    for model in tried:
         if not enough(model, smallest, runs.x.shape[1]):
             continue
         try:
-            said = left_out(model, runs)
+            own = _tuned(model, runs, rows)
+            said = left_out(own, runs)
         except np.linalg.LinAlgError:
             continue
-        off = (said[rows] - runs.y[rows]) / spread
-        error = float(importance[rows] @ np.nan_to_num(off**2, nan=1.0, posinf=1.0).sum(axis=1))
-        if error < least:
-            least, best = error, (model, said)
-    if best is None:
+        # A run that failed by its neighbour is off by the spread.
+        spread = runs.y[rows].std(axis=0)
+        off = np.where(np.isfinite(said[rows]), said[rows] - runs.y[rows], spread)
+        error = importance @ off**2
+        for k in np.flatnonzero(error < least):
+            least[k], models[k], best[:, k] = error[k], own[k], said[:, k]
+    if None in models:
         raise np.linalg.LinAlgError("no surface goes through the runs")
-    return best
+    return tuple(models), best
+
+
+def _tuned(model: Any, runs: Runs, rows: NDArray[np.intp]) -> list[Any]:
+    """Return a model with settings of its own for each output."""
+    if not isinstance(model, Surface):
+        return [model] * runs.y.shape[1]
+    # Those that matter most, should it take only some.
+    order = np.argsort(-runs.importance[rows], kind="stable")
+    some = np.sort(rows[order[:MOST_TUNED]])
+    x = runs.scaled(runs.x[some])
+    found = []
+    for own in runs.y[some].T:
+        spread = own.std() or 1.0
+        found.append(model.tuned(x, (own - own.mean()) / spread))
+    return found

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 
 # Levels at which distribution functions are compared: no more are different with few runs.
-_LEVELS = 32
+_THRESHOLDS = 32
 
 
 def share_of_runs(weights: Floats, y: Floats, said: Floats, blocks: NDArray[np.intp]) -> float:
@@ -60,6 +60,6 @@ def _variance(parts: Floats) -> Floats:
 def _below(values: Floats, levels_of: Floats) -> Floats:
     """Return which values are below quantiles of others, (n, L); NaN is never, +inf only never."""
     finite = levels_of[np.isfinite(levels_of)]
-    shares = (np.arange(_LEVELS) + 0.5) / _LEVELS
+    shares = (np.arange(_THRESHOLDS) + 0.5) / _THRESHOLDS
     levels = np.quantile(finite, shares)
     return (values[:, None] <= levels).astype(float)

@@ -63,6 +63,10 @@ class Surface(ABC):
             From points, shape (k, d), to values, shape (k,).
         """
 
+    def tuned(self, x: Floats, y: Floats) -> Surface:
+        """Return the surface with settings that fit the points, which keeps them with fewer."""
+        return self
+
 
 @dataclass(frozen=True)
 class RadialBasis(Surface):
@@ -215,23 +219,19 @@ def fitted(model: Any, x: Floats, y: Floats) -> Predict:
         A regressor has ``fit(X, y)`` and ``predict(X)``.
     x : ndarray, shape (n, d)
         In the unit cube, or in units of their spread.
-    y : ndarray, shape (n,) or (n, m)
-        In units of the response; of several outputs each has a surface of its own.
+    y : ndarray, shape (n,)
+        In units of the response.
 
     Returns
     -------
     callable
-        From points, shape (k, d), to responses, shape (k,) or (k, m).
+        From points, shape (k, d), to responses, shape (k,).
     """
-    center = y.mean(axis=0)
-    spread = y.std(axis=0)
+    center = y.mean()
     # A response that is constant has no spread to divide by.
-    spread = np.where(spread > 0, spread, 1.0)
+    spread = y.std() or 1.0
     z = (y - center) / spread
-    if z.ndim == 1 or isinstance(model, RadialBasis | Polynomial):
-        predict = _through(model, x, z)
-    else:
-        predict = _SideBySide(tuple(_through(model, x, column) for column in z.T))
+    predict = _through(model, x, z)
     return _InUnits(predict, center, spread)
 
 
@@ -246,27 +246,14 @@ def _through(model: Any, x: Floats, z: Floats) -> Predict:
 
 
 @dataclass(frozen=True, eq=False)
-class _SideBySide:
-    """Surfaces of several outputs."""
-
-    surfaces: tuple[Predict, ...]
-
-    def __call__(self, at: Floats) -> Floats:
-        # Some regressors give a column.
-        columns = [np.asarray(surface(at)).reshape(len(at)) for surface in self.surfaces]
-        return np.stack(columns, axis=1)
-
-
-@dataclass(frozen=True, eq=False)
 class _InUnits:
     """A surface through responses of unit spread, in the response's own units."""
 
     predict: Predict
-    center: Any
-    spread: Any
+    center: float
+    spread: float
 
     def __call__(self, at: Floats) -> Floats:
         values = np.asarray(self.predict(at), dtype=np.float64)
         # Some regressors give a column.
-        values = values.reshape(len(at), *np.shape(self.center))
-        return np.asarray(self.center + self.spread * values)
+        return np.asarray(self.center + self.spread * values.reshape(len(at)))

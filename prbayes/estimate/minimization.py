@@ -524,17 +524,19 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
     short = shortcomings(evaluator, near) or shortcomings(evaluator, state.theta[None])
     if not short:
         # Enough for the populations; for the optimum?
-        error = np.nan if state.sampling is None else state.sampling.design_error()
-        state = replace(state, design_error=error)
-        if not error > AGREE or not grow(evaluator, near, error):
+        if state.sampling is None:
+            return state
+        errors = state.sampling.design_error()
+        state = replace(state, design_error=errors.whole)
+        if not errors.whole > AGREE or not grow(evaluator, near, errors):
             return state
     elif rounds == MAX_ROUNDS:
         refuse(short, evaluator)
     elif state.cloud is None:
         near = pilot(evaluator, state.scales, seed=plan.seed)
         state = replace(state, cloud=near)
-    elif not refine_at(evaluator, near):
-        refine_at(evaluator, state.theta[None])
+    elif not refine_at(evaluator, near, again=rounds > 1):
+        refine_at(evaluator, state.theta[None], again=rounds > 1)
     # What looked best on a thin design may be an artefact of it.
     candidates = np.vstack([state.theta, near])
     return replace(state, restart=plan.search.best_of(candidates, state.scales))
@@ -601,7 +603,7 @@ def _settled(plan: _Plan, state: _State) -> _State:
     known = not np.isnan(state.design_error) and not away.any()
     if known or state.sampling is None:
         return state
-    return replace(state, design_error=state.sampling.design_error())
+    return replace(state, design_error=state.sampling.design_error().whole)
 
 
 # -- after -----------------------------------------------------------------------------------------
@@ -634,7 +636,7 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State) -> Optimum:
     return replace(
         found,
         converged=found.converged and not edge,
-        message=found.message + ran_out,
+        message=found.message + ran_out + _told_of_designs(evaluator, state.design_error),
         seconds=time.perf_counter() - plan.clock,
         design_error=state.design_error,
         rivals=tuple(rival_record(evaluator, o) for o in state.others),
@@ -642,6 +644,16 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State) -> Optimum:
         at_edge=edge,
         at_jump=jump,
     )
+
+
+def _told_of_designs(evaluator: Evaluator, error: float) -> str:
+    """Say how many runs emulators rest on, and how far another design's optimum would be."""
+    told = [d.told for d in evaluator.designs.values() if d.contents.emulation is not None]
+    if not told:
+        return ""
+    if np.isfinite(error):
+        told.append(f"Another design's optimum would differ by {error:.2g} standard errors.")
+    return " " + " ".join(told)
 
 
 def _stopped(plan: _Plan, begun: _Beginning, state: _State, reason: str) -> Optimum:

@@ -9,6 +9,7 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.estimate.data_sets import siblings
+from prbayes.estimate.refit import DesignErrors
 from prbayes.estimate.sandwich import Information
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
@@ -26,6 +27,8 @@ AGREE = 0.1
 # The power of its size with which the error of a design of several inputs falls, about; it only
 # says how many points are added at a time (benchmarks/dimensions.py).
 _RATE = 0.65
+# Share of that which points and emulators may have each: together they then have it all.
+_OF_EACH = np.sqrt(0.5)
 # Most by which a design grows at a time: the estimate of its error is itself uncertain.
 _GROWTH = 2.0
 # Step of a pilot, in standard deviations of the thetas kept: small against their spread, so that
@@ -36,8 +39,12 @@ _PILOT_STEP = 0.4
 FEW_SETS = 50
 
 
-def refine_at(evaluator: Evaluator, thetas: Floats) -> dict[str, Shortcoming]:
+def refine_at(
+    evaluator: Evaluator, thetas: Floats, *, again: bool = False
+) -> dict[str, Shortcoming]:
     """Add one batch to each design that falls short at thetas, (P, d); return what was short.
+
+    A cloud is drawn anew for them, and is larger where that was done before (``again``).
 
     Raises
     ------
@@ -51,14 +58,19 @@ def refine_at(evaluator: Evaluator, thetas: Floats) -> dict[str, Shortcoming]:
                 f"{name}: {what}; repair the response there, return +inf for specimens that fail, "
                 "narrow the priors, or raise max_lost"
             )
-    _reach(evaluator, thetas, set(short))
-    # What a cloud cannot reach needs runs.
-    thin = {name: what for name, what in shortcomings(evaluator, thetas).items() if name in short}
-    _add(evaluator, thetas, set(thin))
+    if again:
+        _widened(evaluator, thetas, set(short))
+    else:
+        _reach(evaluator, thetas, set(short))
+    thin = set(shortcomings(evaluator, thetas)) & set(short)
+    while _widened(evaluator, thetas, thin):
+        thin &= set(shortcomings(evaluator, thetas))
+    # What no cloud reaches needs runs.
+    _add(evaluator, thetas, thin)
     return short
 
 
-def grow(evaluator: Evaluator, thetas: Floats, error: float) -> bool:
+def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
     """Add points to all designs until their error is expected to be small enough.
 
     Parameters
@@ -66,21 +78,43 @@ def grow(evaluator: Evaluator, thetas: Floats, error: float) -> bool:
     evaluator : Evaluator
     thetas : ndarray, shape (P, d)
         Where the populations live that matter.
-    error : float
-        Difference between the optima of independent designs, in standard errors.
+    errors : DesignErrors
+        Differences between the optima of independent designs.
 
     Returns
     -------
     bool
         Whether any were added.
     """
-    factor = min(_GROWTH, (error / AGREE) ** (1 / _RATE))
     _log.info(
         "independent designs would differ by %.2f standard errors, expected at most %.2f",
-        error,
+        errors.whole,
         AGREE,
     )
-    return _add(evaluator, thetas, set(evaluator.designs), factor)
+    clouds = {name for name, design in evaluator.designs.items() if design.contents.cloud}
+    runs = set(evaluator.designs) - clouds
+    grown = False
+    # Points of clouds cost no run; what emulators say of them does.
+    if clouds and errors.points > _OF_EACH * AGREE:
+        grown = _widened(evaluator, thetas, clouds)
+    if clouds and errors.emulators > _OF_EACH * AGREE or runs:
+        grown |= _add(evaluator, thetas, clouds | runs, _factor(errors.whole))
+    return grown
+
+
+def _factor(error: float) -> float:
+    """Return by how much designs are to grow for an error to become small enough."""
+    return float(min(_GROWTH, (error / AGREE) ** (1 / _RATE)))
+
+
+def _widened(evaluator: Evaluator, thetas: Floats, names: set[str]) -> bool:
+    """Draw larger clouds for the populations at thetas; return whether any could be."""
+    grown = False
+    for k, node in enumerate(evaluator.nodes):
+        design = node.design
+        if design is not None and design.contents.cloud is not None and node.name in names:
+            grown |= design.widen(evaluator.roots(thetas, k))
+    return grown
 
 
 def _add(evaluator: Evaluator, thetas: Floats, names: set[str], factor: float = 1.0) -> bool:

@@ -40,6 +40,20 @@ _FAINT = 10.0
 _STEADY = 1.5
 
 
+@dataclass(frozen=True)
+class DesignErrors:
+    """How far the optima of two independent designs are apart, in standard errors."""
+
+    points: float  # by their points; NaN if not known
+    emulators: float  # by what emulators say of them; NaN without emulators
+
+    @property
+    def whole(self) -> float:
+        """Both together; NaN if nothing is known."""
+        known = [e for e in (self.points, self.emulators) if not np.isnan(e)]
+        return float(np.linalg.norm(known)) if known else np.nan
+
+
 @dataclass(frozen=True, eq=False)
 class SamplingDistribution:
     """How the minimiser scatters around an optimum, over data sets that could be observed."""
@@ -172,20 +186,17 @@ class SamplingDistribution:
         # Each part guesses its own curvature: paths differ with their size, not where they lead.
         return max(1, 2 * AT_ONCE // (points * stencil))
 
-    def design_error(self) -> float:
-        """Return how far the optimum of an independent design would be; NaN if not known.
+    def design_error(self) -> DesignErrors:
+        """Return how far the optimum of an independent design would be, by its points and emulators.
 
-        In standard errors, along the worst axis: of its points, and of emulators.
+        In standard errors, along the worst axis.
         """
         if not self._stored:
-            return np.nan
-        found = [self._error_of_points(), self._error_of_emulators()]
-        known = [error for error in found if not np.isnan(error).all()]
-        if not known:
-            return np.nan
-        variance = np.sum(np.square(known), axis=0)
+            return DesignErrors(np.nan, np.nan)
         # Two designs differ by the root of two of one's error.
-        return float(np.sqrt(2 * variance.max(initial=0.0)))
+        points = np.sqrt(2) * self._error_of_points().max(initial=0.0)
+        emulators = np.sqrt(2) * self._error_of_emulators().max(initial=0.0)
+        return DesignErrors(float(points), float(emulators))
 
     def _error_of_emulators(self) -> Floats:
         """Return how far the optimum is off by the emulators' error, (r,); NaN without emulators.

@@ -71,9 +71,15 @@ class Stencil:
     target: Discrepancy
 
     @cached_property
+    def same(self) -> bool:
+        """Whether the responses are the same at all points, as stored ones are."""
+        return np.array_equal(self.values[0], self.values[-1], equal_nan=True)
+
+    @cached_property
     def moves(self) -> Floats:
         """How far a step along each element moves a distribution function, at most, (d,)."""
-        parts = [self._moves_of(values) for values in one_dimensional(self.target, self.values)]
+        values = self.values[:1] if self.same else self.values
+        parts = [self._moves_of(own) for own in one_dimensional(self.target, values)]
         return np.max(parts, axis=0)
 
     def _moves_of(self, values: Floats) -> Floats:
@@ -88,7 +94,8 @@ class Stencil:
         levels = np.linspace(0.05, 0.95, 19)
         knots = quantile(center[known], mass, levels)
         across = slice(1 + 2 * d)
-        below = distribution_function(values[across], self.weights[across], knots)
+        simulated = values[0] if len(values) == 1 else values[across]
+        below = distribution_function(simulated, self.weights[across], knots)
         gaps = np.abs(below[1:] - below[0]).max(axis=-1)
         either_side = np.nan_to_num(gaps).reshape(2, d)
         return np.asarray(either_side.max(axis=0))
@@ -199,7 +206,12 @@ class Information:
     def _features(self) -> Any:
         """Features at the stencil; they do not depend on the observed side."""
         around = self._stencil
-        return self._target.features(around.values, around.weights, np)
+        target = self._target
+        if target.columns and around.same:
+            # Cells are filled once for all points, and not for each.
+            basis = target.stored(around.values[0])
+            return target.from_basis(around.weights, basis, np)
+        return target.features(around.values, around.weights, np)
 
     def _along_stencil(
         self, observed: Floats, weights: Floats, points: slice = slice(None)
@@ -227,12 +239,8 @@ class Information:
         """
         if not self.node.metric.distance:
             return self.theta.size / (2 * self.node.n_specimens)
-        around = self._stencil
-        values, weights = thinned(
-            around.values[:1],
-            around.weights[:1],
-            self.node,
-        )
+        at_theta = self.evaluator.populations(self.theta[None], self.k)
+        values, weights = thinned(*at_theta, self.node)
         observed, data_sets = self.data_set
         found = []
         for own in data_sets:

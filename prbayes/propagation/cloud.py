@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
-from prbayes.emulators.emulator import CANDIDATES, Runs, chosen, each_block, emulated
+from prbayes.emulators.emulator import Runs, candidates, chosen, each_block, emulated
 from prbayes.emulators.share import share_of_runs
 from prbayes.propagation.base import N_BLOCKS
 
@@ -64,23 +64,27 @@ class Emulation:
     Attributes
     ----------
     runs : Runs
-    model : object
-        The surface that was chosen.
+    models : tuple
+        The surface that was chosen for each output.
     share : float
         The share of a population that the runs are.
+    error : float
+        Root mean square error of the worst output at runs that were left out, where the populations
+        that matter live, in units of its spread there.
     event : tuple of int
         Shape of one response: () or (m,).
     """
 
     runs: Runs
-    model: Any
+    models: tuple[Any, ...]
     share: float
+    error: float
     event: tuple[int, ...]
 
     @classmethod
     def of(
         cls,
-        candidates: Sequence[Any],
+        emulator: Any,
         points: Sequence[Floats],
         values: Floats,
         weights: Floats,
@@ -90,7 +94,8 @@ class Emulation:
 
         Parameters
         ----------
-        candidates : sequence of Surface or regressor
+        emulator : str, Surface or regressor
+            Several are tried by default.
         points : sequence of ndarray, shapes (n, *event)
         values : ndarray, shape (n,) or (n, m)
         weights : ndarray, shape (T, n)
@@ -100,25 +105,33 @@ class Emulation:
         x, y = columns(points), values.reshape(len(values), -1)
         runs = Runs(x, y, weights.mean(axis=0), blocks)
         try:
-            model, said = chosen(candidates, runs)
+            models, said = chosen(_tried(emulator, x), runs)
         except np.linalg.LinAlgError:
             return None
         share = share_of_runs(weights, y, said, blocks)
         if share > _ALONE:
             return None
-        return cls(runs, model, 0.0 if share < _LITTLE else share, values.shape[1:])
+        share = 0.0 if share < _LITTLE else share
+        return cls(runs, models, share, _error(runs, said), values.shape[1:])
 
     def at(self, cloud: Cloud) -> Floats:
         """Return the responses at the cloud's points, (M,) or (M, m)."""
-        found = emulated(self.model, self.runs, columns(cloud.points))
+        found = emulated(self.models, self.runs, columns(cloud.points))
         return found.reshape(-1, *self.event)
+
+    def of_another(self, emulator: Any, values: Floats, cloud: Cloud) -> Floats:
+        """Return another response of the same runs at the cloud's points, (M,) or (M, m)."""
+        runs = replace(self.runs, y=values.reshape(len(values), -1))
+        models, _ = chosen(_tried(emulator, runs.x), runs)
+        found = emulated(models, runs, columns(cloud.points))
+        return found.reshape(-1, *values.shape[1:])
 
     def without_each_block(self, cloud: Cloud) -> list[Floats]:
         """Return the same from emulators that were fitted without a block of the runs each."""
         at = columns(cloud.points)
         found = []
-        for block, _ in each_block(self.runs):
-            values = emulated(self.model, self.runs, at, ~block)
+        for block in each_block(self.runs):
+            values = emulated(self.models, self.runs, at, ~block)
             found.append(values.reshape(-1, *self.event))
         return found
 
@@ -139,15 +152,23 @@ class Emulation:
             blocks=np.concatenate([blocks, runs.blocks]),
         )
 
-    def with_values(self, values: Floats) -> Emulation:
-        """Return the same emulator of another response of the runs."""
-        runs = replace(self.runs, y=values.reshape(len(values), -1))
-        return replace(self, runs=runs, event=values.shape[1:])
+
+def _error(runs: Runs, said: Floats) -> float:
+    """Return the relative error of the worst output at runs that were left out."""
+    known = runs.good & np.isfinite(said).all(axis=1)
+    y, importance = runs.y[known], runs.importance[known]
+    total = importance.sum()
+    if not total > 0:
+        return np.nan
+    importance = importance / total
+    spread = np.sqrt(importance @ (y - importance @ y) ** 2)
+    off = np.sqrt(importance @ (said[known] - y) ** 2)
+    return float((off / np.where(spread > 0, spread, 1.0)).max())
 
 
-def candidates_of(emulator: Any) -> tuple[Any, ...]:
-    """Return the surfaces that are tried: several by default, or the user's own."""
-    return CANDIDATES if isinstance(emulator, str) else (emulator,)
+def _tried(emulator: Any, x: Floats) -> Sequence[Any]:
+    """Return the surfaces that are tried: several by default."""
+    return candidates(*x.shape) if isinstance(emulator, str) else [emulator]
 
 
 def columns(points: Sequence[Floats]) -> Floats:
@@ -164,6 +185,7 @@ def some_of(groups: Sequence[Sequence[Floats]]) -> list[Floats]:
         shares = [_POPULATIONS]
     found = []
     for group, most in zip(groups, shares, strict=True):
-        places = np.linspace(0, len(group[0]) - 1, min(most, len(group[0]))).astype(int)
+        # A few come again and again, so that their share does not depend on their number.
+        places = np.linspace(0, len(group[0]) - 1, most).astype(int)
         found.append([values[places] for values in group])
     return [np.concatenate(same) for same in zip(*found, strict=True)]

@@ -9,7 +9,7 @@ import logging
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, ClassVar, Self
 
@@ -22,6 +22,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import AT_ONCE, Floats, positive_integer
 from prbayes.emulators.emulator import MOST_RUNS
+from prbayes.emulators.surfaces import Surface
 from prbayes.metrics.base import Discrepancy
 from prbayes.propagation.base import (
     MAX_LOST,
@@ -39,7 +40,6 @@ from prbayes.propagation.cloud import (
     Cloud,
     Emulation,
     Table,
-    candidates_of,
     some_of,
 )
 from prbayes.propagation.edges import (
@@ -92,7 +92,14 @@ class Reweighted(Propagation):
     max_lost : float
         Largest share of a population's weight that may fall on points whose response is NaN.
     max_points : int, optional
-        Largest number of design points, refinement included; 32 n by default.
+        Largest number of responses, refinement included; 32 n by default.
+    emulator : str, Surface or regressor, optional
+        What says the response between the runs of several inputs: by default the best of a few
+        surfaces for each output, by their errors at runs that were left out, mixed with the runs'
+        own weights as far as these errors ask for it. Populations then are made of thousands of
+        points, of which a few dozen to a few hundred are computed. Or a surface of
+        ``prb.surrogate``, any regressor with ``fit(X, y)`` and ``predict(X)``; None for the runs
+        alone. With a larger n than 2000, and discrete inputs, none is by default.
     executor : Executor, optional
         Where the response is computed: threads, processes, loky,
         ``dask.distributed.Client().get_executor()``, ``mpi4py.futures.MPIPoolExecutor()``. In this
@@ -124,7 +131,7 @@ class Reweighted(Propagation):
     Examples
     --------
     >>> Reweighted(256)
-    Reweighted(n=256, random_seed=0, max_lost=0.05, max_points=None)
+    Reweighted(n=256, random_seed=0, max_lost=0.05, max_points=None, emulator='auto')
     """
 
     n: int = 1024
@@ -138,6 +145,7 @@ class Reweighted(Propagation):
         positive_integer(self.n, "Reweighted: n", minimum=16)
         positive_integer(self.random_seed, "Reweighted: random_seed", minimum=0)
         refuse_max_lost(self.max_lost, "Reweighted")
+        _refuse_emulator(self.emulator)
         if (
             self.max_points is not None
             and positive_integer(self.max_points, "Reweighted: max_points") < self.n
@@ -164,6 +172,23 @@ class Reweighted(Propagation):
                 "weighted=True, or use propagation=prb.Resimulated()"
             )
         return Design(name, inputs, target, responses, self)
+
+
+def _refuse_emulator(emulator: Any) -> None:
+    """Raise if it is no emulator."""
+    if emulator is None or emulator == "auto" or isinstance(emulator, Surface):
+        return
+    if isinstance(emulator, str):
+        raise ValueError(
+            f'Reweighted: emulator: got {emulator!r}, expected "auto", None, or a surface such as '
+            "prb.surrogate.RadialBasis()"
+        )
+    if not (callable(getattr(emulator, "fit", None)) and hasattr(emulator, "predict")):
+        raise TypeError(
+            f"Reweighted: emulator: got {type(emulator).__name__}, expected \"auto\", None, a "
+            "surface such as prb.surrogate.RadialBasis(), or a regressor with fit(X, y) and "
+            "predict(X)"
+        )
 
 
 @dataclass(frozen=True)
@@ -204,6 +229,7 @@ class Contents:
     cloud: Cloud | None = None
     emulation: Emulation | None = None
     clouds: int = 0  # how many were drawn
+    size: int = CLOUD  # of a cloud
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +267,7 @@ class Design(Bound):
         components = prior_draws(inputs.roots, min(config.n, _COMPONENTS), config.random_seed)
         size = self.add(components)
         refuse_all_nan(name, self.values)
-        if size < self.required_ess:
+        if size < self.required_ess and self.contents.cloud is None:
             self._warn_of_thin_support(size)
 
     def _warn_of_thin_support(self, size: float) -> None:
@@ -298,6 +324,19 @@ class Design(Bound):
         return len(self.batches.values)
 
     @property
+    def told(self) -> str:
+        """How many responses were computed, and what is between them, as a sentence."""
+        emulation = self.contents.emulation
+        runs = f"{self.name}: {self.n_runs} runs"
+        if emulation is None:
+            return f"{runs}."
+        return (
+            f"{runs}, between which {self.n_points} points are emulated: at runs that were left "
+            f"out the emulator is off by {emulation.error:.2g} of the response's spread, and "
+            f"populations are to {emulation.share:.0%} of the runs themselves."
+        )
+
+    @property
     def emulates(self) -> bool:
         """Whether responses between the runs are emulated."""
         emulator = self.config.emulator
@@ -306,8 +345,8 @@ class Design(Bound):
         if not isinstance(emulator, str):
             return True
         continuous = all(x.dtype.startswith("float") for x in self.inputs.aleatory)
-        few = self._contents is None or self.n_runs <= MOST_RUNS
-        return continuous and few and self.dimensions > 1
+        # Whoever asks for more than an emulator takes has a response that costs little.
+        return continuous and self.config.n <= MOST_RUNS and self.dimensions > 1
 
     @property
     def batch_size(self) -> int:
@@ -423,7 +462,7 @@ class Design(Bound):
         contents = self.contents
         if contents.cloud is None or contents.emulation is None:
             return known
-        said = contents.emulation.with_values(known).at(contents.cloud)
+        said = contents.emulation.of_another(self.config.emulator, known, contents.cloud)
         return np.concatenate([said, known]) if contents.emulation.share else said
 
     def same_points(self, other: Bound) -> bool:
@@ -478,6 +517,14 @@ class Design(Bound):
         components = self.valid_only(components)
         return self._drawn(self.batches, components)
 
+    def widen(self, components: Sequence[Floats]) -> bool:
+        """Draw a cloud of twice the size for populations; return whether there is room for it."""
+        if self.contents.size >= LARGEST_CLOUD:
+            return False
+        self._contents = replace(self.contents, size=2 * self.contents.size)
+        self.reach(components)
+        return True
+
     def _drawn(self, batches: Batches, components: Sequence[Floats], fresh: int = 0) -> float:
         """Make the table of points anew, of batches and for populations that matter."""
         # The mixture is that of all batches, so its density changes at the old points too.
@@ -487,7 +534,9 @@ class Design(Bound):
         groups = () if before is None else before.groups
         # The prior, and where it was last.
         groups = (*groups[:1], *groups[1:][-1:], tuple(components))
-        contents = Contents(batches, groups, table, clouds=0 if before is None else before.clouds)
+        contents = Contents(batches, groups, table)
+        if before is not None:
+            contents = replace(contents, clouds=before.clouds, size=before.size)
         self._contents = contents
         if self.emulates:
             contents = self._emulated(contents)
@@ -507,7 +556,7 @@ class Design(Bound):
         few = np.linspace(0, len(near[0]) - 1, min(_WEIGHED, len(near[0]))).astype(int)
         near = [values[few] for values in near]
         emulation = Emulation.of(
-            candidates_of(self.config.emulator),
+            self.config.emulator,
             runs.points,
             runs.values,
             self._weights_at(near, runs),
@@ -515,25 +564,22 @@ class Design(Bound):
         )
         if emulation is None:
             return contents
+        # Another prime, so that no cloud shares points with a batch.
+        seed = self.config.random_seed + 104_729 * (1 + contents.clouds)
         components = some_of(contents.groups)
-        size = CLOUD
         place = self._equal_mass if self.is_line else self._place
-        while True:
-            # Another prime, so that no cloud shares points with a batch.
-            seed = self.config.random_seed + 104_729 * (1 + contents.clouds)
-            points, counts = place(components, size, seed)
-            points = self._off_the_edges(points, components, counts)
-            log_g, _ = self._log_mixture(components, counts, points, summed=False)
-            cloud = Cloud(tuple(points), log_g)
-            table = emulation.joined(cloud, emulation.at(cloud), runs)
-            found = Contents(
-                contents.batches, contents.groups, table, cloud, emulation, contents.clouds + 1
-            )
-            self._contents = found
-            enough = self._median_ess(near) > self.required_ess
-            if enough or emulation.share or size >= LARGEST_CLOUD:
-                return found
-            size *= 2
+        points, counts = place(components, contents.size, seed)
+        points = self._off_the_edges(points, components, counts)
+        log_g, _ = self._log_mixture(components, counts, points, summed=False)
+        cloud = Cloud(tuple(points), log_g)
+        table = emulation.joined(cloud, emulation.at(cloud), runs)
+        return replace(
+            contents,
+            table=table,
+            cloud=cloud,
+            emulation=emulation,
+            clouds=contents.clouds + 1,
+        )
 
     def left_out(self) -> list[Floats]:
         """Return the responses as emulators say that lack a block of runs each; none without one."""

@@ -185,7 +185,7 @@ def test_a_minimiser_goes_where_its_data_go() -> None:
 
 def test_a_simulator_without_a_design_has_no_design_error() -> None:
     sampling = neighbourhood("pr", design=False)
-    assert np.isnan(sampling.design_error())
+    assert np.isnan(sampling.design_error().whole)
 
 
 def test_data_that_tell_nothing_leave_nothing_to_refit() -> None:
@@ -207,4 +207,4 @@ def test_data_that_tell_nothing_leave_nothing_to_refit() -> None:
     minimisers, converged = distribution.refit(sets)
     assert minimisers.shape == (5, 0)
     assert converged.all()
-    assert distribution.design_error() == 0
+    assert distribution.design_error().whole == 0

@@ -309,7 +309,7 @@ def hard(
         for name, response in zip(("sum", "difference"), responses, strict=True):
             observed = response(pairs)
             response.count = 0
-            propagation = prb.Reweighted(n, random_seed=seed)
+            propagation = prb.Reweighted(n, random_seed=seed, emulator=None)
             prb.Simulator(
                 name, response, x, metric=metric, observed=observed, propagation=propagation
             )
@@ -450,7 +450,10 @@ def test_many_inputs_are_told_what_to_use(caplog: pytest.LogCaptureFixture) -> N
         with pm.Model():
             x = pm.MvNormal.dist(pm.Normal("mu", 0, 3, shape=k), 0.1 * np.eye(k))
             observed = [0.0, 1.0, 2.0]
-            prb.Simulator("y", lambda x: x.sum(axis=-1), x, metric=AREA, observed=observed)
+            prb.Simulator(
+                "y", lambda x: x.sum(axis=-1), x,
+                metric=AREA, observed=observed, propagation=prb.Reweighted(emulator=None),
+            )  # fmt: skip
         assert (
             "5 inputs are many for stored responses: rather use propagation=prb.Resimulated"
             in caplog.text
@@ -533,7 +536,7 @@ def test_a_design_that_can_never_do_is_refused() -> None:
     thetas = np.stack([np.linspace(-40, 40, 256), np.full(256, np.log(0.01))], axis=1)
     with pytest.raises(
         prb.propagation.DesignError,
-        match=r"y: the design does not support the answer.*now 144 points in all",
+        match=r"y: the design does not support the answer.*now 144 runs in all",
     ):
         prb.refine(model, thetas)
 
@@ -727,7 +730,7 @@ def test_where_a_basis_would_be_too_large_nothing_else_changes(
                 x,
                 metric=prb.Joint(metric),
                 observed=data,
-                propagation=prb.Reweighted(64),
+                propagation=prb.Reweighted(64, emulator=None),
             )
         own = design(model)
         own.add([np.array([0.9, 1.1])])

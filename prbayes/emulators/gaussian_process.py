@@ -1,0 +1,179 @@
+"""A Gaussian process with a length for each input, and a nugget."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from prbayes._checks import Floats
+from prbayes.emulators.surfaces import Predict, Surface
+
+# Points on which lengths are found: half leaves errors six times as large on eight inputs, twice
+# gains a third and takes eight times as long (benchmarks/emulators.py).
+MOST_TUNED = 256
+# Where the likelihood is climbed from: lengths in roots of the number of inputs, and the nugget.
+# Long ones alone miss a resonance, short ones alone a response that is nearly a polynomial.
+_BEGINNINGS = ((0.7, 1e-2), (2.0, 1e-6))
+# Up to how many points both starts are tried; with more one finds the same.
+_BOTH = 128
+# Points that are predicted at a time: they stay in the cache, which is three times as fast.
+_AT_A_TIME = 1024
+
+
+def _squared_exponential(square: Floats) -> tuple[Floats, Floats]:
+    """Return the correlation and minus twice its slope, of squared distances."""
+    correlation = np.exp(-0.5 * square)
+    return correlation, correlation
+
+
+def _matern(square: Floats) -> tuple[Floats, Floats]:
+    """Return the same of a Matern correlation, 5/2."""
+    r = np.sqrt(5 * square)
+    decay = np.exp(-r)
+    return (1 + r + r**2 / 3) * decay, 5 / 3 * (1 + r) * decay
+
+
+_KERNELS: dict[str, Callable[[Floats], tuple[Floats, Floats]]] = {
+    "squared_exponential": _squared_exponential,
+    "matern": _matern,
+}
+
+
+@dataclass(frozen=True)
+class GaussianProcess(Surface):
+    """A Gaussian process around a constant, with a length for each input and a nugget.
+
+    Lengths and nugget are the likeliest ones, with the variance at its best for each of them.
+
+    Parameters
+    ----------
+    kernel : str
+        "squared_exponential", for responses without corners, or "matern", of smoothness 5/2.
+    lengths : tuple of float, optional
+        In the units of the points; found where none are given.
+    nugget : float, optional
+        Variance of what does not depend on the inputs, in that of the response.
+
+    Raises
+    ------
+    ValueError
+        If the kernel is none of these.
+
+    References
+    ----------
+    .. [1] Rasmussen, C. E. and C. K. I. Williams (2006), Gaussian Processes for Machine Learning,
+       MIT Press, ch. 5.
+
+    Examples
+    --------
+    >>> GaussianProcess("matern").terms(3)
+    2
+    """
+
+    kernel: str = "squared_exponential"
+    lengths: tuple[float, ...] | None = None
+    nugget: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.kernel not in _KERNELS:
+            raise ValueError(
+                f"GaussianProcess: kernel: got {self.kernel!r}, expected one of {list(_KERNELS)}"
+            )
+
+    def terms(self, dimensions: int) -> int:
+        """Return how many points it needs at least."""
+        return 2
+
+    def tuned(self, x: Floats, y: Floats) -> GaussianProcess:
+        """Return the same with the likeliest lengths and nugget."""
+        from scipy.optimize import minimize
+
+        few = np.linspace(0, len(x) - 1, min(MOST_TUNED, len(x))).astype(int)
+        likelihood = _Likelihood(_KERNELS[self.kernel], x[few], y[few] - y[few].mean())
+        d = x.shape[1]
+        # Far shorter, a process is noise; far longer, a plane.
+        bounds = [(np.log(0.05), np.log(1e3))] * d + [(np.log(1e-10), 0.0)]
+        best = None
+        for length, nugget in _BEGINNINGS if len(few) <= _BOTH else _BEGINNINGS[:1]:
+            start = np.log([*[length * np.sqrt(d)] * d, nugget])
+            found = minimize(likelihood, start, jac=True, bounds=bounds, method="L-BFGS-B")
+            if best is None or found.fun < best.fun:
+                best = found
+        assert best is not None
+        *lengths, nugget = np.exp(best.x).tolist()
+        return GaussianProcess(self.kernel, tuple(lengths), nugget)
+
+    def through(self, x: Floats, y: Floats) -> Predict:
+        """Return the mean of the process given the points."""
+        from scipy.linalg import cho_factor, cho_solve
+
+        if self.lengths is None or self.nugget is None:
+            return self.tuned(x, y).through(x, y)
+        correlation = _KERNELS[self.kernel]
+        scaled = x / self.lengths
+        own, _ = correlation(_squares(scaled, scaled))
+        root = cho_factor(own + self.nugget * np.eye(len(x)), lower=True)
+        center = float(y.mean())
+        return _Mean(self.kernel, scaled, np.array(self.lengths), center, cho_solve(root, y - center))
+
+
+@dataclass(frozen=True, eq=False)
+class _Mean:
+    """The mean of a process; a class, so that it can be pickled."""
+
+    kernel: str
+    scaled: Floats
+    lengths: Floats
+    center: float
+    coefficients: Floats
+
+    def __call__(self, at: Floats) -> Floats:
+        found = np.empty(len(at))
+        for start in range(0, len(at), _AT_A_TIME):
+            some = slice(start, start + _AT_A_TIME)
+            square = _squares(at[some] / self.lengths, self.scaled)
+            correlation, _ = _KERNELS[self.kernel](square)
+            found[some] = correlation @ self.coefficients
+        return self.center + found
+
+
+@dataclass(frozen=True, eq=False)
+class _Likelihood:
+    """Minus the log-likelihood of log lengths and log nugget, with its gradient."""
+
+    correlation: Callable[[Floats], tuple[Floats, Floats]]
+    x: Floats
+    y: Floats
+
+    def __call__(self, parameters: Floats) -> tuple[float, Floats]:
+        from scipy.linalg import cho_factor, cho_solve
+
+        n = len(self.x)
+        lengths, nugget = np.exp(parameters[:-1]), np.exp(parameters[-1])
+        scaled = self.x / lengths
+        square = _squares(scaled, scaled)
+        np.fill_diagonal(square, 0)
+        correlation, slope = self.correlation(square)
+        try:
+            root = cho_factor(correlation + nugget * np.eye(n), lower=True)
+        except np.linalg.LinAlgError:
+            return 1e10, np.zeros(parameters.size)
+        inverse = cho_solve(root, np.eye(n))
+        weights = inverse @ self.y
+        variance = max(float(self.y @ weights) / n, 1e-300)
+        outer = np.outer(weights, weights) / variance - inverse
+        inner = outer * slope
+        of_lengths = inner.sum(axis=1) @ scaled**2 - ((inner @ scaled) * scaled).sum(axis=0)
+        of_nugget = 0.5 * nugget * np.trace(outer)
+        log_determinant = np.log(np.diag(root[0])).sum()
+        value = 0.5 * n * np.log(variance) + log_determinant
+        return float(value), -np.append(of_lengths, of_nugget)
+
+
+def _squares(a: Floats, b: Floats) -> Any:
+    """Return squared distances of points, (n, k)."""
+    crossed = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * a @ b.T
+    return np.maximum(crossed, 0)

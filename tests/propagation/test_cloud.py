@@ -1,0 +1,201 @@
+"""A design of several inputs tells far more than its runs: a cloud of points is emulated."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import prbayes as prb
+from prbayes._checks import Floats
+from prbayes.model.evaluator import Evaluator
+from prbayes.propagation.cloud import CLOUD, columns, some_of
+from prbayes.propagation.reweighted import Design
+
+OBSERVED = np.random.default_rng(1).normal(2.0, 0.5, 40)
+AT = np.array([[1.1, 0.9, -0.2, -0.5]])
+
+
+def smooth(a: Any, b: Any) -> Any:
+    return a * np.exp(0.3 * b) + 0.2 * b**2
+
+
+def jumping(a: Any, b: Any) -> Any:
+    return smooth(a, b) + np.where(np.sin(40 * a) > 0, 3.0, 0.0)
+
+
+def failing(a: Any, b: Any) -> Any:
+    return np.where(a + b > 4, np.nan, smooth(a, b))
+
+
+def build(response: Any = smooth, n: int = 64, *, known: bool = False, **keywords: Any) -> pm.Model:
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("ma", 1, 0.5), pm.LogNormal("sa", 0, 0.5))
+        if known:
+            b = pm.Normal.dist(1.0, 0.6)
+        else:
+            b = pm.Normal.dist(pm.Normal("mb", 1, 0.5), pm.LogNormal("sb", -0.5, 0.5))
+        stored = prb.Reweighted(n, **keywords)
+        prb.Simulator(
+            "y", response, a, b, metric=prb.KullbackLeibler(), observed=OBSERVED, propagation=stored
+        )
+    return model
+
+
+def design_of(model: pm.Model) -> tuple[Evaluator, Design]:
+    evaluator = Evaluator(model)
+    return evaluator, evaluator.designs["y"]
+
+
+def theta_of(evaluator: Evaluator) -> Floats:
+    # The elements in the order of the model: ma, sa (log), mb, sb (log).
+    return AT[:, [0, 2, 1, 3]]
+
+
+@pytest.mark.parametrize("response", [smooth, failing])
+def test_emulated_points_are_far_better_than_weighted_runs(response: Any) -> None:
+    emulated, alone = build(response), build(response, emulator=None)
+    errors = []
+    for model in (emulated, alone):
+        evaluator, _ = design_of(model)
+        values, weights = evaluator.populations(theta_of(evaluator), 0)
+        found = float((np.nan_to_num(values) * weights).sum())
+        errors.append(abs(found - _truth_at(response)))
+    assert errors[0] < 0.2 * errors[1]
+
+
+def _truth_at(response: Any) -> float:
+    z = np.random.default_rng(7).standard_normal((2, 1_000_000))
+    ma, la, mb, lb = AT[0][[0, 2, 1, 3]]
+    found = response(ma + np.exp(la) * z[0], mb + np.exp(lb) * z[1])
+    return float(np.nan_to_num(found).mean())
+
+
+def test_runs_are_counted_and_cloud_points_are_not() -> None:
+    model = build()
+    evaluator, design = design_of(model)
+    assert evaluator.n_responses == design.n_runs == 64
+    assert design.n_points == CLOUD
+    assert len(design.known_responses) == len(design.first_responses) == 64
+
+
+def test_weights_are_one_on_average_with_runs_among_the_points() -> None:
+    evaluator, design = design_of(build(jumping, 256))
+    emulation = design.contents.emulation
+    if emulation is None:
+        assert design.n_points == 256
+    support = evaluator.support(theta_of(evaluator))["y"]
+    assert support["mean_weight"] == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_response_that_no_surface_follows_keeps_its_runs() -> None:
+    _, design = design_of(build(jumping, 256))
+    emulation = design.contents.emulation
+    assert emulation is None or emulation.share > 0.1
+
+
+def test_a_cloud_reaches_other_populations_without_a_run() -> None:
+    evaluator, design = design_of(build())
+    far = theta_of(evaluator) + [[1.0, 1.0, -1.0, -1.0]]
+    before = evaluator.support(far)["y"]["weight_ess"]
+    design.reach(evaluator.roots(far + 0.1 * np.random.default_rng(0).standard_normal((64, 4)), 0))
+    assert evaluator.support(far)["y"]["weight_ess"] > 2 * before
+    assert evaluator.n_responses == 64
+
+
+def test_a_larger_cloud_is_a_larger_cloud() -> None:
+    evaluator, design = design_of(build())
+    assert design.widen(evaluator.roots(theta_of(evaluator), 0))
+    assert design.n_points == 2 * CLOUD
+    assert evaluator.n_responses == 64
+
+
+def test_another_response_is_computed_at_the_runs_and_emulated() -> None:
+    evaluator, design = design_of(build())
+    calls: list[int] = []
+
+    def double(a: Any, b: Any) -> Any:
+        calls.append(np.size(a))
+        return 2 * smooth(a, b)
+
+    other = evaluator.nodes[0].bound.responses.copied()
+    other.function = double
+    np.testing.assert_allclose(design.values_of(other), 2 * design.values, rtol=1e-2, atol=1e-2)
+    assert sum(calls) == 64
+
+
+def test_a_design_goes_back_to_what_it_was() -> None:
+    evaluator, design = design_of(build())
+    before = evaluator(theta_of(evaluator)).discrepancies
+    with design.undone():
+        design.add(evaluator.roots(theta_of(evaluator), 0), 32)
+        assert design.n_runs == 96
+    assert design.n_runs == 64
+    np.testing.assert_array_equal(evaluator(theta_of(evaluator)).discrepancies, before)
+
+
+def test_a_discrepancy_follows_the_cloud_that_was_drawn_last() -> None:
+    evaluator, design = design_of(build())
+    thetas = theta_of(evaluator)
+    before = evaluator(thetas).discrepancies
+    compiled = evaluator.model.compile_logp(vars=[evaluator.model["y"]])
+    design.reach(evaluator.roots(thetas, 0))
+    after = evaluator(thetas).discrepancies
+    assert 0 < abs(after - before)[0, 0] < 0.05 * before[0, 0]
+    prb.set_epsilon(evaluator.model, {"y": 1.0})
+    at = dict(zip([v.name for v in evaluator.model.value_vars], thetas[0], strict=True))
+    assert -compiled(at) == pytest.approx(after[0, 0], rel=1e-9)
+
+
+def test_left_out_emulators_differ_where_the_emulator_is_wrong() -> None:
+    _, design = design_of(build(lambda a, b: np.abs(a - 1) + b))
+    spread = [np.abs(values - design.values).max() for values in design.left_out()]
+    assert len(spread) == 8
+    assert min(spread) > 1e-3
+    assert design_of(build(emulator=None))[1].left_out() == []
+
+
+def test_an_optimum_from_few_runs_is_that_of_many() -> None:
+    few = prb.minimize(build(known=True), starts=0, progressbar=False)
+    many = build(known=True, n=4096, emulator=None)
+    fine = prb.minimize(many, starts=0, progressbar=False)
+    assert few.n_responses <= 128
+    off = (few.theta - fine.theta) / np.sqrt(np.diag(fine.covariance))
+    assert np.abs(off).max() < 0.15
+
+
+@pytest.mark.parametrize("emulator", [3, "cubic", object()])
+def test_what_is_no_emulator_is_refused(emulator: Any) -> None:
+    with pytest.raises((TypeError, ValueError), match="Reweighted: emulator: got"):
+        prb.Reweighted(64, emulator=emulator)
+
+
+def test_one_input_and_discrete_ones_are_not_emulated() -> None:
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("ma", 1, 0.5), 1.0)
+        prb.Simulator("y", lambda a: a, a, metric=prb.AreaMetric(), observed=OBSERVED)
+    assert design_of(model)[1].contents.cloud is None
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("ma", 1, 0.5), 1.0)
+        k = pm.Poisson.dist(pm.LogNormal("lam", 1, 0.3))
+        stored = prb.Reweighted(64)
+        prb.Simulator(
+            "y", lambda a, k: a + k, a, k,
+            metric=prb.AreaMetric(), observed=OBSERVED, propagation=stored,
+        )  # fmt: skip
+    assert design_of(model)[1].contents.cloud is None
+
+
+def test_inputs_are_columns() -> None:
+    assert columns([np.zeros(3), np.zeros((3, 2))]).shape == (3, 3)
+
+
+def test_half_of_a_clouds_populations_are_of_the_last_group() -> None:
+    groups = [[np.zeros(500)], [np.ones(500)], [np.full(500, 2.0)]]
+    (found,) = some_of(groups)
+    assert (found == 2).mean() == 0.5
+    assert set(found) == {0.0, 1.0, 2.0}
+    (only,) = some_of(groups[:1])
+    assert only.size == 384
