@@ -18,6 +18,8 @@ from prbayes.emulators.surfaces import RadialBasis, Surface, fitted
 # Runs that a surface goes through at most: its cost grows with their cube. More are left to the
 # weights, which are then good enough.
 MOST_RUNS = 2000
+
+
 @dataclass(frozen=True, eq=False)
 class Runs:
     """Runs that an emulator is fitted on.

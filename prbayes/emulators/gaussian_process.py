@@ -16,7 +16,7 @@ from prbayes.emulators.surfaces import Predict, Surface
 MOST_TUNED = 256
 # Where the likelihood is climbed from: lengths in roots of the number of inputs, and the nugget.
 # Long ones alone miss a resonance, short ones alone a response that is nearly a polynomial.
-_BEGINNINGS = ((0.7, 1e-2), (2.0, 1e-6))
+_CLIMBS = ((0.7, 1e-2), (2.0, 1e-6))
 # Up to how many points both starts are tried; with more one finds the same.
 _BOTH = 128
 # Points that are predicted at a time: they stay in the cache, which is three times as fast.
@@ -97,7 +97,7 @@ class GaussianProcess(Surface):
         # Far shorter, a process is noise; far longer, a plane.
         bounds = [(np.log(0.05), np.log(1e3))] * d + [(np.log(1e-10), 0.0)]
         best = None
-        for length, nugget in _BEGINNINGS if len(few) <= _BOTH else _BEGINNINGS[:1]:
+        for length, nugget in _CLIMBS if len(few) <= _BOTH else _CLIMBS[:1]:
             start = np.log([*[length * np.sqrt(d)] * d, nugget])
             found = minimize(likelihood, start, jac=True, bounds=bounds, method="L-BFGS-B")
             if best is None or found.fun < best.fun:
@@ -117,7 +117,9 @@ class GaussianProcess(Surface):
         own, _ = correlation(_squares(scaled, scaled))
         root = cho_factor(own + self.nugget * np.eye(len(x)), lower=True)
         center = float(y.mean())
-        return _Mean(self.kernel, scaled, np.array(self.lengths), center, cho_solve(root, y - center))
+        return _Mean(
+            self.kernel, scaled, np.array(self.lengths), center, cho_solve(root, y - center)
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,7 +97,7 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
     # Points of clouds cost no run; what emulators say of them does.
     if clouds and errors.points > _OF_EACH * AGREE:
         grown = _widened(evaluator, thetas, clouds)
-    if clouds and errors.emulators > _OF_EACH * AGREE or runs:
+    if (clouds and errors.emulators > _OF_EACH * AGREE) or runs:
         grown |= _add(evaluator, thetas, clouds | runs, _factor(errors.whole))
     return grown
 

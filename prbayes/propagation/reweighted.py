@@ -185,7 +185,7 @@ def _refuse_emulator(emulator: Any) -> None:
         )
     if not (callable(getattr(emulator, "fit", None)) and hasattr(emulator, "predict")):
         raise TypeError(
-            f"Reweighted: emulator: got {type(emulator).__name__}, expected \"auto\", None, a "
+            f'Reweighted: emulator: got {type(emulator).__name__}, expected "auto", None, a '
             "surface such as prb.surrogate.RadialBasis(), or a regressor with fit(X, y) and "
             "predict(X)"
         )

@@ -23,6 +23,7 @@ from prbayes._checks import (
     share,
 )
 from prbayes._progress import shown
+from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted, settings_of, shipped
 from prbayes.propagation.points import sobol
 from prbayes.response.calling import Calling, Points, Tally, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
@@ -32,7 +33,6 @@ from prbayes.surrogate.error import CrossValidation, cross_validated, points_nee
 from prbayes.surrogate.files import Kept, read, write
 from prbayes.surrogate.noise import hashed_rows
 from prbayes.surrogate.ranges import Ranges, read_ranges
-from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted, settings_of, shipped
 
 _log = logging.getLogger("prbayes")
 

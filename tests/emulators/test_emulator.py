@@ -27,7 +27,9 @@ def test_a_run_that_is_left_out_is_not_seen() -> None:
     said = left_out([RadialBasis(), RadialBasis()], known)
     block = known.blocks == 3
     other = Runs(known.x, np.where(block[:, None], 7.0, known.y), known.importance, known.blocks)
-    np.testing.assert_array_equal(left_out([RadialBasis(), RadialBasis()], other)[block], said[block])
+    np.testing.assert_array_equal(
+        left_out([RadialBasis(), RadialBasis()], other)[block], said[block]
+    )
     assert np.abs(said - known.y).max() > 0
 
 

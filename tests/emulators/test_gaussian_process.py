@@ -50,7 +50,9 @@ def test_settings_that_were_found_are_kept_with_fewer_points() -> None:
     tuned = GaussianProcess("matern").tuned(x, y)
     assert tuned.tuned(x, y).kernel == "matern"
     at = x[:5] + 0.1
-    np.testing.assert_array_equal(tuned.through(x, y)(at), GaussianProcess("matern").through(x, y)(at))
+    np.testing.assert_array_equal(
+        tuned.through(x, y)(at), GaussianProcess("matern").through(x, y)(at)
+    )
     assert not np.array_equal(tuned.through(x[::2], y[::2])(at), tuned.through(x, y)(at))
 
 

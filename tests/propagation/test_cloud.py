@@ -14,12 +14,17 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.cloud import CLOUD, columns, some_of
 from prbayes.propagation.reweighted import Design
 
-OBSERVED = np.random.default_rng(1).normal(2.0, 0.5, 40)
 AT = np.array([[1.1, 0.9, -0.2, -0.5]])
 
 
 def smooth(a: Any, b: Any) -> Any:
     return a * np.exp(0.3 * b) + 0.2 * b**2
+
+
+# Of specimens whose inputs have means 1.2 and 1, and standard deviations .8 and .6.
+OBSERVED = smooth(
+    *(np.array([[1.2], [1.0]]) + [[0.8], [0.6]] * np.random.default_rng(1).normal(size=(2, 40)))
+)
 
 
 def jumping(a: Any, b: Any) -> Any:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import prbayes as prb
-from prbayes.surrogate.error import FOLDS, CrossValidation, cross_validated, points_needed
 from prbayes.emulators.surfaces import Surface
+from prbayes.surrogate.error import FOLDS, CrossValidation, cross_validated, points_needed
 
 BOX = {"x": (0.0, 3.0), "y": (1.0, 2.0)}
 
