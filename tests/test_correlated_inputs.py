@@ -88,8 +88,7 @@ def exact_errors() -> tuple[Floats, float]:
 
 @pytest.fixture(scope="module")
 def optimum() -> prb.Optimum:
-    # The runs alone leave an element of the factor just not identified.
-    model = model_of(ENOUGH, prb.KullbackLeibler(), max_points=2048, emulator=None)
+    model = model_of(ENOUGH, prb.KullbackLeibler(), max_points=2048)
     return prb.minimize(model, starts=0, progressbar=False)
 
 

@@ -1,4 +1,4 @@
-"""How far an emulator is trusted: the share of a population that is left to the runs' own weights."""
+"""How far an emulator is trusted: the share of a population that runs keep by their own weights."""
 
 from __future__ import annotations
 

@@ -187,7 +187,7 @@ class SamplingDistribution:
         return max(1, 2 * AT_ONCE // (points * stencil))
 
     def design_error(self) -> DesignErrors:
-        """Return how far the optimum of an independent design would be, by its points and emulators.
+        """Return how far the optimum of another design would be, by its points and emulators.
 
         In standard errors, along the worst axis.
         """

@@ -1,4 +1,4 @@
-"""Points that a design's weights are taken of: its runs, or a cloud whose responses are emulated."""
+"""Points that a design takes weights of: its runs, or a cloud whose responses are emulated."""
 
 from __future__ import annotations
 
@@ -178,13 +178,12 @@ def columns(points: Sequence[Floats]) -> Floats:
 
 
 def some_of(groups: Sequence[Sequence[Floats]]) -> list[Floats]:
-    """Return the populations of a cloud's mixture, of groups of them: half are of the last group."""
-    *before, last = groups
-    shares = [*(_POPULATIONS // 2 // len(before) for _ in before), _POPULATIONS // 2]
-    if not before:
-        shares = [_POPULATIONS]
+    """Return the populations of a cloud's mixture: half are of the last of several groups."""
+    before = len(groups) - 1
+    of_last = _POPULATIONS // 2 if before else _POPULATIONS
+    shares = [(_POPULATIONS - of_last) // before for _ in range(before)]
     found = []
-    for group, most in zip(groups, shares, strict=True):
+    for group, most in zip(groups, [*shares, of_last], strict=True):
         # A few come again and again, so that their share does not depend on their number.
         places = np.linspace(0, len(group[0]) - 1, most).astype(int)
         found.append([values[places] for values in group])

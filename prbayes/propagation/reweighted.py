@@ -94,12 +94,12 @@ class Reweighted(Propagation):
     max_points : int, optional
         Largest number of responses, refinement included; 32 n by default.
     emulator : str, Surface or regressor, optional
-        What says the response between the runs of several inputs: by default the best of a few
+        What says the response between the runs, so that a few dozen or hundred of them are enough
+        for several inputs; by default the runs stand alone. ``"auto"`` takes the best of a few
         surfaces for each output, by their errors at runs that were left out, mixed with the runs'
-        own weights as far as these errors ask for it. Populations then are made of thousands of
-        points, of which a few dozen to a few hundred are computed. Or a surface of
-        ``prb.surrogate``, any regressor with ``fit(X, y)`` and ``predict(X)``; None for the runs
-        alone. With a larger n than 2000, and discrete inputs, none is by default.
+        own weights as far as these errors ask for it; not with one input, discrete ones, or an n
+        above 2000, where runs alone are as good. Or a surface of ``prb.surrogate``, or any
+        regressor with ``fit(X, y)`` and ``predict(X)``.
     executor : Executor, optional
         Where the response is computed: threads, processes, loky,
         ``dask.distributed.Client().get_executor()``, ``mpi4py.futures.MPIPoolExecutor()``. In this
@@ -131,14 +131,14 @@ class Reweighted(Propagation):
     Examples
     --------
     >>> Reweighted(256)
-    Reweighted(n=256, random_seed=0, max_lost=0.05, max_points=None, emulator='auto')
+    Reweighted(n=256, random_seed=0, max_lost=0.05, max_points=None, emulator=None)
     """
 
     n: int = 1024
     random_seed: int = 0
     max_lost: float = MAX_LOST
     max_points: int | None = None
-    emulator: Any = "auto"
+    emulator: Any = None
 
     def __post_init__(self) -> None:
         self.check()
@@ -582,7 +582,7 @@ class Design(Bound):
         )
 
     def left_out(self) -> list[Floats]:
-        """Return the responses as emulators say that lack a block of runs each; none without one."""
+        """Return responses as emulators say that lack a block of runs each; none without one."""
         contents = self.contents
         if contents.cloud is None or contents.emulation is None:
             return []

@@ -42,7 +42,7 @@ def build(response: Any = smooth, n: int = 64, *, known: bool = False, **keyword
             b = pm.Normal.dist(1.0, 0.6)
         else:
             b = pm.Normal.dist(pm.Normal("mb", 1, 0.5), pm.LogNormal("sb", -0.5, 0.5))
-        stored = prb.Reweighted(n, **keywords)
+        stored = prb.Reweighted(n, **{"emulator": "auto", **keywords})
         prb.Simulator(
             "y", response, a, b, metric=prb.KullbackLeibler(), observed=OBSERVED, propagation=stored
         )
@@ -103,7 +103,7 @@ def test_a_response_that_no_surface_follows_keeps_its_runs() -> None:
 
 def test_a_cloud_reaches_other_populations_without_a_run() -> None:
     evaluator, design = design_of(build())
-    far = theta_of(evaluator) + [[1.0, 1.0, -1.0, -1.0]]
+    far = theta_of(evaluator) + np.array([1.0, 1.0, -1.0, -1.0])
     before = evaluator.support(far)["y"]["weight_ess"]
     design.reach(evaluator.roots(far + 0.1 * np.random.default_rng(0).standard_normal((64, 4)), 0))
     assert evaluator.support(far)["y"]["weight_ess"] > 2 * before
@@ -180,12 +180,15 @@ def test_what_is_no_emulator_is_refused(emulator: Any) -> None:
 def test_one_input_and_discrete_ones_are_not_emulated() -> None:
     with pm.Model() as model:
         a = pm.Normal.dist(pm.Normal("ma", 1, 0.5), 1.0)
-        prb.Simulator("y", lambda a: a, a, metric=prb.AreaMetric(), observed=OBSERVED)
+        stored = prb.Reweighted(64, emulator="auto")
+        prb.Simulator(
+            "y", lambda a: a, a, metric=prb.AreaMetric(), observed=OBSERVED, propagation=stored
+        )
     assert design_of(model)[1].contents.cloud is None
     with pm.Model() as model:
         a = pm.Normal.dist(pm.Normal("ma", 1, 0.5), 1.0)
         k = pm.Poisson.dist(pm.LogNormal("lam", 1, 0.3))
-        stored = prb.Reweighted(64)
+        stored = prb.Reweighted(64, emulator="auto")
         prb.Simulator(
             "y", lambda a, k: a + k, a, k,
             metric=prb.AreaMetric(), observed=OBSERVED, propagation=stored,
