@@ -1,0 +1,171 @@
+"""How many runs calibrate several inputs with an emulator, how exact is the optimum, and is that known?
+
+Every input has a mean and a standard deviation of its own. Responses are those of
+`benchmarks.responses`, with as many outputs again that each follow one input, so that the data
+identify all hyperparameters; N = 50 specimens, compared by `Joint(KullbackLeibler())`. Priors of
+means are two population standard deviations wide, of standard deviations a factor of 1.6; the frame
+has uniform priors a hundred posterior standard deviations wide.
+
+The design begins with 32 runs an input and grows by itself. The reference is the optimum of
+Resimulated(65 536) on the same data. Beside it: runs alone, without an emulator, which may grow to
+32 768. Off is the root mean square distance of an optimum from the reference, over hyperparameters
+and seeds of designs, in standard errors; claimed is `Optimum.design_error`, for the worst
+hyperparameter and between two designs, so that it is compared with the worst distance times the
+root of two.
+
+Run: uv run python -m benchmarks.few_runs [--seeds 10]
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pymc as pm
+
+import prbayes as prb
+from benchmarks import record
+from benchmarks.responses import RESPONSES
+
+NAMES = ("product", "frame", "NaN region", "three inputs", "two kinks", "jump")
+N = 50
+FIRST = 32  # runs for each input
+
+
+def outputs_of(name: str) -> Callable[..., Any]:
+    """Return the response with an output for each input beside its own: inputs -> (..., m)."""
+    response = RESPONSES[name]
+
+    def together(*inputs: Any) -> Any:
+        x = np.stack(np.broadcast_arrays(*inputs), axis=-1)
+        flat = x.reshape(-1, response.d)
+        own = response(flat)
+        if name != "frame":
+            z = (flat - response.mean) / response.sd
+            own = np.concatenate([own, z + 0.2 * z * z[:, ::-1]], axis=1)
+        return own.reshape(*x.shape[:-1], own.shape[1])
+
+    return together
+
+
+def observed_of(name: str, seed: int) -> Any:
+    """Return outputs of specimens of the true population, without those that have none."""
+    response = RESPONSES[name]
+    rng = np.random.default_rng([seed, N])
+    x = response.mean + response.sd * rng.standard_normal((2 * N, response.d))
+    found = outputs_of(name)(*x.T)
+    return found[np.isfinite(found).all(axis=1)][:N]
+
+
+def build(name: str, observed: Any, propagation: Any) -> pm.Model:
+    """Return the model."""
+    response = RESPONSES[name]
+    with pm.Model() as model:
+        inputs = []
+        for i, (mean, sd) in enumerate(zip(response.mean, response.sd, strict=True)):
+            if name == "frame":
+                half = 50 * sd / np.sqrt(N)
+                mu = pm.Uniform(f"mu{i}", mean - half, mean + half)
+                sigma = pm.Uniform(f"sigma{i}", 0, 100 * sd / np.sqrt(2 * N))
+            else:
+                mu = pm.Normal(f"mu{i}", mean, 2 * sd)
+                sigma = pm.LogNormal(f"sigma{i}", np.log(sd), 0.5)
+            inputs.append(pm.Normal.dist(mu, sigma))
+        metric = prb.Joint(prb.KullbackLeibler())
+        prb.Simulator(
+            "y",
+            outputs_of(name),
+            *inputs,
+            metric=metric,
+            observed=observed,
+            propagation=propagation,
+        )
+    return model
+
+
+def fitted(name: str, observed: Any, propagation: Any, reference: Any) -> dict[str, Any]:
+    """Calibrate once, and say how far from the reference."""
+    clock = time.perf_counter()
+    try:
+        optimum = prb.minimize(build(name, observed, propagation), progressbar=False)
+    except prb.propagation.DesignError as error:
+        return {"refused": str(error)[:200]}
+    away = (optimum.theta - reference.theta) / np.sqrt(np.diag(reference.covariance))
+    return {
+        "runs": optimum.n_responses,
+        "off": [round(float(a), 4) for a in away[np.isfinite(away)]],
+        "claimed": float(optimum.design_error),
+        "seconds": round(time.perf_counter() - clock, 1),
+    }
+
+
+def problem(name: str, seeds: int, of_runs_alone: int) -> dict[str, Any]:
+    """Calibrate a problem with several designs, with an emulator and without."""
+    observed = observed_of(name, 1)
+    n = FIRST * RESPONSES[name].d
+    begin = prb.minimize(
+        build(name, observed, prb.Reweighted(n, emulator="auto", random_seed=1000)),
+        progressbar=False,
+    )
+    reference = prb.minimize(
+        build(name, observed, prb.Resimulated(65_536)),
+        start=begin.point,
+        starts=0,
+        progressbar=False,
+    )
+    rows = []
+    for seed in range(seeds):
+        stored = prb.Reweighted(n, emulator="auto", random_seed=seed)
+        rows.append(fitted(name, observed, stored, reference))
+    alone = []
+    for seed in range(of_runs_alone):
+        stored = prb.Reweighted(1024, max_points=32_768, random_seed=seed)
+        alone.append(fitted(name, observed, stored, reference))
+    return {"inputs": RESPONSES[name].d, "emulated": rows, "alone": alone}
+
+
+def summary(rows: list[dict[str, Any]]) -> str:
+    """Return runs, error and its claim, and seconds, of several designs."""
+    good = [row for row in rows if "off" in row]
+    if not good:
+        return "refused" if rows else "-"
+    runs = sorted(row["runs"] for row in good)
+    off = np.array([row["off"] for row in good])
+    worst = np.sqrt(2 * (off**2).mean(axis=0).max())
+    claimed = np.sqrt(np.mean([row["claimed"] ** 2 for row in good]))
+    seconds = np.median([row["seconds"] for row in good])
+    refused = f", {len(rows) - len(good)} refused" if len(good) < len(rows) else ""
+    return (
+        f"{runs[0]} - {runs[-1]} runs, off {np.sqrt((off**2).mean()):.3f} (worst {worst:.3f}, "
+        f"claimed {claimed:.3f}), {seconds:.0f} s{refused}"
+    )
+
+
+def main() -> None:
+    """Print a table and write JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--alone", type=int, default=2, help="designs without an emulator")
+    parser.add_argument("--problems", nargs="+", default=list(NAMES), choices=NAMES)
+    parser.add_argument("--out", type=Path, default=record.RESULTS / "few_runs.json")
+    parser.add_argument("--only-table", action="store_true")
+    arguments = parser.parse_args()
+    logging.getLogger("prbayes").setLevel(logging.ERROR)
+    table: dict[str, Any] = record.load(arguments.out, {})
+    for name in arguments.problems:
+        if not arguments.only_table:
+            table[name] = problem(name, arguments.seeds, arguments.alone)
+            record.save(arguments.out, table)
+        if name in table:
+            print(f"{name} ({table[name]['inputs']} inputs)")
+            print(f"   with an emulator: {summary(table[name]['emulated'])}")
+            print(f"   runs alone:       {summary(table[name]['alone'])}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
