@@ -108,18 +108,17 @@ class GaussianProcess(Surface):
 
     def through(self, x: Floats, y: Floats) -> Predict:
         """Return the mean of the process given the points."""
-        from scipy.linalg import cho_factor, cho_solve
+        from scipy.linalg import cho_solve
 
         if self.lengths is None or self.nugget is None:
             return self.tuned(x, y).through(x, y)
         correlation = _KERNELS[self.kernel]
         scaled = x / self.lengths
         own, _ = correlation(_squares(scaled, scaled))
-        root = cho_factor(own + self.nugget * np.eye(len(x)), lower=True)
+        root = _root(own, self.nugget)
         center = float(y.mean())
-        return _Mean(
-            self.kernel, scaled, np.array(self.lengths), center, cho_solve(root, y - center)
-        )
+        coefficients = cho_solve((root, True), y - center)
+        return _Mean(self.kernel, scaled, np.array(self.lengths), center, coefficients)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +172,18 @@ class _Likelihood:
         log_determinant = np.log(np.diag(root[0])).sum()
         value = 0.5 * n * np.log(variance) + log_determinant
         return float(value), -np.append(of_lengths, of_nugget)
+
+
+def _root(correlation: Floats, nugget: float) -> Any:
+    """Return the lower root of a correlation with a nugget, a larger one if rounding asks for it."""
+    from scipy.linalg import cholesky
+
+    unit = np.eye(len(correlation))
+    while True:
+        try:
+            return cholesky(correlation + nugget * unit, lower=True)
+        except np.linalg.LinAlgError:
+            nugget = max(10 * nugget, 1e-14)
 
 
 def _squares(a: Floats, b: Floats) -> Any:

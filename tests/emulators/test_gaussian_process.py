@@ -56,6 +56,13 @@ def test_settings_that_were_found_are_kept_with_fewer_points() -> None:
     assert not np.array_equal(tuned.through(x[::2], y[::2])(at), tuned.through(x, y)(at))
 
 
+def test_points_that_are_all_but_the_same_are_no_obstacle() -> None:
+    x, y = points()
+    twice = np.concatenate([x, x + 1e-12])
+    found = GaussianProcess(lengths=(50.0, 50.0, 50.0), nugget=0.0).through(twice, np.tile(y, 2))
+    assert np.isfinite(found(x)).all()
+
+
 def test_it_is_pickled() -> None:
     x, y = points()
     surface = GaussianProcess().through(x, y)
