@@ -175,7 +175,7 @@ class _Likelihood:
 
 
 def _root(correlation: Floats, nugget: float) -> Any:
-    """Return the lower root of a correlation with a nugget, a larger one if rounding asks for it."""
+    """Return the lower root of a correlation with a nugget, larger if rounding asks for it."""
     from scipy.linalg import cholesky
 
     unit = np.eye(len(correlation))
