@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 from prbayes._progress import progress
 from prbayes.response.budget import BudgetError, budget
-from prbayes.response.executors import Pool, capacity, failure_of, is_loss, told
+from prbayes.response.executors import Pool, capacity, failure_of, has_slipped, is_loss, told
 from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
 from prbayes.response.outputs import ONE, Outputs, lacking, outputs_of_result
 from prbayes.response.store import Store, StoreError
@@ -419,6 +419,9 @@ def chunks(
             for future in pool.done(begun):
                 some = begun.pop(future)
                 failure = failure_of(future)
+                if has_slipped(failure):
+                    left = np.concatenate([some, left])
+                    continue
                 if tolerant and is_loss(failure):
                     suspects.append(some)
                     loss = failure
@@ -461,6 +464,8 @@ def _alone(
         pool.renew(failure)
         if failure is None:
             yield some, future.result()
+        elif has_slipped(failure):
+            left.append(some)
         elif not is_loss(failure):
             _raise_lost(pool.name, failure)
         elif some.size == 1:

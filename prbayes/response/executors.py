@@ -19,6 +19,7 @@ from concurrent.futures import (
 )
 from dataclasses import dataclass
 from inspect import signature
+from traceback import walk_tb
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -100,6 +101,20 @@ def is_loss(failure: BaseException | None) -> bool:
     """Return whether a chunk failed since its worker was lost; Dask names that by a class."""
     names = {kind.__name__ for kind in type(failure).__mro__}
     return isinstance(failure, BrokenExecutor) or "KilledWorker" in names
+
+
+def has_slipped(failure: BaseException | None) -> bool:
+    """Return whether a result was there and is not, as its worker left at that very moment.
+
+    Dask's executor reads the state of a task after its result: by then it may be at work again
+    elsewhere, and the executor takes the result for an exception.
+    """
+    if not isinstance(failure, TypeError):
+        return False
+    raised_in = None
+    for frame, _ in walk_tb(failure.__traceback__):
+        raised_in = frame.f_globals.get("__name__")
+    return raised_in == "distributed.cfexecutor"
 
 
 def told(failure: BaseException) -> str:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import (
     BrokenExecutor,
     Executor,
+    Future,
     ProcessPoolExecutor,
     ThreadPoolExecutor,
 )
@@ -33,7 +34,8 @@ from prbayes.response.calling import (
     compute,
     respond,
 )
-from prbayes.response.failures import OnFailure
+from prbayes.response.executors import has_slipped
+from prbayes.response.failures import Abort, OnFailure, Replace
 from prbayes.response.store import Store
 
 N = 64
@@ -633,3 +635,36 @@ def test_a_response_that_leaves_python_is_a_failure_like_another(kind: str) -> N
     np.testing.assert_array_equal(stored(found), np.where(STEEP, np.inf, EXPECTED))
     with pytest.raises(prb.response.ResponseError, match="raised SystemExit: bye"):
         failing(kind, leaves)
+
+
+class Slipping(Executor):
+    """As Dask's, which takes a result for an exception where its worker leaves at that moment."""
+
+    def __init__(self, slips: int) -> None:
+        self.slips = slips
+
+    def submit(self, work: Any, /, *job: Any, **keywords: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        result = work(*job, **keywords)
+        if not self.slips:
+            future.set_result(result)
+            return future
+        self.slips -= 1
+        names: dict[str, Any] = {"__name__": "distributed.cfexecutor"}
+        exec("def cascade(result):\n    typ, exc, tb = result", names)
+        try:
+            names["cascade"](result)
+        except TypeError as error:
+            future.set_exception(error)
+        return future
+
+
+@pytest.mark.parametrize("policy", [Abort(), Replace()], ids=["abort", "replace"])
+def test_a_result_that_slipped_away_is_computed_again(policy: Any) -> None:
+    found = model(prb.scalar(times), executor=Slipping(3), on_failure=policy)
+    np.testing.assert_array_equal(stored(found), EXPECTED)
+
+
+def test_a_type_error_of_another_is_no_slip() -> None:
+    assert not has_slipped(TypeError("x"))
+    assert not has_slipped(None)
