@@ -10,6 +10,8 @@ import pytest
 
 import prbayes as prb
 from prbayes._checks import Floats
+from prbayes.estimate.refinement import grow
+from prbayes.estimate.refit import DesignErrors, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.cloud import CLOUD, columns, some_of
 from prbayes.propagation.reweighted import Design
@@ -108,6 +110,37 @@ def test_a_cloud_reaches_other_populations_without_a_run() -> None:
     design.reach(evaluator.roots(far + 0.1 * np.random.default_rng(0).standard_normal((64, 4)), 0))
     assert evaluator.support(far)["y"]["weight_ess"] > 2 * before
     assert evaluator.n_responses == 64
+
+
+def test_the_prior_stays_in_reach() -> None:
+    evaluator, design = design_of(build())
+    far = theta_of(evaluator) + np.array([1.0, 1.0, -2.0, -2.0])
+    for _ in range(3):
+        design.reach(evaluator.roots(np.repeat(far, 16, axis=0), 0))
+    prior = evaluator.prior_thetas(200, 1)
+    assert np.median(evaluator.support(prior)["y"]["mean_weight"]) == pytest.approx(1, abs=0.05)
+
+
+def test_clouds_grow_for_their_points_and_runs_for_what_emulators_say() -> None:
+    evaluator, design = design_of(build())
+    thetas = theta_of(evaluator) + 0.1 * np.random.default_rng(0).standard_normal((64, 4))
+    assert not grow(evaluator, thetas, DesignErrors(points=0.05, emulators=0.05))
+    assert grow(evaluator, thetas, DesignErrors(points=0.2, emulators=0.0))
+    assert (design.n_runs, design.n_points) == (64, 2 * CLOUD)
+    assert grow(evaluator, thetas, DesignErrors(points=0.0, emulators=0.2))
+    assert (design.n_runs, design.n_points) == (128, 2 * CLOUD)
+
+
+def test_the_error_of_emulators_is_measured_by_runs_that_are_left_out() -> None:
+    errors = {}
+    for kind, response in {"smooth": smooth, "kink": lambda a, b: np.abs(a - 1) + b}.items():
+        evaluator, _ = design_of(build(response, known=True))
+        theta = evaluator.unconstrained({"ma": np.array(1.2), "sa": np.array(0.8)})
+        sampling = SamplingDistribution.of(evaluator, theta, np.ones(1))
+        errors[kind] = sampling.design_error()
+    assert 0.01 < errors["kink"].emulators < np.inf
+    assert errors["smooth"].emulators < 0.1 * errors["kink"].emulators
+    assert 0 < errors["smooth"].points < 0.3
 
 
 def test_a_larger_cloud_is_a_larger_cloud() -> None:
