@@ -12,6 +12,7 @@ import pickle
 import re
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -426,6 +427,7 @@ def test_dask_tells_its_workers_by_address_and_losses_by_a_class() -> None:
         assert address.startswith("inproc:")
         assert threads == 2
     assert distributed.KilledWorker.__name__ == "KilledWorker"
+    assert Path(distributed.cfexecutor.__file__).parts[-2:] == ("distributed", "cfexecutor.py")
     assert not issubclass(distributed.KilledWorker, BrokenExecutor)
 
 

@@ -19,6 +19,7 @@ from concurrent.futures import (
 )
 from dataclasses import dataclass
 from inspect import signature
+from pathlib import Path
 from traceback import walk_tb
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -111,10 +112,10 @@ def has_slipped(failure: BaseException | None) -> bool:
     """
     if not isinstance(failure, TypeError):
         return False
-    raised_in = None
+    file = ""
     for frame, _ in walk_tb(failure.__traceback__):
-        raised_in = frame.f_globals.get("__name__")
-    return raised_in == "distributed.cfexecutor"
+        file = frame.f_code.co_filename
+    return Path(file).parts[-2:] == ("distributed", "cfexecutor.py")
 
 
 def told(failure: BaseException) -> str:

@@ -134,9 +134,9 @@ def test_clouds_grow_for_their_points_and_runs_for_what_emulators_say() -> None:
 def test_the_error_of_emulators_is_measured_by_runs_that_are_left_out() -> None:
     errors = {}
     for kind, response in {"smooth": smooth, "kink": lambda a, b: np.abs(a - 1) + b}.items():
-        evaluator, _ = design_of(build(response, known=True))
-        theta = evaluator.unconstrained({"ma": np.array(1.2), "sa": np.array(0.8)})
-        sampling = SamplingDistribution.of(evaluator, theta, np.ones(1))
+        model = build(response, known=True)
+        optimum = prb.minimize(model, starts=0, refine=False, progressbar=False)
+        sampling = SamplingDistribution.of(optimum.evaluator, optimum.theta, np.ones(1))
         errors[kind] = sampling.design_error()
     assert 0.01 < errors["kink"].emulators < np.inf
     assert errors["smooth"].emulators < 0.1 * errors["kink"].emulators

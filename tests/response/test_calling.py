@@ -650,8 +650,9 @@ class Slipping(Executor):
             future.set_result(result)
             return future
         self.slips -= 1
-        names: dict[str, Any] = {"__name__": "distributed.cfexecutor"}
-        exec("def cascade(result):\n    typ, exc, tb = result", names)
+        names: dict[str, Any] = {}
+        text = "def cascade(result):\n    typ, exc, tb = result"
+        exec(compile(text, "distributed/cfexecutor.py", "exec"), names)
         try:
             names["cascade"](result)
         except TypeError as error:
