@@ -143,13 +143,6 @@ def test_the_error_of_emulators_is_measured_by_runs_that_are_left_out() -> None:
     assert 0 < errors["smooth"].points < 0.3
 
 
-def test_a_larger_cloud_is_a_larger_cloud() -> None:
-    evaluator, design = design_of(build())
-    assert design.widen(evaluator.roots(theta_of(evaluator), 0))
-    assert design.n_points == 2 * CLOUD
-    assert evaluator.n_responses == 64
-
-
 def test_another_response_is_computed_at_the_runs_and_emulated() -> None:
     evaluator, design = design_of(build())
     calls: list[int] = []
