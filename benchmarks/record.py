@@ -21,6 +21,11 @@ def _git(*arguments: str) -> str:
     return found.stdout.strip()
 
 
+def _without_folders(argument: str) -> str:
+    """Return an argument; of a path from the root of this machine's files its name only."""
+    return Path(argument).name if Path(argument).is_absolute() else argument
+
+
 def about() -> dict[str, Any]:
     """Return how, on what and when this process runs."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
@@ -33,7 +38,7 @@ def about() -> dict[str, Any]:
     for name in PACKAGES:
         versions[name] = importlib.metadata.version(name)
     return {
-        "command": " ".join(["python", module, *sys.argv[1:]]),
+        "command": " ".join(["python", module, *map(_without_folders, sys.argv[1:])]),
         "commit": _git("rev-parse", "--short", "HEAD") + changed,
         "versions": versions,
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),

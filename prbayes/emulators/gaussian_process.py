@@ -23,22 +23,26 @@ _BOTH = 128
 _AT_A_TIME = 1024
 
 
-def _squared_exponential(square: Floats) -> tuple[Floats, Floats]:
+# From squared distances to the correlation, and minus twice its slope.
+Kernel = Callable[[Floats], tuple[Floats, Floats]]
+
+
+def squared_exponential(square: Floats) -> tuple[Floats, Floats]:
     """Return the correlation and minus twice its slope, of squared distances."""
     correlation = np.exp(-0.5 * square)
     return correlation, correlation
 
 
-def _matern(square: Floats) -> tuple[Floats, Floats]:
+def matern(square: Floats) -> tuple[Floats, Floats]:
     """Return the same of a Matern correlation, 5/2."""
     r = np.sqrt(5 * square)
     decay = np.exp(-r)
     return (1 + r + r**2 / 3) * decay, 5 / 3 * (1 + r) * decay
 
 
-_KERNELS: dict[str, Callable[[Floats], tuple[Floats, Floats]]] = {
-    "squared_exponential": _squared_exponential,
-    "matern": _matern,
+KERNELS: dict[str, Kernel] = {
+    "squared_exponential": squared_exponential,
+    "matern": matern,
 }
 
 
@@ -78,9 +82,9 @@ class GaussianProcess(Surface):
     nugget: float | None = None
 
     def __post_init__(self) -> None:
-        if self.kernel not in _KERNELS:
+        if self.kernel not in KERNELS:
             raise ValueError(
-                f"GaussianProcess: kernel: got {self.kernel!r}, expected one of {list(_KERNELS)}"
+                f"GaussianProcess: kernel: got {self.kernel!r}, expected one of {list(KERNELS)}"
             )
 
     def terms(self, dimensions: int) -> int:
@@ -92,7 +96,7 @@ class GaussianProcess(Surface):
         from scipy.optimize import minimize
 
         few = np.linspace(0, len(x) - 1, min(MOST_TUNED, len(x))).astype(int)
-        likelihood = _Likelihood(_KERNELS[self.kernel], x[few], y[few] - y[few].mean())
+        likelihood = Likelihood(KERNELS[self.kernel], x[few], y[few] - y[few].mean())
         d = x.shape[1]
         # Far shorter, a process is noise; far longer, a plane.
         bounds = [(np.log(0.05), np.log(1e3))] * d + [(np.log(1e-10), 0.0)]
@@ -108,24 +112,28 @@ class GaussianProcess(Surface):
 
     def through(self, x: Floats, y: Floats) -> Predict:
         """Return the mean of the process given the points."""
-        from scipy.linalg import cho_solve
-
         if self.lengths is None or self.nugget is None:
             return self.tuned(x, y).through(x, y)
-        correlation = _KERNELS[self.kernel]
-        scaled = x / self.lengths
-        own, _ = correlation(_squares(scaled, scaled))
-        root = _root(own, self.nugget)
-        center = float(y.mean())
-        coefficients = cho_solve((root, True), y - center)
-        return _Mean(self.kernel, scaled, np.array(self.lengths), center, coefficients)
+        return mean_through(KERNELS[self.kernel], np.array(self.lengths), self.nugget, x, y)
+
+
+def mean_through(kernel: Kernel, lengths: Floats, nugget: float, x: Floats, y: Floats) -> Predict:
+    """Return the mean of a process given points, with lengths and a nugget that are known."""
+    from scipy.linalg import cho_solve
+
+    scaled = x / lengths
+    own, _ = kernel(_squares(scaled, scaled))
+    root = _root(own, nugget)
+    center = float(y.mean())
+    coefficients = cho_solve((root, True), y - center)
+    return _Mean(kernel, scaled, lengths, center, coefficients)
 
 
 @dataclass(frozen=True, eq=False)
 class _Mean:
     """The mean of a process; a class, so that it can be pickled."""
 
-    kernel: str
+    kernel: Kernel
     scaled: Floats
     lengths: Floats
     center: float
@@ -136,20 +144,21 @@ class _Mean:
         for start in range(0, len(at), _AT_A_TIME):
             some = slice(start, start + _AT_A_TIME)
             square = _squares(at[some] / self.lengths, self.scaled)
-            correlation, _ = _KERNELS[self.kernel](square)
+            correlation, _ = self.kernel(square)
             found[some] = correlation @ self.coefficients
         return self.center + found
 
 
 @dataclass(frozen=True, eq=False)
-class _Likelihood:
+class Likelihood:
     """Minus the log-likelihood of log lengths and log nugget, with its gradient."""
 
-    correlation: Callable[[Floats], tuple[Floats, Floats]]
+    correlation: Kernel
     x: Floats
     y: Floats
 
     def __call__(self, parameters: Floats) -> tuple[float, Floats]:
+        """Return the value and the gradient."""
         from scipy.linalg import cho_factor, cho_solve
 
         n = len(self.x)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -58,13 +58,11 @@ def refine_at(
                 f"{name}: {what}; repair the response there, return +inf for specimens that fail, "
                 "narrow the priors, or raise max_lost"
             )
-    if again:
-        _widened(evaluator, thetas, set(short))
-    else:
-        _reach(evaluator, thetas, set(short))
-    thin = set(shortcomings(evaluator, thetas)) & set(short)
-    while _widened(evaluator, thetas, thin):
+    thin = set(short)
+    drawn = _widened(evaluator, thetas, thin) if again else _reach(evaluator, thetas, thin)
+    while drawn and thin:
         thin &= set(shortcomings(evaluator, thetas))
+        drawn = _widened(evaluator, thetas, thin)
     # What no cloud reaches needs runs.
     _add(evaluator, thetas, thin)
     return short
@@ -105,16 +103,6 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
 def _factor(error: float) -> float:
     """Return by how much designs are to grow for an error to become small enough."""
     return float(min(_GROWTH, (error / AGREE) ** (1 / _RATE)))
-
-
-def _widened(evaluator: Evaluator, thetas: Floats, names: set[str]) -> bool:
-    """Draw larger clouds for the populations at thetas; return whether any could be."""
-    grown = False
-    for k, node in enumerate(evaluator.nodes):
-        design = node.design
-        if design is not None and design.contents.cloud is not None and node.name in names:
-            grown |= design.widen(evaluator.roots(thetas, k))
-    return grown
 
 
 def _add(evaluator: Evaluator, thetas: Floats, names: set[str], factor: float = 1.0) -> bool:
@@ -184,12 +172,31 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
     return best
 
 
-def _reach(evaluator: Evaluator, thetas: Floats, names: set[str]) -> None:
-    """Let the clouds of designs that have one reach the populations at thetas."""
+def _clouds(evaluator: Evaluator, names: set[str]) -> Iterator[tuple[int, Design]]:
+    """Yield designs with a cloud, by position of their simulators, of those named.
+
+    And of those that share their specimens, whose points stay the same ones.
+    """
+    together = siblings(evaluator.nodes, names)
     for k, node in enumerate(evaluator.nodes):
-        design = node.design
-        if design is not None and design.contents.cloud is not None and node.name in names:
-            design.reach(evaluator.roots(thetas, k))
+        if node.design is not None and node.design.contents.cloud and node.name in together:
+            yield k, node.design
+
+
+def _reach(evaluator: Evaluator, thetas: Floats, names: set[str]) -> bool:
+    """Let clouds reach the populations at thetas; return whether there are any."""
+    clouds = list(_clouds(evaluator, names))
+    for k, design in clouds:
+        design.reach(evaluator.roots(thetas, k))
+    return bool(clouds)
+
+
+def _widened(evaluator: Evaluator, thetas: Floats, names: set[str]) -> bool:
+    """Draw larger clouds for the populations at thetas; return whether any could be."""
+    grown = False
+    for k, design in _clouds(evaluator, names):
+        grown |= design.widen(evaluator.roots(thetas, k))
+    return grown
 
 
 def _has_room(design: Design) -> bool:

@@ -79,7 +79,7 @@ class SimulatorIdentity:
     metric, propagation : str
         Their representations.
     n_points, batches : int
-        The design's size, and how often points were added.
+        The number of runs of the design, and how often points of it were drawn.
     epsilon : float
         NaN while it is not set.
     responses : tuple of float
@@ -209,8 +209,8 @@ def _simulator(node: Node, discrepancies: Floats) -> SimulatorIdentity:
         inputs=_inputs(node),
         metric=without_addresses(node.metric),
         propagation=without_addresses(node.propagation),
-        n_points=node.bound.n_points,
-        batches=1 if node.design is None else node.design.n_batches,
+        n_points=node.bound.n_points if node.design is None else node.design.n_runs,
+        batches=1 if node.design is None else node.design.n_drawn,
         epsilon=node.epsilon_value,
         responses=_numbers(node.bound.known_responses[:8].ravel()),
         discrepancies=_numbers(discrepancies),

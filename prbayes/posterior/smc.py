@@ -206,11 +206,12 @@ def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     clock = time.perf_counter()
     in_designs = sum(design.n_runs for design in evaluator.designs.values())
     before = evaluator.n_responses - in_designs
+    drawn = [design.n_drawn for design in evaluator.designs.values()]
     with _epsilons_restored(evaluator), designs_as_before(evaluator):
         adjustment, optimum = _prepared(evaluator, asked)
         rounds = _rounds(evaluator, asked, adjustment, optimum)
         found = rounds.until_supported(asked.progressbar)
-        grown = sum(design.n_runs for design in evaluator.designs.values()) > in_designs
+        grown = [design.n_drawn for design in evaluator.designs.values()] != drawn
         if found.particles.stopped and grown:
             raise BudgetError(found.particles.stopped)
         if found.reason is not None:

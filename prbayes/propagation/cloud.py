@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -66,6 +66,8 @@ class Emulation:
     runs : Runs
     models : tuple
         The surface that was chosen for each output.
+    weights : ndarray, shape (T, n)
+        Of the runs in the populations that matter.
     share : float
         The share of a population that the runs are.
     error : float
@@ -77,6 +79,7 @@ class Emulation:
 
     runs: Runs
     models: tuple[Any, ...]
+    weights: Floats
     share: float
     error: float
     event: tuple[int, ...]
@@ -105,26 +108,20 @@ class Emulation:
         x, y = columns(points), values.reshape(len(values), -1)
         runs = Runs(x, y, weights.mean(axis=0), blocks)
         try:
-            models, said = chosen(_tried(emulator, x), runs)
+            tried = candidates(*x.shape) if isinstance(emulator, str) else [emulator]
+            models, said = chosen(tried, runs)
         except np.linalg.LinAlgError:
             return None
         share = share_of_runs(weights, y, said, blocks)
         if share > _ALONE:
             return None
         share = 0.0 if share < _LITTLE else share
-        return cls(runs, models, share, _error(runs, said), values.shape[1:])
+        return cls(runs, models, weights, share, _error(runs, said), values.shape[1:])
 
     def at(self, cloud: Cloud) -> Floats:
         """Return the responses at the cloud's points, (M,) or (M, m)."""
         found = emulated(self.models, self.runs, columns(cloud.points))
         return found.reshape(-1, *self.event)
-
-    def of_another(self, emulator: Any, values: Floats, cloud: Cloud) -> Floats:
-        """Return another response of the same runs at the cloud's points, (M,) or (M, m)."""
-        runs = replace(self.runs, y=values.reshape(len(values), -1))
-        models, _ = chosen(_tried(emulator, runs.x), runs)
-        found = emulated(models, runs, columns(cloud.points))
-        return found.reshape(-1, *values.shape[1:])
 
     def without_each_block(self, cloud: Cloud) -> list[Floats]:
         """Return the same from emulators that were fitted without a block of the runs each."""
@@ -164,11 +161,6 @@ def _error(runs: Runs, said: Floats) -> float:
     spread = np.sqrt(importance @ (y - importance @ y) ** 2)
     off = np.sqrt(importance @ (said[known] - y) ** 2)
     return float((off / np.where(spread > 0, spread, 1.0)).max())
-
-
-def _tried(emulator: Any, x: Floats) -> Sequence[Any]:
-    """Return the surfaces that are tried: several by default."""
-    return candidates(*x.shape) if isinstance(emulator, str) else [emulator]
 
 
 def columns(points: Sequence[Floats]) -> Floats:

@@ -71,6 +71,9 @@ _COMPONENTS = 512
 # Numbers of a basis in a compiled graph, 1 GiB, when the design has grown to its largest. Graphs
 # without it are as fast (benchmarks/joint_speed.py), but JAX does not know their operations.
 _MOST_NUMBERS = 1 << 27
+# Share that an emulator of another response may want to leave to runs that do not have it. By
+# judgement: its bias is then as large as what weighted runs would scatter by.
+_TRUSTED = 0.5
 # Populations whose weights tell how far an emulator is trusted.
 _WEIGHED = 32
 # Neighbours on either side in the cells of an input whose support moves, beside other inputs: its
@@ -176,9 +179,11 @@ class Reweighted(Propagation):
 
 def _refuse_emulator(emulator: Any) -> None:
     """Raise if it is no emulator."""
-    if emulator is None or emulator == "auto" or isinstance(emulator, Surface):
+    if emulator is None or isinstance(emulator, Surface):
         return
     if isinstance(emulator, str):
+        if emulator == "auto":
+            return
         raise ValueError(
             f'Reweighted: emulator: got {emulator!r}, expected "auto", None, or a surface such as '
             "prb.surrogate.RadialBasis()"
@@ -264,11 +269,24 @@ class Design(Bound):
         self._others: deque[tuple[Responses, Floats]] = deque(maxlen=32)
         self._taken_back: Batches | None = None  # all that there were when some were forgotten
         self._moving: tuple[int, ...] | None = None
+        if config.emulator is not None and not isinstance(config.emulator, str):
+            self._refuse_emulating()
         components = prior_draws(inputs.roots, min(config.n, _COMPONENTS), config.random_seed)
         size = self.add(components)
         refuse_all_nan(name, self.values)
         if size < self.required_ess and self.contents.cloud is None:
             self._warn_of_thin_support(size)
+
+    def _refuse_emulating(self) -> None:
+        """Raise if a user's emulator has nothing to do."""
+        if self._between_runs:
+            return
+        kinds = ", ".join(f"{x.dtype}, {x.type.ndim} dimensions" for x in self.inputs.aleatory)
+        raise TypeError(
+            f"{self.name}: emulator: got {type(self.config.emulator).__name__} for aleatory inputs "
+            f"({kinds}), expected several continuous numbers for each specimen; of one number the "
+            "runs are a quadrature rule, and discrete ones are computed: leave emulator= out"
+        )
 
     def _warn_of_thin_support(self, size: float) -> None:
         # With more inputs weights become so uneven that another propagation is better
@@ -324,6 +342,11 @@ class Design(Bound):
         return len(self.batches.values)
 
     @property
+    def n_drawn(self) -> int:
+        """How often points were drawn: of runs, and of clouds."""
+        return 0 if self._contents is None else self.n_batches + self._contents.clouds
+
+    @property
     def told(self) -> str:
         """How many responses were computed, and what is between them, as a sentence."""
         emulation = self.contents.emulation
@@ -342,11 +365,15 @@ class Design(Bound):
         emulator = self.config.emulator
         if emulator is None:
             return False
-        if not isinstance(emulator, str):
-            return True
-        continuous = all(x.dtype.startswith("float") for x in self.inputs.aleatory)
         # Whoever asks for more than an emulator takes has a response that costs little.
-        return continuous and self.config.n <= MOST_RUNS and self.dimensions > 1
+        wanted = not isinstance(emulator, str) or self.config.n <= MOST_RUNS
+        return wanted and self._between_runs
+
+    @property
+    def _between_runs(self) -> bool:
+        """Whether there are points between runs that need an emulator."""
+        continuous = all(x.dtype.startswith("float") for x in self.inputs.aleatory)
+        return continuous and self.dimensions > 1
 
     @property
     def batch_size(self) -> int:
@@ -462,7 +489,24 @@ class Design(Bound):
         contents = self.contents
         if contents.cloud is None or contents.emulation is None:
             return known
-        said = contents.emulation.of_another(self.config.emulator, known, contents.cloud)
+        other = Emulation.of(
+            self.config.emulator,
+            self.batches.points,
+            known,
+            contents.emulation.weights,
+            self._blocks_of(self.batches.sizes),
+        )
+        # The runs have the share that the design's own response gave them.
+        if other is None or other.share > _TRUSTED + contents.emulation.share:
+            share = 1.0 if other is None else other.share
+            raise DesignError(
+                f"{self.name}: the design is of {self.n_runs} runs, between which its own response "
+                "is emulated; another response of the same specimens is not told by the runs: got "
+                f"an emulator that would leave {share:.0%} of a population to them, expected at "
+                f"most {_TRUSTED:.0%} more than of its own; calibrate with "
+                "prb.Reweighted(n, emulator=None), or let one response return both outputs"
+            )
+        said = other.at(contents.cloud)
         return np.concatenate([said, known]) if contents.emulation.share else said
 
     def same_points(self, other: Bound) -> bool:
@@ -567,8 +611,7 @@ class Design(Bound):
         # Another prime, so that no cloud shares points with a batch.
         seed = self.config.random_seed + 104_729 * (1 + contents.clouds)
         components = some_of(contents.groups)
-        place = self._equal_mass if self.is_line else self._place
-        points, counts = place(components, contents.size, seed)
+        points, counts = self._place(components, contents.size, seed)
         points = self._off_the_edges(points, components, counts)
         log_g, _ = self._log_mixture(components, counts, points, summed=False)
         cloud = Cloud(tuple(points), log_g)

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import approx_fprime
 
 from prbayes._checks import Floats
-from prbayes.emulators.gaussian_process import _KERNELS, GaussianProcess, _Likelihood
+from prbayes.emulators.gaussian_process import KERNELS, GaussianProcess, Likelihood
 
 
 def points(n: int = 40) -> tuple[Floats, Floats]:
@@ -30,10 +30,10 @@ def test_the_mean_is_that_of_scikit_learn(kernel: str, nu: float) -> None:
     np.testing.assert_allclose(found, y.mean() + same.predict(at), atol=1e-9)
 
 
-@pytest.mark.parametrize("kernel", list(_KERNELS))
+@pytest.mark.parametrize("kernel", list(KERNELS))
 def test_the_likelihood_has_the_gradient_that_it_says(kernel: str) -> None:
     x, y = points()
-    likelihood = _Likelihood(_KERNELS[kernel], x, y - y.mean())
+    likelihood = Likelihood(KERNELS[kernel], x, y - y.mean())
     at = np.log([0.8, 1.5, 4.0, 1e-2])
     expected = approx_fprime(at, lambda p: likelihood(p)[0], 1e-6)
     np.testing.assert_allclose(likelihood(at)[1], expected, rtol=1e-4, atol=1e-4)

@@ -10,11 +10,15 @@ import pytest
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.estimate.refinement import grow
+from prbayes.estimate.data_sets import aligned
+from prbayes.estimate.refinement import _reach, _widened, grow
 from prbayes.estimate.refit import DesignErrors, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.identity import identity_of
+from prbayes.propagation.base import DesignError
 from prbayes.propagation.cloud import CLOUD, columns, some_of
 from prbayes.propagation.reweighted import Design
+from prbayes.response.budget import BudgetError
 
 AT = np.array([[1.1, 0.9, -0.2, -0.5]])
 
@@ -220,6 +224,71 @@ def test_one_input_and_discrete_ones_are_not_emulated() -> None:
             metric=prb.AreaMetric(), observed=OBSERVED, propagation=stored,
         )  # fmt: skip
     assert design_of(model)[1].contents.cloud is None
+
+
+def test_a_users_emulator_with_nothing_to_do_is_refused() -> None:
+    calls: list[int] = []
+    with pm.Model():
+        a = pm.Normal.dist(pm.Normal("ma", 1, 0.5), 1.0)
+        stored = prb.Reweighted(64, emulator=prb.surrogate.RadialBasis())
+        keywords: dict[str, Any] = {"metric": prb.AreaMetric(), "observed": OBSERVED}
+        with pytest.raises(TypeError, match=r"y: emulator: got RadialBasis .* several continuous"):
+            prb.Simulator("y", lambda a: calls.append(1) or a, a, propagation=stored, **keywords)
+    assert len(calls) <= 1  # the trial of the response
+
+
+def test_another_response_that_no_surface_follows_is_refused() -> None:
+    evaluator, design = design_of(build(n=256))
+    other = evaluator.nodes[0].bound.responses.copied()
+    other.function = jumping
+    with pytest.raises(DesignError, match="another response of the same specimens is not told"):
+        design.values_of(other)
+
+
+def test_simulators_of_the_same_specimens_keep_the_same_points() -> None:
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("ma", 1, 0.5), pm.LogNormal("sa", 0, 0.5))
+        b = pm.Normal.dist(pm.Normal("mb", 1, 0.5), pm.LogNormal("sb", -0.5, 0.5))
+        stored = prb.Reweighted(64, emulator="auto")
+        specimens = np.arange(OBSERVED.size)
+        for name, response in {"one": smooth, "two": lambda a, b: b + 0.1 * a * b}.items():
+            prb.Simulator(
+                name,
+                response,
+                a,
+                b,
+                metric=prb.KullbackLeibler(),
+                observed=OBSERVED,
+                propagation=stored,
+                specimens=specimens,
+            )
+    evaluator = Evaluator(model)
+    assert aligned(evaluator.nodes)
+    far = theta_of(evaluator) + np.array([0.5, -1.5, 0.5, -1.5])
+    _reach(evaluator, far, {"one"})
+    assert aligned(evaluator.nodes)
+    _widened(evaluator, far, {"two"})
+    assert aligned(evaluator.nodes)
+    assert {d.n_points for d in evaluator.designs.values()} == {2 * CLOUD}
+
+
+def test_another_cloud_is_another_design() -> None:
+    evaluator, design = design_of(build())
+    before = identity_of(evaluator).simulators[0]
+    design.reach(evaluator.roots(theta_of(evaluator), 0))
+    after = identity_of(evaluator).simulators[0]
+    assert (before.n_points, after.n_points) == (64, 64)
+    assert before.batches != after.batches
+
+
+def test_a_sampler_that_was_stopped_goes_on_with_its_clouds(tmp_path: Any) -> None:
+    keywords: dict[str, Any] = {"chains": 1, "random_seed": 1, "progressbar": False}
+    file = tmp_path / "run.nc"
+    whole = prb.sample_smc(20, model=build(known=True), **keywords)
+    with pytest.raises(BudgetError):
+        prb.sample_smc(20, model=build(known=True), checkpoint=file, max_stages=1, **keywords)
+    again = prb.sample_smc(20, model=build(known=True), checkpoint=file, **keywords)
+    np.testing.assert_array_equal(again["posterior"]["ma"], whole["posterior"]["ma"])
 
 
 def test_inputs_are_columns() -> None:
