@@ -56,7 +56,8 @@ class Diagnosis:
     support : xarray.Dataset
         ``weight_ess``, ``mean_weight`` and ``lost_mass`` by simulator and draw, for `Reweighted`.
     notes : tuple of str
-        What was not looked at, and why; and which of several outputs disagree.
+        By what many outputs are compared; what was not looked at, and why; and which of several
+        outputs disagree.
     """
 
     messages: tuple[str, ...]
@@ -151,6 +152,8 @@ def _of_optimum(optimum: Optimum) -> Diagnosis:
         messages.append(_not_converged(optimum.message))
     designs = _computed(optimum.evaluator, optimum.theta[None])
     failed = _failed(optimum.failures)
+    compared = {node.name: node.target.told for node in optimum.evaluator.nodes}
+    notes = (*_compared(compared), *notes)
     return Diagnosis((*messages, *failed, *_unsupported(designs)), designs.support, notes)
 
 
@@ -185,6 +188,19 @@ def _by_output(refitted: Refitted, probability: float) -> tuple[str, ...]:
     return tuple(disagreement(refitted)) if probability < UNLIKELY else ()
 
 
+def _compared(told: Mapping[str, str]) -> tuple[str, ...]:
+    """Say by what outputs are compared, where it is not by themselves."""
+    return tuple(f"{name}: {clause}." for name, clause in told.items() if clause)
+
+
+def _compared_in(result: xr.DataTree) -> tuple[str, ...]:
+    calibration = result["calibration"].to_dataset() if "calibration" in result else xr.Dataset()
+    if "compared" not in calibration:
+        return ()
+    names = calibration["simulator"].values.tolist()
+    return _compared(dict(zip(names, calibration["compared"].values.tolist(), strict=True)))
+
+
 def _not_looked_at(reason: str) -> tuple[str, ...]:
     return (f"Whether the inputs have the right family was not looked at: {reason}.",)
 
@@ -194,7 +210,8 @@ def _of_stored_optimum(result: xr.DataTree) -> Diagnosis:
     messages = _warnings(attrs)
     if not attrs.get("converged", True) and not attrs.get("stopped"):
         messages.append(_not_converged(str(attrs.get("message", ""))))
-    notes = _not_looked_at("refits need the model; pass the Optimum itself")
+    refits = _not_looked_at("refits need the model; pass the Optimum itself")
+    notes = (*_compared_in(result), *refits)
     return Diagnosis((*messages, *_failed_in(result)), xr.Dataset(), notes)
 
 
@@ -243,7 +260,8 @@ def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
         *_failed_in(result),
         *_unsupported(designs),
     ]
-    notes = _of_refits(posterior.attrs, several=_has_several_outputs(result))
+    refits = _of_refits(posterior.attrs, several=_has_several_outputs(result))
+    notes = (*_compared_in(result), *refits)
     return Diagnosis(tuple(messages), designs.support, notes)
 
 

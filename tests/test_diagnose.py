@@ -454,3 +454,32 @@ def test_failed_responses_are_part_of_results_diagnosis_and_report() -> None:
 def test_results_without_failures_have_no_table_of_them() -> None:
     _, tree = sampled()
     assert "failures" not in tree.children
+
+
+@pytest.mark.parametrize("components", [None, 1])
+def test_curves_are_told_of_by_optimum_tree_and_report(
+    components: int | None, tmp_path: Path
+) -> None:
+    at = np.linspace(0.1, 1.0, 12)
+
+    def grown(a: Any, b: Any) -> Any:
+        return np.asarray(a)[..., None] * at + np.asarray(b)[..., None] * at**3
+
+    rng = np.random.default_rng(2)
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("a", 2, 0.5), 0.5)
+        b = pm.Normal.dist(pm.Normal("b", 1, 0.5), 0.5)
+        prb.Simulator(
+            "crack", grown, a, b,
+            metric=prb.Joint(prb.ProbabilityResidual(), components=components),
+            observed=grown(rng.normal(2, 0.5, 30), rng.normal(1, 0.5, 30)),
+            propagation=prb.Resimulated(256),
+        )  # fmt: skip
+    optimum = prb.minimize(model, starts=0)
+    tree = optimum.to_datatree()
+    note = f"crack: 12 outputs are compared by {components or 2} principal component(s)"
+    for result in (optimum, tree):
+        found = prb.diagnose(result)
+        assert any(line.startswith(note) for line in found.notes)
+        assert any("no noise" in line for line in found.messages) == (components == 1)
+    assert note in prb.Report("Cracks", optimum=optimum, pictures=False).to_markdown(tmp_path / "r.md").read_text()

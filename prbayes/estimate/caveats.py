@@ -214,8 +214,11 @@ def _tail_index(values: Floats, weights: Floats) -> float:
 def caveats(
     evaluator: Evaluator, local: Local | None, others: Sequence[Rival], design_error: float
 ) -> tuple[str, ...]:
-    """Say whether the design is too small, what other optima there are, what is not identified."""
-    lines = []
+    """Say what is not seen, is identified only by the prior, or could as well be elsewhere.
+
+    And whether the design is too small.
+    """
+    lines = [f"{node.name}: {node.target.missed}" for node in evaluator.nodes if node.target.missed]
     if design_error > _TOLERATED:
         lines.append(_of_design(evaluator, design_error))
     for rival in others:

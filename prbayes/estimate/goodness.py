@@ -18,7 +18,6 @@ from prbayes.estimate.data_sets import DataSets, observed_set, simulated_sets
 from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.projections import number_parts
 from prbayes.estimate.refit import ARRIVED, SamplingDistribution
-from prbayes.metrics.base import Part
 
 # Probability below which the data are said not to come from the family. By convention; 200 refits
 # tell one of half as much.
@@ -129,18 +128,21 @@ class _Populations:
                 around[k] = evaluator.populations(sampling.thetas(center + cross), k)
         return cls(sampling, center, around)
 
-    def below(self, k: int, part: Part, x: Floats, at: Floats) -> Floats:
+    def of(self, k: int, x: Floats) -> tuple[Floats, Floats]:
+        """Return the values and weights of a simulator from which those at x, (n_sets, r), follow."""
+        if k in self.around:
+            return self.around[k]
+        return self.sampling.evaluator.populations(self.sampling.thetas(x), k)
+
+    def below(self, k: int, seen: Floats, weights: Floats, x: Floats, at: Floats) -> Floats:
         """Return distribution functions at values, (m,), of populations at x, (n_sets, r).
 
-        Of what a part of the metric sees of them. Shape (n_sets, m); of responses that are not
-        stored to first order, as refits are.
+        Of what a part of the metric sees of the values that `of` gives. Shape (n_sets, m); of
+        responses that are not stored to first order, as refits are.
         """
+        found = _middles(seen, weights, at)
         if k not in self.around:
-            thetas = self.sampling.thetas(x)
-            values, weights = self.sampling.evaluator.populations(thetas, k)
-            return _middles(part.of(values), weights, at)
-        values, weights = self.around[k]
-        found = _middles(part.of(values), weights, at)
+            return found
         r = self.center.size
         ahead, behind = found[1 : 1 + r], found[1 + r :]
         slopes = (ahead - behind) / 2
@@ -174,24 +176,27 @@ def _distances(populations: _Populations, x: Floats, sets: DataSets) -> Floats:
     columns = []
     nodes = populations.sampling.evaluator.nodes
     for k, (node, values, weights) in enumerate(zip(nodes, sets.values, sets.weights, strict=True)):
+        simulated, shares = populations.of(k, x)
         for part in number_parts(node.target):
             seen, rows = part.observed_of(values)
             own = weights[:, rows]
             if len(seen) < len(values):
                 own = own / own.sum(axis=1, keepdims=True)
-            columns += _distances_of(populations, k, part, x, seen, own)
+            ranked = np.argsort(seen, kind="stable")
+            at = seen[ranked]
+            columns += _distances_of(
+                populations.below(k, part.of(simulated), shares, x, at), own[:, ranked]
+            )
     stacked = np.maximum(np.stack(columns, axis=1), 1e-300)
     return np.asarray(np.log(stacked))
 
 
-def _distances_of(
-    populations: _Populations, k: int, part: Part, x: Floats, values: Floats, weights: Floats
-) -> list[Floats]:
-    """Return the two distances of what a part sees, values (n,) with weights (n_sets, n)."""
-    ranked = np.argsort(values, kind="stable")
-    w = weights[:, ranked]
+def _distances_of(expected: Floats, w: Floats) -> list[Floats]:
+    """Return the two distances of what a part sees.
+
+    Of distribution functions at the values, in order, and of their weights, (n_sets, n) both.
+    """
     below = np.cumsum(w, axis=1) - w / 2
-    expected = populations.below(k, part, x, values[ranked])
     squares = w * (below - expected) ** 2
     inside = np.clip(expected, BEYOND, 1 - BEYOND)
     in_the_middle = squares.sum(axis=1)

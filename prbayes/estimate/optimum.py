@@ -334,5 +334,6 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
     variables["theta"] = ("element", optimum.theta)
     variables["covariance"] = (["element", "other_element"], optimum.covariance)
     variables["metric"] = ("simulator", metrics)
+    variables["compared"] = ("simulator", [n.target.told for n in optimum.evaluator.nodes])
     elements = {"element": optimum.names, "other_element": optimum.names}
     return xr.Dataset(variables, coords={"simulator": names, **elements})

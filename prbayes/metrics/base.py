@@ -161,6 +161,16 @@ class Discrepancy(ABC):
         """The terms that it is the sum of: itself, unless it is made of several."""
         return (Part(self, 1.0, ""),)
 
+    @property
+    def told(self) -> str:
+        """What a reader has to know of what is compared, as a clause; empty if it is all there is."""
+        return ""
+
+    @property
+    def missed(self) -> str:
+        """What the data vary in and the comparison does not see, as a clause; empty if nothing."""
+        return ""
+
     def beside(self, design: Floats, inputs: int) -> Discrepancy:
         """Return the same comparison, now that the first simulated responses are known.
 

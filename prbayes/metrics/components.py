@@ -12,6 +12,9 @@ from prbayes._weighted import quantile
 # More outputs than this are compared by their principal components; of as many the directions that
 # are enough are seventy.
 MOST_OUTPUTS = 8
+# Correlation of neighbouring outputs in what is left out from which it is no noise: white noise of
+# ten curves of twelve outputs has .1, what one more component would explain has .5 to 1.
+_NO_NOISE = 0.5
 # Share of the variance, of the data and of the design, that components may leave out. By judgement:
 # a tenth of a standard deviation.
 LEFT_OUT = 0.01
@@ -37,6 +40,28 @@ class Components:
     def number(self) -> int:
         """How many there are."""
         return int(self.axes.shape[1])
+
+    @property
+    def told(self) -> str:
+        """How many there are, what they leave out, and whether that is noise."""
+        of = f"{self.left_out:.2g} of the variance of the data"
+        if not np.isnan(self.design_left_out):
+            of += f" and {self.design_left_out:.2g} of that of the design"
+        return (
+            f"{len(self.axes)} outputs are compared by {self.number} principal component(s), which "
+            f"leave out {of}; neighbours in what is left out of the data are correlated by "
+            f"{self.rest_correlation:.2f}"
+        )
+
+    @property
+    def missed(self) -> str:
+        """What is left out of the data and is no noise, as a clause; empty if there is no such."""
+        if self.left_out <= LEFT_OUT or self.rest_correlation < _NO_NOISE:
+            return ""
+        return (
+            f"{self.told}, so that it is no noise: the metric does not see it; pass more "
+            "components= to prb.Joint, or measure more specimens"
+        )
 
 
 def principal_components(

@@ -125,6 +125,16 @@ class CompositeDiscrepancy(Discrepancy):
         return self.members
 
     @property
+    def told(self) -> str:
+        """How many principal components there are, and what they leave out."""
+        return "; ".join(found.told for found in self.components)
+
+    @property
+    def missed(self) -> str:
+        """What principal components leave out that is no noise."""
+        return "; ".join(filter(None, (found.missed for found in self.components)))
+
+    @property
     def targets(self) -> list[Discrepancy]:
         """The discrepancies of the parts."""
         return [part.target for part in self.members]

@@ -209,7 +209,7 @@ def _simulator(node: Node, discrepancies: Floats) -> SimulatorIdentity:
         inputs=_inputs(node),
         metric=without_addresses(node.metric),
         propagation=without_addresses(node.propagation),
-        n_points=node.bound.n_points if node.design is None else node.design.n_runs,
+        n_points=node.bound.n_runs,
         batches=1 if node.design is None else node.design.n_drawn,
         epsilon=node.epsilon_value,
         responses=_numbers(node.bound.known_responses[:8].ravel()),

@@ -214,8 +214,10 @@ def _by_simulator(evaluator: Evaluator) -> dict[str, Any]:
         "required_ess": ("simulator", required),
         "max_lost": ("simulator", [node.bound.max_lost for node in nodes]),
         "metric": ("simulator", [without_addresses(node.metric) for node in nodes]),
+        "compared": ("simulator", [node.target.told for node in nodes]),
         "propagation": ("simulator", [without_addresses(node.propagation) for node in nodes]),
         "n_points": ("simulator", [node.bound.n_points for node in nodes]),
+        "n_runs": ("simulator", [node.bound.n_runs for node in nodes]),
     }
 
 

@@ -176,6 +176,11 @@ class Bound(ABC):
         """Number of points that carry weight in one evaluation of the discrepancy."""
         return self.n_per_theta
 
+    @property
+    def n_runs(self) -> int:
+        """Number of computed responses that one evaluation of the discrepancy rests on."""
+        return self.n_points
+
     def discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy as a scalar graph of the roots' values."""
         # Built on plain symbols: PyMC may clone parameters that are random, and a copy would be

@@ -162,8 +162,22 @@ def metric(m: Material) -> list[Section]:
             " The discrepancy of a posterior is the mean over its draws."
         )
     named = [f"{name}: {metric}." for name, metric in metrics.items()]
+    named += _compared(m)
     table = rows_table(rows) if rows else None
     return [Section("Metric and epsilon", (about, *named), table)]
+
+
+def _compared(m: Material) -> list[str]:
+    """Say by what the outputs of simulators are compared, where it is not by themselves."""
+    said = []
+    for calibration in m.calibrations.values():
+        if "compared" not in calibration:
+            continue
+        told = calibration["compared"].values.tolist()
+        for name, clause in zip(calibration["simulator"].values.tolist(), told, strict=True):
+            if clause:
+                said.append(f"{name}: {clause}.")
+    return list(dict.fromkeys(said))
 
 
 def _discrepancies(label: str, calibration: xr.Dataset) -> list[dict[str, Any]]:
@@ -173,7 +187,7 @@ def _discrepancies(label: str, calibration: xr.Dataset) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for name in calibration["simulator"].values.tolist():
         own = calibration.sel(simulator=name)
-        points = str(int(own["n_points"])) if "n_points" in own else None
+        runs = str(int(own["n_runs"])) if "n_runs" in own else None
         rows.append(
             {
                 "result": label,
@@ -181,7 +195,7 @@ def _discrepancies(label: str, calibration: xr.Dataset) -> list[dict[str, Any]]:
                 "discrepancy": float(mean.sel(simulator=name)),
                 "Monte Carlo error": _optional(own, "discrepancy_error"),
                 "epsilon": _optional(own, "epsilon"),
-                "points": points,
+                "runs": runs,
             }
         )
     return rows

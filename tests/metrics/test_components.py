@@ -89,3 +89,15 @@ def test_curves_that_end_early_are_compared_as_far_as_they_go():
     assert [c.axes.shape[0] for c in target.components] == [40, 30]
     simulated = curves(500, 7)
     assert target(simulated) < target(simulated * 1.2)
+
+
+def test_what_is_left_out_is_told_and_said_if_it_is_no_noise() -> None:
+    enough = principal_components(curves(30), EQUAL, 2)
+    assert "40 outputs are compared by 2 principal component(s)" in enough.told
+    assert not enough.missed
+    too_few = principal_components(curves(30), EQUAL, 1)
+    assert too_few.left_out > 0.01
+    assert "it is no noise" in too_few.missed
+    noisy = principal_components(curves(30, noise=0.2), EQUAL, 2)
+    assert noisy.left_out > 0.01
+    assert not noisy.missed
