@@ -23,6 +23,8 @@ from prbayes.model.hyperparameters import THETAS
 _ELSEWHERE = 1.0
 # Times that it is followed; one or two arrive.
 _STEPS = 5
+# Width of draws, in standard errors, that is none: rounding, where all are copies of one.
+_NO_WIDTH = 1e-6
 # Draws of a mode below which it is left as it is: standard deviations from 50 have an error of a
 # tenth. With 25 a mode that has 36 of 400 draws is mapped as well (docs/constants.md).
 _FEWEST = 50
@@ -85,7 +87,7 @@ class Adjusted:
 
 
 class UnsettledError(ValueError):
-    """Refits of which too few converged to tell a sampling distribution."""
+    """Refits of which too few converged, or draws that have no width, to tell where draws belong."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -411,12 +413,22 @@ def transported(
 
     What remains follows as its regression on them says. Draws count as refits do: their median, and
     no farther from it than three standard deviations.
+
+    Raises
+    ------
+    UnsettledError
+        If the draws have no width.
     """
     r = sampling.stderr.size
     x = drawn_in(x, _FAR)
     # The symmetric map between two normal distributions.
     counted = drawn_in(x, _REACH)
     before = np.cov(counted, rowvar=False).reshape(r, r)
+    if np.linalg.eigvalsh(before)[0] < _NO_WIDTH**2:
+        raise UnsettledError(
+            f"the {len(x)} draws of a mode have no width of their own, as one particle that "
+            "survived has none: pass more draws"
+        )
     root = _root(before)
     inverse = np.linalg.inv(root)
     between = _root(root @ covariance @ root)

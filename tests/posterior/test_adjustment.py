@@ -514,6 +514,17 @@ def test_too_few_draws_are_left_alone_and_it_is_said(caplog: pytest.LogCaptureFi
     assert "not adjusted" in caplog.text
 
 
+def test_copies_of_one_draw_are_left_alone_and_it_is_said() -> None:
+    evaluator = Evaluator(build(METRICS["kl"]))
+    theta = evaluator.unconstrained({"mu": 1.0, "sigma": 0.5})
+    draws = np.tile(theta, (200, 1))
+    found = prb.posterior.Affine(n_sets=50)(evaluator, draws, [theta])
+    np.testing.assert_array_equal(found.thetas, draws)
+    assert "have no width" in found.note
+    (line,) = found.warnings
+    assert "not adjusted" in line
+
+
 def test_data_that_tell_nothing_leave_the_prior() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1.0, 0.01), 0.5)
