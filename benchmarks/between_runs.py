@@ -87,7 +87,7 @@ def off(evaluator: Any, response: Response, known: list[Any]) -> float:
     noise = np.sqrt(LEVELS * (1 - LEVELS) / DATA)
     thetas = []
     for mean, sd in populations(response):
-        values = {}
+        values: dict[str, Any] = {}
         for i in range(response.d):
             values |= {f"mu{i}": mean[i], f"sigma{i}": sd[i]}
         thetas.append(evaluator.unconstrained(values))

@@ -129,20 +129,33 @@ def problem(name: str, seeds: int, of_runs_alone: int) -> dict[str, Any]:
     return {"inputs": RESPONSES[name].d, "emulated": rows, "alone": alone}
 
 
-def summary(rows: list[dict[str, Any]]) -> str:
-    """Return runs, error and its claim, and seconds, of several designs."""
+def figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return runs, error and its claim, and seconds, of several designs; nothing of none."""
     good = [row for row in rows if "off" in row]
     if not good:
-        return "refused" if rows else "-"
+        return {}
     runs = sorted(row["runs"] for row in good)
     off = np.array([row["off"] for row in good])
-    worst = np.sqrt(2 * (off**2).mean(axis=0).max())
-    claimed = np.sqrt(np.mean([row["claimed"] ** 2 for row in good]))
-    seconds = np.median([row["seconds"] for row in good])
-    refused = f", {len(rows) - len(good)} refused" if len(good) < len(rows) else ""
+    return {
+        "runs": (runs[0], runs[-1]),
+        "off": float(np.sqrt((off**2).mean())),
+        "worst": float(np.sqrt(2 * (off**2).mean(axis=0).max())),
+        "claimed": float(np.sqrt(np.mean([row["claimed"] ** 2 for row in good]))),
+        "seconds": float(np.median([row["seconds"] for row in good])),
+        "refused": len(rows) - len(good),
+    }
+
+
+def summary(rows: list[dict[str, Any]]) -> str:
+    """Return the same in words."""
+    found = figures(rows)
+    if not found:
+        return "refused" if rows else "-"
+    low, high = found["runs"]
+    refused = f", {found['refused']} refused" if found["refused"] else ""
     return (
-        f"{runs[0]} - {runs[-1]} runs, off {np.sqrt((off**2).mean()):.3f} (worst {worst:.3f}, "
-        f"claimed {claimed:.3f}), {seconds:.0f} s{refused}"
+        f"{low} - {high} runs, off {found['off']:.3f} (worst {found['worst']:.3f}, "
+        f"claimed {found['claimed']:.3f}), {found['seconds']:.0f} s{refused}"
     )
 
 

@@ -289,6 +289,63 @@ def joint_memory() -> Iterator[Row]:
         ]
 
 
+def between_runs() -> Iterator[Row]:
+    """Return the rows of emulated populations beside those of runs alone."""
+    from benchmarks.responses import RESPONSES
+
+    table = found("between_runs")
+    for name, response in RESPONSES.items():
+        columns = []
+        for n in (64, 256):
+            cell = table[f"{name}/{n}"]
+            columns += [short(cell[key]) for key in ("alone", "emulated", "ratio")]
+        yield [name, str(response.d), str(response.outputs), *columns]
+
+
+def few_runs() -> Iterator[Row]:
+    """Return the rows of optima from few runs."""
+    from benchmarks.few_runs import figures
+
+    for name, cell in found("few_runs").items():
+        emulated, alone = figures(cell["emulated"]), figures(cell["alone"])
+        runs = "{runs[0]} - {runs[1]}".format(**emulated)
+        columns = [short(emulated[key], 3) for key in ("off", "worst", "claimed")]
+        beside = (
+            [f"{alone['runs'][0]} - {alone['runs'][1]}", short(alone["off"], 3)]
+            if alone
+            else ["", ""]
+        )
+        yield [name, str(cell["inputs"]), runs, *columns, *beside]
+
+
+def libraries() -> Iterator[Row]:
+    """Return the rows of libraries' emulators."""
+    table = found("emulators")
+    of_all = table["error over that of the best emulator"]
+    labels = {
+        "quintic 2": ("SciPy, quintic splines", ""),
+        "sklearn RBF": ("scikit-learn, squared exponential", "scikit-learn"),
+        "sklearn Matern": ("scikit-learn, Matérn 5/2", "scikit-learn"),
+        "SMT RBF": ("SMT, squared exponential", "smt"),
+        "SMT Matern": ("SMT, Matérn 5/2", "smt"),
+        "OpenTURNS Matern": ("OpenTURNS, Matérn 5/2", "openturns"),
+        "by hand RBF, 1 start": ("prbayes, squared exponential", ""),
+        "by hand Matern, 1 start": ("prbayes, Matérn 5/2", ""),
+    }
+    for name, (label, package) in labels.items():
+        taken = [
+            sum(row["seconds"].values())
+            for row in table["rows"]
+            if row["emulator"] == name and row["n"] == 256 and "seconds" in row
+        ]
+        errors = []
+        for kind in ("smooth", "not smooth"):
+            mean, worst, _ = of_all[name][kind]
+            errors.append(f"{mean:.2f} ({worst:.1f})")
+        size = f"{table['dependencies'][package]['megabytes']:.0f}" if package else ""
+        yield [label, *errors, short(float(np.median(taken))), size]
+
+
 # Where the rows of each table are from; the first two lines of it are the page's.
 TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "coverage, pooled": pooled,
@@ -310,6 +367,9 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "joint": joint,
     "joint, time": joint_time,
     "joint, memory": joint_memory,
+    "between runs": between_runs,
+    "few runs": few_runs,
+    "libraries": libraries,
 }
 _MARKED = re.compile(
     r"(<!-- table: (?P<name>[^>]+) -->\n\n(?:\|[^\n]*\n){2})(?:\|[^\n]*\n)*(\n<!-- end -->)"

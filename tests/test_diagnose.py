@@ -482,4 +482,9 @@ def test_curves_are_told_of_by_optimum_tree_and_report(
         found = prb.diagnose(result)
         assert any(line.startswith(note) for line in found.notes)
         assert any("no noise" in line for line in found.messages) == (components == 1)
-    assert note in prb.Report("Cracks", optimum=optimum, pictures=False).to_markdown(tmp_path / "r.md").read_text()
+    assert (
+        note
+        in prb.Report("Cracks", optimum=optimum, pictures=False)
+        .to_markdown(tmp_path / "r.md")
+        .read_text()
+    )

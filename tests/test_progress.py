@@ -116,6 +116,28 @@ def test_the_optimiser_shows_its_evaluations(screen: io.StringIO, visible: bool)
 
 
 @pytest.mark.parametrize("visible", [True, False])
+def test_a_design_that_grows_tells_its_error_and_the_runs_that_are_left(
+    screen: io.StringIO, visible: bool
+) -> None:
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
+        b = pm.Normal.dist(1, pm.HalfNormal("sigma", 0.5))
+        prb.Simulator(
+            "y",
+            lambda a, b: a * b,
+            *(a, b),
+            metric=prb.AreaMetric(),
+            observed=np.linspace(-1, 3, 20),
+            propagation=prb.Reweighted(64),
+        )
+    optimum = prb.minimize(model, starts=0, progressbar=visible)
+    text = " ".join(screen.getvalue().split())
+    assert optimum.n_responses > 64
+    assert ("runs to go" in text) == visible
+    assert ("standard errors of 0.1" in text) == visible
+
+
+@pytest.mark.parametrize("visible", [True, False])
 def test_everything_inside_the_sampler_follows_its_keyword(
     screen: io.StringIO, visible: bool
 ) -> None:

@@ -129,7 +129,7 @@ class _Populations:
         return cls(sampling, center, around)
 
     def of(self, k: int, x: Floats) -> tuple[Floats, Floats]:
-        """Return the values and weights of a simulator from which those at x, (n_sets, r), follow."""
+        """Return values and weights of a simulator, from which those at x, (n_sets, r), follow."""
         if k in self.around:
             return self.around[k]
         return self.sampling.evaluator.populations(self.sampling.thetas(x), k)

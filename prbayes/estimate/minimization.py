@@ -23,7 +23,7 @@ from prbayes._checks import (
     real_array,
     seed_number,
 )
-from prbayes._progress import shown
+from prbayes._progress import progress, shown
 from prbayes.estimate.caveats import breakdown, caveats, elements_at_edge, heavy_tails
 from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.methods import Method
@@ -39,6 +39,7 @@ from prbayes.estimate.refinement import (
     refine_at,
     refuse,
     refuse_lost,
+    runs_left,
     spread_around,
 )
 from prbayes.estimate.refit import SamplingDistribution
@@ -303,19 +304,20 @@ def find_optimum(evaluator: Evaluator, asked: Minimisation) -> Optimum:
     """
     for node in evaluator.nodes:
         node.bound.restart(asked.random_seed)
-    plan = _planned(evaluator, asked)
-    begun = _begun(plan, asked)
     last = None
-    try:
-        for state in _states(plan, begun):
-            last = state
-        assert last is not None
-        return _reported(plan, begun, last)
-    except BudgetError as spent:
-        if last is None:
-            raise
-        with unlimited():
-            return _stopped(plan, begun, last, str(spent))
+    with progress("runs") as advance:
+        plan = _planned(evaluator, asked, advance)
+        begun = _begun(plan, asked)
+        try:
+            for state in _states(plan, begun):
+                last = state
+            assert last is not None
+            return _reported(plan, begun, last)
+        except BudgetError as spent:
+            if last is None:
+                raise
+            with unlimited():
+                return _stopped(plan, begun, last, str(spent))
 
 
 def require_finished(optimum: Optimum) -> Optimum:
@@ -339,6 +341,7 @@ class _Plan:
     seed: int
     clock: float  # when it began
     responses_before: int  # computed before it began, without those of designs
+    advance: Callable[[int, str], None]  # of the bar that tells of runs: how many more, and a note
 
     @property
     def evaluator(self) -> Evaluator:
@@ -392,11 +395,13 @@ def _refuse_random(evaluator: Evaluator, method: Method) -> None:
         )
 
 
-def _planned(evaluator: Evaluator, asked: Minimisation) -> _Plan:
+def _planned(
+    evaluator: Evaluator, asked: Minimisation, advance: Callable[[int, str], None]
+) -> _Plan:
     """Return what is to be done."""
     clock = time.perf_counter()
     _refuse_random(evaluator, asked.method)
-    stored = sum(d.n_runs for d in evaluator.designs.values())
+    stored = _runs(evaluator)
     free = not evaluator.responses_per_theta
     return _Plan(
         search=Search(
@@ -413,6 +418,7 @@ def _planned(evaluator: Evaluator, asked: Minimisation) -> _Plan:
         seed=asked.random_seed,
         clock=clock,
         responses_before=evaluator.n_responses - stored,
+        advance=advance,
     )
 
 
@@ -528,8 +534,14 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
             return state
         errors = state.sampling.design_error()
         state = replace(state, design_error=errors.whole)
-        if not errors.whole > AGREE or not grow(evaluator, near, errors):
+        if not errors.whole > AGREE:
             return state
+        left = runs_left(evaluator, errors)
+        note = f"error {errors.whole:.2f} standard errors of {AGREE}, about {left} runs to go"
+        before = _runs(evaluator)
+        if not grow(evaluator, near, errors):
+            return state
+        plan.advance(_runs(evaluator) - before, note)
     elif rounds == MAX_ROUNDS:
         refuse(short, evaluator)
     elif state.cloud is None:
@@ -540,6 +552,11 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
     # What looked best on a thin design may be an artefact of it.
     candidates = np.vstack([state.theta, near])
     return replace(state, restart=plan.search.best_of(candidates, state.scales))
+
+
+def _runs(evaluator: Evaluator) -> int:
+    """Return how many runs designs have."""
+    return sum(design.n_runs for design in evaluator.designs.values())
 
 
 def _against_rivals(plan: _Plan, state: _State) -> _State:

@@ -90,19 +90,36 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
         AGREE,
     )
     clouds = {name for name, design in evaluator.designs.items() if design.contents.cloud}
-    runs = set(evaluator.designs) - clouds
     grown = False
     # Points of clouds cost no run; what emulators say of them does.
     if clouds and errors.points > _OF_EACH * AGREE:
         grown = _widened(evaluator, thetas, clouds)
-    if (clouds and errors.emulators > _OF_EACH * AGREE) or runs:
-        grown |= _add(evaluator, thetas, clouds | runs, _factor(errors.whole))
+    if _needs_runs(evaluator, errors):
+        names = set(evaluator.designs)
+        grown |= _add(evaluator, thetas, names, min(_GROWTH, _factor(errors.whole)))
     return grown
 
 
+def runs_left(evaluator: Evaluator, errors: DesignErrors) -> int:
+    """Return how many more runs are expected until designs' error is small enough."""
+    if not _needs_runs(evaluator, errors):
+        return 0
+    more = _factor(errors.whole) - 1
+    left = 0.0
+    for design in evaluator.designs.values():
+        left += min(more * design.n_runs, max(0, design.max_points - design.n_runs))
+    return round(left)
+
+
+def _needs_runs(evaluator: Evaluator, errors: DesignErrors) -> bool:
+    """Return whether more runs make designs' error smaller."""
+    emulated = all(design.contents.cloud for design in evaluator.designs.values())
+    return not emulated or errors.emulators > _OF_EACH * AGREE
+
+
 def _factor(error: float) -> float:
-    """Return by how much designs are to grow for an error to become small enough."""
-    return float(min(_GROWTH, (error / AGREE) ** (1 / _RATE)))
+    """Return by how much designs have to grow for an error to become small enough."""
+    return float((error / AGREE) ** (1 / _RATE))
 
 
 def _add(evaluator: Evaluator, thetas: Floats, names: set[str], factor: float = 1.0) -> bool:

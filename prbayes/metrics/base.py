@@ -163,7 +163,7 @@ class Discrepancy(ABC):
 
     @property
     def told(self) -> str:
-        """What a reader has to know of what is compared, as a clause; empty if it is all there is."""
+        """What a reader has to know of what is compared, as a clause; empty if it is all."""
         return ""
 
     @property

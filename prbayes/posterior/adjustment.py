@@ -87,7 +87,7 @@ class Adjusted:
 
 
 class UnsettledError(ValueError):
-    """Refits of which too few converged, or draws that have no width, to tell where draws belong."""
+    """Too few refits converged, or draws have no width, to tell where draws belong."""
 
 
 @dataclass(frozen=True, eq=False)

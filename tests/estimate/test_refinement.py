@@ -1,9 +1,13 @@
 """Where designs are refined: thetas around an optimum."""
 
 import numpy as np
+import pymc as pm
 import pytest
 
-from prbayes.estimate.refinement import spread_around
+import prbayes as prb
+from prbayes.estimate.refinement import runs_left, spread_around
+from prbayes.estimate.refit import DesignErrors
+from prbayes.model.evaluator import Evaluator
 
 PRIOR_SD = np.array([2.0, 0.5])
 
@@ -23,3 +27,22 @@ def test_thetas_are_no_wider_than_the_prior(unknown: float) -> None:
     covariance = np.diag([unknown, 0.0025])
     sd = spread_around(np.zeros(2), covariance, PRIOR_SD).std(axis=0)
     np.testing.assert_allclose(sd, [2.0, 0.05], rtol=0.2)
+
+
+def test_the_runs_that_are_left_follow_from_the_error_and_the_room() -> None:
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
+        prb.Simulator(
+            "y",
+            lambda a, b: a * b,
+            *(a, pm.Normal.dist(1, 0.1)),
+            metric=prb.AreaMetric(),
+            observed=np.linspace(-1, 3, 20),
+            propagation=prb.Reweighted(64, max_points=192),
+        )
+    evaluator = Evaluator(model)
+    assert runs_left(evaluator, DesignErrors(points=0.15, emulators=np.nan)) == pytest.approx(
+        64 * (1.5 ** (1 / 0.65) - 1), abs=1
+    )
+    assert runs_left(evaluator, DesignErrors(points=np.inf, emulators=np.nan)) == 128
+    assert runs_left(evaluator, DesignErrors(points=0.1, emulators=np.nan)) == 0
