@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from prbayes.estimate.data_sets import observed_set, simulated_sets
 from prbayes.estimate.goodness import of_another_family, probability_of_fit
 from prbayes.estimate.measured import drawn_in
 from prbayes.estimate.obstacles import refit_obstacle
+from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.refit import ARRIVED, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
@@ -100,12 +101,16 @@ class _Told:
     prior_precision: Floats  # (r, r)
     fit_probability: float  # as in `Adjusted`
     allowed: dict[str, float]  # by the prior, as `prior_probabilities` says
+    design_variance: float = 0.0  # of the minimiser, by the design's error
 
     def combined(self, shifts: Floats) -> tuple[Floats, Floats]:
         """Return the centre (r,) and covariance (r, r) that draws should have."""
         # What the data tell: the minimiser's information and its bias, which as a median is the
         # same in every parametrisation, as where a scale comes near zero.
         information = _precision(shifts, self.center.size)
+        if self.design_variance:
+            unknown = self.design_variance * np.eye(self.center.size)
+            information = np.linalg.inv(np.linalg.inv(information) + unknown)
         bias = np.median(shifts, axis=0)
         covariance = np.linalg.inv(information + self.prior_precision)
         from_data = information @ (self.center - bias)
@@ -211,7 +216,13 @@ class Affine:
         allowed = prior_probabilities(sampling, center, shifts, self.random_seed)
         return _Told(center, shifts, prior.mean(axis=0), precision, fit, allowed)
 
-    def __call__(self, evaluator: Evaluator, thetas: Floats, optima: Sequence[Floats]) -> Adjusted:
+    def __call__(
+        self,
+        evaluator: Evaluator,
+        thetas: Floats,
+        optima: Sequence[Floats],
+        design_error: float = 0.0,
+    ) -> Adjusted:
         """Map draws of the pseudo-posterior, each mode by itself.
 
         Parameters
@@ -221,6 +232,9 @@ class Affine:
         thetas : ndarray, shape (..., d)
         optima : sequence of ndarray, shapes (d,)
             The best one first; draws belong to the nearest, in its own standard errors.
+        design_error : float
+            How far the optima of two designs are apart, in standard errors, as
+            `Optimum.design_error` says; draws are as much wider where it is more than a tenth.
 
         Returns
         -------
@@ -237,7 +251,10 @@ class Affine:
         distances = np.array([_distance(mode, draws) for mode in modes])
         if _run_together(distances):
             return Adjusted(thetas, reason="the posterior has modes that run into each other")
-        return self._adjusted(evaluator, thetas, modes, distances)
+        matters = AGREE < design_error < np.inf
+        # Two designs differ by the root of two of one's error.
+        variance = design_error**2 / 2 if matters else 0.0
+        return self._adjusted(evaluator, thetas, modes, distances, variance)
 
     def _adjusted(
         self,
@@ -245,6 +262,7 @@ class Affine:
         thetas: Floats,
         modes: list[SamplingDistribution],
         distances: Floats,
+        design_variance: float,
     ) -> Adjusted:
         """Map the draws of each mode, (..., d), given their distances (modes, n) from each."""
         draws = thetas.reshape(-1, thetas.shape[-1])
@@ -256,7 +274,7 @@ class Affine:
             if own.sum() < _FEWEST:
                 continue
             try:
-                found = self._mapped(mode, draws[own])
+                found = self._mapped(mode, draws[own], design_variance)
             except UnsettledError as error:
                 reason = str(error)
                 return Adjusted(thetas, reason=reason, warnings=(_UNADJUSTED.format(reason),))
@@ -271,7 +289,7 @@ class Affine:
         allowed = max((found.allowed for found in mapped), key=least_probability)
         return Adjusted(
             out.reshape(thetas.shape),
-            self._said(mapped, len(modes), len(draws)),
+            self._said(mapped, len(modes), len(draws), design_variance),
             center_error=center_error,
             width_error=width_error,
             moved=float(moves.max()),
@@ -285,7 +303,7 @@ class Affine:
             ),
         )
 
-    def _said(self, mapped: list[_Mapped], modes: int, draws: int) -> str:
+    def _said(self, mapped: list[_Mapped], modes: int, draws: int, design_variance: float) -> str:
         """Return what was done, in words."""
         done = f"{self!r}"
         if modes > 1:
@@ -294,13 +312,17 @@ class Affine:
         if far:
             share = far / draws
             done += f", {share:.1%} of the draws drawn in to {_FAR:.0f} standard deviations"
+        if design_variance:
+            done += f", with the design's error of {np.sqrt(design_variance):.2f} standard errors"
         return done
 
-    def _mapped(self, sampling: SamplingDistribution, draws: Floats) -> _Mapped:
+    def _mapped(
+        self, sampling: SamplingDistribution, draws: Floats, design_variance: float
+    ) -> _Mapped:
         """Return the draws of one mode where they should be."""
         sampling = _among(sampling, draws)
         x, remainder = sampling.coordinates(draws)
-        told = self._told(sampling)
+        told = replace(self._told(sampling), design_variance=design_variance)
         center, covariance = told.combined(told.shifts)
         out = transported(sampling, x, remainder, center, covariance)
         outside = drawn_in(x, _FAR) != x

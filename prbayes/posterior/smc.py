@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
@@ -337,6 +337,7 @@ def _rounds(
         seeds=np.random.SeedSequence(entropy),
         adjustment=adjustment,
         optima=() if optimum is None else _optima(optimum, evaluator),
+        design_error=0.0 if optimum is None else optimum.design_error,
         refine=asked.refine and bool(evaluator.designs),
     )
 
@@ -395,6 +396,7 @@ class _Rounds:
     seeds: np.random.SeedSequence
     adjustment: Affine | None
     optima: tuple[Floats, ...]
+    design_error: float  # of the optimum, in standard errors
     refine: bool
 
     def until_supported(self, progressbar: bool) -> _Draws:
@@ -434,11 +436,11 @@ class _Rounds:
         particles = self.run(children, progressbar)
         if self.adjustment is None:
             return _Draws(particles, None)
-        if particles.stopped and not self.run.evaluator.responses_per_theta:
-            with unlimited():
-                adjusted = self.adjustment(self.run.evaluator, particles.thetas, self.optima)
-        else:
-            adjusted = self.adjustment(self.run.evaluator, particles.thetas, self.optima)
+        free = not self.run.evaluator.responses_per_theta
+        with unlimited() if particles.stopped and free else nullcontext():
+            adjusted = self.adjustment(
+                self.run.evaluator, particles.thetas, self.optima, self.design_error
+            )
         return _Draws(particles, adjusted)
 
     def _some_of(self, found: _Draws) -> Floats:

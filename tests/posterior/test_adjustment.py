@@ -1,6 +1,7 @@
 """The adjustment of draws: what it maps exactly, what it leaves alone, and whether the widths are right."""
 
 import logging
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -512,6 +513,30 @@ def test_too_few_draws_are_left_alone_and_it_is_said(caplog: pytest.LogCaptureFi
         idata = sample(build(METRICS["kl"], sd=0.5), 20)
     assert adjustment(idata).startswith("none: ")
     assert "not adjusted" in caplog.text
+
+
+def test_an_error_of_the_design_makes_draws_wider() -> None:
+    optimum = fit("kl")
+    evaluator = optimum.evaluator
+    prb.set_epsilon(optimum.model, prb.calibrate_epsilon(optimum))
+    sampling = SamplingDistribution.of(evaluator, optimum.theta, evaluator.epsilon)
+    x = np.random.default_rng(5).standard_normal((2000, sampling.stderr.size))
+    affine = prb.posterior.Affine(n_sets=100)
+    found = {}
+    for error in (0.0, 0.09, 1.0):
+        adjusted = affine(evaluator, sampling.thetas(x), [optimum.theta], error)
+        assert ("design's error of 0.71" in adjusted.note) == (error == 1)
+        found[error] = np.cov(drawn_in(sampling.coordinates(adjusted.thetas)[0], 3.0).T)
+    np.testing.assert_array_equal(found[0.09], found[0.0])
+    # The prior says next to nothing: half a squared standard error more in each direction.
+    np.testing.assert_allclose(found[1.0] - found[0.0], 0.5 * np.eye(2), atol=0.05)
+
+
+def test_the_sampler_takes_the_error_of_the_design_from_the_optimum() -> None:
+    model = build(METRICS["kl"])
+    optimum = replace(prb.minimize(model, starts=0), design_error=0.5)
+    idata = sample(model, 100, optimum=optimum)
+    assert "design's error of 0.35" in adjustment(idata)
 
 
 def test_copies_of_one_draw_are_left_alone_and_it_is_said() -> None:
