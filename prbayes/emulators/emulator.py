@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from math import comb
@@ -12,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
+from prbayes.emulators.following import Following, predicted, tuned_beside
 from prbayes.emulators.gaussian_process import MOST_TUNED, GaussianProcess
-from prbayes.emulators.surfaces import RadialBasis, Surface, fitted
+from prbayes.emulators.surfaces import RadialBasis, Surface
 
 # Runs that a surface goes through at most: its cost grows with their cube. More are left to the
 # weights, which are then good enough.
@@ -34,12 +36,15 @@ class Runs:
         How much weight each run has in the populations that matter; they sum to one.
     blocks : ndarray, shape (n,)
         Which of a few parts, each spread over all of them, a run belongs to.
+    coarse : ndarray, shape (n, m), optional
+        The same outputs by a coarse response; a run without one of them has none.
     """
 
     x: Floats
     y: Floats
     importance: Floats
     blocks: NDArray[np.intp]
+    coarse: Floats | None = None
 
     @cached_property
     def good(self) -> NDArray[np.bool_]:
@@ -103,7 +108,11 @@ def enough(model: Any, n: int, dimensions: int) -> bool:
 
 
 def emulated(
-    models: Sequence[Any], runs: Runs, at: Floats, kept: NDArray[np.bool_] | None = None
+    models: Sequence[Any],
+    runs: Runs,
+    at: Floats,
+    kept: NDArray[np.bool_] | None = None,
+    coarse: Floats | None = None,
 ) -> Floats:
     """Return what the outputs are about at points.
 
@@ -112,12 +121,14 @@ def emulated(
 
     Parameters
     ----------
-    models : sequence of Surface or regressor
+    models : sequence of Following, Surface or regressor
         Of each output.
     runs : Runs
     at : ndarray, shape (k, d)
     kept : ndarray of bool, shape (n,), optional
         The runs that it is fitted on; all by default.
+    coarse : ndarray, shape (k, m), optional
+        The coarse response at the points, where there is one.
 
     Returns
     -------
@@ -127,7 +138,11 @@ def emulated(
     rows = runs.among(kept)
     x, y = runs.scaled(runs.x[rows]), runs.y[rows]
     points = runs.scaled(at)
-    each = [fitted(model, x, own)(points) for model, own in zip(models, y.T, strict=True)]
+    each = []
+    for k, model in enumerate(models):
+        here = None if runs.coarse is None else runs.coarse[rows, k]
+        there = None if coarse is None else coarse[:, k]
+        each.append(predicted(model, x, y[:, k], points, here, there))
     lowest, highest = y.min(axis=0), y.max(axis=0)
     reach = highest - lowest
     values = np.clip(np.stack(each, axis=1), lowest - reach, highest + reach)
@@ -152,7 +167,8 @@ def left_out(models: Sequence[Any], runs: Runs) -> Floats:
     """Return what surfaces say at the runs that were fitted without the block of each, (n, m)."""
     found = np.empty_like(runs.y)
     for block in each_block(runs):
-        found[block] = emulated(models, runs, runs.x[block], ~block)
+        coarse = None if runs.coarse is None else runs.coarse[block]
+        found[block] = emulated(models, runs, runs.x[block], ~block, coarse)
     return found
 
 
@@ -165,11 +181,12 @@ def each_block(runs: Runs) -> Iterator[NDArray[np.bool_]]:
 def chosen(tried: Sequence[Any], runs: Runs) -> tuple[tuple[Any, ...], Floats]:
     """Return for each output the surface whose left-out errors are smallest, and what it says.
 
-    Errors are squared, and count where the populations that matter live.
+    Errors are squared, and count where the populations that matter live. Where there is a coarse
+    response, following it is another choice.
 
     Returns
     -------
-    models : tuple of Surface or regressor
+    models : tuple of Following, Surface or regressor
         Of each output.
     said : ndarray, shape (n, m)
         What they say of runs that were left out.
@@ -179,39 +196,104 @@ def chosen(tried: Sequence[Any], runs: Runs) -> tuple[tuple[Any, ...], Floats]:
     numpy.linalg.LinAlgError
         If none can be fitted.
     """
-    n, m = runs.y.shape
-    rows = runs.among(np.ones(n, dtype=bool))
-    least, models = np.full(m, np.inf), [None] * m
-    best = np.empty_like(runs.y)
-    # Some of the importance is the same for all: that of a few would be luck.
-    importance = runs.importance[rows] + 0.1 / n
+    rows = runs.among(np.ones(len(runs.y), dtype=bool))
+    best = _Best.of_none(runs, rows)
     smallest = rows.size - rows.size // np.unique(runs.blocks).size - 1
+    tuned = []
     for model in tried:
         if not enough(model, smallest, runs.x.shape[1]):
             continue
         try:
             own = _tuned(model, runs, rows)
-            said = left_out(own, runs)
+            best.take(own)
         except np.linalg.LinAlgError:
             continue
+        tuned.append(own)
+    if None in best.models:
+        raise np.linalg.LinAlgError("no surface goes through the runs")
+    if runs.coarse is not None:
+        otherwise = tuple(best.models)
+        _try_following(best, otherwise, otherwise, joined=False)
+        for own in tuned:
+            _try_following(best, own, otherwise, joined=True)
+    return tuple(best.models), best.said
+
+
+@dataclass(eq=False)
+class _Best:
+    """The best of what was tried so far, for each output."""
+
+    runs: Runs
+    rows: NDArray[np.intp]  # that surfaces go through
+    least: Floats  # (m,): their errors
+    models: list[Any]
+    said: Floats  # (n, m): what they say of runs that were left out
+
+    @classmethod
+    def of_none(cls, runs: Runs, rows: NDArray[np.intp]) -> _Best:
+        """Return what there is before anything was tried."""
+        m = runs.y.shape[1]
+        return cls(runs, rows, np.full(m, np.inf), [None] * m, np.empty_like(runs.y))
+
+    def take(self, models: Sequence[Any]) -> None:
+        """Take models of the outputs for which they are better."""
+        runs, rows = self.runs, self.rows
+        said = left_out(models, runs)
+        # Some of the importance is the same for all: that of a few would be luck.
+        importance = runs.importance[rows] + 0.1 / len(runs.y)
         # A run that failed by its neighbour is off by the spread.
         spread = runs.y[rows].std(axis=0)
         off = np.where(np.isfinite(said[rows]), said[rows] - runs.y[rows], spread)
         error = importance @ off**2
-        for k in np.flatnonzero(error < least):
-            least[k], models[k], best[:, k] = error[k], own[k], said[:, k]
-    if None in models:
-        raise np.linalg.LinAlgError("no surface goes through the runs")
-    return tuple(models), best
+        for k in np.flatnonzero(error < self.least).tolist():
+            self.least[k], self.models[k], self.said[:, k] = error[k], models[k], said[:, k]
+
+
+def _try_following(
+    best: _Best, models: Sequence[Any], otherwise: Sequence[Any], *, joined: bool
+) -> None:
+    """Take choices that follow the coarse response where they are better.
+
+    Parameters
+    ----------
+    best : _Best
+    models : sequence
+        Of each output, which were tuned without the coarse response.
+    otherwise : sequence
+        Of each output, where there is no coarse response.
+    joined : bool
+        Whether the coarse response is among the inputs.
+    """
+    runs = best.runs
+    assert runs.coarse is not None
+    known = best.rows[np.isfinite(runs.coarse[best.rows]).all(axis=1)]
+    in_a_block = max(int(block[known].sum()) for block in each_block(runs))
+    fewest, dimensions = known.size - in_a_block, runs.x.shape[1] + joined
+    if not all(enough(model, fewest, dimensions) for model in models):
+        return
+    some = _most_important(runs, known)
+    x = runs.scaled(runs.x[some])
+    found = []
+    for k, model in enumerate(models):
+        y, coarse = runs.y[some, k], runs.coarse[some, k]
+        tuned = tuned_beside(model, x, y, coarse, joined=joined)
+        found.append(Following(tuned, otherwise[k], joined))
+    with suppress(np.linalg.LinAlgError):
+        best.take(found)
+
+
+def _most_important(runs: Runs, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return those of the runs on which models are tuned."""
+    # Those that matter most, should it take only some.
+    order = np.argsort(-runs.importance[rows], kind="stable")
+    return np.sort(rows[order[:MOST_TUNED]])
 
 
 def _tuned(model: Any, runs: Runs, rows: NDArray[np.intp]) -> list[Any]:
     """Return a model with settings of its own for each output."""
     if not isinstance(model, Surface):
         return [model] * runs.y.shape[1]
-    # Those that matter most, should it take only some.
-    order = np.argsort(-runs.importance[rows], kind="stable")
-    some = np.sort(rows[order[:MOST_TUNED]])
+    some = _most_important(runs, rows)
     x = runs.scaled(runs.x[some])
     found = []
     for own in runs.y[some].T:

@@ -116,6 +116,19 @@ class GaussianProcess(Surface):
             return self.tuned(x, y).through(x, y)
         return mean_through(KERNELS[self.kernel], np.array(self.lengths), self.nugget, x, y)
 
+    def slope(self, x: Floats, y: Floats, along: Floats) -> float:
+        """Return the likeliest slope with these lengths, that of generalised least squares."""
+        from scipy.linalg import cho_solve
+
+        if self.lengths is None or self.nugget is None:
+            return self.tuned(x, y).slope(x, y, along)
+        scaled = x / np.array(self.lengths)
+        own, _ = KERNELS[self.kernel](_squares(scaled, scaled))
+        known = np.column_stack([np.ones(len(x)), along])
+        weighted = cho_solve((_root(own, self.nugget), True), known)
+        _, slope = np.linalg.lstsq(weighted.T @ known, weighted.T @ y, rcond=None)[0]
+        return float(slope)
+
 
 def mean_through(kernel: Kernel, lengths: Floats, nugget: float, x: Floats, y: Floats) -> Predict:
     """Return the mean of a process given points, with lengths and a nugget that are known."""

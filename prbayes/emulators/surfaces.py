@@ -67,6 +67,10 @@ class Surface(ABC):
         """Return the surface with settings that fit the points, which keeps them with fewer."""
         return self
 
+    def slope(self, x: Floats, y: Floats, along: Floats) -> float:
+        """Return how steeply responses follow another one, of spread 1, beside such a surface."""
+        return least_squares(x, y, along)
+
 
 @dataclass(frozen=True)
 class RadialBasis(Surface):
@@ -187,6 +191,12 @@ class _LeastSquares:
 
     def __call__(self, at: Floats) -> Floats:
         return np.asarray(self.polynomial.basis(at) @ self.coefficients)
+
+
+def least_squares(x: Floats, y: Floats, along: Floats) -> float:
+    """Return how steeply responses follow another one beside a plane, which any surface tells."""
+    columns = np.column_stack([np.ones(len(x)), x, along])
+    return float(np.linalg.lstsq(columns, y, rcond=None)[0][-1])
 
 
 # Those that a file can name, so that it is read without being handed the surface.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats
 from prbayes.emulators.emulator import Runs, candidates, chosen, each_block, emulated
+from prbayes.emulators.following import Following
 from prbayes.emulators.share import share_of_runs
 from prbayes.propagation.base import N_BLOCKS
 
@@ -52,6 +53,7 @@ class Cloud:
 
     points: tuple[Floats, ...]  # (M, *event): of each aleatory input
     log_g: Floats  # (M,)
+    coarse: Floats | None = None  # (M, m): of a coarse response, if emulators follow one
 
     def __len__(self) -> int:
         return len(self.log_g)
@@ -92,6 +94,7 @@ class Emulation:
         values: Floats,
         weights: Floats,
         blocks: NDArray[np.intp],
+        coarse: Floats | None = None,
     ) -> Emulation | None:
         """Choose an emulator; None where runs alone are as good.
 
@@ -104,9 +107,11 @@ class Emulation:
         weights : ndarray, shape (T, n)
             Of the runs in the populations that matter.
         blocks : ndarray, shape (n,)
+        coarse : ndarray, shape (n, m), optional
+            A coarse response at the runs.
         """
         x, y = columns(points), values.reshape(len(values), -1)
-        runs = Runs(x, y, weights.mean(axis=0), blocks)
+        runs = Runs(x, y, weights.mean(axis=0), blocks, coarse)
         try:
             tried = candidates(*x.shape) if isinstance(emulator, str) else [emulator]
             models, said = chosen(tried, runs)
@@ -118,9 +123,14 @@ class Emulation:
         share = 0.0 if share < _LITTLE else share
         return cls(runs, models, weights, share, _error(runs, said), values.shape[1:])
 
+    @property
+    def following(self) -> int:
+        """How many outputs follow a coarse response, of which a cloud then needs values."""
+        return sum(isinstance(model, Following) for model in self.models)
+
     def at(self, cloud: Cloud) -> Floats:
         """Return the responses at the cloud's points, (M,) or (M, m)."""
-        found = emulated(self.models, self.runs, columns(cloud.points))
+        found = emulated(self.models, self.runs, columns(cloud.points), coarse=cloud.coarse)
         return found.reshape(-1, *self.event)
 
     def without_each_block(self, cloud: Cloud) -> list[Floats]:
@@ -128,7 +138,7 @@ class Emulation:
         at = columns(cloud.points)
         found = []
         for block in each_block(self.runs):
-            values = emulated(self.models, self.runs, at, ~block)
+            values = emulated(self.models, self.runs, at, ~block, cloud.coarse)
             found.append(values.reshape(-1, *self.event))
         return found
 

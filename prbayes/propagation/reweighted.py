@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -42,6 +42,7 @@ from prbayes.propagation.cloud import (
     Table,
     some_of,
 )
+from prbayes.propagation.coarse import Coarse
 from prbayes.propagation.edges import (
     averaged_log_density,
     cells_around,
@@ -61,7 +62,7 @@ from prbayes.response.distributions import (
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import lacking
 from prbayes.response.repeats import Known, once_each
-from prbayes.response.response import Responses
+from prbayes.response.response import Responses, refuse_coarse
 
 _log = logging.getLogger("prbayes")
 
@@ -103,6 +104,13 @@ class Reweighted(Propagation):
         own weights as far as these errors ask for it; not with one input, discrete ones, or an n
         above 2000, where runs alone are as good. Or a surface of ``prb.surrogate``, or any
         regressor with ``fit(X, y)`` and ``predict(X)``.
+    coarse : callable, optional
+        A cheap response of the same inputs and outputs that is about the expensive one, such as
+        that of a coarser mesh, with ``emulator=``: the emulator then tells what is between the
+        two, for each output as far as that makes errors at left-out runs smaller. It is called at
+        all runs, and at every one of thousands of points between them, on the same executor; none
+        of its calls is counted or stored. Where it raises, or is not finite, the emulator goes on
+        without it, and the log says so.
     executor : Executor, optional
         Where the response is computed: threads, processes, loky,
         ``dask.distributed.Client().get_executor()``, ``mpi4py.futures.MPIPoolExecutor()``. In this
@@ -134,7 +142,7 @@ class Reweighted(Propagation):
     Examples
     --------
     >>> Reweighted(256)
-    Reweighted(n=256, random_seed=0, max_lost=0.05, max_points=None, emulator=None)
+    Reweighted(n=256, random_seed=0, max_lost=0.05, max_points=None, emulator=None, coarse=None)
     """
 
     n: int = 1024
@@ -142,6 +150,7 @@ class Reweighted(Propagation):
     max_lost: float = MAX_LOST
     max_points: int | None = None
     emulator: Any = None
+    coarse: Callable[..., Any] | None = None
 
     def __post_init__(self) -> None:
         self.check()
@@ -149,6 +158,7 @@ class Reweighted(Propagation):
         positive_integer(self.random_seed, "Reweighted: random_seed", minimum=0)
         refuse_max_lost(self.max_lost, "Reweighted")
         _refuse_emulator(self.emulator)
+        _refuse_coarse(self.coarse, self.emulator)
         if (
             self.max_points is not None
             and positive_integer(self.max_points, "Reweighted: max_points") < self.n
@@ -196,6 +206,18 @@ def _refuse_emulator(emulator: Any) -> None:
         )
 
 
+def _refuse_coarse(coarse: Any, emulator: Any) -> None:
+    """Raise if it is no coarse response, or nothing would follow it."""
+    if coarse is None:
+        return
+    refuse_coarse("Reweighted: coarse", coarse)
+    if emulator is None:
+        raise ValueError(
+            "Reweighted: coarse: got a coarse response and no emulator to follow it, expected "
+            'emulator="auto", or a surface, beside it'
+        )
+
+
 @dataclass(frozen=True)
 class Batches:
     """The points of a design, batch after batch, and the mixture that they were drawn from."""
@@ -206,6 +228,7 @@ class Batches:
     components: tuple[Floats, ...]
     counts: Floats  # (k,): how many points came from each component
     sizes: tuple[int, ...]  # number of points of each batch
+    coarse: Floats | None = None  # (n, m): a coarse response at the points
 
     def followed_by(self, other: Batches) -> Batches:
         """Return these batches with others after them."""
@@ -215,6 +238,7 @@ class Batches:
             components=tuple(map(_end_to_end, self.components, other.components)),
             counts=_end_to_end(self.counts, other.counts),
             sizes=(*self.sizes, *other.sizes),
+            coarse=_both(self.coarse, other.coarse),
         )
 
     def rows(self) -> Iterator[slice]:
@@ -271,6 +295,10 @@ class Design(Bound):
         self._moving: tuple[int, ...] | None = None
         if config.emulator is not None and not isinstance(config.emulator, str):
             self._refuse_emulating()
+        self._coarse: Coarse | None = None
+        if config.coarse is not None:
+            self._refuse_following()
+            self._coarse = Coarse(config.coarse, responses, config.executor)
         components = prior_draws(inputs.roots, min(config.n, _COMPONENTS), config.random_seed)
         size = self.add(components)
         refuse_all_nan(name, self.values)
@@ -287,6 +315,16 @@ class Design(Bound):
             f"({kinds}), expected several continuous numbers for each specimen; of one number the "
             "runs are a quadrature rule, and discrete ones are computed: leave emulator= out"
         )
+
+    def _refuse_following(self) -> None:
+        """Raise if there is no emulator that could follow a coarse response."""
+        if not self.emulates:
+            raise TypeError(
+                f"{self.name}: coarse: got a coarse response for {self.dimensions} aleatory "
+                f"number(s) and n = {self.config.n}, expected several continuous numbers for each "
+                f"specimen and at most {MOST_RUNS} runs, between which something is emulated: "
+                "leave coarse= out"
+            )
 
     def _warn_of_thin_support(self, size: float) -> None:
         # With more inputs weights become so uneven that another propagation is better
@@ -356,8 +394,20 @@ class Design(Bound):
         return (
             f"{runs}, between which {self.n_points} points are emulated: at runs that were left "
             f"out the emulator is off by {emulation.error:.2g} of the response's spread, and "
-            f"populations are to {emulation.share:.0%} of the runs themselves."
+            f"populations are to {emulation.share:.0%} of the runs themselves.{self._following}"
         )
+
+    @property
+    def _following(self) -> str:
+        """How far the emulator follows a coarse response, as a sentence; empty without one."""
+        emulation = self.contents.emulation
+        if self._coarse is None or emulation is None:
+            return ""
+        number, outputs = emulation.following, len(emulation.models)
+        if not number:
+            return " It does not follow the coarse response, which tells nothing more."
+        some = f" in {number} of {outputs} outputs" if number < outputs else ""
+        return f" It follows the coarse response{some}."
 
     @property
     def emulates(self) -> bool:
@@ -541,8 +591,10 @@ class Design(Bound):
         place = self._equal_mass if self.is_line else self._place
         points, counts = place(components, n, seed)
         points = self._off_the_edges(points, components, counts)
+        # First, as what is wrong with it then costs no run.
+        coarse = None if self._coarse is None else self._coarse.at_runs(points)
         values = self._responses_at(points)
-        batch = Batches(tuple(points), values, tuple(components), counts, (n,))
+        batch = Batches(tuple(points), values, tuple(components), counts, (n,), coarse)
         before = self._contents
         batches = batch if before is None else before.batches.followed_by(batch)
         if self._moving is None:
@@ -605,6 +657,7 @@ class Design(Bound):
             runs.values,
             self._weights_at(near, runs),
             runs.blocks,
+            contents.batches.coarse,
         )
         if emulation is None:
             return contents
@@ -614,7 +667,10 @@ class Design(Bound):
         points, counts = self._place(components, contents.size, seed)
         points = self._off_the_edges(points, components, counts)
         log_g, _ = self._log_mixture(components, counts, points, summed=False)
-        cloud = Cloud(tuple(points), log_g)
+        coarse = None
+        if self._coarse is not None and emulation.following:
+            coarse = self._coarse(points)
+        cloud = Cloud(tuple(points), log_g, coarse)
         table = emulation.joined(cloud, emulation.at(cloud), runs)
         return replace(
             contents,
@@ -1005,6 +1061,11 @@ def _inverted(levels: Floats, grid: Floats, density: Floats) -> Floats:
     else:
         found = np.interp(levels, share, grid)
     return np.asarray(found)
+
+
+def _both(first: Floats | None, second: Floats | None) -> Floats | None:
+    """Return arrays one after the other, where there are any."""
+    return None if first is None or second is None else _end_to_end(first, second)
 
 
 def _end_to_end(first: Floats, second: Floats) -> Floats:

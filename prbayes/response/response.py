@@ -42,6 +42,15 @@ def refuse_uncallable(name: str, function: object) -> None:
         )
 
 
+def refuse_coarse(label: str, function: object) -> None:
+    """Raise if a coarse response is no function."""
+    if not callable(function) or isinstance(function, type):
+        raise TypeError(
+            f"{label}: got {called(function)}, expected a function of the same inputs as the "
+            "response"
+        )
+
+
 def refuse_calling(executor: object, store: object, version: object, on_failure: object) -> None:
     """Raise if one of the arguments that say how a response is called is not of its kind."""
     executes(executor, "executor")

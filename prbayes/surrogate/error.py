@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes.emulators.surfaces import Surface, fitted
+from prbayes.emulators.following import predicted
+from prbayes.emulators.surfaces import Surface
 
 # Tenfold: Kohavi (1995), A study of cross-validation and bootstrap for accuracy estimation and
 # model selection, IJCAI. More folds are nearer to the surface through all points, and cost as many
@@ -57,17 +58,21 @@ class CrossValidation:
         )
 
 
-def cross_validated(model: Any, x: Floats, y: Floats, random_seed: int) -> Floats:
+def cross_validated(
+    model: Any, x: Floats, y: Floats, random_seed: int, coarse: Floats | None = None
+) -> Floats:
     """Return responses less what a surface says that was fitted without their tenth of the points.
 
     Parameters
     ----------
-    model : Surface or regressor
+    model : Following, Surface or regressor
     x : ndarray, shape (n, d)
         In the unit cube.
     y : ndarray, shape (n,)
     random_seed : int
         Of the order in which points are dealt out to folds.
+    coarse : ndarray, shape (n,), optional
+        A coarse response, for a model that follows one.
 
     Returns
     -------
@@ -77,8 +82,8 @@ def cross_validated(model: Any, x: Floats, y: Floats, random_seed: int) -> Float
     residuals = np.empty(len(y))
     for fold in np.array_split(order, min(FOLDS, len(y))):
         kept = np.setdiff1d(order, fold)
-        surface = fitted(model, x[kept], y[kept])
-        residuals[fold] = y[fold] - surface(x[fold])
+        pair = (None, None) if coarse is None else (coarse[kept], coarse[fold])
+        residuals[fold] = y[fold] - predicted(model, x[kept], y[kept], x[fold], *pair)
     return residuals
 
 

@@ -31,6 +31,7 @@ class Kept:
     noise: int | None
     n_runs: int
     probes: Floats  # (k,): values of the surface at fixed points, by which another surface is known
+    joined: bool | None = None  # how a coarse response is followed; None if none is
 
 
 def write(path: str | PathLike[str], kept: Kept) -> None:
@@ -79,6 +80,7 @@ def read(path: str | PathLike[str]) -> Kept:
             noise=config["noise"],
             n_runs=config["n_runs"],
             probes=data["probes"].values,
+            joined=config["joined"],
         )
     # Damaged files raise whatever the library that meets the damage raises.
     except Exception as error:
@@ -103,6 +105,7 @@ def _configuration(kept: Kept) -> dict[str, Any]:
         "outside": outside,
         "noise": kept.noise,
         "n_runs": kept.n_runs,
+        "joined": kept.joined,
     }
 
 

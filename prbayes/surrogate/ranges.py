@@ -69,6 +69,11 @@ class Ranges:
         )
 
     @property
+    def varying(self) -> list[bool]:
+        """Which inputs are not constant."""
+        return [not one.constant for one in self.inputs]
+
+    @property
     def dimensions(self) -> int:
         """Number of columns that are not constant."""
         return int(self.free.sum())

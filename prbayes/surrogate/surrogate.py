@@ -23,11 +23,12 @@ from prbayes._checks import (
     share,
 )
 from prbayes._progress import shown
+from prbayes.emulators.following import Followed, Following, followed
 from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted, settings_of, shipped
 from prbayes.propagation.points import sobol
-from prbayes.response.calling import Calling, Points, Tally, respond
+from prbayes.response.calling import Calling, Points, Tally, compute, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
-from prbayes.response.response import refuse_calling
+from prbayes.response.response import refuse_calling, refuse_coarse
 from prbayes.response.store import Store
 from prbayes.surrogate.error import CrossValidation, cross_validated, points_needed
 from prbayes.surrogate.files import Kept, read, write
@@ -67,6 +68,9 @@ class Surrogate:
     error : CrossValidation
     noise : int or None
         The seed of residual noise, see `with_error`.
+    coarse : callable or None
+        The coarse response that it follows. It is called wherever the surrogate is, and travels
+        with it by pickle, if it can.
 
     See Also
     --------
@@ -95,7 +99,11 @@ class Surrogate:
     n_runs: int
     error: CrossValidation
     noise: int | None = None
+    coarse: Callable[..., Any] | None = None
+    # Whether the coarse response is among the inputs of the surface, too.
+    _joined: bool = field(repr=False, default=False)
     _predict: Predict = field(repr=False, default=cast(Predict, None))
+    _followed: Followed = field(repr=False, default=cast(Followed, None))
     # Search trees of all points, and of those that did not fail.
     _trees: tuple[Any, Any] = field(repr=False, default=(None, None))
 
@@ -107,6 +115,7 @@ class Surrogate:
         n: int,
         *,
         model: Any = None,
+        coarse: Callable[..., Any] | None = None,
         outside: OnFailure | None = None,
         coverage: float = 0.999,
         name: str = "surrogate",
@@ -135,6 +144,11 @@ class Surrogate:
             `RadialBasis` (default), `Polynomial`, or any regressor with ``fit(X, y)`` and
             ``predict(X)``, as those of scikit-learn; it gets inputs scaled to [0, 1] and responses
             of mean 0 and spread 1, and is left as it is.
+        coarse : callable, optional
+            A cheap response of the same inputs that is about the expensive one, such as that of a
+            coarser mesh. The surrogate follows it if its cross-validated error is smaller then; it
+            calls it wherever it is called. Where it raises, or is not finite, the surface goes on
+            without it, and the log says so.
         outside : OnFailure, optional
             `Replace` (default): points outside the ranges give its value, NaN, with a warning in
             the log. A simulator with `Reweighted` reports them as lost mass, and refuses an answer
@@ -171,6 +185,8 @@ class Surrogate:
         outside = Replace() if outside is None else outside
         policy = Abort() if on_failure is None else on_failure
         _refuse_wrong(name, response, model, outside)
+        if coarse is not None:
+            refuse_coarse(f"{name}: coarse", coarse)
         refuse_calling(executor, store, version, policy)
         flag(retry_failed, f"{name}: retry_failed")
         share(coverage, f"{name}: coverage")
@@ -181,12 +197,18 @@ class Surrogate:
 
         # Compute the responses.
         points = domain.at(sobol(n, domain.dimensions, seed))
+        # First, as what is wrong with it then costs no run.
+        beside = None if coarse is None else _coarse_at(name, coarse, domain, points)
+        if beside is not None and not np.isfinite(beside).any():
+            raise ResponseError(
+                f"{name}: coarse: got no number at any of {n} points, expected a response of the "
+                "same inputs; repair it, or leave coarse= out"
+            )
         kept = None if store is None else Store(store, name, points.shape[1], version=version)
         calling = Calling(name, response, executor, kept, policy, retry_failed)
-        varying = [not one.constant for one in domain.inputs]
         tally = Tally()
         with shown(progressbar):
-            responses = respond(calling, Points(domain.arguments(points), varying), tally)
+            responses = respond(calling, Points(domain.arguments(points), domain.varying), tally)
         good = np.isfinite(responses)
         if good.sum() < needed:
             raise ResponseError(
@@ -197,10 +219,28 @@ class Surrogate:
         unit = domain.scaled(points)
         residuals = np.full(n, np.nan)
         residuals[good] = cross_validated(model, unit[good], responses[good], seed)
+        joined = False
+        if beside is not None:
+            least, choice = _best_following(model, unit[good], responses[good], beside[good], seed)
+            if (least**2).sum() < (residuals[good] ** 2).sum():
+                residuals[good], joined = least, choice
+            else:
+                coarse = None
+                _log.info("%s: the coarse response tells nothing more, and is not followed", name)
         error = CrossValidation(residuals, float(responses[good].std()))
 
         # Fit the surface; only then is the spread over the prior predictive distribution known.
-        unfitted = cls(domain, points, responses, model, outside, tally.computed, error)
+        unfitted = cls(
+            domain,
+            points,
+            responses,
+            model,
+            outside,
+            tally.computed,
+            error,
+            coarse=coarse,
+            _joined=joined,
+        )
         found = unfitted._completed()
         if predictive is not None:
             values = found._at(predictive)
@@ -315,11 +355,18 @@ class Surrogate:
             noise=self.noise,
             n_runs=self.n_runs,
             probes=self._probes(),
+            joined=None if self.coarse is None else self._joined,
         )
         write(path, kept)
 
     @classmethod
-    def load(cls, path: str | PathLike[str], *, model: Any = None) -> Surrogate:
+    def load(
+        cls,
+        path: str | PathLike[str],
+        *,
+        model: Any = None,
+        coarse: Callable[..., Any] | None = None,
+    ) -> Surrogate:
         """Read what `save` wrote, and fit the surface anew.
 
         No response is computed, and nothing is unpickled.
@@ -330,6 +377,9 @@ class Surrogate:
         model : object, optional
             The surface or regressor, where it is not one that ships with prbayes: a file keeps its
             design, not its code.
+        coarse : callable, optional
+            The coarse response, where the surrogate follows one: for the same reason. It is called
+            at the design. A surrogate that follows none needs none.
 
         Raises
         ------
@@ -346,6 +396,11 @@ class Surrogate:
                 f"Surrogate.load: got no model, expected the {kept.kind} it was fitted with; "
                 "pass model="
             )
+        if kept.joined is not None and coarse is None:
+            raise TypeError(
+                "Surrogate.load: got no coarse response, expected the one that the surrogate "
+                "follows: a file does not keep it; pass coarse="
+            )
         unfitted = cls(
             domain=kept.ranges,
             points=kept.points,
@@ -355,6 +410,8 @@ class Surrogate:
             n_runs=kept.n_runs,
             error=kept.error,
             noise=kept.noise,
+            coarse=None if kept.joined is None else coarse,
+            _joined=bool(kept.joined),
         )
         found = unfitted._completed()
         good = kept.responses[np.isfinite(kept.responses)]
@@ -363,10 +420,11 @@ class Surrogate:
         # changes.
         tolerance = 1e-6 * spread
         if not np.allclose(found._probes(), kept.probes, rtol=0, atol=tolerance, equal_nan=True):
+            beside = "" if kept.joined is None else ", and the same coarse response"
             raise ValueError(
                 f"Surrogate.load: got a {type(model).__name__} that gives other values than the "
                 f"{kept.kind} that was saved in this file, expected the same one with the same "
-                "settings (and a fixed seed of its own)"
+                f"settings (and a fixed seed of its own){beside}"
             )
         return found
 
@@ -378,7 +436,14 @@ class Surrogate:
         good = np.isfinite(self.responses)
         surface = fitted(self.model, unit[good], self.responses[good])
         trees = cKDTree(unit), cKDTree(unit[good])
-        return replace(self, _predict=surface, _trees=trees)
+        found = replace(self, _predict=surface, _trees=trees)
+        if self.coarse is None:
+            return found
+        coarse = _coarse_at("surrogate", self.coarse, self.domain, self.points)
+        good &= np.isfinite(coarse)
+        y = self.responses[good]
+        beside = followed(self.model, unit[good], y, coarse[good], joined=self._joined)
+        return replace(found, _followed=beside)
 
     def _at(self, columns: Floats) -> Floats:
         """Return values inside the ranges, shape (n,)."""
@@ -386,7 +451,7 @@ class Surrogate:
             return np.empty(0)
         # What lies outside by its rounding only is on the edge.
         unit = np.clip(self.domain.scaled(columns), 0.0, 1.0)
-        values = self._predict(unit)
+        values = self._surface(columns, unit)
         if self.noise is not None:
             values = values + self._noise_at(columns, unit, self.noise)
         if not np.isfinite(self.responses).all():
@@ -395,6 +460,25 @@ class Surrogate:
             _, which = all_points.query(unit)
             nearest = self.responses[which]
             values = np.where(np.isfinite(nearest), values, nearest)
+        return values
+
+    def _surface(self, columns: Floats, unit: Floats) -> Floats:
+        """Return values of the surface at rows, which are also given in the unit cube."""
+        if self.coarse is None:
+            return self._predict(unit)
+        coarse = _coarse_at("surrogate", self.coarse, self.domain, columns)
+        known = np.isfinite(coarse)
+        values = np.empty(len(unit))
+        values[known] = self._followed(unit[known], coarse[known])
+        if not known.all():
+            values[~known] = self._predict(unit[~known])
+            lost = (~known).sum()
+            _log.warning(
+                "surrogate: coarse: got no number at %d of %d points, where the surface goes on "
+                "without it",
+                lost,
+                known.size,
+            )
         return values
 
     def _noise_at(self, columns: Floats, unit: Floats, random_seed: int) -> Floats:
@@ -421,7 +505,36 @@ class Surrogate:
         """Return values of the surface, without noise, at a few fixed points."""
         # More than surfaces that ship have coefficients, in few dimensions, so that another one
         # cannot agree at all of them.
-        return self._predict(sobol(64, self.domain.dimensions, 0))
+        unit = sobol(64, self.domain.dimensions, 0)
+        return self._surface(self.domain.at(unit), unit)
+
+
+def _coarse_at(name: str, coarse: Callable[..., Any], domain: Ranges, columns: Floats) -> Floats:
+    """Return a coarse response at rows, (n,); NaN where it raises."""
+    points = Points(domain.arguments(columns), domain.varying)
+    try:
+        return compute(coarse, points, tolerant=True).values
+    except ResponseError as error:
+        raise ResponseError(f"{name}: coarse: {error}") from None
+
+
+def _best_following(
+    model: Any, x: Floats, y: Floats, coarse: Floats, seed: int
+) -> tuple[Floats, bool]:
+    """Return residuals of a surface that follows a coarse response, and whether it is joined.
+
+    Infinite ones where too few runs have a coarse response.
+    """
+    least, choice = np.full(len(y), np.inf), False
+    known = int(np.isfinite(coarse).sum())
+    for joined in (False, True):
+        if known < points_needed(model, x.shape[1] + joined):
+            continue
+        following = Following(model, model, joined)
+        residuals = cross_validated(following, x, y, seed, coarse)
+        if (residuals**2).sum() < (least**2).sum():
+            least, choice = residuals, joined
+    return least, choice
 
 
 def _refuse_wrong(name: str, response: object, model: Any, outside: object) -> None:
