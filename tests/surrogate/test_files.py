@@ -71,6 +71,28 @@ def test_a_regressor_is_passed_again_at_load(tmp_path: Path) -> None:
         prb.Surrogate.load(tmp_path / "s.nc", model=Ridge(alpha=10.0))
 
 
+@pytest.mark.parametrize("joined", [False, True])
+def test_a_coarse_response_is_passed_again_at_load(tmp_path: Path, joined: bool) -> None:
+    def fine(x: Any, y: Any) -> Any:
+        waves = np.sin(12 * x) * np.cos(9 * y)
+        return bent(x, y) + (x * waves if joined else waves)
+
+    def coarse(x: Any, y: Any) -> Any:
+        return np.sin(12 * x) * np.cos(9 * y)
+
+    found = prb.Surrogate.fit(fine, BOX, 48, coarse=coarse)
+    found.save(tmp_path / "s.nc")
+    with pytest.raises(TypeError, match="got no coarse response, expected the one"):
+        prb.Surrogate.load(tmp_path / "s.nc")
+    with pytest.raises(ValueError, match="and the same coarse response"):
+        prb.Surrogate.load(tmp_path / "s.nc", coarse=lambda x, y: coarse(x, 1.01 * y))
+    back = prb.Surrogate.load(tmp_path / "s.nc", coarse=coarse)
+    x, y = fresh_points()
+    np.testing.assert_array_equal(back(x, y), found(x, y))
+    prb.Surrogate.fit(bent, BOX, 48).save(tmp_path / "alone.nc")
+    assert prb.Surrogate.load(tmp_path / "alone.nc", coarse=coarse).coarse is None
+
+
 def test_what_is_no_surrogate_is_refused(tmp_path: Path) -> None:
     (tmp_path / "s.nc").write_bytes(b"not a file of this kind")
     with pytest.raises(StoreError, match=r"path: got .*expected a file of Surrogate.save"):

@@ -198,3 +198,64 @@ def test_a_model_whose_length_is_unknown_before_it_is_fitted_is_taken() -> None:
     forest = ensemble.RandomForestRegressor(n_estimators=5, random_state=0)
     found = prb.Surrogate.fit(bent, BOX, 64, model=forest)
     assert found(1.5, 1.5) == pytest.approx(bent(1.5, 1.5), abs=0.3)
+
+
+def wavy(x: Any, y: Any) -> Any:
+    return bent(x, y) + 0.3 * np.sin(12 * x) * np.cos(9 * y)
+
+
+def coarse_waves(x: Any, y: Any) -> Any:
+    return 5 - 4 * wavy(x, y) + y * x
+
+
+def test_a_coarse_response_is_followed(surrogate: prb.Surrogate) -> None:
+    alone = prb.Surrogate.fit(wavy, BOX, 48)
+    found = prb.Surrogate.fit(wavy, BOX, 48, coarse=coarse_waves)
+    assert found.coarse is coarse_waves
+    assert found.error.relative < 0.1 * alone.error.relative
+    x, y = np.random.default_rng(2).uniform([[0], [1]], [[3], [2]], (2, 500))
+    off, without = found(x, y) - wavy(x, y), alone(x, y) - wavy(x, y)
+    assert off.std() < 0.1 * without.std()
+    # The error is of surfaces, and of a rho, that do not know the runs that are left out.
+    assert 0.5 < found.error.rms / off.std() < 3
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(found))(x, y), found(x, y))
+    assert surrogate.coarse is None
+
+
+def test_a_coarse_response_that_tells_nothing_is_not_followed(surrogate: prb.Surrogate) -> None:
+    found = prb.Surrogate.fit(bent, BOX, 64, coarse=lambda x, y: np.sin(70 * x + 60 * y))
+    assert found.coarse is None
+    assert found(1.0, 1.5) == surrogate(1.0, 1.5)
+    np.testing.assert_array_equal(found.error.residuals, surrogate.error.residuals)
+
+
+def test_where_there_is_no_coarse_response_the_surface_goes_on(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def partly(x: Any, y: Any) -> Any:
+        return np.where(x > 2, np.nan, coarse_waves(x, y))
+
+    alone = prb.Surrogate.fit(wavy, BOX, 48)
+    found = prb.Surrogate.fit(wavy, BOX, 48, coarse=partly)
+    with caplog.at_level(logging.WARNING, "prbayes"):
+        values = found([1.0, 2.5], 1.5)
+    assert "coarse: got no number at 1 of 2 points" in caplog.text
+    assert values[1] == alone(2.5, 1.5)
+    assert values[0] == pytest.approx(wavy(1.0, 1.5), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("coarse", "error", "told"),
+    [
+        (3, TypeError, "surrogate: coarse: got int 3, expected a function"),
+        (lambda x, y: np.stack([x, y]), ResponseError, r"surrogate: coarse: .* returned shape"),
+        (lambda x: x, ResponseError, "surrogate: coarse: got no number at any of 48 points"),
+    ],
+)
+def test_what_is_no_coarse_response_is_refused_before_any_run(
+    coarse: Any, error: type[Exception], told: str
+) -> None:
+    calls: list[int] = []
+    with pytest.raises(error, match=told):
+        prb.Surrogate.fit(lambda x, y: calls.append(1) or bent(x, y), BOX, 48, coarse=coarse)
+    assert not calls
