@@ -28,7 +28,8 @@ class Coarse:
     Raises
     ------
     ResponseError
-        When called, if it gives no real numbers, or another shape than the expensive one does.
+        When called, if it gives no real numbers, or another shape than the expensive one does, or
+        is finite at none of the points that it is called at first.
     """
 
     def __init__(self, function: Callable[..., Any], expensive: Responses, executor: Any) -> None:
@@ -40,21 +41,18 @@ class Coarse:
             on_failure=Replace(),
             outputs=expensive.outputs,
         )
+        self._known = False
 
     def __call__(self, points: Sequence[Floats]) -> Floats:
-        """Return the outputs at points, (n, m)."""
+        """Return the outputs at points, (n, m), of which the first have to have some."""
         # What a user limits is the expensive response.
         with unlimited():
             found = self._responses(points, [])
-        return found.reshape(len(found), -1)
-
-    def at_runs(self, points: Sequence[Floats]) -> Floats:
-        """Return the same at runs, some of which have to have a coarse response."""
-        found = self(points)
-        if not np.isfinite(found).any():
+        self._known = self._known or bool(np.isfinite(found).any())
+        if not self._known:
             why = next((failure.reason for failure in self._responses.failed), "it is infinite")
             raise ResponseError(
                 f"{self._responses.name}: got no number at any of {len(found)} runs ({why}), "
                 "expected a response of the same inputs; repair it, or leave coarse= out"
             )
-        return found
+        return found.reshape(len(found), -1)

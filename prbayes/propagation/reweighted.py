@@ -591,8 +591,8 @@ class Design(Bound):
         place = self._equal_mass if self.is_line else self._place
         points, counts = place(components, n, seed)
         points = self._off_the_edges(points, components, counts)
-        # First, as what is wrong with it then costs no run.
-        coarse = None if self._coarse is None else self._coarse.at_runs(points)
+        # Before the runs: what is wrong with it then costs none.
+        coarse = None if self._coarse is None else self._coarse(points)
         values = self._responses_at(points)
         batch = Batches(tuple(points), values, tuple(components), counts, (n,), coarse)
         before = self._contents

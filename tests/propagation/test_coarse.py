@@ -93,6 +93,21 @@ def test_runs_that_are_added_have_a_coarse_response_as_well() -> None:
     assert len(design.batches.coarse) == design.n_runs == 64
 
 
+def test_runs_that_are_added_where_there_is_none_are_no_mistake() -> None:
+    def partly(a: Any, b: Any, scale: Any) -> Any:
+        return np.where(a > 4, np.nan, coarse(a, b))
+
+    evaluator = Evaluator(build(partly))
+    design = evaluator.designs["y"]
+    far = [
+        np.full_like(root, 30.0 if i == 0 else 1.0)
+        for i, root in enumerate(evaluator.roots(evaluator.prior_thetas(32, 3), 0))
+    ]
+    design.add(far, 16)
+    assert design.n_runs == 80
+    assert np.isfinite(design.values).all()
+
+
 def test_its_calls_are_neither_counted_nor_limited() -> None:
     calls: list[int] = []
 
