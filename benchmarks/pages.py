@@ -318,6 +318,17 @@ def few_runs() -> Iterator[Row]:
         yield [name, str(cell["inputs"]), runs, *columns, *beside]
 
 
+def two_fidelities() -> Iterator[Row]:
+    """Return the rows of errors with a coarse response and without."""
+    from benchmarks.two_fidelities import WAYS, median, rms
+
+    table = found("two_fidelities")
+    for n, errors in table["emulators"].items():
+        optima = table["optima"][n]
+        of_emulators = [short(median(errors[way])) for way in WAYS]
+        yield [n, *of_emulators, *(short(rms(optima[way]), 3) for way in WAYS)]
+
+
 def libraries() -> Iterator[Row]:
     """Return the rows of libraries' emulators."""
     table = found("emulators")
@@ -369,6 +380,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "joint, memory": joint_memory,
     "between runs": between_runs,
     "few runs": few_runs,
+    "two fidelities": two_fidelities,
     "libraries": libraries,
 }
 _MARKED = re.compile(

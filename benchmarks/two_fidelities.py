@@ -73,6 +73,9 @@ CASES: dict[str, Callable[..., Any]] = {
 }
 
 
+WAYS = ("without", *CASES)
+
+
 def prior(uniforms: Any) -> Any:
     """Return specimens of the prior, (n, 3), of points of the unit cube, (n, 9)."""
     z = norm.ppf(uniforms)
@@ -105,7 +108,7 @@ def emulator_error(coarse: Callable[..., Any] | None, n: int, seed: int) -> floa
 def emulators(seeds: int, found: dict[str, dict[str, list[float]]]) -> Iterator[None]:
     """Fit emulators that are not yet among those that were found, by runs and coarse response."""
     for n in RUNS:
-        rows = found.setdefault(str(n), {way: [] for way in ("without", *CASES)})
+        rows = found.setdefault(str(n), {way: [] for way in WAYS})
         for way, errors in rows.items():
             for seed in range(len(errors), seeds):
                 errors.append(emulator_error(CASES.get(way), n, seed))
