@@ -80,7 +80,7 @@ def read(path: str | PathLike[str]) -> Kept:
             noise=config["noise"],
             n_runs=config["n_runs"],
             probes=data["probes"].values,
-            joined=config["joined"],
+            joined=config.get("joined"),
         )
     # Damaged files raise whatever the library that meets the damage raises.
     except Exception as error:

@@ -185,8 +185,6 @@ class Surrogate:
         outside = Replace() if outside is None else outside
         policy = Abort() if on_failure is None else on_failure
         _refuse_wrong(name, response, model, outside)
-        if coarse is not None:
-            refuse_coarse(f"{name}: coarse", coarse)
         refuse_calling(executor, store, version, policy)
         flag(retry_failed, f"{name}: retry_failed")
         share(coverage, f"{name}: coverage")
@@ -198,12 +196,7 @@ class Surrogate:
         # Compute the responses.
         points = domain.at(sobol(n, domain.dimensions, seed))
         # First, as what is wrong with it then costs no run.
-        beside = None if coarse is None else _coarse_at(name, coarse, domain, points)
-        if beside is not None and not np.isfinite(beside).any():
-            raise ResponseError(
-                f"{name}: coarse: got no number at any of {n} points, expected a response of the "
-                "same inputs; repair it, or leave coarse= out"
-            )
+        beside = None if coarse is None else _first_coarse(name, coarse, domain, points)
         kept = None if store is None else Store(store, name, points.shape[1], version=version)
         calling = Calling(name, response, executor, kept, policy, retry_failed)
         tally = Tally()
@@ -218,15 +211,11 @@ class Surrogate:
         # Tell the error.
         unit = domain.scaled(points)
         residuals = np.full(n, np.nan)
-        residuals[good] = cross_validated(model, unit[good], responses[good], seed)
-        joined = False
-        if beside is not None:
-            least, choice = _best_following(model, unit[good], responses[good], beside[good], seed)
-            if (least**2).sum() < (residuals[good] ** 2).sum():
-                residuals[good], joined = least, choice
-            else:
-                coarse = None
-                _log.info("%s: the coarse response tells nothing more, and is not followed", name)
+        beside = None if beside is None else beside[good]
+        residuals[good], joined = _best(model, unit[good], responses[good], beside, seed)
+        if coarse is not None and joined is None:
+            coarse = None
+            _log.info("%s: the coarse response tells nothing more, and is not followed", name)
         error = CrossValidation(residuals, float(responses[good].std()))
 
         # Fit the surface; only then is the spread over the prior predictive distribution known.
@@ -239,7 +228,7 @@ class Surrogate:
             tally.computed,
             error,
             coarse=coarse,
-            _joined=joined,
+            _joined=bool(joined),
         )
         found = unfitted._completed()
         if predictive is not None:
@@ -518,20 +507,33 @@ def _coarse_at(name: str, coarse: Callable[..., Any], domain: Ranges, columns: F
         raise ResponseError(f"{name}: coarse: {error}") from None
 
 
-def _best_following(
-    model: Any, x: Floats, y: Floats, coarse: Floats, seed: int
-) -> tuple[Floats, bool]:
-    """Return residuals of a surface that follows a coarse response, and whether it is joined.
+def _first_coarse(name: str, coarse: Callable[..., Any], domain: Ranges, columns: Floats) -> Floats:
+    """Return the same at the design, or raise if it is no response of the inputs."""
+    refuse_coarse(f"{name}: coarse", coarse)
+    found = _coarse_at(name, coarse, domain, columns)
+    if not np.isfinite(found).any():
+        raise ResponseError(
+            f"{name}: coarse: got no number at any of {len(columns)} points, expected a response "
+            "of the same inputs; repair it, or leave coarse= out"
+        )
+    return found
 
-    Infinite ones where too few runs have a coarse response.
+
+def _best(
+    model: Any, x: Floats, y: Floats, coarse: Floats | None, seed: int
+) -> tuple[Floats, bool | None]:
+    """Return the least cross-validated residuals, and how a coarse response is followed for them.
+
+    None if it is not; else whether it is among the inputs of the surface, too.
     """
-    least, choice = np.full(len(y), np.inf), False
+    least, choice = cross_validated(model, x, y, seed), None
+    if coarse is None:
+        return least, choice
     known = int(np.isfinite(coarse).sum())
     for joined in (False, True):
         if known < points_needed(model, x.shape[1] + joined):
             continue
-        following = Following(model, model, joined)
-        residuals = cross_validated(following, x, y, seed, coarse)
+        residuals = cross_validated(Following(model, model, joined), x, y, seed, coarse)
         if (residuals**2).sum() < (least**2).sum():
             least, choice = residuals, joined
     return least, choice
