@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pymc.distributions.censored import CensoredRV
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats
+from prbayes._checks import AT_ONCE, Floats
 from prbayes.response.compilation import compile_batched, with_leading_axis
 from prbayes.response.distributions import is_elliptical
 from prbayes.response.inputs import Inputs
@@ -66,26 +66,33 @@ def moving_inputs(
     symbols = inputs.placeholders()
     dists, _ = inputs.rebuilt(symbols)
     given = with_leading_axis(inputs.aleatory)
-    outside = []
-    for dist, x in zip(dists, given, strict=True):
-        everywhere_positive = is_elliptical(dist)
-        log = pt.zeros(x.shape[0]) if everywhere_positive else pm.logp(dist, x, warn_rvs=False)
-        outside.append(pt.isneginf(log))
-    compiled = compile_batched(symbols, outside, given)
-    found = compiled(*components, *points)
     moving = []
-    k = len(components[0])
-    for i, dist in enumerate(dists):
-        # One of each element, or one of a vector that is drawn as a whole.
-        each = points[i].shape[: outside[i].type.ndim]
-        at_each = np.broadcast_to(found[i], (k, *each))
-        sometimes = at_each.any(axis=0)
-        always = at_each.all(axis=0)
-        if np.any(sometimes & ~always):
+    for i, (dist, x) in enumerate(zip(dists, given, strict=True)):
+        if is_elliptical(dist):  # positive everywhere
+            continue
+        outside = pt.isneginf(pm.logp(dist, x, warn_rvs=False))
+        compiled = compile_batched(symbols, [outside], [x])
+        if _is_outside_for_some(compiled, outside.type.ndim, components, points[i]):
             _require_distribution_function(name, dist)
             _refuse_atoms(name, dist)
             moving.append(i)
     return tuple(moving)
+
+
+def _is_outside_for_some(
+    compiled: Any, ndim: int, components: Sequence[Floats], points: Floats
+) -> bool:
+    """Return whether a point is outside the support of some populations, and inside of others."""
+    k = len(components[0])
+    step = max(1, AT_ONCE // (k * max(1, points[0].size)))
+    for start in range(0, len(points), step):
+        some = points[start : start + step]
+        (found,) = compiled(*components, some)
+        # One of each element, or one of a vector that is drawn as a whole.
+        at_each = np.broadcast_to(found, (k, *some.shape[:ndim]))
+        if np.any(at_each.any(axis=0) & ~at_each.all(axis=0)):
+            return True
+    return False
 
 
 def _require_distribution_function(name: str, dist: TensorVariable) -> None:
