@@ -289,6 +289,29 @@ def joint_memory() -> Iterator[Row]:
         ]
 
 
+def scale() -> Iterator[Row]:
+    """Return the rows of time and memory of large problems."""
+    from benchmarks.scale import THETAS
+
+    metrics = {"ProbabilityResidual": "PR", "AreaMetric": "area metric"}
+    after = {"n resimulated": "one theta", "n reweighted": "one theta, after set-up"}
+    for row in found("scale"):
+        kind, size = row["kind"], row.get("size", 0)
+        if kind in after and size >= 1_000_000:
+            name = "Resimulated" if kind == "n resimulated" else "Reweighted"
+            what = f"`{name}({size:_})`, {after[kind]}, {metrics[row['metric']]}"
+            seconds = row["s"] / THETAS
+        elif kind.startswith("particles") and size >= 10_000:
+            name = "Resimulated(100)" if kind == "particles resimulated" else "Reweighted(256)"
+            responses = f"{row['responses']:_} responses"
+            what = f"`{name}`, {size:_} particles sampled, {metrics[row['metric']]}, {responses}"
+            seconds = row["sampling s"]
+        else:
+            continue
+        digits = 1 if seconds >= 1 else 3 if seconds < 0.05 else 2
+        yield [what.replace("_", " "), f"{seconds:.{digits}f} s", f"{row['MiB']:.0f} MiB"]
+
+
 def between_runs() -> Iterator[Row]:
     """Return the rows of emulated populations beside those of runs alone."""
     from benchmarks.responses import RESPONSES
@@ -378,6 +401,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "joint": joint,
     "joint, time": joint_time,
     "joint, memory": joint_memory,
+    "scale": scale,
     "between runs": between_runs,
     "few runs": few_runs,
     "two fidelities": two_fidelities,
