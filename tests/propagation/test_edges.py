@@ -13,6 +13,7 @@ import pytest
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
+from prbayes.propagation import edges
 from prbayes.propagation.edges import averaged_log_density, cells_around, refuse_moving_atoms
 from prbayes.response.inputs import read_inputs
 
@@ -214,3 +215,21 @@ def test_the_weights_follow_the_design_when_it_grows() -> None:
     assert float(weights[0] @ values[0]) == pytest.approx(3.5, abs=0.02)
     (mass,) = evaluator.support(theta)["y"]["mean_weight"]
     assert mass == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("place", [0, 6])
+def test_a_support_that_moves_is_found_in_any_chunk_of_points(
+    monkeypatch: pytest.MonkeyPatch, place: int
+) -> None:
+    monkeypatch.setattr(edges, "AT_ONCE", 4)  # two points at a time
+    lower = np.array([0.0, 1.0])
+
+    def outside(lower: Any, x: Any) -> Any:
+        return (x < lower[:, None],)
+
+    points = np.full(7, 2.0)
+    assert not edges._is_outside_for_some(outside, 1, [lower], points)
+    points[place] = -1.0  # outside for all
+    assert not edges._is_outside_for_some(outside, 1, [lower], points)
+    points[place] = 0.5
+    assert edges._is_outside_for_some(outside, 1, [lower], points)
