@@ -16,7 +16,7 @@ from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.disagreement import disagreement
 from prbayes.estimate.goodness import UNLIKELY, Refitted, of_another_family, of_held_away
 from prbayes.estimate.obstacles import refit_obstacle
-from prbayes.estimate.optimum import Optimum, require_of_model
+from prbayes.estimate.optimum import Optimum, compared_in, require_of_model
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.elements import (
     finite_draws,
@@ -152,8 +152,7 @@ def _of_optimum(optimum: Optimum) -> Diagnosis:
         messages.append(_not_converged(optimum.message))
     designs = _computed(optimum.evaluator, optimum.theta[None])
     failed = _failed(optimum.failures)
-    compared = {node.name: node.target.told for node in optimum.evaluator.nodes}
-    notes = (*_compared(compared), *notes)
+    notes = (*_compared(optimum.to_datatree()), *notes)
     return Diagnosis((*messages, *failed, *_unsupported(designs)), designs.support, notes)
 
 
@@ -188,17 +187,9 @@ def _by_output(refitted: Refitted, probability: float) -> tuple[str, ...]:
     return tuple(disagreement(refitted)) if probability < UNLIKELY else ()
 
 
-def _compared(told: Mapping[str, str]) -> tuple[str, ...]:
+def _compared(result: xr.DataTree) -> tuple[str, ...]:
     """Say by what outputs are compared, where it is not by themselves."""
-    return tuple(f"{name}: {clause}." for name, clause in told.items() if clause)
-
-
-def _compared_in(result: xr.DataTree) -> tuple[str, ...]:
-    calibration = result["calibration"].to_dataset() if "calibration" in result else xr.Dataset()
-    if "compared" not in calibration:
-        return ()
-    names = calibration["simulator"].values.tolist()
-    return _compared(dict(zip(names, calibration["compared"].values.tolist(), strict=True)))
+    return compared_in(result["calibration"].to_dataset()) if "calibration" in result else ()
 
 
 def _not_looked_at(reason: str) -> tuple[str, ...]:
@@ -211,7 +202,7 @@ def _of_stored_optimum(result: xr.DataTree) -> Diagnosis:
     if not attrs.get("converged", True) and not attrs.get("stopped"):
         messages.append(_not_converged(str(attrs.get("message", ""))))
     refits = _not_looked_at("refits need the model; pass the Optimum itself")
-    notes = (*_compared_in(result), *refits)
+    notes = (*_compared(result), *refits)
     return Diagnosis((*messages, *_failed_in(result)), xr.Dataset(), notes)
 
 
@@ -261,7 +252,7 @@ def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
         *_unsupported(designs),
     ]
     refits = _of_refits(posterior.attrs, several=_has_several_outputs(result))
-    notes = (*_compared_in(result), *refits)
+    notes = (*_compared(result), *refits)
     return Diagnosis(tuple(messages), designs.support, notes)
 
 

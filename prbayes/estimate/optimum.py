@@ -337,3 +337,12 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
     variables["compared"] = ("simulator", [n.target.told for n in optimum.evaluator.nodes])
     elements = {"element": optimum.names, "other_element": optimum.names}
     return xr.Dataset(variables, coords={"simulator": names, **elements})
+
+
+def compared_in(calibration: xr.Dataset) -> tuple[str, ...]:
+    """Say by what the outputs of simulators are compared, where it is not by themselves."""
+    if "compared" not in calibration:
+        return ()
+    told = calibration["compared"].values.tolist()
+    pairs = zip(calibration["simulator"].values.tolist(), told, strict=True)
+    return tuple(f"{name}: {clause}." for name, clause in pairs if clause)

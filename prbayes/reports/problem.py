@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from prbayes._checks import Floats
+from prbayes.estimate.optimum import compared_in
 from prbayes.plots.outputs import correlation
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import NOTHING, alike
@@ -162,22 +163,10 @@ def metric(m: Material) -> list[Section]:
             " The discrepancy of a posterior is the mean over its draws."
         )
     named = [f"{name}: {metric}." for name, metric in metrics.items()]
-    named += _compared(m)
+    compared = [line for each in m.calibrations.values() for line in compared_in(each)]
+    named += dict.fromkeys(compared)
     table = rows_table(rows) if rows else None
     return [Section("Metric and epsilon", (about, *named), table)]
-
-
-def _compared(m: Material) -> list[str]:
-    """Say by what the outputs of simulators are compared, where it is not by themselves."""
-    said = []
-    for calibration in m.calibrations.values():
-        if "compared" not in calibration:
-            continue
-        told = calibration["compared"].values.tolist()
-        for name, clause in zip(calibration["simulator"].values.tolist(), told, strict=True):
-            if clause:
-                said.append(f"{name}: {clause}.")
-    return list(dict.fromkeys(said))
 
 
 def _discrepancies(label: str, calibration: xr.Dataset) -> list[dict[str, Any]]:
