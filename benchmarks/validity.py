@@ -12,6 +12,12 @@ same u-values in the posterior's pool (in closed form, Student's t), and all wit
 from the same simulation of a right model, so that each has the nominal size.
 
     uv run python -m benchmarks.validity [--parts size pipeline power outputs]
+
+Of several outputs there is no prior that all take. Under the one that makes credible regions
+confidence regions the size is to be nominal; under Jeffreys' the posterior of so few data is wider.
+Their table has a file of its own:
+
+    uv run python -m benchmarks.validity --parts outputs --out benchmarks/results/validity_outputs.json
 """
 
 from __future__ import annotations
@@ -60,19 +66,42 @@ def correlated(rho: float) -> Any:
     return np.linalg.cholesky(np.full((OUTPUTS, OUTPUTS), rho) + (1 - rho) * np.eye(OUTPUTS))
 
 
-def populations_of_outputs(data: Any, rng: np.random.Generator, draws: int = 200) -> Any:
-    """Return one population per draw of the exact posterior under Jeffreys' prior, (draws, 200, m)."""
+def matching_roots(data: Any, rng: np.random.Generator, draws: int) -> Any:
+    """Return roots of covariances, (draws, m, m), of the posterior whose regions are confidence regions.
+
+    That under the right Haar prior of lower triangular roots (Geisser and Cornfield 1963,
+    doi:10.1111/j.2517-6161.1963.tb00518.x): the root of the scatter is the covariance's root times
+    Bartlett's factor of a Wishart matrix, whose distribution is known.
+    """
     n, m = data.shape
+    factors = np.tril(rng.standard_normal((draws, m, m)), -1)
+    factors[:, range(m), range(m)] = np.sqrt(rng.chisquare(n - 1 - np.arange(m), (draws, m)))
+    return np.linalg.cholesky(np.cov(data.T) * (n - 1)) @ np.linalg.inv(factors)
+
+
+def jeffreys_roots(data: Any, rng: np.random.Generator, draws: int) -> Any:
+    """Return roots of covariances, (draws, m, m), of the posterior under Jeffreys' prior."""
+    n = len(data)
     scatter = np.cov(data.T) * (n - 1)
+    return np.linalg.cholesky(invwishart.rvs(n - 1, scatter, size=draws, random_state=rng))
+
+
+PRIORS = {"matching": matching_roots, "Jeffreys": jeffreys_roots}
+
+
+def populations_of_outputs(
+    data: Any, prior: str, rng: np.random.Generator, draws: int = 200
+) -> Any:
+    """Return one population per draw of the exact posterior, (draws, 200, m)."""
+    n, m = data.shape
     found = []
-    for covariance in invwishart.rvs(n - 1, scatter, size=draws, random_state=rng):
-        root = np.linalg.cholesky(covariance)
+    for root in PRIORS[prior](data, rng, draws):
         mean = data.mean(axis=0) + rng.standard_normal(m) @ root.T / np.sqrt(n)
         found.append(mean + rng.standard_normal((200, m)) @ root.T)
     return np.array(found)
 
 
-def outputs(replicates: int) -> dict[str, list[float]]:
+def outputs(prior: str, replicates: int) -> dict[str, list[float]]:
     """Return p-values of tests of several outputs, by the fresh data's correlation."""
     n0, n = OUTPUTS_AT
     found: dict[str, list[float]] = {f"{rho:g}": [] for rho in (CORRELATION, *WRONG)}
@@ -80,7 +109,7 @@ def outputs(replicates: int) -> dict[str, list[float]]:
     for i in range(replicates):
         rng = np.random.default_rng([9, n0, i])
         predicted = populations_of_outputs(
-            rng.normal(size=(n0, OUTPUTS)) @ correlated(CORRELATION).T, rng
+            rng.normal(size=(n0, OUTPUTS)) @ correlated(CORRELATION).T, prior, rng
         )
         null = prb.validation.PosteriorNull(999, random_seed=i)
         for name, p_values in found.items():
@@ -289,7 +318,9 @@ def run_outputs(result: dict[str, Any], arguments: argparse.Namespace) -> None:
     table = result["outputs"] = {}
     print(f"{OUTPUTS} outputs, {arguments.outputs} replicates\n{HEADER}")
     result["outputs_replicates"] = arguments.outputs
-    report(table, *OUTPUTS_AT, outputs(arguments.outputs))
+    for prior in PRIORS:
+        print(f"posterior under the prior: {prior}")
+        report(table.setdefault(prior, {}), *OUTPUTS_AT, outputs(prior, arguments.outputs))
 
 
 PARTS = {"size": run_sizes, "pipeline": run_pipeline, "power": run_power, "outputs": run_outputs}

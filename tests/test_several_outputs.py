@@ -274,13 +274,10 @@ def graph(a, b):
     return a[..., None] * np.ones(2) + b[..., None] * np.array([1.0, -2.0])
 
 
-@pytest.mark.parametrize("propagation", [prb.Resimulated(1024), prb.Resimulated(256)])
 @pytest.mark.parametrize("response", [two, graph])
-def test_resimulated_outputs_give_the_same_optimum(response, propagation):
-    if response is not two and propagation.n == 1024:
-        pytest.skip("one size is enough for graphs")
+def test_resimulated_outputs_give_the_same_optimum(response):
     expected = prb.minimize(model_of())
-    found = prb.minimize(model_of(response, propagation=propagation))
+    found = prb.minimize(model_of(response, propagation=prb.Resimulated(256)))
     gap = np.abs(found.point["m"] - expected.point["m"]) / expected.stderr["m"]
     assert (gap < 0.2).all()
 

@@ -55,7 +55,7 @@ def test_a_right_family_is_called_wrong_as_rarely_as_said() -> None:
     assert abs(p.mean() - 0.5) < 0.16
 
 
-@pytest.mark.parametrize("name", ["area", "kl"])
+@pytest.mark.parametrize("name", [pytest.param("area", marks=pytest.mark.slow), "kl"])
 def test_a_population_with_two_modes_is_no_normal_one(name: str) -> None:
     assert (probabilities(name, "bimodal", 3) < UNLIKELY).all()
 

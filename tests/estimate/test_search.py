@@ -205,10 +205,11 @@ print(begun, peak())
     [
         # A tenth of a million says as much of what each response takes, in less time.
         ("ProbabilityResidual", 100_000),
-        pytest.param("ProbabilityResidual", 1_000_000, marks=pytest.mark.slow),
-        pytest.param("AreaMetric", 1_000_000, marks=pytest.mark.slow),
+        ("ProbabilityResidual", 1_000_000),
+        ("AreaMetric", 1_000_000),
     ],
 )
+@pytest.mark.slow
 def test_a_million_responses_with_gradients_and_standard_errors_take_less_than_a_gibibyte(
     metric: str, n: int
 ) -> None:

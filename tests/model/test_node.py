@@ -100,7 +100,9 @@ def test_conditioned_models_have_the_same_discrepancy(name: str) -> None:
         np.testing.assert_allclose(log_density(clone)(at), -expected / 0.1, **tolerance)
 
 
-@each_copy
+@pytest.mark.parametrize(
+    "way", [way if " " not in way else pytest.param(way, marks=pytest.mark.slow) for way in COPIES]
+)
 def test_a_copy_gives_the_same_optimum(way: str) -> None:
     model = build(prb.Reweighted(64))
     other = COPIES[way](model)

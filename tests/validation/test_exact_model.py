@@ -37,7 +37,7 @@ def test_one_value_has_a_closed_form() -> None:
     assert EXACT.p_value(0.25 + 0.3**2, 1) == pytest.approx(0.4, abs=2e-3)
 
 
-@pytest.mark.parametrize("n", [2, 3, 4, 7, 23, 60, 170])
+@pytest.mark.parametrize("n", [2, 3, 4, 7, 23, 60, pytest.param(170, marks=pytest.mark.slow)])
 def test_the_table_against_simulation(n: int) -> None:
     size = 100_000
     found = area(np.random.default_rng(n).random((size, n)))
