@@ -88,7 +88,7 @@ def exact_errors() -> tuple[Floats, float]:
 
 @pytest.fixture(scope="module")
 def optimum() -> prb.Optimum:
-    model = model_of(ENOUGH, prb.KullbackLeibler(), max_points=2048)
+    model = model_of(ENOUGH, prb.KullbackLeibler(), max_points=2048, emulator=None)
     return prb.minimize(model, starts=0, progressbar=False)
 
 

@@ -128,7 +128,7 @@ def test_a_design_that_grows_tells_its_error_and_the_runs_that_are_left(
             *(a, b),
             metric=prb.AreaMetric(),
             observed=np.linspace(-1, 3, 20),
-            propagation=prb.Reweighted(64),
+            propagation=prb.Reweighted(64, emulator=None),
         )
     optimum = prb.minimize(model, starts=0, progressbar=visible)
     text = " ".join(screen.getvalue().split())

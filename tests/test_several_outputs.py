@@ -171,7 +171,7 @@ def test_an_output_that_is_nan_costs_the_point_all_of_them():
 
     node = node_of(model_of(partly, propagation=prb.Reweighted(256)))
     lost = np.isnan(node.design.values)
-    assert 0 < lost[:, 0].sum() < 64
+    assert 0 < lost[:, 0].mean() < 0.25
     np.testing.assert_array_equal(lost[:, 0], lost[:, 1])
 
 

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from prbayes._checks import Floats
 
 # Levels at which distribution functions are compared: no more are different with few runs.
 _THRESHOLDS = 32
+# Width of the steps of distribution functions, in standard deviations: metrics see no finer, and a
+# response that is one value for many specimens would else be off by all of them wherever an
+# emulator is off by a rounding. By judgement: the bandwidth of a thousand data.
+_RAMP = 0.2
 
 
 def share_of_runs(weights: Floats, y: Floats, said: Floats, blocks: NDArray[np.intp]) -> float:
@@ -35,10 +40,12 @@ def share_of_runs(weights: Floats, y: Floats, said: Floats, blocks: NDArray[np.i
     bias, variance = 0.0, 0.0
     numbers = np.unique(blocks)
     member = (blocks == numbers[:, None]).astype(float)
+    importance = weights.mean(axis=0)
     for own, other in zip(y.T, said.T, strict=True):
-        below = _below(own, own)
+        levels, width = _levels(own, importance)
+        below = _below(own, levels, width)
         # What the emulator puts below each level, less what there is: by block, (T, B, L).
-        off = np.einsum("tn,bn,nl->tbl", weights, member, _below(other, own) - below)
+        off = np.einsum("tn,bn,nl->tbl", weights, member, _below(other, levels, width) - below)
         total = off.sum(axis=1)
         scatter = _variance(off)
         bias += float(np.maximum(total**2 - scatter, 0.0).sum(axis=-1).mean())
@@ -57,9 +64,21 @@ def _variance(parts: Floats) -> Floats:
     return np.asarray(number * spread)
 
 
-def _below(values: Floats, levels_of: Floats) -> Floats:
-    """Return which values are below quantiles of others, (n, L); NaN is never, +inf only never."""
-    finite = levels_of[np.isfinite(levels_of)]
+def _levels(values: Floats, importance: Floats) -> tuple[Floats, float]:
+    """Return quantiles of what weighted values are finite, (L,), and the width of steps there."""
+    finite = np.isfinite(values)
+    order = np.argsort(values[finite])
+    known, weights = values[finite][order], importance[finite][order]
+    cumulated = np.cumsum(weights) - 0.5 * weights
     shares = (np.arange(_THRESHOLDS) + 0.5) / _THRESHOLDS
-    levels = np.quantile(finite, shares)
-    return (values[:, None] <= levels).astype(float)
+    levels = np.interp(shares * weights.sum(), cumulated, known)
+    low, high = np.interp(ndtr([-1.0, 1.0]) * weights.sum(), cumulated, known)
+    return levels, _RAMP * (high - low) / 2
+
+
+def _below(values: Floats, levels: Floats, width: float) -> Floats:
+    """Return how far values are below levels, (n, L), from 0 to 1; NaN and +inf never are."""
+    if not width > 0:
+        return (values[:, None] <= levels).astype(float)
+    ramp = (levels - values[:, None]) / width + 0.5
+    return np.asarray(np.clip(np.nan_to_num(ramp, nan=0.0), 0.0, 1.0))

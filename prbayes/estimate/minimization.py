@@ -524,7 +524,9 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
     if not (plan.refine and evaluator.designs):
         return state
     near = state.cloud
-    if near is None:
+    emulated = all(design.contents.cloud for design in evaluator.designs.values())
+    if near is None or (emulated and state.local is not None):
+        # Points of clouds follow wherever it goes; runs are added where the pilot has led.
         near = spread_around(state.theta, _covariance(state), evaluator.prior_sd, seed=plan.seed)
     near = near[evaluator.in_support(near)]
     short = shortcomings(evaluator, near) or shortcomings(evaluator, state.theta[None])
@@ -547,8 +549,10 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
     elif state.cloud is None:
         near = pilot(evaluator, state.scales, seed=plan.seed)
         state = replace(state, cloud=near)
-    elif not refine_at(evaluator, near, again=rounds > 1):
-        refine_at(evaluator, state.theta[None], again=rounds > 1)
+    else:
+        again = rounds > 1 and near is state.cloud
+        if not refine_at(evaluator, near, again=again):
+            refine_at(evaluator, state.theta[None], again=again)
     # What looked best on a thin design may be an artefact of it.
     candidates = np.vstack([state.theta, near])
     return replace(state, restart=plan.search.best_of(candidates, state.scales))

@@ -35,6 +35,9 @@ _GROWTH = 2.0
 # the next ones are within reach of the design. Half or twice leads to another design, and moves an
 # optimum within that design's own error (docs/constants.md).
 _PILOT_STEP = 0.4
+# Error of an emulator, in the response's spread, from which on runs are added on the way: what is
+# minimised is then another response. By judgement, as it only leads the way.
+_UNTOLD = 0.25
 # Data sets that tell a noise floor which only says when a pilot stops, or when optima are compared.
 FEW_SETS = 50
 
@@ -63,9 +66,19 @@ def refine_at(
     while drawn and thin:
         thin &= set(shortcomings(evaluator, thetas))
         drawn = _widened(evaluator, thetas, thin)
-    # What no cloud reaches needs runs.
-    _add(evaluator, thetas, thin)
+    # What no cloud reaches needs runs, and so does what no emulator tells.
+    _add(evaluator, thetas, thin | _untold(evaluator, set(short)))
     return short
+
+
+def _untold(evaluator: Evaluator, names: set[str]) -> set[str]:
+    """Return the designs, of those named, whose emulators say little where the last points went."""
+    found = set()
+    for name in names:
+        emulation = evaluator.designs[name].contents.emulation
+        if emulation is not None and emulation.error > _UNTOLD:
+            found.add(name)
+    return found
 
 
 def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
@@ -90,14 +103,14 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
         AGREE,
     )
     clouds = {name for name, design in evaluator.designs.items() if design.contents.cloud}
-    grown = False
-    # Points of clouds cost no run; what emulators say of them does.
-    if clouds and errors.points > _OF_EACH * AGREE:
-        grown = _widened(evaluator, thetas, clouds)
     if _needs_runs(evaluator, errors):
         names = set(evaluator.designs)
-        grown |= _add(evaluator, thetas, names, min(_GROWTH, _factor(errors.whole)))
-    return grown
+        # A cloud is then drawn anew for these populations; whether that is enough is seen next.
+        if _add(evaluator, thetas, names, min(_GROWTH, _factor(errors.whole))):
+            return True
+    # Points of clouds cost no run.
+    short = clouds and errors.points > _OF_EACH * AGREE
+    return bool(short) and _widened(evaluator, thetas, clouds)
 
 
 def runs_left(evaluator: Evaluator, errors: DesignErrors) -> int:

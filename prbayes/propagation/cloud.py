@@ -18,8 +18,14 @@ from prbayes.propagation.base import N_BLOCKS
 # Points of a cloud at first, and at most: they cost no run.
 CLOUD = 8192
 LARGEST_CLOUD = 65536
-# Populations whose mixture a cloud is drawn from; more would cost time and add nothing.
+# Populations of a group at most: more would cost time and add nothing.
 _POPULATIONS = 384
+# The share of a cloud that the prior keeps beside populations that are known to matter: it is only
+# to stay in reach, and its points among theirs are noise. Of those the mixture is of few, so that
+# each has enough points to fill its space evenly, and of more in a larger cloud.
+_OF_PRIOR = 1 / 16
+_FROM_PRIOR = 96
+_NEAR = 30
 # Share of the runs in a population from which on it is theirs alone, and to which it is the
 # emulator's: what is in between has the least error.
 _ALONE, _LITTLE = 0.95, 0.05
@@ -179,14 +185,29 @@ def columns(points: Sequence[Floats]) -> Floats:
     return np.concatenate(flat, axis=1)
 
 
-def some_of(groups: Sequence[Sequence[Floats]]) -> list[Floats]:
-    """Return the populations of a cloud's mixture: half are of the last of several groups."""
-    before = len(groups) - 1
-    of_last = _POPULATIONS // 2 if before else _POPULATIONS
-    shares = [(_POPULATIONS - of_last) // before for _ in range(before)]
-    found = []
-    for group, most in zip(groups, [*shares, of_last], strict=True):
-        # A few come again and again, so that their share does not depend on their number.
-        places = np.linspace(0, len(group[0]) - 1, most).astype(int)
-        found.append([values[places] for values in group])
-    return [np.concatenate(same) for same in zip(*found, strict=True)]
+def some_of(group: Sequence[Floats], most: int = _POPULATIONS) -> list[Floats]:
+    """Return populations of a group, spread over it; a few come again and again."""
+    places = np.linspace(0, len(group[0]) - 1, most).astype(int)
+    return [values[places] for values in group]
+
+
+def mixture_of(groups: Sequence[Sequence[Floats]], size: int) -> tuple[list[Floats], Floats]:
+    """Return the populations that a cloud is drawn from, and the share that each has of it.
+
+    Parameters
+    ----------
+    groups : sequence
+        The prior's, and others that are known to matter; arrays (k, *shape) of the roots each.
+    size : int
+        Of the cloud.
+    """
+    prior, *others = groups
+    if not others:
+        found = some_of(prior)
+        return found, np.full(_POPULATIONS, 1 / _POPULATIONS)
+    near = _NEAR * size // CLOUD
+    chosen = [some_of(prior, _FROM_PRIOR), *(some_of(group, near) for group in others)]
+    each = (1 - _OF_PRIOR) / (near * len(others))
+    shares = np.full(_FROM_PRIOR + near * len(others), each)
+    shares[:_FROM_PRIOR] = _OF_PRIOR / _FROM_PRIOR
+    return [np.concatenate(same) for same in zip(*chosen, strict=True)], shares

@@ -40,6 +40,7 @@ from prbayes.propagation.cloud import (
     Cloud,
     Emulation,
     Table,
+    mixture_of,
     some_of,
 )
 from prbayes.propagation.coarse import Coarse
@@ -99,14 +100,14 @@ class Reweighted(Propagation):
         Largest number of responses, refinement included; 32 n by default.
     emulator : str, Surface or regressor, optional
         What says the response between the runs, so that a few dozen or hundred of them are enough
-        for several inputs; by default the runs stand alone. ``"auto"`` takes the best of a few
-        surfaces for each output, by their errors at runs that were left out, mixed with the runs'
-        own weights as far as these errors ask for it; not with one input, discrete ones, or an n
-        above 2000, where runs alone are as good. Or a surface of ``prb.surrogate``, or any
-        regressor with ``fit(X, y)`` and ``predict(X)``.
+        for several inputs. ``"auto"`` takes the best of a few surfaces for each output, by their
+        errors at runs that were left out, mixed with the runs' own weights as far as these errors
+        ask for it; not with one input, discrete ones, or an n above 2000, where runs alone are as
+        good. Or a surface of ``prb.surrogate``, or any regressor with ``fit(X, y)`` and
+        ``predict(X)``. With None the runs stand alone.
     coarse : callable, optional
         A cheap response of the same inputs and outputs that is about the expensive one, such as
-        that of a coarser mesh, with ``emulator=``: the emulator then tells what is between the
+        that of a coarser mesh: the emulator then tells what is between the
         two, for each output as far as that makes errors at left-out runs smaller. It is called at
         all runs, and at every one of thousands of points between them, on the same executor; none
         of its calls is counted or stored. Where it raises, or is not finite, the emulator goes on
@@ -142,14 +143,14 @@ class Reweighted(Propagation):
     Examples
     --------
     >>> Reweighted(256)
-    Reweighted(n=256, random_seed=0, max_lost=0.05, max_points=None, emulator=None, coarse=None)
+    Reweighted(n=256, random_seed=0, max_lost=0.05, max_points=None, emulator='auto', coarse=None)
     """
 
     n: int = 1024
     random_seed: int = 0
     max_lost: float = MAX_LOST
     max_points: int | None = None
-    emulator: Any = None
+    emulator: Any = "auto"
     coarse: Callable[..., Any] | None = None
 
     def __post_init__(self) -> None:
@@ -327,15 +328,18 @@ class Design(Bound):
             )
 
     def _warn_of_thin_support(self, size: float) -> None:
-        # With more inputs weights become so uneven that another propagation is better
-        # (docs/choose.md).
-        advice = (
-            "prb.minimize and prb.sample_smc refine it themselves, "
-            "before pm.sample call prb.refine(model)"
-            if self.dimensions <= 4
-            else f"{self.dimensions} inputs are many for stored responses: rather use "
-            "propagation=prb.Resimulated(n), which has no design"
-        )
+        # With more inputs weights become so uneven that something else is better (docs/choose.md).
+        if self.dimensions <= 4:
+            advice = (
+                "prb.minimize and prb.sample_smc refine it themselves, "
+                "before pm.sample call prb.refine(model)"
+            )
+        else:
+            leave = "leave out emulator=None, or " if self._between_runs else ""
+            advice = (
+                f"{self.dimensions} inputs are many for stored responses alone: {leave}use "
+                "propagation=prb.Resimulated(n), which has no design"
+            )
         _log.warning(
             "%s: the design of %d responses supports a typical population of the prior with a "
             "weight effective sample size of %.0f, expected %.0f; %s",
@@ -643,14 +647,12 @@ class Design(Bound):
             ess = np.exp(log_ess)
             of_these = ess[-fresh:]
             return float(np.median(of_these))
-        return self._median_ess(some_of([components]))
+        return self._median_ess(some_of(components))
 
     def _emulated(self, contents: Contents) -> Contents:
         """Return the same with a cloud whose responses are emulated, where that is better."""
         runs = contents.table
-        near = some_of([contents.groups[-1]])
-        few = np.linspace(0, len(near[0]) - 1, min(_WEIGHED, len(near[0]))).astype(int)
-        near = [values[few] for values in near]
+        near = some_of(contents.groups[-1], _WEIGHED)
         emulation = Emulation.of(
             self.config.emulator,
             runs.points,
@@ -663,8 +665,8 @@ class Design(Bound):
             return contents
         # Another prime, so that no cloud shares points with a batch.
         seed = self.config.random_seed + 104_729 * (1 + contents.clouds)
-        components = some_of(contents.groups)
-        points, counts = self._place(components, contents.size, seed)
+        components, shares = mixture_of(contents.groups, contents.size)
+        points, counts = self._place(components, contents.size, seed, shares)
         points = self._off_the_edges(points, components, counts)
         log_g, _ = self._log_mixture(components, counts, points, summed=False)
         coarse = None
@@ -766,16 +768,26 @@ class Design(Bound):
         return found
 
     def _place(
-        self, components: Sequence[Floats], n: int, seed: int
+        self,
+        components: Sequence[Floats],
+        n: int,
+        seed: int,
+        shares: Floats | None = None,
     ) -> tuple[list[Floats], Floats]:
-        """Return n points, and how often each component of the mixture was used.
+        """Return n points, and how often each component of the mixture was used, (k,).
+
+        Components have equal ``shares``, (k,), by default.
 
         One point comes from each population of a stratified list.
         Scrambled Sobol points go through the inverse distribution functions where they exist.
         """
         k = len(components[0])
         spare, uniforms = base_points(self.inputs, n, seed)
-        which = np.minimum((spare * k).astype(int), k - 1)
+        if shares is None:
+            which = (spare * k).astype(int)
+        else:
+            which = np.searchsorted(np.cumsum(shares), spare, side="right")
+        which = np.minimum(which, k - 1)
         at = [c[which] for c in components]
         try:
             points = list(self._quantiles(*at, *uniforms))

@@ -38,7 +38,7 @@ def test_the_runs_that_are_left_follow_from_the_error_and_the_room() -> None:
             *(a, pm.Normal.dist(1, 0.1)),
             metric=prb.AreaMetric(),
             observed=np.linspace(-1, 3, 20),
-            propagation=prb.Reweighted(64, max_points=192),
+            propagation=prb.Reweighted(64, max_points=192, emulator=None),
         )
     evaluator = Evaluator(model)
     assert runs_left(evaluator, DesignErrors(points=0.15, emulators=np.nan)) == pytest.approx(

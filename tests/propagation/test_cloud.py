@@ -16,7 +16,7 @@ from prbayes.estimate.refit import DesignErrors, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import identity_of
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.cloud import CLOUD, columns, some_of
+from prbayes.propagation.cloud import CLOUD, columns, mixture_of
 from prbayes.propagation.reweighted import Design
 from prbayes.response.budget import BudgetError
 
@@ -295,10 +295,19 @@ def test_inputs_are_columns() -> None:
     assert columns([np.zeros(3), np.zeros((3, 2))]).shape == (3, 3)
 
 
-def test_half_of_a_clouds_populations_are_of_the_last_group() -> None:
-    groups = [[np.zeros(500)], [np.ones(500)], [np.full(500, 2.0)]]
-    (found,) = some_of(groups)
-    assert (found == 2).mean() == 0.5
-    assert set(found) == {0.0, 1.0, 2.0}
-    (only,) = some_of(groups[:1])
-    assert only.size == 384
+def test_clouds_are_of_populations_that_matter_and_the_prior_stays() -> None:
+    groups = [[np.zeros(500)], [np.ones(500)], [np.full(3, 2.0)]]
+    for size in (CLOUD, 2 * CLOUD):
+        (found,), shares = mixture_of(groups, size)
+        of_each = [shares[found == k].sum() for k in range(3)]
+        np.testing.assert_allclose(of_each, [1 / 16, 15 / 32, 15 / 32])
+        assert (found > 0).sum() == 60 * size / CLOUD
+    (only,), shares = mixture_of(groups[:1], CLOUD)
+    np.testing.assert_allclose(shares, 1 / only.size)
+
+
+def test_points_are_as_many_as_the_shares_of_their_populations() -> None:
+    evaluator, design = design_of(build())
+    thetas = evaluator.prior_thetas(2, 0)
+    _, counts = design._place(evaluator.roots(thetas, 0), 1024, 3, np.array([0.125, 0.875]))
+    np.testing.assert_array_equal(counts, [128, 896])

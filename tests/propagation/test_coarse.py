@@ -204,7 +204,7 @@ def test_several_outputs_are_followed_one_by_one() -> None:
 
 def test_what_cannot_follow_is_refused() -> None:
     with pytest.raises(ValueError, match="coarse: got a coarse response and no emulator"):
-        prb.Reweighted(64, coarse=coarse)
+        prb.Reweighted(64, emulator=None, coarse=coarse)
     with pytest.raises(TypeError, match="Reweighted: coarse: got int 3, expected a function"):
         prb.Reweighted(64, emulator="auto", coarse=3)  # type: ignore[arg-type]
     RUNS.clear()

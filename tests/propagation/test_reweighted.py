@@ -309,7 +309,8 @@ def hard(
         for name, response in zip(("sum", "difference"), responses, strict=True):
             observed = response(pairs)
             response.count = 0
-            propagation = prb.Reweighted(n, random_seed=seed)
+            # The runs alone.
+            propagation = prb.Reweighted(n, random_seed=seed, emulator=None)
             prb.Simulator(
                 name, response, x, metric=metric, observed=observed, propagation=propagation
             )
@@ -450,11 +451,15 @@ def test_many_inputs_are_told_what_to_use(caplog: pytest.LogCaptureFixture) -> N
         with pm.Model():
             x = pm.MvNormal.dist(pm.Normal("mu", 0, 3, shape=k), 0.1 * np.eye(k))
             observed = [0.0, 1.0, 2.0]
-            prb.Simulator("y", lambda x: x.sum(axis=-1), x, metric=AREA, observed=observed)
-        assert (
-            "5 inputs are many for stored responses: rather use propagation=prb.Resimulated"
-            in caplog.text
-        ) == (k == 5)
+            prb.Simulator(
+                *("y", lambda x: x.sum(axis=-1), x),
+                metric=AREA,
+                observed=observed,
+                propagation=prb.Reweighted(emulator=None),
+            )
+        assert ("5 inputs are many for stored responses alone: leave out" in caplog.text) == (
+            k == 5
+        )
 
 
 def test_minimize_refines_where_the_answer_is_far_out_in_the_prior() -> None:
@@ -727,7 +732,7 @@ def test_where_a_basis_would_be_too_large_nothing_else_changes(
                 x,
                 metric=prb.Joint(metric),
                 observed=data,
-                propagation=prb.Reweighted(64),
+                propagation=prb.Reweighted(64, emulator=None),
             )
         own = design(model)
         own.add([np.array([0.9, 1.1])])
