@@ -124,7 +124,7 @@ def problem(name: str, seeds: int, of_runs_alone: int) -> dict[str, Any]:
         rows.append(fitted(name, observed, stored, reference))
     alone = []
     for seed in range(of_runs_alone):
-        stored = prb.Reweighted(1024, max_points=32_768, random_seed=seed)
+        stored = prb.Reweighted(1024, emulator=None, max_points=32_768, random_seed=seed)
         alone.append(fitted(name, observed, stored, reference))
     return {"inputs": RESPONSES[name].d, "emulated": rows, "alone": alone}
 

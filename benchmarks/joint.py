@@ -212,7 +212,7 @@ class Cell:
         p = self.problem
         some = p.response(p.draw(np.random.default_rng(0), self.size))
         n = p.points * (2 if self.size > 50 else 1)
-        stored = prb.Reweighted(16, max_points=n + 16)
+        stored = prb.Reweighted(16, max_points=n + 16, emulator=None)
         with pm.Model() as model:
             inputs = p.model(self.size, separate)
             if separate:

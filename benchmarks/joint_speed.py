@@ -66,7 +66,7 @@ def model_of(outputs: int, metric: str, points: int, unknown: int) -> Any:
             b,
             metric=lifted if outputs == 1 else prb.Joint(lifted),
             observed=response(*specimens),
-            propagation=prb.Reweighted(points, max_points=points),
+            propagation=prb.Reweighted(points, max_points=points, emulator=None),
         )
     return model
 
@@ -125,7 +125,7 @@ def memory(metric: str, outputs: int, points: int) -> dict[str, Any]:
         # concern here: a first batch is small.
         prb.Simulator(
             "y", normal, x, metric=prb.Joint(lifted), observed=data,
-            propagation=prb.Reweighted(16, max_points=points),
+            propagation=prb.Reweighted(16, max_points=points, emulator=None),
         )  # fmt: skip
     evaluator = Evaluator(model)
     (design,) = evaluator.designs.values()
