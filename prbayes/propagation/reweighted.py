@@ -682,6 +682,26 @@ class Design(Bound):
             clouds=contents.clouds + 1,
         )
 
+    @contextmanager
+    def part(self, rows: NDArray[np.bool_]) -> Iterator[None]:
+        """Take weights of some of the points only, inside."""
+        before = self.contents
+        kept = [shared.get_value() for shared in self._shared]
+        table = before.table
+        some = Table(
+            points=tuple(x[rows] for x in table.points),
+            values=table.values[rows],
+            log_g=table.log_g[rows],
+            blocks=table.blocks[rows],
+        )
+        self._contents = replace(before, table=some)
+        self._share(self._arrays())
+        try:
+            yield
+        finally:
+            self._contents = before
+            self._share(kept)
+
     def left_out(self) -> list[Floats]:
         """Return responses as emulators say that lack a block of runs each; none without one."""
         contents = self.contents
