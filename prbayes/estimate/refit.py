@@ -298,7 +298,8 @@ class SamplingDistribution:
             values = objective(self.thetas(x), slice(50))
             return np.asarray(values.mean(axis=0))
 
-        return _mean_hessian(typical, self.stderr.size)
+        r = self.stderr.size
+        return _mean_hessian(typical, r) if r else np.zeros((0, 0))
 
     def _roughly(self, objective: BatchObjective, curvature: Floats) -> Floats:
         """Return the minimiser of one data set along the axes, (r,): inf where none was found."""
