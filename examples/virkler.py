@@ -78,7 +78,12 @@ def calibrate(observed):
         x = pm.MvNormal.dist(mean, chol=chol)
         # The curves have two degrees of freedom: the rest of four readings is their error.
         metric = prb.Joint(prb.ProbabilityResidual(), components=2)
-        prb.Simulator("half length", at_times, x, metric=metric, observed=observed)
+        prb.Simulator(
+            *("half length", at_times, x),
+            metric=metric,
+            observed=observed,
+            propagation=prb.Reweighted(64),
+        )
     optimum = prb.minimize(model)
     print(optimum)
     posterior = prb.sample_smc(
