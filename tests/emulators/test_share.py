@@ -22,6 +22,23 @@ def test_scatter_around_the_response_is_no_bias() -> None:
     assert share_of_runs(EVEN, Y, near, BLOCKS) < 0.1
 
 
+def test_a_rounding_is_no_bias_where_many_specimens_have_one_value() -> None:
+    capped = np.minimum(Y, 0.5)
+    assert (capped == 0.5).mean() > 0.2
+    off = 1e-3 * np.random.default_rng(7).standard_normal((N, 1))
+    assert share_of_runs(EVEN, capped, capped + off, BLOCKS) < 0.01
+    assert share_of_runs(EVEN, capped, capped + 0.5, BLOCKS) > 0.5
+
+
+def test_levels_are_where_the_populations_are() -> None:
+    near = np.exp(-((Y[:, 0] / 0.1) ** 2))
+    weights = np.repeat(near[None] / near.sum(), 3, axis=0)
+    wrong_there = np.where(np.abs(Y) < 0.3, Y + 0.2, Y)
+    wrong_elsewhere = np.where(np.abs(Y) > 0.6, Y + 2.0, Y)
+    assert share_of_runs(weights, Y, wrong_there, BLOCKS) > 0.5
+    assert share_of_runs(weights, Y, wrong_elsewhere, BLOCKS) < 0.01
+
+
 def test_an_emulator_that_is_wrong_is_not_trusted() -> None:
     assert share_of_runs(EVEN, Y, 0 * Y, BLOCKS) > 0.9
     assert share_of_runs(EVEN, Y, Y + 1.0, BLOCKS) > 0.9

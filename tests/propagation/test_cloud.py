@@ -11,7 +11,7 @@ import pytest
 import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.estimate.data_sets import aligned
-from prbayes.estimate.refinement import _reach, _widened, grow
+from prbayes.estimate.refinement import _reach, _widened, grow, refine_at
 from prbayes.estimate.refit import DesignErrors, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import identity_of
@@ -133,6 +133,36 @@ def test_clouds_grow_for_their_points_and_runs_for_what_emulators_say() -> None:
     assert (design.n_runs, design.n_points) == (64, 2 * CLOUD)
     assert grow(evaluator, thetas, DesignErrors(points=0.0, emulators=0.2))
     assert (design.n_runs, design.n_points) == (128, 2 * CLOUD)
+    # Another emulator has another cloud: whether that is large enough is seen next.
+    assert grow(evaluator, thetas, DesignErrors(points=0.2, emulators=0.2))
+    assert design.n_runs > 128 and design.n_points == 2 * CLOUD
+
+
+def test_runs_are_added_where_emulators_tell_little() -> None:
+    far = np.array([[2.0, 0.0, 2.0, 0.0]]) + 0.01 * np.random.default_rng(0).normal(size=(64, 4))
+    runs = {}
+    for kind, response in {"smooth": smooth, "rough": lambda a, b: np.sin(9 * a * b)}.items():
+        evaluator, design = design_of(build(response, emulator=prb.surrogate.RadialBasis()))
+        refine_at(evaluator, far)
+        runs[kind] = design.n_runs
+    assert runs == {"smooth": 64, "rough": 80}
+
+
+def test_a_part_of_a_cloud_is_a_cloud_of_its_own_for_a_while() -> None:
+    evaluator, design = design_of(build())
+    theta = theta_of(evaluator)
+    values, weights = evaluator.populations(theta, 0)
+    (whole,) = evaluator(theta).discrepancies
+    rows = design.blocks == 3
+    with design.part(rows):
+        some, of_some = evaluator.populations(theta, 0)
+        expected = weights[:, rows] / weights[:, rows].sum()
+        np.testing.assert_allclose(of_some, expected, rtol=1e-9)
+        np.testing.assert_array_equal(some, values[:, rows])
+        (part,) = evaluator(theta).discrepancies
+    assert 0 < abs(part[0] - whole[0]) < 0.2 * whole[0]
+    np.testing.assert_array_equal(evaluator(theta).discrepancies[0], whole)
+    np.testing.assert_array_equal(evaluator.populations(theta, 0)[1], weights)
 
 
 def test_the_error_of_emulators_is_measured_by_runs_that_are_left_out() -> None:
