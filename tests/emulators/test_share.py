@@ -31,12 +31,14 @@ def test_a_rounding_is_no_bias_where_many_specimens_have_one_value() -> None:
 
 
 def test_levels_are_where_the_populations_are() -> None:
-    near = np.exp(-((Y[:, 0] / 0.1) ** 2))
+    y = np.random.default_rng(5).standard_normal((4096, 1))
+    blocks = np.arange(4096) % 8
+    near = np.exp(-((y[:, 0] / 0.02) ** 2))
     weights = np.repeat(near[None] / near.sum(), 3, axis=0)
-    wrong_there = np.where(np.abs(Y) < 0.3, Y + 0.2, Y)
-    wrong_elsewhere = np.where(np.abs(Y) > 0.6, Y + 2.0, Y)
-    assert share_of_runs(weights, Y, wrong_there, BLOCKS) > 0.5
-    assert share_of_runs(weights, Y, wrong_elsewhere, BLOCKS) < 0.01
+    wider = np.where(np.abs(y) < 0.1, 3 * y, y)
+    wrong_elsewhere = np.where(np.abs(y) > 0.2, y + 2.0, y)
+    assert share_of_runs(weights, y, wider, blocks) > 0.5
+    assert share_of_runs(weights, y, wrong_elsewhere, blocks) < 0.01
 
 
 def test_an_emulator_that_is_wrong_is_not_trusted() -> None:
