@@ -130,6 +130,17 @@ def sizes_through() -> Iterator[Row]:
         yield [str(n0), label, *(short(value, 3) for value in row.values())]
 
 
+def sizes_of_outputs() -> Iterator[Row]:
+    """Return the rows of the area test of several outputs."""
+    table = found("validity_outputs")["outputs"]
+    told = {"0.9": "correlation .9, as calibrated", "mean + 0.75 sd": "mean + .75 sd"}
+    for name in ("0.9", "0.8", "0.6", "0", "mean + 0.75 sd"):
+        label = told.get(name, f"correlation {short(float(name), 1) if name != '0' else '0'}")
+        row = f"15/20/{name}"
+        shares = [short(value, 3) for value in table["matching"][row].values()]
+        yield [label, *shares, short(table["Jeffreys"][row]["0.05"], 3)]
+
+
 def power() -> Iterator[Row]:
     """Return the rows of the power of tests."""
     for name, row in found("validity")["power"].items():
@@ -388,6 +399,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "samplers": samplers,
     "size": sizes,
     "size, through prbayes": sizes_through,
+    "size, several outputs": sizes_of_outputs,
     "power": power,
     "case study, Sobol points": lambda: case_study("sobol"),
     "case study, Monte Carlo": lambda: case_study("monte carlo"),
