@@ -133,9 +133,14 @@ def sizes_through() -> Iterator[Row]:
 def sizes_of_outputs() -> Iterator[Row]:
     """Return the rows of the area test of several outputs."""
     table = found("validity_outputs")["outputs"]
-    told = {"0.9": "correlation .9, as calibrated", "mean + 0.75 sd": "mean + .75 sd"}
-    for name in ("0.9", "0.8", "0.6", "0", "mean + 0.75 sd"):
-        label = told.get(name, f"correlation {short(float(name), 1) if name != '0' else '0'}")
+    labels = {
+        "0.9": "correlation .9, as calibrated",
+        "0.8": "correlation .8",
+        "0.6": "correlation .6",
+        "0": "correlation 0",
+        "mean + 0.75 sd": "mean + .75 sd",
+    }
+    for name, label in labels.items():
         row = f"15/20/{name}"
         shares = [short(value, 3) for value in table["matching"][row].values()]
         yield [label, *shares, short(table["Jeffreys"][row]["0.05"], 3)]

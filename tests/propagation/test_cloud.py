@@ -135,7 +135,8 @@ def test_clouds_grow_for_their_points_and_runs_for_what_emulators_say() -> None:
     assert (design.n_runs, design.n_points) == (128, 2 * CLOUD)
     # Another emulator has another cloud: whether that is large enough is seen next.
     assert grow(evaluator, thetas, DesignErrors(points=0.2, emulators=0.2))
-    assert design.n_runs > 128 and design.n_points == 2 * CLOUD
+    assert design.n_runs > 128
+    assert design.n_points == 2 * CLOUD
 
 
 @pytest.mark.parametrize(("little", "runs"), [(0.25, 64), (0.0, 80)])
