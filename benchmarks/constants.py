@@ -53,6 +53,7 @@ ROOMS = (
     "model",
     "estimate",
     "propagation",
+    "emulators",
     "metrics",
     "_weighted",
     "_predict",

@@ -357,6 +357,15 @@ def few_runs() -> Iterator[Row]:
         yield [name, str(cell["inputs"]), runs, *columns, *beside]
 
 
+def three_masses() -> Iterator[Row]:
+    """Return the rows of the benchmark of three masses."""
+    for case, rows in found("three_masses").items():
+        for row in rows:
+            errors = [abs(error) for pair in row["errors %"] for error in pair]
+            ends = (f"[{low:.3f}, {high:.3f}]" for low, high in row["ends"])
+            yield [case, str(row["runs"]), *ends, short(max(errors)), str(row["seconds"])]
+
+
 def two_fidelities() -> Iterator[Row]:
     """Return the rows of errors with a coarse response and without."""
     from benchmarks.two_fidelities import WAYS, median, rms
@@ -421,6 +430,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "scale": scale,
     "between runs": between_runs,
     "few runs": few_runs,
+    "three masses": three_masses,
     "two fidelities": two_fidelities,
     "libraries": libraries,
 }
