@@ -58,7 +58,7 @@ def main():
     """Print the table, save it as JSON."""
     logging.getLogger("prbayes").setLevel(logging.ERROR)
     clock = time.perf_counter()
-    reference = calibrate(crest_factor, prb.Reweighted(16384, random_seed=99))
+    reference = calibrate(crest_factor, prb.Reweighted(16384, emulator=None, random_seed=99))
     names = ("mu_r", "sd_r")
     error = np.array([reference.stderr[n] for n in names])
     center = np.array([reference.point[n] for n in names])
@@ -85,12 +85,19 @@ def main():
         for n in sizes:
             found = [surrogate_and_optimum(n, model, seed) for seed in range(DESIGNS)]
             add(f"surrogate, {type(model).__name__}, {n}; Resimulated(1024)", found)
-    for n in (256, 1024):
+    for n, emulator, what in (
+        (16, "auto", "emulated between"),
+        (32, "auto", "emulated between"),
+        (64, "auto", "emulated between"),
+        (256, None, "alone"),
+        (1024, None, "alone"),
+    ):
         optima = [
-            calibrate(crest_factor, prb.Reweighted(n, random_seed=seed)) for seed in range(DESIGNS)
+            calibrate(crest_factor, prb.Reweighted(n, emulator=emulator, random_seed=seed))
+            for seed in range(DESIGNS)
         ]
         add(
-            f"no surrogate, Reweighted({n}) and its refinement",
+            f"no surrogate, Reweighted({n}), runs {what}",
             [(o.n_responses, np.nan, o) for o in optima],
         )
     for n in (32, 64, 128):
