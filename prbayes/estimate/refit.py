@@ -266,7 +266,10 @@ class SamplingDistribution:
                 if curvature is None:
                     curvature = self._curvature(objective)
                 found.append(self._roughly(objective, curvature))
-        return np.asarray(np.std(found, axis=0, ddof=1))
+        arrived = np.array([x for x in found if np.isfinite(x).all()])
+        if len(arrived) < N_BLOCKS / 2:
+            return np.full(self.stderr.size, np.inf)
+        return np.asarray(arrived.std(axis=0, ddof=1))
 
     @property
     def _of_clouds(self) -> bool:
@@ -299,7 +302,9 @@ class SamplingDistribution:
             return np.asarray(values.mean(axis=0))
 
         r = self.stderr.size
-        return _mean_hessian(typical, r) if r else np.zeros((0, 0))
+        if r == 0 or measured_by_refits(self.evaluator):  # then nothing follows it
+            return np.zeros((r, r))
+        return _mean_hessian(typical, r)
 
     def _roughly(self, objective: BatchObjective, curvature: Floats) -> Floats:
         """Return the minimiser of one data set along the axes, (r,): inf where none was found."""

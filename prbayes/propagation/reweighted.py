@@ -457,7 +457,7 @@ class Design(Bound):
             return
         before = len(self._shared) - len(self._basis_of(self.values[:1]))
         self.target = target
-        kept = [shared.get_value() for shared in self._shared[:before]]
+        kept = self._held()[:before]
         self._shared = []
         self._share([*kept, *self._basis_of(self.values)])
 
@@ -647,7 +647,7 @@ class Design(Bound):
             ess = np.exp(log_ess)
             of_these = ess[-fresh:]
             return float(np.median(of_these))
-        return self._median_ess(some_of(components))
+        return self._median_ess(some_of(components, _WEIGHED))
 
     def _emulated(self, contents: Contents) -> Contents:
         """Return the same with a cloud whose responses are emulated, where that is better."""
@@ -686,7 +686,7 @@ class Design(Bound):
     def part(self, rows: NDArray[np.bool_]) -> Iterator[None]:
         """Take weights of some of the points only, inside."""
         before = self.contents
-        kept = [shared.get_value() for shared in self._shared]
+        kept = self._held()
         table = before.table
         some = Table(
             points=tuple(x[rows] for x in table.points),
@@ -738,7 +738,8 @@ class Design(Bound):
 
         That does not change while the design grows.
         """
-        return self.target.columns * self.max_points > _MOST_NUMBERS
+        most = max(self.max_points, LARGEST_CLOUD) if self.emulates else self.max_points
+        return self.target.columns * most > _MOST_NUMBERS
 
     def _basis_of(self, values: Floats) -> tuple[NDArray[Any], ...]:
         """Return what graphs make features of."""
@@ -898,7 +899,7 @@ class Design(Bound):
         other = super().copied()
         other._others = deque(self._others, maxlen=self._others.maxlen)
         other._shared = []
-        other._share([shared.get_value() for shared in self._shared])
+        other._share(self._held())
         other.__dict__.pop("_log_weights", None)  # compiled on the shared variables of this one
         return other
 
@@ -914,7 +915,7 @@ class Design(Bound):
     def mark(self) -> Mark:
         """Return what brings the design back to what it is now."""
         runs = tuple(self.responses.runs.stored)
-        return Mark(self.contents, tuple(s.get_value() for s in self._shared), runs)
+        return Mark(self.contents, tuple(self._held()), runs)
 
     def go_back(self, mark: Mark, *, remember: bool = False) -> None:
         """Forget the batches since a mark; their responses may be remembered for the next time."""
@@ -928,14 +929,18 @@ class Design(Bound):
         self._basis = (None, None, None)
         self._share(mark.shared)
 
+    def _held(self) -> list[Any]:
+        """Return the arrays that compiled graphs read, none of which is ever written to."""
+        return [shared.get_value(borrow=True) for shared in self._shared]
+
     def _share(self, arrays: Sequence[Any]) -> None:
         """Hand arrays to the compiled graphs, which read shared variables of any length."""
         if not self._shared:
             for array in arrays:
                 of_any_length = (None,) * array.ndim
-                self._shared.append(pytensor.shared(array, shape=of_any_length))
+                self._shared.append(pytensor.shared(array, borrow=True, shape=of_any_length))
         for shared, array in zip(self._shared, arrays, strict=True):
-            shared.set_value(array)
+            shared.set_value(array, borrow=True)
 
     # -- Weights --
 

@@ -179,6 +179,18 @@ def test_the_error_of_emulators_is_measured_by_runs_that_are_left_out() -> None:
     assert 0.02 < errors["smooth"].points < 0.1
 
 
+@pytest.mark.parametrize(("lost", "known"), [(3, True), (5, False)])
+def test_parts_of_a_cloud_without_a_minimum_leave_its_error_to_the_others(
+    lost: int, known: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = build(known=True)
+    optimum = prb.minimize(model, starts=0, refine=False, progressbar=False)
+    sampling = SamplingDistribution.of(optimum.evaluator, optimum.theta, np.ones(1))
+    found = iter([np.full(2, np.inf)] * lost + [np.array([k, -k]) for k in np.arange(8.0)])
+    monkeypatch.setattr(SamplingDistribution, "_roughly", lambda *_: next(found))
+    assert np.isfinite(sampling._error_of_points()).all() == known
+
+
 def test_another_response_is_computed_at_the_runs_and_emulated() -> None:
     evaluator, design = design_of(build())
     calls: list[int] = []

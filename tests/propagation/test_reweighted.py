@@ -401,7 +401,7 @@ def test_the_error_of_a_design_is_measured() -> None:
         rng = np.random.default_rng(3)
         with pm.Model() as model:
             a = pm.Normal.dist(pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1))
-            propagation = prb.Reweighted(512, random_seed=seed, **keywords)
+            propagation = prb.Reweighted(512, emulator=None, random_seed=seed, **keywords)
             observed = rng.normal(2, 0.5, 40) * np.exp(rng.normal(0, 0.2, 40))
             b = pm.Normal.dist(0, 0.2)
             prb.Simulator(
