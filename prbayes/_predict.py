@@ -33,7 +33,7 @@ from prbayes.model.support import TOLERABLE, shortcoming
 from prbayes.model.turns import in_turn
 from prbayes.propagation.base import MAX_LOST, DesignError, refuse_max_lost
 from prbayes.propagation.points import base_points, inside
-from prbayes.propagation.reweighted import Design
+from prbayes.propagation.reweighted import Design, UntoldError
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, quantiles
 from prbayes.response.failures import Abort, ResponseError
@@ -346,8 +346,13 @@ def _resampled_responses(
     design = node.design
     assert design is not None
     roots = [points[str(rv.name)] for rv in design.inputs.roots]
+    try:
+        values = design.values_of(responses)
+    except UntoldError:
+        with design.alone():
+            return _resampled_responses(node, responses, points, n, rng)
     chosen = _resampled(node.name, design, roots, n, rng)
-    values = design.values_of(responses)[chosen]
+    values = values[chosen]
     specimens = [x[chosen] for x in design.points_of(responses.inputs)]
     what = "design points" if responses.count else "stored responses"
     return _Drawn(values, specimens, f"{what} of {node.name}")

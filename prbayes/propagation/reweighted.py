@@ -522,6 +522,11 @@ class Design(Bound):
         """Return another response of the design's specimens, (n,) or (n, m).
 
         None that is known is computed again.
+
+        Raises
+        ------
+        UntoldError
+            If the runs do not tell it between them; inside `alone` they need not.
         """
         if responses.same_as(self.responses):
             return self.values
@@ -553,7 +558,7 @@ class Design(Bound):
         # The runs have the share that the design's own response gave them.
         if other is None or other.share > _TRUSTED + contents.emulation.share:
             share = 1.0 if other is None else other.share
-            raise DesignError(
+            raise UntoldError(
                 f"{self.name}: the design is of {self.n_runs} runs, between which its own response "
                 "is emulated; another response of the same specimens is not told by the runs: got "
                 f"an emulator that would leave {share:.0%} of a population to them, expected at "
@@ -685,16 +690,31 @@ class Design(Bound):
     @contextmanager
     def part(self, rows: NDArray[np.bool_]) -> Iterator[None]:
         """Take weights of some of the points only, inside."""
-        before = self.contents
-        kept = self._held()
-        table = before.table
+        table = self.contents.table
         some = Table(
             points=tuple(x[rows] for x in table.points),
             values=table.values[rows],
             log_g=table.log_g[rows],
             blocks=table.blocks[rows],
         )
-        self._contents = replace(before, table=some)
+        with self._instead(replace(self.contents, table=some)):
+            yield
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Take weights of the runs only, inside."""
+        batches = self.batches
+        log_g, _ = self._log_mixture(
+            batches.components, batches.counts, batches.points, summed=False
+        )
+        table = Table(batches.points, batches.values, log_g, self._blocks_of(batches.sizes))
+        with self._instead(replace(self.contents, table=table, cloud=None, emulation=None)):
+            yield
+
+    @contextmanager
+    def _instead(self, contents: Contents) -> Iterator[None]:
+        before, kept = self.contents, self._held()
+        self._contents = contents
         self._share(self._arrays())
         try:
             yield
@@ -1065,6 +1085,10 @@ class Design(Bound):
             "lost_mass": np.nan_to_num(lost, nan=1.0),
             "failed_mass": np.nan_to_num(broken_share),
         }
+
+
+class UntoldError(DesignError):
+    """An emulator does not tell another response of the same specimens."""
 
 
 def design_of(bound: Bound) -> Design | None:

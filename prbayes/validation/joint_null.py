@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -13,8 +14,10 @@ from prbayes._checks import Floats, called, positive_integer
 from prbayes._predict import data_digest, in_order, serving, specimen_names
 from prbayes.estimate.data_sets import groups, sets_at, simulated_points, specimens
 from prbayes.estimate.optimum import Optimum, require_refits
+from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.identity import Level, require_same
 from prbayes.model.node import Node
+from prbayes.propagation.reweighted import UntoldError
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
 from prbayes.validation.conditions import Case, Condition
@@ -86,11 +89,24 @@ class JointNull(SimulatedNull):
 
     def replicates_of(self, case: Case) -> Iterator[Floats]:
         """Draw, calibrate, test."""
+        require_same(case.identity, self.optimum.identity, "JointNull: predicted", Level.OPTIMUM)
+        sampling = self.optimum.sampling()
+        with ExitStack() as alone:
+            try:
+                served = [self._served(case, condition) for condition in case.conditions]
+            except UntoldError:
+                # All on the same points: those of the runs.
+                for design in self.optimum.evaluator.designs.values():
+                    alone.enter_context(design.alone())
+                served = [self._served(case, condition) for condition in case.conditions]
+            yield self._replicates(case, served, sampling)
+
+    def _replicates(
+        self, case: Case, served: list[_Served], sampling: SamplingDistribution
+    ) -> Floats:
         evaluator = self.optimum.evaluator
         theta = self.optimum.theta
         ties = case.rng(1)
-        require_same(case.identity, self.optimum.identity, "JointNull: predicted", Level.OPTIMUM)
-        served = [self._served(case, condition) for condition in case.conditions]
         numbers, more = _specimen_numbers(evaluator.nodes, served)
         simulators = range(len(evaluator.nodes))
         populations = [evaluator.populations(theta[None], k) for k in simulators]
@@ -103,7 +119,7 @@ class JointNull(SimulatedNull):
         points = simulated_points(
             evaluator, populations, self.replicates, self.random_seed, more=more
         )
-        thetas, converged = self._calibrated(populations, points)
+        thetas, converged = self._calibrated(sampling, populations, points)
 
         # Test their responses against the population that was found.
         u: list[Floats] = []
@@ -121,7 +137,7 @@ class JointNull(SimulatedNull):
             u.append(np.array(found))
         together = np.concatenate(u, axis=1)
         missing = np.isnan(together).any(axis=1)
-        yield together[~missing]
+        return np.asarray(together[~missing])
 
     def describe(self, case: Case) -> str:
         """Return what is held to be true."""
@@ -131,11 +147,13 @@ class JointNull(SimulatedNull):
         )
 
     def _calibrated(
-        self, populations: list[tuple[Floats, Floats]], points: list[NDArray[np.intp]]
+        self,
+        sampling: SamplingDistribution,
+        populations: list[tuple[Floats, Floats]],
+        points: list[NDArray[np.intp]],
     ) -> tuple[Floats, NDArray[np.bool_]]:
         """Return the minimisers of the replicates that converged, (r, d), and which did."""
         evaluator = self.optimum.evaluator
-        sampling = self.optimum.sampling()
         x, converged = sampling.refit(sets_at(evaluator, populations, points))
         # Replicates are then those of most data sets, and not of an odd few.
         if converged.mean() < 0.5:
