@@ -18,6 +18,7 @@ import pymc as pm
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from scipy.special import ndtr
 
 import prbayes as prb
 from prbayes._checks import Floats
@@ -92,13 +93,14 @@ class Grid:
         return cls(h, low, int(np.ceil((observed.max() + margin - low) / (h / 4))) + 1)
 
     def density(self, x: Floats, w: Floats) -> tuple[Floats, Floats]:
-        """Return the sum of kernels at the nodes, and the mass below and above them."""
-        nodes = self.low + self.h / 4 * np.arange(self.n)
-        inside = self.holds(x)
-        u = (nodes[:, None] - x[inside]) / self.h
+        """Return the sum of kernels at the nodes, and what of them is below and above their cells."""
+        step = self.h / 4
+        nodes = self.low + step * np.arange(self.n)
+        u = (nodes[:, None] - x) / self.h
         kernels = np.exp(-0.5 * u**2) / (self.h * np.sqrt(2 * np.pi))
-        outer = w[~inside & (x < nodes[2])].sum(), w[~inside & (x > nodes[2])].sum()
-        return kernels @ w[inside], np.array(outer)
+        below = ndtr((nodes[0] - step / 2 - x) / self.h)
+        above = ndtr((x - nodes[-1] - step / 2) / self.h)
+        return kernels @ w, np.array([below @ w, above @ w])
 
     def holds(self, x: Floats) -> Any:
         """Return which values have four nodes around them."""

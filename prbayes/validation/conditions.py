@@ -336,7 +336,7 @@ def _simulated(name: str, values: Any, event: tuple[int, ...]) -> Floats:
     if isinstance(values, xr.DataArray):
         own = ("chain", "draw", "sample")
         if not set(own) <= set(values.dims) or len(values.dims) != 3 + len(event):
-            also = ", and one for the outputs" if event else ""
+            also = f", and one for the {event[0]} outputs that are observed" if event else ""
             raise ValueError(
                 f"{name}: predicted: got a DataArray with dims {values.dims}, expected (chain, "
                 f"draw, sample){also}, as prb.predict returns"

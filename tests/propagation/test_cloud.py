@@ -17,7 +17,7 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import identity_of
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.cloud import CLOUD, columns, mixture_of
-from prbayes.propagation.reweighted import Design
+from prbayes.propagation.reweighted import Design, UntoldError
 from prbayes.response.budget import BudgetError
 
 AT = np.array([[1.1, 0.9, -0.2, -0.5]])
@@ -203,6 +203,33 @@ def test_another_response_is_computed_at_the_runs_and_emulated() -> None:
     other.function = double
     np.testing.assert_allclose(design.values_of(other), 2 * design.values, rtol=1e-2, atol=1e-2)
     assert sum(calls) == 64
+
+
+def rough(a: Any, b: Any) -> Any:
+    return np.sin(1e3 * a) + np.sin(1e3 * b)
+
+
+def test_another_response_that_no_emulator_tells_is_predicted_from_the_runs() -> None:
+    model = build(n=700, known=True, emulator=prb.surrogate.RadialBasis())
+    optimum = prb.minimize(model, starts=0, refine=False, progressbar=False)
+    (design,) = optimum.evaluator.designs.values()
+    values, weights = optimum.evaluator.populations(optimum.theta[None], 0)
+    other = optimum.evaluator.nodes[0].bound.responses.copied()
+    other.function = rough
+    with pytest.raises(UntoldError, match="another response of the same specimens is not told"):
+        design.values_of(other)
+    inputs = optimum.evaluator.nodes[0].bound.inputs.aleatory
+    predicted = prb.predict(optimum, rough, *inputs, n_samples=2000, random_seed=1)
+    runs = rough(*design.batches.points)
+    assert np.isin(predicted, runs).all()
+    # Sines of uniform phases.
+    assert float(predicted.std()) == pytest.approx(1.0, abs=0.15)
+    # The cloud is there again.
+    np.testing.assert_array_equal(optimum.evaluator.populations(optimum.theta[None], 0)[1], weights)
+    null = prb.validation.JointNull(optimum, (rough, *inputs), replicates=99)
+    test = prb.area_test(rough(*np.full((2, 20), 1.0) + np.arange(20)), predicted, null=null)
+    assert 0 < test.p_value <= 1
+    np.testing.assert_array_equal(optimum.evaluator.populations(optimum.theta[None], 0)[0], values)
 
 
 def test_a_design_goes_back_to_what_it_was() -> None:
