@@ -38,6 +38,7 @@ LEVEL = 0.89
 METRICS = {"PR": "ProbabilityResidual", "KLD": "KullbackLeibler", "area": "AreaMetric"}
 SCHOOLS = ("joint", "correlation", "separate")
 METHODS = ("exact", *(f"{school} {metric}" for school in SCHOOLS for metric in METRICS))
+_ENOUGH = 20  # data sets of a cell that is pooled with others
 _BLOCK = 10  # data sets of a problem before it is the next problem's turn
 _FEW = 8  # specimens of the data sets whose estimates are the populations of the design
 _WIDER = 2.5  # the proposal's covariance, in that of the estimate
@@ -479,20 +480,25 @@ def pooled(cells: dict[str, Any]) -> dict[str, Any]:
     print("\npooled over hyperparameters and problems")
     for method in METHODS:
         for size in sorted(SIZES):
-            chosen = [c for k, c in cells.items() if k.endswith(f"/{size}/{method}")]
+            chosen = [
+                cell
+                for key, cell in cells.items()
+                if key.endswith(f"/{size}/{method}") and cell["data sets"] >= _ENOUGH
+            ]
             if not chosen:
                 continue
+            weights = [cell["data sets"] for cell in chosen for _ in cell["coverage"]]
 
             def every(figure: str, chosen: list[Any] = chosen) -> Any:
                 return np.concatenate([cell[figure] for cell in chosen])
 
             found[f"{method}/{size}"] = {
                 "data sets": sum(cell["data sets"] for cell in chosen),
-                "coverage": float(every("coverage").mean()),
+                "coverage": float(np.average(every("coverage"), weights=weights)),
                 "worst rmse over likelihood": float(every("rmse over likelihood").max()),
                 "worst rmse over posterior": float(every("rmse over posterior").max()),
                 "worst off": float(np.abs(every("off")).max()),
-                "mean sd over exact": float(every("sd over exact").mean()),
+                "mean sd over exact": float(np.average(every("sd over exact"), weights=weights)),
             }
             row = "  ".join(f"{k} {v:.3f}" for k, v in found[f"{method}/{size}"].items())
             print(f"{method:16s} N = {size:3d}  {row}")
