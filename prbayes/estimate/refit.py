@@ -44,8 +44,8 @@ _FAINT = 10.0
 _STEADY = 1.5
 
 
-# The power of its size with which the error of a cloud falls, at least: chosen on two problems of
-# benchmarks/clouds.py, where it was .66 and 1.3, and no others.
+# The power of its size with which the error of a cloud falls, about: that of two problems of
+# benchmarks/clouds.py, where it is .60 and .66, and of no others.
 _OF_CLOUDS = 0.65
 
 
