@@ -43,7 +43,7 @@ def model_of(response=two, data=None, *, metric=JOINT, propagation=None):
             b,
             metric=metric,
             observed=observed() if data is None else data,
-            propagation=propagation or prb.Reweighted(1024),
+            propagation=propagation or prb.Reweighted(64),
         )
     return model
 

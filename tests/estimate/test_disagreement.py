@@ -33,7 +33,7 @@ def model_of(data: Any) -> pm.Model:
             *inputs,
             metric=metric,
             observed=data,
-            propagation=prb.Reweighted(768, max_points=768),
+            propagation=prb.Reweighted(128, max_points=768),
         )
     return model
 

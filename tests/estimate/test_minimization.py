@@ -319,7 +319,7 @@ def test_vector_hyperparameters_of_a_multivariate_input() -> None:
         for i, name in enumerate(("first", "second")):
             prb.Simulator(
                 name, lambda x, i=i: x[..., i], x, metric=METRICS["kl"], observed=data[:, i],
-                propagation=prb.Reweighted(1024),
+                propagation=prb.Reweighted(64),
             )  # fmt: skip
         pm.Deterministic("gap", mean[1] - mean[0])
     optimum = prb.minimize(model)
