@@ -17,6 +17,8 @@ from prbayes.estimate.optimum import Optimum, require_refits
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.identity import Level, require_same
 from prbayes.model.node import Node
+from prbayes.model.support import shortcomings
+from prbayes.propagation.base import DesignError
 from prbayes.propagation.reweighted import UntoldError
 from prbayes.response.inputs import read_inputs
 from prbayes.response.response import Responses, refuse_uncallable
@@ -94,12 +96,25 @@ class JointNull(SimulatedNull):
         with ExitStack() as alone:
             try:
                 served = [self._served(case, condition) for condition in case.conditions]
-            except UntoldError:
+            except UntoldError as untold:
                 # All on the same points: those of the runs.
                 for design in self.optimum.evaluator.designs.values():
                     alone.enter_context(design.alone())
+                self._refuse_unsupported(untold)
                 served = [self._served(case, condition) for condition in case.conditions]
-            yield self._replicates(case, served, sampling)
+            found = self._replicates(case, served, sampling)
+        # Designs are whole again before anyone else goes on.
+        yield found
+
+    def _refuse_unsupported(self, untold: UntoldError) -> None:
+        """Raise if the runs by themselves are too few for the population at the optimum."""
+        short = shortcomings(self.optimum.evaluator, self.optimum.theta[None])
+        if short:
+            what = "; ".join(f"{name}: {each}" for name, each in short.items())
+            raise DesignError(
+                f"JointNull: {untold}; its runs alone do not support the calibrated population "
+                f"({what})"
+            ) from untold
 
     def _replicates(
         self, case: Case, served: list[_Served], sampling: SamplingDistribution

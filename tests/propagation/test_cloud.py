@@ -232,6 +232,21 @@ def test_another_response_that_no_emulator_tells_is_predicted_from_the_runs() ->
     np.testing.assert_array_equal(optimum.evaluator.populations(optimum.theta[None], 0)[0], values)
 
 
+def test_runs_that_are_too_few_for_another_response_are_refused() -> None:
+    optimum = prb.minimize(build(), starts=0, refine=False, progressbar=False)
+    inputs = optimum.evaluator.nodes[0].bound.inputs.aleatory
+    with pytest.raises(DesignError, match=r"weight effective sample size of .* stored=False"):
+        prb.predict(optimum, rough, *inputs, n_samples=100, random_seed=1)
+    fresh = prb.predict(optimum, rough, *inputs, n_samples=500, random_seed=1, stored=False)
+    null = prb.validation.JointNull(optimum, (rough, *inputs), replicates=99)
+    before = optimum.evaluator(optimum.theta[None]).discrepancies
+    with pytest.raises(
+        DesignError, match=r"JointNull: y: .* not told .* runs alone do not support"
+    ):
+        prb.area_test(np.linspace(-1, 1, 20), fresh, null=null)
+    np.testing.assert_array_equal(optimum.evaluator(optimum.theta[None]).discrepancies, before)
+
+
 def test_a_design_goes_back_to_what_it_was() -> None:
     evaluator, design = design_of(build())
     before = evaluator(theta_of(evaluator)).discrepancies
