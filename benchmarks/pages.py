@@ -341,6 +341,12 @@ def between_runs() -> Iterator[Row]:
         yield [name, str(response.d), str(response.outputs), *columns]
 
 
+def placement() -> Iterator[Row]:
+    """Return the rows of errors by where runs are added."""
+    for name, cell in found("placement").items():
+        yield [name, *(f"{error:.3f}".lstrip("0") for error in cell.values())]
+
+
 def few_runs() -> Iterator[Row]:
     """Return the rows of optima from few runs."""
     from benchmarks.few_runs import figures
@@ -429,6 +435,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "joint, memory": joint_memory,
     "scale": scale,
     "between runs": between_runs,
+    "placement": placement,
     "few runs": few_runs,
     "three masses": three_masses,
     "two fidelities": two_fidelities,

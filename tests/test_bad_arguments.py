@@ -140,7 +140,7 @@ def but_none(bad: Sequence[Any]) -> list[Any]:
 LOST: Sequence[Any] = (1.0, -0.1, np.nan, "a", None, True, False)
 BUDGETS: Mapping[str, Sequence[Any]] = {
     "max_seconds": but_none(POSITIVE),
-    "max_responses": but_none(COUNT),
+    "max_runs": but_none(COUNT),
 }
 EXECUTOR: Sequence[Any] = (4, map, "processes", object())
 STORE: Sequence[Any] = (4, True, b"folder", "")

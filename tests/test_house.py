@@ -186,7 +186,7 @@ TAIL = (
     "retry_failed",
     "max_stages",
     "max_seconds",
-    "max_responses",
+    "max_runs",
     "checkpoint",
     "random_seed",
     "progressbar",

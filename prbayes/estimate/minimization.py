@@ -64,7 +64,7 @@ def refine(
     thetas: Floats | None = None,
     *,
     max_seconds: float | None = None,
-    max_responses: int | None = None,
+    max_runs: int | None = None,
     progressbar: bool = True,
 ) -> dict[str, int]:
     """Add design points where the posterior's populations live, until the designs support them.
@@ -80,7 +80,7 @@ def refine(
         Unconstrained hyperparameters whose populations matter; by default those around the optimum.
     max_seconds : float, optional
         Seconds after which nothing new is begun.
-    max_responses : int, optional
+    max_runs : int, optional
         Largest number of responses to compute, without those found in a store.
     progressbar : bool
         Whether work of more than two seconds shows a bar on stderr.
@@ -117,7 +117,7 @@ def refine(
     with (
         shown(progressbar),
         explained(evaluator, "prb.refine"),
-        limited(max_seconds, max_responses),
+        limited(max_seconds, max_runs),
     ):
         if wanted is None:
             require_finished(find_optimum(evaluator, Minimisation()))
@@ -170,7 +170,7 @@ def minimize(
     refine: bool = True,
     starts: int | None = None,
     max_seconds: float | None = None,
-    max_responses: int | None = None,
+    max_runs: int | None = None,
     random_seed: Seed = 0,
     progressbar: bool = True,
 ) -> Optimum:
@@ -220,7 +220,7 @@ def minimize(
         ``stopped`` and not converged. The same call on the same model, built again, with a larger
         budget gives the optimum that it would have given at once; with a ``store`` it computes
         nothing again.
-    max_responses : int, optional
+    max_runs : int, optional
         Largest number of responses to compute, without those found in a store; as for
         ``max_seconds``.
     random_seed : int, sequence of int, numpy.random.Generator or None
@@ -275,7 +275,7 @@ def minimize(
     with (
         shown(progressbar),
         explained(evaluator, "prb.minimize"),
-        limited(max_seconds, max_responses),
+        limited(max_seconds, max_runs),
     ):
         return find_optimum(evaluator, asked)
 

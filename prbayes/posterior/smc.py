@@ -54,7 +54,7 @@ def sample_smc(
     refine: bool = True,
     max_stages: int | None = None,
     max_seconds: float | None = None,
-    max_responses: int | None = None,
+    max_runs: int | None = None,
     checkpoint: str | PathLike[str] | None = None,
     random_seed: Seed = 0,
     progressbar: bool = True,
@@ -90,7 +90,7 @@ def sample_smc(
         same ``checkpoint`` goes on, and gives the draws that it would have given at once.
     max_seconds : float, optional
         Seconds after which nothing new is begun.
-    max_responses : int, optional
+    max_runs : int, optional
         Largest number of responses to compute, without those found in a store.
     checkpoint : path-like, optional
         A file that keeps the state after every stage: a run that was killed goes on from there when
@@ -179,7 +179,7 @@ def sample_smc(
     with (
         shown(progressbar),
         explained(evaluator, "prb.sample_smc", *stages),
-        limited(max_seconds, max_responses),
+        limited(max_seconds, max_runs),
     ):
         return sample(evaluator, asked)
 

@@ -24,7 +24,7 @@ class Budget:
     """What may be spent, and what was."""
 
     max_seconds: float | None = None
-    max_responses: int | None = None
+    max_runs: int | None = None
     begun: float = field(default_factory=time.perf_counter)
     computed: int = 0  # responses; those found in a store cost nothing
     spent: str = ""  # what was spent, in words; nothing goes on from then on
@@ -43,11 +43,11 @@ class Budget:
         They count as computed.
         """
         self.go_on()
-        if self.max_responses is None:
+        if self.max_runs is None:
             return wanted
-        granted = min(wanted, self.max_responses - self.computed)
+        granted = min(wanted, self.max_runs - self.computed)
         if granted < least:
-            self.spent = f"max_responses = {self.max_responses} was reached"
+            self.spent = f"max_runs = {self.max_runs} was reached"
             raise BudgetError(self.spent)
         self.computed += granted
         return granted
@@ -63,7 +63,7 @@ def budget() -> Budget:
 
 
 @contextmanager
-def limited(max_seconds: float | None, max_responses: int | None) -> Iterator[None]:
+def limited(max_seconds: float | None, max_runs: int | None) -> Iterator[None]:
     """Stop what happens inside, by `BudgetError`, when a budget is spent.
 
     Raises
@@ -73,9 +73,9 @@ def limited(max_seconds: float | None, max_responses: int | None) -> Iterator[No
     """
     if max_seconds is not None:
         positive_number(max_seconds, "max_seconds")
-    if max_responses is not None:
-        positive_integer(max_responses, "max_responses")
-    token = _at_work.set(Budget(max_seconds, max_responses))
+    if max_runs is not None:
+        positive_integer(max_runs, "max_runs")
+    token = _at_work.set(Budget(max_seconds, max_runs))
     try:
         yield
     finally:

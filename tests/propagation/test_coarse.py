@@ -115,7 +115,7 @@ def test_its_calls_are_neither_counted_nor_limited() -> None:
         calls.append(np.size(a))
         return coarse(a, b, scale)
 
-    with limited(None, max_responses=64):
+    with limited(None, max_runs=64):
         evaluator = Evaluator(build(called))
     assert evaluator.n_responses == 64
     assert sum(calls) == 64 + CLOUD

@@ -50,7 +50,7 @@ def test_responses_are_granted_as_long_as_there_are_some() -> None:
     with limited(None, 10):
         assert budget().grant(6, least=1) == 6
         assert budget().grant(6, least=1) == 4
-        with pytest.raises(BudgetError, match="max_responses = 10 was reached"):
+        with pytest.raises(BudgetError, match="max_runs = 10 was reached"):
             budget().grant(1, least=1)
     assert budget().grant(1, least=1) == 1
 
@@ -95,8 +95,8 @@ def test_minimize_goes_on_to_the_same_bits(tmp_path: Path, at_once: prb.Optimum)
     response = Counted()
     total = 0
     for most in (100, 150):
-        optimum = found(tmp_path, prb.scalar(response), max_responses=most)
-        assert optimum.stopped == f"max_responses = {most} was reached"
+        optimum = found(tmp_path, prb.scalar(response), max_runs=most)
+        assert optimum.stopped == f"max_runs = {most} was reached"
         assert not optimum.converged
         assert np.isfinite(optimum.discrepancy)
         assert np.isnan(optimum.covariance).all()
@@ -108,7 +108,7 @@ def test_minimize_goes_on_to_the_same_bits(tmp_path: Path, at_once: prb.Optimum)
         assert str(tmp_path) in message
         assert optimum.to_datatree()["optimum"].attrs["stopped"] == optimum.stopped
     # A budget that is large enough changes nothing.
-    optimum = found(tmp_path, max_seconds=1000, max_responses=at_once.n_responses)
+    optimum = found(tmp_path, max_seconds=1000, max_runs=at_once.n_responses)
     assert not optimum.stopped
     assert np.array_equal(optimum.theta, at_once.theta)
     assert np.array_equal(optimum.covariance, at_once.covariance)
@@ -117,7 +117,7 @@ def test_minimize_goes_on_to_the_same_bits(tmp_path: Path, at_once: prb.Optimum)
 
 def test_before_anything_is_known_minimize_says_what_is_kept(tmp_path: Path) -> None:
     with pytest.raises(BudgetError, match=r"prb\.minimize: .*no result|before there was a result"):
-        found(tmp_path, max_responses=10)
+        found(tmp_path, max_runs=10)
     stored = prb.response.Store(tmp_path, "y", version="1")
     assert len(stored) == 16 + 10
 
@@ -132,8 +132,8 @@ def test_minimize_stops_in_time(tmp_path: Path) -> None:
 
 def test_with_stored_responses_the_best_so_far_is_complete() -> None:
     model, node = build(prb.Reweighted(16), prb.scalar(Counted()))
-    optimum = prb.minimize(model, max_responses=10, **QUIET)
-    assert optimum.stopped == "max_responses = 10 was reached"
+    optimum = prb.minimize(model, max_runs=10, **QUIET)
+    assert optimum.stopped == "max_runs = 10 was reached"
     assert not optimum.converged
     assert optimum.discrepancy == pytest.approx(optimum.discrepancies["y"])
     assert optimum.support["y"]["weight_ess"] > 1
@@ -149,9 +149,9 @@ def test_refine_goes_on_with_the_design_that_has_grown() -> None:
     whole, node = build(prb.Reweighted(16))
     prb.refine(whole, FAR, **QUIET)
     parts, other = build(prb.Reweighted(16))
-    expected = r"prb\.refine: max_responses = 20 was reached .*the model's designs"
+    expected = r"prb\.refine: max_runs = 20 was reached .*the model's designs"
     with pytest.raises(BudgetError, match=expected):
-        prb.refine(parts, FAR, max_responses=20, **QUIET)
+        prb.refine(parts, FAR, max_runs=20, **QUIET)
     assert other.bound.n_points == 32 < node.bound.n_points
     prb.refine(parts, FAR, **QUIET)
     assert np.array_equal(other.bound.known_responses, node.bound.known_responses)
@@ -159,8 +159,8 @@ def test_refine_goes_on_with_the_design_that_has_grown() -> None:
 
 def test_refinement_around_the_optimum_has_a_budget_too() -> None:
     model, _ = build(prb.Reweighted(16))
-    with pytest.raises(BudgetError, match="max_responses = 10 was reached"):
-        prb.refine(model, max_responses=10, **QUIET)
+    with pytest.raises(BudgetError, match="max_runs = 10 was reached"):
+        prb.refine(model, max_runs=10, **QUIET)
 
 
 # -- sample_smc ------------------------------------------------------------------------------------
@@ -212,10 +212,10 @@ def test_stages_are_limited_and_go_on(name: str, tmp_path: Path) -> None:
 def test_finished_chains_are_returned_and_the_rest_goes_on(name: str, tmp_path: Path) -> None:
     path = tmp_path / "run.nc"
     most = 3 * undisturbed(name)["posterior"].attrs["n_responses"] // 4
-    part = sampled(name, path, max_responses=most)
+    part = sampled(name, path, max_runs=most)
     attrs = part["posterior"].attrs
     assert attrs["n_responses"] <= most
-    assert attrs["stopped"] == f"max_responses = {most} was reached in chain 2 of 2"
+    assert attrs["stopped"] == f"max_runs = {most} was reached in chain 2 of 2"
     assert dict(part["posterior"].sizes) == {"chain": 1, "draw": 30}
     assert any("1 of 2 chains are here" in line for line in prb.diagnose(part).messages)
     whole = undisturbed(name)["posterior"]["mu"]
@@ -229,8 +229,8 @@ def test_a_design_that_grew_for_nothing_is_what_it_was_and_nothing_is_computed_t
     model, node = build(prb.Reweighted(16), prb.scalar(response))
     keywords: dict[str, Any] = {"model": model, "chains": 1} | QUIET
     before = response.calls
-    with pytest.raises(BudgetError, match=r"prb\.sample_smc: max_responses = 20 was reached"):
-        prb.sample_smc(30, max_responses=20, **keywords)
+    with pytest.raises(BudgetError, match=r"prb\.sample_smc: max_runs = 20 was reached"):
+        prb.sample_smc(30, max_runs=20, **keywords)
     assert node.bound.n_points == 16
     assert response.calls == before + 20
     posterior = prb.sample_smc(30, **keywords)["posterior"]
@@ -244,8 +244,8 @@ def test_a_design_that_grew_for_nothing_is_what_it_was_and_nothing_is_computed_t
 
 def test_the_optimum_within_is_not_taken_for_an_answer() -> None:
     model, _ = build(prb.Resimulated(16), black_box, epsilon=None)
-    with pytest.raises(BudgetError, match=r"prb\.sample_smc: max_responses = 50 was reached"):
-        prb.sample_smc(30, model=model, max_responses=50, **QUIET)
+    with pytest.raises(BudgetError, match=r"prb\.sample_smc: max_runs = 50 was reached"):
+        prb.sample_smc(30, model=model, max_runs=50, **QUIET)
 
 
 def test_time_is_a_budget_of_the_sampler() -> None:
