@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,6 +45,19 @@ KERNELS: dict[str, Kernel] = {
     "squared_exponential": squared_exponential,
     "matern": matern,
 }
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Do linear algebra in one thread, inside or in the function that this decorates.
+
+    Several gain nothing on matrices of a few hundred rows, and take ten times as long where
+    something else computes as well.
+    """
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1, user_api="blas"):
+        yield
 
 
 @dataclass(frozen=True)
@@ -91,6 +105,7 @@ class GaussianProcess(Surface):
         """Return how many points it needs at least."""
         return 2
 
+    @one_thread()
     def tuned(self, x: Floats, y: Floats) -> GaussianProcess:
         """Return the same with the likeliest lengths and nugget."""
         from scipy.optimize import minimize

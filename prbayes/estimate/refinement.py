@@ -65,7 +65,7 @@ def refine_at(
     drawn = _widened(evaluator, thetas, thin) if again else _reach(evaluator, thetas, thin)
     while drawn and thin:
         thin &= set(shortcomings(evaluator, thetas))
-        drawn = _widened(evaluator, thetas, thin)
+        drawn = _widened(evaluator, thetas, thin, on_the_way=True)
     # What no cloud reaches needs runs, and so does what no emulator tells.
     _add(evaluator, thetas, thin | _untold(evaluator, set(short)))
     return short
@@ -182,7 +182,7 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         best = thetas[order]
         # Let the designs reach them.
         thin = _thin(evaluator, best)
-        _reach(evaluator, best, thin)
+        _reach(evaluator, best, thin, on_the_way=True)
         growing = {name for name in thin if _has_room(evaluator.designs[name])}
         _add(evaluator, best, growing)
         # Stop where sampling explains the differences that are left.
@@ -213,19 +213,23 @@ def _clouds(evaluator: Evaluator, names: set[str]) -> Iterator[tuple[int, Design
             yield k, node.design
 
 
-def _reach(evaluator: Evaluator, thetas: Floats, names: set[str]) -> bool:
+def _reach(
+    evaluator: Evaluator, thetas: Floats, names: set[str], *, on_the_way: bool = False
+) -> bool:
     """Let clouds reach the populations at thetas; return whether there are any."""
     clouds = list(_clouds(evaluator, names))
     for k, design in clouds:
-        design.reach(evaluator.roots(thetas, k))
+        design.reach(evaluator.roots(thetas, k), on_the_way=on_the_way)
     return bool(clouds)
 
 
-def _widened(evaluator: Evaluator, thetas: Floats, names: set[str]) -> bool:
+def _widened(
+    evaluator: Evaluator, thetas: Floats, names: set[str], *, on_the_way: bool = False
+) -> bool:
     """Draw larger clouds for the populations at thetas; return whether any could be."""
     grown = False
     for k, design in _clouds(evaluator, names):
-        grown |= design.widen(evaluator.roots(thetas, k))
+        grown |= design.widen(evaluator.roots(thetas, k), on_the_way=on_the_way)
     return grown
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 from prbayes.emulators.emulator import Runs, candidates, chosen, each_block, emulated
 from prbayes.emulators.following import Following
+from prbayes.emulators.gaussian_process import one_thread
 from prbayes.emulators.share import share_of_runs
 from prbayes.propagation.base import N_BLOCKS
 
@@ -74,6 +75,8 @@ class Emulation:
     runs : Runs
     models : tuple
         The surface that was chosen for each output.
+    said : ndarray, shape (n, m)
+        What they say of runs that were left out.
     weights : ndarray, shape (T, n)
         Of the runs in the populations that matter.
     share : float
@@ -87,12 +90,14 @@ class Emulation:
 
     runs: Runs
     models: tuple[Any, ...]
+    said: Floats
     weights: Floats
     share: float
     error: float
     event: tuple[int, ...]
 
     @classmethod
+    @one_thread()
     def of(
         cls,
         emulator: Any,
@@ -123,22 +128,41 @@ class Emulation:
             models, said = chosen(tried, runs)
         except np.linalg.LinAlgError:
             return None
-        share = share_of_runs(weights, y, said, blocks)
+        return cls._judged(runs, models, said, weights, values.shape[1:])
+
+    @classmethod
+    def _judged(
+        cls,
+        runs: Runs,
+        models: tuple[Any, ...],
+        said: Floats,
+        weights: Floats,
+        event: tuple[int, ...],
+    ) -> Emulation | None:
+        """Return it with the share that the runs have, for the populations that matter."""
+        share = share_of_runs(weights, runs.y, said, runs.blocks)
         if share > _ALONE:
             return None
         share = 0.0 if share < _LITTLE else share
-        return cls(runs, models, weights, share, _error(runs, said), values.shape[1:])
+        error = _error(runs, said, weights.mean(axis=0))
+        return cls(runs, models, said, weights, share, error, event)
+
+    def elsewhere(self, weights: Floats) -> Emulation | None:
+        """Return the same surfaces for other populations; None where runs alone are as good."""
+        return self._judged(self.runs, self.models, self.said, weights, self.event)
 
     @property
     def following(self) -> int:
         """How many outputs follow a coarse response, of which a cloud then needs values."""
         return sum(isinstance(model, Following) for model in self.models)
 
+    @one_thread()
     def at(self, cloud: Cloud) -> Floats:
         """Return the responses at the cloud's points, (M,) or (M, m)."""
         found = emulated(self.models, self.runs, columns(cloud.points), coarse=cloud.coarse)
         return found.reshape(-1, *self.event)
 
+    @one_thread()
     def without_each_block(self, cloud: Cloud) -> list[Floats]:
         """Return the same from emulators that were fitted without a block of the runs each."""
         at = columns(cloud.points)
@@ -166,10 +190,10 @@ class Emulation:
         )
 
 
-def _error(runs: Runs, said: Floats) -> float:
+def _error(runs: Runs, said: Floats, importance: Floats) -> float:
     """Return the relative error of the worst output at runs that were left out."""
     known = runs.good & np.isfinite(said).all(axis=1)
-    y, importance = runs.y[known], runs.importance[known]
+    y, importance = runs.y[known], importance[known]
     total = importance.sum()
     if not total > 0:
         return np.nan

@@ -611,8 +611,11 @@ class Design(Bound):
             self.support_moves = bool(self._moving)
         return self._drawn(batches, components, len(counts))
 
-    def reach(self, components: Sequence[Floats]) -> float:
+    def reach(self, components: Sequence[Floats], *, on_the_way: bool = False) -> float:
         """Let the cloud reach populations, without a run.
+
+        On the way to others the emulator's surfaces stay as they are: to choose them anew for these
+        populations takes most of the time.
 
         Returns
         -------
@@ -620,17 +623,25 @@ class Design(Bound):
             The median weight effective sample size over these populations.
         """
         components = self.valid_only(components)
-        return self._drawn(self.batches, components)
+        emulation = self.contents.emulation if on_the_way else None
+        return self._drawn(self.batches, components, emulation=emulation)
 
-    def widen(self, components: Sequence[Floats]) -> bool:
+    def widen(self, components: Sequence[Floats], *, on_the_way: bool = False) -> bool:
         """Draw a cloud of twice the size for populations; return whether there is room for it."""
         if self.contents.size >= LARGEST_CLOUD:
             return False
         self._contents = replace(self.contents, size=2 * self.contents.size)
-        self.reach(components)
+        self.reach(components, on_the_way=on_the_way)
         return True
 
-    def _drawn(self, batches: Batches, components: Sequence[Floats], fresh: int = 0) -> float:
+    def _drawn(
+        self,
+        batches: Batches,
+        components: Sequence[Floats],
+        fresh: int = 0,
+        *,
+        emulation: Emulation | None = None,
+    ) -> float:
         """Make the table of points anew, of batches and for populations that matter."""
         # The mixture is that of all batches, so its density changes at the old points too.
         log_g, sums = self._log_mixture(batches.components, batches.counts, batches.points)
@@ -644,7 +655,7 @@ class Design(Bound):
             contents = replace(contents, clouds=before.clouds, size=before.size)
         self._contents = contents
         if self.emulates:
-            contents = self._emulated(contents)
+            contents = self._emulated(contents, emulation)
         self._contents = contents
         self._share(self._arrays())
         if fresh and contents.cloud is None:
@@ -654,18 +665,22 @@ class Design(Bound):
             return float(np.median(of_these))
         return self._median_ess(some_of(components, _WEIGHED))
 
-    def _emulated(self, contents: Contents) -> Contents:
+    def _emulated(self, contents: Contents, known: Emulation | None) -> Contents:
         """Return the same with a cloud whose responses are emulated, where that is better."""
         runs = contents.table
         near = some_of(contents.groups[-1], _WEIGHED)
-        emulation = Emulation.of(
-            self.config.emulator,
-            runs.points,
-            runs.values,
-            self._weights_at(near, runs),
-            runs.blocks,
-            contents.batches.coarse,
-        )
+        weights = self._weights_at(near, runs)
+        if known is None:
+            emulation = Emulation.of(
+                self.config.emulator,
+                runs.points,
+                runs.values,
+                weights,
+                runs.blocks,
+                contents.batches.coarse,
+            )
+        else:
+            emulation = known.elsewhere(weights)
         if emulation is None:
             return contents
         # Another prime, so that no cloud shares points with a batch.
