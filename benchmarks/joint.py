@@ -9,7 +9,8 @@ around the optimum instead of `sample_smc`.
 
 Errors are those of means in units of the population's spread, of logarithms of standard deviations
 and of inverse hyperbolic tangents of correlations. Every data set is stored as it comes, so that an
-interrupted study goes on where it stopped:
+interrupted study goes on where it stopped; a cell of the table stays as it is until the store has
+more data sets of it:
 
     uv run python -m benchmarks.joint --replicates 200
     uv run python -m benchmarks.joint --only-table
@@ -449,15 +450,20 @@ def grouped(name: str, values: list[float]) -> list[float]:
     return [float(np.mean(group)) for group in groups if group]
 
 
-def table(store: Path) -> dict[str, Any]:
-    """Summarise what is stored, and print it; numbers alike are taken together."""
+def table(store: Path, before: dict[str, Any]) -> dict[str, Any]:
+    """Summarise what is stored, and print it; numbers alike are taken together.
+
+    Cells of ``before`` with more data sets stay.
+    """
     cells: dict[str, Any] = {}
     for name in PROBLEMS:
         for size in sorted(SIZES):
             for method in METHODS:
-                found = summarise(store, name, size, method)
-                if found is not None:
-                    cells[f"{name}/{size}/{method}"] = found
+                key = f"{name}/{size}/{method}"
+                known = [before.get(key), summarise(store, name, size, method)]
+                both = [cell for cell in known if cell is not None]
+                if both:
+                    cells[key] = max(both, key=lambda cell: cell["data sets"])
     print(
         f"{'problem':10s} {'N':>3s} {'method':16s} {'sets':>4s} {'fail':>4s} {'s':>5s}  rmse/ML, rmse"
         "/posterior (mean, log sd, corr)   coverage 89%   off   sd/exact"
@@ -519,7 +525,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if not arguments.only_table:
         run(arguments)
-    record.save(arguments.out, table(arguments.store))
+    before = record.load(arguments.out, {}).get("cells", {})
+    record.save(arguments.out, table(arguments.store, before))
 
 
 if __name__ == "__main__":

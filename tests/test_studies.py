@@ -49,6 +49,7 @@ def test_a_study_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(coverage, "block", block)
     monkeypatch.setattr(coverage, "ProcessPoolExecutor", _Here)
     arguments = ["coverage", "--problems", "linear", "--sizes", "20", "--store", str(tmp_path)]
+    arguments += ["--out", str(tmp_path / "coverage.json")]
     for replicates in ("20", "40", "40"):
         monkeypatch.setattr(sys, "argv", [*arguments, "--replicates", replicates])
         coverage.main()
