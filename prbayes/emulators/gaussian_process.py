@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from prbayes._checks import Floats
 from prbayes.emulators.surfaces import Predict, Surface
@@ -131,6 +132,27 @@ class GaussianProcess(Surface):
             return self.tuned(x, y).through(x, y)
         return mean_through(KERNELS[self.kernel], np.array(self.lengths), self.nugget, x, y)
 
+    def without_each(self, x: Floats, y: Floats, lacking: NDArray[np.bool_]) -> Predict:
+        """Return the means of processes that lack some of the points each, from one inverse."""
+        if self.lengths is None or self.nugget is None:
+            return self.tuned(x, y).without_each(x, y, lacking)
+        kernel, lengths = KERNELS[self.kernel], np.array(self.lengths)
+        scaled = x / lengths
+        own, _ = kernel(_squares(scaled, scaled))
+        inverse = _inverse(_root(own, self.nugget))
+        of_ones, of_y = inverse.sum(axis=1), inverse @ (y - y.mean())
+        coefficients, centers = [], []
+        for row in lacking:
+            center = float(y[~row].mean())
+            whole = of_y - (center - y.mean()) * of_ones
+            # Conditioned on what is left: nothing hangs on the others any more.
+            taken = np.linalg.solve(inverse[np.ix_(row, row)], whole[row])
+            found = whole - inverse[:, row] @ taken
+            found[row] = 0.0
+            coefficients.append(found)
+            centers.append(center)
+        return _Mean(kernel, scaled, lengths, np.array(centers), np.stack(coefficients, axis=1))
+
     def slope(self, x: Floats, y: Floats, along: Floats) -> float:
         """Return the likeliest slope with these lengths, that of generalised least squares."""
         from scipy.linalg import cho_solve
@@ -159,22 +181,22 @@ def mean_through(kernel: Kernel, lengths: Floats, nugget: float, x: Floats, y: F
 
 @dataclass(frozen=True, eq=False)
 class _Mean:
-    """The mean of a process; a class, so that it can be pickled."""
+    """The mean of a process, or of B; a class, so that it can be pickled."""
 
     kernel: Kernel
     scaled: Floats
     lengths: Floats
-    center: float
-    coefficients: Floats
+    center: float | Floats  # or (B,)
+    coefficients: Floats  # (n,) or (n, B)
 
     def __call__(self, at: Floats) -> Floats:
-        found = np.empty(len(at))
+        found = np.empty((len(at), *self.coefficients.shape[1:]))
         for start in range(0, len(at), _AT_A_TIME):
             some = slice(start, start + _AT_A_TIME)
             square = _squares(at[some] / self.lengths, self.scaled)
             correlation, _ = self.kernel(square)
             found[some] = correlation @ self.coefficients
-        return self.center + found
+        return np.asarray(self.center + found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +209,7 @@ class Likelihood:
 
     def __call__(self, parameters: Floats) -> tuple[float, Floats]:
         """Return the value and the gradient."""
-        from scipy.linalg import cho_factor, cho_solve
+        from scipy.linalg import cholesky
 
         n = len(self.x)
         lengths, nugget = np.exp(parameters[:-1]), np.exp(parameters[-1])
@@ -196,17 +218,17 @@ class Likelihood:
         np.fill_diagonal(square, 0)
         correlation, slope = self.correlation(square)
         try:
-            root = cho_factor(correlation + nugget * np.eye(n), lower=True)
+            root = cholesky(correlation + nugget * np.eye(n), lower=True)
         except np.linalg.LinAlgError:
             return 1e10, np.zeros(parameters.size)
-        inverse = cho_solve(root, np.eye(n))
+        inverse = _inverse(root)
         weights = inverse @ self.y
         variance = max(float(self.y @ weights) / n, 1e-300)
         outer = np.outer(weights, weights) / variance - inverse
         inner = outer * slope
         of_lengths = inner.sum(axis=1) @ scaled**2 - ((inner @ scaled) * scaled).sum(axis=0)
         of_nugget = 0.5 * nugget * np.trace(outer)
-        log_determinant = np.log(np.diag(root[0])).sum()
+        log_determinant = np.log(np.diag(root)).sum()
         value = 0.5 * n * np.log(variance) + log_determinant
         return float(value), -np.append(of_lengths, of_nugget)
 
@@ -221,6 +243,15 @@ def _root(correlation: Floats, nugget: float) -> Any:
             return cholesky(correlation + nugget * unit, lower=True)
         except np.linalg.LinAlgError:
             nugget = max(10 * nugget, 1e-14)
+
+
+def _inverse(root: Floats) -> Floats:
+    """Return the inverse of a matrix, of its lower root."""
+    from scipy.linalg.lapack import dpotri
+
+    lower, _ = dpotri(root, lower=True)  # a third of what solving for each column takes
+    lower = np.tril(lower)
+    return np.asarray(lower + np.tril(lower, -1).T)
 
 
 def _squares(a: Floats, b: Floats) -> Any:

@@ -11,6 +11,7 @@ from math import comb
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
 
@@ -70,6 +71,23 @@ class Surface(ABC):
     def slope(self, x: Floats, y: Floats, along: Floats) -> float:
         """Return how steeply responses follow another one, of spread 1, beside such a surface."""
         return least_squares(x, y, along)
+
+    def without_each(self, x: Floats, y: Floats, lacking: NDArray[np.bool_]) -> Predict | None:
+        """Return surfaces that each lack some of the points, if there is a short way to them.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n, d)
+        y : ndarray, shape (n,)
+            In any unit.
+        lacking : ndarray of bool, shape (B, n)
+
+        Returns
+        -------
+        callable or None
+            From points, shape (k, d), to values, shape (k, B).
+        """
+        return None
 
 
 @dataclass(frozen=True)

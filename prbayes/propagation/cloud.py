@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
-from prbayes.emulators.emulator import Runs, candidates, chosen, each_block, emulated
+from prbayes.emulators.emulator import (
+    Runs,
+    candidates,
+    chosen,
+    emulated,
+    emulated_without_each,
+)
 from prbayes.emulators.following import Following
 from prbayes.emulators.gaussian_process import one_thread
 from prbayes.emulators.share import share_of_runs
@@ -166,11 +172,8 @@ class Emulation:
     def without_each_block(self, cloud: Cloud) -> list[Floats]:
         """Return the same from emulators that were fitted without a block of the runs each."""
         at = columns(cloud.points)
-        found = []
-        for block in each_block(self.runs):
-            values = emulated(self.models, self.runs, at, ~block, cloud.coarse)
-            found.append(values.reshape(-1, *self.event))
-        return found
+        found = emulated_without_each(self.models, self.runs, at, cloud.coarse)
+        return [values.reshape(-1, *self.event) for values in found]
 
     def joined(self, cloud: Cloud, said: Floats, runs: Table) -> Table:
         """Return cloud and runs as one table, in which the runs have their share."""
