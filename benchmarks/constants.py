@@ -15,9 +15,10 @@ for each problem whose answers change at all, the largest change over hyperparam
 The first row says how much another seed of the sampler changes. docs/constants.md shows the table.
 
 One process imports and compiles what can be kept; each variation is a fork of it, so that none sees
-another's. The file is written after each row, and rows that it has are not computed again.
+another's: in one thread, as forks of a process with several may hang. The file is written after
+each row, and rows that it has are not computed again.
 
-    uv run python -m benchmarks.constants [--only sandwich] [--anew] [--check]
+    OMP_NUM_THREADS=1 uv run python -m benchmarks.constants [--only sandwich] [--anew] [--check]
 """
 
 from __future__ import annotations
@@ -212,6 +213,28 @@ def two_inputs(rng: np.random.Generator) -> pm.Model:
     return model
 
 
+def three_outputs(rng: np.random.Generator) -> pm.Model:
+    """Return a model of two inputs and three outputs of a run, emulated between 64 runs."""
+    a, b = rng.normal(1.0, 0.3, 40), rng.normal(2.0, 0.5, 40)
+
+    def response(x: Any, y: Any) -> Any:
+        return np.stack(np.broadcast_arrays(x * y, x + 0.3 * y**2, np.exp(0.5 * y) - x), axis=-1)
+
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu_a", 1, 1), pm.HalfNormal("sd_a", 1))
+        y = pm.Normal.dist(pm.Normal("mu_b", 2, 1), pm.HalfNormal("sd_b", 1))
+        prb.Simulator(
+            "y",
+            response,
+            x,
+            y,
+            metric=prb.Joint(prb.ProbabilityResidual()),
+            observed=response(a, b),
+            propagation=prb.Reweighted(64),
+        )
+    return model
+
+
 def kolmogorov(simulated: Any, observed: Any, weights: Any) -> Any:
     """Return the largest difference of two distribution functions."""
     measured = np.broadcast_to(observed, (*simulated.shape[:-1], observed.size))
@@ -343,6 +366,9 @@ def problems() -> dict[str, Problem]:
         ),
         "two inputs, PR, N = 30": Problem(
             partial(minimised, lambda: two_inputs(again())), sampled, True
+        ),
+        "two inputs, three outputs, PR, N = 40": Problem(
+            partial(minimised, lambda: three_outputs(again())), sampled, True
         ),
         "KLD, histogram, N = 60": of_one(np.tanh, np.tanh(larger), bins),
         "Kolmogorov, N = 30": of_one(np.sinh, np.sinh(some), own),
