@@ -62,6 +62,8 @@ ROOMS = (
 )
 COLUMNS = ("optimum", "stderr", "epsilon", "mean", "sd", "responses", "p")
 RESULTS = record.RESULTS / "constants.json"
+# The problem that docs/constants.md leaves out of its table.
+LEFT_OUT = "two inputs, PR, N = 30"
 # Seconds for all problems of one variation: many times what they take.
 PATIENCE = 300
 # What by its nature touches no answer.
@@ -322,7 +324,7 @@ class Problem:
         Of what the first returned and a seed: the answers.
     everywhere : bool
         Whether it is solved for each constant that it reads, or for those alone that no problem
-        before it reads.
+        before it reads, but the one that the page leaves out.
     """
 
     first: Callable[[], Any]
@@ -364,11 +366,9 @@ def problems() -> dict[str, Problem]:
         "log-likelihood, N = 60": of_one(
             np.exp, np.exp(larger), prb.LogLikelihood(), everywhere=True
         ),
-        "two inputs, PR, N = 30": Problem(
-            partial(minimised, lambda: two_inputs(again())), sampled, True
-        ),
+        LEFT_OUT: Problem(partial(minimised, lambda: two_inputs(again())), sampled, True),
         "two inputs, three outputs, PR, N = 40": Problem(
-            partial(minimised, lambda: three_outputs(again())), sampled, True
+            partial(minimised, lambda: three_outputs(again())), sampled, False
         ),
         "KLD, histogram, N = 60": of_one(np.tanh, np.tanh(larger), bins),
         "Kolmogorov, N = 30": of_one(np.sinh, np.sinh(some), own),
@@ -573,7 +573,8 @@ class Reference:
         found: dict[str, Callable[[], dict[str, Any]]] = {}
         for name, problem in self.problems.items():
             early, late = (one.read_by(names) for names in self.read[name])
-            if not (early or late) or not (problem.everywhere or not found):
+            known = set(found) - {LEFT_OUT}
+            if not (early or late) or (known and not problem.everywhere):
                 continue
             half, answers = self.half[name], self.answers[name]
             if early and late:
