@@ -347,6 +347,13 @@ def placement() -> Iterator[Row]:
         yield [name, *(f"{error:.3f}".lstrip("0") for error in cell.values())]
 
 
+def emulator_speed() -> Iterator[Row]:
+    """Return the rows of what it costs to emulate."""
+    for n, cell in found("emulator_speed").items():
+        seconds = [f"{cell[key]:.2f}" for key in ("choose", "say", "left out")]
+        yield [n, *seconds, f"{cell['MiB']:.0f}"]
+
+
 def few_runs() -> Iterator[Row]:
     """Return the rows of optima from few runs."""
     from benchmarks.few_runs import figures
@@ -436,6 +443,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "scale": scale,
     "between runs": between_runs,
     "placement": placement,
+    "emulators, time": emulator_speed,
     "few runs": few_runs,
     "three masses": three_masses,
     "two fidelities": two_fidelities,

@@ -132,7 +132,8 @@ def test_where_there_is_no_coarse_response_the_surface_goes_on_without_it() -> N
     found = emulated(models, known, AT, coarse=partly(AT)[:, None])
     without = AT[:, 0] > 1
     alone = emulated([models[0].otherwise], known, AT)
-    np.testing.assert_array_equal(found[without], alone[without])
+    # Up to the last digit, in which sums over fewer points at a time differ.
+    np.testing.assert_allclose(found[without], alone[without], rtol=1e-12)
     assert np.std(found[~without, 0] - fine(AT[~without])) < 0.1 * fine(AT).std()
 
 
