@@ -270,6 +270,29 @@ def test_a_discrepancy_follows_the_cloud_that_was_drawn_last() -> None:
     assert -compiled(at) == pytest.approx(after[0, 0], rel=1e-9)
 
 
+def test_on_the_way_surfaces_stay_and_what_they_are_worth_is_judged_anew() -> None:
+    # Smooth where the prior is, and with a corner where the populations are that come next.
+    def corner(a: Any, b: Any) -> Any:
+        return smooth(a, b) + np.abs(b - 0.5)
+
+    evaluator, design = design_of(build(corner))
+    before = design.contents.emulation
+    roots = evaluator.roots(theta_of(evaluator), 0)
+    design.reach(roots, on_the_way=True)
+    after = design.contents.emulation
+    assert before is not None
+    assert after is not None
+    assert after.models is before.models
+    assert after.runs is before.runs
+    assert after.error != before.error
+    # The same as if they were chosen anew, but for the surfaces.
+    design.reach(roots)
+    anew = design.contents.emulation
+    assert anew is not None
+    assert anew.runs is not before.runs
+    np.testing.assert_array_equal(anew.weights, after.weights)
+
+
 def test_left_out_emulators_differ_where_the_emulator_is_wrong() -> None:
     _, design = design_of(build(lambda a, b: np.abs(a - 1) + b))
     spread = [np.abs(values - design.values).max() for values in design.left_out()]
