@@ -12,6 +12,7 @@ Resimulated(65 536) on the same data. Beside it: runs alone, without an emulator
 of designs, in standard errors; of optima that a result names as ones that the data do not tell
 apart, the nearest counts. Worst is that along the worst principal axis of the sampling distribution,
 times the root of two, as between two designs: what is claimed of it is `Optimum.design_error`.
+Standard errors are compared with those of the reference, as root mean square ratios.
 
 Run: uv run python -m benchmarks.few_runs [--seeds 10]
 """
@@ -100,11 +101,13 @@ def fitted(name: str, observed: Any, propagation: Any, reference: Any) -> dict[s
     others = [rival["theta"] for rival in optimum.rivals if rival["comparable"]]
     each = [(theta - reference.theta) / stderr for theta in (optimum.theta, *others)]
     away = min(each, key=lambda off: np.nansum(off**2))
+    widths = np.sqrt(np.diag(optimum.covariance)) / stderr
     return {
         "runs": optimum.n_responses,
         "mirrored": away is not each[0],
         "along": [round(float(x), 4) for x in along @ np.nan_to_num(away * stderr)],
         "off": [round(float(a), 4) for a in away[np.isfinite(away)]],
+        "stderr": [round(float(a), 4) for a in widths[np.isfinite(widths)]],
         "claimed": float(optimum.design_error),
         "seconds": round(time.perf_counter() - clock, 1),
     }
@@ -154,11 +157,14 @@ def figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
         return {}
     runs = sorted(row["runs"] for row in good)
     off, along = (np.array([row[key] for row in good]) for key in ("off", "along"))
+    # Standard errors at another optimum are its own.
+    own = [row["stderr"] for row in good if not row["mirrored"]]
     return {
         "runs": (runs[0], runs[-1]),
         "off": float(np.sqrt((off**2).mean())),
         "worst": float(np.sqrt(2 * (along**2).mean(axis=0).max())),
         "claimed": float(np.sqrt(np.mean([row["claimed"] ** 2 for row in good]))),
+        "widths": float(np.sqrt((np.log(own) ** 2).mean())),
         "seconds": float(np.median([row["seconds"] for row in good])),
         "refused": len(rows) - len(good),
     }
@@ -173,7 +179,8 @@ def summary(rows: list[dict[str, Any]]) -> str:
     refused = f", {found['refused']} refused" if found["refused"] else ""
     return (
         f"{low} - {high} runs, off {found['off']:.3f} (worst {found['worst']:.3f}, "
-        f"claimed {found['claimed']:.3f}), {found['seconds']:.0f} s{refused}"
+        f"claimed {found['claimed']:.3f}), standard errors off by {found['widths']:.1%}, "
+        f"{found['seconds']:.0f} s{refused}"
     )
 
 

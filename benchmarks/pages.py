@@ -362,6 +362,7 @@ def few_runs() -> Iterator[Row]:
         emulated, alone = figures(cell["emulated"]), figures(cell["alone"])
         runs = "{runs[0]} - {runs[1]}".format(**emulated)
         columns = [short(emulated[key], 3) for key in ("off", "worst", "claimed")]
+        columns.append(f"{emulated['widths']:.1%}")
         beside = (
             [f"{alone['runs'][0]} - {alone['runs'][1]}", short(alone["off"], 3)]
             if alone
