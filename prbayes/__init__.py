@@ -48,6 +48,7 @@ from prbayes.propagation.reweighted import Reweighted
 from prbayes.reports.report import Report
 from prbayes.response.calling import scalar
 from prbayes.response.program import command
+from prbayes.response.um_bridge import umbridge
 from prbayes.surrogate.surrogate import Surrogate
 from prbayes.validation.cross_validation import cross_validate
 from prbayes.validation.validity import area_test
@@ -104,5 +105,6 @@ __all__ = [
     "set_epsilon",
     "simulation_based_calibration",
     "surrogate",
+    "umbridge",
     "validation",
 ]

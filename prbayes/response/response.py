@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,14 +52,16 @@ def refuse_coarse(label: str, function: object) -> None:
         )
 
 
-def refuse_misfit(name: str, function: object, inputs: Inputs, outputs: Outputs | None) -> None:
+def refuse_misfit(
+    name: str, function: object, sizes: Callable[[], list[int]], outputs: Outputs | None
+) -> None:
     """Raise if a function of one specimen says that it takes other inputs, or gives other outputs.
 
     Those that know it have a method of this name; nothing is computed yet.
     """
     refuse = getattr(getattr(function, "function", None), "refuse_misfit", None)
     if refuse is not None:
-        refuse(name, _sizes(inputs), outputs)
+        refuse(name, sizes(), outputs)
 
 
 def refuse_calling(executor: object, store: object, version: object, on_failure: object) -> None:
@@ -169,7 +172,7 @@ class Responses:
         outputs: Outputs | None = ONE,
     ) -> None:
         refuse_uncallable(name, function)
-        refuse_misfit(name, function, inputs, outputs)
+        refuse_misfit(name, function, partial(_sizes, inputs), outputs)
         policy = Abort() if on_failure is None else on_failure
         kept = None
         if store is not None:
