@@ -47,6 +47,7 @@ from prbayes.propagation.resimulated import Resimulated
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.reports.report import Report
 from prbayes.response.calling import scalar
+from prbayes.response.mock_up import fmu
 from prbayes.response.program import command
 from prbayes.response.um_bridge import umbridge
 from prbayes.surrogate.surrogate import Surrogate
@@ -83,6 +84,7 @@ __all__ = [
     "cross_validate",
     "datasets",
     "diagnose",
+    "fmu",
     "metrics",
     "minimize",
     "plot_comparison",
