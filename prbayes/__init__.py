@@ -47,7 +47,9 @@ from prbayes.propagation.resimulated import Resimulated
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.reports.report import Report
 from prbayes.response.calling import scalar
+from prbayes.response.mock_up import fmu
 from prbayes.response.program import command
+from prbayes.response.um_bridge import umbridge
 from prbayes.surrogate.surrogate import Surrogate
 from prbayes.validation.cross_validation import cross_validate
 from prbayes.validation.validity import area_test
@@ -82,6 +84,7 @@ __all__ = [
     "cross_validate",
     "datasets",
     "diagnose",
+    "fmu",
     "metrics",
     "minimize",
     "plot_comparison",
@@ -104,5 +107,6 @@ __all__ = [
     "set_epsilon",
     "simulation_based_calibration",
     "surrogate",
+    "umbridge",
     "validation",
 ]

@@ -169,7 +169,8 @@ def test_public_names_are_documented(name: str) -> None:
 
 
 def test_the_top_has_few_names_and_no_function_is_called_like_a_module() -> None:
-    assert len(prbayes.__all__) <= 50
+    names = [name for name in prbayes.__all__ if not inspect.ismodule(getattr(prbayes, name))]
+    assert len(names) <= 50, "namespaces apart"
     stems = {module.split(".")[-1] for module in MODULES}
     functions = {name for name, value in PUBLIC.items() if isinstance(value, FunctionType)}
     assert not stems & {name.split(".")[-1] for name in functions}

@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,18 @@ def refuse_coarse(label: str, function: object) -> None:
             f"{label}: got {called(function)}, expected a function of the same inputs as the "
             "response"
         )
+
+
+def refuse_misfit(
+    name: str, function: object, sizes: Callable[[], list[int]], outputs: Outputs | None
+) -> None:
+    """Raise if a function of one specimen says that it takes other inputs, or gives other outputs.
+
+    Those that know it have a method of this name; nothing is computed yet.
+    """
+    refuse = getattr(getattr(function, "function", None), "refuse_misfit", None)
+    if refuse is not None:
+        refuse(name, sizes(), outputs)
 
 
 def refuse_calling(executor: object, store: object, version: object, on_failure: object) -> None:
@@ -159,6 +172,7 @@ class Responses:
         outputs: Outputs | None = ONE,
     ) -> None:
         refuse_uncallable(name, function)
+        refuse_misfit(name, function, partial(_sizes, inputs), outputs)
         policy = Abort() if on_failure is None else on_failure
         kept = None
         if store is not None:
@@ -315,12 +329,22 @@ def _with_names(version: str | None, outputs: Outputs | None) -> str | None:
 
 def _columns(inputs: Inputs) -> int:
     """Return of how many numbers the inputs of one point are made, constants included."""
-    sizes = [int(np.prod(shape, dtype=int)) for shape in inputs.event_shapes]
-    for variable in inputs.epistemic:
-        shape = variable.shape.eval() if variable.type.ndim else ()
+    # One that stands for several arguments counts once for each.
+    return sum(_sizes(inputs))
+
+
+def _sizes(inputs: Inputs) -> list[int]:
+    """Return of how many numbers each argument of one point is made."""
+    sizes = []
+    for argument in inputs.arguments:
+        if isinstance(argument, int):
+            shape = inputs.event_shapes[argument]
+        elif isinstance(argument, Variable):
+            shape = argument.shape.eval() if argument.type.ndim else ()
+        else:
+            shape = np.shape(argument)
         sizes.append(int(np.prod(shape, dtype=int)))
-    constants = [a for a in inputs.arguments if not isinstance(a, int | Variable)]
-    return sum(sizes) + sum(np.size(a) for a in constants)
+    return sizes
 
 
 def _same(inputs: Inputs, x: Any, others: Inputs, y: Any) -> bool:

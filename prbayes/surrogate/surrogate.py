@@ -28,7 +28,8 @@ from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted, se
 from prbayes.propagation.points import sobol
 from prbayes.response.calling import Calling, Points, Tally, compute, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
-from prbayes.response.response import refuse_calling, refuse_coarse
+from prbayes.response.outputs import ONE
+from prbayes.response.response import refuse_calling, refuse_coarse, refuse_misfit
 from prbayes.response.store import Store
 from prbayes.surrogate.error import CrossValidation, cross_validated, points_needed
 from prbayes.surrogate.files import Kept, read, write
@@ -190,6 +191,7 @@ class Surrogate:
         share(coverage, f"{name}: coverage")
         seed = seed_number(random_seed, f"{name}: random_seed")
         domain, predictive = read_ranges(name, inputs, coverage, seed)
+        refuse_misfit(name, response, lambda: [one.size for one in domain.inputs], ONE)
         needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=needed)
 

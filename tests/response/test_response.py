@@ -130,3 +130,25 @@ def test_two_responses_are_the_same_by_function_inputs_and_constants() -> None:
     epistemic = Responses("y", weighted, inputs(X, MU))
     assert epistemic.same_as(Responses("y", weighted, inputs(X, MU)))
     assert not epistemic.same_as(Responses("y", weighted, inputs(X, 2.0)))
+
+
+def test_an_input_that_is_given_twice_is_stored_and_found_again(tmp_path: Path) -> None:
+    for known in (False, True):
+        responses = Responses("y", scalar(lambda a, b: a + 2 * b), inputs(X, X), store=tmp_path)
+        np.testing.assert_array_equal(responses([XS[0]], []), 3 * XS[0])
+        # One is computed again, to see that the store is of this function.
+        assert responses.computed == (1 if known else 3)
+
+
+def test_a_function_that_knows_its_sizes_is_told_those_of_a_simulator() -> None:
+    told = []
+
+    class Sized:
+        def __call__(self, *x: Any) -> float:
+            return 0.0
+
+        def refuse_misfit(self, *given: Any) -> None:
+            told.append(given)
+
+    Responses("y", scalar(Sized()), inputs(PAIR, [1.0, 2.0, 3.0], X, MU, X), outputs=None)
+    assert told == [("y", [2, 3, 1, 1, 1], None)]

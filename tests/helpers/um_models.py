@@ -1,0 +1,96 @@
+"""A server of UM-Bridge models: `python um_models.py PORT FILE` serves until it is killed."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import umbridge
+
+# Of one that dies: the evaluations before it does, once.
+LIFETIME = 10
+
+
+class Beam(umbridge.Model):
+    """Two numbers in, two out; none of them can be taken for another."""
+
+    def get_input_sizes(self, config: Any) -> list[int]:
+        return [2]
+
+    def get_output_sizes(self, config: Any) -> list[int]:
+        return [2]
+
+    def __call__(self, parameters: Any, config: Any) -> list[list[float]]:
+        ((x, y),) = parameters
+        return [[config.get("scale", 1.0) * (x - 2 * y), x * x * y]]
+
+    def supports_evaluate(self) -> bool:
+        return True
+
+
+class Mortal(Beam):
+    """Ends the server after some evaluations, unless that has happened before."""
+
+    def __init__(self, name: str, flag: Path) -> None:
+        super().__init__(name)
+        self.flag, self.count = flag, 0
+
+    def __call__(self, parameters: Any, config: Any) -> list[list[float]]:
+        self.count += 1
+        if self.count == LIFETIME and not self.flag.exists():
+            self.flag.touch()
+            os._exit(1)
+        return super().__call__(parameters, config)
+
+
+class Vectors(Beam):
+    """A number and three in; one number and two out."""
+
+    def get_input_sizes(self, config: Any) -> list[int]:
+        return [1, 3]
+
+    def get_output_sizes(self, config: Any) -> list[int]:
+        return [1, 2]
+
+    def __call__(self, parameters: Any, config: Any) -> list[list[float]]:
+        (a,), (x, y, z) = parameters
+        return [[a], [x - y, 10 * z]]
+
+
+class Moody(Beam):
+    """Gives one number, none, or an error."""
+
+    def get_input_sizes(self, config: Any) -> list[int]:
+        return [1]
+
+    get_output_sizes = get_input_sizes
+
+    def __call__(self, parameters: Any, config: Any) -> list[list[float]]:
+        ((x,),) = parameters
+        if x == 5:
+            raise ArithmeticError("no equilibrium")
+        if x < 0:
+            time.sleep(-x)
+        return [[{6: float("nan"), 7: float("inf"), 8: -float("inf")}.get(x, 2 * x)]]
+
+
+class Mute(Beam):
+    """Cannot be evaluated."""
+
+    def supports_evaluate(self) -> bool:
+        return False
+
+
+if __name__ == "__main__":
+    port, flag = int(sys.argv[1]), Path(sys.argv[2])
+    models = [
+        Beam("beam"),
+        Mortal("mortal", flag),
+        Vectors("vectors"),
+        Moody("moody"),
+        Mute("mute"),
+    ]
+    umbridge.serve_models(models, port, max_workers=4)
