@@ -323,6 +323,29 @@ TABLE: dict[str, Row] = {
         },
         {"arguments": [sys.executable, "{x}"], "inputs": ["x"], "read": float},
     ),
+    "umbridge": Row(
+        prb.umbridge,
+        {
+            "url": (3, "", "localhost:4242", None, "ftp://localhost", "http://"),
+            "model": (3, "", None, ["forward"]),
+            "config": (3, "level", {"level": np.arange(2)}, [1]),
+            "timeout": but_none(POSITIVE),
+            "patience": POSITIVE,
+        },
+        {"url": "http://127.0.0.1:9"},
+    ),
+    "fmu": Row(
+        prb.fmu,
+        {
+            "path": (3, "", None, b"unit.fmu"),
+            "inputs": ("x", [], None, ["x", "x"], [3]),
+            "outputs": ("y", [], None, ["y", "y"], {"a": 3}),
+            "parameters": (3, "m", {3: 1.0}, ["m"]),
+            "timeout": but_none(POSITIVE),
+            "reset": FLAG,
+        },
+        {"path": __file__, "inputs": ["x"], "outputs": ["y"]},
+    ),
     "ProbabilityResidual": Row(
         prb.ProbabilityResidual,
         {"density": (None, 0.3, prb.GaussianKDE, "kde"), "scale_base": POSITIVE},

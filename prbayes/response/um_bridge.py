@@ -134,8 +134,8 @@ def umbridge(
         positive_number(patience, "umbridge: patience"),
     )
     server.refuse_malformed()
-    server.refuse_strange(plain_text(model, "umbridge: model"))
-    asked = {"name": model, "config": _config(config)}
+    asked = {"name": plain_text(model, "umbridge: model"), "config": _config(config)}
+    server.refuse_strange(model)
     sizes = []
     for path, key in (("/InputSizes", "inputSizes"), ("/OutputSizes", "outputSizes")):
         sizes.append(_sizes(server.asked(path, asked).get(key), model, key))
