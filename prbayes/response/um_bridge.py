@@ -441,6 +441,10 @@ class _Connection:
             pieces.append(piece)
             if until is not None and not answer.isclosed():
                 sock.settimeout(max(until - time.monotonic(), 1e-3))
+        if answer.length:
+            raise http.client.IncompleteRead(b"".join(pieces), answer.length)
+        # Python 3.12 leaves it open, and the connection of no use.
+        answer.close()
         return answer.status, b"".join(pieces).decode("utf-8", "replace")
 
 

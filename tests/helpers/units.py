@@ -30,8 +30,9 @@ def changed(
     target: Path,
     *swaps: tuple[str, str],
     keep: Callable[[str], bool] = lambda name: True,
+    **files: bytes,
 ) -> Path:
-    """Return a copy of a unit with other words in its description, and some of its files."""
+    """Return a copy of a unit with other words in its description, some of its files, and others in the place of those with an ending."""
     with zipfile.ZipFile(unit) as old, zipfile.ZipFile(target, "w") as new:
         for name in filter(keep, old.namelist()):
             content = old.read(name)
@@ -41,5 +42,5 @@ def changed(
                     assert was in text
                     text = text.replace(was, is_now)
                 content = text.encode()
-            new.writestr(name, content)
+            new.writestr(name, files.get(Path(name).suffix[1:], content))
     return target

@@ -186,9 +186,7 @@ def test_files_that_are_no_units_for_this_machine_are_refused(unit: Path, tmp_pa
     old = units.changed(unit, tmp_path / "old.fmu", ('fmiVersion="2.0"', 'fmiVersion="1.0"'))
     with pytest.raises(ValueError, match=r"of FMI 1.0, expected FMI 2 or 3 for co-simulation"):
         work(old)
-    models = units.changed(
-        unit, tmp_path / "models.fmu", ("CoSimulation needs", "ModelExchange needs")
-    )
+    models = units.changed(unit, tmp_path / "models.fmu", ("CoSimulation", "ModelExchange"))
     with pytest.raises(ValueError, match=r"of FMI 2.0 without co-simulation, expected FMI 2 or 3"):
         work(models)
     # A name without a library, and an archive of which a part was overwritten.
@@ -198,6 +196,10 @@ def test_files_that_are_no_units_for_this_machine_are_refused(unit: Path, tmp_pa
     )
     with pytest.raises(RuntimeError, match=r"Oscillator: got a library that cannot be loaded from"):
         work(hollow)
+    with pytest.raises(
+        RuntimeError, match=r"cannot be loaded from .*text.fmu \(.*, expected one for"
+    ):
+        work(units.changed(unit, text, so=b"no library"))
     content = bytearray(unit.read_bytes())
     content[len(content) // 2 : len(content) // 2 + 1000] = bytes(1000)
     broken.write_bytes(content)

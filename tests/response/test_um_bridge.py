@@ -414,6 +414,22 @@ def test_a_specimen_that_ends_its_server_is_sent_three_times() -> None:
         assert response(5.0, 1.0)[1] == 25
 
 
+def test_an_answer_that_is_cut_off_is_asked_for_again() -> None:
+    def evaluate(handler: Told, x: float, y: float) -> None:
+        if handler.server.asked[1:]:
+            give(handler, x, y)
+        else:
+            handler.send_response(200)
+            handler.send_header("Content-Length", "100")
+            handler.end_headers()
+            handler.wfile.write(b'{"output": [[1')
+            handler.close_connection = True
+
+    with telling(evaluate) as server:
+        assert prb.umbridge(server.url)(7.0, 1.0)[1] == 49
+    assert len(server.asked) == 2
+
+
 def test_a_gateway_whose_server_is_away_is_asked_again(caplog: pytest.LogCaptureFixture) -> None:
     def evaluate(handler: Told, x: float, y: float) -> None:
         if handler.server.asked[3:]:
