@@ -132,6 +132,7 @@ def test_two_responses_are_the_same_by_function_inputs_and_constants() -> None:
     assert not epistemic.same_as(Responses("y", weighted, inputs(X, 2.0)))
 
 
+@pytest.mark.exact
 def test_an_input_that_is_given_twice_is_stored_and_found_again(tmp_path: Path) -> None:
     for known in (False, True):
         responses = Responses("y", scalar(lambda a, b: a + 2 * b), inputs(X, X), store=tmp_path)
