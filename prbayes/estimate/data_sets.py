@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
+from prbayes._checks import AT_ONCE, Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node
 from prbayes.response.distributions import PopulationSampler
@@ -139,6 +139,51 @@ def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int =
         populations.append(population)
     points = simulated_points(evaluator, populations, n_sets, seed)
     return sets_at(evaluator, populations, points)
+
+
+def sets_along(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) -> DataSets:
+    """Draw one data set from the populations at each theta, (n, d), where responses are stored.
+
+    As `simulated_sets` does; the same points carry all of them.
+
+    Raises
+    ------
+    ValueError
+        As `simulated_sets`.
+    """
+    nodes = evaluator.nodes
+    n_specimens = specimens(nodes)[1]
+    size = (len(thetas), n_specimens)
+    populations = []
+    points: dict[int, NDArray[np.intp]] = {}
+    for k in range(len(nodes)):
+        responses, _ = evaluator.populations(thetas[:1], k)
+        populations.append((responses, np.empty(0)))
+    for group in groups(nodes):
+        _refuse_unlike([nodes[k] for k in group])
+        finite = np.all([observable(populations[k][0][0]) for k in group], axis=0)
+        uniform = rng.random(size)
+        drawn = _drawn_along(evaluator, group[0], thetas, finite, uniform)
+        points |= dict.fromkeys(group, drawn)
+    return sets_at(evaluator, populations, [points[k] for k in range(len(nodes))])
+
+
+def _drawn_along(
+    evaluator: Evaluator, k: int, thetas: Floats, finite: NDArray[np.bool_], uniform: Floats
+) -> NDArray[np.intp]:
+    """Return the points of the specimens of each theta, (n, specimens), by inverted sums."""
+    at_once = max(1, AT_ONCE // finite.size)
+    drawn = np.empty(uniform.shape, dtype=np.intp)
+    for first in range(0, len(thetas), at_once):
+        rows = slice(first, first + at_once)
+        _, weights = evaluator.populations(thetas[rows], k)
+        below = np.cumsum(weights * finite, axis=1)
+        for i, sums in enumerate(below, start=first):
+            height = uniform[i] * sums[-1]
+            # On the right of equal sums, so that no point without weight is drawn.
+            drawn[i] = np.searchsorted(sums, height, side="right")
+    # A product may be rounded up to the whole.
+    return np.minimum(drawn, finite.size - 1)
 
 
 def simulated_points(

@@ -154,11 +154,13 @@ class SamplingDistribution:
         shifted = self.theta + shifts * self.local.prior_sd
         return np.asarray(shifted + remainder)
 
-    def refit(self, sets: DataSets) -> tuple[Floats, NDArray[np.bool_]]:
+    def refit(
+        self, sets: DataSets, start: Floats | None = None
+    ) -> tuple[Floats, NDArray[np.bool_]]:
         """Return the minimiser of each data set, (n_sets, r) in coordinates, and which converged.
 
-        With designs the minimisation is exact, and else of first order; no response is computed
-        with designs.
+        With designs the minimisation is exact, from ``start`` on, (n_sets, r), which is the optimum
+        by default; and else of first order. No response is computed with designs.
         """
         if not self._stored:
             shifts = first_order_shifts(self.information, self.scales, self.axes, sets)
@@ -173,7 +175,8 @@ class SamplingDistribution:
                 weights = [w[i : i + at_once] for w in sets.weights]
                 some = DataSets(sets.values, weights)
                 objective = BatchObjective.of(self.evaluator, self.scales, some)
-                x, converged = self._minimise(objective)
+                begin = None if start is None else start[i : i + at_once]
+                x, converged = self._minimise(objective, start=begin)
                 minimisers.append(x)
                 arrived.append(converged)
                 report(len(converged), "")
@@ -328,14 +331,16 @@ class SamplingDistribution:
         curvature: Floats | None = None,
         *,
         tolerance: float = _TOLERANCE,
+        start: Floats | None = None,
     ) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return the minimisers of data sets from the optimum on, along the axes."""
+        """Return the minimisers of data sets, by default from the optimum on, along the axes."""
 
         def value(x: Floats, rows: Any) -> Floats:
             return objective(self.thetas(x), rows)
 
         r = self.stderr.size
-        start = np.zeros((objective.n_sets, r))
+        if start is None:
+            start = np.zeros((objective.n_sets, r))
         if r == 0:  # the data tell nothing: there is no direction to go
             return start, np.ones(len(start), dtype=bool)
         if measured_by_refits(self.evaluator):

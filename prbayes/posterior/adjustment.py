@@ -51,7 +51,7 @@ _APART = 0.75
 # Standard error, in units of the prior's spread, up to which refits follow a direction. Twice
 # changes nothing; with half, directions about which data and prior tell as much are left to draws
 # of exp(-d / epsilon), whose spread differs by a third there (docs/constants.md).
-_WEAKEST = 2.0
+WEAKEST = 2.0
 
 
 def refuse_adjustment(adjust: object) -> None:
@@ -297,13 +297,22 @@ class Affine:
             prior_probability=least_probability(allowed),
             warnings=(
                 *of_conflict(allowed),
-                *_of_motion(moves, evaluator.readable_names),
-                *_of_noise(center_error, width_error, self.n_sets),
+                *self._distrust(moves, mapped, evaluator.readable_names),
+                *_of_noise(center_error, width_error, self._refits),
                 *of_another_family(mapped[0].fit_probability),
             ),
         )
 
-    def _said(self, mapped: list[_Mapped], modes: int, draws: int, design_variance: float) -> str:
+    @property
+    def _refits(self) -> str:
+        """What the number of refits is set by."""
+        return f"Affine(n_sets={self.n_sets})"
+
+    def _distrust(self, moves: Floats, mapped: list[Mapped], names: list[str]) -> list[str]:
+        """Say where the map is not to be relied on, given how far each median moved, (d,)."""
+        return _of_motion(moves, names)
+
+    def _said(self, mapped: list[Mapped], modes: int, draws: int, design_variance: float) -> str:
         """Return what was done, in words."""
         done = f"{self!r}"
         if modes > 1:
@@ -318,9 +327,13 @@ class Affine:
 
     def _mapped(
         self, sampling: SamplingDistribution, draws: Floats, design_variance: float
-    ) -> _Mapped:
+    ) -> Mapped:
         """Return the draws of one mode where they should be."""
-        sampling = _among(sampling, draws)
+        return self._by_refits(among(sampling, draws), draws, design_variance)
+
+    def _by_refits(
+        self, sampling: SamplingDistribution, draws: Floats, design_variance: float
+    ) -> Mapped:
         x, remainder = sampling.coordinates(draws)
         told = replace(self._told(sampling), design_variance=design_variance)
         center, covariance = told.combined(told.shifts)
@@ -328,11 +341,11 @@ class Affine:
         outside = drawn_in(x, _FAR) != x
         errors = told.errors(self.random_seed)
         far = int(outside.any(axis=1).sum())
-        return _Mapped(out, far, *errors, told.fit_probability, told.allowed)
+        return Mapped(out, far, *errors, told.fit_probability, told.allowed)
 
 
 @dataclass(frozen=True, eq=False)
-class _Mapped:
+class Mapped:
     """The draws of one mode where they should be."""
 
     draws: Floats  # (n, d)
@@ -341,6 +354,8 @@ class _Mapped:
     width_error: float
     fit_probability: float
     allowed: dict[str, float]  # as in `_Told`
+    # How far out the estimate is for a typical draw, in standard deviations; NaN where unknown.
+    strain: float = np.nan
 
 
 _UNADJUSTED = "the draws are not adjusted: {}; their width is epsilon's"
@@ -369,14 +384,15 @@ def _of_motion(moves: Floats, names: list[str]) -> list[str]:
     ]
 
 
-def _of_noise(center_error: float, width_error: float, n_sets: int) -> list[str]:
+def _of_noise(center_error: float, width_error: float, refits: str) -> list[str]:
     """Say so where too few refits tell."""
     if center_error <= _UNSURE_CENTER and width_error <= _UNSURE_WIDTH:
         return []
     return [
-        f"the adjustment rests on {n_sets} refits, from which its centre has a Monte Carlo error "
-        f"of {center_error:.2f} standard deviations and its width one of {width_error:.0%}; pass "
-        "adjust=prb.posterior.Affine(n_sets=...) with more"
+        f"the adjustment has a Monte Carlo error of {center_error:.2f} standard deviations of the "
+        f"centre and of {width_error:.0%} of the width, from the number of its refits, expected at "
+        f"most {_UNSURE_CENTER} and {_UNSURE_WIDTH:.0%}; it was prb.posterior.{refits}: pass "
+        "adjust= with more"
     ]
 
 
@@ -385,7 +401,7 @@ def _identified_modes(evaluator: Evaluator, optima: Sequence[Floats]) -> list[Sa
     scales = evaluator.epsilon
     found = []
     for theta in optima:
-        sampling = _at_minimiser(SamplingDistribution.of(evaluator, theta, scales, _WEAKEST))
+        sampling = _at_minimiser(SamplingDistribution.of(evaluator, theta, scales, WEAKEST))
         if sampling.stderr.size:
             found.append(sampling)
     return found
@@ -403,7 +419,7 @@ def _at_minimiser(sampling: SamplingDistribution) -> SamplingDistribution:
         if not np.abs(center).max() > _ELSEWHERE:
             break
         place = sampling.thetas(center)
-        sampling = SamplingDistribution.of(sampling.evaluator, place, sampling.scales, _WEAKEST)
+        sampling = SamplingDistribution.of(sampling.evaluator, place, sampling.scales, WEAKEST)
     return sampling
 
 
@@ -465,7 +481,7 @@ def transported(
     return sampling.thetas(to, remainder + follows)
 
 
-def _among(sampling: SamplingDistribution, thetas: Floats) -> SamplingDistribution:
+def among(sampling: SamplingDistribution, thetas: Floats) -> SamplingDistribution:
     """Return the distribution at the median of draws, (n, d), along directions not identified.
 
     The optimum is anywhere along them, where the prior may hardly be; refits hold them at one
@@ -482,7 +498,7 @@ def _among(sampling: SamplingDistribution, thetas: Floats) -> SamplingDistributi
         sampling.evaluator,
         place,
         sampling.scales,
-        _WEAKEST,
+        WEAKEST,
     )
     # Where more or fewer directions are identified there, the coordinates would not be the same.
     same = found.stderr.size == sampling.stderr.size

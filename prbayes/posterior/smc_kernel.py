@@ -118,13 +118,13 @@ class BatchedKernel(SMC_KERNEL):
     def mutate(self) -> None:
         """Move all particles by Metropolis-Hastings steps that keep the tempered posterior."""
         before = self.tempered_posterior.copy()
-        fitted = _Normal.of(before)
+        fitted = Normal.of(before)
         enough = _UNCORRELATED if self.beta == 1 else _UNCORRELATED * _ON_THE_WAY
         # The scale that is best for normal targets, steered to an acceptance rate between those for
         # many dimensions and for one: Roberts, Gelman and Gilks (1997),
         # doi:10.1214/aoap/1034625254.
         scale = 2.38 / np.sqrt(before.shape[1])
-        correlation = 1.0
+        remembered = 1.0
         accepted = []
         # A bound on the cost where particles do not forget.
         for step in range(1, 25 + 1):
@@ -138,26 +138,18 @@ class BatchedKernel(SMC_KERNEL):
             scale *= np.exp(rate - 0.3)
 
             # Terminate when the particles have forgotten, or stop forgetting
-            last = correlation
-            correlation = _correlation(before, self.tempered_posterior)
-            if correlation < enough or correlation > last - 0.01:
+            last = remembered
+            remembered = correlation(before, self.tempered_posterior)
+            if remembered < enough or remembered > last - 0.01:
                 break
         self.accept_rate = float(np.mean(accepted))
         self.n_steps = step
 
-    def _jump(self, fitted: _Normal, noise: Floats) -> float:
+    def _jump(self, fitted: Normal, noise: Floats) -> float:
         """Propose independent draws of the fitted normal; return the rate of acceptance."""
-        proposed = fitted.mean + noise @ fitted.root.T
-        from_mean = self.tempered_posterior - fitted.mean
-        here = np.linalg.solve(fitted.root, from_mean.T)
-        # Log density of the normal, up to a constant, at the present place less that at the
-        # proposed one.
-        squared_there = (noise**2).sum(axis=1)
-        squared_here = (here**2).sum(axis=0)
-        log_ratio = 0.5 * (squared_there - squared_here)
-        return self._accept(proposed, log_ratio)
+        return self._accept(*fitted.independent(self.tempered_posterior, noise))
 
-    def _walk(self, fitted: _Normal, noise: Floats) -> float:
+    def _walk(self, fitted: Normal, noise: Floats) -> float:
         """Propose a step from each particle; return the rate of acceptance."""
         proposed = self.tempered_posterior + noise @ fitted.root.T
         return self._accept(proposed, np.zeros(len(proposed)))
@@ -225,7 +217,7 @@ class BatchedKernel(SMC_KERNEL):
 
 
 @dataclass(frozen=True, eq=False)
-class _Normal:
+class Normal:
     """A normal distribution fitted to particles.
 
     Mean, shape (d,), and Cholesky factor, shape (d, d).
@@ -235,14 +227,27 @@ class _Normal:
     root: Floats
 
     @classmethod
-    def of(cls, particles: Floats) -> _Normal:
+    def of(cls, particles: Floats) -> Normal:
+        """Return the one with the particles' mean and covariance."""
         covariance = np.atleast_2d(np.cov(particles, rowvar=False))
         # Makes the covariance of identical particles a proper one.
         jitter = 1e-12 * np.diag(np.diag(covariance) + 1e-300)
         return cls(particles.mean(axis=0), np.linalg.cholesky(covariance + jitter))
 
+    def independent(self, particles: Floats, noise: Floats) -> tuple[Floats, Floats]:
+        """Return draws of it, (n, d), and the log ratio of densities that a proposal counts.
 
-def _correlation(before: Floats, after: Floats) -> float:
+        That is its log-density at the present places less that at the proposed ones, shape (n,).
+        """
+        proposed = self.mean + noise @ self.root.T
+        from_mean = particles - self.mean
+        here = np.linalg.solve(self.root, from_mean.T)
+        squared_there = (noise**2).sum(axis=1)
+        squared_here = (here**2).sum(axis=0)
+        return proposed, 0.5 * (squared_there - squared_here)
+
+
+def correlation(before: Floats, after: Floats) -> float:
     """Return the mean absolute correlation of the particles' coordinates with those before."""
     a = before - before.mean(axis=0)
     b = after - after.mean(axis=0)

@@ -16,6 +16,7 @@ from prbayes.estimate.data_sets import (
     fresh_data,
     groups,
     reweighted_sets,
+    sets_along,
     siblings,
     simulated_sets,
     specimens,
@@ -369,3 +370,36 @@ def test_designs_of_the_same_points() -> None:
         assert not a.same_points(b)
     assert a.same_points(b)
     assert not a.same_points(Evaluator(build(propagation=prb.Resimulated(256))).nodes[0].bound)
+
+
+# -- a data set at each theta
+# ---------------------------------------------------------------------------------------------
+
+
+def test_each_theta_has_a_data_set_from_its_own_population() -> None:
+    evaluator = Evaluator(build(observed=np.arange(20.0) / 10, sd=None))
+    low, high = np.array([0.5, np.log(0.3)]), np.array([1.4, np.log(0.6)])
+    thetas = np.repeat([low, high], 300, axis=0)
+    sets = sets_along(evaluator, thetas, np.random.default_rng(1))
+    (values,), (weights,) = sets.values, sets.weights
+    np.testing.assert_allclose(weights.sum(axis=1), 1)
+    # Twenty specimens, each a point of the design.
+    np.testing.assert_allclose(weights * 20, np.round(weights * 20), atol=1e-9)
+    means = weights @ values
+    spreads = np.sqrt(weights @ values**2 - means**2)
+    for rows, (mu, log_sigma) in ((slice(300), low), (slice(300, 600), high)):
+        sigma = np.exp(log_sigma)
+        assert abs(means[rows].mean() - mu) < 4 * sigma / np.sqrt(20 * 300)
+        assert 0.85 < means[rows].std() / (sigma / np.sqrt(20)) < 1.15
+        assert 0.93 < spreads[rows].mean() / sigma < 1.0
+
+
+def test_specimens_are_shared_at_each_theta() -> None:
+    labels = [f"s{i}" for i in range(N)]
+    evaluator = pair(labels, labels)
+    thetas = np.linspace(0, 2, 12)[:, None]
+    sets = sets_along(evaluator, thetas, np.random.default_rng(2))
+    # The second response is twice the first, of the same specimen; the third is another input's.
+    means = [w @ v for w, v in zip(sets.weights, sets.values, strict=True)]
+    np.testing.assert_allclose(means[1], 2 * means[0])
+    assert not np.allclose(means[2], means[0])

@@ -105,6 +105,30 @@ def test_refits_are_minimisers(name: str) -> None:
         np.testing.assert_allclose(found, best.x, atol=0.15 if name == "area" else 0.04)
 
 
+def test_where_refits_begin_makes_no_difference() -> None:
+    sampling = neighbourhood("pr")
+    sets = simulated_sets(sampling.evaluator, sampling.theta, 20)
+    x, converged = sampling.refit(sets)
+    start = np.random.default_rng(1).normal(size=x.shape)
+    again, _ = sampling.refit(sets, start)
+    assert converged.all()
+    np.testing.assert_allclose(again, x, atol=0.05)
+
+
+def test_clouds_come_closer_at_the_rate_of_their_dimension(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
+        z = pm.Normal.dist(0, 1)
+        prb.Simulator("y", lambda a, b: a + b, x, z, metric=METRICS["kl"], observed=[0.0, 1.0, 3.0])
+    evaluator = Evaluator(model)
+    evaluator(np.zeros((1, 1)))
+    sampling = SamplingDistribution.of(evaluator, np.zeros(1), np.ones(1))
+    monkeypatch.setattr(SamplingDistribution, "_of_clouds", True)
+    monkeypatch.setattr(SamplingDistribution, "_spread_of_parts", lambda *_: np.array([8.0]))
+    # Eight parts, two inputs: 1/2 + 1/4 as the power of the size.
+    np.testing.assert_allclose(sampling._error_of_points(), 8 / 8**0.75)
+
+
 def test_the_observed_responses_are_fitted_by_the_optimum() -> None:
     for name in ("kl", "pr"):
         (x,), (converged,) = neighbourhood(name).refit(observed_set(neighbourhood(name).evaluator))

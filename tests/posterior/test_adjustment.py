@@ -708,7 +708,9 @@ def test_results_have_the_error_from_the_number_of_refits() -> None:
         assert 0.02 < many.posterior.attrs[name] < 0.15
         # The root of ten; of twenty refits it is known to a sixth.
         assert 1.5 < few.posterior.attrs[name] / many.posterior.attrs[name] < 6
-    assert "The adjustment rests on 20 refits" in str(prb.diagnose(few))
+    said = str(prb.diagnose(few))
+    assert "The adjustment has a Monte Carlo error" in said
+    assert "prb.posterior.Affine(n_sets=20)" in said
     assert prb.diagnose(many).ok
 
 

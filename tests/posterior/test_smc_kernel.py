@@ -15,7 +15,7 @@ from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluator
-from prbayes.posterior.smc_kernel import BatchedKernel, _correlation, _Normal
+from prbayes.posterior.smc_kernel import BatchedKernel, Normal, correlation
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 
@@ -87,7 +87,7 @@ def test_proposals_leave_a_standard_normal_as_it_is(proposal: str) -> None:
     n = 20_000
     kernel = at_standard_normal(n, Quadratic())
     # A fit that is off, as one to few particles is: the acceptance has to make up for it.
-    fitted = _Normal(np.array([0.4, -0.3]), np.array([[1.4, 0.0], [0.5, 0.8]]))
+    fitted = Normal(np.array([0.4, -0.3]), np.array([[1.4, 0.0], [0.5, 0.8]]))
     propose = getattr(kernel, proposal)
     before = kernel.tempered_posterior.copy()
     rates = [propose(fitted, kernel.rng.standard_normal((n, 2))) for _ in range(8)]
@@ -121,20 +121,20 @@ def test_places_without_a_discrepancy_are_never_accepted() -> None:
 
 def test_the_fitted_normal_has_the_moments_of_the_particles() -> None:
     particles = np.random.default_rng(2).normal([1.0, -2.0], [0.5, 3.0], (200, 2))
-    fitted = _Normal.of(particles)
+    fitted = Normal.of(particles)
     np.testing.assert_allclose(fitted.mean, particles.mean(axis=0))
     np.testing.assert_allclose(fitted.root @ fitted.root.T, np.cov(particles.T), rtol=1e-9)
-    identical = _Normal.of(np.ones((10, 2)))
+    identical = Normal.of(np.ones((10, 2)))
     assert np.isfinite(identical.root).all()
 
 
 def test_correlation_of_particles_with_those_before() -> None:
     before = np.random.default_rng(2).normal(size=(2000, 2))
     other = np.random.default_rng(3).normal(size=(2000, 2))
-    np.testing.assert_allclose(_correlation(before, before), 1.0)
-    np.testing.assert_allclose(_correlation(before, 3.0 - 2.0 * before), 1.0)
-    assert _correlation(before, other) < 5 * 2000**-0.5
-    assert _correlation(before, np.ones_like(before)) == 0.0
+    np.testing.assert_allclose(correlation(before, before), 1.0)
+    np.testing.assert_allclose(correlation(before, 3.0 - 2.0 * before), 1.0)
+    assert correlation(before, other) < 5 * 2000**-0.5
+    assert correlation(before, np.ones_like(before)) == 0.0
 
 
 # -- Stages

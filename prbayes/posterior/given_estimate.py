@@ -1,0 +1,385 @@
+"""The posterior given the metric's own estimate: ABC whose summary is the estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from prbayes._checks import Floats, positive_integer
+from prbayes.estimate.data_sets import observed_set, sets_along
+from prbayes.estimate.refit import ARRIVED, SamplingDistribution
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.support import TOLERABLE, supports_each
+from prbayes.posterior.adjustment import WEAKEST, Affine, Mapped, UnsettledError, among
+from prbayes.posterior.sampling_model import SamplingModel, Sight
+from prbayes.posterior.smc_kernel import Normal, correlation
+
+# How much wider than the draws so far the hyperparameters are spread that data sets are drawn at:
+# the model of the estimates has to hold in the tails of the posterior as well.
+_SPREAD_OUT = 1.5
+# Standard deviations of the draws within which refits count for most.
+_NEARBY = 2.0
+# The same of the refits' hyperparameters, beyond which the model is not believed at all.
+_BEYOND = 5.0
+# Standard deviations of the draws that their middle may have moved since data sets were drawn.
+_MOVED = 1.0
+# Standard deviations of the draws around the estimate within which estimates count as numbers, and
+# the share of draws beyond which an estimate is none.
+_IN_SIGHT = 4.0
+_OUTERMOST = 0.01
+# Times more that data sets are drawn, where the draws have moved.
+_FOLLOWED = 4
+# Standard deviations that an estimate may be from where it is expected, for a typical draw: as far
+# as the outermost of so many refits.
+_STRAINED = 3.5
+# Resamples of the refits that tell the Monte Carlo error, and draws that they are told on.
+_RESAMPLED = 30
+_TOLD_ON = 500
+# Steps of the draws, and their mean absolute correlation with where they began, at which they end.
+_WALK = 200
+_FORGOTTEN = 0.05
+
+
+@dataclass(frozen=True)
+class GivenEstimate(Affine):
+    r"""Draws from the posterior of theta given the estimate of the metric.
+
+    The draws of the pseudo-posterior, mapped as `Affine` does, say where to look. Hyperparameters
+    are drawn there, more widely; a data set is drawn at each, on stored responses, and fitted. What
+    these estimates tell is how the estimate is distributed as a function of the hyperparameters:
+    its bias, spread and skewness, each changing with them. The density of the estimate that was
+    found is a likelihood, to which the prior is added exactly, and draws are made from both.
+
+    Where responses are not stored, the draws are those of `Affine`.
+
+    Parameters
+    ----------
+    n_sets : int
+        Number of data sets drawn and fitted at the optimum, which `Affine` needs.
+    random_seed : int
+    n_fits : int
+        Number of data sets drawn and fitted along the posterior.
+
+    References
+    ----------
+    .. [1] Drovandi, C. C., A. N. Pettitt and M. J. Faddy (2011), Approximate Bayesian computation
+       using indirect inference, J. R. Stat. Soc. C 60, 317-337,
+       doi:10.1111/j.1467-9876.2010.00747.x.
+
+    Examples
+    --------
+    >>> GivenEstimate()
+    GivenEstimate(n_sets=200, random_seed=0, n_fits=1000)
+    """
+
+    n_fits: int = 1000
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive_integer(self.n_fits, "GivenEstimate: n_fits", minimum=200)
+
+    @property
+    def _refits(self) -> str:
+        return f"GivenEstimate(n_fits={self.n_fits})"
+
+    def _distrust(self, moves: Floats, mapped: list[Mapped], names: list[str]) -> list[str]:
+        """Say where the estimate lies where its distribution is extrapolated."""
+        strain = max(found.strain for found in mapped)
+        if not strain > _STRAINED:
+            return []
+        return [
+            f"for a typical draw the estimate of the data is {strain:.1f} standard deviations from "
+            f"where it is expected, of which {_STRAINED} can be told from {self.n_fits} refits: "
+            "prior and data probably contradict each other, and the draws rest on an "
+            "extrapolation; look at the prior"
+        ]
+
+    def _mapped(
+        self, sampling: SamplingDistribution, draws: Floats, design_variance: float
+    ) -> Mapped:
+        """Return the draws of one mode where they should be."""
+        sampling = among(sampling, draws)
+        first = self._by_refits(sampling, draws, design_variance)
+        if not all(node.bound.stored for node in sampling.evaluator.nodes):
+            return first
+        rng = np.random.default_rng([self.random_seed, 7])
+        look = _Look.at(sampling, draws, design_variance)
+        out, model, refits = self._followed(look, first.draws, rng)
+        center_error, width_error = look.errors(refits, model, out, rng)
+        strain = look.strain(model, out)
+        return replace(
+            first,
+            draws=out,
+            center_error=center_error,
+            width_error=width_error,
+            strain=strain,
+        )
+
+    def _followed(
+        self, look: _Look, draws: Floats, rng: np.random.Generator
+    ) -> tuple[Floats, SamplingModel, _Refits]:
+        """Draw data sets where the draws are, until these stay there."""
+        refits = look.refits(draws, self.n_fits // 2, rng)
+        moved = np.inf
+        for _ in range(1 + _FOLLOWED):
+            before = draws
+            model = look.model(refits, draws)
+            draws = look.drawn(model, refits, draws, rng)
+            moved = _motion(look.points(before), look.points(draws))
+            refits = refits.and_more(look.refits(draws, self.n_fits // 2, rng))
+            if moved < _MOVED:
+                break
+        model = look.model(refits, draws)
+        return look.drawn(model, refits, draws, rng), model, refits
+
+
+@dataclass(frozen=True, eq=False)
+class _Refits:
+    """Estimates of data sets, and the hyperparameters that these were drawn at."""
+
+    thetas: Floats  # (n, d)
+    estimates: Floats  # (n, r)
+
+    def and_more(self, other: _Refits) -> _Refits:
+        """Return these and others."""
+        thetas = np.concatenate([self.thetas, other.thetas])
+        return _Refits(thetas, np.concatenate([self.estimates, other.estimates]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What is looked at: the estimate of the data, along what they identify."""
+
+    sampling: SamplingDistribution
+    estimate: Floats  # (r,): in coordinates
+    variance: float  # of the estimate, by the design's error
+
+    @classmethod
+    def at(cls, sampling: SamplingDistribution, draws: Floats, variance: float) -> _Look:
+        """Return it for a mode; along the hyperparameters where all are identified."""
+        if sampling.local.unidentified.size:
+            # An optimum at an edge, as where a standard deviation is about zero, sees less than
+            # the middle of the draws does.
+            middle = np.median(draws, axis=0)
+            within = SamplingDistribution.of(sampling.evaluator, middle, sampling.scales, WEAKEST)
+            if within.stderr.size > sampling.stderr.size:
+                sampling = within
+        sampling = _along_elements(sampling)
+        (estimate,), _ = sampling.refit(observed_set(sampling.evaluator))
+        return cls(sampling, estimate, variance)
+
+    @property
+    def evaluator(self) -> Evaluator:
+        """That of the model."""
+        return self.sampling.evaluator
+
+    def points(self, thetas: Floats) -> Floats:
+        """Return coordinates of thetas, (n, d): what is identified first."""
+        local = self.sampling.local
+        x, _ = self.sampling.coordinates(thetas)
+        shifts = (thetas - self.sampling.theta) / local.prior_sd
+        return np.column_stack([x, shifts @ local.unidentified])
+
+    def thetas(self, points: Floats) -> Floats:
+        """Return the thetas of coordinates, (n, d)."""
+        local = self.sampling.local
+        r = self.sampling.stderr.size
+        remainder = points[:, r:] @ local.unidentified.T * local.prior_sd
+        return self.sampling.thetas(points[:, :r], remainder)
+
+    def kinds(self, thetas: Floats) -> list[Floats]:
+        """Return coordinates of several kinds, (n, d) each: also the users' own values.
+
+        Where a standard deviation comes near zero nothing changes any more with its logarithm.
+        """
+        kinds = [self.points(thetas)]
+        own = self.evaluator.constrained(thetas)
+        columns = [np.reshape(values, (len(thetas), -1)) for values in own.values()]
+        values = np.column_stack(columns)
+        if values.shape == thetas.shape and not np.allclose(values, thetas):
+            kinds.append(values)
+        return kinds
+
+    def sight(self, draws: Floats) -> Sight:
+        """Return where an estimate counts as a number, around that of the data or the draws."""
+        r = self.estimate.size
+        points = self.points(draws)[:, :r]
+        low, high = np.quantile(points, [_OUTERMOST, 1 - _OUTERMOST], axis=0)
+        # An estimate that ran away is beyond what the posterior is about.
+        width = points.std(axis=0)
+        middle = np.clip(self.estimate, low - width, high + width)
+        return Sight(middle - _IN_SIGHT * width, middle + _IN_SIGHT * width)
+
+    def refits(self, draws: Floats, number: int, rng: np.random.Generator) -> _Refits:
+        """Draw data sets around draws, and fit them.
+
+        Raises
+        ------
+        UnsettledError
+            If designs support too few of them, or too few refits converge.
+        """
+        near = self.points(draws)
+        middle = np.median(near, axis=0)
+        chosen = near[rng.integers(len(near), size=number)]
+        points = middle + _SPREAD_OUT * (chosen - middle)
+        thetas = self.thetas(points)
+        supported = self._supported(thetas)
+        if supported.mean() < 0.5:
+            raise UnsettledError(
+                f"designs support {supported.mean():.0%} of the populations around the posterior, "
+                "expected at least half, so that data sets cannot be drawn there"
+            )
+        thetas = thetas[supported]
+        sets = sets_along(self.evaluator, thetas, rng)
+        start = points[supported, : self.estimate.size]
+        estimates, converged = self.sampling.refit(sets, start)
+        if converged.mean() < ARRIVED:
+            raise UnsettledError(
+                f"{int(converged.sum())} of {converged.size} refits converged, expected at least "
+                f"{ARRIVED:.0%}, so that they do not tell how the estimate is distributed"
+            )
+        return _Refits(thetas[converged], estimates[converged])
+
+    def _supported(self, thetas: Floats) -> Any:
+        """Return at which thetas designs support the populations, shape (n,)."""
+        supported = np.isfinite(self.evaluator.hyperparameters.log_prior(thetas))
+        for name, support in self.evaluator.support(thetas).items():
+            design = self.evaluator.designs[name]
+            most = design.config.max_lost
+            supported &= supports_each(support, design.required_ess, most, TOLERABLE)
+        return supported
+
+    def weights(self, refits: _Refits, near: Floats) -> Floats:
+        """Return how much each refit counts for a model around draws, (m, d)."""
+        squared = _distances(self.points(refits.thetas), self.points(near))
+        return np.asarray(np.exp(-0.5 * squared / _NEARBY**2))
+
+    def model(self, refits: _Refits, draws: Floats) -> SamplingModel:
+        """Return the model of the estimate around draws."""
+        kinds = self.kinds(refits.thetas)
+        weights = self.weights(refits, draws)
+        return SamplingModel.fit(kinds, refits.estimates, weights, self.sight(draws))
+
+    def drawn(
+        self, model: SamplingModel, refits: _Refits, draws: Floats, rng: np.random.Generator
+    ) -> Floats:
+        """Return as many draws of the posterior, (n, d)."""
+        clouds = self.kinds(refits.thetas)
+
+        def log_density(thetas: Floats) -> Floats:
+            total = np.full(len(thetas), -np.inf)
+            kinds = self.kinds(thetas)
+            near = np.isfinite(thetas).all(axis=1)
+            for points, cloud in zip(kinds, clouds, strict=True):
+                near &= _distances(points, cloud) <= _BEYOND**2
+            some = [points[near] for points in kinds]
+            likelihood = model.log_likelihood(some, self.estimate, self.variance)
+            log_prior = self.evaluator.hyperparameters.log_prior(thetas[near])
+            total[near] = log_prior + likelihood
+            return np.where(np.isnan(total), -np.inf, total)
+
+        return _walked(log_density, draws, rng)
+
+    def strain(self, model: SamplingModel, draws: Floats) -> float:
+        """Return how far out the estimate is for a typical draw, in standard deviations."""
+        return float(np.median(model.strain(self.kinds(draws), self.estimate)))
+
+    def errors(
+        self, refits: _Refits, model: SamplingModel, draws: Floats, rng: np.random.Generator
+    ) -> tuple[float, float]:
+        """Return the Monte Carlo errors of centre and width, as `Adjusted` has them."""
+        some = draws[rng.permutation(len(draws))[:_TOLD_ON]]
+        points = self.points(some)
+        kinds = self.kinds(some)
+        weights = self.weights(refits, some)
+        before = model.log_likelihood(kinds, self.estimate, self.variance)
+        sd = points.std(axis=0)
+        fitted = self.kinds(refits.thetas)
+        n = len(weights)
+        centers = []
+        widths = []
+        for _ in range(_RESAMPLED):
+            chosen = rng.integers(n, size=n)
+            other = SamplingModel.fit(
+                [kind[chosen] for kind in fitted],
+                refits.estimates[chosen],
+                weights[chosen],
+                model.sight,
+                like=model,
+            )
+            after = other.log_likelihood(kinds, self.estimate, self.variance)
+            ratio = np.exp(after - before - (after - before).max())
+            ratio /= ratio.sum()
+            center = ratio @ points
+            variance = ratio @ (points - center) ** 2
+            centers.append(center / sd)
+            widths.append(np.sqrt(variance) / sd)
+        of_center = np.std(centers, axis=0).max()
+        of_width = np.std(widths, axis=0).max()
+        return float(of_center), float(of_width)
+
+
+def _along_elements(sampling: SamplingDistribution) -> SamplingDistribution:
+    """Return the distribution along the hyperparameters themselves, where all are identified.
+
+    The estimate of a scale is skewed, that of a location is not: axes between them would be both.
+    """
+    local = sampling.local
+    if local.unidentified.size:
+        return sampling
+    covariance = local.identified @ local.covariance @ local.identified.T
+    stderr = np.sqrt(np.diag(covariance))
+    return replace(sampling, axes=np.eye(stderr.size), stderr=stderr)
+
+
+def _distances(points: Floats, cloud: Floats) -> Floats:
+    """Return the mean squared distance of points, (n, d), from the middle of a cloud, (m, d).
+
+    In standard deviations of the cloud, (n,): the mean over its principal axes.
+    """
+    d = points.shape[1]
+    covariance = np.cov(cloud, rowvar=False).reshape(d, d)
+    values, vectors = np.linalg.eigh(covariance)
+    along = (points - np.median(cloud, axis=0)) @ vectors
+    squared = along**2 / np.maximum(values, 1e-12 * values[-1])
+    return np.asarray(squared.mean(axis=1))
+
+
+def _motion(before: Floats, after: Floats) -> float:
+    """Return how far the middle of draws moved, in standard deviations of those before."""
+    shift = np.median(after, axis=0) - np.median(before, axis=0)
+    return float(np.abs(shift / before.std(axis=0)).max())
+
+
+def _walked(
+    log_density: Callable[[Floats], Floats], start: Floats, rng: np.random.Generator
+) -> Floats:
+    """Return draws of a density, each of which walked from a start of its own, (n, d).
+
+    Independent proposals from a normal fitted to all, in turn with random walks, by the rule of
+    Metropolis and Hastings.
+    """
+    here = start.copy()
+    density = log_density(here)
+    scale = 2.38 / np.sqrt(here.shape[1])
+    for step in range(_WALK):
+        fitted = Normal.of(here)
+        noise = rng.standard_normal(here.shape)
+        if step % 2:
+            there, log_ratio = fitted.independent(here, noise)
+        else:
+            there, log_ratio = here + scale * noise @ fitted.root.T, np.zeros(len(here))
+        other = log_density(there)
+        with np.errstate(invalid="ignore"):
+            gain = other - density + log_ratio
+        accepted = np.log(rng.random(len(here))) < np.nan_to_num(gain, nan=-np.inf)
+        here[accepted] = there[accepted]
+        density[accepted] = other[accepted]
+        if step % 2 == 0:
+            scale *= np.exp(accepted.mean() - 0.3)
+        elif correlation(start, here) < _FORGOTTEN and step > 20:
+            break
+    return here
