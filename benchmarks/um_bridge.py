@@ -49,7 +49,7 @@ def serve(port: int, workers: int) -> None:
     """Serve a model that sleeps, and one that tells for how long it has."""
     import umbridge
 
-    class Sleeping(umbridge.Model):  # type: ignore[name-defined, misc]
+    class Sleeping(umbridge.Model):
         count, busy, turn = 0, 0.0, threading.Lock()
 
         def get_input_sizes(self, config: Any) -> list[int]:

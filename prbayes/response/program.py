@@ -14,7 +14,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-
 from typing import Any
 
 import numpy as np
