@@ -173,9 +173,8 @@ class Reweighted(Propagation):
     def demand(self) -> Demand:
         """No run for a value of the hyperparameters; more where a design does not support it."""
         decides = (
-            f"up to {self.most} in all, around the calibrated populations, where prb.minimize or "
-            "prb.refine finds that the runs do not support these, or that another design would "
-            "give another answer"
+            f"up to {self.most} in all, where the calibrated populations are not supported, or "
+            "another design would answer differently"
         )
         return Demand(0, self.most, decides)
 

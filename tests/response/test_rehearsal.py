@@ -10,6 +10,7 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
+from prbayes.response.calling import Tally, respond
 from prbayes.response.inputs import read_inputs
 from prbayes.response.rehearsal import Rehearsal
 from prbayes.response.response import Responses
@@ -84,3 +85,12 @@ def test_a_specimen_that_fails_is_an_error_whatever_the_policy(made: Any, tmp_pa
             rehearsal.tried(asked(rehearsal, [2.0]))
         # NaN is a result, which is stored.
         assert rehearsal.stored(asked(rehearsal, [2.0, 3.0])).tolist() == [True, False]
+
+
+def test_a_stored_failure_is_known_only_where_it_stays_one(made: Any, tmp_path: Path) -> None:
+    replacing = made(on_failure=prb.response.Replace(), store=tmp_path)
+    respond(replacing._calling, asked(replacing, [1.0, 3.0]), Tally())
+    assert replacing.stored(asked(replacing, [1.0, 3.0, 4.0])).tolist() == [True, True, False]
+    for other in ({}, {"on_failure": prb.response.Replace(), "retry_failed": True}):
+        again = made(store=tmp_path, **other)
+        assert again.stored(asked(again, [1.0, 3.0, 4.0])).tolist() == [True, False, False]
