@@ -131,7 +131,7 @@ def main():
     with ThreadPoolExecutor(2) as threads, tempfile.TemporaryDirectory() as temporary:
         measured = pd.DataFrame(list(threads.map(plate.function, moduli, thicknesses)))
         store = arguments.store or temporary
-        model, optimum, posterior = calibrate(plate, measured.astype(float), threads, store)
+        model, optimum, posterior = calibrate(plate, measured, threads, store)
     print(optimum.message)
     print(f"{optimum.n_computed} runs of the calibration, {MEASURED} for the measured plates")
     print(f"{'':10} {'truth':>8} {'these plates':>13} {'optimum':>17} {'posterior':>17}")

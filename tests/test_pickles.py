@@ -84,6 +84,7 @@ MAKE: dict[str, Callable[[], Any]] = {
     "reports.Section": lambda: prb.reports.Section("A title"),
     "response.Abort": prb.response.Abort,
     "response.BudgetError": lambda: prb.response.BudgetError("max_seconds = 1 was reached"),
+    "response.Cost": lambda: prb.cost(optimum().model, dry_run=True),
     "response.Replace": lambda: prb.response.Replace(1.0),
     "response.ResponseError": lambda: prb.response.ResponseError("y: it raised"),
     "response.Retry": lambda: prb.response.Retry(2),

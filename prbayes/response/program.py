@@ -147,7 +147,7 @@ class Program:
                         f"as {{{name}:.6e}}"
                     ) from None
 
-    def __call__(self, *values: float) -> float | Floats | dict[str, Floats]:
+    def __call__(self, *values: float) -> float | Floats | dict[str, float | Floats]:
         """Run the program for one specimen, and read the response.
 
         Raises
@@ -216,13 +216,13 @@ class Program:
                 f"{self.__name__}: ended with code {code}, expected 0{self._last_words(here)}"
             )
 
-    def _read(self, here: Path) -> float | Floats | dict[str, Floats]:
+    def _read(self, here: Path) -> float | Floats | dict[str, float | Floats]:
         """Return what the program computed, as numbers."""
         try:
             found = self.read(here)
             if isinstance(found, Mapping):
                 return {name: _numbers(value) for name, value in found.items()}
-            array = _numbers(found)
+            return _numbers(found)
         except TimeoutError:  # a worker's time limit
             raise
         except Exception as error:
@@ -232,7 +232,6 @@ class Program:
                 f"{error!s:.300}), expected numbers in the files that it wrote; there are "
                 f"{', '.join(files[:_NAMED])}{self._last_words(here)}"
             ) from error
-        return array if array.ndim else float(array)
 
     def _last_words(self, here: Path) -> str:
         """Return the end of what the program wrote, and where all of it is, to add to an error."""
@@ -335,12 +334,12 @@ def _formatted(value: float, layout: str | None) -> str:
     return repr(float(value)) if layout is None else format(float(value), layout[1:])
 
 
-def _numbers(found: object) -> Floats:
-    """Return what was read as numbers; a text may be one."""
+def _numbers(found: object) -> float | Floats:
+    """Return what was read as a number, or an array of them; a text may be one."""
     array = np.asarray(found)
     if array.dtype.kind in "Oc":
         raise TypeError(f"got {called(found)}")
-    return array.astype(np.float64)
+    return array.astype(np.float64) if array.ndim else float(array)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

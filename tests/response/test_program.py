@@ -101,10 +101,9 @@ def test_a_run_has_several_outputs_as_an_array_or_by_name() -> None:
     as_array = prb.command([*PYTHON, code], read=both, **settings)
     np.testing.assert_array_equal(as_array(x), np.stack([x, 3 * x], axis=-1))
     found = prb.command([*PYTHON, code], read=named, **settings).function(2.0)
-    assert {name: value.tolist() for name, value in found.items()} == {
-        "twice": [6.0, 2.0],
-        "one": 2.0,
-    }
+    assert found.pop("twice").tolist() == [6.0, 2.0]
+    assert found == {"one": 2.0}
+    assert type(found["one"]) is float
 
 
 @pytest.mark.parametrize(
