@@ -328,6 +328,19 @@ def scale() -> Iterator[Row]:
         yield [what.replace("_", " "), f"{seconds:.{digits}f} s", f"{row['MiB']:.0f} MiB"]
 
 
+def busy_workers() -> Iterator[Row]:
+    """Return the rows of workers of a server that are busy."""
+    for row in found("um_bridge"):
+        yield [
+            str(row["workers"]),
+            row["how"],
+            str(row["runs"]),
+            f"{row['wall']:.2f}",
+            f"{row['utilisation']:.1%}",
+            f"{row['lowest']:.1%}",
+        ]
+
+
 def between_runs() -> Iterator[Row]:
     """Return the rows of emulated populations beside those of runs alone."""
     from benchmarks.responses import RESPONSES
@@ -442,6 +455,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "joint, time": joint_time,
     "joint, memory": joint_memory,
     "scale": scale,
+    "busy workers": busy_workers,
     "between runs": between_runs,
     "placement": placement,
     "emulators, time": emulator_speed,

@@ -1,6 +1,7 @@
 """Configuration of the pages: `uv run --group docs sphinx-build -W docs docs/_build/html`."""
 
 from inspect import isclass, ismodule
+from shutil import which
 
 from docutils import nodes
 from sphinx.addnodes import pending_xref
@@ -52,6 +53,8 @@ nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 nb_execution_timeout = 600
 nb_merge_streams = True
+# A page that runs a program which is not here is shown as it is written.
+nb_execution_excludepatterns = [] if which("ccx") else ["finite_elements.md"]
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4
 

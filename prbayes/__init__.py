@@ -26,6 +26,7 @@ from prbayes.metrics.function import FunctionMetric
 from prbayes.metrics.joint import Joint
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual
+from prbayes.model.costing import cost
 from prbayes.model.epsilon import set_epsilon
 from prbayes.model.simulator import Simulator
 from prbayes.model.stock import abc_distance
@@ -81,6 +82,7 @@ __all__ = [
     "calibrate_epsilon",
     "command",
     "compare",
+    "cost",
     "cross_validate",
     "datasets",
     "diagnose",

@@ -458,6 +458,14 @@ TABLE: dict[str, Row] = {
         },
         {"thetas": [[1.0]]},
     ),
+    "cost": Row(
+        prb.cost,
+        {
+            "model": (3, "model", Name("bare"), print, Name("optimum")),
+            "dry_run": FLAG,
+        },
+        {"model": Name("model")},
+    ),
     "set_epsilon": Row(
         prb.set_epsilon,
         {

@@ -2,6 +2,8 @@
 
 import os
 import re
+import runpy
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -42,3 +44,30 @@ def test_gallery(tmp_path: Path) -> None:
     command = [sys.executable, "-W", "error::UserWarning", str(script)]
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     assert done.stdout.split()[-1] == str(page.count("prb.plot_"))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("ccx") is None, reason="no CalculiX: apt-get install calculix-ccx")
+def test_calculix_finds_the_plates_with_few_runs(tmp_path: Path) -> None:
+    command = [sys.executable, str(EXAMPLES / "calculix.py"), "--out", str(tmp_path)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert (tmp_path / "calculix.png").stat().st_size > 20_000
+    runs = re.search(r"^(\d+) runs of the calibration, (\d+) for the meas", done.stdout, re.M)
+    assert runs is not None
+    assert sum(map(int, runs.groups())) <= 150
+    rows = re.findall(
+        r"^(?:mean|sd)_\w+ +([\d.]+) +[\d.]+ +([\d.]+) \+- ([\d.]+) ", done.stdout, re.M
+    )
+    assert len(rows) == 4
+    for truth, estimate, error in rows:
+        assert abs(float(estimate) - float(truth)) < 2.5 * float(error)
+
+
+def test_calculix_is_left_out_with_a_message_where_it_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(sys, "argv", ["calculix.py"])
+    runpy.run_path(str(EXAMPLES / "calculix.py"), run_name="__main__")
+    assert capsys.readouterr().out.startswith("ccx is not on the path: install CalculiX")

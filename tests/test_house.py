@@ -46,6 +46,7 @@ WITHOUT_EXAMPLE = {
     "BatchedKernel",
     "BudgetError",
     "Bound",
+    "Cost",
     "CrossValidation",
     "DensityDiscrepancy",
     "DensityEstimator",

@@ -24,6 +24,8 @@ from prbayes._checks import (
 )
 from prbayes._progress import shown
 from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.model.costing import Asked, listening
+from prbayes.model.description import without_addresses
 from prbayes.model.node import (
     Node,
     SimulatorDistribution,
@@ -150,8 +152,24 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         positive_number(epsilon, f"{name}: epsilon")
     refuse_uncallable(name, response)
     sorted_inputs = read_inputs(name, inputs, model)
+    responses = _responses(name, response, sorted_inputs, propagation, outputs)
+    asked = listening()
+    if asked is not None:
+        others_asked = [(one.propagation, one.responses) for one in asked]
+        shared = _share(responses, propagation, others_asked)
+        asked.append(Asked(responses, propagation, target, shared))
+        return pt.as_tensor(target.observed, name=name)
+    _share(responses, propagation, [(other.propagation, other.bound.responses) for other in before])
+    demand = propagation.demand
+    _log.info(
+        "%s: %s; runs for each value of the hyperparameters: %d; more: %s",
+        name,
+        without_addresses(propagation),
+        demand.each,
+        demand.decides,
+    )
     with shown(progressbar):
-        bound = _bound(name, response, sorted_inputs, target, propagation, before, outputs)
+        bound = propagation.bind(name, sorted_inputs, target, responses)
         bound.aim(target.beside(bound.first_responses, bound.dimensions))
         target = bound.target
     if epsilon is None:
@@ -188,20 +206,15 @@ def _propagation(name: str, propagation: Propagation | None) -> Propagation:
     return propagation
 
 
-def _bound(
+def _responses(
     name: str,
     response: Callable[..., Any],
     inputs: Inputs,
-    target: Discrepancy,
     propagation: Propagation,
-    others: list[Node],
     outputs: Outputs,
-) -> Bound:
-    """Return the propagation at work, with the responses that it needs at first.
-
-    What another simulator has computed of the same response and inputs is not computed again.
-    """
-    responses = Responses(
+) -> Responses:
+    """Return the response as the propagation's settings say."""
+    return Responses(
         name,
         response,
         inputs,
@@ -213,11 +226,17 @@ def _bound(
         timeout=propagation.timeout,
         outputs=outputs,
     )
-    for other in others:
-        if other.propagation == propagation and responses.same_as(other.bound.responses):
-            responses.share(other.bound.responses)
-            break
-    return propagation.bind(name, inputs, target, responses)
+
+
+def _share(
+    responses: Responses, propagation: Propagation, others: list[tuple[Propagation, Responses]]
+) -> str:
+    """Take the runs of another simulator with the same response and inputs; return its name."""
+    for settings, other in others:
+        if settings == propagation and responses.same_as(other):
+            responses.share(other)
+            return other.name
+    return ""
 
 
 def _target(name: str, metric: Metric, observed: Floats, weights: ArrayLike | None) -> Discrepancy:

@@ -24,6 +24,7 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._checks import Floats, flag, positive_number
 from prbayes.metrics.base import Discrepancy
 from prbayes.response.compilation import compile_batched
+from prbayes.response.costs import Demand
 from prbayes.response.distributions import (
     PopulationSampler,
     prior_draws,
@@ -39,6 +40,11 @@ from prbayes.response.response import Responses, refuse_calling
 # Parts of a population's points whose differences tell its error: few enough that each is a design
 # of its own, and their spread is then known to about a quarter, 1 / sqrt(2 (8 - 1)).
 N_BLOCKS = 8
+
+# What decides how many runs there are where each value of the hyperparameters takes some.
+BY_EVALUATIONS = (
+    "each value that the optimiser or sampler asks for; max_runs= and max_seconds= end it"
+)
 
 # Share of a population's weight, at an answer, that may fall on points without response. By
 # judgement: as much as one may choose to overlook; whoever knows better passes another.
@@ -317,6 +323,11 @@ class Propagation(ABC):
         refuse_calling(self.executor, self.store, self.version, self.on_failure)
         flag(self.retry_failed, "retry_failed")
         refuse_timeout(self.timeout, self.executor)
+
+    @property
+    def demand(self) -> Demand:
+        """What is asked for after the first runs, as far as it is known."""
+        return Demand(0, None, f"as {type(self).__name__} asks for them")
 
     @abstractmethod
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:

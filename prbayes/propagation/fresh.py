@@ -12,9 +12,17 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
-from prbayes.propagation.base import MAX_LOST, Bound, Propagation, probe, refuse_max_lost
+from prbayes.propagation.base import (
+    BY_EVALUATIONS,
+    MAX_LOST,
+    Bound,
+    Propagation,
+    probe,
+    refuse_max_lost,
+)
 from prbayes.propagation.ops import OwnOp
 from prbayes.response.batches import batch_shape, broadcast_batch
+from prbayes.response.costs import Demand
 from prbayes.response.distributions import PopulationSampler
 from prbayes.response.inputs import Inputs
 from prbayes.response.response import Responses
@@ -54,6 +62,11 @@ class Fresh(Propagation):
         positive_integer(self.n, "Fresh: n", minimum=1)
         positive_integer(self.random_seed, "Fresh: random_seed", minimum=0)
         refuse_max_lost(self.max_lost, "Fresh")
+
+    @property
+    def demand(self) -> Demand:
+        """The same number for each value of the hyperparameters."""
+        return Demand(self.n, None, BY_EVALUATIONS)
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Prepare the generator of draws."""

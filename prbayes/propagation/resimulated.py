@@ -17,6 +17,7 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._checks import AT_ONCE, Floats, positive_integer
 from prbayes.metrics.base import Discrepancy
 from prbayes.propagation.base import (
+    BY_EVALUATIONS,
     MAX_LOST,
     Bound,
     Propagation,
@@ -27,6 +28,7 @@ from prbayes.propagation.base import (
 from prbayes.propagation.ops import ResponseOp, symbolic_discrepancy
 from prbayes.propagation.points import base_points, points_from
 from prbayes.response.compilation import PLAIN, compile_batched, ninf_for_invalid
+from prbayes.response.costs import Demand
 from prbayes.response.distributions import PopulationSampler, quantiles, valid
 from prbayes.response.inputs import Inputs
 from prbayes.response.response import Responses
@@ -70,6 +72,11 @@ class Resimulated(Propagation):
         points_from(self.points)
         refuse_max_lost(self.max_lost, "Resimulated")
         positive_integer(self.random_seed, "Resimulated: random_seed", minimum=0)
+
+    @property
+    def demand(self) -> Demand:
+        """The same number for each value of the hyperparameters."""
+        return Demand(self.n, None, BY_EVALUATIONS)
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Lay out the base points and find out whether the response accepts PyTensor variables."""

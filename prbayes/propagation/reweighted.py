@@ -53,6 +53,7 @@ from prbayes.propagation.edges import (
 from prbayes.propagation.ops import CompactOp, OpaqueOp
 from prbayes.propagation.points import base_points
 from prbayes.response.compilation import compile_batched
+from prbayes.response.costs import Demand
 from prbayes.response.distributions import (
     PopulationSampler,
     log_density,
@@ -167,6 +168,20 @@ class Reweighted(Propagation):
             raise ValueError(
                 f"Reweighted: max_points: got {self.max_points}, expected n = {self.n} or more"
             )
+
+    @property
+    def demand(self) -> Demand:
+        """No run for a value of the hyperparameters; more where a design does not support it."""
+        decides = (
+            f"up to {self.most} in all, where the calibrated populations are not supported, or "
+            "another design would answer differently"
+        )
+        return Demand(0, self.most, decides)
+
+    @property
+    def most(self) -> int:
+        """The largest number of responses, refinement included."""
+        return self.max_points or 32 * self.n
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Compute the responses at the first design points."""
@@ -439,7 +454,7 @@ class Design(Bound):
     @property
     def max_points(self) -> int:
         """The largest number of points that refinement may reach."""
-        return self.config.max_points or 32 * self.config.n
+        return self.config.most
 
     @property
     def known_responses(self) -> Floats:

@@ -1,12 +1,14 @@
 """The user's response: its inputs, how it is called, when it fails, where it is kept."""
 
 from prbayes.response.budget import BudgetError
+from prbayes.response.costs import Cost
 from prbayes.response.failures import Abort, Replace, ResponseError, Retry
 from prbayes.response.store import Store, StoreError
 
 __all__ = [
     "Abort",
     "BudgetError",
+    "Cost",
     "Replace",
     "ResponseError",
     "Retry",

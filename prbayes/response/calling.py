@@ -141,6 +141,10 @@ class Chunk:
     seconds: float  # how long it took
 
 
+# A chunk that is done, with the rows of its points.
+type Done = tuple[Rows, Chunk]
+
+
 @dataclass(frozen=True)
 class Calling:
     """How a response is called."""
@@ -215,14 +219,13 @@ def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
         last = attempt == policy.tries - 1
         tolerant = policy.final.goes_on or not last
         raised = {}
-        for rows, chunk in chunks(calling, points, missing, tolerant, tally):
-            values = _filled_in(values, rows, chunk.values)
-            raised.update({int(rows[i]): text for i, text in chunk.raised.items()})
+        for done in chunks(calling, points, missing, tolerant, tally):
+            for rows, chunk in done:
+                values = _filled_in(values, rows, chunk.values)
+                raised.update({int(rows[i]): text for i, text in chunk.raised.items()})
             if calling.store is not None:
                 # NaN is a result, too, after the last try, but not where a chunk broke off.
-                whole = tolerant or not chunk.raised
-                keep = ~lacking(chunk.values) | (last and whole)
-                _keep(calling.store, keys[rows], chunk, keep)
+                _keep(calling.store, keys, done, last=last, tolerant=tolerant)
         if raised and not tolerant:
             tally.note(points, raised)
             raise _failed(calling, raised)
@@ -274,7 +277,7 @@ def _again(calling: Calling, point: Points, tally: Tally) -> tuple[Floats, str]:
     """Return the response at one point, and what came of it in words."""
     chunk = Chunk(np.array([np.nan]), {}, 0.0)
     for _ in range(calling.on_failure.tries):
-        for _, chunk in chunks(calling, point, np.arange(1), True, tally):
+        for ((_, chunk),) in chunks(calling, point, np.arange(1), True, tally):
             if not chunk.raised:
                 found = chunk.values.ravel()
                 return found, _numbers_told(found)
@@ -308,15 +311,23 @@ def _stored(calling: Calling, keys: Floats) -> tuple[Floats, Rows, dict[int, str
     return values, np.flatnonzero(~known), failed
 
 
-def _keep(store: Store, keys: Floats, chunk: Chunk, keep: NDArray[np.bool_]) -> None:
-    """Store the responses of a chunk that are to be kept, with what was raised in place of some."""
-    kept = np.flatnonzero(keep)
-    if kept.size:
-        reasons = {}
-        for i, row in enumerate(kept):
-            if int(row) in chunk.raised:
-                reasons[i] = chunk.raised[int(row)]
-        store.add(keys[kept], chunk.values[kept], reasons)
+def _keep(store: Store, keys: Floats, done: Sequence[Done], *, last: bool, tolerant: bool) -> None:
+    """Store the responses of chunks that are to be kept, with what was raised in place of some.
+
+    In one transaction, since each waits for the disk.
+    """
+    parts = []
+    for rows, chunk in done:
+        whole = tolerant or not chunk.raised
+        kept = np.flatnonzero(~lacking(chunk.values) | (last and whole))
+        if kept.size:
+            reasons = {}
+            for i, row in enumerate(kept):
+                if int(row) in chunk.raised:
+                    reasons[i] = chunk.raised[int(row)]
+            parts.append((keys[rows[kept]], chunk.values[kept], reasons))
+    if parts:
+        store.add_all(parts)
 
 
 def _settled(
@@ -375,8 +386,10 @@ def chunk_size(calling: Calling, tally: Tally, left: int, workers: int) -> int:
 
 def chunks(
     calling: Calling, points: Points, rows: Rows, tolerant: bool, tally: Tally
-) -> Iterator[tuple[Rows, Chunk]]:
+) -> Iterator[list[Done]]:
     """Compute the responses at some rows of the points, and yield chunks of them as they are done.
+
+    Those that are done at the same time come together.
 
     After a failure that is not tolerated, and where a budget is spent, nothing more is begun, and
     what was begun is waited for and yielded.
@@ -402,7 +415,7 @@ def chunks(
                 for some, chunk in _alone(pool, work, points, suspects, loss):
                     tally.take(some.size, chunk.seconds)
                     report(some.size, "")
-                    yield some, chunk
+                    yield [(some, chunk)]
                 suspects = []
             # Send out as many chunks as the executor takes.
             while left.size and not suspects and len(begun) < room.chunks:
@@ -416,6 +429,7 @@ def chunks(
                 some, left = left[:size], left[size:]
                 begun[pool.submitted(work, points.at(some), tolerant)] = some
             # Take what is done.
+            done = []
             for future in pool.done(begun):
                 some = begun.pop(future)
                 failure = failure_of(future)
@@ -435,7 +449,9 @@ def chunks(
                     left = left[:0]
                 tally.take(some.size, chunk.seconds)
                 report(some.size, f"{room.workers / max(tally.seconds, 1e-9):.3g}/s")
-                yield some, chunk
+                done.append((some, chunk))
+            if done:
+                yield done
     if error is not None:
         # One that is broken is of no use to what runs next, either.
         pool.renew(error)
@@ -448,7 +464,7 @@ def _alone(
     points: Points,
     suspects: list[Rows],
     loss: BaseException | None,
-) -> Iterator[tuple[Rows, Chunk]]:
+) -> Iterator[Done]:
     """Compute chunks one at a time, halved where the worker is lost, and yield them.
 
     A point that is alone with its worker when that is lost has failed.

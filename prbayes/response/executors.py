@@ -71,7 +71,8 @@ def refuse_timeout(timeout: object, executor: Executor | None) -> None:
         raise ValueError(
             f"timeout: got {timeout} with executor {called(executor)}, expected an executor of "
             "processes, such as concurrent.futures.ProcessPoolExecutor(4), or of Dask with workers "
-            "in other processes: nothing else ends a response that hangs"
+            "in other processes: nothing else ends a response that hangs; prb.command, "
+            "prb.umbridge and prb.fmu have a timeout= of their own, which is kept anywhere"
         )
 
 

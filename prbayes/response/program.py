@@ -14,12 +14,17 @@ from contextlib import suppress
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
-from prbayes._checks import called, flag, folder_path, positive_number
+import numpy as np
+
+from prbayes._checks import Floats, called, flag, folder_path, positive_number
 from prbayes.response.calling import scalar
 
 # Characters of what a program wrote that an error repeats: its last lines say what went wrong.
 _REPEATED = 1000
+# Files of a run that an error names: what fits a line.
+_NAMED = 12
 # Seconds for a program without a time limit: 46 days, the longest that Windows waits for.
 _LONGEST = 4e6
 
@@ -28,7 +33,7 @@ def command(
     arguments: Sequence[str | PathLike[str]],
     *,
     inputs: Sequence[str],
-    read: Callable[[Path], float],
+    read: Callable[[Path], Any],
     write: Mapping[str, str | PathLike[str]] | None = None,
     timeout: float | None = None,
     folder: str | PathLike[str] | None = None,
@@ -37,7 +42,7 @@ def command(
     """Turn a program into a response: it is run once for each specimen, in a folder of its own.
 
     There is no shell: arguments reach the program as they are. What it prints is in the files
-    ``stdout.txt`` and ``stderr.txt`` of the folder.
+    ``stdout.txt`` and ``stderr.txt`` of the folder. The response is of one output or several.
 
     Parameters
     ----------
@@ -47,8 +52,9 @@ def command(
         Names of the simulator's inputs, in their order. ``{name}`` or ``{name:.6e}`` in an argument
         or a template stands for the value; other braces are left alone.
     read : callable
-        ``read(folder) -> float`` takes the response, in the unit of the observed values, from the
-        files in the folder.
+        ``read(folder)`` takes the response, in the unit of the observed values, from the files in
+        the folder: a number, or for several outputs an array, shape (m,), or a mapping of numbers
+        or arrays by the names that they have in what was observed.
     write : mapping of str to str or path, optional
         Files to write before each run: the name of the file in the folder, and the text of its
         template, or the path of a template.
@@ -70,9 +76,9 @@ def command(
     Notes
     -----
     A run fails if the program ends with another code than zero, takes longer than ``timeout``, or
-    if ``read`` raises. The error tells what the program wrote last; a propagation's ``on_failure``
-    says what becomes of the point. Programs run outside Python, so that threads serve as an
-    executor.
+    if ``read`` raises, or gives no numbers. The error tells what the program wrote last; a
+    propagation's ``on_failure`` says what becomes of the point. Programs run outside Python, so
+    that threads serve as an executor.
 
     Examples
     --------
@@ -87,7 +93,10 @@ def command(
     array([4., 2.])
     """
     if not callable(read):
-        raise TypeError(f"command: read: got {called(read)}, expected read(folder) -> float")
+        raise TypeError(
+            f"command: read: got {called(read)}, expected a function of the run's folder that "
+            "returns numbers"
+        )
     found = Program(
         arguments=_arguments(arguments),
         inputs=_names(inputs),
@@ -108,7 +117,7 @@ class Program:
     arguments: tuple[str, ...]
     inputs: tuple[str, ...]
     templates: dict[str, str]  # of files, by name
-    read: Callable[[Path], float]
+    read: Callable[[Path], Any]
     timeout: float | None
     folder: Path | None
     keep: bool
@@ -138,13 +147,13 @@ class Program:
                         f"as {{{name}:.6e}}"
                     ) from None
 
-    def __call__(self, *values: float) -> float:
+    def __call__(self, *values: float) -> float | Floats | dict[str, float | Floats]:
         """Run the program for one specimen, and read the response.
 
         Raises
         ------
         RuntimeError
-            If the program ends with another code than zero.
+            If the program ends with another code than zero, or its results cannot be read.
         TimeoutError
             If it takes too long; it is ended then, with all that it started.
         ValueError
@@ -166,7 +175,7 @@ class Program:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_text(_filled(template, known), encoding="utf-8")
             self._run([_filled(text, known) for text in self.arguments], here)
-            found = float(self.read(here))
+            found = self._read(here)
             failed = False
         finally:
             kept = self.keep or (failed and self.folder is not None)
@@ -206,6 +215,23 @@ class Program:
             raise RuntimeError(
                 f"{self.__name__}: ended with code {code}, expected 0{self._last_words(here)}"
             )
+
+    def _read(self, here: Path) -> float | Floats | dict[str, float | Floats]:
+        """Return what the program computed, as numbers."""
+        try:
+            found = self.read(here)
+            if isinstance(found, Mapping):
+                return {name: _numbers(value) for name, value in found.items()}
+            return _numbers(found)
+        except TimeoutError:  # a worker's time limit
+            raise
+        except Exception as error:
+            files = sorted(path.name for path in here.iterdir())
+            raise RuntimeError(
+                f"{self.__name__}: its results cannot be read ({type(error).__name__}: "
+                f"{error!s:.300}), expected numbers in the files that it wrote; there are "
+                f"{', '.join(files[:_NAMED])}{self._last_words(here)}"
+            ) from error
 
     def _last_words(self, here: Path) -> str:
         """Return the end of what the program wrote, and where all of it is, to add to an error."""
@@ -306,6 +332,14 @@ def _filled(text: str, values: Mapping[str, float]) -> str:
 def _formatted(value: float, layout: str | None) -> str:
     # All digits, unless it is said how many.
     return repr(float(value)) if layout is None else format(float(value), layout[1:])
+
+
+def _numbers(found: object) -> float | Floats:
+    """Return what was read as a number, or an array of them; a text may be one."""
+    array = np.asarray(found)
+    if array.dtype.kind in "Oc":
+        raise TypeError(f"got {called(found)}")
+    return array.astype(np.float64) if array.ndim else float(array)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -268,17 +268,23 @@ class Responses:
 
     def _computed(self, given: list[Floats]) -> Floats:
         """Call the function for values of the inputs."""
+        if self.plain:
+            batch = batch_shape(given, self._event_ndims)
+            values = broadcast_batch(given, self._event_ndims, batch)
+            return self._at_once(self._filled(values), batch)
+        batch, points = self._rows(given)
+        self.count += len(points)
+        found = respond(self._calling, points, self._tally)
+        return found.reshape(batch + found.shape[1:])
+
+    def _rows(self, given: list[Floats]) -> tuple[tuple[int, ...], Points]:
+        """Return the batch shape of values of the inputs, and their points, each a row."""
         batch = batch_shape(given, self._event_ndims)
         values = broadcast_batch(given, self._event_ndims, batch)
-        if self.plain:
-            return self._at_once(self._filled(values), batch)
-        # Here a point is a row.
         n = int(np.prod(batch, dtype=int))
         flat = [v.reshape(n, *v.shape[len(batch) :]) for v in values]
         varying = [isinstance(a, int | Variable) for a in self.inputs.arguments]
-        self.count += n
-        found = respond(self._calling, Points(self._filled(flat), varying), self._tally)
-        return found.reshape(batch + found.shape[1:])
+        return batch, Points(self._filled(flat), varying)
 
     def count_symbolic(self, size: int) -> None:
         """Count responses that are computed in a graph."""

@@ -217,8 +217,14 @@ class Store:
         reasons : mapping, optional
             Of those that failed: why, by row.
         """
+        self.add_all([(inputs, values, reasons or {})])
+
+    def add_all(self, parts: Iterable[tuple[Floats, Floats, Mapping[int, str]]]) -> None:
+        """Append several batches of responses as `add` does, all or none of them."""
         session = self._read()
-        rows = _rows(session.entry.number, inputs, values, reasons or {})
+        rows = []
+        for inputs, values, reasons in parts:
+            rows += _rows(session.entry.number, inputs, values, reasons)
         with self._explained(), transaction(session.connection):
             session.connection.executemany(INSERT_RUN, rows)
 

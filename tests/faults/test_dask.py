@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pymc as pm
 import pytest
+import units
+from um_server import Real
 
 import prbayes as prb
 from prbayes.model.node import nodes
+from prbayes.response.calling import Calling, Points, Tally, respond
 from prbayes.response.executors import Capacity, capacity
+from prbayes.response.outputs import Outputs
+from prbayes.response.store import Store
 
 distributed = pytest.importorskip("distributed")
 
@@ -89,3 +97,93 @@ def test_a_worker_is_killed_and_nothing_is_lost(tmp_path: Path) -> None:
         killer.join()
         assert pids[0] not in client.run(os.getpid).values()
     all_there(model, tmp_path)
+
+
+# -- models of other programs ----------------------------------------------------------------------
+
+
+def by_command(folder: Path) -> Iterator[prb.scalar]:
+    code = "import time; time.sleep(0.05); print({x} - 2 * {y}, {x} * {x} * {y})"
+
+    def read(run: Path) -> list[float]:
+        return [float(text) for text in (run / "stdout.txt").read_text().split()]
+
+    yield prb.command([sys.executable, "-S", "-c", code], inputs=["x", "y"], read=read)
+
+
+def by_umbridge(folder: Path) -> Iterator[prb.scalar]:
+    server = Real(folder)
+    try:
+        yield prb.umbridge(server.url, "beam", config={"seconds": 0.05})
+    finally:
+        server.kill()
+
+
+def by_fmu(folder: Path) -> Iterator[prb.scalar]:
+    unit = units.built(folder)
+    # A force above 100 takes as many milliseconds for each of the steps.
+    yield prb.fmu(unit, inputs=["stiffness", "force"], outputs=["position", "work"])
+
+
+NAMED = Outputs(("position", "work"), keys=(("position", None), ("work", None)))
+# What each gives at a point, from which second input on, and how many take two workers seconds.
+CODES: dict[str, Any] = {
+    "command": (by_command, lambda x, y: [x - 2 * y, x * x * y], Outputs((0, 1)), 0.0, 100),
+    "umbridge": (by_umbridge, lambda x, y: [x - 2 * y, x * x * y], Outputs((0, 1)), 0.0, 100),
+    "fmu": (by_fmu, lambda x, y: [3 * y / x, 2 * y * y], NAMED, 101.0, 20),
+}
+
+
+def study(code: str, folder: Path, executor: Any, n: int) -> Tally:
+    """Compute n specimens on a cluster, and see that all are right, and stored."""
+    make, formula, outputs, start, _ = CODES[code]
+    x = 1.0 + np.arange(n) / n
+    points = Points([x, start + 3 * x], [True, True])
+    store, tally = Store(folder, "y", 2, version="1", outputs=2), Tally()
+    making = make(folder)
+    response = next(making)
+    try:
+        calling = Calling("y", response, executor, store, outputs=outputs)
+        found = respond(calling, points, tally)
+    finally:
+        making.close()
+    expected = np.array([formula(*pair) for pair in zip(*points.arguments, strict=True)])
+    np.testing.assert_allclose(found, expected, rtol=1e-13)
+    np.testing.assert_array_equal(store.find(points.keys())[0], found)
+    return tally
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
+def test_models_of_other_programs_are_computed_by_a_cluster_s_threads(tmp_path: Path) -> None:
+    cluster = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=2, processes=False, dashboard_address="127.0.0.1:0"
+    )
+    with cluster, distributed.Client(cluster) as client:
+        for code in CODES:
+            folder = tmp_path / code
+            folder.mkdir()
+            assert study(code, folder, client.get_executor(pure=False), 4).computed == 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("code", list(CODES))
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
+def test_a_worker_that_is_killed_with_a_model_of_another_program_loses_nothing(
+    code: str, tmp_path: Path
+) -> None:
+    cluster = distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
+    )
+    with cluster, distributed.Client(cluster) as client:
+        pids = list(client.run(os.getpid).values())
+        killer = threading.Timer(1.0, os.kill, (pids[0], signal.SIGKILL))
+        killer.start()
+        begun = time.perf_counter()
+        study(code, tmp_path, client.get_executor(pure=False), CODES[code][-1])
+        assert time.perf_counter() - begun > 1.0, "the worker was to be killed while it computes"
+        killer.join()
+        assert pids[0] not in client.run(os.getpid).values()

@@ -1,5 +1,7 @@
 """A unit for co-simulation, FMI 2: `pythonfmu build -f oscillator.py` makes it."""
 
+import contextlib
+import os
 import time
 
 from pythonfmu import (
@@ -50,6 +52,12 @@ class Oscillator(Fmi2Slave):
     def do_step(self, begin, size):
         if self.force > 100:
             time.sleep(self.force / 1000)
+        if self.stiffness == -7:
+            os._exit(3)
+        while self.stiffness == -9:
+            # As what hangs outside Python, which no exception ends.
+            with contextlib.suppress(BaseException):
+                time.sleep(600)
         if self.stiffness < 0:
             raise ArithmeticError("no equilibrium")
         if self.stiffness == 0:

@@ -25,6 +25,7 @@ class Beam(umbridge.Model):
 
     def __call__(self, parameters: Any, config: Any) -> list[list[float]]:
         ((x, y),) = parameters
+        time.sleep(config.get("seconds", 0.0))
         return [[config.get("scale", 1.0) * (x - 2 * y), x * x * y]]
 
     def supports_evaluate(self) -> bool:

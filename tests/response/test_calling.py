@@ -175,8 +175,30 @@ def test_chunks_follow_the_measured_cost() -> None:
 
 def test_a_scalar_function_that_is_slow_is_a_task_of_its_own() -> None:
     calling = Calling("y", prb.scalar(lambda x, a: time.sleep(0.02) or x))
-    taken = [rows.size for rows, _ in chunks(calling, line(5), np.arange(5), False, Tally())]
+    found = chunks(calling, line(5), np.arange(5), False, Tally())
+    taken = [rows.size for done in found for rows, _ in done]
     assert taken == [1] * 5
+
+
+def test_responses_that_are_done_while_the_disk_is_busy_are_stored_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commits, add = [], Store.add_all
+
+    def slow(self: Store, parts: Any) -> None:
+        commits.append(len(parts))
+        time.sleep(0.03)
+        add(self, parts)
+
+    monkeypatch.setattr(Store, "add_all", slow)
+    store = Store(tmp_path, "y", 2)
+    with ThreadPoolExecutor(4) as pool:
+        calling = Calling("y", prb.scalar(lambda x, a: time.sleep(0.01) or a * x), pool, store)
+        found = respond(calling, line(40), Tally())
+    assert sum(commits) == 40
+    assert len(commits) < 20
+    np.testing.assert_array_equal(store.find(line(40).keys())[0], found)
+    np.testing.assert_array_equal(found, 2 * np.arange(40.0))
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from typing import Any, cast
 
 import pytest
 
+import prbayes as prb
 from prbayes.response import executors
 from prbayes.response.executors import (
     Capacity,
@@ -72,13 +73,30 @@ def test_how_much_an_executor_takes() -> None:
 # -- time limits ---------------------------------------------------------------------------------
 
 
+class Mpi(ThreadPoolExecutor):
+    """Of processes, of which none may be ended without all of the others."""
+
+    num_workers = 4
+
+
 @pytest.mark.parametrize(
     "executor",
-    [None, ThreadPoolExecutor(1), Dask(Client(inproc_a=2)), Dask(Client(tcp_a=1, inproc_b=1))],
+    [
+        None,
+        ThreadPoolExecutor(1),
+        Mpi(1),
+        Dask(Client(inproc_a=2)),
+        Dask(Client(tcp_a=1, inproc_b=1)),
+    ],
 )
 def test_a_time_limit_that_nobody_keeps_is_refused(executor: Any) -> None:
-    with pytest.raises(ValueError, match=r"timeout: got 5 with executor .*expected an executor of"):
+    with pytest.raises(
+        ValueError, match=r"timeout: got 5 with executor .*expected an executor of .*of their own"
+    ):
         refuse_timeout(5, executor)
+    for propagation in (prb.Reweighted, prb.Resimulated, prb.Fresh):
+        with pytest.raises(ValueError, match=r"timeout: got 5 with executor"):
+            propagation(64, executor=executor, timeout=5)
     refuse_timeout(None, executor)
 
 

@@ -86,6 +86,49 @@ def test_a_program_that_fails_says_what_it_wrote_and_keeps_its_files(tmp_path: P
     assert (kept / "stderr.txt").read_text() == "singular matrix 2.0\n"
 
 
+def test_a_run_has_several_outputs_as_an_array_or_by_name() -> None:
+    code = "x = {x}; print(x, 3 * x)"
+
+    def both(folder: Path) -> list[float]:
+        return [float(text) for text in (folder / "stdout.txt").read_text().split()]
+
+    def named(folder: Path) -> dict[str, Any]:
+        first, second = both(folder)
+        return {"twice": [second, first], "one": first}
+
+    x = np.array([[1.5, -2.0]])
+    settings: dict[str, Any] = {"inputs": ["x"]}
+    as_array = prb.command([*PYTHON, code], read=both, **settings)
+    np.testing.assert_array_equal(as_array(x), np.stack([x, 3 * x], axis=-1))
+    found = prb.command([*PYTHON, code], read=named, **settings).function(2.0)
+    assert found.pop("twice").tolist() == [6.0, 2.0]
+    assert found == {"one": 2.0}
+    assert type(found["one"]) is float
+
+
+@pytest.mark.parametrize(
+    ("read", "said"),
+    [
+        (lambda folder: "diverged", r"\(ValueError: could not convert string to float: .*diverged"),
+        (lambda folder: {"a": [[1.0], [1.0, 2.0]]}, r"\(ValueError: setting an array"),
+        (lambda folder: (folder / "result.dat").read_text(), r"\(FileNotFoundError: .*result.dat"),
+        (lambda folder: None, r"\(TypeError: "),
+    ],
+)
+def test_a_result_file_that_is_malformed_is_told_with_the_files_that_are_there(
+    read: Any, said: str
+) -> None:
+    run = prb.command([*PYTHON, "print('step 3 of 7', {x})"], inputs=["x"], read=read)
+    text = rf"its results cannot be read {said}.* there are stderr.txt, stdout.txt; it wrote: step"
+    with pytest.raises(RuntimeError, match=text):
+        run(2.0)
+    # Before the long work: the first specimen ends the study.
+    with pm.Model():
+        x = pm.Normal.dist(pm.Normal("mu", 0.9, 0.1), 0.5)
+        with pytest.raises(prb.response.ResponseError, match=rf"^y: .*at 1 point.*{text}"):
+            prb.Simulator("y", run, x, metric=prb.AreaMetric(), observed=[0.1, 0.5, 0.8])
+
+
 @pytest.mark.exact
 def test_a_result_that_cannot_be_read_is_a_failure_of_that_point() -> None:
     code = "x = {x}; print(x if x < 1 else 'diverged')"

@@ -21,6 +21,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import um_models
+from um_server import Real
 
 import prbayes as prb
 from prbayes.model.node import nodes
@@ -102,42 +103,6 @@ def telling(evaluate: Callable[..., None] = give, **known: Any) -> Iterator[Tell
 
 
 # -- a real server ---------------------------------------------------------------------------------
-
-
-class Real:
-    """A server of UM-Bridge in a process of its own, which may be killed and started again."""
-
-    def __init__(self, folder: Path) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = free.getsockname()[1]
-        self.url = f"http://127.0.0.1:{self.port}"
-        self.folder = folder
-        self.process: Any = None
-        self.start()
-        self.wait()
-
-    def start(self) -> None:
-        if self.process is not None:
-            self.process.wait()
-        program = [sys.executable, um_models.__file__, str(self.port), str(self.folder / "died")]
-        with (self.folder / "log.txt").open("ab") as log:
-            self.process = subprocess.Popen(program, stdout=log, stderr=log)
-
-    def wait(self) -> None:
-        """Wait until it is there."""
-        until = time.monotonic() + 60
-        while True:
-            try:
-                socket.create_connection(("127.0.0.1", self.port), 1).close()
-                return
-            except OSError:
-                assert time.monotonic() < until
-                time.sleep(0.05)
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.process.wait()
 
 
 @pytest.fixture(scope="module")
