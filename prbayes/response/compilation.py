@@ -37,13 +37,22 @@ def _sums_of_sums(fgraph: Any, node: Any) -> Any:
     return [op(*parts)]
 
 
+def _softplus_of_arrays(fgraph: Any, node: Any) -> Any:
+    """Return log(1 + exp(x)) in steps that NumPy has: PyTensor's would loop over numbers."""
+    if node.op.scalar_op != pt.softplus.scalar_op:
+        return False
+    (x,) = node.inputs
+    return [pt.maximum(x, 0.0) + pt.log1p(pt.exp(-pt.abs(x)))]
+
+
 # Batched NumPy calls: nothing here runs often enough to repay a heavy compilation. Without fusion
 # every elementwise operation is one NumPy ufunc; with it, the Python linker would loop over
-# scalars. Sums are divided last, lest they be put together again.
+# scalars. Sums and the like are divided last, lest they be put together again.
 PLAIN = (
     Mode(linker="py", optimizer="fast_run")
     .excluding("fusion", "inplace", "BlasOpt", "c_blas", "symbolic_op_recognition")
-    .register((out2in(node_rewriter([Elemwise])(_sums_of_sums)), 1000))
+    .register((out2in(node_rewriter([Elemwise])(_softplus_of_arrays)), 1000))
+    .register((out2in(node_rewriter([Elemwise])(_sums_of_sums)), 1001))
 )
 
 # Functions that are kept, the oldest of which goes: a model has about ten. What they hold beside

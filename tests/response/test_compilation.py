@@ -226,3 +226,13 @@ def test_threads_leave_the_compiler_as_they_found_it() -> None:
     with ThreadPoolExecutor(4) as pool:
         assert list(pool.map(compile_one, range(8))) == [k + 1.125 for k in range(8)]
     assert pytensor.config.cxx == before
+
+
+def test_softplus_takes_whole_arrays_and_is_right_everywhere() -> None:
+    x = pt.dvector("x")
+    function = compiled([x], [pt.softplus(x), pt.log1p(pt.exp(2 * x))])
+    names = [str(node.op) for node in function.maker.fgraph.toposort()]
+    assert not any("oftplus" in name for name in names)
+    at = np.array([-800.0, -40.0, -1e-3, 0.0, 0.3, 17.9, 18.1, 40.0, 800.0])
+    for found, scale in zip(function(at), (1.0, 2.0), strict=True):
+        np.testing.assert_allclose(found, np.logaddexp(0, scale * at), rtol=1e-15)
