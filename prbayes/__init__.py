@@ -4,7 +4,9 @@ from importlib.metadata import version
 
 from prbayes import (
     datasets,
+    decision,
     metrics,
+    plots,
     posterior,
     propagation,
     reports,
@@ -15,6 +17,7 @@ from prbayes import (
 from prbayes._compare import compare
 from prbayes._diagnose import Diagnosis, diagnose
 from prbayes._predict import predict
+from prbayes.decision.influence import sensitivity
 from prbayes.estimate.minimization import minimize, refine
 from prbayes.estimate.optimum import Optimum
 from prbayes.metrics.area import AreaMetric
@@ -83,6 +86,7 @@ __all__ = [
     "compare",
     "cross_validate",
     "datasets",
+    "decision",
     "diagnose",
     "fmu",
     "metrics",
@@ -96,6 +100,7 @@ __all__ = [
     "plot_responses",
     "plot_stages",
     "plot_validity",
+    "plots",
     "posterior",
     "predict",
     "propagation",
@@ -104,6 +109,7 @@ __all__ = [
     "response",
     "sample_smc",
     "scalar",
+    "sensitivity",
     "set_epsilon",
     "simulation_based_calibration",
     "surrogate",

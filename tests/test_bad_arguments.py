@@ -167,6 +167,8 @@ NO_DATA: Sequence[Any] = (
     [10**400, 1.0],
     np.ma.masked_array([1.0, 2.0, 3.0], [0, 1, 0]),
 )
+NO_RESPONSE: Mapping[str, Sequence[Any]] = {"response": (3, "line", None, dict)}
+NO_LIMIT: Sequence[Any] = ("a", None, np.nan, np.inf, True, [1.0])
 CALLING: dict[str, Sequence[Any]] = {
     "executor": EXECUTOR,
     "store": STORE,
@@ -242,6 +244,18 @@ def report(**given: Any) -> Any:
 
 def with_model(function: Callable[..., Any]) -> Callable[..., Any]:
     return lambda **given: function(**{"model": model()} | QUIET | given)
+
+
+def with_decision(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a question about a posterior, with what it asks of the shared model."""
+
+    def asked(**given: Any) -> Any:
+        common = {"result": posterior(), "model": model()}
+        if function is prb.sensitivity:
+            common["quantity"] = prb.decision.Mean(line, specimen())
+        return function(**common | given)
+
+    return asked
 
 
 def of_optimum(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -566,6 +580,37 @@ TABLE: dict[str, Row] = {
             "progressbar": FLAG,
         },
     ),
+    "decision.Mean": Row(prb.decision.Mean, NO_RESPONSE),
+    "decision.StandardDeviation": Row(prb.decision.StandardDeviation, NO_RESPONSE),
+    "decision.Quantile": Row(
+        prb.decision.Quantile,
+        {**NO_RESPONSE, "probability": SHARE},
+        {"response": line, "probability": 0.9},
+    ),
+    "decision.Exceedance": Row(
+        prb.decision.Exceedance,
+        {**NO_RESPONSE, "limit": NO_LIMIT, "below": FLAG},
+        {"response": line, "limit": 1.0},
+    ),
+    "sensitivity": Row(
+        with_decision(prb.sensitivity),
+        {
+            "result": NO_RESULT,
+            "quantity": (None, "mean", 3, prb.decision.Mean, np.mean),
+            "model": (3, "model", Name("bare")),
+            "samples": (*COUNT, 31),
+            "computed": FLAG,
+            "random_seed": SEED,
+        },
+    ),
+    "plots.plot_sensitivity": Row(
+        prb.plots.plot_sensitivity,
+        {
+            **{k: PICTURE[k] for k in ("backend", "labels")},
+            "table": (None, 3, xr.Dataset(), Name("comparison"), Name("posterior")),
+        },
+        {"table": xr.Dataset({"first": 1.0, "total": 1.0})},
+    ),
     "validation.u_values": Row(
         prb.validation.u_values,
         {
@@ -882,6 +927,15 @@ def test_every_public_name_has_a_row() -> None:
     assert len(CASES) >= 1300
     # Names of packages and of what calls give back; the constructor of data has no arguments, nor
     # has the area metric; whoever writes a metric of his own derives from the class.
-    spared = {"datasets", "metrics", "posterior", "propagation", "reports", "response"}
+    spared = {
+        "datasets",
+        "metrics",
+        "posterior",
+        "propagation",
+        "reports",
+        "response",
+        "decision",
+        "plots",
+    }
     spared |= {"surrogate", "validation", "Diagnosis", "Optimum", "AreaMetric", "Metric"}
     assert set(prb.__all__) - spared <= set(TABLE)

@@ -56,6 +56,7 @@ WITHOUT_EXAMPLE = {
     "Minimum",
     "Optimum",
     "Propagation",
+    "Quantity",
     "ResponseError",
     "Store",
     "StoreError",

@@ -530,6 +530,10 @@ class Design(Bound):
         """
         if responses.same_as(self.responses):
             return self.values
+        return self._tabulated(self._at_runs(responses))
+
+    def _at_runs(self, responses: Responses) -> Floats:
+        """Return another response at the runs, (n,) or (n, m)."""
         before = [pair for pair in self._others if responses.same_as(pair[0])]
         known = before[0][1] if before else np.empty(0)
         if len(known) < self.n_runs:
@@ -541,13 +545,42 @@ class Design(Bound):
             if before:
                 self._others.remove(before[0])
             self._others.append((responses, known))
-        return self._tabulated(known)
+        return known
 
     def _tabulated(self, known: Floats) -> Floats:
         """Return another response of the points that have weights, of that of the runs."""
         contents = self.contents
         if contents.cloud is None or contents.emulation is None:
             return known
+        said = self._emulation_of(known).at(contents.cloud)
+        return np.concatenate([said, known]) if contents.emulation.share else said
+
+    def emulated(self, responses: Responses, points: Sequence[Floats]) -> list[Floats]:
+        """Return a response at any points of the design's inputs, (n,) or (n, m), as emulators say.
+
+        That of all runs first, then those that lack a block of them each; none without emulators.
+        """
+        emulation = self.contents.emulation
+        if emulation is None:
+            return []
+        coarse = None
+        if not responses.same_as(self.responses):
+            emulation = self._emulation_of(self._at_runs(responses))
+        elif self._coarse is not None and emulation.following:
+            coarse = self._coarse(points)
+        cloud = Cloud(tuple(points), np.zeros(len(points[0])), coarse)
+        return [emulation.at(cloud), *emulation.without_each_block(cloud)]
+
+    def _emulation_of(self, known: Floats) -> Emulation:
+        """Return an emulator of another response, of that at the runs.
+
+        Raises
+        ------
+        UntoldError
+            If the runs do not tell it between them.
+        """
+        contents = self.contents
+        assert contents.emulation is not None
         other = Emulation.of(
             self.config.emulator,
             self.batches.points,
@@ -565,8 +598,7 @@ class Design(Bound):
                 f"most {_TRUSTED:.0%} more than of its own; calibrate with "
                 "prb.Reweighted(n, emulator=None), or let one response return both outputs"
             )
-        said = other.at(contents.cloud)
-        return np.concatenate([said, known]) if contents.emulation.share else said
+        return other
 
     def same_points(self, other: Bound) -> bool:
         """Return whether another design has the same points, whose responses belong together."""

@@ -1,0 +1,11 @@
+"""From scatter to decision: what moves a decision, what more data would change, what is risked."""
+
+from prbayes.decision.quantities import (
+    Exceedance,
+    Mean,
+    Quantile,
+    Quantity,
+    StandardDeviation,
+)
+
+__all__ = ["Exceedance", "Mean", "Quantile", "Quantity", "StandardDeviation"]
