@@ -18,6 +18,7 @@ from prbayes._compare import compare
 from prbayes._diagnose import Diagnosis, diagnose
 from prbayes._predict import predict
 from prbayes.decision.influence import sensitivity
+from prbayes.decision.planning import plan
 from prbayes.estimate.minimization import minimize, refine
 from prbayes.estimate.optimum import Optimum
 from prbayes.metrics.area import AreaMetric
@@ -91,6 +92,7 @@ __all__ = [
     "fmu",
     "metrics",
     "minimize",
+    "plan",
     "plot_comparison",
     "plot_landscape",
     "plot_optimizer",

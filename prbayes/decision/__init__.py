@@ -1,5 +1,6 @@
 """From scatter to decision: what moves a decision, what more data would change, what is risked."""
 
+from prbayes.decision.information import Condition
 from prbayes.decision.quantities import (
     Exceedance,
     Mean,
@@ -8,4 +9,4 @@ from prbayes.decision.quantities import (
     StandardDeviation,
 )
 
-__all__ = ["Exceedance", "Mean", "Quantile", "Quantity", "StandardDeviation"]
+__all__ = ["Condition", "Exceedance", "Mean", "Quantile", "Quantity", "StandardDeviation"]

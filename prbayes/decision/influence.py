@@ -31,6 +31,9 @@ _DRAWS = 4000
 # Step of differences of weights, in standard deviations of an element of theta. Half or twice
 # changes an index by less than a hundredth (tests/decision/test_influence.py).
 _WEIGHT_STEP = 0.02
+# Share of populations that may have no finite number of the quantity, and are left out: shares are
+# not known to a hundredth anyway.
+_LEFT_OUT = 0.01
 
 
 @in_turn
@@ -185,6 +188,14 @@ def _of_hyperparameters(
         return told.at(quantity, thetas).reshape(z.shape[:-1])
 
     values = at(z)
+    unknown = 1 - np.isfinite(values).mean()
+    if unknown > _LEFT_OUT:
+        raise ValueError(
+            f"prb.sensitivity: {quantity!r}: got no finite number in {unknown:.1%} of the "
+            f"populations, expected one in all but {_LEFT_OUT:.0%}; where specimens fail, ask for "
+            "a smaller probability, or an Exceedance"
+        )
+    values = np.where(np.isfinite(values), values, np.nan)
     first, total, derivative = [], [], []
     for i, sd in enumerate(copula.conditional_sd):
         first.append(first_order(values, at(copula.others_redrawn(z, elsewhere, i))))

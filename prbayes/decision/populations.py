@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -102,12 +102,16 @@ class Populations:
         DesignError
             If the design does not support the populations, or too many responses are NaN.
         """
+        found = self.all_outputs(response, inputs)
+        return replace(found, place=output_place(found.responses, found.every, output))
+
+    def all_outputs(self, response: Callable[..., Any], inputs: Sequence[Any]) -> Told:
+        """Return the same of all outputs together."""
         responses = self.responses(response, inputs)
         k = self.design_for(responses)
-        bound = self.evaluator.nodes[k].bound
-        assert isinstance(bound, Design)
-        values = bound.values_of(responses)
-        found = Told(self, k, bound, responses, values, output_place(responses, values, output))
+        design = self.evaluator.nodes[k].design
+        assert design is not None
+        found = Told(self, k, design, responses, design.values_of(responses), None)
         found.refuse_unsupported()
         return found
 

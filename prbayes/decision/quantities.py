@@ -203,11 +203,10 @@ class Exceedance(Quantity):
         return beyond.astype(float)
 
 
-def refuse_quantity(quantity: object, caller: str) -> Quantity:
-    """Return a quantity, or raise if it is none."""
+def refuse_quantity(quantity: object, caller: str) -> None:
+    """Raise if it is no quantity."""
     if not isinstance(quantity, Quantity):
         raise TypeError(
             f"{caller}: quantity: got {type(quantity).__name__}, expected a quantity with its "
             "response, such as prb.decision.Quantile(response, x, probability=0.99)"
         )
-    return quantity

@@ -970,6 +970,22 @@ class Design(Bound):
         other.__dict__.pop("_log_weights", None)  # compiled on the shared variables of this one
         return other
 
+    def telling(self, values: Floats, target: Discrepancy) -> Self:
+        """Return a design of the same points with another response of theirs, and other data.
+
+        It is not to grow: its runs are those of this design.
+        """
+        other = super().copied()
+        table = replace(self.contents.table, values=values)
+        other._contents = replace(self.contents, table=table, cloud=None, emulation=None)
+        other.target = target
+        other._others = deque(maxlen=self._others.maxlen)
+        other._basis = (None, None, None)
+        other._shared = []
+        other._share(other._arrays())
+        other.__dict__.pop("_log_weights", None)  # compiled on the shared variables of this one
+        return other
+
     @contextmanager
     def undone(self) -> Iterator[None]:
         """Forget, afterwards, the batches that are added inside."""

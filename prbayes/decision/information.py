@@ -1,0 +1,158 @@
+"""What one more specimen under a condition tells of theta, and the posterior that follows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from prbayes._checks import Floats, called
+from prbayes._weighted import reached
+from prbayes.decision.populations import Told
+from prbayes.estimate.data_sets import observable
+from prbayes.estimate.measured import drawn_in
+from prbayes.estimate.refit import SamplingDistribution
+from prbayes.metrics.base import Metric
+from prbayes.response.response import refuse_uncallable
+
+# Specimens of the ideal sample from which the information in one is told, at least: of fewer a
+# metric's bandwidth or cells would be those of a small sample. By judgement.
+_IDEAL = 50
+# Standard error of an ideal sample, in spreads of the prior, up to which it tells of a direction:
+# what it leaves out is less than a hundredth of what a prior tells.
+_FAINTEST = 10.0
+# Standard deviations beyond which draws count as so far away in their covariance, as refits do.
+_WITHIN = 3.0
+
+
+class Condition:
+    """A condition under which specimens could be tested: a response, its inputs, and a metric.
+
+    Parameters
+    ----------
+    response : callable
+        As for `Simulator`: that of a simulator of the model, or another one of the same specimens.
+    *inputs
+        As for `predict`.
+    metric : Metric, optional
+        By which its data would be compared; that of the model's simulator by default.
+
+    Raises
+    ------
+    TypeError
+        If an argument is not as described.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> prb.decision.Condition(np.square, pm.Normal.dist(), metric=prb.AreaMetric())
+    Condition of square
+    """
+
+    def __init__(
+        self, response: Callable[..., Any], *inputs: Any, metric: Metric | None = None
+    ) -> None:
+        refuse_uncallable("prb.decision.Condition", response)
+        if metric is not None and not isinstance(metric, Metric):
+            raise TypeError(
+                f"prb.decision.Condition: metric: got {called(metric)}, expected a metric, such as "
+                "prb.ProbabilityResidual()"
+            )
+        self.response = response
+        self.inputs = inputs
+        self.metric = metric
+
+    def __repr__(self) -> str:
+        return f"Condition of {getattr(self.response, '__name__', type(self.response).__name__)}"
+
+
+def of_a_specimen(told: Told, metric: Metric | None, specimens: int) -> Floats:
+    r"""Return the information of one specimen, (d, d), in units of the prior's spread.
+
+    The Godambe information :math:`H J^{-1} H` of an ideal sample of the population at the centre,
+    divided by its size.
+
+    Parameters
+    ----------
+    told : Told
+        The response under the condition.
+    metric : Metric, optional
+    specimens : int
+        How many are thought of.
+    """
+    evaluator = told.populations.evaluator
+    node = evaluator.nodes[told.k]
+    center = told.populations.center
+    n = max(specimens, _IDEAL)
+    sample = _ideal(told, n)
+    target = (metric or node.metric).against(sample)
+    design = told.design
+    bound = design.telling(told.every, target.beside(told.every, design.dimensions))
+    alone = replace(node, target=bound.target, bound=bound, specimens=None)
+    sampling = SamplingDistribution.of(
+        evaluator.of_one(alone, told.k), center, np.ones(1), _FAINTEST
+    )
+    local = sampling.local
+    if not local.identified.size:
+        return np.zeros((center.size, center.size))
+    found = local.identified @ np.linalg.inv(local.covariance) @ local.identified.T
+    return np.asarray(found / n)
+
+
+def _ideal(told: Told, n: int) -> Floats:
+    """Return n specimens at equal steps of probability of the population at the centre."""
+    evaluator, center = told.populations.evaluator, told.populations.center
+    _, weights = told.design.populations(evaluator.roots(center[None], told.k))
+    seen = observable(told.every)
+    values, mass = told.every[seen], weights[0][seen]
+    order = np.argsort(values.reshape(len(values), -1)[:, 0])
+    places = reached(mass[order], (np.arange(n) + 0.5) / n, normalized=True)
+    return np.asarray(values[order][places])
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """What is known of theta: draws, and the precision that they stand for.
+
+    Attributes
+    ----------
+    thetas : ndarray, shape (k, d)
+    unit : ndarray, shape (d,)
+        The prior's spread.
+    covariance : ndarray, shape (d, d)
+        Of the draws, in that unit.
+    """
+
+    thetas: Floats
+    unit: Floats
+    covariance: Floats
+
+    @classmethod
+    def of(cls, thetas: Floats, unit: Floats) -> Belief:
+        """Read draws, (k, d)."""
+        counted = drawn_in(thetas / unit, _WITHIN)
+        d = unit.size
+        return cls(thetas, unit, np.cov(counted, rowvar=False).reshape(d, d))
+
+    def after(self, information: Floats) -> Floats:
+        """Return the draws, narrower by so much information, (d, d), around the same median.
+
+        Their precision is then the sum, as that of normal distributions; the map is the symmetric
+        one between those.
+        """
+        precision = np.linalg.inv(self.covariance) + information
+        covariance = np.linalg.inv(precision)
+        root = _root(self.covariance)
+        inverse = np.linalg.inv(root)
+        matrix = inverse @ _root(root @ covariance @ root) @ inverse
+        middle = np.median(self.thetas, axis=0)
+        away = (self.thetas - middle) / self.unit
+        return np.asarray(middle + (away @ matrix.T) * self.unit)
+
+
+def _root(matrix: Floats) -> Floats:
+    """Return the symmetric square root."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
