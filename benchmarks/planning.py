@@ -25,7 +25,6 @@ import prbayes as prb
 from benchmarks import record
 
 OUT = record.RESULTS / "planning.json"
-QUIET = {"progressbar": False}
 # Of Paris' law: examples/crack_growth.py, and the mean of the fits of examples/virkler.py.
 EXPONENT, STEEPER = 2.6, 2.9
 # Of log C, about as in examples/crack_growth.py.
@@ -107,10 +106,12 @@ def calibrated(problem: Problem, data: dict[str, Any]) -> tuple[Any, pm.Model, A
                 metric=prb.ProbabilityResidual(),
                 observed=observed,
                 propagation=prb.Reweighted(512),
-                **QUIET,
+                progressbar=False,
             )
-    optimum = prb.minimize(model, **QUIET)
-    posterior = prb.sample_smc(500, chains=2, model=model, optimum=optimum, random_seed=1, **QUIET)
+    optimum = prb.minimize(model, progressbar=False)
+    posterior = prb.sample_smc(
+        500, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False
+    )
     return posterior, model, x
 
 

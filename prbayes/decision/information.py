@@ -12,6 +12,7 @@ from prbayes._checks import Floats, called
 from prbayes._weighted import reached
 from prbayes.decision.populations import Told
 from prbayes.estimate.data_sets import observable
+from prbayes.estimate.differences import cross, slopes
 from prbayes.estimate.measured import drawn_in
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.metrics.base import Metric
@@ -23,6 +24,8 @@ _IDEAL = 50
 # Standard error of an ideal sample, in spreads of the prior, up to which it tells of a direction:
 # what it leaves out is less than a hundredth of what a prior tells.
 _FAINTEST = 10.0
+# Step of differences of log weights, in spreads of the prior: as those of densities elsewhere.
+_LOG_WEIGHT_STEP = 1e-3
 # Standard deviations beyond which draws count as so far away in their covariance, as refits do.
 _WITHIN = 3.0
 
@@ -72,7 +75,7 @@ def of_a_specimen(told: Told, metric: Metric | None, specimens: int) -> Floats:
     r"""Return the information of one specimen, (d, d), in units of the prior's spread.
 
     The Godambe information :math:`H J^{-1} H` of an ideal sample of the population at the centre,
-    divided by its size.
+    divided by its size, and at most the Fisher information of the response.
 
     Parameters
     ----------
@@ -98,7 +101,52 @@ def of_a_specimen(told: Told, metric: Metric | None, specimens: int) -> Floats:
     if not local.identified.size:
         return np.zeros((center.size, center.size))
     found = local.identified @ np.linalg.inv(local.covariance) @ local.identified.T
-    return np.asarray(found / n)
+    return _at_most(found / n, fisher_information(told))
+
+
+def fisher_information(told: Told) -> Floats:
+    r"""Return the Fisher information of one specimen, (d, d), in units of the prior's spread.
+
+    The covariance of the score of a response, :math:`E[s(x) | y]`, which is the mean over bins of
+    the response of that of the inputs, the derivative of their log weights. Of several outputs that
+    of the inputs themselves, which bounds it.
+    """
+    evaluator, center = told.populations.evaluator, told.populations.center
+    unit = evaluator.prior_sd
+    step = _LOG_WEIGHT_STEP * unit
+    around = cross(center, step)
+    _, weights = told.design.populations(evaluator.roots(around, told.k))
+    used = (weights[0] > 0) & observable(told.every)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scores = slopes(np.log(weights[:, used]), step) * unit
+    mass = weights[0][used] / weights[0][used].sum()
+    scores = scores - mass @ scores
+    if told.every.ndim > 1:
+        return np.asarray((scores.T * mass) @ scores)
+    values = told.every[used]
+    # As many bins as fine ones and full ones ask for; those in the tails have little weight.
+    rank = np.searchsorted(np.sort(values), values)  # the same for equal values
+    bins = rank // max(1, int(np.sqrt(len(mass)) / 2))
+    share = np.bincount(bins, mass)
+    sums = np.array([np.bincount(bins, mass * column) for column in scores.T])
+    means = sums / np.where(share > 0, share, 1.0)
+    return np.asarray((means * share) @ means.T)
+
+
+def _at_most(information: Floats, bound: Floats) -> Floats:
+    """Return what is not more than a bound in any direction: matrices (d, d).
+
+    Along directions of which the response tells next to nothing, both halves of a sandwich are
+    rounding errors, and their quotient may be anything.
+    """
+    if not np.isfinite(bound).all():  # the support moves, and the likelihood is no bound
+        return information
+    d = len(bound)
+    root = np.linalg.cholesky(bound + 1e-9 * np.trace(bound) * np.eye(d))
+    inverse = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(inverse @ information @ inverse.T)
+    capped = (vectors * np.minimum(values, 1.0)) @ vectors.T
+    return np.asarray(root @ capped @ root.T)
 
 
 def _ideal(told: Told, n: int) -> Floats:

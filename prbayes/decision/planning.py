@@ -43,8 +43,8 @@ def plan(
     The posterior has the precision :math:`\Lambda` that its draws say. One specimen under a
     condition adds the metric's (Godambe) information :math:`a = H J^{-1} H`, H the Hessian of its
     discrepancy at the centre and J the covariance of its gradient, both by the weights of stored
-    responses. After k specimens the draws are expected to be as wide as
-    :math:`(\Lambda + k a)^{-1}` says.
+    responses; it is at most the Fisher information of the response. After k specimens the draws
+    are expected to be as wide as :math:`(\Lambda + k a)^{-1}` says.
 
     Parameters
     ----------
@@ -69,9 +69,10 @@ def plan(
     xarray.Dataset
         Dimensions ``candidate``, ``k`` and ``name``, the hyperparameters, deterministics among
         them, and ``"quantity"``. Variables ``sd``, the expected standard deviation, in the user's
-        own units, inf where the quantity is infinite in some populations; ``now``, the present one; and with ``target``, ``specimens``: the least number of
-        them that reaches it, inf if a million do not, NaN where there is no target. Attributes:
-        ``responses`` (how many were computed) and ``identity``.
+        own units, inf where the quantity is infinite in some populations; ``now``, the present one;
+        and with ``target``, ``specimens``: the least number of them that reaches it, inf if a
+        million do not, NaN where there is no target. Attributes: ``responses`` (how many were
+        computed) and ``identity``.
 
     Raises
     ------
