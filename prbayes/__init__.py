@@ -19,6 +19,7 @@ from prbayes._diagnose import Diagnosis, diagnose
 from prbayes._predict import predict
 from prbayes.decision.influence import sensitivity
 from prbayes.decision.planning import plan
+from prbayes.decision.tail import exceedance
 from prbayes.estimate.minimization import minimize, refine
 from prbayes.estimate.optimum import Optimum
 from prbayes.metrics.area import AreaMetric
@@ -89,6 +90,7 @@ __all__ = [
     "datasets",
     "decision",
     "diagnose",
+    "exceedance",
     "fmu",
     "metrics",
     "minimize",

@@ -1,5 +1,7 @@
 """From scatter to decision: what moves a decision, what more data would change, what is risked."""
 
+from prbayes.decision.bounds import Interval
+from prbayes.decision.box import p_box
 from prbayes.decision.information import Condition
 from prbayes.decision.quantities import (
     Exceedance,
@@ -9,4 +11,13 @@ from prbayes.decision.quantities import (
     StandardDeviation,
 )
 
-__all__ = ["Condition", "Exceedance", "Mean", "Quantile", "Quantity", "StandardDeviation"]
+__all__ = [
+    "Condition",
+    "Exceedance",
+    "Interval",
+    "Mean",
+    "Quantile",
+    "Quantity",
+    "StandardDeviation",
+    "p_box",
+]

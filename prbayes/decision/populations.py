@@ -94,7 +94,9 @@ class Populations:
             )
         return self.evaluator.nodes.index(node)
 
-    def told(self, response: Callable[..., Any], inputs: Sequence[Any], output: Any) -> Told:
+    def told(
+        self, response: Callable[..., Any], inputs: Sequence[Any], output: Any, **calling: Any
+    ) -> Told:
         """Return a response of the design's specimens; what is not known of it is computed.
 
         Raises
@@ -102,12 +104,14 @@ class Populations:
         DesignError
             If the design does not support the populations, or too many responses are NaN.
         """
-        found = self.all_outputs(response, inputs)
+        found = self.all_outputs(response, inputs, **calling)
         return replace(found, place=output_place(found.responses, found.every, output))
 
-    def all_outputs(self, response: Callable[..., Any], inputs: Sequence[Any]) -> Told:
+    def all_outputs(
+        self, response: Callable[..., Any], inputs: Sequence[Any], **calling: Any
+    ) -> Told:
         """Return the same of all outputs together."""
-        responses = self.responses(response, inputs)
+        responses = self.responses(response, inputs, **calling)
         k = self.design_for(responses)
         design = self.evaluator.nodes[k].design
         assert design is not None

@@ -16,6 +16,7 @@ from prbayes._checks import Floats
 from prbayes._predict import through_inverses
 from prbayes.propagation.points import inside
 from prbayes.response.compilation import compile_batched
+from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs
 from prbayes.response.response import Responses
 
@@ -76,6 +77,15 @@ class Specimens:
             np.broadcast_to(v, (1, len(z), *shape))[0]
             for v, shape in zip(values[: len(shapes)], shapes, strict=True)
         ]
+
+    def log_density(self, roots: Sequence[Floats], x: Sequence[Floats]) -> Floats:
+        """Return log densities, (k, n), of inputs in populations at roots, shapes (k, *shape)."""
+        (found,) = self._log_density(*roots, *x)
+        return np.asarray(found)
+
+    @cached_property
+    def _log_density(self) -> Any:
+        return compiled_log_density(self.inputs)
 
     def computed(self, responses: Responses, z: Floats) -> Floats:
         """Return a response, (n,) or (n, m), called at normal numbers (n, size)."""

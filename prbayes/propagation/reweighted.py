@@ -55,6 +55,7 @@ from prbayes.propagation.points import base_points
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import (
     PopulationSampler,
+    compiled_log_density,
     log_density,
     prior_draws,
     quantiles,
@@ -1029,14 +1030,7 @@ class Design(Bound):
 
     @cached_property
     def _log_density(self) -> Any:
-        symbols = self.inputs.placeholders()
-        points = []
-        for x in self.inputs.aleatory:
-            shape = (None,) * (x.type.ndim + 1)
-            points.append(pt.tensor(dtype=x.dtype, shape=shape))
-        dists, _ = self.inputs.rebuilt(symbols)
-        density = log_density(self.inputs, dists, points)
-        return compile_batched(symbols, [density], points)
+        return compiled_log_density(self.inputs)
 
     @cached_property
     def _quantiles(self) -> Any:
