@@ -253,6 +253,15 @@ def with_decision(function: Callable[..., Any]) -> Callable[..., Any]:
         common = {"result": posterior(), "model": model()}
         if function is prb.sensitivity:
             common["quantity"] = prb.decision.Mean(line, specimen())
+        elif function is prb.plan:
+            common["candidates"] = {"same": prb.decision.Condition(line, specimen())}
+        else:
+            asked_of = {**common, "response": line, "limit": 1.0, "input": specimen()} | given
+            if function is prb.decision.p_box:
+                asked_of.pop("limit")
+            first = ("result", "response", "limit", "input")
+            ordered = [asked_of.pop(name) for name in first if name in asked_of]
+            return function(*ordered, **asked_of)
         return function(**common | given)
 
     return asked
@@ -603,6 +612,58 @@ TABLE: dict[str, Row] = {
             "random_seed": SEED,
         },
     ),
+    "decision.Condition": Row(
+        prb.decision.Condition,
+        {**NO_RESPONSE, "metric": but_none(NO_METRIC)},
+        {"response": line},
+    ),
+    "decision.Interval": Row(
+        prb.decision.Interval,
+        {"low": NO_LIMIT, "high": (*NO_LIMIT, 0.0)},
+        {"low": 0.0, "high": 1.0},
+    ),
+    "plan": Row(
+        with_decision(prb.plan),
+        {
+            "result": NO_RESULT,
+            "candidates": (None, {}, 3, {"a": 3}, {3: prb.decision.Condition(line)}, [1]),
+            "k": (*[v for v in COUNT if v != [64]], [], [0], "ab"),
+            "model": (3, "model", Name("bare")),
+            "quantity": ("mean", 3, prb.decision.Mean),
+            "target": ({}, 3, {"tau": 1.0}, {"mu": 0.0}, {"mu": "a"}, {"quantity": 1.0}),
+        },
+    ),
+    "exceedance": Row(
+        with_decision(prb.exceedance),
+        {
+            "result": NO_RESULT,
+            "response": (3, "line", None),
+            "limit": NO_LIMIT,
+            "input": (None, "a", np.nan, 3.0, pm.Normal),
+            "model": (3, "model", Name("bare")),
+            "output": (0, "a"),
+            "below": FLAG,
+            "level": SHARE,
+            "draws": (*COUNT, 1),
+            "points": (-1, 5, 1.5, "a", None, True),
+            "steps": (*COUNT, 1),
+            "executor": EXECUTOR,
+            "random_seed": SEED,
+        },
+    ),
+    "decision.p_box": Row(
+        with_decision(prb.decision.p_box),
+        {
+            "result": NO_RESULT,
+            "response": (3, "line", None),
+            "input": (None, "a", np.nan, 3.0, pm.Normal),
+            "model": (3, "model", Name("bare")),
+            "output": (0, "a"),
+            "level": SHARE,
+            "draws": (*COUNT, 1),
+            "steps": (*COUNT, 1),
+        },
+    ),
     "plots.plot_sensitivity": Row(
         prb.plots.plot_sensitivity,
         {
@@ -746,6 +807,7 @@ TABLE: dict[str, Row] = {
             "posterior": (3, "posterior", {"a": 3}, xr.DataTree(), Name("optimum")),
             "validity": (3, "test", {"a": 3}, Name("comparison")),
             "comparison": (3, "table", Name("optimum"), xr.Dataset()),
+            "decision": (3, "risk", xr.Dataset(), {"a": 3}, Name("comparison")),
             "pictures": FLAG,
         },
     ),

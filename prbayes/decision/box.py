@@ -23,7 +23,7 @@ from prbayes.response.response import refuse_uncallable
 # monotone, differ from those at twice as many by less than the eye sees.
 _PLACES = 200
 # Probability beyond the outermost places, on either side, of the mean distribution.
-_OUTSIDE = 1e-4
+_BEYOND_PLACES = 1e-4
 
 
 @in_turn
@@ -141,7 +141,7 @@ def _places(told: list[Told]) -> Floats:
     """Return places at even steps of the mean distributions, with tails, all different."""
     scores = np.linspace(0, 1, _PLACES // len(told) or 2)
     # More of them in the tails: even steps of the logit.
-    reach = np.log(_OUTSIDE)
+    reach = np.log(_BEYOND_PLACES)
     levels = 1 / (1 + np.exp(reach * (1 - 2 * scores)))
     found = []
     for one in told:

@@ -23,7 +23,7 @@ from prbayes.model.turns import in_turn
 # Draws that are made narrower: standard deviations are then known to two percent.
 _READ = 2000
 # Specimens up to which one that reaches a target is looked for.
-_MOST = 1_000_000
+_MOST_SPECIMENS = 1_000_000
 # What the row of the decision quantity is called.
 _QUANTITY = "quantity"
 
@@ -197,7 +197,7 @@ class _Outlook:
         short, enough = 0, 1
         while self._of_one(enough * each, name) > target:
             short, enough = enough, 2 * enough
-            if short > _MOST:
+            if short > _MOST_SPECIMENS:
                 return np.inf
         while enough - short > 1:
             middle = (enough + short) // 2

@@ -12,14 +12,14 @@ from prbayes._checks import AT_ONCE, Floats
 from prbayes.decision.specimens import Specimens
 
 # Parts of all points of which one is spent on each step towards the limit: half of them are taken.
-_PARTS = 16
+_SEARCH_PARTS = 16
 # Points that count for one from the wide proposal, which bounds weights. By judgement, as a tenth
 # of them costs a twentieth of the accuracy.
 _TO_ONE = 9
 # How much wider than the population the first points are, in standard deviations, over the root of
 # the number of dimensions; they keep weights bounded. By judgement: of one input eight points in a
 # thousand are then four standard deviations out, and of ten weights are as even as of one.
-_WIDER = 0.5
+_ROOM_AT_FIRST = 0.5
 # Share of a step's points that the next one is drawn towards, as in Rubinstein's method, where .1
 # to .2 are usual.
 _ELITE = 0.2
@@ -31,7 +31,7 @@ _SURE = 3.0
 _ROOMY = 1.2
 # Variance towards the limit at least: of the tail of a normal population beyond four standard
 # deviations it is .05, and a proposal may be wider.
-_NARROWEST = 0.1
+_LEAST_ALONG = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,10 +125,10 @@ def rare(
     """
     d = specimens.size
     points = Points()
-    widest = _Proposal(np.zeros(d), (1 + _WIDER / np.sqrt(d)) * np.eye(d))
+    widest = _Proposal(np.zeros(d), (1 + _ROOM_AT_FIRST / np.sqrt(d)) * np.eye(d))
     proposals = [widest]
     # More dimensions need more points for a step.
-    part = max(size // _PARTS, min(10 * d, size // 8), 1)
+    part = max(size // _SEARCH_PARTS, min(10 * d, size // 8), 1)
     # Towards the limit; once there, where it is exceeded becomes known better.
     search = size // 2
     while search:
@@ -152,8 +152,16 @@ def rare(
     return Rare(
         by_draw=np.where(beyond, weights, 0.0).mean(axis=1),
         error=float(error),
-        lost=float(pooled[~known].sum() / pooled.sum()),
+        lost=_lost(points),
     )
+
+
+def _lost(points: Points) -> float:
+    """Return the share of the populations' weight on points without response."""
+    z, values, log_ratio = points.all()
+    log_weight = logsumexp(log_ratio, axis=0) + log_normal(z) - points.log_mixture(z)
+    weights = np.exp(log_weight - log_weight.max())
+    return float(weights[np.isnan(values)].sum() / weights.sum())
 
 
 def _repeated(proposals: list[_Proposal]) -> list[_Proposal]:
@@ -210,7 +218,7 @@ def _towards(points: Points, level: float, limit: float) -> list[_Proposal]:
     z = z[above]
     weights = np.exp(log_weight[above] - log_weight[above].max())
     # Narrower only where the limit is reached: a step is longer for it before.
-    least = _NARROWEST if level >= limit else 1.0
+    least = _LEAST_ALONG if level >= limit else 1.0
     mean = weights @ z / weights.sum()
     away = z - mean
     variances, axes = np.linalg.eigh((away.T * weights) @ away / weights.sum())
