@@ -6,9 +6,9 @@ from typing import Any
 import pymc as pm
 import pytest
 import xarray as xr
+from decisions import normal, optimum, same
 
 import prbayes as prb
-from decisions import normal, optimum, same
 
 
 @cache
