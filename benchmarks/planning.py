@@ -174,9 +174,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=OUT)
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
-    whole = record.load(arguments.out, {})
     for name in arguments.problems:
         rows = [repetition(PROBLEMS[name], seed) for seed in range(arguments.data_sets)]
+        whole = record.load(arguments.out, {})  # of another problem, which may have run meanwhile
         whole[name] = {"data sets": len(rows), "table": summary(rows)}
         for key, cell in whole[name]["table"].items():
             print(name, key, {k: np.round(v, 4).tolist() for k, v in cell.items()}, flush=True)
