@@ -394,7 +394,7 @@ def two_fidelities() -> Iterator[Row]:
 def plans() -> Iterator[Row]:
     """Return the rows of expected and found standard deviations."""
     labels = {"crack": ("crack growth", "21 + 20"), "virkler": ("Virkler", "20 + 24")}
-    names = {"quantity": "99% quantile"}
+    names = {"quantity": "quantile later on"}
     for problem, (label, specimens) in labels.items():
         table = found("planning")[problem]
         for key, cell in table["table"].items():
