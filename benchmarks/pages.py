@@ -434,6 +434,9 @@ def risk_coverage() -> Iterator[Row]:
         of, _, band = key.partition("/")
         what = labels.get(band, "interval of `exceedance`")
         yield [of, what, str(table["data sets"]), f"{share:.1%}"]
+    for size, shares in found("risk")["exact"].items():
+        for key in ("simultaneous", "pointwise"):
+            yield ["exact posterior, for comparison", labels[key], size, f"{shares[key]:.1%}"]
 
 
 def libraries() -> Iterator[Row]:

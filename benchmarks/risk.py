@@ -7,9 +7,10 @@ The posterior is given, so that the truth is known.
 
 Coverage: 200 data sets of 50 specimens, each calibrated by `minimize` and `sample_smc` from 512 runs;
 in how many the 90% bands of `p_box` hold the true distribution function, of the response and of
-another one, and the interval of `exceedance` its probability of 1e-3.
+another one, and the interval of `exceedance` its probability of 1e-3. Beside that the same bands of
+the exact posterior under the right Haar prior, on the same 200 data sets and on 2000.
 
-    uv run python -m benchmarks.risk [--parts errors coverage] [--data-sets 200]
+    uv run python -m benchmarks.risk [--parts errors coverage exact] [--data-sets 200]
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from scipy.special import ndtr, ndtri
 
 import prbayes as prb
 from benchmarks import record
+from prbayes._envelope import envelope
 
 OUT = record.RESULTS / "risk.json"
 DRAWS = 200
@@ -180,10 +182,36 @@ def coverage(data_sets: int) -> dict[str, Any]:
     return {"data sets": data_sets, "level": 0.9, "held": shares}
 
 
+def exact(data_sets: int) -> dict[str, Any]:
+    """Return how often the same bands hold the truth with the exact posterior of the same data."""
+    held: dict[str, list[float]] = {"simultaneous": [], "pointwise": []}
+    z = ndtri(np.linspace(3e-4, 1 - 3e-4, 150))
+    n = 50
+    for seed in range(data_sets):
+        data = np.random.default_rng(seed).normal(TRUE_MU, TRUE_SIGMA, n)
+        rng = np.random.default_rng([seed, 1])
+        sigma = data.std(ddof=1) * np.sqrt((n - 1) / rng.chisquare(n - 1, (999, 1)))
+        mu = data.mean() + sigma / np.sqrt(n) * rng.normal(size=(999, 1))
+        y = data.mean() + data.std(ddof=1) * z
+        truth = ndtr((y - TRUE_MU) / TRUE_SIGMA)
+        functions = ndtr((y - mu) / sigma)
+        low, high = envelope(functions, 0.1)
+        held["simultaneous"].append(bool(((low <= truth) & (truth <= high)).all()))
+        low, high = np.quantile(functions, [0.05, 0.95], axis=0)
+        inside = ((low <= truth) & (truth <= high)).astype(float)
+        held["pointwise"].append(
+            float(np.interp(np.linspace(0.05, 0.95, 19), truth, inside).mean())
+        )
+    return {
+        f"{size}": {key: float(np.mean(rows[:size])) for key, rows in held.items()}
+        for size in (200, data_sets)
+    }
+
+
 def main() -> None:
     """Compute, print and save."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--parts", nargs="*", default=["errors", "coverage"])
+    parser.add_argument("--parts", nargs="*", default=["errors", "coverage", "exact"])
     parser.add_argument("--data-sets", type=int, default=200)
     parser.add_argument("--repetitions", type=int, default=50)
     parser.add_argument("--out", type=Path, default=OUT)
@@ -195,6 +223,9 @@ def main() -> None:
     if "coverage" in arguments.parts:
         whole["coverage"] = coverage(arguments.data_sets)
         print(whole["coverage"])
+    if "exact" in arguments.parts:
+        whole["exact"] = exact(2000)
+        print(whole["exact"])
     record.save(arguments.out, whole)
 
 

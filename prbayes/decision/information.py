@@ -18,8 +18,8 @@ from prbayes.estimate.refit import SamplingDistribution
 from prbayes.metrics.base import Metric
 from prbayes.response.response import refuse_uncallable
 
-# Specimens of the ideal sample from which the information in one is told, at least: of fewer a
-# metric's bandwidth or cells would be those of a small sample. By judgement.
+# Specimens of the ideal sample from which the information in one is told, or as many as there are:
+# of fewer a metric's bandwidth or cells would be those of a small sample. By judgement.
 _IDEAL = 50
 # Standard error of an ideal sample, in spreads of the prior, up to which it tells of a direction:
 # what it leaves out is less than a hundredth of what a prior tells.
@@ -71,7 +71,7 @@ class Condition:
         return f"Condition of {getattr(self.response, '__name__', type(self.response).__name__)}"
 
 
-def of_a_specimen(told: Told, metric: Metric | None, specimens: int) -> Floats:
+def of_a_specimen(told: Told, metric: Metric | None) -> Floats:
     r"""Return the information of one specimen, (d, d), in units of the prior's spread.
 
     The Godambe information :math:`H J^{-1} H` of an ideal sample of the population at the centre,
@@ -82,13 +82,11 @@ def of_a_specimen(told: Told, metric: Metric | None, specimens: int) -> Floats:
     told : Told
         The response under the condition.
     metric : Metric, optional
-    specimens : int
-        How many are thought of.
     """
     evaluator = told.populations.evaluator
     node = evaluator.nodes[told.k]
     center = told.populations.center
-    n = max(specimens, _IDEAL)
+    n = max(round(node.n_specimens), _IDEAL)
     sample = _ideal(told, n)
     target = (metric or node.metric).against(sample)
     design = told.design

@@ -131,7 +131,7 @@ def plan(
     }
     sd, needed = [], []
     for label, one in candidates.items():
-        each = of_a_specimen(told[label], one.metric, max(numbers))
+        each = of_a_specimen(told[label], one.metric)
         rows = [outlook.sd(number * each) for number in numbers]
         sd.append([[row[name] for name in now] for row in rows])
         needed.append([outlook.needed(each, name, (target or {}).get(name)) for name in now])

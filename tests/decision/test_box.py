@@ -26,7 +26,7 @@ def functions(y: Any) -> Any:
     return ndtr((y - MU[:, None]) / SIGMA[:, None])
 
 
-@pytest.mark.parametrize("level", [0.5, 0.9])
+@pytest.mark.parametrize("level", [0.9, pytest.param(0.5, marks=pytest.mark.slow)])
 def test_bands_hold_what_they_say(level: float) -> None:
     found = box(level=level)
     each = functions(found.y.values)
@@ -72,6 +72,15 @@ def test_an_interval_widens_to_both_ends() -> None:
     np.testing.assert_allclose(found.mean_upper, high, atol=0.012)
     assert (found.lower.sel(band="pointwise") <= low + 0.01).all()
     assert (found.upper.sel(band="pointwise") >= high - 0.01).all()
+
+
+def test_a_value_counts_where_it_is() -> None:
+    found = box(np.round)
+    y = found.y.values
+    whole = np.isclose(y, 1.0)
+    assert whole.any()
+    expected = ndtr((1.5 - MU) / SIGMA).mean()
+    assert float(found["mean"].values[whole][0]) == pytest.approx(expected, abs=0.01)
 
 
 def test_specimens_that_failed_are_above_all_others() -> None:

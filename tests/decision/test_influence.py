@@ -77,6 +77,7 @@ def test_errors_fall_with_the_samples_and_seeds_matter() -> None:
     assert np.isnan(float(many.derivative.sel(factor="x")))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_the_step_does_not_matter(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
     model, x = normal()

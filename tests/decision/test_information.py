@@ -19,7 +19,7 @@ def test_a_specimen_of_a_normal_population(metric: prb.Metric, least: float) -> 
     populations = Populations.of(optimum(), None, 10, "prb.plan")
     told = populations.all_outputs(same, (normal()[1],))
     unit = populations.evaluator.prior_sd
-    found = of_a_specimen(told, metric, 50) / np.outer(unit, unit)
+    found = of_a_specimen(told, metric) / np.outer(unit, unit)
     # Fisher's information of the mean and of log sigma.
     sigma = np.exp(populations.center[1])
     expected = np.array([1 / sigma**2, 2.0])
@@ -33,8 +33,7 @@ def test_the_unit_of_a_response_does_not_matter() -> None:
     populations = Populations.of(optimum(), None, 10, "prb.plan")
     x = normal()[1]
     one, two = (
-        of_a_specimen(populations.all_outputs(response, (x,)), None, 50)
-        for response in (same, doubled)
+        of_a_specimen(populations.all_outputs(response, (x,)), None) for response in (same, doubled)
     )
     np.testing.assert_allclose(one, two, rtol=1e-3, atol=1e-3 * np.abs(one).max())
 
@@ -57,7 +56,7 @@ def test_fishers_information_of_a_response() -> None:
 def test_what_tells_of_one_direction_only() -> None:
     populations = Populations.of(optimum(), None, 10, "prb.plan")
     told = populations.all_outputs(lambda x: np.abs(x - 1.0), (normal()[1],))
-    found = of_a_specimen(told, prb.LogLikelihood(), 50)
+    found = of_a_specimen(told, prb.LogLikelihood())
     # How far specimens are from about the middle says little of where that is.
     sigma = np.exp(populations.center[1])
     unit = populations.evaluator.prior_sd

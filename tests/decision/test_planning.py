@@ -16,8 +16,7 @@ def table() -> xr.Dataset:
         "same": prb.decision.Condition(same, x),
         "size": prb.decision.Condition(lambda x: np.abs(x - 1.0), x, metric=prb.LogLikelihood()),
     }
-    target = {"mu": 0.03, "quantity": 1e-9, "sigma": 9.0}
-    return prb.plan(optimum(), candidates, [N, 3 * N], quantity=quantity, target=target)
+    return prb.plan(optimum(), candidates, [N, 3 * N], quantity=quantity)
 
 
 def test_specimens_of_the_same_kind_narrow_by_their_number(table: xr.Dataset) -> None:
@@ -33,7 +32,12 @@ def test_another_condition_tells_of_what_it_sees(table: xr.Dataset) -> None:
     assert float(ratio.sel(name="sigma")) < 0.6
 
 
-def test_the_number_that_reaches_a_target(table: xr.Dataset) -> None:
+def test_the_number_that_reaches_a_target() -> None:
+    _, x = normal()
+    condition = {"same": prb.decision.Condition(same, x)}
+    target = {"mu": 0.03, "quantity": 1e-9, "sigma": 9.0}
+    quantity = prb.decision.Quantile(same, x, probability=0.95)
+    table = prb.plan(optimum(), condition, 5, quantity=quantity, target=target)
     needed = table.specimens.sel(candidate="same")
     now = float(table.now.sel(name="mu"))
     assert float(needed.sel(name="mu")) == pytest.approx(N * ((now / 0.03) ** 2 - 1), rel=0.1)
@@ -41,7 +45,6 @@ def test_the_number_that_reaches_a_target(table: xr.Dataset) -> None:
     assert float(needed.sel(name="quantity")) == np.inf
     # It is the least.
     k = int(needed.sel(name="mu"))
-    condition = {"same": prb.decision.Condition(same, normal()[1])}
     around = prb.plan(optimum(), condition, [k - 1, k]).sd.sel(candidate="same", name="mu")
     assert float(around[1]) <= 0.03 < float(around[0])
 

@@ -27,7 +27,7 @@ TOTAL = FIRST + 0.01 * np.pi**8 * (1 / 18 - 1 / 50) / VARIANCE * np.array([1, 0,
 
 
 @cache
-def problem(emulator: str | None = "auto") -> tuple[prb.Optimum, list[Any]]:
+def problem(emulator: str | None = "auto", n: int = 256) -> tuple[prb.Optimum, list[Any]]:
     rng = np.random.default_rng(1)
     with pm.Model() as model:
         inputs = [pm.Uniform.dist(-np.pi, np.pi) for _ in range(3)]
@@ -37,12 +37,42 @@ def problem(emulator: str | None = "auto") -> tuple[prb.Optimum, list[Any]]:
             *("y", ishigami, *inputs),
             metric=prb.ProbabilityResidual(),
             observed=data,
-            propagation=prb.Reweighted(200, emulator=emulator),
+            propagation=prb.Reweighted(n, emulator=emulator),
         )
-    return prb.minimize(model, progressbar=False), inputs
+    return prb.minimize(model, refine=False, starts=0, progressbar=False), inputs
 
 
-def test_ishigami_emulated_from_two_hundred_runs_and_called() -> None:
+def test_two_inputs_that_act_together_emulated_and_called() -> None:
+    def together(a: Any, b: Any) -> Any:
+        return a + b + a * b
+
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
+        b = pm.Normal.dist(0.0, 1.0)
+        z = np.random.default_rng(1).normal(size=(2, 100))
+        prb.Simulator(
+            *("y", together, a, b),
+            metric=prb.ProbabilityResidual(),
+            observed=together(*z),
+            propagation=prb.Reweighted(64),
+        )
+    optimum = prb.minimize(model, starts=0, progressbar=False)
+    # mu + a + (1 + mu) b + a b, with a and b standard normal.
+    slope = 1 + float(optimum.point["mu"])
+    alone = np.array([1.0, slope**2])
+    for computed in (False, True):
+        quantity = prb.decision.Mean(together, a, b)
+        table = prb.sensitivity(optimum, quantity, samples=512, computed=computed)
+        own = table.sel(factor=["a", "b"])
+        for key, part in (("first", alone), ("total", alone + 1)):
+            off = np.abs(own[key] - part / (alone.sum() + 1))
+            assert (off < 5 * own[f"{key}_error"]).all()
+            assert (own[f"{key}_error"] < 0.05).all()
+        assert (table.attrs["responses"] > 0) == computed
+
+
+@pytest.mark.slow
+def test_ishigami_emulated_from_few_runs_and_called() -> None:
     optimum, inputs = problem()
     quantity = prb.decision.Mean(ishigami, *inputs)
     for computed in (False, True):
@@ -56,6 +86,7 @@ def test_ishigami_emulated_from_two_hundred_runs_and_called() -> None:
         assert (table.attrs["responses"] > 0) == computed
 
 
+@pytest.mark.slow
 def test_derivatives_bound_a_linear_response_as_tightly_as_they_can() -> None:
     optimum, inputs = problem()
     quantity = prb.decision.Mean(bounds, *inputs)
@@ -69,8 +100,9 @@ def test_derivatives_bound_a_linear_response_as_tightly_as_they_can() -> None:
     np.testing.assert_allclose(own.derivative[1:3], 0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_without_an_emulator_nothing_tells_what_is_between_the_runs() -> None:
-    optimum, inputs = problem(None)
+    optimum, inputs = problem(None, 4096)
     quantity = prb.decision.Mean(ishigami, *inputs)
     table = prb.sensitivity(optimum, quantity, samples=64)
     assert np.isnan(table["first"].sel(factor="a"))
@@ -90,6 +122,7 @@ def test_where_the_nearest_run_failed_a_line_ends() -> None:
     assert found.indices.total == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_the_step_does_not_matter(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
     optimum, inputs = problem()

@@ -1,6 +1,7 @@
 """Probabilities of exceedance beside closed forms, with bounds where an input is an interval."""
 
 import logging
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from decisions import doubled, normal, posterior, same
 from scipy.special import ndtr
 
 import prbayes as prb
+from prbayes.decision.tail import _error_of_points
 
 MU, SIGMA = (posterior().posterior[name].values[0] for name in ("mu", "sigma"))
 THINNED = np.unique(np.linspace(0, 3999, 400).round().astype(int))
@@ -50,9 +52,25 @@ def test_from_points_where_it_matters() -> None:
 
 def test_below_is_above_of_the_opposite() -> None:
     for points in (0, 500):
-        below = ask(0.0, below=True, points=points)
-        above = ask(0.0, lambda x: -x, points=points)
+        below = ask(0.2, below=True, points=points)
+        above = ask(-0.2, lambda x: -x, points=points)
         np.testing.assert_allclose(below.by_draw, above.by_draw, rtol=1e-9)
+
+
+def test_the_error_of_equal_points_is_that_of_their_blocks_means() -> None:
+    values = np.arange(64.0)
+    blocks = np.arange(64) % 8
+    thetas = np.zeros((3, 1))
+    told = SimpleNamespace(
+        populations=SimpleNamespace(thetas=thetas),
+        values=values,
+        blocks=blocks,
+        weights=lambda thetas: np.full((len(thetas), 64), 1 / 64),
+    )
+    quantity = prb.decision.Exceedance(same, normal()[1], limit=42.0)
+    means = [(values[blocks == b] > 42).mean() for b in range(8)]
+    expected = np.std(means, ddof=1) / np.sqrt(8)
+    assert _error_of_points(told, quantity) == pytest.approx(expected)  # type: ignore[arg-type]
 
 
 def shifted(x: Any, by: Any) -> Any:
