@@ -28,9 +28,13 @@ class Quantity(ABC):
     ----------
     needs_finite : bool
         Whether no specimen may have failed (+inf).
+    differentiable : bool
+        Whether the number of a specimen whose variance is shared out has derivatives where the
+        response has.
     """
 
     needs_finite = False
+    differentiable = True
 
     def __init__(self, response: Callable[..., Any], *inputs: Any, output: Any = None) -> None:
         refuse_uncallable(f"prb.decision.{type(self).__name__}", response)
@@ -131,6 +135,8 @@ class Quantile(Quantity):
     99% quantile of square
     """
 
+    differentiable = False
+
     def __init__(
         self,
         response: Callable[..., Any],
@@ -175,6 +181,8 @@ class Exceedance(Quantity):
     >>> prb.decision.Exceedance(np.square, pm.Normal.dist(), limit=4.0)
     probability above 4 of square
     """
+
+    differentiable = False
 
     def __init__(
         self,

@@ -118,12 +118,10 @@ def scatter(told: Told, quantity: Quantity, samples: int, seed: int, *, computed
             "between the runs nothing tells the response; computed=True calls it at new specimens",
         )
     (at,) = told.at(quantity, center)
-    probe = np.linspace(0.0, 1.0, 3)
-    smooth = bool(np.array_equal(quantity.of_specimen(probe, 0.5), probe))
     found = []
     for each in responses:
         values = quantity.of_specimen(each, at).reshape(matched.z.shape[:-1])
-        found.append(matched.indices(values, specimens.columns, smooth=smooth))
+        found.append(matched.indices(values, specimens.columns, smooth=quantity.differentiable))
     whole = Indices.of(*found[0])
     return Scatter(_with_error(whole, found))
 
