@@ -391,6 +391,28 @@ def two_fidelities() -> Iterator[Row]:
         yield [n, *of_emulators, *(short(rms(optima[way]), 3) for way in WAYS)]
 
 
+def plans() -> Iterator[Row]:
+    """Return the rows of expected and found standard deviations."""
+    labels = {"crack": ("crack growth", "21 + 20"), "virkler": ("Virkler", "20 + 24")}
+    names = {"quantity": "quantile later on"}
+    for problem, (label, specimens) in labels.items():
+        table = found("planning")[problem]
+        for key, cell in table["table"].items():
+            condition, name = key.split("/")
+            low, high = (short(value) for value in cell["5% to 95%"])
+            ratio = f"{short(cell['ratio'])} ± {short(cell['error'])}"
+            of = names.get(name, f"`{name}`")
+            yield [
+                label,
+                specimens,
+                condition,
+                of,
+                str(table["data sets"]),
+                ratio,
+                f"{low} to {high}",
+            ]
+
+
 def risk_errors() -> Iterator[Row]:
     """Return the rows of small probabilities."""
     for key, cell in found("risk")["errors"].items():
@@ -475,6 +497,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "three masses": three_masses,
     "two fidelities": two_fidelities,
     "libraries": libraries,
+    "planning": plans,
     "risk, errors": risk_errors,
     "risk, coverage": risk_coverage,
 }
