@@ -404,6 +404,54 @@ def two_fidelities() -> Iterator[Row]:
         yield [n, *of_emulators, *(short(rms(optima[way]), 3) for way in WAYS)]
 
 
+def plans() -> Iterator[Row]:
+    """Return the rows of expected and found standard deviations."""
+    labels = {"crack": ("crack growth", "21 + 20"), "virkler": ("Virkler", "20 + 24")}
+    names = {"quantity": "quantile later on"}
+    for problem, (label, specimens) in labels.items():
+        table = found("planning")[problem]
+        for key, cell in table["table"].items():
+            condition, name = key.split("/")
+            low, high = (short(value) for value in cell["5% to 95%"])
+            ratio = f"{short(cell['ratio'])} ± {short(cell['error'])}"
+            of = names.get(name, f"`{name}`")
+            yield [
+                label,
+                specimens,
+                condition,
+                of,
+                str(table["data sets"]),
+                ratio,
+                f"{low} to {high}",
+            ]
+
+
+def risk_errors() -> Iterator[Row]:
+    """Return the rows of small probabilities."""
+    for key, cell in found("risk")["errors"].items():
+        name, p, points = key.split("/")
+        source = "stored responses" if points.startswith("0 ") else points
+        errors = [f"{cell[column]:.0%}" for column in ("rms", "stated", "within 2")]
+        yield [name, f"{float(p):.0e}", source, str(cell["repetitions"]), *errors]
+
+
+def risk_coverage() -> Iterator[Row]:
+    """Return the rows of coverage of bands."""
+    table = found("risk")["coverage"]
+    labels = {
+        "simultaneous": "simultaneous band, the whole function",
+        "pointwise, entirely": "pointwise band, the whole function",
+        "pointwise": "pointwise band, at one place",
+    }
+    for key, share in table["held"].items():
+        of, _, band = key.partition("/")
+        what = labels.get(band, "interval of `exceedance`")
+        yield [of, what, str(table["data sets"]), f"{share:.1%}"]
+    for size, shares in found("risk")["exact"].items():
+        for key in ("simultaneous", "pointwise"):
+            yield ["exact posterior, for comparison", labels[key], size, f"{shares[key]:.1%}"]
+
+
 def libraries() -> Iterator[Row]:
     """Return the rows of libraries' emulators."""
     table = found("emulators")
@@ -463,6 +511,9 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "three masses": three_masses,
     "two fidelities": two_fidelities,
     "libraries": libraries,
+    "planning": plans,
+    "risk, errors": risk_errors,
+    "risk, coverage": risk_coverage,
 }
 _MARKED = re.compile(
     r"(<!-- table: (?P<name>[^>]+) -->\n\n(?:\|[^\n]*\n){2})(?:\|[^\n]*\n)*(\n<!-- end -->)"

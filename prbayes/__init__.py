@@ -4,7 +4,9 @@ from importlib.metadata import version
 
 from prbayes import (
     datasets,
+    decision,
     metrics,
+    plots,
     posterior,
     propagation,
     reports,
@@ -15,6 +17,9 @@ from prbayes import (
 from prbayes._compare import compare
 from prbayes._diagnose import Diagnosis, diagnose
 from prbayes._predict import predict
+from prbayes.decision.influence import sensitivity
+from prbayes.decision.planning import plan
+from prbayes.decision.tail import exceedance
 from prbayes.estimate.minimization import minimize, refine
 from prbayes.estimate.optimum import Optimum
 from prbayes.metrics.area import AreaMetric
@@ -85,10 +90,13 @@ __all__ = [
     "cost",
     "cross_validate",
     "datasets",
+    "decision",
     "diagnose",
+    "exceedance",
     "fmu",
     "metrics",
     "minimize",
+    "plan",
     "plot_comparison",
     "plot_landscape",
     "plot_optimizer",
@@ -98,6 +106,7 @@ __all__ = [
     "plot_responses",
     "plot_stages",
     "plot_validity",
+    "plots",
     "posterior",
     "predict",
     "propagation",
@@ -106,6 +115,7 @@ __all__ = [
     "response",
     "sample_smc",
     "scalar",
+    "sensitivity",
     "set_epsilon",
     "simulation_based_calibration",
     "surrogate",

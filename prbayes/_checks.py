@@ -227,6 +227,15 @@ def positive_number(value: object, name: str) -> float:
     return float(value)
 
 
+def finite_number(value: object, name: str) -> float:
+    """Return ``value`` as a float, or raise if it is not a finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise TypeError(f"{name}: got {called(value)}, expected a number")
+    if not np.isfinite(value):
+        raise ValueError(f"{name}: got {value!r}, expected a finite number")
+    return float(value)
+
+
 def positive_integer(value: object, name: str, *, minimum: int = 1) -> int:
     """Return ``value`` as an int, or raise if it is not an integer of at least ``minimum``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):

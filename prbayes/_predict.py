@@ -156,13 +156,8 @@ def predict(
     if name is not None:
         plain_text(name, "name")
     refuse_calling(executor, store, version, Abort())
-    if model is None and isinstance(result, Optimum):
-        model = result.model
-    model = model_on_context(model, "prb.predict")
     label = _label(response, name, store)
-    if not (isinstance(result, Optimum) and model is result.model):
-        require_of_model(result, model, "prb.predict", Level.POPULATIONS)
-        require_same_responses(identity_in(result), model, "prb.predict")
+    model = model_of(result, model, "prb.predict")
     points, coords = populations_of(result, model, draws, "prb.predict")
     sorted_inputs = read_inputs(label, inputs, model)
     found = list(nodes(model).values())
@@ -173,7 +168,7 @@ def predict(
         executor=executor,
         store=store,
         version=version,
-        outputs=_known_outputs(found, response),
+        outputs=known_outputs(found, response),
     )
     seed = None if random_seed is None else seed_number(random_seed)
     rng = np.random.default_rng(seed)
@@ -205,6 +200,17 @@ def predict(
             **versions(),
         },
     )
+
+
+def model_of(result: Any, model: pm.Model | None, caller: str) -> pm.Model:
+    """Return the model of a result, the one given, or on the context; raise if it is another's."""
+    if model is None and isinstance(result, Optimum):
+        model = result.model
+    model = model_on_context(model, caller)
+    if not (isinstance(result, Optimum) and model is result.model):
+        require_of_model(result, model, caller, Level.POPULATIONS)
+        require_same_responses(identity_in(result), model, caller)
+    return model
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,7 +313,7 @@ def _refuse_incomplete(known: Any, names: list[str], caller: str) -> None:
         )
 
 
-def _known_outputs(among: Sequence[Node], response: Callable[..., Any]) -> Outputs | None:
+def known_outputs(among: Sequence[Node], response: Callable[..., Any]) -> Outputs | None:
     """Return the outputs of a response that is a simulator's; None where its runs tell."""
     for node in among:
         if node.bound.responses.function is response:
@@ -365,14 +371,14 @@ def _resampled(
 
     Systematic resampling: as many of each point as its weight says, but for one.
     """
-    _refuse_unsupported(name, design, roots)
+    refuse_unsupported(name, design, roots)
     _, weights = design.populations(roots)
     places = (np.arange(n) + rng.random((len(weights), 1))) / n
     found = reached(np.nan_to_num(weights), places, normalized=True)
     return rng.permuted(found, axis=1)
 
 
-def _refuse_unsupported(name: str, design: Design, roots: list[Floats]) -> None:
+def refuse_unsupported(name: str, design: Design, roots: list[Floats]) -> None:
     """Raise if the design does not support most of the populations."""
     support = design.support(roots)
     ess = np.median(support["weight_ess"])
@@ -410,7 +416,7 @@ def _new_specimens(
     symbols = inputs.placeholders()
     uniforms = [pt.tensor(dtype="float64", shape=(None, *s)) for s in inputs.event_shapes]
     try:
-        placed, epistemic = _through_inverses(label, inputs, symbols, uniforms)
+        placed, epistemic = through_inverses(label, inputs, symbols, uniforms)
     except TypeError:
         return PopulationSampler(inputs)(roots, n, rng)
 
@@ -428,7 +434,7 @@ def _new_specimens(
     return aleatory, [v[:, None] for v in values[len(placed) :]]
 
 
-def _through_inverses(
+def through_inverses(
     label: str, inputs: Inputs, symbols: list[Any], uniforms: list[Any]
 ) -> tuple[list[Any], list[Any]]:
     """Return aleatory inputs as inverse distribution functions of uniforms, and epistemic ones.

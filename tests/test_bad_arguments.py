@@ -167,6 +167,8 @@ NO_DATA: Sequence[Any] = (
     [10**400, 1.0],
     np.ma.masked_array([1.0, 2.0, 3.0], [0, 1, 0]),
 )
+NO_RESPONSE: Mapping[str, Sequence[Any]] = {"response": (3, "line", None, dict)}
+NO_LIMIT: Sequence[Any] = ("a", None, np.nan, np.inf, True, [1.0])
 CALLING: dict[str, Sequence[Any]] = {
     "executor": EXECUTOR,
     "store": STORE,
@@ -242,6 +244,27 @@ def report(**given: Any) -> Any:
 
 def with_model(function: Callable[..., Any]) -> Callable[..., Any]:
     return lambda **given: function(**{"model": model()} | QUIET | given)
+
+
+def with_decision(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a question about a posterior, with what it asks of the shared model."""
+
+    def asked(**given: Any) -> Any:
+        common = {"result": posterior(), "model": model()}
+        if function is prb.sensitivity:
+            common["quantity"] = prb.decision.Mean(line, specimen())
+        elif function is prb.plan:
+            common["candidates"] = {"same": prb.decision.Condition(line, specimen())}
+        else:
+            asked_of = {**common, "response": line, "limit": 1.0, "input": specimen()} | given
+            if function is prb.decision.p_box:
+                asked_of.pop("limit")
+            first = ("result", "response", "limit", "input")
+            ordered = [asked_of.pop(name) for name in first if name in asked_of]
+            return function(*ordered, **asked_of)
+        return function(**common | given)
+
+    return asked
 
 
 def of_optimum(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -574,6 +597,89 @@ TABLE: dict[str, Row] = {
             "progressbar": FLAG,
         },
     ),
+    "decision.Mean": Row(prb.decision.Mean, NO_RESPONSE),
+    "decision.StandardDeviation": Row(prb.decision.StandardDeviation, NO_RESPONSE),
+    "decision.Quantile": Row(
+        prb.decision.Quantile,
+        {**NO_RESPONSE, "probability": SHARE},
+        {"response": line, "probability": 0.9},
+    ),
+    "decision.Exceedance": Row(
+        prb.decision.Exceedance,
+        {**NO_RESPONSE, "limit": NO_LIMIT, "below": FLAG},
+        {"response": line, "limit": 1.0},
+    ),
+    "sensitivity": Row(
+        with_decision(prb.sensitivity),
+        {
+            "result": NO_RESULT,
+            "quantity": (None, "mean", 3, prb.decision.Mean, np.mean),
+            "model": (3, "model", Name("bare")),
+            "samples": (*COUNT, 31),
+            "computed": FLAG,
+            "random_seed": SEED,
+        },
+    ),
+    "decision.Condition": Row(
+        prb.decision.Condition,
+        {**NO_RESPONSE, "metric": but_none(NO_METRIC)},
+        {"response": line},
+    ),
+    "decision.Interval": Row(
+        prb.decision.Interval,
+        {"low": NO_LIMIT, "high": (*NO_LIMIT, 0.0)},
+        {"low": 0.0, "high": 1.0},
+    ),
+    "plan": Row(
+        with_decision(prb.plan),
+        {
+            "result": NO_RESULT,
+            "candidates": (None, {}, 3, {"a": 3}, {3: prb.decision.Condition(line)}, [1]),
+            "k": (*[v for v in COUNT if v != [64]], [], [0], "ab"),
+            "model": (3, "model", Name("bare")),
+            "quantity": ("mean", 3, prb.decision.Mean),
+            "target": ({}, 3, {"tau": 1.0}, {"mu": 0.0}, {"mu": "a"}, {"quantity": 1.0}),
+        },
+    ),
+    "exceedance": Row(
+        with_decision(prb.exceedance),
+        {
+            "result": NO_RESULT,
+            "response": (3, "line", None),
+            "limit": NO_LIMIT,
+            "input": (None, "a", np.nan, 3.0, pm.Normal),
+            "model": (3, "model", Name("bare")),
+            "output": (0, "a"),
+            "below": FLAG,
+            "level": SHARE,
+            "draws": (*COUNT, 1),
+            "points": (-1, 5, 1.5, "a", None, True),
+            "steps": (*COUNT, 1),
+            "executor": EXECUTOR,
+            "random_seed": SEED,
+        },
+    ),
+    "decision.p_box": Row(
+        with_decision(prb.decision.p_box),
+        {
+            "result": NO_RESULT,
+            "response": (3, "line", None),
+            "input": (None, "a", np.nan, 3.0, pm.Normal),
+            "model": (3, "model", Name("bare")),
+            "output": (0, "a"),
+            "level": SHARE,
+            "draws": (*COUNT, 1),
+            "steps": (*COUNT, 1),
+        },
+    ),
+    "plots.plot_sensitivity": Row(
+        prb.plots.plot_sensitivity,
+        {
+            **{k: PICTURE[k] for k in ("backend", "labels")},
+            "table": (None, 3, xr.Dataset(), Name("comparison"), Name("posterior")),
+        },
+        {"table": xr.Dataset({"first": 1.0, "total": 1.0})},
+    ),
     "validation.u_values": Row(
         prb.validation.u_values,
         {
@@ -709,6 +815,7 @@ TABLE: dict[str, Row] = {
             "posterior": (3, "posterior", {"a": 3}, xr.DataTree(), Name("optimum")),
             "validity": (3, "test", {"a": 3}, Name("comparison")),
             "comparison": (3, "table", Name("optimum"), xr.Dataset()),
+            "decision": (3, "risk", xr.Dataset(), {"a": 3}, Name("comparison")),
             "pictures": FLAG,
         },
     ),
@@ -890,6 +997,15 @@ def test_every_public_name_has_a_row() -> None:
     assert len(CASES) >= 1300
     # Names of packages and of what calls give back; the constructor of data has no arguments, nor
     # has the area metric; whoever writes a metric of his own derives from the class.
-    spared = {"datasets", "metrics", "posterior", "propagation", "reports", "response"}
+    spared = {
+        "datasets",
+        "metrics",
+        "posterior",
+        "propagation",
+        "reports",
+        "response",
+        "decision",
+        "plots",
+    }
     spared |= {"surrogate", "validation", "Diagnosis", "Optimum", "AreaMetric", "Metric"}
     assert set(prb.__all__) - spared <= set(TABLE)

@@ -260,6 +260,15 @@ class Evaluator:
             targets.append(target.beside(bound.first_responses, bound.dimensions))
         return self._with_targets(targets)
 
+    def of_one(self, node: Node, k: int) -> Evaluator:
+        """Return an evaluator of one simulator alone, of the k-th's inputs; it is not compiled."""
+        other = copy.copy(self)
+        other.nodes = [node]
+        other._variables = [self._variables[k]]
+        vars(other).pop("_roots", None)
+        other.__dict__["objective"] = other._uncompiled
+        return other
+
     def _with_targets(self, targets: list[Discrepancy]) -> Evaluator:
         other = copy.copy(self)
         pairs = zip(self.nodes, targets, strict=True)

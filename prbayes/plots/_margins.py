@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +19,7 @@ from prbayes.plots._curves import GRID_POINTS, central_range, smooth_densities
 from prbayes.plots._names import variable_of
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, is_mvnormal
-from prbayes.response.inputs import Inputs
+from prbayes.response.inputs import Inputs, aleatory_names
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +48,11 @@ def margins(evaluator: Evaluator) -> list[Margin]:
     taken = {str(variable.name) for variable in variables}
     for k, node in enumerate(evaluator.nodes):
         inputs = node.bound.inputs
-        arguments = _arguments(node.bound.responses.function)
+        names = aleatory_names(inputs, node.bound.responses.function)
         for position, dist in enumerate(inputs.aleatory):
             if any(margin.dist is dist for margin in found):
                 continue
-            name = dist.name or _argument_of(position, inputs, arguments)
+            name = names[position]
             if name in taken:
                 name = f"{name} of {node.name}"
             taken.add(name)
@@ -61,24 +60,6 @@ def margins(evaluator: Evaluator) -> list[Margin]:
                 element = element_name(name, index)
                 found.append(Margin(element, dist, k, position, index))
     return found
-
-
-def _arguments(function: Any) -> list[str]:
-    """Return the names of a response's arguments, as far as there are any."""
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        return []
-    plain = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return [p.name for p in parameters if p.kind in plain]
-
-
-def _argument_of(position: int, inputs: Inputs, arguments: list[str]) -> str:
-    """Return the name of the argument that takes an aleatory input, or its number."""
-    place = inputs.arguments.index(position)
-    if place < len(arguments):
-        return arguments[place]
-    return f"input {place + 1}"
 
 
 def chosen(known: list[Margin], inputs: Iterable[Any] | None) -> list[Margin]:

@@ -56,6 +56,7 @@ from prbayes.response.compilation import compile_batched
 from prbayes.response.costs import Demand
 from prbayes.response.distributions import (
     PopulationSampler,
+    compiled_log_density,
     log_density,
     prior_draws,
     quantiles,
@@ -545,6 +546,10 @@ class Design(Bound):
         """
         if responses.same_as(self.responses):
             return self.values
+        return self._tabulated(self._at_runs(responses))
+
+    def _at_runs(self, responses: Responses) -> Floats:
+        """Return another response at the runs, (n,) or (n, m)."""
         before = [pair for pair in self._others if responses.same_as(pair[0])]
         known = before[0][1] if before else np.empty(0)
         if len(known) < self.n_runs:
@@ -556,13 +561,42 @@ class Design(Bound):
             if before:
                 self._others.remove(before[0])
             self._others.append((responses, known))
-        return self._tabulated(known)
+        return known
 
     def _tabulated(self, known: Floats) -> Floats:
         """Return another response of the points that have weights, of that of the runs."""
         contents = self.contents
         if contents.cloud is None or contents.emulation is None:
             return known
+        said = self._emulation_of(known).at(contents.cloud)
+        return np.concatenate([said, known]) if contents.emulation.share else said
+
+    def emulated(self, responses: Responses, points: Sequence[Floats]) -> list[Floats]:
+        """Return a response at any points of the design's inputs, (n,) or (n, m), as emulators say.
+
+        That of all runs first, then those that lack a block of them each; none without emulators.
+        """
+        emulation = self.contents.emulation
+        if emulation is None:
+            return []
+        coarse = None
+        if not responses.same_as(self.responses):
+            emulation = self._emulation_of(self._at_runs(responses))
+        elif self._coarse is not None and emulation.following:
+            coarse = self._coarse(points)
+        cloud = Cloud(tuple(points), np.zeros(len(points[0])), coarse)
+        return [emulation.at(cloud), *emulation.without_each_block(cloud)]
+
+    def _emulation_of(self, known: Floats) -> Emulation:
+        """Return an emulator of another response, of that at the runs.
+
+        Raises
+        ------
+        UntoldError
+            If the runs do not tell it between them.
+        """
+        contents = self.contents
+        assert contents.emulation is not None
         other = Emulation.of(
             self.config.emulator,
             self.batches.points,
@@ -580,8 +614,7 @@ class Design(Bound):
                 f"most {_TRUSTED:.0%} more than of its own; calibrate with "
                 "prb.Reweighted(n, emulator=None), or let one response return both outputs"
             )
-        said = other.at(contents.cloud)
-        return np.concatenate([said, known]) if contents.emulation.share else said
+        return other
 
     def same_points(self, other: Bound) -> bool:
         """Return whether another design has the same points, whose responses belong together."""
@@ -953,6 +986,22 @@ class Design(Bound):
         other.__dict__.pop("_log_weights", None)  # compiled on the shared variables of this one
         return other
 
+    def telling(self, values: Floats, target: Discrepancy) -> Self:
+        """Return a design of the same points with another response of theirs, and other data.
+
+        It is not to grow: its runs are those of this design.
+        """
+        other = super().copied()
+        table = replace(self.contents.table, values=values)
+        other._contents = replace(self.contents, table=table, cloud=None, emulation=None)
+        other.target = target
+        other._others = deque(maxlen=self._others.maxlen)
+        other._basis = (None, None, None)
+        other._shared = []
+        other._share(other._arrays())
+        other.__dict__.pop("_log_weights", None)  # compiled on the shared variables of this one
+        return other
+
     @contextmanager
     def undone(self) -> Iterator[None]:
         """Forget, afterwards, the batches that are added inside."""
@@ -996,14 +1045,7 @@ class Design(Bound):
 
     @cached_property
     def _log_density(self) -> Any:
-        symbols = self.inputs.placeholders()
-        points = []
-        for x in self.inputs.aleatory:
-            shape = (None,) * (x.type.ndim + 1)
-            points.append(pt.tensor(dtype=x.dtype, shape=shape))
-        dists, _ = self.inputs.rebuilt(symbols)
-        density = log_density(self.inputs, dists, points)
-        return compile_batched(symbols, [density], points)
+        return compiled_log_density(self.inputs)
 
     @cached_property
     def _quantiles(self) -> Any:

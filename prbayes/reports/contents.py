@@ -7,6 +7,8 @@ from typing import Any
 from prbayes.reports.assessment import comparison as comparison_of
 from prbayes.reports.assessment import diagnostics, failures, origin
 from prbayes.reports.assessment import validity as validity_of
+from prbayes.reports.decision import decision as decision_of
+from prbayes.reports.decision import refuse_decisions
 from prbayes.reports.estimates import optima, posteriors
 from prbayes.reports.illustrations import illustrate, with_graph
 from prbayes.reports.material import Material, gather
@@ -33,6 +35,7 @@ _PARTS = (
     diagnostics,
     failures,
     validity_of,
+    decision_of,
     origin,
 )
 
@@ -43,11 +46,13 @@ def contents(
     posterior: Any,
     validity: Any,
     comparison: Any,
+    decision: Any = None,
     *,
     pictures: bool,
 ) -> tuple[Section, ...]:
     """Return the sections that the results allow, with pictures if wanted."""
-    material = gather(model, optimum, posterior, validity, comparison)
+    refuse_decisions(decision)
+    material = gather(model, optimum, posterior, validity, comparison, decision)
     sections = tuple(section for part in _PARTS for section in part(material))
     if not pictures:
         return sections

@@ -13,6 +13,7 @@ import pymc as pm
 
 from prbayes.model.node import nodes
 from prbayes.plots.comparison import plot_comparison
+from prbayes.plots.influences import plot_sensitivity
 from prbayes.plots.landscape import plot_landscape
 from prbayes.plots.optimizer import plot_optimizer
 from prbayes.plots.outputs import plot_outputs
@@ -21,6 +22,7 @@ from prbayes.plots.posterior import plot_posterior
 from prbayes.plots.responses import plot_responses
 from prbayes.plots.stages import plot_stages
 from prbayes.plots.validity import plot_validity
+from prbayes.reports.decision import kind_of_decision
 from prbayes.reports.images import image
 from prbayes.reports.material import Material
 from prbayes.reports.section import Section
@@ -126,6 +128,12 @@ def _validity(m: Material) -> Request:
     return Call((_first(m.tests),)) if len(m.tests) == 1 else Call((m.tests,))
 
 
+def _decision(m: Material) -> Request:
+    tables = m.decisions.values()
+    found = [table for table in tables if kind_of_decision(table) == "sensitivity"]
+    return Call((found[0],)) if found else None
+
+
 # In the order of the report, and within a section in this order.
 ILLUSTRATIONS = (
     Illustration(
@@ -207,6 +215,16 @@ ILLUSTRATIONS = (
         "A right model keeps near the diagonal; the shaded area is the statistic, "
         "and the band holds the whole curve with the stated probability. "
         "Of several outputs there is a line for each direction in which they are seen.",
+    ),
+    Illustration(
+        after="Decision",
+        function=plot_sensitivity,
+        request=_decision,
+        title="Shares of hyperparameters and inputs",
+        alt="Share of each hyperparameter in the variance of the decision quantity, and of each "
+        "input in that of the response.",
+        caption="What moves the decision: a dot is the share of a factor by itself, a diamond what "
+        "is left when all others are known, with two standard errors to either side.",
     ),
 )
 

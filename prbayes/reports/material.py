@@ -35,6 +35,7 @@ class Material:
     observed: dict[str, Floats]  # measured responses by simulator; of several outputs (N, m)
     outputs: dict[str, Outputs]  # of a run, by simulator
     diagnoses: dict[str, Diagnosis | None]
+    decisions: dict[str, xr.Dataset]
 
     @property
     def results(self) -> dict[str, xr.DataTree]:
@@ -70,7 +71,9 @@ class Material:
         return list(map(str, _answer(first).data_vars))
 
 
-def gather(model: Any, optimum: Any, posterior: Any, validity: Any, comparison: Any) -> Material:
+def gather(
+    model: Any, optimum: Any, posterior: Any, validity: Any, comparison: Any, decision: Any = None
+) -> Material:
     """Check what was given.
 
     Raises
@@ -82,6 +85,7 @@ def gather(model: Any, optimum: Any, posterior: Any, validity: Any, comparison: 
     given = _labelled(optimum, "optimum")
     posteriors = _labelled(posterior, "posterior")
     tests = _labelled(validity, "validity")
+    decisions = _labelled(decision, "decision")
 
     # Refuse what is not as described
     _require_model(model)
@@ -100,6 +104,7 @@ def gather(model: Any, optimum: Any, posterior: Any, validity: Any, comparison: 
     results = optima | posteriors
     identities = {label: identity_in(result) for label, result in (results | found).items()}
     identities |= {label: test.identity for label, test in tests.items()}
+    identities |= {label: identity_in(table) for label, table in decisions.items()}
     identities["comparison"] = identity_in(comparison)
     require_together(identities, "Report", model=model)
 
@@ -122,6 +127,7 @@ def gather(model: Any, optimum: Any, posterior: Any, validity: Any, comparison: 
         observed=observed,
         outputs=outputs,
         diagnoses=diagnoses,
+        decisions=decisions,
     )
 
 
@@ -131,7 +137,7 @@ def gather(model: Any, optimum: Any, posterior: Any, validity: Any, comparison: 
 def _labelled(given: Any, kind: str) -> dict[str, Any]:
     if given is None:
         return {}
-    if isinstance(given, Mapping) and not isinstance(given, xr.DataTree):
+    if isinstance(given, Mapping) and not isinstance(given, xr.DataTree | xr.Dataset):
         return {str(label): value for label, value in given.items()}
     return {kind: given}
 

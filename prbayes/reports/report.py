@@ -156,6 +156,8 @@ class Report(_Document):
         From `area_test`; several by name.
     comparison : xarray.Dataset, optional
         From `compare`; that of the optima and posteriors by default, where there are two or more.
+    decision : xarray.Dataset, or a mapping of such, optional
+        From `exceedance`, `sensitivity` or `plan`; several by name.
     pictures : bool
         Whether pictures are made of the results.
 
@@ -194,6 +196,7 @@ class Report(_Document):
         posterior: xr.DataTree | Mapping[str, xr.DataTree] | None = None,
         validity: ValidityTest | Mapping[str, ValidityTest] | None = None,
         comparison: xr.Dataset | None = None,
+        decision: xr.Dataset | Mapping[str, xr.Dataset] | None = None,
         pictures: bool = True,
     ) -> None:
         if not isinstance(title, str) or not title.strip():
@@ -207,7 +210,8 @@ class Report(_Document):
             )
         made = tuple(sections)
         if not made:
-            made = contents(model, optimum, posterior, validity, comparison, pictures=pictures)
+            results = (model, optimum, posterior, validity, comparison, decision)
+            made = contents(*results, pictures=pictures)
         for section in made:
             if not isinstance(section, Section):
                 got = type(section).__name__

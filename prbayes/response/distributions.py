@@ -54,6 +54,18 @@ def log_density(
     return total
 
 
+def compiled_log_density(inputs: Inputs) -> Any:
+    """Return log p(x) as a function of roots (k, *shape), then points (n, *event): (k, n)."""
+    symbols = inputs.placeholders()
+    points = []
+    for x in inputs.aleatory:
+        shape = (None,) * (x.type.ndim + 1)
+        points.append(pt.tensor(dtype=x.dtype, shape=shape))
+    dists, _ = inputs.rebuilt(symbols)
+    density = log_density(inputs, dists, points)
+    return compile_batched(symbols, [density], points)
+
+
 def is_mvnormal(dist: TensorVariable) -> bool:
     """Whether a distribution is a multivariate normal."""
     return isinstance(dist.owner.op, type(MvNormal.rv_op))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import inspect
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -206,6 +207,25 @@ def _constant(x: object, label: str) -> Any:
     array = array.copy()
     array.setflags(write=False)
     return array
+
+
+def aleatory_names(inputs: Inputs, function: Callable[..., Any]) -> list[str]:
+    """Return what a reader calls each aleatory input.
+
+    The name of its distribution, or of the response's argument that takes it, or its number.
+    """
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        parameters = []
+    plain = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    arguments = [p.name for p in parameters if p.kind in plain]
+    found = []
+    for position, x in enumerate(inputs.aleatory):
+        place = inputs.arguments.index(position)
+        argument = arguments[place] if place < len(arguments) else f"input {place + 1}"
+        found.append(str(x.name or argument))
+    return found
 
 
 def is_random(variable: Variable) -> bool:

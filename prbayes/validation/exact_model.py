@@ -9,8 +9,8 @@ from importlib.resources import files
 import numpy as np
 
 from prbayes._checks import Floats, positive_integer, positive_number, share
+from prbayes._envelope import ENVELOPED, envelope
 from prbayes.validation.conditions import Case
-from prbayes.validation.envelope import ENVELOPED, envelope
 from prbayes.validation.nulls import Judgement, Null
 
 

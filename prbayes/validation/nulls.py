@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import AT_ONCE, Floats, positive_integer
+from prbayes._envelope import ENVELOPED, envelope
 from prbayes._progress import progress
 from prbayes.validation.conditions import Case, Condition
-from prbayes.validation.envelope import ENVELOPED, envelope
 from prbayes.validation.predictive import Predictive, between
 
 # The fewest replicates that can reject at 5%: p is at least 1 / 20.

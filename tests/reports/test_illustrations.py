@@ -91,7 +91,10 @@ def test_each_illustration_gets_what_it_needs(
     names = {i.function.__name__ for i in illustrations.ILLUSTRATIONS}
     drawn_by(monkeypatch, {name: drawn(name) for name in names})
     full = prb.Report("x", model=model, optimum=optimum, posterior=posterior, validity=test)
-    assert set(called) == names - {"plot_outputs"}  # for several outputs
+    assert set(called) == names - {
+        "plot_outputs",
+        "plot_sensitivity",
+    }  # for several outputs; for a decision
     assert called["plot_responses"] == called["plot_population"] == (posterior, model)
     assert called["plot_posterior"] == (posterior, optimum, model)
     assert called["plot_optimizer"] == (optimum, 2)

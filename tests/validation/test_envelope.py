@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import ndtri
 
 import prbayes as prb
-from prbayes.validation.envelope import envelope
+from prbayes._envelope import envelope
 
 Posterior = Callable[..., Any]
 QUICK = prb.validation.PosteriorNull(999)

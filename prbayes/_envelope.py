@@ -1,4 +1,4 @@
-"""The simultaneous envelope of sorted u-values, from replicates of any null."""
+"""The simultaneous envelope of sorted values, from replicates of any kind."""
 
 from __future__ import annotations
 

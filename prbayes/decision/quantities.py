@@ -1,0 +1,220 @@
+"""What a decision looks at: a number of a population of responses, such as a quantile of them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from prbayes._checks import Floats, finite_number, flag, share
+from prbayes.response.response import refuse_uncallable
+
+
+class Quantity(ABC):
+    """A number of the population of a response; derive from it for one of your own.
+
+    Parameters
+    ----------
+    response : callable
+        As for `Simulator`; that of a simulator of the model, or another one of the same specimens.
+    *inputs
+        As for `predict`.
+    output : label, optional
+        Which output, where a run of the response gives several: a label, or its place.
+
+    Attributes
+    ----------
+    needs_finite : bool
+        Whether no specimen may have failed (+inf).
+    differentiable : bool
+        Whether the number of a specimen whose variance is shared out has derivatives where the
+        response has.
+    """
+
+    needs_finite = False
+    differentiable = True
+
+    def __init__(self, response: Callable[..., Any], *inputs: Any, output: Any = None) -> None:
+        refuse_uncallable(f"prb.decision.{type(self).__name__}", response)
+        self.response = response
+        self.inputs = inputs
+        self.output = output
+
+    def __repr__(self) -> str:
+        name = getattr(self.response, "__name__", type(self.response).__name__)
+        return f"{self.told} of {name}" + ("" if self.output is None else f"[{self.output}]")
+
+    @property
+    def told(self) -> str:
+        """What it is, in words."""
+        return type(self).__name__
+
+    @abstractmethod
+    def of(self, values: Floats, weights: Floats) -> Floats:
+        """Return the number of each population.
+
+        Parameters
+        ----------
+        values : ndarray, shape (n,)
+            Responses in ascending order; +inf is a specimen that failed.
+        weights : ndarray, shape (k, n)
+            Of each population; they sum to one.
+
+        Returns
+        -------
+        ndarray, shape (k,)
+        """
+
+    def of_specimen(self, values: Floats, at: float) -> Floats:
+        """Return the number of each specimen whose variance is shared out among the inputs.
+
+        By default the response itself; ``at`` is the quantity of the population.
+        """
+        return values
+
+
+class Mean(Quantity):
+    """The mean of a response over the population.
+
+    Parameters are those of `Quantity`.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> prb.decision.Mean(np.square, pm.Normal.dist())
+    mean of square
+    """
+
+    needs_finite = True
+    told = "mean"
+
+    def of(self, values: Floats, weights: Floats) -> Floats:
+        """Return the means."""
+        return weights @ values
+
+
+class StandardDeviation(Quantity):
+    """The standard deviation of a response over the population.
+
+    Parameters are those of `Quantity`.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> prb.decision.StandardDeviation(np.square, pm.Normal.dist())
+    standard deviation of square
+    """
+
+    needs_finite = True
+    told = "standard deviation"
+
+    def of(self, values: Floats, weights: Floats) -> Floats:
+        """Return the standard deviations."""
+        # From a value in the middle, so that large means leave digits for the spread.
+        away = values - values[values.size // 2]
+        variance = weights @ away**2 - (weights @ away) ** 2
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+class Quantile(Quantity):
+    """A quantile of a response over the population.
+
+    Parameters
+    ----------
+    response, *inputs, output
+        As for `Quantity`.
+    probability : float
+        Between 0 and 1.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> prb.decision.Quantile(np.square, pm.Normal.dist(), probability=0.99)
+    99% quantile of square
+    """
+
+    differentiable = False
+
+    def __init__(
+        self,
+        response: Callable[..., Any],
+        *inputs: Any,
+        probability: float,
+        output: Any = None,
+    ) -> None:
+        super().__init__(response, *inputs, output=output)
+        self.probability = share(probability, "probability")
+
+    @property
+    def told(self) -> str:
+        """What it is, in words."""
+        return f"{100 * self.probability:g}% quantile"
+
+    def of(self, values: Floats, weights: Floats) -> Floats:
+        """Return the quantiles, by lines between the middles of the steps."""
+        middles = np.cumsum(weights, axis=1) - 0.5 * weights
+        rows = [np.interp(self.probability, row, values) for row in middles]
+        return np.array(rows)
+
+    def of_specimen(self, values: Floats, at: float) -> Floats:
+        """Return whether each specimen is beyond the population's quantile."""
+        return (values > at).astype(float)
+
+
+class Exceedance(Quantity):
+    """The probability that a response is above a limit, or below it.
+
+    Parameters
+    ----------
+    response, *inputs, output
+        As for `Quantity`.
+    limit : float
+        In units of the response.
+    below : bool
+        Whether to look below the limit.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> prb.decision.Exceedance(np.square, pm.Normal.dist(), limit=4.0)
+    probability above 4 of square
+    """
+
+    differentiable = False
+
+    def __init__(
+        self,
+        response: Callable[..., Any],
+        *inputs: Any,
+        limit: float,
+        below: bool = False,
+        output: Any = None,
+    ) -> None:
+        super().__init__(response, *inputs, output=output)
+        self.limit = finite_number(limit, "limit")
+        self.below = flag(below, "below")
+
+    @property
+    def told(self) -> str:
+        """What it is, in words."""
+        return f"probability {'below' if self.below else 'above'} {self.limit:g}"
+
+    def of(self, values: Floats, weights: Floats) -> Floats:
+        """Return the probabilities."""
+        return weights @ self.of_specimen(values, np.nan)
+
+    def of_specimen(self, values: Floats, at: float) -> Floats:
+        """Return whether each specimen is beyond the limit."""
+        beyond = values < self.limit if self.below else values > self.limit
+        return beyond.astype(float)
+
+
+def refuse_quantity(quantity: object, caller: str) -> None:
+    """Raise if it is no quantity."""
+    if not isinstance(quantity, Quantity):
+        raise TypeError(
+            f"{caller}: quantity: got {type(quantity).__name__}, expected a quantity with its "
+            "response, such as prb.decision.Quantile(response, x, probability=0.99)"
+        )

@@ -1,0 +1,105 @@
+"""What moves a decision quantity."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from prbayes.plots._canvas import (
+    BLUE,
+    CIRCLE,
+    DIAMOND,
+    DOTTED,
+    GREY,
+    VERMILION,
+    Canvas,
+    Panel,
+    refuse_look,
+)
+from prbayes.plots._names import named
+
+_PANELS = {
+    "hyperparameter": "share of the quantity's variance",
+    "input": "share of the response's variance",
+}
+_MARKERS = {"first": CIRCLE, "total": DIAMOND}
+
+
+def plot_sensitivity(
+    table: xr.Dataset,
+    *,
+    labels: Mapping[str, str] | None = None,
+    backend: str | None = None,
+    **pc_kwargs: Any,
+) -> Any:
+    """Draw the shares of hyperparameters and inputs, a row per factor.
+
+    A dot is the share that a factor explains by itself, a diamond the one that is left when all
+    others are known, each with two standard errors to either side.
+
+    Parameters
+    ----------
+    table : xarray.Dataset
+        From `sensitivity`.
+    labels : mapping, optional
+        What a reader calls a factor, by its name.
+    backend : {"matplotlib", "bokeh", "plotly"}, optional
+        That of ArviZ's settings by default.
+    **pc_kwargs
+        For ``arviz.PlotCollection.wrap``.
+
+    Returns
+    -------
+    arviz.PlotCollection
+        With the panels ``hyperparameter`` and ``input``; its ``viz`` has the artists ``first`` and
+        ``total``, and the errors ``first_0``, ``total_0`` and so on by factor.
+
+    Raises
+    ------
+    TypeError
+        If it is no table of shares.
+
+    Examples
+    --------
+    >>> import numpy as np, pymc as pm, prbayes as prb
+    >>> with pm.Model() as model:
+    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0, name="x")
+    ...     y = prb.Simulator("y", lambda x: x, x, metric=prb.AreaMetric(), observed=[0, 2, 4])
+    >>> table = prb.sensitivity(prb.minimize(model), prb.decision.Mean(np.square, x))
+    >>> sorted(prb.plots.plot_sensitivity(table, backend="none").viz["first"])
+    ['hyperparameter', 'input']
+    """
+    refuse_look(labels, backend)
+    if not isinstance(table, xr.Dataset) or not {"first", "total"} <= set(table.data_vars):
+        got = type(table).__name__
+        raise TypeError(
+            f"plot_sensitivity: table: got {got}, expected the Dataset of prb.sensitivity"
+        )
+    count = int(max((table.kind == kind).sum() for kind in _PANELS))
+    size = (4.8, 1.6 + 0.4 * count)
+    canvas = Canvas(list(_PANELS), size=size, backend=backend, pc_kwargs=pc_kwargs)
+    for kind, title in _PANELS.items():
+        own = table.sel(factor=(table.kind == kind).values)
+        rows = np.arange(count - 1.0, count - 1.0 - own.sizes["factor"], -1.0)
+        panel = canvas.panel(kind)
+        limits = (-0.6, count - 0.4)
+        for end in (0.0, 1.0):
+            panel.line(f"end_{end:.0f}", [end, end], limits, GREY, style=DOTTED, width=1.0)
+        _draw(panel, own, "first", rows + 0.12, BLUE, "by itself")
+        _draw(panel, own, "total", rows - 0.12, VERMILION, "with all others known")
+        names = [named(str(factor), labels) for factor in own.factor.values]
+        panel.axes(x=title, ylim=limits, yticks=(rows.tolist(), names))
+    return canvas.finish()
+
+
+def _draw(panel: Panel, own: xr.Dataset, key: str, rows: Any, color: str, text: str) -> None:
+    """Draw shares with two standard errors."""
+    shares, errors = own[key].values, own[f"{key}_error"].values
+    for i, (share, error, row) in enumerate(zip(shares, errors, rows, strict=True)):
+        if np.isfinite(share):
+            ends = [share - 2 * error, share + 2 * error]
+            panel.line(f"{key}_{i}", ends, [row, row], color, width=2)
+    panel.points(key, shares, rows, color, marker=_MARKERS[key], legend=text)

@@ -1,0 +1,52 @@
+"""Numbers of weighted populations beside NumPy's and closed forms."""
+
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+from decisions import same
+from scipy.special import ndtri
+
+import prbayes as prb
+
+VALUES = np.array([1.0, 2.0, 2.5, 7.0])
+WEIGHTS = np.array([[0.25, 0.25, 0.25, 0.25], [0.5, 0.0, 0.5, 0.0]])
+X = pm.Normal.dist()
+
+
+@pytest.mark.parametrize(
+    ("quantity", "expected"),
+    [
+        (prb.decision.Mean(same, X), [3.125, 1.75]),
+        (prb.decision.StandardDeviation(same, X), [np.std(VALUES), 0.75]),
+        (prb.decision.Exceedance(same, X, limit=2.0), [0.5, 0.5]),
+        (prb.decision.Exceedance(same, X, limit=2.0, below=True), [0.25, 0.5]),
+        (prb.decision.Exceedance(same, X, limit=7.0), [0.0, 0.0]),
+    ],
+    ids=repr,
+)
+def test_numbers_of_a_population(quantity: prb.decision.Quantity, expected: Any) -> None:
+    np.testing.assert_allclose(quantity.of(VALUES, WEIGHTS), expected, rtol=1e-12)
+
+
+def test_a_quantile_of_many_is_that_of_the_distribution() -> None:
+    z = ndtri((np.arange(2000) + 0.5) / 2000)
+    quantity = prb.decision.Quantile(same, X, probability=0.9)
+    (found,) = quantity.of(z, np.full((1, 2000), 1 / 2000))
+    np.testing.assert_allclose(found, ndtri(0.9), atol=1e-3)
+
+
+def test_a_large_mean_leaves_digits_for_the_spread() -> None:
+    quantity = prb.decision.StandardDeviation(same, X)
+    np.testing.assert_allclose(
+        quantity.of(VALUES + 1e9, WEIGHTS), quantity.of(VALUES, WEIGHTS), rtol=1e-6
+    )
+
+
+def test_what_counts_of_a_specimen() -> None:
+    limit = prb.decision.Exceedance(same, X, limit=2.0, below=True)
+    np.testing.assert_array_equal(limit.of_specimen(VALUES, 0.0), [1, 0, 0, 0])
+    quantile = prb.decision.Quantile(same, X, probability=0.5)
+    np.testing.assert_array_equal(quantile.of_specimen(VALUES, 2.2), [0, 0, 1, 1])
+    np.testing.assert_array_equal(prb.decision.Mean(same, X).of_specimen(VALUES, 0), VALUES)
