@@ -74,6 +74,7 @@ MAKE: dict[str, Callable[[], Any]] = {
     "Reweighted": lambda: prb.Reweighted(64, on_failure=prb.response.Replace()),
     "Surrogate": surrogate,
     "abc_distance": lambda: prb.abc_distance(prb.AreaMetric()),
+    "decision.Interval": lambda: prb.decision.Interval(0.9, 1.1),
     "metrics.DensityDiscrepancy": lambda: target(prb.KullbackLeibler()),
     "metrics.DensityEstimator": lambda: prb.Histogram(4),
     "metrics.Discrepancy": lambda: target(prb.AreaMetric()),
@@ -101,7 +102,16 @@ MAKE: dict[str, Callable[[], Any]] = {
     "validation.ValidityTest": lambda: prb.area_test([1.0, 1.5, 2.0], predicted(), **QUIET),
 }
 # What is at work inside a model, and goes with it.
-INSIDE = {"posterior.BatchedKernel", "propagation.Bound"}
+INSIDE = {
+    "decision.Condition",
+    "decision.Exceedance",
+    "decision.Mean",
+    "decision.Quantile",
+    "decision.Quantity",
+    "decision.StandardDeviation",
+    "posterior.BatchedKernel",
+    "propagation.Bound",
+}
 RESULTS: dict[str, Callable[[], Any]] = {
     "calibrate_epsilon": lambda: prb.calibrate_epsilon(optimum()),
     "sample_smc": posterior,

@@ -32,6 +32,7 @@ def test_another_condition_tells_of_what_it_sees(table: xr.Dataset) -> None:
     assert float(ratio.sel(name="sigma")) < 0.6
 
 
+@pytest.mark.slow
 def test_the_number_that_reaches_a_target() -> None:
     _, x = normal()
     condition = {"same": prb.decision.Condition(same, x)}

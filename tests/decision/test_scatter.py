@@ -42,6 +42,7 @@ def problem(emulator: str | None = "auto", n: int = 256) -> tuple[prb.Optimum, l
     return prb.minimize(model, refine=False, starts=0, progressbar=False), inputs
 
 
+@pytest.mark.slow
 def test_two_inputs_that_act_together_emulated_and_called() -> None:
     def together(a: Any, b: Any) -> Any:
         return a + b + a * b

@@ -152,7 +152,10 @@ if hasattr(os, "fork"):
     assert not list(tmp_path.glob("*fmu*"))
 
 
-@pytest.mark.parametrize("stiffness", [-7.0, -9.0], ids=["crashes", "hangs"])
+@pytest.mark.parametrize(
+    "stiffness",
+    [pytest.param(-7.0, id="crashes"), pytest.param(-9.0, id="hangs", marks=pytest.mark.slow)],
+)
 def test_a_unit_that_ends_or_hangs_its_process_costs_its_specimen_and_instances_are_used_again(
     unit: Path, tmp_path: Path, stiffness: float
 ) -> None:
