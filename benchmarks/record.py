@@ -9,6 +9,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,8 @@ def _without_folders(argument: str) -> str:
     return Path(argument).name if Path(argument).is_absolute() else argument
 
 
-def about() -> dict[str, Any]:
-    """Return how, on what and when this process runs."""
+def about(packages: Iterable[str] = PACKAGES) -> dict[str, Any]:
+    """Return how, on what and when this process runs, with the versions of packages."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     module = f"-m {spec.name}" if spec is not None else sys.argv[0]
     # What the benchmarks themselves write is no change of what they measure.
@@ -35,7 +36,7 @@ def about() -> dict[str, Any]:
     status = _git("status", "--porcelain", "--untracked-files=no", "--", *code)
     changed = " with changes" if status else ""
     versions = {"python": platform.python_version()}
-    for name in PACKAGES:
+    for name in packages:
         versions[name] = importlib.metadata.version(name)
     return {
         "command": " ".join(["python", module, *map(_without_folders, sys.argv[1:])]),
@@ -46,9 +47,9 @@ def about() -> dict[str, Any]:
     }
 
 
-def save(path: Path, found: Any) -> None:
+def save(path: Path, found: Any, packages: Iterable[str] = PACKAGES) -> None:
     """Write what was found, and how."""
-    whole = {"run": about(), "found": found}
+    whole = {"run": about(packages), "found": found}
     path.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
 
 

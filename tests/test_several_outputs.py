@@ -274,7 +274,7 @@ def graph(a, b):
     return a[..., None] * np.ones(2) + b[..., None] * np.array([1.0, -2.0])
 
 
-@pytest.mark.parametrize("response", [two, graph])
+@pytest.mark.parametrize("response", [two, pytest.param(graph, marks=pytest.mark.slow)])
 def test_resimulated_outputs_give_the_same_optimum(response):
     expected = prb.minimize(model_of())
     found = prb.minimize(model_of(response, propagation=prb.Resimulated(256)))
@@ -296,6 +296,7 @@ def test_data_sets_lack_the_outputs_that_the_observed_ones_lack():
         assert row[second & ~first].sum() == pytest.approx(5 / N)
 
 
+@pytest.mark.slow
 def test_specimens_with_missing_outputs_make_the_estimate_better_than_without_them():
     data = observed()
     data[20:, 1] = np.nan
@@ -373,6 +374,7 @@ def test_tested_outputs_are_taken_by_their_names():
         prb.area_test({"y": {"a": data[:, 0], "b": data[:, 1]}}, {"y": predicted}, null=null)
 
 
+@pytest.mark.slow
 def test_own_specimens_of_several_outputs_are_tested_by_recalibration():
     data = observed(seed=3)
     optimum = prb.minimize(model_of(data=data))

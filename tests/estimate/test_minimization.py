@@ -310,6 +310,7 @@ def test_given_epsilons_weigh_the_simulators() -> None:
     np.testing.assert_allclose(optimum.stderr["mu"], noise**0.5 / precision.sum(), rtol=0.02)
 
 
+@pytest.mark.slow
 def test_vector_hyperparameters_of_a_multivariate_input() -> None:
     covariance = np.array([[1.0, 0.5], [0.5, 1.0]])
     data = np.random.default_rng(4).multivariate_normal([1.0, 2.0], covariance, 30)

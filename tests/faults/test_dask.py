@@ -58,6 +58,7 @@ def all_there(model: pm.Model, store: Path) -> None:
     assert again.computed == 1  # whether the response is still the same
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
 def test_a_worker_that_leaves_while_it_computes_loses_nothing(tmp_path: Path) -> None:
     cluster = distributed.LocalCluster(

@@ -183,6 +183,7 @@ def test_find_map_agrees_with_minimize(name: str) -> None:
         np.testing.assert_allclose(found[key].item(), optimum[key], atol=0.1 * sd)
 
 
+@pytest.mark.slow
 def test_a_black_box_gets_slice_steps_from_stock_sampling() -> None:
     model = model_of("black box")[0]
     idata = pm.sample(

@@ -629,6 +629,7 @@ def test_results_can_be_saved(tmp_path: Path) -> None:
     assert "unadjusted" in results["smc"].children
 
 
+@pytest.mark.slow
 def test_an_optimum_that_the_prior_held_gives_the_same_draws() -> None:
     # The prior is in conflict with the data: its optimum is several standard errors away from the
     # metric's own, around which draws are adjusted.

@@ -390,6 +390,7 @@ def test_another_cloud_is_another_design() -> None:
     assert before.batches != after.batches
 
 
+@pytest.mark.slow
 def test_a_sampler_that_was_stopped_goes_on_with_its_clouds(tmp_path: Any) -> None:
     keywords: dict[str, Any] = {"chains": 1, "random_seed": 1, "progressbar": False}
     file = tmp_path / "run.nc"

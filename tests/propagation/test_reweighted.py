@@ -228,6 +228,7 @@ def test_an_input_without_inverse_distribution_function() -> None:
     assert abs(optimum.point["mu"] - 1.0) < 4 * 1.25 * 0.58 / 40**0.5
 
 
+@pytest.mark.slow
 @pytest.mark.exact
 def test_a_discrete_input() -> None:
     data = np.random.default_rng(4).poisson(4.0, 40)
@@ -674,6 +675,7 @@ def test_a_value_with_probability_itself_has_its_share_of_points_and_weight() ->
     assert below_one == pytest.approx(norm.cdf(1 - mu[:, 0]), abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_mixture_is_reweighted() -> None:
     shares = np.array([0.3, 0.7])
     with pm.Model() as model:

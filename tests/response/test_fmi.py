@@ -99,6 +99,7 @@ def test_an_instance_with_which_something_went_wrong_is_freed_unless_that_is_fat
     assert made.count("__init__") == 3
 
 
+@pytest.mark.slow
 def test_threads_have_an_instance_each_and_those_of_one_only_take_turns(
     unit: Path, tmp_path: Path
 ) -> None:
@@ -119,6 +120,7 @@ def test_threads_have_an_instance_each_and_those_of_one_only_take_turns(
         assert (seconds < 1.1) == (most > 1)
 
 
+@pytest.mark.slow
 def test_it_travels_to_processes_that_fork_and_nothing_is_left_behind(
     unit: Path, tmp_path: Path
 ) -> None:

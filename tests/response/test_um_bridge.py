@@ -161,6 +161,7 @@ def test_requests_are_at_work_at_the_same_time(real: Real) -> None:
     assert time.monotonic() - clock < 1.2
 
 
+@pytest.mark.slow
 def test_it_travels_to_processes_and_none_speaks_on_the_connection_of_another(real: Real) -> None:
     beam = prb.umbridge(real.url, "beam")
     assert beam(1.0, 2.0).tolist() == [-3.0, 2.0]
