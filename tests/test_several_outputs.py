@@ -88,7 +88,7 @@ NAMED = {"sum": observed()[:, 0], "difference": observed()[:, 1]}
         (prb.scalar(of_one_by_name), NAMED),
     ],
 )
-@pytest.mark.parametrize("way", ["here", "stored", "threads"])
+@pytest.mark.parametrize("way", ["here", pytest.param("stored", marks=pytest.mark.slow), "threads"])
 def test_every_way_to_give_outputs_is_the_same_run(response, data, way, tmp_path):
     expected = node_of(model_of(propagation=prb.Reweighted(64))).design.values
     with ThreadPoolExecutor(2) as pool:
@@ -259,7 +259,12 @@ def test_predictive_draws_have_the_shape_of_the_data():
 
 
 @pytest.mark.parametrize(
-    "metric", [prb.ProbabilityResidual(), prb.KullbackLeibler(), prb.AreaMetric()]
+    "metric",
+    [
+        prb.ProbabilityResidual(),
+        pytest.param(prb.KullbackLeibler(), marks=pytest.mark.slow),
+        prb.AreaMetric(),
+    ],
 )
 def test_the_optimum_and_its_errors_are_those_of_the_exact_estimate(metric):
     found = prb.minimize(model_of(metric=prb.Joint(metric)))

@@ -596,7 +596,7 @@ def from_the_data(name: str, propagation: Any) -> prb.Optimum:
 @pytest.mark.parametrize(
     "propagation", [R256, prb.Resimulated(1024)], ids=["reweighted", "resimulated"]
 )
-@pytest.mark.parametrize("name", ["pr", "kl"])
+@pytest.mark.parametrize("name", ["pr", pytest.param("kl", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("start", [(-3.0, 0.5), (30.0, 0.1)])  # 8 sd of the data away, and 58
 def test_far_starts_converge(name: str, propagation: Any, start: tuple[float, float]) -> None:
     model = far_model(name, propagation)

@@ -149,7 +149,9 @@ def test_populations_of_inputs(name: str, propagation: Propagation) -> None:
 
 @pytest.mark.exact
 @pytest.mark.parametrize(
-    "propagation", [prb.Reweighted(256), prb.Fresh(20_000)], ids=lambda p: type(p).__name__
+    "propagation",
+    [prb.Reweighted(256), pytest.param(prb.Fresh(20_000), marks=pytest.mark.slow)],
+    ids=lambda p: type(p).__name__,
 )
 @pytest.mark.parametrize("name", ROUGH)
 def test_populations_of_inputs_without_quantiles(name: str, propagation: Propagation) -> None:

@@ -99,6 +99,7 @@ def test_where_responses_are_not_stored_it_is_the_straight_map() -> None:
     np.testing.assert_array_equal(given.posterior["mu"], straight.posterior["mu"])
 
 
+@pytest.mark.slow
 def test_it_depends_on_its_seed_alone() -> None:
     model = build(METRICS["area"], TEN, 2.0)
     optimum = prb.minimize(model, progressbar=False)
