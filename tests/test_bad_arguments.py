@@ -257,7 +257,7 @@ def with_decision(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a question about a posterior, with what it asks of the shared model."""
 
     def asked(**given: Any) -> Any:
-        common = {"idata": posterior(), "model": model()}
+        common = {"result": posterior(), "model": model()}
         if function is prb.sensitivity:
             common["quantity"] = prb.decision.Mean(line, specimen())
         elif function is prb.plan:

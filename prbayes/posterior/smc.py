@@ -31,6 +31,7 @@ from prbayes.model.turns import in_turn
 from prbayes.posterior.adjustment import Adjusted, Affine, refuse_adjustment
 from prbayes.posterior.chains import Chains, Particles
 from prbayes.posterior.checkpoint import Checkpoint, stored_settings
+from prbayes.posterior.default_adjustment import default_adjustment
 from prbayes.posterior.epsilon import calibrate_epsilon
 from prbayes.posterior.trees import posterior_tree, share_of_lossy
 from prbayes.response.budget import BudgetError, limited, unlimited
@@ -77,8 +78,10 @@ def sample_smc(
         Where to calibrate epsilon, and the centre of the adjustment; `minimize` finds it if needed.
     adjust : Affine or bool
         Whether, and how, the draws are brought to the width that the data warrant. By default by
-        `Affine()`, unless an epsilon was given, which is then taken at its word; an `Affine`
-        adjusts in any case.
+        ``prb.posterior.GivenEstimate()``, and not where they are the posterior as they are, as
+        those of `LogLikelihood` with one simulator, stored responses and epsilon = 1/N; nor where
+        an epsilon was given, which is then taken at its word. An `Affine` or `GivenEstimate` that
+        is given adjusts in any case.
     threshold : float
         Share of the effective sample size that a stage keeps; higher means more stages.
     refine : bool
@@ -501,7 +504,7 @@ def _adjustment(adjust: Affine | bool, evaluator: Evaluator, unset: list[Node]) 
     if isinstance(adjust, Affine):
         return adjust
     nobody_gave_one = all(node in unset or node.epsilon_is_default for node in evaluator.nodes)
-    return Affine() if adjust and nobody_gave_one else None
+    return default_adjustment(evaluator) if adjust and nobody_gave_one else None
 
 
 def _needs_optimum(evaluator: Evaluator, unset: list[Node], adjustment: Affine | None) -> bool:
