@@ -498,7 +498,8 @@ def _evaluator(model: pm.Model, optimum: Optimum | None) -> Evaluator:
     """
     if optimum is None:
         return Evaluator(model)
-    evaluator = optimum.evaluator if optimum.model is model else Evaluator(model)
+    own = optimum.model is model and optimum.evaluator.is_current
+    evaluator = optimum.evaluator if own else Evaluator(model)
     require_same(optimum.identity, identity_of(evaluator), "sample_smc: optimum")
     return evaluator
 

@@ -13,9 +13,10 @@ from pymc.distributions.multivariate import MvNormal, MvStudentT
 from pymc.distributions.shape_utils import change_dist_size
 from pytensor.graph.basic import Variable
 from pytensor.graph.replace import graph_replace, vectorize_graph
-from pytensor.graph.traversal import ancestors
+from pytensor.graph.traversal import ancestors, walk
 from pytensor.graph.utils import MissingInputError
 from pytensor.tensor.random.type import RandomGeneratorType
+from pytensor.tensor.shape import Shape, Shape_i
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats
@@ -46,12 +47,20 @@ def log_density(
         elif is_elliptical(dist):
             logp = _elliptical_logp(dist, x, shape[-1])
         else:
-            logp = pm.logp(dist, x, warn_rvs=False)
+            logp = _logp(dist, x)
         # Elements of a vector of independent inputs.
         if logp.type.ndim > 1:
             logp = logp.sum(axis=tuple(range(1, logp.type.ndim)))
         total = total + logp
     return total
+
+
+def _logp(dist: TensorVariable, x: Any) -> TensorVariable:
+    """Return PyMC's log p(x) of values (n, *event); that of random walks takes one at a time."""
+    if not isinstance(dist.owner.op, pm.RandomWalk.rv_type):
+        return pm.logp(dist, x, warn_rvs=False)
+    one = dist.type()
+    return vectorize_graph(pm.logp(dist, one, warn_rvs=False), {one: x})
 
 
 def compiled_log_density(inputs: Inputs) -> Any:
@@ -176,9 +185,21 @@ def _density(dist: TensorVariable) -> TensorVariable | None:
         density = pm.logp(dist, pt.zeros_like(dist), warn_rvs=False)
     except NotImplementedError:
         return None
-    # Zero takes its shape from the distribution.
-    above = set(ancestors([density], blockers=[dist])) - {dist}
-    return None if any(map(is_random, above)) else density
+    return None if any(map(is_random, _values_above(density, dist))) else density
+
+
+def _values_above(density: TensorVariable, dist: TensorVariable) -> list[Variable]:
+    """Return what the values of a density depend on, besides shapes and the distribution."""
+
+    def inputs_of(variable: Variable) -> Any:
+        # Zero takes its shape from the distribution, and a random walk's parts theirs.
+        if variable is dist or variable.owner is None:
+            return None
+        if isinstance(variable.owner.op, Shape | Shape_i):
+            return None
+        return variable.owner.inputs
+
+    return [v for v in walk([density], inputs_of) if v is not dist]
 
 
 def refuse_without_density(name: str, inputs: Inputs) -> None:
