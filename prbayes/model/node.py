@@ -93,13 +93,14 @@ class Node:
                 f"{self.name}: observed: got shape {values.shape}, expected "
                 f"{('N', *before.event)}, as when the simulator was made"
             )
-        weights = before.weights
-        if len(values) != len(weights):
+        weights: Floats | None = before.weights
+        n = len(before.weights)
+        if len(values) != n:
             # What goes with the values before has no counterpart.
-            if self.specimens is not None or np.ptp(weights) > 0:
+            if self.specimens is not None or np.ptp(before.weights) > 0:
                 raise ValueError(
                     f"{self.name}: observed: got {len(values)} specimens, expected "
-                    f"{len(weights)}, as many as there are specimens= or weights=; build the "
+                    f"{n}, as many as there are specimens= or weights=; build the "
                     "model again with those of the new ones"
                 )
             weights = None

@@ -108,7 +108,8 @@ def as_multitrace(tree: xr.DataTree, evaluator: Evaluator) -> Any:
     sizes = [int(np.prod(shape, dtype=int)) for shape in evaluator.shapes.values()]
     ends = np.cumsum(sizes)[:-1]
     chains = []
-    for chain, thetas in enumerate(tree["calibration"]["theta"].values):
+    of_all = np.asarray(tree["calibration"]["theta"])
+    for chain, thetas in enumerate(of_all):
         held = NDArray(model=evaluator.model)
         held.setup(len(thetas), chain)
         for theta in thetas:
