@@ -283,11 +283,14 @@ def _log_density(
     (value,) = values
     known = known_value(value)
     node = op.node if known is None else _observing(op.node, known)
-    check = CheckParameterValue(
+    unset = (
         f"{node.name}: epsilon is not set; call prb.set_epsilon(model, "
         "prb.calibrate_epsilon(prb.minimize(model))), pass epsilon= to prb.Simulator, or use "
         "prb.sample_smc, which calibrates it"
     )
+    if np.isnan(node.epsilon_value):
+        _log.warning("%s", unset)  # nutpie tells no more of an error than its number
+    check = CheckParameterValue(unset)
     epsilon = check(node.epsilon, pt.gt(node.epsilon, 0.0))
     inputs = node.bound.inputs
     density = log_kernel(node.bound.discrepancy(inputs.core(params)), epsilon)

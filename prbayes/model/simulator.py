@@ -208,8 +208,7 @@ def _data(name: str, observed: Any) -> Any:
     values = None if is_labelled(observed) else known_value(observed)
     if values is None:
         raise TypeError(
-            f"{name}: observed: got {observed} of type {observed.type}, expected numbers or "
-            "pm.Data"
+            f"{name}: observed: got {observed} of type {observed.type}, expected numbers or pm.Data"
         )
     return values
 
