@@ -141,15 +141,15 @@ def sample_smc(
         (``posterior_predictive``, ``prior_predictive``) of simulators whose responses are stored,
         and ``log_likelihood`` for power-scaling: one number for each draw, of which adjusted draws
         are draws; it is left out where they were not adjusted by one affine map. Attributes of
-        ``posterior``: ``log_marginal_likelihood``, from all chains, and ``log_marginal_likelihood_sd``, the spread of the chains' own; a number to
-        compare models by with one metric and one epsilon, and with no others. Of an adjustment they
-        have ``adjustment_center_error`` and ``adjustment_width_error``, its Monte Carlo errors from
-        the number of refits, in standard deviations of the draws and as a share of the width, for
-        the worst direction; ``adjustment_moved``, how far it moved the medians, in standard
-        deviations, for the worst hyperparameter; ``fit_probability``, how often data sets drawn
-        from the model at its minimiser are as far from their own fit as the data are; and
-        ``prior_probability``, how often estimates that the prior leads to are as far out as that of
-        the data.
+        ``posterior``: ``log_marginal_likelihood``, from all chains, and
+        ``log_marginal_likelihood_sd``, the spread of the chains' own; a number to compare models by
+        with one metric and one epsilon, and with no others. Of an adjustment they have
+        ``adjustment_center_error`` and ``adjustment_width_error``, its Monte Carlo errors from the
+        number of refits, in standard deviations of the draws and as a share of the width, for the
+        worst direction; ``adjustment_moved``, how far it moved the medians, in standard deviations,
+        for the worst hyperparameter; ``fit_probability``, how often data sets drawn from the model
+        at its minimiser are as far from their own fit as the data are; and ``prior_probability``,
+        how often estimates that the prior leads to are as far out as that of the data.
 
     Raises
     ------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
@@ -60,7 +61,14 @@ def _logp(dist: TensorVariable, x: Any) -> TensorVariable:
     if not isinstance(dist.owner.op, pm.RandomWalk.rv_type):
         return pm.logp(dist, x, warn_rvs=False)
     one = dist.type()
-    return vectorize_graph(pm.logp(dist, one, warn_rvs=False), {one: x})
+    return vectorize_graph(_quiet_logp(dist, one), {one: x})
+
+
+def _quiet_logp(dist: TensorVariable, x: Any) -> TensorVariable:
+    """Return PyMC's log p(x), without its warning of the parts of a random walk."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "RandomVariables", UserWarning)
+        return pm.logp(dist, x, warn_rvs=False)
 
 
 def compiled_log_density(inputs: Inputs) -> Any:
@@ -182,7 +190,7 @@ def _density(dist: TensorVariable) -> TensorVariable | None:
     One that is drawn, as that of a `pymc.Simulator`, is none.
     """
     try:
-        density = pm.logp(dist, pt.zeros_like(dist), warn_rvs=False)
+        density = _quiet_logp(dist, pt.zeros_like(dist))
     except NotImplementedError:
         return None
     return None if any(map(is_random, _values_above(density, dist))) else density

@@ -347,7 +347,7 @@ def test_data_that_are_set_anew_are_those_of_a_model_made_with_them(metric: prb.
     drawn = pm.draw(model["y"], random_seed=1)
     assert drawn.shape == NEW.shape
     # What was made from the data before is not taken for the new problem.
-    with pytest.raises(ValueError, match="data"):
+    with pytest.raises(ValueError, match="other observed values of y"):
         prb.sample_smc(20, model=model, optimum=first, **QUIET)
     if compiled is not None:
         with pytest.raises(ParameterValueError, match=OTHER):

@@ -109,7 +109,7 @@ def test_predictive_draws_are_those_of_pymc_s_own_function() -> None:
 
 
 def test_many_numbers_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, optimum, tree = adjusted()
+    _, optimum, tree = adjusted()
     monkeypatch.setattr(groups, "AT_ONCE", 2 * 500 * 40 // 4)
     rng = np.random.default_rng(1)
     thetas = tree.calibration["theta"].values
