@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
@@ -14,10 +13,9 @@ from pymc.distributions.multivariate import MvNormal, MvStudentT
 from pymc.distributions.shape_utils import change_dist_size
 from pytensor.graph.basic import Variable
 from pytensor.graph.replace import graph_replace, vectorize_graph
-from pytensor.graph.traversal import ancestors, walk
+from pytensor.graph.traversal import ancestors
 from pytensor.graph.utils import MissingInputError
 from pytensor.tensor.random.type import RandomGeneratorType
-from pytensor.tensor.shape import Shape, Shape_i
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats
@@ -27,7 +25,7 @@ from prbayes.response.compilation import (
     interpreted,
     with_leading_axis,
 )
-from prbayes.response.inputs import Inputs, event_shape, is_random
+from prbayes.response.inputs import Inputs, event_shape, is_random, quiet_logp
 
 
 def log_density(
@@ -58,17 +56,15 @@ def log_density(
 
 def _logp(dist: TensorVariable, x: Any) -> TensorVariable:
     """Return PyMC's log p(x) of values (n, *event); that of random walks takes one at a time."""
-    if not isinstance(dist.owner.op, pm.RandomWalk.rv_type):
+    if not _is_walk(dist):
         return pm.logp(dist, x, warn_rvs=False)
     one = dist.type()
-    return vectorize_graph(_quiet_logp(dist, one), {one: x})
+    return vectorize_graph(quiet_logp(dist, one), {one: x})
 
 
-def _quiet_logp(dist: TensorVariable, x: Any) -> TensorVariable:
-    """Return PyMC's log p(x), without its warning of the parts of a random walk."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "RandomVariables", UserWarning)
-        return pm.logp(dist, x, warn_rvs=False)
+def _is_walk(dist: TensorVariable) -> bool:
+    """Whether a distribution is a random walk."""
+    return isinstance(dist.owner.op, pm.RandomWalk.rv_type)
 
 
 def compiled_log_density(inputs: Inputs) -> Any:
@@ -190,24 +186,14 @@ def _density(dist: TensorVariable) -> TensorVariable | None:
     One that is drawn, as that of a `pymc.Simulator`, is none.
     """
     try:
-        density = _quiet_logp(dist, pt.zeros_like(dist))
+        density = quiet_logp(dist, pt.zeros_like(dist))
     except NotImplementedError:
         return None
-    return None if any(map(is_random, _values_above(density, dist))) else density
-
-
-def _values_above(density: TensorVariable, dist: TensorVariable) -> list[Variable]:
-    """Return what the values of a density depend on, besides shapes and the distribution."""
-
-    def inputs_of(variable: Variable) -> Any:
-        # Zero takes its shape from the distribution, and a random walk's parts theirs.
-        if variable is dist or variable.owner is None:
-            return None
-        if isinstance(variable.owner.op, Shape | Shape_i):
-            return None
-        return variable.owner.inputs
-
-    return [v for v in walk([density], inputs_of) if v is not dist]
+    if _is_walk(dist):
+        return density  # its parts stand in it for their shapes alone
+    # Zero takes its shape from the distribution.
+    above = set(ancestors([density], blockers=[dist])) - {dist}
+    return None if any(map(is_random, above)) else density
 
 
 def refuse_without_density(name: str, inputs: Inputs) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -137,10 +138,17 @@ def _marginal(x: TensorVariable, parts: set[Variable]) -> bool:
     As of a mixture, which has copies of what it is made of.
     """
     try:
-        density = pm.logp(x, pt.zeros_like(x), warn_rvs=False)
+        density = quiet_logp(x, pt.zeros_like(x))
     except (NotImplementedError, TypeError, ValueError):
         return False
     return not parts & set(ancestors([density], blockers=[x]))
+
+
+def quiet_logp(dist: TensorVariable, x: Any) -> TensorVariable:
+    """Return PyMC's log p(x), without its warning of the parts of a random walk."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "RandomVariables", UserWarning)
+        return pm.logp(dist, x, warn_rvs=False)
 
 
 def _refuse_too_little(name: str, n: int, aleatory: bool, roots: bool) -> None:
