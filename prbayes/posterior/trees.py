@@ -175,7 +175,7 @@ def _posterior(evaluator: Evaluator, thetas: Floats, attrs: dict[str, Any]) -> x
     return _draws(evaluator, thetas).assign_attrs(
         {
             **arviz_attributes(),
-            "sampling_time": attrs["seconds"],
+            **({"sampling_time": attrs["seconds"]} if "seconds" in attrs else {}),
             **attrs,
             **as_attribute(evaluator.model),
             **as_attributes(identity_of(evaluator)),
