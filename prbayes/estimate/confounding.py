@@ -17,9 +17,8 @@ from prbayes.response.inadequacy import corrected
 
 Places = NDArray[np.intp]
 
-# Share of a direction, a thirtieth of a spread of the prior, above which hyperparameters take part
-# in it: below,
-# a prior has told them from the others. By judgement.
+# Share of a direction above which hyperparameters take part in it, a thirtieth of a spread of the
+# prior: below, a prior has told them from the others. By judgement.
 _TAKES_PART = 0.001
 # Correlation of estimates from which two are said not to be told apart: the variance of either is
 # then ten times what it would be if the other were known. By judgement.
