@@ -117,7 +117,7 @@ class Inadequacy(ABC):
 
         Examples
         --------
-        >>> import numpy as np, pymc as pm, prbayes as prb
+        >>> import prbayes as prb
         >>> rise = prb.response.Additive([20.0, 1000.0])
         >>> hot = rise.of(lambda k: k, 1000.0)
         >>> hot(5.0, 2.5)
@@ -176,13 +176,13 @@ class Additive(Inadequacy):
     --------
     >>> import numpy as np, pymc as pm, prbayes as prb
     >>> rise = prb.response.Additive([0.0, 2.0])
-    >>> data = np.random.default_rng(1).normal([1.0, 4.0], [0.2, 0.4], (40, 2))
+    >>> data = np.random.default_rng(1).normal(4.0, 0.5, 40)
     >>> with pm.Model() as model:
-    ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
-    ...     b = pm.Normal.dist(pm.Normal("lift", 0, 5), pm.HalfNormal("sd_lift", 1))
+    ...     x = pm.Normal.dist(1.0, 0.2)
+    ...     b = pm.Normal.dist(pm.Normal("lift", 0, 5), 0.5)
     ...     y = prb.Simulator(
-    ...         "y", rise.of(lambda x: np.stack([x, x], axis=-1), [0.0, 2.0]), x, b,
-    ...         metric=prb.Joint(prb.KullbackLeibler()), observed=data)
+    ...         "y", rise.of(lambda x: x, 2.0), x, b, metric=prb.AreaMetric(), observed=data,
+    ...         propagation=prb.Resimulated(256))
     >>> optimum = prb.minimize(model)
     >>> bool(abs(optimum.point["lift"] - 3) < 0.3)
     True
