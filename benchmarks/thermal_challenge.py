@@ -10,7 +10,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-
 from benchmarks import record
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "thermal_challenge.py"
@@ -23,7 +22,8 @@ MIDDLE = (0.0499, 0.026, 3.93e5)
 def example() -> Any:
     """Return the example as a module."""
     spec = importlib.util.spec_from_file_location("thermal_challenge", EXAMPLE)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)

@@ -432,8 +432,12 @@ def picture(kept, path):
     right.axvline(LIMIT, color="k", lw=1)
     right.axhline(ALLOWED, color="k", lw=1, ls=":")
     right.set(
-        xlabel="T, C", ylabel="share of devices above T", title="device, 3500 W/m2, 1.90 cm",
-        xlim=(650, 1100), ylim=(0.002, 1), yscale="log",
+        xlabel="T, C",
+        ylabel="share of devices above T",
+        title="device, 3500 W/m2, 1.90 cm",
+        xlim=(650, 1100),
+        ylim=(0.002, 1),
+        yscale="log",
     )
     path.mkdir(parents=True, exist_ok=True)
     figure.savefig(path / "thermal_challenge.png", dpi=110)

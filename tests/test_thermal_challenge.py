@@ -78,9 +78,14 @@ def test_differences_take_specimens_together(example: Any) -> None:
     k, rise, c = np.random.default_rng(1).uniform([0.04, 0, 3e5], [0.06, 0.04, 5e5], (6, 3)).T
     coarse = {"cells": 10, "steps": 20}
     every = example.differences(k, rise, c, FLUX, THICKNESS, 1000.0, **coarse)
-    one = [example.differences(*x, FLUX, THICKNESS, 1000.0, **coarse) for x in zip(k, rise, c)]
+    one = [
+        example.differences(*x, FLUX, THICKNESS, 1000.0, **coarse)
+        for x in zip(k, rise, c, strict=True)
+    ]
     np.testing.assert_allclose(every, one, rtol=1e-12)
-    both = example.differences(*(x.reshape(2, 3) for x in (k, rise, c)), FLUX, THICKNESS, 1000.0, **coarse)
+    both = example.differences(
+        *(x.reshape(2, 3) for x in (k, rise, c)), FLUX, THICKNESS, 1000.0, **coarse
+    )
     np.testing.assert_allclose(both.ravel(), one, rtol=1e-12)
 
 
@@ -106,7 +111,8 @@ def test_the_scatter_of_the_heat_capacity_comes_out_of_the_calibration(example: 
 
 def test_each_coupon_is_measured_at_its_temperature(example: Any) -> None:
     measured, labels = example.coupons()
-    assert measured.shape == (60, 6) and (np.isfinite(measured).sum(axis=1) == 1).all()
+    assert measured.shape == (60, 6)
+    assert (np.isfinite(measured).sum(axis=1) == 1).all()
     assert np.isfinite(measured).sum(axis=0).tolist() == [6, 6, 6, 6, 6, 30]
     np.testing.assert_allclose(
         np.nanmean(measured, axis=0)[[0, 4, 5]], [0.049117, 0.074583, 393_900], rtol=1e-5

@@ -81,7 +81,8 @@ def test_a_function_of_one_specimen_stays_one() -> None:
     one = prb.scalar(lambda x: x**2 if x > 0 else 0.0)
     both = prb.response.Additive([0.0, 1.0]).of(one, 1.0)
     assert isinstance(both, prb.scalar)
-    assert corrected(both) and not corrected(one)
+    assert corrected(both)
+    assert not corrected(one)
     np.testing.assert_allclose(both([3.0, -1.0], [0.5, 0.5]), [9.5, 0.5])
 
 
@@ -114,7 +115,8 @@ def test_predictions_say_that_they_extrapolate(caplog: pytest.LogCaptureFixture)
         optimum = prb.minimize(progressbar=False)
     assert not caplog.records
     inside = prb.predict(optimum, drift.of(line, 2.0), x, b, model=model, n_samples=50)
-    assert inside.attrs["caveats"] == [] and not caplog.records
+    assert inside.attrs["caveats"] == []
+    assert not caplog.records
     with caplog.at_level(logging.WARNING, "prbayes"):
         beyond = prb.predict(optimum, drift.of(line, 3.0), x, b, model=model, n_samples=50)
     said = "line at 3: extrapolates its inadequacy, seen from 0 to 2"
