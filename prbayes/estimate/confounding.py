@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats
 from prbayes.estimate.identifiability import named_direction
@@ -54,7 +54,8 @@ def _mixed(local: Local, own: Places, others: Places, names: list[str]) -> str:
         shares = [float((direction[block] ** 2).sum()) for block in (own, others)]
         if min(shares) > _TAKES_PART:
             found.append(named_direction(direction, names))
-    return f"{', '.join(found)} is not identified" if found else ""
+    verb = "is" if len(found) == 1 else "are"
+    return f"{' and '.join(found)} {verb} not identified" if found else ""
 
 
 def _alike(local: Local, own: Places, others: Places, names: list[str]) -> str:
@@ -85,7 +86,7 @@ def _elements(evaluator: Evaluator, node: Node) -> tuple[Places, Places]:
     return np.setdiff1d(own, rest), np.setdiff1d(rest, own)
 
 
-def _places(evaluator: Evaluator, roots: Sequence[TensorVariable]) -> Places:
+def _places(evaluator: Evaluator, roots: Sequence[Any]) -> Places:
     """Return which elements of theta some roots are."""
     names = {rv.name for rv in roots}
     model = evaluator.model
