@@ -452,6 +452,67 @@ def risk_coverage() -> Iterator[Row]:
             yield ["exact posterior, for comparison", labels[key], size, f"{shares[key]:.1%}"]
 
 
+def thermal_conductivity() -> Iterator[Row]:
+    """Return the rows of treatments of the conductivity."""
+    for name, row in found("thermal_challenge")["conductivity"].items():
+        mean, constant = (f"{row[what]:+.0f}" for what in ("at the mean temperature", "at 500 C"))
+        yield [name, f"{row['differences']:.0f}", mean, constant]
+
+
+def thermal_population() -> Iterator[Row]:
+    """Return the rows of the population of the material."""
+    for name, row in found("thermal_challenge")["population"].items():
+        digits = 0 if "rhoCp" in name else 4
+        optimum = f"{row['optimum']:.{digits}f} ± {row['error']:.{digits}f}"
+        yield [name, optimum, f"{row['mean']:.{digits}f} ± {row['sd']:.{digits}f}"]
+
+
+def thermal_capacity() -> Iterator[Row]:
+    """Return the rows of the heat capacity's scatter."""
+    table = found("thermal_challenge")
+    for name, row in table["capacity"].items():
+        share = row["sd"] / table["sample sd"] - 1
+        yield [f"`{name}`", f"{row['sd']:.0f} ± {row['error']:.0f}", f"{share:+.1%}"]
+
+
+def thermal_slabs() -> Iterator[Row]:
+    """Return the rows of tests of slabs."""
+    for name in ("ensemble", "accreditation"):
+        row = found("thermal_challenge")[name]
+        measured = f"{row['measured']:.0f}"
+        if "measured sd" in row:
+            measured += f" ± {row['measured sd']:.0f}"
+        predicted = f"{row['predicted']:.0f} ± {row['predicted sd']:.0f}"
+        yield [name, measured, predicted, short(row["p, means"]), short(row["p, spreads"])]
+
+
+def thermal_risk() -> Iterator[Row]:
+    """Return the rows of the required probability."""
+    labels = {"device": "published equation", "device_by_differences": "finite differences"}
+    for key, row in found("thermal_challenge")["risk"].items():
+        name, points = key.split("/")
+        source = f"{points} points" if int(points) else "stored responses"
+        interval = f"{short(row['lower'], 3)} to {short(row['upper'], 3)}"
+        numbers = [short(row["probability"], 3), interval, short(row["error"], 3)]
+        yield [labels[name], source, *numbers, f"{row['above']:.0%}", row["verdict"]]
+
+
+def thermal_shares() -> Iterator[Row]:
+    """Return the rows of sensitivities."""
+    for name, row in found("thermal_challenge")["sensitivity"].items():
+        shares = [f"{short(row[w])} ± {short(row[w + '_error'])}" for w in ("first", "total")]
+        yield [name, *shares]
+
+
+def thermal_tests() -> Iterator[Row]:
+    """Return the rows of tests to come."""
+    plan = found("thermal_challenge")["plan"]
+    yield ["nothing", *[short(plan["now"], 3)] * 2, ""]
+    for name, row in plan["tests"].items():
+        after = [short(row[k], 3) for k in ("after 10", "after 50")]
+        yield [name, *after, f"{row['halves']:.0f} of them"]
+
+
 def libraries() -> Iterator[Row]:
     """Return the rows of libraries' emulators."""
     table = found("emulators")
@@ -514,6 +575,13 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "planning": plans,
     "risk, errors": risk_errors,
     "risk, coverage": risk_coverage,
+    "thermal, conductivity": thermal_conductivity,
+    "thermal, population": thermal_population,
+    "thermal, capacity": thermal_capacity,
+    "thermal, slabs": thermal_slabs,
+    "thermal, risk": thermal_risk,
+    "thermal, shares": thermal_shares,
+    "thermal, tests": thermal_tests,
 }
 _MARKED = re.compile(
     r"(<!-- table: (?P<name>[^>]+) -->\n\n(?:\|[^\n]*\n){2})(?:\|[^\n]*\n)*(\n<!-- end -->)"

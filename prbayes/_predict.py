@@ -37,6 +37,7 @@ from prbayes.propagation.reweighted import Design, UntoldError
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, quantiles
 from prbayes.response.failures import Abort, ResponseError
+from prbayes.response.inadequacy import caveats_of
 from prbayes.response.inputs import Inputs, read_inputs
 from prbayes.response.outputs import Outputs, lacking
 from prbayes.response.response import Responses, refuse_calling, refuse_uncallable
@@ -113,7 +114,8 @@ def predict(
         Dims (chain, draw, sample), and for several outputs a last one, with their names where they
         are known: those of the simulator with this response, or the keys of a mapping. Attributes:
         ``source`` (how specimens were made), ``responses``
-        (how many were computed), ``nan`` (how many values are NaN), ``specimens_id`` (equal for
+        (how many were computed), ``nan`` (how many values are NaN), ``caveats`` (what the response
+        says of itself, such as that its inadequacy extrapolates), ``specimens_id`` (equal for
         predictions with the same specimens), ``calibration_data`` and ``calibration_specimens``
         (digests of the data, and specimen labels, of the calibration, by which `area_test` knows
         them), ``identity`` (of the problem that was calibrated).
@@ -195,6 +197,7 @@ def predict(
             "nan": missing,
             "specimens_id": _digest(*drawn.specimens),
             "random_seed": str(seed),
+            "caveats": list(caveats_of(response)),
             **_calibration(result, model),
             **as_attributes(identity_in(result) or identity_of_model(model)),
             **versions(),

@@ -334,6 +334,22 @@ TABLE: dict[str, Row] = {
     ),
     "Fresh": Row(prb.Fresh, {**PROPAGATION, "n": COUNT}),
     "response.Abort": Row(prb.response.Abort, {"on_nan": FLAG}),
+    "response.Additive": Row(
+        prb.response.Additive,
+        {
+            "seen": (None, "x", 1.0, [1.0], [1.0, 1.0], [0.0, np.inf], [[0.0, 1.0]]),
+            "shape": (3, "line", lambda c: np.nan * c, lambda c: 1.0),
+        },
+        {"seen": [0.0, 1.0]},
+    ),
+    "response.Multiplicative": Row(
+        prb.response.Multiplicative,
+        {
+            "seen": (None, "x", 1.0, [1.0], [1.0, 1.0], [0.0, np.inf], [[0.0, 1.0]]),
+            "shape": (3, "line", lambda c: np.nan * c, lambda c: 1.0),
+        },
+        {"seen": [0.0, 1.0]},
+    ),
     "response.Replace": Row(prb.response.Replace, {"value": ("x", None, -np.inf, True, [1.0], 1j)}),
     "response.Retry": Row(
         prb.response.Retry,

@@ -8,6 +8,7 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes._weighted import distribution_function, quantile
+from prbayes.estimate.confounding import confounded
 from prbayes.estimate.differences import cross
 from prbayes.estimate.identifiability import unidentified_directions
 from prbayes.estimate.projections import one_dimensional
@@ -228,6 +229,7 @@ def caveats(
         names = evaluator.readable_names
         directions = unidentified_directions(local.unidentified, names)
         lines += [_of_direction(direction) for direction in directions]
+        lines += confounded(evaluator, local)
     return tuple(lines)
 
 

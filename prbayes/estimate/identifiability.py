@@ -35,7 +35,7 @@ def unidentified_directions(unidentified: Floats, names: list[str]) -> list[str]
         i = int(np.argmax(within))
         length = np.sqrt(within[i])
         direction = projector[i] / length
-        found.append(_named(direction, names))
+        found.append(named_direction(direction, names))
         # What is left is orthogonal to it.
         along = np.outer(direction, direction @ left)
         without = left - along
@@ -45,7 +45,8 @@ def unidentified_directions(unidentified: Floats, names: list[str]) -> list[str]
     return found
 
 
-def _named(direction: Floats, names: list[str]) -> str:
+def named_direction(direction: Floats, names: list[str]) -> str:
+    """Name a direction by its largest elements, relative to the largest: 'mu - 0.8 sigma'."""
     largest = np.argmax(np.abs(direction))
     shares = direction / direction[largest]
     order = np.argsort(-np.abs(shares), kind="stable")

@@ -3,12 +3,15 @@
 from prbayes.response.budget import BudgetError
 from prbayes.response.costs import Cost
 from prbayes.response.failures import Abort, Replace, ResponseError, Retry
+from prbayes.response.inadequacy import Additive, Multiplicative
 from prbayes.response.store import Store, StoreError
 
 __all__ = [
     "Abort",
+    "Additive",
     "BudgetError",
     "Cost",
+    "Multiplicative",
     "Replace",
     "ResponseError",
     "Retry",

@@ -49,6 +49,17 @@ class Inputs:
                 found[str(variable.name or f"shared variable {i}")] = variable
         return found
 
+    def roots_above(self, positions: Sequence[int]) -> tuple[TensorVariable, ...]:
+        """Return the roots above some arguments, by their positions; none above constants."""
+        known = set(self.roots)
+        found: dict[TensorVariable, None] = {}
+        for position in positions:
+            argument = self.arguments[position]
+            x = self.aleatory[argument] if isinstance(argument, int) else argument
+            if isinstance(x, Variable):
+                found.update((v, None) for v in _ancestry(x, known) if v in known)
+        return tuple(found)
+
     def rebuilt(self, params: Sequence[Any]) -> tuple[list[TensorVariable], list[TensorVariable]]:
         """Return the aleatory and epistemic inputs with the roots replaced by ``params``."""
         # In two steps, because params may themselves depend on the roots.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -27,9 +28,12 @@ from prbayes.response.calling import (
 )
 from prbayes.response.executors import capacity
 from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
+from prbayes.response.inadequacy import caveats_of
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import ONE, Outputs, outputs_of_result
 from prbayes.response.store import Store
+
+_log = logging.getLogger("prbayes")
 
 
 def refuse_uncallable(name: str, function: object) -> None:
@@ -173,6 +177,8 @@ class Responses:
     ) -> None:
         refuse_uncallable(name, function)
         refuse_misfit(name, function, partial(_sizes, inputs), outputs)
+        for caveat in caveats_of(function):
+            _log.warning("%s", caveat)
         policy = Abort() if on_failure is None else on_failure
         kept = None
         if store is not None:
