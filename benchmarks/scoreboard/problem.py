@@ -94,7 +94,6 @@ class Problem:
     told: Callable[[Draws], Draws] = dict  # what is told of hyperparameters
     degrees: int | None = None  # of freedom of outputs that are readings of a curve, with errors
     error: float | None = None  # sd of a reading, where it is known
-    symbolic: bool = True  # whether the formula takes PyTensor in NumPy's place
     published: tuple[str, ...] = ()  # results of others, with their source
     correlation: str = ""  # the hyperparameter that correlates the first two inputs, if one does
 
@@ -124,6 +123,16 @@ class Problem:
 
 def _column(value: Any) -> Any:
     return np.asarray(value, dtype=float)[..., None]
+
+
+def capped(simulated: Any, observed: Any) -> Any:
+    """Return responses, those of specimens that have failed far above all measured ones."""
+    return np.minimum(np.where(np.isnan(simulated), np.inf, simulated), 10 * observed.max(axis=0))
+
+
+def ordered(y: Any) -> Any:
+    """Return what tells a data set, (..., N m): sorted values of each output (..., N, m)."""
+    return np.swapaxes(np.sort(y, axis=-2), -2, -1).reshape(*y.shape[:-2], -1)
 
 
 class Response:
