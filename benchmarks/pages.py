@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks import record
+from benchmarks.scoreboard import table as scoreboard
+from benchmarks.scoreboard.problems import PROBLEMS
 
 PAGES = Path(__file__).parents[1] / "docs"
 METRICS = {
@@ -480,6 +483,11 @@ def libraries() -> Iterator[Row]:
         yield [label, *errors, short(float(np.median(taken))), size]
 
 
+def _scoreboard(problem: str) -> Iterator[Row]:
+    """Return the rows of a problem of the scoreboard."""
+    return scoreboard.rows(found("scoreboard"), problem)
+
+
 # Where the rows of each table are from; the first two lines of it are the page's.
 TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "coverage, pooled": pooled,
@@ -514,7 +522,13 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "planning": plans,
     "risk, errors": risk_errors,
     "risk, coverage": risk_coverage,
+    "scoreboard, errors": lambda: scoreboard.matrix(found("scoreboard"), "rms"),
+    "scoreboard, widths": lambda: scoreboard.matrix(found("scoreboard"), "width"),
+    "scoreboard, cannot": lambda: scoreboard.cannot(found("scoreboard")),
+    "scoreboard, yields": lambda: scoreboard.yields(),
 }
+for _name in PROBLEMS:
+    TABLES[f"scoreboard, {_name}"] = partial(_scoreboard, _name)
 _MARKED = re.compile(
     r"(<!-- table: (?P<name>[^>]+) -->\n\n(?:\|[^\n]*\n){2})(?:\|[^\n]*\n)*(\n<!-- end -->)"
 )

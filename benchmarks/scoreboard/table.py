@@ -1,12 +1,13 @@
-"""The scoreboard: every rival's score on every problem, as a table and two pictures.
+"""The scoreboard: every rival's score on every problem, in one file, and two pictures of it.
 
     uv run python -m benchmarks.scoreboard.table
+    uv run python -m benchmarks.pages
 
-Bias is the mean over data sets of what lies between a mean and the reference's, in standard
-deviations of the reference, and beside it the root of its mean square; width is the median ratio of
-the standard deviations; coverage that of 89% intervals, from twenty data sets on. Runs and seconds
-of a processor are medians over data sets. A rival without draws has no width. Figures of
-hyperparameters stand in the problem's order. No runs means that they were not counted.
+The first writes `benchmarks/results/scoreboard.json`, from which the second writes the tables of
+`docs/scoreboard.md`. Bias is the mean over data sets of what lies between a mean and the
+reference's, in standard deviations of the reference, and rms the root of its mean square; width is
+the median ratio of the standard deviations; coverage that of 89% intervals, from twenty data sets
+on. Runs and seconds of a processor are medians over data sets.
 """
 
 from __future__ import annotations
@@ -20,14 +21,30 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.scoreboard.problem import Problem
-from benchmarks.scoreboard.problems import PROBLEMS
+from benchmarks import record
+from benchmarks.scoreboard.problems import PROBLEMS, tension_304l
 from benchmarks.scoreboard.score import score
 from benchmarks.scoreboard.study import STORE
 
+PICTURES = Path(__file__).parents[2] / "docs" / "images"
 _ENOUGH = 20  # data sets of a coverage that is told: its standard error is .07
 _ACROSS = 4  # panels of a picture
+_TENSION = tension_304l.PROBLEM.name
 _COSTS = ("data sets", "failures", "runs", "cpu")
+# In the order of the page: by what a rival is, and prbayes first because the page is its own.
+RIVALS = (
+    "prbayes PR",
+    "prbayes KLD",
+    "prbayes area",
+    "prbayes log-likelihood",
+    "hierarchical PyMC",
+    "stock PyMC",
+    "pyABC Wasserstein",
+    "pyABC adaptive",
+    "sbi",
+    "mud",
+    "Nelder-Mead PR",
+)
 
 
 def stored(store: Path) -> Iterator[dict[str, Any]]:
@@ -49,53 +66,98 @@ def scores(store: Path) -> dict[str, Any]:
                 cell[one["rival"]] = {"cannot": one["cannot"]}
             elif size in sizes:
                 cell[one["rival"]] = score(problem, size, one["rows"])
-    return found
+    return {name: found[name] for name in PROBLEMS if name in found}
 
 
-def cells(problem: Problem, one: dict[str, Any]) -> list[str]:
-    """Return the cells of a row behind the rival's name."""
+def hyperparameters(one: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the scores of a cell's hyperparameters, in the problem's order."""
+    return [value for name, value in one.items() if name not in (*_COSTS, "cannot")]
+
+
+def worst(one: dict[str, Any], key: str) -> float | None:
+    """Return the largest error of a cell, or the width that is farthest from one."""
+    values = [value[key] for value in hyperparameters(one) if value[key] is not None]
+    if not values:
+        return None
+    return float(max(values, key=lambda v: abs(np.log(v)) if key == "width" else v))
+
+
+def size_of(sizes: dict[str, Any]) -> str:
+    """Return the number of specimens at which most rivals were run, the largest of several."""
+    return max(sizes, key=lambda size: (len(sizes[size]), int(size)))
+
+
+def matrix(found: dict[str, Any], key: str) -> Iterator[list[str]]:
+    """Yield a row of a rival over all problems: the worst figure, and how many data sets it has."""
+    columns = [sizes[size_of(sizes)] for sizes in found.values()]
+    for rival in RIVALS:
+        yield [rival, *(_summary(column.get(rival), key) for column in columns)]
+
+
+def _summary(one: dict[str, Any] | None, key: str) -> str:
+    if one is None:
+        return "not run"
     if "cannot" in one:
-        return [one["cannot"]]
-    names = [name for name in one if name not in _COSTS]
-    shown = [_figures(one, names, key) for key in ("bias", "rms", "width", "coverage")]
+        return "cannot"
+    value = worst(one, key)
+    if value is None:
+        return "fails" if one["failures"] else "no width"
+    return f"{value:.2f} ({one['data sets'] - one['failures']})"
+
+
+def rows(found: dict[str, Any], problem: str) -> Iterator[list[str]]:
+    """Yield the rows of a problem: every rival at every number of specimens."""
+    for size, cell in found[problem].items():
+        for rival in RIVALS:
+            if rival in cell and "cannot" not in cell[rival]:
+                yield [size, rival, *_cells(cell[rival])]
+
+
+def _cells(one: dict[str, Any]) -> list[str]:
+    shown = [_figures(one, key) for key in ("bias", "width", "coverage")]
     if one["data sets"] < _ENOUGH:
-        shown[-1] = "-"
-    runs = "-" if one["runs"] is None else f"{one['runs']:.3g}"
-    cpu = "-" if one["cpu"] is None else f"{one['cpu']:.2g}"
-    return [*shown, runs, cpu, str(one["data sets"]), str(one["failures"])]
+        shown[-1] = ""
+    error = worst(one, "rms")
+    shown.insert(1, "" if error is None else f"{error:.2f}")
+    runs = "not counted" if one["runs"] == 0 else _short(one["runs"])
+    failed = str(one["failures"] or "")
+    return [*shown, runs, _short(one["cpu"]), str(one["data sets"]), failed]
 
 
-def _figures(one: dict[str, Any], names: list[str], key: str) -> str:
-    values = [one[name][key] for name in names]
-    return " ".join("-" if value is None else f"{value:.2f}" for value in values) or "-"
+def _short(value: float | None) -> str:
+    return "" if value is None else f"{float(f'{value:.2g}'):,g}".replace("e+0", "e")
 
 
-HEAD = ("rival", "bias", "rms", "width", "coverage", "runs", "cpu s", "data sets", "failures")
+def _figures(one: dict[str, Any], key: str) -> str:
+    values = [value[key] for value in hyperparameters(one)]
+    return ", ".join(f"{value:.2f}" for value in values if value is not None)
 
 
-def page(found: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of the table."""
-    for name, sizes in found.items():
-        problem = PROBLEMS[name]
-        for size, rivals in sizes.items():
-            yield f"\n**{name}**, {size} specimens. {problem.what}\n"
-            yield "| " + " | ".join(HEAD) + " |"
-            yield "|" + "---|" * len(HEAD)
-            for rival, one in rivals.items():
-                row = [rival, *cells(problem, one)]
-                yield "| " + " | ".join([*row, *[""] * (len(HEAD) - len(row))]) + " |"
-            if problem.published:
-                yield "\nPublished: " + "; ".join(problem.published) + "."
+def yields() -> Iterator[list[str]]:
+    """Yield each rival's predictive standard deviation of the yield of 304L, in ksi."""
+    by_rival = {one["rival"]: one["rows"] for one in stored(STORE) if one["problem"] == _TENSION}
+    for rival in RIVALS:
+        for row in by_rival.get(rival, []):
+            if "error" not in row:
+                yield [rival, f"{row['values'][tension_304l.PREDICTIVE]['mean']:.2f}"]
+
+
+def cannot(found: dict[str, Any]) -> Iterator[list[str]]:
+    """Yield who cannot say a problem, and why."""
+    reasons: dict[tuple[str, str], list[str]] = {}
+    for problem, sizes in found.items():
+        for rival, one in sizes[size_of(sizes)].items():
+            if "cannot" in one:
+                reasons.setdefault((rival, one["cannot"]), []).append(problem)
+    for (rival, reason), problems in reasons.items():
+        yield [rival, "; ".join(problems), reason]
 
 
 def pictures(found: dict[str, Any], folder: Path) -> None:
     """Draw accuracy against runs, and width against the number of specimens."""
     import matplotlib.pyplot as plt
 
-    rivals = sorted(
-        {rival for sizes in found.values() for cell in sizes.values() for rival in cell}
-    )
-    colors = dict(zip(rivals, plt.get_cmap("tab20")(np.arange(len(rivals))), strict=True))
+    colors = dict(zip(RIVALS, plt.get_cmap("tab20")(np.arange(len(RIVALS))), strict=True))
     rows = -(-len(found) // _ACROSS)
     for key, file in (("rms", "accuracy"), ("width", "width")):
         size = (3.2 * _ACROSS, 2.8 * rows + 0.8)
@@ -113,7 +175,7 @@ def pictures(found: dict[str, Any], folder: Path) -> None:
         told = [axis.get_legend_handles_labels() for axis in axes.ravel()]
         handles = {t: h for both in told for h, t in zip(*both, strict=True)}
         figure.legend(handles.values(), handles, loc="outside lower center", ncols=5, frameon=False)
-        figure.savefig(folder / f"{file}.png", dpi=110)
+        figure.savefig(folder / f"scoreboard_{file}.png", dpi=90)
         plt.close(figure)
 
 
@@ -132,26 +194,22 @@ def _panel(axis: Any, name: str, sizes: dict[str, Any], colors: dict[str, Any], 
 
 def _points(sizes: dict[str, Any], rival: str, key: str) -> Iterator[tuple[float, float]]:
     for size, cell in sizes.items():
-        one = cell.get(rival, {"cannot": ""})
-        values = [v[key] for name, v in one.items() if name not in (*_COSTS, "cannot")]
-        values = [value for value in values if value is not None]
+        one = cell.get(rival)
+        value = None if one is None else worst(one, key)
         # A rival whose runs are not counted has no place on that axis.
-        if values and (key == "width" or one["runs"]):
-            # The farthest from one of the ratios, and the largest of the errors.
-            worst = max(values, key=lambda v: abs(np.log(v)) if key == "width" else v)
-            yield (float(size) if key == "width" else one["runs"]), worst
+        if one is not None and value and (key == "width" or one["runs"]):
+            yield (float(size) if key == "width" else one["runs"]), value
 
 
 def main() -> None:
-    """Print the table, write it, and draw."""
+    """Write the scores, and draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--store", type=Path, default=STORE)
+    parser.add_argument("--pictures", type=Path, default=PICTURES)
     arguments = parser.parse_args()
     found = scores(arguments.store)
-    text = "\n".join(page(found))
-    print(text)
-    (arguments.store / "table.md").write_text(f"{text.strip()}\n", encoding="utf-8")
-    pictures(found, arguments.store)
+    record.save(arguments.store.with_suffix(".json"), found, ("numpy", "scipy"))
+    pictures(found, arguments.pictures)
 
 
 if __name__ == "__main__":
