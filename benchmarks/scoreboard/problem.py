@@ -130,9 +130,29 @@ def capped(simulated: Any, observed: Any) -> Any:
     return np.minimum(np.where(np.isnan(simulated), np.inf, simulated), 10 * observed.max(axis=0))
 
 
-def ordered(y: Any) -> Any:
-    """Return what tells a data set, (..., N m): sorted values of each output (..., N, m)."""
-    return np.swapaxes(np.sort(y, axis=-2), -2, -1).reshape(*y.shape[:-2], -1)
+def components(problem: Problem, observed: Any) -> Callable[[Any], Any]:
+    """Return the map of outputs (..., m) to principal components of the data, (..., k).
+
+    There are as many as inputs, each with a standard deviation of one in the data.
+    """
+    center, unit = observed.mean(axis=0), observed.std(axis=0)
+    _, size, directions = np.linalg.svd((observed - center) / unit, full_matrices=False)
+    count = len(problem.inputs)
+    kept = directions[:count].T / size[:count] * np.sqrt(len(observed))
+    return lambda y: (y - center) / unit @ kept
+
+
+def statistics(y: Any) -> Any:
+    """Return what tells data sets (..., N, m): sorted values of each output, and correlations.
+
+    A correlation is multiplied by the root of N, to count as much as a mean of N values does.
+    """
+    ordered = np.swapaxes(np.sort(y, axis=-2), -2, -1).reshape(*y.shape[:-2], -1)
+    first, second = np.triu_indices(y.shape[-1], 1)
+    centred = y - y.mean(axis=-2, keepdims=True)
+    centred = centred / np.sqrt((centred**2).sum(axis=-2, keepdims=True))
+    correlations = (centred[..., first] * centred[..., second]).sum(axis=-2)
+    return np.concatenate([ordered, np.sqrt(y.shape[-2]) * correlations], axis=-1)
 
 
 class Response:

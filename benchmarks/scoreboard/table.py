@@ -30,6 +30,9 @@ PICTURES = Path(__file__).parents[2] / "docs" / "images"
 _ENOUGH = 20  # data sets of a coverage that is told: its standard error is .07
 _ACROSS = 4  # panels of a picture
 _TENSION = tension_304l.PROBLEM.name
+# Axes that are the same in all panels; what lies beyond stands at their edge.
+_LIMITS = {"rms": (0.02, 20.0), "width": (0.25, 8.0)}
+_RUNS, _WIDTHS = (300.0, 3e8), (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 _COSTS = ("data sets", "failures", "runs", "cpu")
 # In the order of the page: by what a rival is, and prbayes first because the page is its own.
 RIVALS = (
@@ -180,25 +183,40 @@ def pictures(found: dict[str, Any], folder: Path) -> None:
 
 
 def _panel(axis: Any, name: str, sizes: dict[str, Any], colors: dict[str, Any], key: str) -> None:
-    style = "-" if key == "width" else "none"
+    """Draw a problem: accuracy at one number of specimens, or width at all of them."""
+    shown = sizes if key == "width" else {size_of(sizes): sizes[size_of(sizes)]}
     for rival, color in colors.items():
-        points = list(_points(sizes, rival, key))
-        if points:
-            x, y = zip(*points, strict=True)
-            axis.plot(x, y, marker="o", linestyle=style, color=color, label=rival)
-    axis.set(title=name, xscale="log", yscale="log")
-    axis.set_xlabel("specimens" if key == "width" else "runs of the response")
+        marker = "s" if rival.startswith("prbayes") else "o"
+        points = list(_points(shown, rival, key))
+        if not points:
+            continue
+        x, y = zip(*points, strict=True)
+        style = {"marker": marker, "color": color, "label": rival}
+        if x[0]:
+            axis.plot(x, y, linestyle="-" if key == "width" else "none", **style)
+        else:  # runs were not counted
+            axis.axhline(y[0], linestyle=":", **style | {"marker": None})
+    axis.set(title=name, xscale="log", yscale="log", ylim=_LIMITS[key])
     if key == "width":
+        axis.set_xlabel("specimens")
+        numbers = [float(size) for size in sizes]
+        axis.set_xlim(min(numbers) / 1.5, max(numbers) * 1.5)
+        axis.set_xticks(numbers, list(sizes), minor=False)
+        axis.set_xticks([], minor=True)
+        axis.set_yticks(_WIDTHS, [f"{width:g}" for width in _WIDTHS])
+        axis.set_yticks([], minor=True)
         axis.axhline(1.0, color="k", lw=0.6)
+    else:
+        axis.set(xlim=_RUNS, xlabel=f"runs of the response, {size_of(sizes)} specimens")
 
 
 def _points(sizes: dict[str, Any], rival: str, key: str) -> Iterator[tuple[float, float]]:
     for size, cell in sizes.items():
         one = cell.get(rival)
         value = None if one is None else worst(one, key)
-        # A rival whose runs are not counted has no place on that axis.
-        if one is not None and value and (key == "width" or one["runs"]):
-            yield (float(size) if key == "width" else one["runs"]), value
+        if one is not None and value:
+            kept = np.clip(value, *_LIMITS[key])
+            yield (float(size) if key == "width" else one["runs"]), float(kept)
 
 
 def main() -> None:

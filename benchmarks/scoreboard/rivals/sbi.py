@@ -1,8 +1,9 @@
 """sbi: neural posterior estimation, from whole data sets that are simulated from the prior.
 
-A data set is told by the sorted values of each output, standardised by the observed ones, and by
-the correlations of outputs; sbi's own standardisation and its default estimator, a masked
-autoregressive flow, are used. Draws outside the prior are drawn anew, as sbi's posteriors do.
+A data set is told by its sorted values, standardised by the observed ones; of several outputs by
+those of the data's principal components and their correlations. sbi's own standardisation and its
+default estimator, a masked autoregressive flow, are used. Draws outside the prior are drawn anew,
+as sbi's posteriors do.
 
     python -m benchmarks.scoreboard.rivals.sbi
 """
@@ -15,19 +16,10 @@ import numpy as np
 import torch
 from sbi.inference import NPE
 
-from benchmarks.scoreboard.problem import Draws, capped, ordered
+from benchmarks.scoreboard.problem import Draws, capped, components, statistics
 from benchmarks.scoreboard.study import Rival, Task, main
 
 _TRIES = 100  # batches of draws; an estimator that leaves so few within the prior has failed
-
-
-def statistics(y: Any) -> Any:
-    """Return what tells data sets (..., N, m)."""
-    centred = y - y.mean(axis=-2, keepdims=True)
-    unit = np.sqrt((centred**2).sum(axis=-2, keepdims=True))
-    correlations = np.swapaxes(centred, -2, -1) @ centred / (unit * np.swapaxes(unit, -2, -1))
-    first, second = np.triu_indices(y.shape[-1], 1)
-    return np.concatenate([ordered(y), correlations[..., first, second]], axis=-1)
 
 
 def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
@@ -40,8 +32,10 @@ def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
     values = problem.prior_draws(rng, count)
     z = rng.standard_normal((count, len(y), len(problem.inputs)))
     responses = task.response(*problem.population(values, z)).reshape(count, *y.shape)
-    standard = [(v - y.mean(axis=0)) / y.std(axis=0) for v in (capped(responses, y), y)]
-    told = [torch.tensor(statistics(v), dtype=torch.float32) for v in standard]
+    several = y.shape[1] > 1
+    standard = components(problem, y) if several else lambda v: (v - y.mean()) / y.std()
+    both = [standard(v) for v in (capped(responses, y), y)]
+    told = [torch.tensor(statistics(v), dtype=torch.float32) for v in both]
     # Positive hyperparameters by their logarithms, so that no draw leaves the prior's support.
     positive = {name: p.distribution().support()[0] >= 0 for name, p in problem.priors.items()}
     columns = [np.log(v) if positive[name] else v for name, v in values.items()]

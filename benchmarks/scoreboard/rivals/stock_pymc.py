@@ -1,8 +1,8 @@
 """Stock PyMC: `pm.Simulator` with sorted values and a Gaussian distance, and `pm.sample_smc`.
 
 As its documentation has it, a data set of the observed size is simulated at each call. The
-tolerance is a share of the standard deviation of the data. Of several outputs the values of each
-are sorted, and the squared distance is the mean of theirs.
+tolerance is a share of the standard deviation of the data. Of several outputs the principal
+components of the data are taken, and their correlations beside their sorted values.
 
     python -m benchmarks.scoreboard.rivals.stock_pymc
 """
@@ -15,7 +15,7 @@ import numpy as np
 import pymc as pm
 
 from benchmarks.scoreboard import in_pymc
-from benchmarks.scoreboard.problem import Draws, capped, ordered
+from benchmarks.scoreboard.problem import Draws, capped, components, statistics
 from benchmarks.scoreboard.study import Rival, Task, main
 
 
@@ -24,14 +24,13 @@ def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
     problem, y = task.problem, task.observed
     names = list(problem.priors)
     several = y.ndim > 1
-    # One output is sorted by PyMC, and has its unit; several are sorted here, in units of theirs.
-    unit = y.std(axis=0) if several else 1.0
-    outputs = y.shape[1] if several else 1
-    epsilon = settings["epsilon"] * (np.sqrt(outputs) if several else y.std())
+    # One output is sorted by PyMC, and has its unit; components are sorted here, and have one.
+    parts = components(problem, y) if several else None
+    epsilon = settings["epsilon"] * (1.0 if several else y.std())
     statistic = "identity" if several else settings["sum_stat"]
 
     def told(values: Any) -> Any:
-        return ordered(values / unit) if several else values
+        return values if parts is None else statistics(parts(values))
 
     def simulate(rng: Any, *arguments: Any, size: Any = None) -> Any:
         *values, size = (*arguments, size) if size is not None else arguments
