@@ -483,6 +483,11 @@ def libraries() -> Iterator[Row]:
         yield [label, *errors, short(float(np.median(taken))), size]
 
 
+def _matrix(key: str, several: bool) -> Iterator[Row]:
+    """Return the rows of rivals over the problems of the scoreboard."""
+    return scoreboard.matrix(found("scoreboard"), key, several)
+
+
 def _scoreboard(problem: str) -> Iterator[Row]:
     """Return the rows of a problem of the scoreboard."""
     return scoreboard.rows(found("scoreboard"), problem)
@@ -522,10 +527,12 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "planning": plans,
     "risk, errors": risk_errors,
     "risk, coverage": risk_coverage,
-    "scoreboard, errors": lambda: scoreboard.matrix(found("scoreboard"), "rms"),
-    "scoreboard, widths": lambda: scoreboard.matrix(found("scoreboard"), "width"),
+    "scoreboard, errors, one output": lambda: _matrix("rms", several=False),
+    "scoreboard, errors, several outputs": lambda: _matrix("rms", several=True),
+    "scoreboard, widths, one output": lambda: _matrix("width", several=False),
+    "scoreboard, widths, several outputs": lambda: _matrix("width", several=True),
     "scoreboard, cannot": lambda: scoreboard.cannot(found("scoreboard")),
-    "scoreboard, yields": lambda: scoreboard.yields(),
+    "scoreboard, yields": scoreboard.yields,
 }
 for _name in PROBLEMS:
     TABLES[f"scoreboard, {_name}"] = partial(_scoreboard, _name)

@@ -22,9 +22,10 @@ from benchmarks.scoreboard.problem import (
     Reference,
     Response,
     capped,
+    components,
     half_normal,
     normal,
-    ordered,
+    statistics,
     truncated,
     uniform,
 )
@@ -239,10 +240,21 @@ def test_the_spread_of_a_predicted_yield() -> None:
 
 def test_data_sets_are_told_by_sorted_outputs_and_failures_stand_above() -> None:
     y = np.array([[3.0, 10.0], [1.0, 30.0], [2.0, 20.0]])
-    assert ordered(y).tolist() == [1, 2, 3, 10, 20, 30]
-    assert ordered(np.stack([y, -y]))[1].tolist() == [-3, -2, -1, -30, -20, -10]
+    rho = np.sqrt(3) * np.corrcoef(y.T)[0, 1]
+    assert statistics(y) == pytest.approx([1, 2, 3, 10, 20, 30, rho])
+    assert statistics(np.stack([y, -y]))[1] == pytest.approx([-3, -2, -1, -30, -20, -10, rho])
     simulated = np.array([[2.0, np.nan], [np.inf, 5.0], [-1.0, 1e9]])
     assert capped(simulated, y).tolist() == [[2, 300], [30, 5], [-1, 300]]
+
+
+def test_components_of_the_data_have_unit_spread_and_no_correlation() -> None:
+    problem = frame.PROBLEM
+    y = problem.data(50, 0)
+    parts = components(problem, y)
+    assert parts(y).shape == (50, 2)
+    assert np.cov(parts(y).T, bias=True) == pytest.approx(np.eye(2), abs=1e-9)
+    assert parts(y).mean(axis=0) == pytest.approx(0, abs=1e-9)
+    assert np.allclose(parts(np.stack([y, 2 * y]))[1], parts(2 * y))
 
 
 def test_gross_values_are_in_the_data_and_not_in_the_reference() -> None:
@@ -393,19 +405,20 @@ def test_the_tables_tell_the_worst_hyperparameter() -> None:
             "50": {"prbayes PR": _cell((0.7, 1.0), sets=20)},
         }
     }
-    errors = dict(table.matrix(found, "rms"))
-    assert errors["prbayes PR"] == "0.50 (2)"
+    errors = dict(table.matrix(found, "rms", several=False))
+    assert errors["prbayes PR"] == ".50 (2)"
+    assert errors["*specimens*"] == "20"
     assert errors["stock PyMC"] == "cannot"
     assert errors["sbi"] == "fails"
-    assert errors["pyABC adaptive"] == "not run"
-    widths = dict(table.matrix(found, "width"))
-    assert (widths["prbayes PR"], widths["mud"]) == ("0.50 (2)", "no width")
+    assert errors["pyABC adaptive"] == ""
+    widths = dict(table.matrix(found, "width", several=False))
+    assert (widths["prbayes PR"], widths["mud"]) == (".50 (2)", "one number")
     told = list(table.rows(found, "linear"))
     assert [row[:2] for row in told] == [
         ["20", "prbayes PR"], ["20", "sbi"], ["20", "mud"], ["50", "prbayes PR"]
     ]  # fmt: skip
-    assert told[0][2:] == ["-0.10, -0.50", "0.50", "1.20, 0.50", "", "1,000", "2.3", "3", "1"]
-    assert told[-1][5] == "0.80", "coverage is told from twenty data sets on"
+    assert told[0][2:] == ["-.10, -.50", ".50", "1.20, .50", "", "1,000", "2.3", "3, 1 failed"]
+    assert told[-1][5] == ".80", "coverage is told from twenty data sets on"
 
 
 def test_the_scores_are_those_of_the_stored_results() -> None:

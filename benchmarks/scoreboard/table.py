@@ -90,22 +90,29 @@ def size_of(sizes: dict[str, Any]) -> str:
     return max(sizes, key=lambda size: (len(sizes[size]), int(size)))
 
 
-def matrix(found: dict[str, Any], key: str) -> Iterator[list[str]]:
-    """Yield a row of a rival over all problems: the worst figure, and how many data sets it has."""
-    columns = [sizes[size_of(sizes)] for sizes in found.values()]
+def matrix(found: dict[str, Any], key: str, several: bool) -> Iterator[list[str]]:
+    """Yield a row of a rival over problems of one output or several: the worst figure of each."""
+    names = [name for name in found if (np.ndim(_observed(name)) > 1) == several]
+    columns = [found[name][size_of(found[name])] for name in names]
+    yield ["*specimens*", *(size_of(found[name]) for name in names)]
     for rival in RIVALS:
         yield [rival, *(_summary(column.get(rival), key) for column in columns)]
 
 
+def _observed(name: str) -> Any:
+    problem = PROBLEMS[name]
+    return problem.data(problem.sizes[0], 0)
+
+
 def _summary(one: dict[str, Any] | None, key: str) -> str:
     if one is None:
-        return "not run"
+        return ""
     if "cannot" in one:
         return "cannot"
     value = worst(one, key)
     if value is None:
-        return "fails" if one["failures"] else "no width"
-    return f"{value:.2f} ({one['data sets'] - one['failures']})"
+        return "fails" if one["failures"] else "one number"
+    return f"{_plain(value)} ({one['data sets'] - one['failures']})"
 
 
 def rows(found: dict[str, Any], problem: str) -> Iterator[list[str]]:
@@ -121,10 +128,15 @@ def _cells(one: dict[str, Any]) -> list[str]:
     if one["data sets"] < _ENOUGH:
         shown[-1] = ""
     error = worst(one, "rms")
-    shown.insert(1, "" if error is None else f"{error:.2f}")
+    shown.insert(1, "" if error is None else _plain(error))
     runs = "not counted" if one["runs"] == 0 else _short(one["runs"])
-    failed = str(one["failures"] or "")
-    return [*shown, runs, _short(one["cpu"]), str(one["data sets"]), failed]
+    failed = f", {one['failures']} failed" if one["failures"] else ""
+    return [*shown, runs, _short(one["cpu"]), f"{one['data sets']}{failed}"]
+
+
+def _plain(value: float) -> str:
+    """Return a number with two digits behind the point, and without a zero before it."""
+    return f"{value:.2f}".replace("0.", ".", 1) if abs(value) < 1 else f"{value:.2f}"
 
 
 def _short(value: float | None) -> str:
@@ -133,7 +145,7 @@ def _short(value: float | None) -> str:
 
 def _figures(one: dict[str, Any], key: str) -> str:
     values = [value[key] for value in hyperparameters(one)]
-    return ", ".join(f"{value:.2f}" for value in values if value is not None)
+    return ", ".join(_plain(value) for value in values if value is not None)
 
 
 def yields() -> Iterator[list[str]]:
