@@ -44,6 +44,7 @@ from prbayes.plots.posterior import plot_posterior
 from prbayes.plots.responses import plot_responses
 from prbayes.plots.stages import plot_stages
 from prbayes.plots.validity import plot_validity
+from prbayes.posterior.adjusting import adjust
 from prbayes.posterior.bootstrapping import bootstrap
 from prbayes.posterior.epsilon import calibrate_epsilon
 from prbayes.posterior.sbc import simulation_based_calibration
@@ -82,6 +83,7 @@ __all__ = [
     "Simulator",
     "Surrogate",
     "abc_distance",
+    "adjust",
     "area_test",
     "bootstrap",
     "calibrate_epsilon",

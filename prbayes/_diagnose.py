@@ -252,8 +252,19 @@ def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
         *_unsupported(designs),
     ]
     refits = _of_refits(posterior.attrs, several=_has_several_outputs(result))
-    notes = (*_compared(result), *refits)
+    notes = (*_compared(result), *_unadjusted(posterior.attrs), *refits)
     return Diagnosis(tuple(messages), designs.support, notes)
+
+
+def _unadjusted(attrs: Mapping[Any, Any]) -> tuple[str, ...]:
+    """Say of draws that were not adjusted what their width is."""
+    # Those of a bootstrap are estimates of resampled specimens, and have no epsilon.
+    if not str(attrs.get("adjustment", "none")).startswith("none") or "converged" in attrs:
+        return ()
+    return (
+        "The draws are those of exp(-discrepancy / epsilon), as wide as epsilon makes them; "
+        "prb.adjust brings them to the width that the data warrant.",
+    )
 
 
 def _has_several_outputs(result: xr.DataTree) -> bool:

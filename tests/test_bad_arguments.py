@@ -88,6 +88,13 @@ def posterior() -> xr.DataTree:
 
 
 @cache
+def adjusted() -> xr.DataTree:
+    draws = posterior().copy()
+    draws["posterior"].attrs["adjustment"] = "Affine()"
+    return draws
+
+
+@cache
 def predicted() -> xr.DataArray:
     return prb.predict(posterior(), line, specimen(), model=model(), n_samples=50, **QUIET)
 
@@ -250,7 +257,7 @@ def with_decision(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a question about a posterior, with what it asks of the shared model."""
 
     def asked(**given: Any) -> Any:
-        common = {"result": posterior(), "model": model()}
+        common = {"idata": posterior(), "model": model()}
         if function is prb.sensitivity:
             common["quantity"] = prb.decision.Mean(line, specimen())
         elif function is prb.plan:
@@ -535,6 +542,21 @@ TABLE: dict[str, Row] = {
             "progressbar": FLAG,
         },
         {"refine": False},
+    ),
+    "adjust": Row(
+        lambda **given: prb.adjust(
+            **{"idata": posterior(), "model": model(), "optimum": optimum()}
+            | {"progressbar": False}
+            | given
+        ),
+        {
+            "idata": (None, 3, "draws", Name("optimum"), Name("adjusted")),
+            "model": NO_MODEL,
+            "optimum": [value for value in NO_OPTIMUM if value is not None],
+            "by": ("affine", 1, True, prb.posterior.Affine),
+            "refine": FLAG,
+            "progressbar": FLAG,
+        },
     ),
     "posterior.Affine": Row(prb.posterior.Affine, {"n_sets": (*COUNT, 1), "random_seed": SEED}),
     "posterior.BatchedKernel": Row(

@@ -198,6 +198,7 @@ TAIL = (
 SLOW = (
     "Simulator",
     "Surrogate.fit",
+    "adjust",
     "area_test",
     "bootstrap",
     "cross_validate",

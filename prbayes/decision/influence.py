@@ -181,11 +181,13 @@ def _of_hyperparameters(
     n = samples // REPLICATES
     nets = [ndtri(sobol(n, 2 * d, seed + 7919 * r)) for r in range(REPLICATES)]
     here, fresh = np.split(np.array(nets), 2, axis=-1)
-    z, elsewhere = here @ copula.root.T, fresh @ copula.root.T
+    z = here @ copula.root.T
+    elsewhere = fresh @ copula.root.T
 
     def at(z: Floats) -> Floats:
         thetas = copula.thetas(z).reshape(-1, d)
-        return told.at(quantity, thetas).reshape(z.shape[:-1])
+        found = told.at(quantity, thetas)
+        return found.reshape(z.shape[:-1])
 
     values = at(z)
     unknown = 1 - np.isfinite(values).mean()
@@ -196,13 +198,17 @@ def _of_hyperparameters(
             "a smaller probability, or an Exceedance"
         )
     values = np.where(np.isfinite(values), values, np.nan)
-    first, total, derivative = [], [], []
-    for i, sd in enumerate(copula.conditional_sd):
-        first.append(first_order(values, at(copula.others_redrawn(z, elsewhere, i))))
-        total.append(total_order(values, at(copula.redrawn(z, fresh, i))))
-        step = np.zeros(d)
-        step[i] = _WEIGHT_STEP / 2
-        slopes = (at(z + step) - at(z - step)) / _WEIGHT_STEP
+    first = []
+    total = []
+    derivative = []
+    steps = np.eye(d) * _WEIGHT_STEP / 2
+    for i, (sd, step) in enumerate(zip(copula.conditional_sd, steps, strict=True)):
+        without_others = at(copula.others_redrawn(z, elsewhere, i))
+        first.append(first_order(values, without_others))
+        without_it = at(copula.redrawn(z, fresh, i))
+        total.append(total_order(values, without_it))
+        change = at(z + step) - at(z - step)
+        slopes = change / _WEIGHT_STEP
         derivative.append(derivative_bound((sd * slopes) ** 2, values))
     rows = [np.transpose(each) for each in (first, total, derivative)]
     return Indices.of(*rows), values
@@ -210,8 +216,10 @@ def _of_hyperparameters(
 
 def _share_of_scatter(told: Told, quantity: Quantity) -> float:
     """Return the share of a new specimen's variance that is there in each population."""
-    thetas = told.populations.thetas[:: max(1, len(told.populations.thetas) // 400)]
-    (at,) = told.at(quantity, told.populations.center[None])
+    populations = told.populations
+    step = max(1, len(populations.thetas) // 400)
+    thetas = populations.thetas[::step]
+    (at,) = told.at(quantity, populations.center[None])
     numbers = quantity.of_specimen(told.values, at)
     if not np.isfinite(numbers).all():
         return np.nan

@@ -115,16 +115,18 @@ def fisher_information(told: Told) -> Floats:
     around = cross(center, step)
     _, weights = told.design.populations(evaluator.roots(around, told.k))
     used = (weights[0] > 0) & observable(told.every)
+    weights = weights[:, used]
     with np.errstate(divide="ignore", invalid="ignore"):
-        scores = slopes(np.log(weights[:, used]), step) * unit
-    mass = weights[0][used] / weights[0][used].sum()
+        scores = slopes(np.log(weights), step) * unit
+    mass = weights[0] / weights[0].sum()
     scores = scores - mass @ scores
     if told.every.ndim > 1:
         return np.asarray((scores.T * mass) @ scores)
     values = told.every[used]
     # As many bins as fine ones and full ones ask for; those in the tails have little weight.
     rank = np.searchsorted(np.sort(values), values)  # the same for equal values
-    bins = rank // max(1, int(np.sqrt(len(mass)) / 2))
+    in_each = max(1, int(np.sqrt(len(mass)) / 2))
+    bins = rank // in_each
     share = np.bincount(bins, mass)
     sums = np.array([np.bincount(bins, mass * column) for column in scores.T])
     means = sums / np.where(share > 0, share, 1.0)
@@ -152,9 +154,12 @@ def _ideal(told: Told, n: int) -> Floats:
     evaluator, center = told.populations.evaluator, told.populations.center
     _, weights = told.design.populations(evaluator.roots(center[None], told.k))
     seen = observable(told.every)
-    values, mass = told.every[seen], weights[0][seen]
-    order = np.argsort(values.reshape(len(values), -1)[:, 0])
-    places = reached(mass[order], (np.arange(n) + 0.5) / n, normalized=True)
+    values = told.every[seen]
+    mass = weights[0][seen]
+    first = values.reshape(len(values), -1)[:, 0]
+    order = np.argsort(first)
+    steps = (np.arange(n) + 0.5) / n
+    places = reached(mass[order], steps, normalized=True)
     return np.asarray(values[order][places])
 
 

@@ -158,10 +158,18 @@ def rare(
 
 def _lost(points: Points) -> float:
     """Return the share of the populations' weight on points without response."""
-    z, values, log_ratio = points.all()
-    log_weight = logsumexp(log_ratio, axis=0) + log_normal(z) - points.log_mixture(z)
+    _, values, log_weight = _weighed(points)
     weights = np.exp(log_weight - log_weight.max())
-    return float(weights[np.isnan(values)].sum() / weights.sum())
+    lost = weights[np.isnan(values)]
+    return float(lost.sum() / weights.sum())
+
+
+def _weighed(points: Points) -> tuple[Floats, Floats, Floats]:
+    """Return points (n, D), responses and log weights in all populations together, (n,) each."""
+    z, values, log_ratio = points.all()
+    all_together = logsumexp(log_ratio, axis=0)
+    log_weight = all_together + log_normal(z) - points.log_mixture(z)
+    return z, values, log_weight
 
 
 def _repeated(proposals: list[_Proposal]) -> list[_Proposal]:
@@ -210,19 +218,21 @@ def _towards(points: Points, level: float, limit: float) -> list[_Proposal]:
 
     Two, where what is above spreads wider than the population, as on two sides of it.
     """
-    z, values, log_ratio = points.all()
-    log_weight = logsumexp(log_ratio, axis=0) + log_normal(z) - points.log_mixture(z)
+    z, values, log_weight = _weighed(points)
     above = values >= level
     if not above.any():
         return []
     z = z[above]
-    weights = np.exp(log_weight[above] - log_weight[above].max())
+    log_weight = log_weight[above]
+    weights = np.exp(log_weight - log_weight.max())
+    total = weights.sum()
     # Narrower only where the limit is reached: a step is longer for it before.
     least = _LEAST_ALONG if level >= limit else 1.0
-    mean = weights @ z / weights.sum()
+    mean = weights @ z / total
     away = z - mean
-    variances, axes = np.linalg.eigh((away.T * weights) @ away / weights.sum())
-    error = np.sqrt(2 * (weights**2).sum()) / weights.sum()  # of a variance of one
+    covariance = (away.T * weights) @ away / total
+    variances, axes = np.linalg.eigh(covariance)
+    error = np.sqrt(2 * (weights**2).sum()) / total  # of a variance of one
     # The largest of several is larger by chance (Marchenko and Pastur 1967).
     by_chance = (1 + np.sqrt(mean.size / 2) * error) ** 2
     if variances[-1] <= max(by_chance, 1 + _SURE * error):
@@ -236,16 +246,20 @@ def _nearest(z: Floats, weights: Floats, least: float) -> _Proposal:
 
     Few points tell no covariance of several dimensions: across it is the same everywhere.
     """
-    mean = weights @ z / weights.sum()
-    towards = mean / max(float(np.linalg.norm(mean)), 1e-300)
-    share = weights / weights.sum()
+    total = weights.sum()
+    mean = weights @ z / total
+    distance = float(np.linalg.norm(mean))
+    towards = mean / max(distance, 1e-300)
+    share = weights / total
     away = z - mean
     whole = float(share @ (away**2).sum(axis=1))
     own = float(share @ (away @ towards) ** 2)
     along = max(own, least)
-    across = _ROOMY * max((whole - own) / max(mean.size - 1, 1), 1.0)
+    others = max(mean.size - 1, 1)
+    across = _ROOMY * max((whole - own) / others, 1.0)
     outer = np.outer(towards, towards)
-    covariance = across * (np.eye(mean.size) - outer) + along * outer
+    identity = np.eye(mean.size)
+    covariance = across * (identity - outer) + along * outer
     return _Proposal(mean, np.linalg.cholesky(covariance))
 
 

@@ -45,15 +45,14 @@ class _Matched:
         d = specimens.size
         nets = [ndtri(sobol(n, 2 * d, seed + 7919 * r)) for r in range(REPLICATES)]
         here, elsewhere = np.split(np.array(nets), 2, axis=-1)
-        same, other, around = [], [], []
+        same = []
+        other = []
+        around = []
         for own in specimens.columns:
-            other.append(here.copy())
-            other[-1][..., own] = elsewhere[..., own]
-            same.append(elsewhere.copy())
-            same[-1][..., own] = here[..., own]
-        for column in range(d):
-            step = np.zeros(d)
-            step[column] = _SCORE_STEP / 2
+            taken = np.isin(np.arange(d), np.arange(d)[own])
+            other.append(np.where(taken, elsewhere, here))
+            same.append(np.where(taken, here, elsewhere))
+        for step in np.eye(d) * _SCORE_STEP / 2:
             around += [here + step, here - step]
         return cls(np.array([here, *same, *other, *around]), len(same), d)
 
@@ -61,18 +60,20 @@ class _Matched:
         self, values: Floats, columns: list[slice], *, smooth: bool
     ) -> tuple[Floats, Floats, Floats]:
         """Return first, total and derivative-based indices by replicate, (r, inputs) each."""
-        here, same, other, around = np.split(
-            values, [1, 1 + self.inputs, 1 + 2 * self.inputs], axis=0
-        )
+        ends = 1 + self.inputs * np.arange(3)
+        (here,), same, other, around = np.split(values, ends, axis=0)
         slopes = (around[::2] - around[1::2]) / _SCORE_STEP
-        first, total, derivative = [], [], []
+        first = []
+        total = []
+        derivative = []
         for i, own in enumerate(columns):
-            first.append(first_order(here[0], same[i]))
-            total.append(total_order(here[0], other[i]))
+            first.append(first_order(here, same[i]))
+            total.append(total_order(here, other[i]))
             squares = (slopes[own] ** 2).sum(axis=0)
-            derivative.append(derivative_bound(squares, here[0]))
-        unknown = np.full((len(columns), values.shape[1]), np.nan)
-        rows = (first, total, derivative if smooth else unknown)
+            derivative.append(derivative_bound(squares, here))
+        if not smooth:
+            derivative = [np.full_like(one, np.nan) for one in derivative]
+        rows = (first, total, derivative)
         return tuple(np.transpose(row) for row in rows)  # type: ignore[return-value]
 
 

@@ -281,11 +281,16 @@ class _Best:
         # Some of the importance is the same for all: that of a few would be luck.
         importance = runs.importance[rows] + 0.1 / len(runs.y)
         # A run that failed by its neighbour is off by the spread.
-        spread = runs.y[rows].std(axis=0)
-        off = np.where(np.isfinite(said[rows]), said[rows] - runs.y[rows], spread)
+        own = runs.y[rows]
+        spread = own.std(axis=0)
+        found = said[rows]
+        off = np.where(np.isfinite(found), found - own, spread)
         error = importance @ off**2
-        for k in np.flatnonzero(error < self.least).tolist():
-            self.least[k], self.models[k], self.said[:, k] = error[k], models[k], said[:, k]
+        better = np.flatnonzero(error < self.least)
+        for k in better.tolist():
+            self.least[k] = error[k]
+            self.models[k] = models[k]
+            self.said[:, k] = said[:, k]
 
 
 def _try_following(

@@ -146,18 +146,23 @@ class GaussianProcess(Surface):
         """Return the means of processes that lack some of the points each, from one inverse."""
         if self.lengths is None or self.nugget is None:
             return self.tuned(x, y).without_each(x, y, lacking)
-        kernel, lengths = KERNELS[self.kernel], np.array(self.lengths)
+        kernel = KERNELS[self.kernel]
+        lengths = np.array(self.lengths)
         scaled = x / lengths
         own, _ = kernel(_squares(scaled, scaled))
         inverse = _inverse(_root(own, self.nugget))
-        of_ones, of_y = inverse.sum(axis=1), inverse @ (y - y.mean())
-        coefficients, centers = [], []
+        mean = y.mean()
+        of_ones = inverse.sum(axis=1)
+        of_y = inverse @ (y - mean)
+        coefficients = []
+        centers = []
         for row in lacking:
             center = float(y[~row].mean())
-            whole = of_y - (center - y.mean()) * of_ones
+            whole = of_y - (center - mean) * of_ones
             # Conditioned on what is left: nothing hangs on the others any more.
-            taken = np.linalg.solve(inverse[np.ix_(row, row)], whole[row])
-            found = whole - inverse[:, row] @ taken
+            columns = inverse[:, row]
+            taken = np.linalg.solve(columns[row], whole[row])
+            found = whole - columns @ taken
             found[row] = 0.0
             coefficients.append(found)
             centers.append(center)

@@ -67,12 +67,16 @@ def _variance(parts: Floats) -> Floats:
 def _levels(values: Floats, importance: Floats) -> tuple[Floats, float]:
     """Return quantiles of what weighted values are finite, (L,), and the width of steps there."""
     finite = np.isfinite(values)
-    order = np.argsort(values[finite])
-    known, weights = values[finite][order], importance[finite][order]
+    known = values[finite]
+    weights = importance[finite]
+    order = np.argsort(known)
+    known = known[order]
+    weights = weights[order]
+    total = weights.sum()
     cumulated = np.cumsum(weights) - 0.5 * weights
     shares = (np.arange(_THRESHOLDS) + 0.5) / _THRESHOLDS
-    levels = np.interp(shares * weights.sum(), cumulated, known)
-    low, high = np.interp(ndtr([-1.0, 1.0]) * weights.sum(), cumulated, known)
+    levels = np.interp(shares * total, cumulated, known)
+    low, high = np.interp(ndtr([-1.0, 1.0]) * total, cumulated, known)
     return levels, _RAMP * (high - low) / 2
 
 

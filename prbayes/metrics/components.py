@@ -103,10 +103,8 @@ def principal_components(
     shares = [np.einsum("ij,ik,kj->j", axes, scatter, axes) for scatter in unit]
     explained = np.array([np.cumsum(share) for share in shares])
     if number is None:
-        most = max(1, min(m, MOST_OUTPUTS, n // _SPECIMENS))
-        enough = (explained >= 1 - LEFT_OUT).all(axis=0)
-        number = int(np.argmax(enough)) + 1 if enough.any() else m
-        number = min(number, most)
+        most = min(m, MOST_OUTPUTS, n // _SPECIMENS)
+        number = min(_enough(explained), max(1, most))
     # Signs that do not hang on the algorithm.
     largest = np.abs(axes).argmax(axis=0)
     signs = np.sign(axes[largest, np.arange(m)])
@@ -135,6 +133,14 @@ def _scatter(
     center = w @ sample
     away = sample - center
     return center, (w[:, None] * away).T @ away
+
+
+def _enough(explained: Floats) -> int:
+    """Return how many components explain enough of each variance, from sums of shares, (k, m)."""
+    enough = (explained >= 1 - LEFT_OUT).all(axis=0)
+    if not enough.any():
+        return len(enough)
+    return int(np.argmax(enough)) + 1
 
 
 def _between_neighbours(rest: Floats) -> float:

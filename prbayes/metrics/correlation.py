@@ -199,17 +199,23 @@ def _correlations(moments: Any, m: int, xp: Any) -> Any:
     rows, columns = np.tril_indices(m)
     place = np.zeros((m, m), dtype=int)
     place[rows, columns] = np.arange(rows.size)
-    i, j = _pairs(m)
+    of_squares = np.diag(place)
+    of_products = place[_pairs(m)]
     total = xp.maximum(moments[..., 0], 1e-300)
-    mean = moments[..., 1 : m + 1] / total[..., None]
-    second = moments[..., m + 1 :] / total[..., None]
-    squares = second[..., np.diag(place)]
-    variance = squares - mean**2
+    unit = total[..., None]
+    mean = moments[..., 1 : m + 1] / unit
+    second = moments[..., m + 1 :] / unit
+    variance = second[..., of_squares] - mean**2
     sd = xp.sqrt(xp.maximum(variance, _LEAST_VARIANCE))
-    products = second[..., place[i, j]]
-    covariance = products - mean[..., i] * mean[..., j]
-    unit = sd[..., i] * sd[..., j]
-    return xp.clip(covariance / unit, -1.0, 1.0)
+    covariance = second[..., of_products] - _by_pair(mean, m)
+    correlations = covariance / _by_pair(sd, m)
+    return xp.clip(correlations, -1.0, 1.0)
+
+
+def _by_pair(values: Any, m: int) -> Any:
+    """Return the products of pairs, (..., m) -> (..., pairs)."""
+    i, j = _pairs(m)
+    return values[..., i] * values[..., j]
 
 
 def _observed_correlations(values: Floats, weights: Floats) -> Floats:

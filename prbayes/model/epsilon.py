@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 
 import numpy as np
@@ -12,6 +13,8 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Identity, identity_of, require_same
 from prbayes.model.node import Node, required_nodes
 from prbayes.model.turns import in_turn
+
+_log = logging.getLogger("prbayes")
 
 
 class Epsilon(dict[str, float]):
@@ -89,3 +92,7 @@ def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
     for node in simulators:
         if node.name in values:
             node.epsilon.set_value(np.asarray(values[node.name]))
+    _log.info(
+        "draws of exp(-discrepancy / epsilon), as those of pymc.sample, are as wide as epsilon "
+        "makes them; prb.adjust brings them to the width that the data warrant"
+    )

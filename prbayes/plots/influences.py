@@ -73,19 +73,22 @@ def plot_sensitivity(
     ['hyperparameter', 'input']
     """
     refuse_look(labels, backend)
-    if not isinstance(table, xr.Dataset) or not {"first", "total"} <= set(table.data_vars):
+    needed = {"first", "total"}
+    if not isinstance(table, xr.Dataset) or not needed <= set(table.data_vars):
         got = type(table).__name__
         raise TypeError(
             f"plot_sensitivity: table: got {got}, expected the Dataset of prb.sensitivity"
         )
-    count = int(max((table.kind == kind).sum() for kind in _PANELS))
+    by_panel = {kind: table.sel(factor=(table.kind == kind).values) for kind in _PANELS}
+    count = max(own.sizes["factor"] for own in by_panel.values())
+    top = count - 1.0
+    limits = (-0.6, top + 0.6)
     size = (4.8, 1.6 + 0.4 * count)
     canvas = Canvas(list(_PANELS), size=size, backend=backend, pc_kwargs=pc_kwargs)
     for kind, title in _PANELS.items():
-        own = table.sel(factor=(table.kind == kind).values)
-        rows = np.arange(count - 1.0, count - 1.0 - own.sizes["factor"], -1.0)
+        own = by_panel[kind]
+        rows = top - np.arange(own.sizes["factor"])
         panel = canvas.panel(kind)
-        limits = (-0.6, count - 0.4)
         for end in (0.0, 1.0):
             panel.line(f"end_{end:.0f}", [end, end], limits, GREY, style=DOTTED, width=1.0)
         _draw(panel, own, "first", rows + 0.12, BLUE, "by itself")
@@ -97,9 +100,11 @@ def plot_sensitivity(
 
 def _draw(panel: Panel, own: xr.Dataset, key: str, rows: Any, color: str, text: str) -> None:
     """Draw shares with two standard errors."""
-    shares, errors = own[key].values, own[f"{key}_error"].values
-    for i, (share, error, row) in enumerate(zip(shares, errors, rows, strict=True)):
-        if np.isfinite(share):
-            ends = [share - 2 * error, share + 2 * error]
-            panel.line(f"{key}_{i}", ends, [row, row], color, width=2)
+    shares = own[key].values
+    errors = own[f"{key}_error"].values
+    low = shares - 2 * errors
+    high = shares + 2 * errors
+    for i in np.flatnonzero(np.isfinite(shares)):
+        row = rows[i]
+        panel.line(f"{key}_{i}", [low[i], high[i]], [row, row], color, width=2)
     panel.points(key, shares, rows, color, marker=_MARKERS[key], legend=text)

@@ -354,8 +354,8 @@ class Mapped:
     width_error: float
     fit_probability: float
     allowed: dict[str, float]  # as in `_Told`
-    # How far out the estimate is for a typical draw, in standard deviations; NaN where unknown.
-    strain: float = np.nan
+    given: bool = False  # whether they are draws given the estimate, and not only mapped
+    doubts: tuple[str, ...] = ()  # what speaks against them
 
 
 _UNADJUSTED = "the draws are not adjusted: {}; their width is epsilon's"

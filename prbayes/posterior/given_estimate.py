@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +13,14 @@ from prbayes.estimate.data_sets import observed_set, sets_along
 from prbayes.estimate.refit import ARRIVED, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.support import TOLERABLE, supports_each
-from prbayes.posterior.adjustment import WEAKEST, Affine, Mapped, UnsettledError, among
+from prbayes.posterior.adjustment import (
+    WEAKEST,
+    Adjusted,
+    Affine,
+    Mapped,
+    UnsettledError,
+    among,
+)
 from prbayes.posterior.sampling_model import SamplingModel, Sight
 from prbayes.posterior.smc_kernel import Normal, correlation
 
@@ -40,7 +47,10 @@ _RESAMPLED = 30
 _TOLD_ON = 500
 # Steps of the draws, and their mean absolute correlation with where they began, at which they end.
 _WALK = 200
+_AT_LEAST = 20
 _FORGOTTEN = 0.05
+# The same, from which on it is told. By judgement.
+_REMEMBERED = 0.2
 
 
 @dataclass(frozen=True)
@@ -53,7 +63,8 @@ class GivenEstimate(Affine):
     its bias, spread and skewness, each changing with them. The density of the estimate that was
     found is a likelihood, to which the prior is added exactly, and draws are made from both.
 
-    Where responses are not stored, the draws are those of `Affine`.
+    Where responses are not stored, or too few of these fits arrive, the draws are those of
+    `Affine`, and the result says so.
 
     Parameters
     ----------
@@ -85,17 +96,47 @@ class GivenEstimate(Affine):
     def _refits(self) -> str:
         return f"GivenEstimate(n_fits={self.n_fits})"
 
+    def __call__(
+        self,
+        evaluator: Evaluator,
+        thetas: Floats,
+        optima: Sequence[Floats],
+        design_error: float = 0.0,
+    ) -> Adjusted:
+        """Draw from the posterior given the estimate, around each mode by itself.
+
+        Parameters
+        ----------
+        evaluator : Evaluator
+            With the epsilons of the draws.
+        thetas : ndarray, shape (..., d)
+        optima : sequence of ndarray, shapes (d,)
+        design_error : float
+            As for `Affine`.
+
+        Returns
+        -------
+        Adjusted
+        """
+        if all(node.bound.stored for node in evaluator.nodes):
+            return super().__call__(evaluator, thetas, optima, design_error)
+        # Data sets along the posterior would cost a response for each of their specimens.
+        affine = Affine(self.n_sets, self.random_seed)
+        return affine(evaluator, thetas, optima, design_error)
+
     def _distrust(self, moves: Floats, mapped: list[Mapped], names: list[str]) -> list[str]:
-        """Say where the estimate lies where its distribution is extrapolated."""
-        strain = max(found.strain for found in mapped)
-        if not strain > _STRAINED:
-            return []
-        return [
-            f"for a typical draw the estimate of the data is {strain:.1f} standard deviations from "
-            f"where it is expected, of which {_STRAINED} can be told from {self.n_fits} refits: "
-            "prior and data probably contradict each other, and the draws rest on an "
-            "extrapolation; look at the prior"
-        ]
+        """Say where draws rest on an extrapolation, or are not where they should be."""
+        found = [doubt for mode in mapped for doubt in mode.doubts]
+        if all(mode.given for mode in mapped):
+            return found
+        return [*found, *super()._distrust(moves, mapped, names)]
+
+    def _said(self, mapped: list[Mapped], modes: int, draws: int, design_variance: float) -> str:
+        """Return what was done, in words."""
+        done = super()._said(mapped, modes, draws, design_variance)
+        if all(mode.given for mode in mapped):
+            return done
+        return f"{done}, as Affine does where too few refits arrived"
 
     def _mapped(
         self, sampling: SamplingDistribution, draws: Floats, design_variance: float
@@ -103,37 +144,64 @@ class GivenEstimate(Affine):
         """Return the draws of one mode where they should be."""
         sampling = among(sampling, draws)
         first = self._by_refits(sampling, draws, design_variance)
-        if not all(node.bound.stored for node in sampling.evaluator.nodes):
-            return first
         rng = np.random.default_rng([self.random_seed, 7])
-        look = _Look.at(sampling, draws, design_variance)
-        out, model, refits = self._followed(look, first.draws, rng)
-        center_error, width_error = look.errors(refits, model, out, rng)
-        strain = look.strain(model, out)
+        try:
+            look = _Look.at(sampling, draws, design_variance)
+            found = self._followed(look, first.draws, rng)
+        except UnsettledError as error:
+            doubt = f"{error}; the draws are those of prb.posterior.Affine()"
+            return replace(first, doubts=(doubt,))
+        center_error, width_error = look.errors(found, rng)
         return replace(
             first,
-            draws=out,
+            given=True,
+            draws=found.draws,
             center_error=center_error,
             width_error=width_error,
-            strain=strain,
+            doubts=self._doubts(look, found),
         )
 
-    def _followed(
-        self, look: _Look, draws: Floats, rng: np.random.Generator
-    ) -> tuple[Floats, SamplingModel, _Refits]:
+    def _followed(self, look: _Look, draws: Floats, rng: np.random.Generator) -> _Found:
         """Draw data sets where the draws are, until these stay there."""
         refits = look.refits(draws, self.n_fits // 2, rng)
-        moved = np.inf
         for _ in range(1 + _FOLLOWED):
             before = draws
             model = look.model(refits, draws)
-            draws = look.drawn(model, refits, draws, rng)
-            moved = _motion(look.points(before), look.points(draws))
+            draws, _ = look.drawn(model, refits, draws, rng)
             refits = refits.and_more(look.refits(draws, self.n_fits // 2, rng))
+            moved = _motion(look.points(before), look.points(draws))
             if moved < _MOVED:
                 break
         model = look.model(refits, draws)
-        return look.drawn(model, refits, draws, rng), model, refits
+        draws, memory = look.drawn(model, refits, draws, rng)
+        return _Found(draws, model, refits, moved, memory)
+
+    def _doubts(self, look: _Look, found: _Found) -> tuple[str, ...]:
+        """Say what speaks against the draws."""
+        doubts = []
+        strain = look.strain(found.model, found.draws)
+        if strain > _STRAINED:
+            doubts.append(
+                f"for a typical draw the estimate of the data is {strain:.1f} standard deviations "
+                f"from where it is expected, of which {_STRAINED} can be told from {self.n_fits} "
+                "refits: prior and data probably contradict each other, and the draws rest on an "
+                "extrapolation; look at the prior"
+            )
+        if not found.moved < _MOVED:
+            doubts.append(
+                f"the draws still moved by {found.moved:.1f} of their standard deviations in the "
+                f"last of {1 + _FOLLOWED} rounds of refits, expected less than {_MOVED}; pass "
+                f"adjust=prb.posterior.GivenEstimate(n_fits={2 * self.n_fits}), or look at the "
+                "prior"
+            )
+        if found.memory > _REMEMBERED:
+            doubts.append(
+                f"after {_WALK} steps the draws still have a correlation of {found.memory:.2f} "
+                f"with where they began, expected at most {_REMEMBERED}, so that they are not yet "
+                "those of the posterior given the estimate; compare with adjust="
+                "prb.posterior.Affine()"
+            )
+        return tuple(doubts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,12 +218,24 @@ class _Refits:
 
 
 @dataclass(frozen=True, eq=False)
+class _Found:
+    """The posterior given the estimate, and what it was found by."""
+
+    draws: Floats  # (n, d)
+    model: SamplingModel
+    refits: _Refits
+    moved: float  # in the last round, in standard deviations
+    memory: float  # correlation of the draws with where their walk began
+
+
+@dataclass(frozen=True, eq=False)
 class _Look:
     """What is looked at: the estimate of the data, along what they identify."""
 
     sampling: SamplingDistribution
     estimate: Floats  # (r,): in coordinates
     variance: float  # of the estimate, by the design's error
+    bounded: bool  # whether the users' own values are others than unconstrained ones
 
     @classmethod
     def at(cls, sampling: SamplingDistribution, draws: Floats, variance: float) -> _Look:
@@ -169,7 +249,9 @@ class _Look:
                 sampling = within
         sampling = _along_elements(sampling)
         (estimate,), _ = sampling.refit(observed_set(sampling.evaluator))
-        return cls(sampling, estimate, variance)
+        own = _own_values(sampling.evaluator, draws)
+        bounded = own.shape == draws.shape and not np.allclose(own, draws)
+        return cls(sampling, estimate, variance, bounded)
 
     @property
     def evaluator(self) -> Evaluator:
@@ -196,11 +278,8 @@ class _Look:
         Where a standard deviation comes near zero nothing changes any more with its logarithm.
         """
         kinds = [self.points(thetas)]
-        own = self.evaluator.constrained(thetas)
-        columns = [np.reshape(values, (len(thetas), -1)) for values in own.values()]
-        values = np.column_stack(columns)
-        if values.shape == thetas.shape and not np.allclose(values, thetas):
-            kinds.append(values)
+        if self.bounded:
+            kinds.append(_own_values(self.evaluator, thetas))
         return kinds
 
     def sight(self, draws: Floats) -> Sight:
@@ -265,8 +344,8 @@ class _Look:
 
     def drawn(
         self, model: SamplingModel, refits: _Refits, draws: Floats, rng: np.random.Generator
-    ) -> Floats:
-        """Return as many draws of the posterior, (n, d)."""
+    ) -> tuple[Floats, float]:
+        """Return as many draws of the posterior, (n, d), and how they hang on the given ones."""
         clouds = self.kinds(refits.thetas)
 
         def log_density(thetas: Floats) -> Floats:
@@ -287,10 +366,11 @@ class _Look:
         """Return how far out the estimate is for a typical draw, in standard deviations."""
         return float(np.median(model.strain(self.kinds(draws), self.estimate)))
 
-    def errors(
-        self, refits: _Refits, model: SamplingModel, draws: Floats, rng: np.random.Generator
-    ) -> tuple[float, float]:
+    def errors(self, found: _Found, rng: np.random.Generator) -> tuple[float, float]:
         """Return the Monte Carlo errors of centre and width, as `Adjusted` has them."""
+        model = found.model
+        refits = found.refits
+        draws = found.draws
         some = draws[rng.permutation(len(draws))[:_TOLD_ON]]
         points = self.points(some)
         kinds = self.kinds(some)
@@ -354,10 +434,19 @@ def _motion(before: Floats, after: Floats) -> float:
     return float(np.abs(shift / before.std(axis=0)).max())
 
 
+def _own_values(evaluator: Evaluator, thetas: Floats) -> Floats:
+    """Return the users' own values of thetas, (n, d), side by side."""
+    own = evaluator.constrained(thetas)
+    columns = [np.reshape(values, (len(thetas), -1)) for values in own.values()]
+    return np.column_stack(columns)
+
+
 def _walked(
     log_density: Callable[[Floats], Floats], start: Floats, rng: np.random.Generator
-) -> Floats:
+) -> tuple[Floats, float]:
     """Return draws of a density, each of which walked from a start of its own, (n, d).
+
+    And the mean absolute correlation that they still have with where they began.
 
     Independent proposals from a normal fitted to all, in turn with random walks, by the rule of
     Metropolis and Hastings.
@@ -365,13 +454,15 @@ def _walked(
     here = start.copy()
     density = log_density(here)
     scale = 2.38 / np.sqrt(here.shape[1])
+    memory = 1.0
     for step in range(_WALK):
         fitted = Normal.of(here)
         noise = rng.standard_normal(here.shape)
         if step % 2:
             there, log_ratio = fitted.independent(here, noise)
         else:
-            there, log_ratio = here + scale * noise @ fitted.root.T, np.zeros(len(here))
+            there = here + scale * noise @ fitted.root.T
+            log_ratio = np.zeros(len(here))
         other = log_density(there)
         with np.errstate(invalid="ignore"):
             gain = other - density + log_ratio
@@ -380,6 +471,8 @@ def _walked(
         density[accepted] = other[accepted]
         if step % 2 == 0:
             scale *= np.exp(accepted.mean() - 0.3)
-        elif correlation(start, here) < _FORGOTTEN and step > 20:
+            continue
+        memory = correlation(start, here)
+        if memory < _FORGOTTEN and step > _AT_LEAST:
             break
-    return here
+    return here, memory

@@ -143,10 +143,11 @@ class SamplingModel:
         elements = []
         for k in range(estimates.shape[1]):
             start = None if like is None else like.elements[k]
+            tried = range(len(terms)) if start is None else [start.terms]
             fits = []
-            for which, (own, kind) in enumerate(zip(terms, points, strict=True)):
-                if start is not None and which != start.terms:
-                    continue
+            for which in tried:
+                own = terms[which]
+                kind = points[which]
                 every = np.column_stack([own.all(kind), before])
                 fit = _Fit(every, own.linear(kind), seen[:, k], side[:, k], weights)
                 fits.append(fit.element(which, start))
@@ -163,8 +164,9 @@ class SamplingModel:
         By element, shapes (n, r).
         """
         (seen,), (side,) = self.sight.seen(estimate[None])
-        every = [own.all(kind) for own, kind in zip(self.terms, points, strict=True)]
-        linear = [own.linear(kind) for own, kind in zip(self.terms, points, strict=True)]
+        kinds = list(zip(self.terms, points, strict=True))
+        every = [own.all(kind) for own, kind in kinds]
+        linear = [own.linear(kind) for own, kind in kinds]
         before = np.empty((len(points[0]), 0))
         noise = []
         known = []
@@ -172,15 +174,18 @@ class SamplingModel:
             own = np.column_stack([every[element.terms], before])
             residuals = seen[k] - own @ element.mean
             log_sd = linear[element.terms] @ element.log_sd
-            log_sd = log_sd + 0.5 * np.log1p(variance * np.exp(-2 * log_sd))
+            by_design = variance * np.exp(-2 * log_sd)
+            log_sd = log_sd + 0.5 * np.log1p(by_design)
             z = residuals * np.exp(-log_sd)
             sides = np.full(len(z), side[k])
             density = element.noise.log_likelihood(z, sides)
-            # A probability has no unit.
-            known.append(density - (log_sd if side[k] == 0 else 0.0))
+            if side[k] == 0:  # a probability has no unit
+                density = density - log_sd
+            known.append(density)
             noise.append(z)
             expected, _ = _expected(z, sides)
-            before = np.column_stack([before, expected * np.exp(log_sd)])
+            completed = expected * np.exp(log_sd)
+            before = np.column_stack([before, completed])
         return np.column_stack(noise), np.column_stack(known)
 
     def log_likelihood(
@@ -212,7 +217,8 @@ class _Fit:
     def element(self, which: int, start: _Element | None) -> tuple[_Element, Floats]:
         """Return the model, and residuals of its mean, (n,), expected ones where out of sight."""
         log_sd = np.zeros(self.linear.shape[1])
-        log_sd[0] = np.log(max(self.seen.std(), 1e-300))
+        spread = max(self.seen.std(), 1e-300)
+        log_sd[0] = np.log(spread)
         values = self.seen
         if start is not None:
             log_sd = start.log_sd
@@ -227,11 +233,13 @@ class _Fit:
             if np.abs(log_sd - before).max() < _STILL:
                 break
         residuals = values - fitted
-        z = (self.seen - fitted) * np.exp(-self.linear @ log_sd)
+        log_spread = self.linear @ log_sd
+        z = (self.seen - fitted) * np.exp(-log_spread)
         noise = LogGamma.fit(z, self.side, self.weights) if start is None else start.noise
-        known = noise.log_likelihood(z, self.side)
-        known = known - np.where(self.side == 0, self.linear @ log_sd, 0.0)
-        return _Element(which, mean, log_sd, noise, float(self.weights @ known)), residuals
+        density = noise.log_likelihood(z, self.side)
+        known = density - np.where(self.side == 0, log_spread, 0.0)
+        total = float(self.weights @ known)
+        return _Element(which, mean, log_sd, noise, total), residuals
 
     def _completed(self, fitted: Floats, log_sd: Floats) -> tuple[Floats, Floats]:
         """Return estimates, expected ones where out of sight, and their squared noise, (n,)."""

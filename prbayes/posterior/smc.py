@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from os import PathLike
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import pymc as pm
@@ -174,7 +174,7 @@ def sample_smc(
         random_seed=None if random_seed is None else seed_number(random_seed),
         progressbar=progressbar,
     )
-    evaluator = _evaluator(model, optimum)
+    evaluator = evaluator_of(model, optimum, "sample_smc")
     stages = () if checkpoint is None else (f"all finished stages ({checkpoint})",)
     with (
         shown(progressbar),
@@ -207,18 +207,14 @@ def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     in_designs = sum(design.n_runs for design in evaluator.designs.values())
     before = evaluator.n_responses - in_designs
     drawn = [design.n_drawn for design in evaluator.designs.values()]
-    with _epsilons_restored(evaluator), designs_as_before(evaluator):
+    with epsilons_restored(evaluator), designs_as_before(evaluator):
         adjustment, optimum = _prepared(evaluator, asked)
         rounds = _rounds(evaluator, asked, adjustment, optimum)
         found = rounds.until_supported(asked.progressbar)
         grown = [design.n_drawn for design in evaluator.designs.values()] != drawn
         if found.particles.stopped and grown:
             raise BudgetError(found.particles.stopped)
-        if found.reason is not None:
-            _log.warning("the draws are not adjusted: %s; their width is epsilon's", found.reason)
-        else:
-            for line in found.warnings:
-                _log.warning("%s", line)
+        found.warn()
         particles = found.particles
         stopped, errors, missing = particles.stopped, None, None
         try:
@@ -318,7 +314,7 @@ def _prepared(evaluator: Evaluator, asked: Sampling) -> tuple[Affine | None, Opt
 
 def _rounds(
     evaluator: Evaluator, asked: Sampling, adjustment: Affine | None, optimum: Optimum | None
-) -> _Rounds:
+) -> Rounds:
     """Return the rounds of sampling, perhaps with what a run before has saved."""
     saved = _checkpoint(
         asked.checkpoint,
@@ -331,12 +327,12 @@ def _rounds(
         refine=asked.refine,
     )
     entropy = asked.random_seed if saved is None else int(saved.settings["entropy"])
-    return _Rounds(
+    return Rounds(
         run=Chains(evaluator, asked.draws, asked.threshold, saved, asked.max_stages),
         chains=asked.chains,
         seeds=np.random.SeedSequence(entropy),
         adjustment=adjustment,
-        optima=() if optimum is None else _optima(optimum, evaluator),
+        optima=() if optimum is None else optima_of(optimum, evaluator),
         design_error=0.0 if optimum is None else optimum.design_error,
         refine=asked.refine and bool(evaluator.designs),
     )
@@ -372,6 +368,14 @@ class _Draws:
         """What is to be said of the adjustment."""
         return () if self.adjusted is None else self.adjusted.warnings
 
+    def warn(self) -> None:
+        """Say it in the log."""
+        if self.reason is not None:
+            _log.warning("the draws are not adjusted: %s; their width is epsilon's", self.reason)
+            return
+        for line in self.warnings:
+            _log.warning("%s", line)
+
     @property
     def measured(self) -> dict[str, float]:
         """What was measured of the adjustment, by name."""
@@ -387,11 +391,24 @@ class _Draws:
         }
 
 
+class Sampler(Protocol):
+    """What gives the draws of a round, such as `Chains`."""
+
+    evaluator: Evaluator
+    refined: list[Floats]  # thetas at which designs were refined in earlier rounds
+
+    def __call__(self, seeds: list[np.random.SeedSequence], progressbar: bool) -> Particles:
+        """Return the draws."""
+
+    def saved_refinement(self, round_: int) -> Floats | None:
+        """Return where a finished round refined the designs, if it was saved."""
+
+
 @dataclass(frozen=True, eq=False)
-class _Rounds:
+class Rounds:
     """Sampling, adjustment and refinement, again until the designs support the draws."""
 
-    run: Chains
+    run: Sampler
     chains: int
     seeds: np.random.SeedSequence
     adjustment: Affine | None
@@ -451,7 +468,7 @@ class _Rounds:
 
 
 @contextmanager
-def _epsilons_restored(evaluator: Evaluator) -> Iterator[None]:
+def epsilons_restored(evaluator: Evaluator) -> Iterator[None]:
     """Give the simulators their epsilons back afterwards."""
     before = evaluator.epsilon
     try:
@@ -491,7 +508,7 @@ def _needs_optimum(evaluator: Evaluator, unset: list[Node], adjustment: Affine |
     return bool(unset) or (adjustment is not None and refit_obstacle(evaluator) is None)
 
 
-def _evaluator(model: pm.Model, optimum: Optimum | None) -> Evaluator:
+def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evaluator:
     """Return the evaluator of a model.
 
     An optimum's own if it is this model's, and no optimum of another problem.
@@ -499,11 +516,11 @@ def _evaluator(model: pm.Model, optimum: Optimum | None) -> Evaluator:
     if optimum is None:
         return Evaluator(model)
     evaluator = optimum.evaluator if optimum.model is model else Evaluator(model)
-    require_same(optimum.identity, identity_of(evaluator), "sample_smc: optimum")
+    require_same(optimum.identity, identity_of(evaluator), f"{caller}: optimum")
     return evaluator
 
 
-def _optima(optimum: Optimum, evaluator: Evaluator) -> tuple[Floats, ...]:
+def optima_of(optimum: Optimum, evaluator: Evaluator) -> tuple[Floats, ...]:
     """Return the optimum, and others that the data could as well come from.
 
     Their elements are in the evaluator's order, which in a clone of the optimum's model may be

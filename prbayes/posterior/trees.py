@@ -101,6 +101,65 @@ def posterior_tree(
     return xr.DataTree.from_dict(groups)
 
 
+# Groups of a result that depend on its draws, which are others after an adjustment.
+_OF_DRAWS = ("posterior_predictive", "predictions", "log_likelihood", "log_prior")
+
+
+def adjusted_tree(
+    evaluator: Evaluator,
+    given: xr.DataTree,
+    before: Floats,
+    thetas: Floats,
+    *,
+    adjustment: str,
+    measured: dict[str, float],
+    warnings: tuple[str, ...],
+    seconds: float,
+) -> xr.DataTree:
+    """Return the DataTree of another sampler's draws that were adjusted.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    given : DataTree
+        The sampler's.
+    before, thetas : ndarray, shapes (chains, draws, d)
+        The draws before and after the adjustment.
+    adjustment, measured, warnings
+        As in `posterior_tree`.
+    seconds : float
+    """
+    told = {
+        "adjustment": adjustment,
+        **measured,
+        "adjustment_seconds": seconds,
+        "warnings": "\n".join(warnings),
+        **versions(),
+    }
+    unknown = np.full((*thetas.shape[:2], len(evaluator.nodes)), np.nan)
+    again = _discrepancies_again(evaluator, thetas, unknown)
+    support = _support(evaluator, thetas, unknown, adjusted=True)
+    no_errors = np.full(len(evaluator.nodes), np.nan)
+    calibration = _calibration(evaluator, thetas, again, no_errors, {}, support)
+    attrs = {str(name): value for name, value in given["posterior"].attrs.items()}
+    own = {
+        "posterior": _posterior(evaluator, thetas, {**attrs, **told}),
+        "unadjusted": _draws(evaluator, before),
+        "calibration": calibration.assign_attrs(told),
+    }
+    coords = given["posterior"].coords
+    where = {name: coords[name].values for name in ("chain", "draw") if name in coords}
+    groups = {name: group.assign_coords(where) for name, group in own.items()}
+    groups["observed_data"] = observed_dataset(evaluator)
+    failures = failures_dataset(evaluator)
+    if failures.sizes["failure"]:
+        groups["failures"] = failures
+    for name, group in given.children.items():
+        if name not in groups and name not in _OF_DRAWS:
+            groups[name] = group.to_dataset()
+    return xr.DataTree.from_dict(groups)
+
+
 def _posterior(evaluator: Evaluator, thetas: Floats, attrs: dict[str, Any]) -> xr.Dataset:
     """Return the draws, with what is told of them and of the model."""
     return _draws(evaluator, thetas).assign_attrs(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,19 +71,29 @@ class Rehearsal(Responses):
         ResponseError
             If it fails, or is NaN.
         """
-        missing = np.flatnonzero(~self.stored(points))
-        store = self._calling.store if missing.size else None
-        some = missing if missing.size else np.arange(len(points))
-        point = points.at(some[[_middle(points.keys()[some])]])
+        store = self._calling.store
+        some = np.flatnonzero(~self.stored(points))
+        if not some.size:
+            store = None
+            some = np.arange(len(points))
+        keys = points.keys()[some]
+        middle = _middle(keys)
+        point = points.at(some[[middle]])
         calling = replace(self._calling, on_failure=Abort(on_nan=True), store=store)
         tally = Tally()
         values = respond(calling, point, tally).ravel()
-        names: Any = () if self.outputs is None else self.outputs.names
-        if not names:
-            many = values.size > 1
-            names = [f"{self.name}[{i}]" if many else self.name for i in range(values.size)]
-        outputs = dict(zip(names, values.tolist(), strict=True))
-        return DryRun(tuple(point.keys()[0].tolist()), outputs, tally.seconds)
+        outputs = dict(zip(self._names(values.size), values.tolist(), strict=True))
+        numbers = tuple(keys[middle].tolist())
+        return DryRun(numbers, outputs, tally.seconds)
+
+    def _names(self, number: int) -> tuple[str, ...]:
+        """Return what each output is called."""
+        named = () if self.outputs is None else self.outputs.names
+        if named:
+            return named
+        if number == 1:
+            return (self.name,)
+        return tuple(f"{self.name}[{i}]" for i in range(number))
 
 
 def _middle(keys: Floats) -> int:

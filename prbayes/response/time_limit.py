@@ -36,11 +36,18 @@ def limited(seconds: float | None) -> Iterator[None]:
     raised = _by_signal if main and hasattr(signals, "setitimer") else _by_injection
     # Half as long again, and a second, so that the exception comes first.
     with _or_end(1.5 * seconds + 1):
+        began = time.monotonic()
+        message = f"no result within timeout = {seconds:g} s"
         try:
             with raised(seconds):
                 yield
         except _LateError:
-            raise TimeoutError(f"no result within timeout = {seconds:g} s") from None
+            raise TimeoutError(message) from None
+        except Exception as error:
+            # Other languages inside tell of what was raised in their own words.
+            if time.monotonic() - began < seconds:
+                raise
+            raise TimeoutError(message) from error
 
 
 @contextmanager

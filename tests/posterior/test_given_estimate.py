@@ -1,6 +1,7 @@
 """The posterior given the estimate: against exact posteriors, and where it is left as it is."""
 
 import logging
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,8 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.posterior import GivenEstimate
+from prbayes.posterior import GivenEstimate, given_estimate
+from prbayes.posterior.adjustment import UnsettledError
 
 TEN = np.random.default_rng(5).normal(0, 1, 10)
 
@@ -97,6 +99,69 @@ def test_where_responses_are_not_stored_it_is_the_straight_map() -> None:
     given = sample(model, GivenEstimate(), draws=200)
     straight = sample(model, prb.posterior.Affine(), draws=200)
     np.testing.assert_array_equal(given.posterior["mu"], straight.posterior["mu"])
+    assert given.posterior.attrs["adjustment"].startswith("Affine(")
+
+
+def test_where_too_few_refits_arrive_it_is_the_straight_map_and_says_so(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = build(METRICS["pr"], TEN, 2.0)
+    straight = sample(model, prb.posterior.Affine(), draws=200)
+
+    def none(*_: Any) -> None:
+        raise UnsettledError("3 of 500 refits converged")
+
+    monkeypatch.setattr(given_estimate._Look, "refits", none)
+    with caplog.at_level(logging.WARNING, "prbayes"):
+        given = sample(model, GivenEstimate(), draws=200)
+    assert "3 of 500 refits converged; the draws are those of prb.posterior.Affine()" in caplog.text
+    assert given.posterior.attrs["adjustment"].endswith(
+        "as Affine does where too few refits arrived"
+    )
+    np.testing.assert_array_equal(given.posterior["mu"], straight.posterior["mu"])
+
+
+def test_draws_walk_to_the_density_that_they_are_of_and_forget_where_they_began() -> None:
+    rng = np.random.default_rng(3)
+    start = rng.normal(2, 3, (2000, 2))
+    draws, memory = given_estimate._walked(lambda x: -0.5 * (x**2).sum(axis=1), start, rng)
+    assert memory < 0.05
+    np.testing.assert_allclose(draws.mean(axis=0), 0, atol=0.1)
+    np.testing.assert_allclose(draws.std(axis=0), 1, rtol=0.06)
+
+
+def test_draws_that_stay_where_they_were_remember_it() -> None:
+    rng = np.random.default_rng(3)
+    start = rng.normal(0, 1, (50, 1))
+    known = {float(x) for x in start[:, 0]}
+
+    def nowhere_else(x: Floats) -> Floats:
+        return np.array([0.0 if float(row[0]) in known else -np.inf for row in x])
+
+    draws, memory = given_estimate._walked(nowhere_else, start, rng)
+    np.testing.assert_array_equal(draws, start)
+    assert memory > 0.99
+
+
+@pytest.mark.parametrize(
+    ("strain", "moved", "memory", "words"),
+    [
+        (1.0, 0.5, 0.01, []),
+        (4.0, 0.5, 0.01, ["4.0 standard deviations from where it is expected"]),
+        (1.0, 1.5, 0.01, ["still moved by 1.5 of their standard deviations"]),
+        (1.0, 0.5, 0.4, ["still have a correlation of 0.40 with where they began"]),
+        (4.0, 1.5, 0.4, ["4.0", "1.5", "0.40"]),
+    ],
+)
+def test_what_speaks_against_draws_is_told(
+    strain: float, moved: float, memory: float, words: list[str]
+) -> None:
+    look: Any = SimpleNamespace(strain=lambda model, draws: strain)
+    found: Any = SimpleNamespace(model=None, draws=None, moved=moved, memory=memory)
+    doubts = GivenEstimate()._doubts(look, found)
+    assert len(doubts) == len(words)
+    for doubt, word in zip(doubts, words, strict=True):
+        assert word in doubt
 
 
 @pytest.mark.slow

@@ -155,11 +155,14 @@ if hasattr(os, "fork"):
 
 
 @pytest.mark.parametrize(
-    "stiffness",
-    [pytest.param(-7.0, id="crashes"), pytest.param(-9.0, id="hangs", marks=pytest.mark.slow)],
+    ("stiffness", "timeout"),
+    [
+        pytest.param(-7.0, None, id="crashes"),
+        pytest.param(-9.0, 2.0, id="hangs", marks=pytest.mark.slow),
+    ],
 )
 def test_a_unit_that_ends_or_hangs_its_process_costs_its_specimen_and_instances_are_used_again(
-    unit: Path, tmp_path: Path, stiffness: float
+    unit: Path, tmp_path: Path, stiffness: float, timeout: float | None
 ) -> None:
     response = prb.fmu(unit, inputs=["stiffness", "force"], outputs=["position"])
     x = np.arange(1.0, 21.0)
@@ -167,7 +170,7 @@ def test_a_unit_that_ends_or_hangs_its_process_costs_its_specimen_and_instances_
     points, tally = Points([x, 2 * x], [True, True]), Tally()
     store, policy = Store(tmp_path, "y", 2), prb.response.Replace(-1.0)
     with processes() as executor:
-        calling = Calling("y", response, executor, store, policy, timeout=0.4)
+        calling = Calling("y", response, executor, store, policy, timeout=timeout)
         found = respond(calling, points, tally)
         np.testing.assert_array_equal(found, np.where(x == stiffness, -1.0, 6.0))
         (failure,) = tally.failed.values()

@@ -111,6 +111,23 @@ def test_a_time_limit_of_the_response_s_own_is_its_own() -> None:
         assert nothing_is_left()
 
 
+@MAIN_OR_THREAD
+def test_what_is_said_in_other_words_of_what_was_late_is_a_time_limit(where: str) -> None:
+    def respond() -> None:
+        try:
+            spin(10.0)
+        except BaseException as error:
+            raise RuntimeError("Failed to instantiate model") from error
+
+    def late() -> None:
+        with limited(0.05):
+            respond()
+
+    with pytest.raises(TimeoutError, match=r"^no result within timeout = 0.05 s$"):
+        run(where, late)
+    assert nothing_is_left()
+
+
 def test_without_signals_the_main_thread_is_ended_like_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
