@@ -40,6 +40,7 @@ RIVALS = (
     "prbayes KLD",
     "prbayes area",
     "prbayes log-likelihood",
+    "prbayes PR given estimate",
     "hierarchical PyMC",
     "stock PyMC",
     "pyABC Wasserstein",
