@@ -410,7 +410,7 @@ def test_the_tables_tell_the_worst_hyperparameter() -> None:
     assert errors["*specimens*"] == "20"
     assert errors["stock PyMC"] == "cannot"
     assert errors["sbi"] == "fails"
-    assert errors["pyABC adaptive"] == ""
+    assert "pyABC adaptive" not in errors, "it was not run"
     widths = dict(table.matrix(found, "width", several=False))
     assert (widths["prbayes PR"], widths["mud"]) == (".50 (2)", "one number")
     told = list(table.rows(found, "linear"))

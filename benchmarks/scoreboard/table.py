@@ -97,7 +97,9 @@ def matrix(found: dict[str, Any], key: str, several: bool) -> Iterator[list[str]
     columns = [found[name][size_of(found[name])] for name in names]
     yield ["*specimens*", *(size_of(found[name]) for name in names)]
     for rival in RIVALS:
-        yield [rival, *(_summary(column.get(rival), key) for column in columns)]
+        row = [_summary(column.get(rival), key) for column in columns]
+        if any(row):
+            yield [rival, *row]
 
 
 def _observed(name: str) -> Any:
