@@ -33,7 +33,9 @@ def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
         prb.Simulator("y", response, *inputs, metric=metric, observed=task.observed)
     optimum = prb.minimize(model, progressbar=False)
     # What is not named is left to `sample_smc`.
-    adjustment = {"adjust": prb.posterior.GivenEstimate()} if "adjust" in settings else {}
+    adjustment: dict[str, Any] = (
+        {"adjust": prb.posterior.GivenEstimate()} if "adjust" in settings else {}
+    )
     tree = prb.sample_smc(
         optimum=optimum, model=model, random_seed=task.seed, progressbar=False, **adjustment
     )
