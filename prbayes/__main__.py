@@ -1,5 +1,7 @@
 """The command line: ``python -m prbayes report results.nc`` and ``python -m prbayes demo``."""
 
+# What a command needs is imported where it is run: help and mistakes are answered at once.
+
 from __future__ import annotations
 
 import argparse
@@ -8,15 +10,12 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import xarray as xr
+if TYPE_CHECKING:
+    import xarray as xr
 
-from prbayes._demo import run_demo
-from prbayes.model.identity import from_attributes
-from prbayes.reports.report import Report, visible
-from prbayes.reports.soundness import complaints
-from prbayes.validation.validity import ValidityTest
+    from prbayes.validation.validity import ValidityTest
 
 _REPORT = """examples:
   prbayes report results.nc
@@ -130,6 +129,8 @@ def _log_to_stderr(*, quiet: bool) -> None:
 
 
 def _report(given: argparse.Namespace) -> list[Path]:
+    from prbayes.reports.report import Report
+
     try:
         report = Report(
             given.title or given.files[0].stem,
@@ -179,6 +180,8 @@ def _demo(given: argparse.Namespace) -> list[Path]:
         given.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"--out: cannot write: {_line(error)}") from error
+    from prbayes._demo import run_demo
+
     return run_demo(given.out, draws=given.draws, chains=given.chains, seed=given.seed)
 
 
@@ -197,6 +200,10 @@ def _opened(path: Path) -> xr.DataTree:
     """Read a file whole."""
     if not path.is_file():
         raise UserError(f"{path}: there is no such file")
+    import xarray as xr
+
+    from prbayes.reports.soundness import complaints
+
     try:
         with xr.open_datatree(path, engine="h5netcdf") as tree:
             found: xr.DataTree = tree.load()
@@ -216,6 +223,9 @@ def _opened(path: Path) -> xr.DataTree:
 
 
 def _test_of(path: Path, dataset: xr.Dataset) -> ValidityTest:
+    from prbayes.model.identity import from_attributes
+    from prbayes.validation.validity import ValidityTest
+
     try:
         return ValidityTest(
             **{
@@ -237,6 +247,8 @@ def _test_of(path: Path, dataset: xr.Dataset) -> ValidityTest:
 
 
 def _line(error: Exception) -> str:
+    from prbayes.reports.report import visible
+
     # A KeyError puts its message in quotes.
     text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
     return visible(" ".join(text.split())) or type(error).__name__

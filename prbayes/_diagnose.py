@@ -259,7 +259,9 @@ def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
 def _unadjusted(attrs: Mapping[Any, Any]) -> tuple[str, ...]:
     """Say of draws that were not adjusted what their width is."""
     # Those of a bootstrap are estimates of resampled specimens, and have no epsilon.
-    if not str(attrs.get("adjustment", "none")).startswith("none") or "converged" in attrs:
+    done = str(attrs.get("adjustment", "none"))
+    left = done == "none" or done.startswith("none: ")
+    if not left or "converged" in attrs:
         return ()
     return (
         "The draws are those of exp(-discrepancy / epsilon), as wide as epsilon makes them; "

@@ -257,7 +257,7 @@ def with_decision(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a question about a posterior, with what it asks of the shared model."""
 
     def asked(**given: Any) -> Any:
-        common = {"idata": posterior(), "model": model()}
+        common = {"result": posterior(), "model": model()}
         if function is prb.sensitivity:
             common["quantity"] = prb.decision.Mean(line, specimen())
         elif function is prb.plan:
@@ -535,6 +535,11 @@ TABLE: dict[str, Row] = {
             "adjust": ("affine", 1, None, prb.posterior.Affine),
             "threshold": SHARE,
             "refine": FLAG,
+            "start": (3, "mu", {"nu": [1.0]}, [{}, {}], {"mu": [1.0]}),
+            "cores": but_none(COUNT),
+            "return_inferencedata": FLAG,
+            "idata_kwargs": (3, "dims", {"model": 1}, {"dims": 1}, {"log_prior": 1}),
+            "var_names": (3, "nu", [], [1], ["nu"]),
             "max_stages": but_none(COUNT),
             **BUDGETS,
             "checkpoint": (3, True, "", b"a", "/dev/null/run.nc", "/"),

@@ -434,3 +434,26 @@ def test_dask_tells_its_workers_by_address_and_losses_by_a_class() -> None:
 def test_mpi_tells_how_many_workers_it_has() -> None:
     futures = pytest.importorskip("mpi4py.futures")
     assert hasattr(futures.MPIPoolExecutor, "num_workers")
+
+
+def test_data_are_shared_variables() -> None:
+    from pytensor.compile.sharedvalue import SharedVariable
+
+    with pm.Model() as model:
+        data = pm.Data("data", [1.0, 2.0])
+        assert isinstance(data, SharedVariable)
+        pm.Normal("y", 0, 1, observed=data)
+    assert isinstance(model.rvs_to_values[model["y"]], SharedVariable)
+    assert data.get_value().tolist() == [1.0, 2.0]
+
+
+def test_traces_of_pymc_take_points_of_value_variables() -> None:
+    from pymc.backends.base import MultiTrace
+    from pymc.backends.ndarray import NDArray
+
+    with pm.Model() as model:
+        pm.HalfNormal("sigma")
+    held = NDArray(model=model)
+    held.setup(1, 0)
+    held.record({"sigma_log__": np.asarray(0.0)}, in_warmup=False)
+    assert MultiTrace([held])["sigma"].tolist() == [1.0]

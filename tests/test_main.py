@@ -4,6 +4,7 @@ import logging
 import os
 import subprocess
 import sys
+import time
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -196,7 +197,7 @@ def test_demo(folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
         asked.append((out, keywords))
         return [out / "results.nc", out / "report.html"]
 
-    monkeypatch.setattr("prbayes.__main__.run_demo", run_demo)
+    monkeypatch.setattr("prbayes._demo.run_demo", run_demo)
     assert main(["demo", "--out", "here", "--draws", "50", "--chains", "2", "--seed", "3"]) == 0
     assert main(["demo", "--quiet"]) == 0
     first, second = asked
@@ -215,7 +216,7 @@ def test_what_is_logged_goes_to_stderr(
         logging.getLogger("prbayes").info("sampling")
         return []
 
-    monkeypatch.setattr("prbayes.__main__.run_demo", run_demo)
+    monkeypatch.setattr("prbayes._demo.run_demo", run_demo)
     assert main(["demo", "--out", str(tmp_path), *options]) == 0
     assert logging.getLogger("prbayes").level == level
     out, err = capsys.readouterr()
@@ -250,3 +251,22 @@ def test_crafted_attributes_get_no_traceback(
     assert main(given) == 0
     assert main([*given, "--markdown", str(tmp_path / "p.nc")]) == 2
     assert "cannot write: folder: got" in capsys.readouterr().err
+
+
+def test_help_is_there_before_anything_heavy_is_loaded() -> None:
+    code = (
+        "import sys\n"
+        "from prbayes.__main__ import main\n"
+        "try:\n"
+        "    main(['--help'])\n"
+        "except SystemExit:\n"
+        "    pass\n"
+        "heavy = {'pymc', 'pytensor', 'xarray', 'numpy', 'scipy', 'prbayes._public'}\n"
+        "assert not heavy & set(sys.modules)\n"
+    )
+    took = []
+    for _ in range(3):  # the fastest: another program may have the processor
+        clock = time.perf_counter()
+        subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+        took.append(time.perf_counter() - clock)
+    assert min(took) < 0.5

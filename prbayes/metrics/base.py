@@ -185,6 +185,11 @@ class Discrepancy(ABC):
         return self.metric.likelihood
 
     @property
+    def exact(self) -> bool:
+        """Whether N times it is minus the log-likelihood itself, but for a narrow kernel."""
+        return False
+
+    @property
     def additive(self) -> bool:
         """Whether its gradient in the hyperparameters is a mean over observations."""
         return self.metric.additive

@@ -188,6 +188,11 @@ class CompositeDiscrepancy(Discrepancy):
         return len(self.members) == 1 and self.targets[0].likelihood
 
     @property
+    def exact(self) -> bool:
+        """Whether N times it is minus a log-likelihood itself."""
+        return len(self.members) == 1 and self.targets[0].exact
+
+    @property
     def additive(self) -> bool:
         """Whether the gradient is a mean over observations: not where some see fewer outputs."""
         complete = not np.isnan(self.observed).any()

@@ -85,6 +85,11 @@ class LikelihoodDiscrepancy(CellwiseDiscrepancy):
         return replace(other, reading=reading)
 
     @property
+    def exact(self) -> bool:
+        """Whether the kernel is as narrow as the default."""
+        return bool(self.metric == LogLikelihood())
+
+    @property
     def constants(self) -> tuple[Any, ...]:
         """The floor of the density, and how it is read at the observed values."""
         return self.least, self.reading

@@ -13,7 +13,7 @@ from pymc.printing import str_for_dist
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
 
-from prbayes.model.node import Node, nodes
+from prbayes.model.node import Node, nodes, response_name
 
 # What is told of a variable and of a simulator.
 _VARIABLE = ("name", "role", "distribution")
@@ -92,18 +92,13 @@ def _simulator(node: Node, known: Set[Any]) -> dict[str, str]:
     arguments = [_input(argument, inputs.aleatory, known) for argument in inputs.arguments]
     return {
         "name": node.name,
-        "response": _called(node.bound.responses.function),
+        "response": response_name(node.bound.responses.function),
         "inputs": ", ".join(arguments),
         "metric": without_addresses(node.metric),
         "propagation": without_addresses(node.propagation),
         "n_points": str(node.bound.n_points),
         "specimens": _specimens(node),
     }
-
-
-def _called(function: Any) -> str:
-    inner = getattr(function, "function", function)  # of what `scalar` wraps
-    return str(getattr(inner, "__name__", type(inner).__name__))
 
 
 def _input(argument: Any, aleatory: tuple[Any, ...], known: Set[Any]) -> str:

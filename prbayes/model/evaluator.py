@@ -94,6 +94,12 @@ class Evaluator:
         return other
 
     @property
+    def is_current(self) -> bool:
+        """Whether the model has the data that this was made with: `pymc.set_data` changes them."""
+        now = required_nodes(self.model).values()
+        return all(a is b for a, b in zip(now, self.nodes, strict=True))
+
+    @property
     def names(self) -> list[str]:
         """Names of the elements of theta, such as 'sigma_log__' or 'mu[1]'."""
         return self.hyperparameters.names

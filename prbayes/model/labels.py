@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.metadata
+from collections.abc import Sequence
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,19 @@ def versions() -> dict[str, str]:
     for name in ("prbayes", "pymc", "numpy"):
         found[f"{name}_version"] = importlib.metadata.version(name)
     return found
+
+
+def arviz_attributes() -> dict[str, str]:
+    """Return the attributes that ArviZ gives a group."""
+    version = importlib.metadata.version("prbayes")
+    return {
+        "created_at": datetime.now(UTC).isoformat(),
+        "creation_library": "prbayes",
+        "creation_library_version": version,
+        "creation_library_language": "Python",
+        "inference_library": "prbayes",
+        "inference_library_version": version,
+    }
 
 
 def labelled(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, int]) -> xr.Dataset:
@@ -69,9 +84,20 @@ def failures_dataset(evaluator: Evaluator) -> xr.Dataset:
 def observed_dataset(evaluator: Evaluator) -> xr.Dataset:
     """Return the observed responses of all simulators, labelled; several outputs by their names."""
     observed = {node.name: node.target.observed for node in evaluator.nodes}
-    data = labelled(evaluator, observed, {})
+    return labelled_responses(evaluator, observed)
+
+
+def labelled_responses(
+    evaluator: Evaluator, values: dict[str, Any], leading: Sequence[int] = ()
+) -> xr.Dataset:
+    """Return responses of simulators by their names, shapes (*leading, N) or (*leading, N, m).
+
+    Leading dimensions are chains and draws.
+    """
+    sizes = dict(zip(("chain", "draw"), leading, strict=False))
+    data = labelled(evaluator, values, sizes)
     for node in evaluator.nodes:
-        if node.outputs.event:
+        if node.name in values and node.outputs.event:
             data = _with_outputs(data, node.name, node.outputs)
     return data
 

@@ -22,7 +22,9 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pymc.logprob.abstract import _logprob
 from pymc.logprob.utils import CheckParameterValue
+from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Apply, Constant
+from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
@@ -30,6 +32,7 @@ from prbayes._checks import Floats, called
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Design, design_of
+from prbayes.response.compilation import PLAIN
 from prbayes.response.outputs import ONE, Outputs
 
 _log = logging.getLogger("prbayes")
@@ -75,6 +78,43 @@ class Node:
         """Effective number of specimens: repeated observations of one are no further ones."""
         return effective_specimens(self.target, self.specimens)
 
+    def observing(self, values: Floats) -> Node:
+        """Return the same simulator with other observed responses; it computes nothing anew.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the metric does not take them, or weights or labels go with as many as before.
+        """
+        before = self.target
+        values = np.asarray(values, dtype=np.float64)
+        if values.shape[1:] != before.event or values.ndim != before.observed.ndim:
+            raise ValueError(
+                f"{self.name}: observed: got shape {values.shape}, expected "
+                f"{('N', *before.event)}, as when the simulator was made"
+            )
+        weights: Floats | None = before.weights
+        n = len(before.weights)
+        if len(values) != n:
+            # What goes with the values before has no counterpart.
+            if self.specimens is not None or np.ptp(before.weights) > 0:
+                raise ValueError(
+                    f"{self.name}: observed: got {len(values)} specimens, expected "
+                    f"{n}, as many as there are specimens= or weights=; build the "
+                    "model again with those of the new ones"
+                )
+            weights = None
+        try:
+            target = self.metric.against(values, weights)
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"{self.name}: {error}") from None
+        bound = self.bound.copied()
+        bound.aim(target.beside(bound.first_responses, bound.dimensions))
+        other = replace(self, target=bound.target, bound=bound)
+        if self.epsilon_is_default:
+            other.epsilon.set_value(np.asarray(1 / other.n_specimens))
+        return other
+
     def copied(self) -> Node:
         """Return the same simulator with its own design, count of responses and epsilon."""
         epsilon = shared_epsilon(self.name, self.epsilon_value)
@@ -118,25 +158,33 @@ class SimulatorRV(RandomVariable):
     """
 
     __props__ = ("name", "signature", "dtype", "inplace", "node")
-    _print_name = ("prbayes_Simulator", "\\operatorname{prbayes\\_Simulator}")
 
     def __init__(
         self,
-        name: str = "prbayes_Simulator",
+        name: str | None = None,
         signature: str | None = None,
         dtype: str = "floatX",
         inplace: bool = False,
         *,
         node: Node,
     ) -> None:
-        super().__init__(name=name, signature=signature, dtype=dtype, inplace=inplace)
+        # What pictures of the model show.
+        told = f"Simulator of {_plain_name(node)} by {type(node.metric).__name__}"
+        super().__init__(name=name or told, signature=signature, dtype=dtype, inplace=inplace)
         self.node = node
         self._owner: weakref.ref[Any] | None = None
         self._warned = False
 
     def __str__(self) -> str:
         """Show the name and the signature, without what the node holds."""
-        return f'{self.name}_rv{{"{self.signature}"}}'
+        return f'prbayes_Simulator_rv{{"{self.signature}"}}'
+
+    @property
+    def _print_name(self) -> tuple[str, str]:
+        """What PyMC prints for the distribution, as text and as LaTeX."""
+        told = f"{_plain_name(self.node)}, {type(self.node.metric).__name__}"
+        latex = told.replace("_", "\\_")
+        return f"Simulator[{told}]", f"\\operatorname{{Simulator}}[\\text{{{latex}}}]"
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the owner: a copy that is unpickled belongs to a model of its own."""
@@ -153,8 +201,11 @@ class SimulatorRV(RandomVariable):
             self._owner = weakref.ref(apply)
         if self._owner() is apply:
             return self.node
-        properties = {**self._props_dict(), "node": self.node.copied()}
-        own = SimulatorRV(**properties)
+        return self.replaced(apply, self.node.copied())
+
+    def replaced(self, apply: Apply[Any, Any], node: Node) -> Node:
+        """Let an application in a model have an operation of its own, which carries a node."""
+        own = SimulatorRV(**{**self._props_dict(), "node": node})
         apply.op = own
         return own.own_node(apply)
 
@@ -200,6 +251,17 @@ class SimulatorRV(RandomVariable):
         )
 
 
+def response_name(function: Any) -> str:
+    """Return what a response is called."""
+    inner = getattr(function, "function", function)  # of what `scalar` wraps
+    return str(getattr(inner, "__name__", type(inner).__name__))
+
+
+def _plain_name(node: Node) -> str:
+    """Return the same without the brackets of a lambda, which pictures take for markup."""
+    return response_name(node.bound.responses.function).strip("<>")
+
+
 def _own_index(index: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, ...]:
     """Return where an array of this leading shape is read, for an index after broadcasting."""
     last = index[len(index) - len(shape) :]
@@ -218,18 +280,21 @@ def _log_density(
     op: SimulatorRV, values: Any, rng: Any, size: Any, *params: Any, **kwargs: Any
 ) -> TensorVariable:
     """Return the log-density of the observed data: a graph of the roots and of epsilon."""
-    node = op.node
-    check = CheckParameterValue(
+    (value,) = values
+    known = known_value(value)
+    node = op.node if known is None else _observing(op.node, known)
+    unset = (
         f"{node.name}: epsilon is not set; call prb.set_epsilon(model, "
         "prb.calibrate_epsilon(prb.minimize(model))), pass epsilon= to prb.Simulator, or use "
         "prb.sample_smc, which calibrates it"
     )
+    if np.isnan(node.epsilon_value):
+        _log.warning("%s", unset)  # nutpie tells no more of an error than its number
+    check = CheckParameterValue(unset)
     epsilon = check(node.epsilon, pt.gt(node.epsilon, 0.0))
     inputs = node.bound.inputs
     density = log_kernel(node.bound.discrepancy(inputs.core(params)), epsilon)
-    (value,) = values
     if isinstance(value, Constant):
-        _require_own_data(node, value.data)
         return density
     observed = node.target.observed.astype(value.dtype)
     first = value[: len(observed)]
@@ -237,29 +302,30 @@ def _log_density(
     if np.isnan(observed).any():
         equal = equal | (pt.isnan(first) & np.isnan(observed))
     same = pt.eq(value.shape[0], len(observed)) & pt.all(equal)
-    return CheckParameterValue(_other_data(node))(density, same)
+    return CheckParameterValue(
+        f"{node.name}: got other observed values than when this was compiled, expected the same "
+        "ones, against which its metric is prepared; compile it again, as pm.sample, prb.minimize "
+        "and prb.sample_smc do"
+    )(density, same)
 
 
-def _require_own_data(node: Node, value: Any) -> None:
-    """Raise if values are others than those that a simulator's metric was prepared against.
+def known_value(value: Any) -> Any:
+    """Return the numbers of observed values that a model holds, as `pymc.Data`; else None."""
+    if isinstance(value, Constant):
+        return value.data
+    if isinstance(value, SharedVariable):
+        return value.get_value()
+    leaves = [v for v in ancestors([value]) if v.owner is None]
+    if all(isinstance(leaf, Constant | SharedVariable) for leaf in leaves):
+        return value.eval(mode=PLAIN)  # as whole numbers that became real ones
+    return None
 
-    Raises
-    ------
-    ValueError
-        With what to do.
-    """
-    given = np.asarray(value)
+
+def _observing(node: Node, values: Any) -> Node:
+    """Return a simulator with these observed responses: the same one, where it has them."""
+    given = np.asarray(values)
     own = node.target.observed.astype(given.dtype)
-    if not np.array_equal(given, own, equal_nan=True):
-        raise ValueError(_other_data(node))
-
-
-def _other_data(node: Node) -> str:
-    return (
-        f"{node.name}: got other observed values than the simulator was made with, expected the "
-        "same ones, against which its metric is prepared; build the model again, with "
-        "observed= the new ones"
-    )
+    return node if np.array_equal(given, own, equal_nan=True) else node.observing(given)
 
 
 class SimulatorDistribution(pm.Distribution):
@@ -300,24 +366,22 @@ def nodes(model: pm.Model) -> dict[Any, Node]:
     """Return the simulators of a model, keyed by their observed variables, in the model's order.
 
     In a clone they are copies, made when they are first asked for, which its compiled functions
-    follow from then on.
+    follow from then on. Where `pymc.set_data` or `pymc.observe` gave one other data, its metric is
+    prepared anew, and the responses are the same.
 
     Raises
     ------
-    TypeError
-        If it is no model.
-    ValueError
-        If `pymc.observe` gave one other data than it was made with.
+    TypeError, ValueError
+        If it is no model, or a metric does not take the data that it has now.
     """
     if not isinstance(model, pm.Model):
         raise TypeError(f"model: got {called(model)}, expected a pm.Model")
     found = {}
     for rv in model.observed_RVs:
         if isinstance(rv.owner.op, SimulatorRV):
-            node = rv.owner.op.own_node(rv.owner)
-            value = model.rvs_to_values[rv]
-            _require_own_data(node, value.data if isinstance(value, Constant) else value.eval())
-            found[rv] = node
+            own = rv.owner.op.own_node(rv.owner)
+            node = _observing(own, known_value(model.rvs_to_values[rv]))
+            found[rv] = node if node is own else rv.owner.op.replaced(rv.owner, node)
     return found
 
 

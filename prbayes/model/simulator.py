@@ -11,6 +11,7 @@ import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import ArrayLike, NDArray
 from pytensor import config
+from pytensor.graph.basic import Variable
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import (
@@ -30,6 +31,7 @@ from prbayes.model.node import (
     Node,
     SimulatorDistribution,
     effective_specimens,
+    known_value,
     model_on_context,
     nodes,
     shared_epsilon,
@@ -37,7 +39,7 @@ from prbayes.model.node import (
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.response.compilation import PLAIN
-from prbayes.response.inputs import Inputs, read_inputs
+from prbayes.response.inputs import Inputs, is_labelled, read_inputs
 from prbayes.response.outputs import Outputs, read_observed
 from prbayes.response.response import Responses, refuse_uncallable
 
@@ -78,11 +80,12 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         same specimens.
     metric : Metric
         How simulated and observed responses are compared.
-    observed : array_like, shape (N,) or (N, m), DataFrame, DataArray or mapping
+    observed : array_like, shape (N,) or (N, m), DataFrame, DataArray, mapping or pymc.Data
         Measured responses, of at least two specimens. Several outputs of each, (N, m), go with a
         metric that sees them together, such as `Joint`: an array, a DataFrame whose columns are
         outputs, a DataArray with specimens first, or a mapping of arrays. NaN is an output that was
-        not measured, +inf a specimen that had failed.
+        not measured, +inf a specimen that had failed. After `pymc.set_data` or `pymc.observe` the
+        metric is prepared against the new values, and no response is computed anew.
     epsilon : float, optional
         Scale of the discrepancy. 1/N for metrics on the scale of a likelihood, N the effective
         number of specimens; unset for the others, until `calibrate_epsilon` and `set_epsilon`, or
@@ -138,7 +141,7 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     # A model within another one puts its own name before those of its variables.
     name = pm.modelcontext(None).name_for(plain_text(name, "prb.Simulator: name"))
     _refuse_name(name, model)
-    values, outputs = read_observed(name, observed)
+    values, outputs = read_observed(name, _data(name, observed))
     target = _target(name, metric, values, weights)
     propagation = _propagation(name, propagation)
     size = len(target.observed)
@@ -152,6 +155,8 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         positive_number(epsilon, f"{name}: epsilon")
     refuse_uncallable(name, response)
     sorted_inputs = read_inputs(name, inputs, model)
+    for root in sorted_inputs.roots:
+        refuse_single_precision(f"{name}: {root.name}", root.dtype)
     responses = _responses(name, response, sorted_inputs, propagation, outputs)
     asked = listening()
     if asked is not None:
@@ -187,11 +192,25 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     _warn_of_shared_specimens(node, others)
     # As a constant, in which PyMC does not look for missing values to impute.
     data: Any = target.observed
-    if np.isnan(target.observed).any():
+    if isinstance(observed, Variable):
+        data = observed
+    elif np.isnan(target.observed).any():
         data = pt.constant(target.observed)
     rv = SimulatorDistribution(name, *sorted_inputs.roots, node=node, observed=data, dims=dims)
     rv.owner.op.own_node(rv.owner)
     return rv
+
+
+def _data(name: str, observed: Any) -> Any:
+    """Return observed responses as they were given; of `pymc.Data` the present numbers."""
+    if not isinstance(observed, Variable):
+        return observed
+    values = None if is_labelled(observed) else known_value(observed)
+    if values is None:
+        raise TypeError(
+            f"{name}: observed: got {observed} of type {observed.type}, expected numbers or pm.Data"
+        )
+    return values
 
 
 def _propagation(name: str, propagation: Propagation | None) -> Propagation:

@@ -23,6 +23,7 @@ from prbayes.model.node import model_on_context
 from prbayes.model.turns import in_turn
 from prbayes.posterior.adjustment import Affine
 from prbayes.posterior.chains import Particles
+from prbayes.posterior.default_adjustment import default_adjustment
 from prbayes.posterior.epsilon import calibrate_epsilon
 from prbayes.posterior.smc import Rounds, epsilons_restored, evaluator_of, optima_of
 from prbayes.posterior.trees import adjusted_tree
@@ -53,7 +54,7 @@ def adjust(
     optimum : Optimum, optional
         The centre of the adjustment; `minimize` finds it if needed.
     by : Affine, optional
-        By what: ``prb.posterior.Affine()``, the default, or ``prb.posterior.GivenEstimate()``.
+        By what: `Affine` or `GivenEstimate` of ``prb.posterior``; by default as `sample_smc` does.
     refine : bool
         Whether designs of `Reweighted` that do not support the draws get more points.
     progressbar : bool
@@ -97,7 +98,7 @@ def adjust(
     ...     idata = pm.sample(50, tune=100, chains=2, cores=1, random_seed=1, **quiet)
     >>> adjusted = prb.adjust(idata, model=model, progressbar=False)
     >>> adjusted.posterior.attrs["adjustment"]
-    'Affine(n_sets=200, random_seed=0)'
+    'GivenEstimate(n_sets=200, random_seed=0, n_fits=1000)'
     """
     model = model_on_context(model, "prb.adjust")
     if by is not None and not isinstance(by, Affine):
@@ -118,7 +119,7 @@ def adjust(
         raise ValueError(f"adjust: the draws cannot be adjusted: {obstacle}")
     draws = _Drawn(evaluator, _thetas(idata, evaluator))
     with shown(progressbar):
-        return _adjusted(draws, idata, optimum, by or Affine(), refine=refine)
+        return _adjusted(draws, idata, optimum, by or default_adjustment(evaluator), refine=refine)
 
 
 def _refuse_other(idata: object) -> None:

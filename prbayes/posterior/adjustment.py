@@ -386,7 +386,7 @@ def _of_motion(moves: Floats, names: list[str]) -> list[str]:
 
 def _of_noise(center_error: float, width_error: float, refits: str) -> list[str]:
     """Say so where too few refits tell."""
-    if center_error <= _UNSURE_CENTER and width_error <= _UNSURE_WIDTH:
+    if not (center_error > _UNSURE_CENTER or width_error > _UNSURE_WIDTH):
         return []
     return [
         f"the adjustment has a Monte Carlo error of {center_error:.2f} standard deviations of the "

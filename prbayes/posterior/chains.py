@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -56,12 +56,14 @@ class Chains:
         threshold: float,
         checkpoint: Checkpoint | None,
         max_stages: int | None = None,
+        starts: Sequence[Floats] | None = None,
     ) -> None:
         self.evaluator = evaluator
         self.draws = draws
         self.threshold = threshold
         self.checkpoint = checkpoint
         self.max_stages = max_stages
+        self.starts = starts
         self.refined: list[Floats] = []
 
     def __call__(self, seeds: list[np.random.SeedSequence], progressbar: bool) -> Particles:
@@ -164,7 +166,8 @@ class Chains:
             self.draws, model=evaluator.model, threshold=self.threshold, evaluator=evaluator
         )
         if chain != self._saved.get("chain"):
-            kernel.initialize(None, np.random.default_rng(seed))
+            start = None if self.starts is None else self.starts[chain]
+            kernel.initialize(start, np.random.default_rng(seed))
             return kernel, {name: [] for name in kernel.stats_dtypes_shapes}
         saved = self._saved
         kernel.restore(self._arrays("now_"), saved["state"])

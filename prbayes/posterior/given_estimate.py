@@ -148,7 +148,7 @@ class GivenEstimate(Affine):
         try:
             look = _Look.at(sampling, draws, design_variance)
             found = self._followed(look, first.draws, rng)
-        except UnsettledError as error:
+        except (UnsettledError, np.linalg.LinAlgError) as error:
             doubt = f"{error}; the draws are those of prb.posterior.Affine()"
             return replace(first, doubts=(doubt,))
         center_error, width_error = look.errors(found, rng)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from os import PathLike
@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 import pymc as pm
 import xarray as xr
+from threadpoolctl import threadpool_limits
 
 from prbayes._checks import Floats, Seed, file_path, flag, positive_integer, seed_number, share
 from prbayes._progress import shown
@@ -26,12 +27,21 @@ from prbayes.model.hyperparameters import THETAS
 from prbayes.model.identity import identity_of, require_same
 from prbayes.model.interruption import designs_as_before, explained
 from prbayes.model.node import Node, model_on_context
+from prbayes.model.start import fingerprint, starting_thetas
 from prbayes.model.support import shortcomings
 from prbayes.model.turns import in_turn
 from prbayes.posterior.adjustment import Adjusted, Affine, refuse_adjustment
 from prbayes.posterior.chains import Chains, Particles
 from prbayes.posterior.checkpoint import Checkpoint, stored_settings
+from prbayes.posterior.default_adjustment import default_adjustment
 from prbayes.posterior.epsilon import calibrate_epsilon
+from prbayes.posterior.groups import arviz_groups
+from prbayes.posterior.returned import (
+    as_asked,
+    as_multitrace,
+    checked_idata_kwargs,
+    checked_names,
+)
 from prbayes.posterior.trees import posterior_tree, share_of_lossy
 from prbayes.response.budget import BudgetError, limited, unlimited
 
@@ -52,6 +62,11 @@ def sample_smc(
     adjust: Affine | bool = True,
     threshold: float = 0.5,
     refine: bool = True,
+    start: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
+    cores: int | None = None,
+    return_inferencedata: bool = True,
+    idata_kwargs: Mapping[str, Any] | None = None,
+    var_names: Sequence[str] | None = None,
     max_stages: int | None = None,
     max_seconds: float | None = None,
     max_runs: int | None = None,
@@ -77,12 +92,29 @@ def sample_smc(
         Where to calibrate epsilon, and the centre of the adjustment; `minimize` finds it if needed.
     adjust : Affine or bool
         Whether, and how, the draws are brought to the width that the data warrant. By default by
-        `Affine()`, unless an epsilon was given, which is then taken at its word; an `Affine`
-        adjusts in any case.
+        ``prb.posterior.GivenEstimate()``, and not where they are the posterior as they are, as
+        those of `LogLikelihood` with one simulator, stored responses and epsilon = 1/N; nor where
+        an epsilon was given, which is then taken at its word. An `Affine` or `GivenEstimate` that
+        is given adjusts in any case.
     threshold : float
         Share of the effective sample size that a stage keeps; higher means more stages.
     refine : bool
         Whether designs of `Reweighted` that do not support the posterior get more points.
+    start : mapping or sequence of mapping, optional
+        Particles to begin with, for all chains or for each: arrays (draws, *shape) by the names of
+        the free variables, or of their transformed values, such as ``sigma_log__``. They have to
+        be draws of the prior, as they are by default: others lead to another posterior.
+    cores : int, optional
+        Most threads that linear algebra takes. Particles are evaluated in batches in this process,
+        one chain after the other; responses are computed by a propagation's ``executor``.
+    return_inferencedata : bool
+        With False a `pymc.backends.base.MultiTrace` of the draws alone.
+    idata_kwargs : dict, optional
+        ``log_likelihood=False`` and ``log_prior=False`` leave these groups out; ``dims`` and
+        ``coords`` name dimensions and coordinates that the model does not name.
+    var_names : sequence of str, optional
+        Variables and deterministics that the result has; all by default. Without a free variable
+        nothing can be predicted from it.
     max_stages : int, optional
         Largest number of stages of a chain. Where it is reached, or another budget is spent, the
         chains that are finished are returned, if there are any and no design had to grow for them;
@@ -108,16 +140,19 @@ def sample_smc(
         ``lossy_draws``: the share of draws, as they were sampled, of whose populations more than
         ``max_lost`` has no response; ``discrepancy_error``: the Monte Carlo error of the
         discrepancy at the best draw; by simulator) and ``observed_data``; ArviZ takes it,
-        ``to_netcdf`` saves it. Attributes of ``posterior``: ``log_marginal_likelihood``, from all
-        chains, and ``log_marginal_likelihood_sd``, the spread of the chains' own; a number to
-        compare models by with one metric and one epsilon, and with no others. Of an adjustment they
-        have ``adjustment_center_error`` and ``adjustment_width_error``, its Monte Carlo errors from
-        the number of refits, in standard deviations of the draws and as a share of the width, for
-        the worst direction; ``adjustment_moved``, how far it moved the medians, in standard
-        deviations, for the worst hyperparameter; ``fit_probability``, how often data sets drawn
-        from the model at its minimiser are as far from their own fit as the data are; and
-        ``prior_probability``, how often estimates that the prior leads to are as far out as that of
-        the data.
+        ``to_netcdf`` saves it. For ArviZ there are ``prior``, ``log_prior`` and predictive draws
+        (``posterior_predictive``, ``prior_predictive``) of simulators whose responses are stored,
+        and ``log_likelihood`` for power-scaling: one number for each draw, of which adjusted draws
+        are draws; it is left out where they were not adjusted by one affine map. Attributes of
+        ``posterior``: ``log_marginal_likelihood``, from all chains, and
+        ``log_marginal_likelihood_sd``, the spread of the chains' own; a number to compare models by
+        with one metric and one epsilon, and with no others. Of an adjustment they have
+        ``adjustment_center_error`` and ``adjustment_width_error``, its Monte Carlo errors from the
+        number of refits, in standard deviations of the draws and as a share of the width, for the
+        worst direction; ``adjustment_moved``, how far it moved the medians, in standard deviations,
+        for the worst hyperparameter; ``fit_probability``, how often data sets drawn from the model
+        at its minimiser are as far from their own fit as the data are; and ``prior_probability``,
+        how often estimates that the prior leads to are as far out as that of the data.
 
     Raises
     ------
@@ -161,6 +196,11 @@ def sample_smc(
         raise TypeError(f"optimum: got {got}, expected an Optimum; call prb.minimize() first")
     if max_stages is not None:
         positive_integer(max_stages, "max_stages")
+    names = checked_names(var_names, model)
+    keywords = checked_idata_kwargs(idata_kwargs)
+    flag(return_inferencedata, "return_inferencedata")
+    if cores is not None:
+        positive_integer(cores, "cores")
     asked = Sampling(
         draws=draws,
         chains=chains,
@@ -169,10 +209,12 @@ def sample_smc(
         adjust=adjust,
         threshold=threshold,
         refine=refine,
+        start=start,
         max_stages=max_stages,
         checkpoint=checkpoint,
         random_seed=None if random_seed is None else seed_number(random_seed),
         progressbar=progressbar,
+        with_groups=True,
     )
     evaluator = evaluator_of(model, optimum, "sample_smc")
     stages = () if checkpoint is None else (f"all finished stages ({checkpoint})",)
@@ -180,8 +222,12 @@ def sample_smc(
         shown(progressbar),
         explained(evaluator, "prb.sample_smc", *stages),
         limited(max_seconds, max_runs),
+        nullcontext() if cores is None else threadpool_limits(cores),
     ):
-        return sample(evaluator, asked)
+        tree = sample(evaluator, asked)
+        if not return_inferencedata:
+            return as_multitrace(tree, evaluator)  # type: ignore[no-any-return]
+        return as_asked(tree, names, keywords)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,10 +241,12 @@ class Sampling:
     adjust: Affine | bool = True
     threshold: float = 0.5
     refine: bool = True
+    start: Any = None
     max_stages: int | None = None
     checkpoint: str | PathLike[str] | None = None
     random_seed: int | None = 0
     progressbar: bool = False
+    with_groups: bool = False  # whether the result has what ArviZ looks for besides
 
 
 def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
@@ -224,6 +272,15 @@ def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
         else:
             _refuse_lost(evaluator, particles, missing)
         with unlimited():
+            groups = None
+            if asked.with_groups:
+                groups = arviz_groups(
+                    evaluator,
+                    particles.thetas,
+                    particles.discrepancies,
+                    found.thetas,
+                    asked.random_seed,
+                )
             return posterior_tree(
                 evaluator,
                 found.thetas,
@@ -245,6 +302,7 @@ def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
                 seed=asked.random_seed,
                 n_responses=evaluator.n_responses - before,
                 seconds=time.perf_counter() - clock,
+                groups=groups,
             )
 
 
@@ -316,6 +374,8 @@ def _rounds(
     evaluator: Evaluator, asked: Sampling, adjustment: Affine | None, optimum: Optimum | None
 ) -> Rounds:
     """Return the rounds of sampling, perhaps with what a run before has saved."""
+    starts = _starts(evaluator, asked)
+    told = {} if starts is None else {"start": fingerprint(starts)}
     saved = _checkpoint(
         asked.checkpoint,
         evaluator,
@@ -325,10 +385,11 @@ def _rounds(
         threshold=asked.threshold,
         adjust=repr(adjustment),
         refine=asked.refine,
+        **told,
     )
     entropy = asked.random_seed if saved is None else int(saved.settings["entropy"])
     return Rounds(
-        run=Chains(evaluator, asked.draws, asked.threshold, saved, asked.max_stages),
+        run=Chains(evaluator, asked.draws, asked.threshold, saved, asked.max_stages, starts),
         chains=asked.chains,
         seeds=np.random.SeedSequence(entropy),
         adjustment=adjustment,
@@ -336,6 +397,19 @@ def _rounds(
         design_error=0.0 if optimum is None else optimum.design_error,
         refine=asked.refine and bool(evaluator.designs),
     )
+
+
+def _starts(evaluator: Evaluator, asked: Sampling) -> list[Floats] | None:
+    """Return the particles that each chain begins with, None for draws of the prior."""
+    start = asked.start
+    if start is None:
+        return None
+    each = list(start) if isinstance(start, list | tuple) else [start] * asked.chains
+    if len(each) != asked.chains:
+        raise ValueError(
+            f"start: got {len(each)} dicts, expected one, or {asked.chains}, one for each chain"
+        )
+    return [starting_thetas(evaluator.hyperparameters, one, asked.draws) for one in each]
 
 
 @dataclass(frozen=True, eq=False)
@@ -501,7 +575,7 @@ def _adjustment(adjust: Affine | bool, evaluator: Evaluator, unset: list[Node]) 
     if isinstance(adjust, Affine):
         return adjust
     nobody_gave_one = all(node in unset or node.epsilon_is_default for node in evaluator.nodes)
-    return Affine() if adjust and nobody_gave_one else None
+    return default_adjustment(evaluator) if adjust and nobody_gave_one else None
 
 
 def _needs_optimum(evaluator: Evaluator, unset: list[Node], adjustment: Affine | None) -> bool:
@@ -515,7 +589,8 @@ def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evalu
     """
     if optimum is None:
         return Evaluator(model)
-    evaluator = optimum.evaluator if optimum.model is model else Evaluator(model)
+    own = optimum.model is model and optimum.evaluator.is_current
+    evaluator = optimum.evaluator if own else Evaluator(model)
     require_same(optimum.identity, identity_of(evaluator), f"{caller}: optimum")
     return evaluator
 

@@ -13,6 +13,7 @@ from prbayes._checks import Floats, positive_integer, share
 from prbayes._checks import random_seed as refuse_seed
 from prbayes.model.evaluator import Evaluation, Evaluator
 from prbayes.model.node import model_on_context
+from prbayes.model.start import starting_thetas
 
 # Mean absolute correlation with the particles before a stage at which they count as new draws;
 # among 500 particles that share nothing it is .036. On the way to the posterior six times as much
@@ -34,8 +35,8 @@ class BatchedKernel(SMC_KERNEL):
     ----------
     draws : int
         Number of particles.
-    start : None
-        Particles start from the prior.
+    start : mapping, optional
+        Particles to begin with, as for `sample_smc`; draws of the prior by default.
     model : pymc.Model, optional
         The one on the context by default.
     random_seed : int, optional
@@ -95,7 +96,10 @@ class BatchedKernel(SMC_KERNEL):
 
     def _initialize_kernel(self) -> None:
         seed = int(self.rng.integers(2**31))
-        self.tempered_posterior = self.evaluator.prior_thetas(self.draws, seed)
+        if self.start is None:
+            self.tempered_posterior = self.evaluator.prior_thetas(self.draws, seed)
+        else:
+            self.tempered_posterior = self._started()
         found = self._evaluate(self.tempered_posterior)
         self.prior_logp, self.likelihood_logp, self.discrepancies, self.lost = found
         if not np.isfinite(self.likelihood_logp).any():
@@ -104,6 +108,12 @@ class BatchedKernel(SMC_KERNEL):
                 "expected some; the populations of the prior are invalid or far from the design: "
                 "look at the priors"
             )
+
+    def _started(self) -> Floats:
+        """Return the particles that were given: thetas, or values by the names of variables."""
+        if isinstance(self.start, np.ndarray):
+            return self.start.copy()
+        return starting_thetas(self.evaluator.hyperparameters, self.start, self.draws)
 
     def resample(self) -> None:
         """Resample the particles in proportion to their weights."""

@@ -13,7 +13,13 @@ from prbayes.model.description import as_attribute, without_addresses
 from prbayes.model.elements import split_elements
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import as_attributes, identity_of
-from prbayes.model.labels import failures_dataset, labelled, observed_dataset, versions
+from prbayes.model.labels import (
+    arviz_attributes,
+    failures_dataset,
+    labelled,
+    observed_dataset,
+    versions,
+)
 
 
 def posterior_tree(
@@ -33,6 +39,7 @@ def posterior_tree(
     seed: int | None,
     n_responses: int,
     seconds: float,
+    groups: Mapping[str, xr.Dataset] | None = None,
 ) -> xr.DataTree:
     """Return the DataTree of a sampler's draws.
 
@@ -64,6 +71,8 @@ def posterior_tree(
     n_responses : int
         Scalar responses computed, the designs' included.
     seconds : float
+    groups : mapping, optional
+        What ArviZ looks for besides.
     """
     if unadjusted is not None:
         discrepancies = _discrepancies_again(evaluator, thetas, discrepancies)
@@ -80,8 +89,9 @@ def posterior_tree(
     }
     if errors is None:
         errors = np.full(len(evaluator.nodes), np.nan)
-    groups = {
+    tree = {
         "posterior": _posterior(evaluator, thetas, attrs | _evidence(stats)),
+        **(groups or {}),
         "sample_stats": _sample_stats(stats),
         "calibration": _calibration(
             evaluator,
@@ -95,10 +105,10 @@ def posterior_tree(
     }
     failures = failures_dataset(evaluator)
     if failures.sizes["failure"]:
-        groups["failures"] = failures
+        tree["failures"] = failures
     if unadjusted is not None:
-        groups["unadjusted"] = _draws(evaluator, unadjusted)
-    return xr.DataTree.from_dict(groups)
+        tree["unadjusted"] = _draws(evaluator, unadjusted)
+    return xr.DataTree.from_dict(tree)
 
 
 # Groups of a result that depend on its draws, which are others after an adjustment.
@@ -164,7 +174,8 @@ def _posterior(evaluator: Evaluator, thetas: Floats, attrs: dict[str, Any]) -> x
     """Return the draws, with what is told of them and of the model."""
     return _draws(evaluator, thetas).assign_attrs(
         {
-            "inference_library": "prbayes",
+            **arviz_attributes(),
+            **({"sampling_time": attrs["seconds"]} if "seconds" in attrs else {}),
             **attrs,
             **as_attribute(evaluator.model),
             **as_attributes(identity_of(evaluator)),

@@ -18,6 +18,7 @@ import pytensor
 import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pytensor.gradient import disconnected_grad
+from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import AT_ONCE, Floats, positive_integer
@@ -189,6 +190,12 @@ class Reweighted(Propagation):
         if inputs.epistemic:
             each = [str(e.name or e) for e in inputs.epistemic]
             names = ", ".join(each)
+            if not any(above in inputs.roots for above in ancestors(inputs.epistemic)):
+                raise TypeError(
+                    f"{name}: {names} goes into the response as data whose value may change, while "
+                    "responses are stored; pass the value itself, such as "
+                    f"{each[0]}.get_value(), or use propagation=prb.Resimulated()"
+                )
             raise TypeError(
                 f"{name}: {names} goes into the response as a model variable (epistemic), so "
                 "stored responses cannot be reweighted; use propagation=prb.Resimulated()"
@@ -1035,9 +1042,12 @@ class Design(Bound):
     def _share(self, arrays: Sequence[Any]) -> None:
         """Hand arrays to the compiled graphs, which read shared variables of any length."""
         if not self._shared:
-            for array in arrays:
+            for i, array in enumerate(arrays):
                 of_any_length = (None,) * array.ndim
-                self._shared.append(pytensor.shared(array, borrow=True, shape=of_any_length))
+                # Some samplers know shared variables by their names.
+                name = f"{self.name}_design_{i}"
+                held = pytensor.shared(array, name=name, borrow=True, shape=of_any_length)
+                self._shared.append(held)
         for shared, array in zip(self._shared, arrays, strict=True):
             shared.set_value(array, borrow=True)
 

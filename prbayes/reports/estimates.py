@@ -141,6 +141,8 @@ def _width(tree: xr.DataTree) -> list[str]:
             f"combined with the prior ({adjustment}).",
             *_width_error(attrs),
         ]
+    if adjustment.startswith("none needed"):
+        return [f"The draws are as they were sampled; an adjustment: {adjustment}."]
     reason = adjustment.removeprefix("none").removeprefix(": ")
     why = f" ({reason})" if reason else ""
     return [f"The draws are not adjusted{why}: their width is that of epsilon."]

@@ -25,7 +25,7 @@ from prbayes.response.compilation import (
     interpreted,
     with_leading_axis,
 )
-from prbayes.response.inputs import Inputs, event_shape, is_random
+from prbayes.response.inputs import Inputs, event_shape, is_random, quiet_logp
 
 
 def log_density(
@@ -46,12 +46,25 @@ def log_density(
         elif is_elliptical(dist):
             logp = _elliptical_logp(dist, x, shape[-1])
         else:
-            logp = pm.logp(dist, x, warn_rvs=False)
+            logp = _logp(dist, x)
         # Elements of a vector of independent inputs.
         if logp.type.ndim > 1:
             logp = logp.sum(axis=tuple(range(1, logp.type.ndim)))
         total = total + logp
     return total
+
+
+def _logp(dist: TensorVariable, x: Any) -> TensorVariable:
+    """Return PyMC's log p(x) of values (n, *event); that of random walks takes one at a time."""
+    if not _is_walk(dist):
+        return pm.logp(dist, x, warn_rvs=False)
+    one = dist.type()
+    return vectorize_graph(quiet_logp(dist, one), {one: x})
+
+
+def _is_walk(dist: TensorVariable) -> bool:
+    """Whether a distribution is a random walk."""
+    return isinstance(dist.owner.op, pm.RandomWalk.rv_type)
 
 
 def compiled_log_density(inputs: Inputs) -> Any:
@@ -173,9 +186,11 @@ def _density(dist: TensorVariable) -> TensorVariable | None:
     One that is drawn, as that of a `pymc.Simulator`, is none.
     """
     try:
-        density = pm.logp(dist, pt.zeros_like(dist), warn_rvs=False)
+        density = quiet_logp(dist, pt.zeros_like(dist))
     except NotImplementedError:
         return None
+    if _is_walk(dist):
+        return density  # its parts stand in it for their shapes alone
     # Zero takes its shape from the distribution.
     above = set(ancestors([density], blockers=[dist])) - {dist}
     return None if any(map(is_random, above)) else density

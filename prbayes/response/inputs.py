@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -108,6 +109,7 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
             arguments.append(_constant(x, label))
             continue
         above = _ancestry(x, known)
+        _refuse_labelled(above, label)
         roots.update((v, None) for v in above if v in known)
         latent = [v for v in above if v not in known and is_random(v)]
         _refuse_strays(x, above, latent, label)
@@ -136,10 +138,17 @@ def _marginal(x: TensorVariable, parts: set[Variable]) -> bool:
     As of a mixture, which has copies of what it is made of.
     """
     try:
-        density = pm.logp(x, pt.zeros_like(x), warn_rvs=False)
+        density = quiet_logp(x, pt.zeros_like(x))
     except (NotImplementedError, TypeError, ValueError):
         return False
     return not parts & set(ancestors([density], blockers=[x]))
+
+
+def quiet_logp(dist: TensorVariable, x: Any) -> TensorVariable:
+    """Return PyMC's log p(x), without its warning of the parts of a random walk."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "RandomVariables", UserWarning)
+        return pm.logp(dist, x, warn_rvs=False)
 
 
 def _refuse_too_little(name: str, n: int, aleatory: bool, roots: bool) -> None:
@@ -156,6 +165,22 @@ def _refuse_too_little(name: str, n: int, aleatory: bool, roots: bool) -> None:
             "to calibrate; give the `.dist()` parameters that are model variables, such as "
             "mu = pm.Normal('mu', 0, 1)"
         )
+
+
+def _refuse_labelled(above: Sequence[Variable], label: str) -> None:
+    """Refuse variables of `pymc.dims`, whose arrays carry their own names of dimensions."""
+    for variable in above:
+        if is_labelled(variable):
+            raise TypeError(
+                f"{label}: got {variable} of pymc.dims, expected variables of PyMC itself, since "
+                "populations are evaluated in batches of plain arrays; write "
+                "pm.Normal(..., dims=...) and pm.Normal.dist(...) for all that simulators depend on"
+            )
+
+
+def is_labelled(variable: object) -> bool:
+    """Whether a variable is one of `pymc.dims`."""
+    return isinstance(variable, Variable) and hasattr(variable.type, "dims")
 
 
 def _inputs_of(variable: Variable) -> Any:

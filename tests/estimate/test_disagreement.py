@@ -109,7 +109,7 @@ def test_of_draws_the_optimum_tells() -> None:
     model = model_of(drawn())
     draws = xr.Dataset(
         {"mu": (("chain", "draw"), np.random.default_rng(1).normal(0, 0.1, (2, 100)))},
-        attrs={"fit_probability": 0.001},
+        attrs={"fit_probability": 0.001, "adjustment": "GivenEstimate()"},
     )
     observed = xr.Dataset({"y": (("i", "output"), drawn())})
     tree = xr.DataTree.from_dict({"posterior": draws, "observed_data": observed})

@@ -149,7 +149,8 @@ def test_where_it_is_not_looked_at_a_line_says_why() -> None:
     assert str(diagnosis) == f"{said}it would take responses; draws of prb.sample_smc tell of it."
     keywords = {"model": found.model, "optimum": found, "progressbar": False}
     plain = prb.sample_smc(60, chains=2, adjust=False, **keywords)
-    (note,) = prb.diagnose(plain).notes
+    unadjusted, note = prb.diagnose(plain).notes
+    assert "as wide as epsilon makes them" in unadjusted
     assert "refits tell of it, and there was no adjustment; look at prb.diagnose of an op" in note
     (note,) = prb.diagnose(found.to_datatree()).notes
     assert "refits need the model; pass the Optimum itself" in note

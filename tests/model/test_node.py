@@ -279,9 +279,12 @@ def test_a_batch_of_parameters_is_a_batch_of_populations() -> None:
     np.testing.assert_allclose(drawn.mean(axis=1), means, atol=0.5)
 
 
-def test_a_picture_of_the_model_names_the_simulator() -> None:
-    graph = pm.model_graph.ModelGraph(build(prb.Reweighted(64)))
-    assert graph.model["y"].owner.op._print_name[0] == "prbayes_Simulator"
+def test_pictures_and_prints_of_the_model_show_response_and_metric() -> None:
+    model = build(prb.Reweighted(64))
+    assert "Simulator of positive by AreaMetric" in pm.model_to_graphviz(model).source
+    assert "y ~ Simulator of positive by AreaMetric" in pm.model_to_mermaid(model)
+    assert "y ~ Simulator[positive, AreaMetric](mu, sigma)" in model.str_repr()
+    assert r"\operatorname{Simulator}[\text{positive, AreaMetric}]" in model._repr_latex_()
 
 
 def test_nothing_of_a_simulator_stands_in_the_way_of_plain_pickle() -> None:
@@ -298,24 +301,90 @@ def test_nothing_of_a_simulator_stands_in_the_way_of_plain_pickle() -> None:
 # Other data.
 
 
-OTHER = r"y: got other observed values than the simulator was made with, .*observed= the new ones"
+OTHER = r"y: got other observed values than when this was compiled, .* compile it again"
+NEW = np.append(OBSERVED + 0.5, [2.0, 2.2, 1.7])
 
 
-def test_pymc_observe_with_other_data_is_refused_and_with_the_same_it_is_not() -> None:
+def with_data(metric: prb.Metric, observed: Any) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
+        prb.Simulator(
+            "y", np.positive, x, metric=metric, propagation=prb.Reweighted(64),
+            observed=pm.Data("data", observed),
+        )  # fmt: skip
+    return model
+
+
+def test_pymc_observe_prepares_the_metric_for_other_data() -> None:
     model = build(prb.Reweighted(64))
     same = pm.observe(model, {"y": OBSERVED})
     assert log_density(same)(AT) == log_density(model)(AT)
-    assert prb.minimize(same, starts=0, **QUIET).converged
+    before = log_density(model)(AT)
     other = pm.observe(model, {"y": OBSERVED + 1})
-    for use in (
-        log_density,
-        prb.minimize,
-        lambda model: prb.sample_smc(20, model=model, **QUIET),
-        lambda model: prb.set_epsilon(model, {"y": 0.2}),
-        lambda model: pm.sample(2, tune=2, chains=1, model=model, **QUIET),
-    ):
-        with pytest.raises(ValueError, match=OTHER):
-            use(other)
+    expected = prb.AreaMetric().against(OBSERVED + 1)
+    values, weights = Evaluator(other).populations(_theta(other), 0)
+    found = -0.1 * log_density(other)(AT)
+    assert found == pytest.approx(float(expected(values[0], weights[0])), rel=1e-9)
+    assert Evaluator(other)(_theta(other)).discrepancies[0, 0] == pytest.approx(found, rel=1e-9)
+    assert node_of(other).bound.responses.count == 64, "no response is computed anew"
+    assert log_density(model)(AT) == before
+
+
+def _theta(model: pm.Model) -> Floats:
+    return np.array([[AT[name] for name in Evaluator(model).names]])
+
+
+@pytest.mark.parametrize("metric", [prb.AreaMetric(), prb.LogLikelihood()])
+def test_data_that_are_set_anew_are_those_of_a_model_made_with_them(metric: prb.Metric) -> None:
+    model, new = with_data(metric, OBSERVED), with_data(metric, NEW)
+    first = prb.minimize(model, starts=0, **QUIET)
+    compiled = log_density(model) if metric.likelihood else None
+    pm.set_data({"data": NEW}, model=model)
+    # The first minimisation let the design grow.
+    found, expected = (Evaluator(m)(THETA).discrepancies for m in (model, new))
+    np.testing.assert_allclose(found, expected, rtol=0.02)
+    np.testing.assert_equal(node_of(model).epsilon_value, node_of(new).epsilon_value)
+    drawn = pm.draw(model["y"], random_seed=1)
+    assert drawn.shape == NEW.shape
+    # What was made from the data before is not taken for the new problem.
+    with pytest.raises(ValueError, match="other observed values of y"):
+        prb.sample_smc(20, model=model, optimum=first, **QUIET)
+    if compiled is not None:
+        with pytest.raises(ParameterValueError, match=OTHER):
+            compiled(AT)
+        assert log_density(model)(AT) == pytest.approx(log_density(new)(AT), rel=0.02)
+    pm.set_data({"data": OBSERVED}, model=model)
+    assert Evaluator(model)(THETA).discrepancies == first.evaluator(THETA).discrepancies
+
+
+def test_data_of_whole_numbers_may_be_set_too() -> None:
+    model = with_data(prb.AreaMetric(), np.arange(5))
+    pm.set_data({"data": np.arange(7)}, model=model)
+    assert node_of(model).target.observed.tolist() == list(range(7))
+
+
+def test_data_that_do_not_fit_what_goes_with_them_are_refused() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
+        prb.Simulator(
+            "y", np.positive, x, metric=prb.AreaMetric(), propagation=prb.Reweighted(64),
+            observed=pm.Data("data", OBSERVED), specimens=range(20),
+        )  # fmt: skip
+    pm.set_data({"data": OBSERVED + 1}, model=model)
+    assert nodes(model)
+    pm.set_data({"data": OBSERVED[:5]}, model=model)
+    with pytest.raises(ValueError, match="y: observed: got 5 specimens, expected 20, as many as"):
+        nodes(model)
+    pm.set_data({"data": np.append(OBSERVED[:19], np.nan)}, model=model)
+    with pytest.raises(ValueError, match="y: observed: got"):
+        prb.minimize(model)
+
+
+def test_an_epsilon_that_is_not_set_is_told_when_the_density_is_made(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    build(prb.Reweighted(64), epsilon=None).logp()
+    assert "y: epsilon is not set; call prb.set_epsilon(model" in caplog.text
 
 
 def test_the_value_that_a_log_density_is_asked_at_has_to_be_the_data() -> None:
@@ -323,8 +392,8 @@ def test_the_value_that_a_log_density_is_asked_at_has_to_be_the_data() -> None:
     at = {model["mu"]: AT["mu"], model["sigma"]: float(np.exp(AT["sigma_log__"]))}
     expected = log_density(model)(AT)
     assert float(pm.logp(model["y"], OBSERVED).eval(at)) == pytest.approx(expected, rel=1e-9)
-    with pytest.raises(ValueError, match=OTHER):
-        pm.logp(model["y"], OBSERVED + 1)
+    moved = float(pm.logp(model["y"], OBSERVED + 1).eval(at))
+    assert moved != pytest.approx(expected, rel=0.01)
     value = pytensor.tensor.vector("value", dtype="float64")
     symbolic = pm.logp(model["y"], value)
     assert float(symbolic.eval({**at, value: OBSERVED})) == pytest.approx(expected, rel=1e-9)

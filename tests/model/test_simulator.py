@@ -367,7 +367,10 @@ def test_single_precision_is_refused_before_the_response_is_computed() -> None:
             prb.Simulator("y", lambda x: 1 / 0, x, metric=prb.AreaMetric(), observed=[1.0, 2.0])
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", dtype="float32"), 1.0)
-        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=[1.0, 2.0])
+        with pytest.raises(TypeError, match=r"y: mu: got hyperparameters of float32"):
+            prb.Simulator("y", lambda x: 1 / 0, x, metric=prb.AreaMetric(), observed=[1.0, 2.0])
+        x = pm.Normal.dist(pm.Normal("nu"), 1.0)
+        prb.Simulator("z", np.positive, x, metric=prb.AreaMetric(), observed=[1.0, 2.0])
     with pytest.raises(TypeError, match=r"model: mu: got hyperparameters of float32"):
         prb.minimize(model)
 

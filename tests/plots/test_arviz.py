@@ -1,5 +1,7 @@
 """ArviZ's own plots take our trees."""
 
+import inspect
+import re
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,9 +24,6 @@ def checked() -> xr.DataTree:
         observed = np.random.default_rng(2).normal(1, 0.5, 40)
         prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=observed)
         idata = prb.sample_smc(60, chains=2, random_seed=1, progressbar=False)
-        pm.sample_posterior_predictive(
-            idata, extend_inferencedata=True, random_seed=1, progressbar=False
-        )
     return idata
 
 
@@ -63,3 +62,47 @@ def test_predictions_of_unequal_size_give_u_values_that_arviz_draws(tmp_path: Pa
     pc.savefig(tmp_path / "figure.png")
     assert (tmp_path / "figure.png").stat().st_size > 5000
     assert area(test.u_values) == test.statistic
+
+
+ROWS = dict(
+    re.findall(
+        r"^\| ([a-z_0-9 ]+) \| (.+) \|$",
+        (Path(__file__).parents[2] / "docs" / "pymc_and_arviz.md")
+        .read_text(encoding="utf-8")
+        .split("## ArviZ")[1],
+        re.MULTILINE,
+    )
+)
+TOLD = {name: told for names, told in ROWS.items() for name in names.split()}
+MORE: dict[str, Any] = {
+    "plot_bf": {"var_names": "mu", "ref_val": 1.0},
+    "bayes_factor": {"var_names": "mu", "ref_vals": 1.0},
+    "plot_pair_focus": {"focus_var": "mu"},
+    "rhat_nested": {"superchain_ids": [0, 1]},
+    "ci_in_rope": {"rope": (1, 2)},
+}
+
+
+def test_the_table_has_every_function_of_arviz() -> None:
+    own = {name for name in vars(az) if not name.startswith("_")}
+    functions = {name for name in own if inspect.isroutine(getattr(az, name))}
+    assert functions <= set(TOLD)
+    assert set(TOLD) - {"functions", "of"} <= own
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name, told in TOLD.items() if told.startswith("work")])
+def test_what_the_table_says_works_does(name: str) -> None:
+    if name == "combine_plots":
+        assert az.combine_plots(checked(), [(az.plot_trace, {}), (az.plot_rank, {})])
+        return
+    assert getattr(az, name)(checked(), **MORE.get(name, {})) is not None
+
+
+@pytest.mark.parametrize(
+    "name", ["loo", "loo_pit", "plot_loo_pit", "plot_energy", "bfmi"],
+)  # fmt: skip
+def test_what_the_table_says_is_refused_gives_no_number(name: str) -> None:
+    assert TOLD[name].startswith("refused")
+    with pytest.raises((TypeError, KeyError, ValueError)):
+        getattr(az, name)(checked())

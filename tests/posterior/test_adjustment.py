@@ -329,7 +329,7 @@ def test_hyperparameters_absent_from_the_response_keep_their_prior(name: str) ->
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
         prb.Simulator("y", same, x, metric=METRICS[name], observed=OBSERVED, propagation=R256)
     idata = sample(model, 500)
-    assert idata.posterior.attrs["adjustment"].startswith("Affine")
+    assert idata.posterior.attrs["adjustment"].startswith("GivenEstimate")
     assert_quantiles(idata.posterior["idle"], norm(3, 20), 1000)
     assert_quantiles(idata.posterior["rate"], gamma(2), 1000)
     # While the others were adjusted.
@@ -365,17 +365,17 @@ def test_hyperparameters_that_follow_others_in_the_prior_still_do() -> None:
 
 
 def adjustment(idata: xr.DataTree) -> str:
-    assert ("unadjusted" in idata.children) == idata.posterior.attrs["adjustment"].startswith(
-        "Affine"
-    )
-    return str(idata.posterior.attrs["adjustment"])
+    done = str(idata.posterior.attrs["adjustment"])
+    assert ("unadjusted" in idata.children) == (not done.startswith("none"))
+    return done
 
 
 def test_a_given_epsilon_is_taken_at_its_word() -> None:
     optimum = prb.minimize(build(METRICS["kl"], sd=0.5))
     short = {"draws": 60, "optimum": optimum}
     assert (
-        adjustment(sample(optimum.model, **short)) == "Affine(n_sets=200, random_seed=0)"
+        adjustment(sample(optimum.model, **short))
+        == "GivenEstimate(n_sets=200, random_seed=0, n_fits=1000)"
     )  # 1/N, which nobody gave
     assert adjustment(sample(optimum.model, epsilon=0.01, **short)) == "none"
     assert (
@@ -501,7 +501,7 @@ def test_a_metric_of_ones_own_is_adjusted_to_the_width_of_its_refits() -> None:
     own = prb.FunctionMetric(lambda z, y, w: np.abs((z * w).sum(-1) - y.mean()), weighted=True)
     optimum = prb.minimize(build(own, sd=0.5), starts=0)
     idata = sample(optimum.model, optimum=optimum)
-    assert adjustment(idata).startswith("Affine")
+    assert adjustment(idata).startswith("GivenEstimate")
     # The mean of normal data with known spread and a wide prior; 200 data sets: 5%, 600 draws: 3%.
     np.testing.assert_allclose(idata.posterior["mu"].std(), 0.5 / N**0.5, rtol=4 * 0.06)
     # Epsilon alone came near it.
@@ -585,7 +585,7 @@ def test_shared_specimens_do_not_count_twice(name: str) -> None:
         optimum = prb.minimize(two_responses(METRICS[name], labels=labels), method="Nelder-Mead")
         stderr.append(optimum.stderr["mu"])
         idata = sample(optimum.model, optimum=optimum)
-        assert adjustment(idata).startswith("Affine")
+        assert adjustment(idata).startswith("GivenEstimate")
         widths.append(float(idata.posterior["mu"].std()))
         bootstrapped.append(float(prb.bootstrap(optimum, 400).posterior["mu"].std()))
     # Standard deviations of 200 data sets, twice: 5% each, 7% the ratio; of 400: 5%.
@@ -704,7 +704,7 @@ def test_the_error_from_the_number_of_refits_is_that_over_seeds() -> None:
 def test_results_have_the_error_from_the_number_of_refits() -> None:
     optimum = fit("pr")
     few = sample(optimum.model, 200, optimum=optimum, adjust=prb.posterior.Affine(20))
-    many = sample(optimum.model, 200, optimum=optimum)
+    many = sample(optimum.model, 200, optimum=optimum, adjust=prb.posterior.Affine())
     for name in ("adjustment_center_error", "adjustment_width_error"):
         assert 0.02 < many.posterior.attrs[name] < 0.15
         # The root of ten; of twenty refits it is known to a sixth.
@@ -724,7 +724,7 @@ def test_a_prior_in_conflict_with_the_data_is_said(
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 0.1))
         prb.Simulator("y", same, x, metric=METRICS[name], observed=OBSERVED, propagation=R256)
     with caplog.at_level(logging.WARNING, logger="prbayes"):
-        idata = sample(model)
+        idata = sample(model, adjust=prb.posterior.Affine())
     assert idata.posterior.attrs["adjustment_moved"] > 1
     said = "prior and data probably contradict each other"
     assert said in caplog.text

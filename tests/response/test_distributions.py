@@ -16,6 +16,7 @@ from prbayes.response.distributions import (
     PopulationSampler,
     PriorPoints,
     PriorSampler,
+    compiled_log_density,
     is_mvnormal,
     log_density,
     prior_draws,
@@ -272,3 +273,19 @@ def test_what_has_no_density_is_refused() -> None:
     )
     with pytest.raises(TypeError, match=r"y: got Trunc.* PyMC has no density.* expected one .*"):
         refuse_without_density("y", inputs)
+
+
+def test_random_walks_have_pymc_s_density_and_no_other() -> None:
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 0, 1), pm.HalfNormal("sigma", 1)
+        walk = pm.GaussianRandomWalk.dist(mu, sigma, init_dist=pm.Normal.dist(0, 1), steps=3)
+        inputs = read_inputs("y", [walk], model)
+    refuse_without_density("y", inputs)
+    values = {"mu": np.array([0.5, -0.3]), "sigma": np.array([0.7, 1.2])}
+    points = np.random.default_rng(1).normal(size=(5, 4))
+    roots = [values[str(root.name)] for root in inputs.roots]
+    found = compiled_log_density(inputs)(*roots, points)[0]
+    steps = np.diff(points, axis=1)
+    for row, m, s in zip(found, values["mu"], values["sigma"], strict=True):
+        expected = stats.norm.logpdf(points[:, 0]) + stats.norm.logpdf(steps, m, s).sum(axis=1)
+        np.testing.assert_allclose(row, expected, rtol=1e-10)

@@ -161,3 +161,13 @@ def test_constants_are_changed_by_nobody() -> None:
     np.testing.assert_array_equal(kept, [1.0, 2.0])
     with pytest.raises(ValueError, match="read-only"):
         kept *= 2
+
+
+def test_variables_of_pymc_dims_are_refused_by_a_sentence() -> None:
+    import pymc.dims as pmd
+
+    with pm.Model(coords={"a": [1, 2]}) as model:
+        mu = pmd.Normal("mu", 0.0, 1.0, dims="a")
+        for given in (pm.Normal.dist(mu.values[0], 1.0), pmd.Normal.dist(mu, 1.0)):
+            with pytest.raises(TypeError, match=r"y: input 1: got .* of pymc\.dims"):
+                read_inputs("y", [given], model)

@@ -1,0 +1,66 @@
+"""How draws are adjusted where nobody chose: given the estimate, or not at all where none need be.
+
+The choice rests on ``benchmarks/posterior.py``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from prbayes._checks import Floats
+from prbayes.estimate.refinement import AGREE
+from prbayes.estimate.refit import SamplingDistribution
+from prbayes.model.evaluator import Evaluator
+from prbayes.posterior.adjustment import Adjusted, Affine, Mapped
+from prbayes.posterior.given_estimate import GivenEstimate
+
+# How results say that nothing had to be done.
+NONE_NEEDED = "none needed: the draws of the log-likelihood are the posterior"
+
+
+@dataclass(frozen=True)
+class _LikelihoodDraws(Affine):
+    """Draws that stay as they are; refits only tell whether the family of the inputs fits."""
+
+    def __call__(
+        self,
+        evaluator: Evaluator,
+        thetas: Floats,
+        optima: Sequence[Floats],
+        design_error: float = 0.0,
+    ) -> Adjusted:
+        """Return the draws, with what refits tell.
+
+        Where designs leave the estimate uncertain, `GivenEstimate` widens the draws by that.
+        """
+        if AGREE < design_error < np.inf:
+            given = GivenEstimate(self.n_sets, self.random_seed)
+            return given(evaluator, thetas, optima, design_error)
+        found = super().__call__(evaluator, thetas, optima, design_error)
+        if found.reason is not None:  # nothing could be refitted
+            return Adjusted(thetas, NONE_NEEDED)
+        return replace(found, thetas=thetas, done=NONE_NEEDED)
+
+    def _mapped(
+        self, sampling: SamplingDistribution, draws: Floats, design_variance: float
+    ) -> Mapped:
+        """Return the draws."""
+        told = self._told(sampling)
+        return Mapped(draws, 0, np.nan, np.nan, told.fit_probability, told.allowed)
+
+
+def default_adjustment(evaluator: Evaluator) -> Affine:
+    """Return what adjusts the draws of a model by default."""
+    return _LikelihoodDraws() if _is_likelihood(evaluator) else GivenEstimate()
+
+
+def _is_likelihood(evaluator: Evaluator) -> bool:
+    """Return whether exp(-d / epsilon) is the likelihood of independent specimens, and smooth."""
+    if len(evaluator.nodes) > 1:  # others may share its specimens
+        return False
+    (node,) = evaluator.nodes
+    all_alike = np.isclose(node.n_specimens, len(node.target.observed))
+    return node.target.exact and node.epsilon_is_default and node.bound.stored and bool(all_alike)

@@ -1,0 +1,176 @@
+"""What ArviZ looks for beside the posterior: prior, predictive draws, and densities of draws."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from prbayes._checks import AT_ONCE, Floats
+from prbayes.model.evaluator import Evaluation, Evaluator
+from prbayes.model.labels import arviz_attributes, labelled, labelled_responses
+from prbayes.response.outputs import lacking
+
+# The names that ArviZ's functions which want a number for each observation show when they refuse.
+_LIKELIHOOD = ("one_number_for_all_specimens", "adjustment_of_it")
+_NOTE = (
+    "The log-density of all specimens together, and what the adjustment of the draws adds to it: "
+    "one number for each draw, for power-scaling (psense). loo, compare and khat want one for each "
+    "observation and have no meaning here; use prb.cross_validate."
+)
+# Draws farther than this share of a standard deviation from where an affine map would have them
+# were mapped by another one; rounding is far below.
+_OFF_THE_MAP = 1e-6
+# Share of draws that may be: the adjustment draws those in that are far out.
+_FAR_OUT_DRAWS = 0.02
+
+
+def arviz_groups(
+    evaluator: Evaluator,
+    particles: Floats,
+    discrepancies: Floats,
+    thetas: Floats,
+    seed: int | None,
+) -> dict[str, xr.Dataset]:
+    """Return groups that cost no response.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+        With the epsilons of the draws.
+    particles : ndarray, shape (chains, draws, d)
+        Draws before an adjustment.
+    discrepancies : ndarray, shape (chains, draws, k)
+        Those of them.
+    thetas : ndarray, shape (chains, draws, d)
+        Draws after it, or the same.
+    seed : int or None
+
+    Returns
+    -------
+    dict
+        ``prior``, ``log_prior`` and ``log_likelihood``, the last where the density of adjusted
+        draws is known; ``posterior_predictive`` and ``prior_predictive`` of the simulators whose
+        responses are stored.
+    """
+    draws = thetas.shape[1]
+    rng = np.random.default_rng(seed)
+    prior_seed = int(rng.integers(2**31))
+    prior = evaluator.prior_thetas(draws, prior_seed)
+    groups = {
+        "prior": _variables(evaluator, prior[None]),
+        "log_prior": _log_prior(evaluator, thetas),
+    }
+    likelihood = _log_likelihood(evaluator, particles, discrepancies, thetas)
+    if likelihood is not None:
+        groups["log_likelihood"] = likelihood
+    groups["posterior_predictive"] = _predictive(evaluator, thetas, rng)
+    groups["prior_predictive"] = _predictive(evaluator, prior[None], rng)
+    if not groups["prior_predictive"]:
+        del groups["posterior_predictive"], groups["prior_predictive"]
+    return {name: group.assign_attrs(arviz_attributes()) for name, group in groups.items()}
+
+
+def _variables(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
+    """Return variables and deterministics at thetas, shape (chains, draws, d)."""
+    chains, draws, d = thetas.shape
+    found = {}
+    for name, value in evaluator.constrained(thetas.reshape(-1, d)).items():
+        found[name] = value.reshape(chains, draws, *value.shape[1:])
+    return labelled(evaluator, found, {"chain": chains, "draw": draws})
+
+
+def _predictive(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) -> xr.Dataset:
+    """Return responses of the simulators that store theirs, at thetas (chains, draws, d).
+
+    At every draw, or, where these are more numbers than are held at once, at some of them.
+    """
+    chains, draws, d = thetas.shape
+    stored = [k for k, node in enumerate(evaluator.nodes) if node.bound.n_per_theta == 0]
+    numbers = sum(evaluator.nodes[k].target.observed.size for k in stored)
+    every = -(-chains * draws * numbers // AT_ONCE) or 1
+    some = thetas[:, ::every]
+    drawn = {}
+    for k in stored:
+        values = _specimens(evaluator, k, some.reshape(-1, d), rng)
+        drawn[evaluator.nodes[k].name] = values.reshape(*some.shape[:2], *values.shape[1:])
+    found = labelled_responses(evaluator, drawn, some.shape[:2])
+    return found.assign_coords(draw=np.arange(draws)[::every])
+
+
+def _log_prior(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
+    """Return the log prior density of each variable in the user's own units, by draw."""
+    chains, draws, d = thetas.shape
+    free = evaluator.model.free_RVs
+    graphs = evaluator.model.logp(vars=free, jacobian=False, sum=False)
+    values = evaluator.hyperparameters.compile(graphs)(thetas.reshape(-1, d))
+    found = {}
+    for rv, value in zip(free, values, strict=True):
+        total = np.reshape(value, (chains * draws, -1)).sum(axis=1)
+        found[str(rv.name)] = (["chain", "draw"], total.reshape(chains, draws))
+    return xr.Dataset(found, coords={"chain": np.arange(chains), "draw": np.arange(draws)})
+
+
+def _log_likelihood(
+    evaluator: Evaluator, particles: Floats, discrepancies: Floats, thetas: Floats
+) -> xr.Dataset | None:
+    r"""Return the log-likelihood that the draws are of, up to a constant, in two parts.
+
+    An adjustment maps draws of :math:`p(\theta) e^{\ell(\theta)}` by an affine
+    :math:`\theta' = T(\theta)`, so that theirs is
+    :math:`\ell'(\theta') = \ell(\theta) + \log p(\theta) - \log p(\theta')`. None, where the map
+    was another one.
+    """
+    chains, draws, d = thetas.shape
+    before, after = particles.reshape(-1, d), thetas.reshape(-1, d)
+    k = discrepancies.shape[-1]
+    log_prior = evaluator.hyperparameters.log_prior(before)
+    found = discrepancies.reshape(-1, k)
+    there = Evaluation(log_prior, evaluator.log_other(before), found, np.full_like(found, np.nan))
+    own = there.log_likelihood(evaluator.epsilon)
+    adjustment = np.zeros(len(after))
+    if thetas is not particles:
+        if not _is_affine(before, after):
+            return None
+        adjustment = log_prior - evaluator.hyperparameters.log_prior(after)
+    parts = {}
+    for name, values in zip(_LIKELIHOOD, (own, adjustment), strict=True):
+        parts[name] = (["chain", "draw"], values.reshape(chains, draws))
+    coords = {"chain": np.arange(chains), "draw": np.arange(draws)}
+    return xr.Dataset(parts, coords=coords, attrs={"note": _NOTE})
+
+
+def _is_affine(before: Floats, after: Floats) -> bool:
+    """Whether draws, (n, d), were mapped by one affine function, but for a few far out."""
+    n, d = before.shape
+    if n <= 2 * (d + 1):
+        return False
+    # Of those in the middle: a few far out are drawn in.
+    away = np.abs(before - np.median(before, axis=0)) / np.maximum(before.std(axis=0), 1e-300)
+    middle = np.argsort(away.max(axis=1))[: n // 2]
+    terms = np.column_stack([np.ones(n), before])
+    coefficients = np.linalg.lstsq(terms[middle], after[middle])[0]
+    off = np.abs(after - terms @ coefficients) / np.maximum(after.std(axis=0), 1e-300)
+    return bool((off.max(axis=1) > _OFF_THE_MAP).mean() <= _FAR_OUT_DRAWS)
+
+
+def _specimens(evaluator: Evaluator, k: int, thetas: Floats, rng: np.random.Generator) -> Floats:
+    """Draw as many responses as were observed at each theta, shape (P, N) or (P, N, m).
+
+    They are specimens of the population's points, by weight and with replacement.
+    """
+    node = evaluator.nodes[k]
+    size, event = len(node.target.observed), node.target.event
+    drawn = np.full((len(thetas), size, *event), np.nan)
+    step = max(1, AT_ONCE // node.bound.n_points)
+    for first in range(0, len(thetas), step):
+        roots = evaluator.roots(thetas[first : first + step], k)
+        where = np.flatnonzero(node.bound.valid(roots))
+        if not where.size:
+            continue
+        values, weights = node.bound.populations([root[where] for root in roots])
+        for place, points, mass in zip(first + where, values, weights, strict=True):
+            edges = np.cumsum(np.where(lacking(points), 0.0, mass))
+            if edges[-1] > 0:
+                uniform = rng.random(size) * edges[-1]
+                drawn[place] = points[np.searchsorted(edges, uniform, side="right")]
+    return drawn

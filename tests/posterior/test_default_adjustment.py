@@ -1,0 +1,71 @@
+"""What adjusts draws where nobody chose."""
+
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+from four_metrics import METRICS, R256, same
+
+import prbayes as prb
+from prbayes._checks import Floats
+from prbayes.metrics.joint import Joint
+from prbayes.model.evaluator import Evaluator
+from prbayes.posterior import Affine, GivenEstimate
+from prbayes.posterior.default_adjustment import NONE_NEEDED, default_adjustment
+
+OBSERVED = np.random.default_rng(2).normal(1.0, 0.5, 30)
+
+
+def build(metric: prb.Metric, observed: Floats = OBSERVED, **keywords: Any) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        given = {"propagation": R256} | keywords
+        prb.Simulator("y", same, x, metric=metric, observed=observed, **given)
+    return model
+
+
+def chosen(metric: prb.Metric, observed: Floats = OBSERVED, **keywords: Any) -> Affine:
+    return default_adjustment(Evaluator(build(metric, observed, **keywords)))
+
+
+def test_draws_are_those_given_the_estimate_but_for_a_likelihood() -> None:
+    for name in ("pr", "kl", "area"):
+        assert chosen(METRICS[name]) == GivenEstimate()
+    assert not isinstance(chosen(METRICS["ll"]), GivenEstimate)
+    assert not isinstance(chosen(Joint(METRICS["ll"])), GivenEstimate)
+
+
+@pytest.mark.parametrize(
+    "keywords",
+    [
+        {"metric": prb.LogLikelihood(prb.GaussianKDE(0.3))},
+        {"epsilon": 0.1},
+        {"specimens": [i // 2 for i in range(30)]},
+        {"propagation": prb.Resimulated(256)},
+    ],
+    ids=["wide kernel", "an epsilon", "specimens", "not stored"],
+)
+def test_what_is_not_quite_a_likelihood_is_adjusted(keywords: dict[str, Any]) -> None:
+    assert chosen(**{"metric": METRICS["ll"]} | keywords) == GivenEstimate()
+
+
+def sample(model: pm.Model, **keywords: Any) -> xr.DataTree:
+    return prb.sample_smc(200, chains=2, model=model, random_seed=1, progressbar=False, **keywords)
+
+
+def test_draws_of_a_likelihood_stay_and_refits_tell_whether_the_family_fits() -> None:
+    model = build(METRICS["ll"])
+    optimum = prb.minimize(model, progressbar=False)
+    idata = sample(model, optimum=optimum)
+    plain = sample(model, optimum=optimum, adjust=False)
+    np.testing.assert_array_equal(idata.posterior["sigma"], plain.posterior["sigma"])
+    assert "unadjusted" not in idata.children
+    assert idata.posterior.attrs["adjustment"] == NONE_NEEDED
+    assert 0.05 < idata.posterior.attrs["fit_probability"] <= 1
+    assert prb.diagnose(idata).notes == ()
+    assert NONE_NEEDED in prb.Report("A", posterior=idata, pictures=False)._repr_html_()
+    # Two lumps, of which no normal population is.
+    lumps = np.concatenate([OBSERVED[:15] * 0.05, 3 + OBSERVED[15:] * 0.05])
+    assert "family" in str(prb.diagnose(sample(build(METRICS["ll"], lumps))))

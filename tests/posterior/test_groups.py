@@ -1,0 +1,138 @@
+"""What ArviZ looks for beside the posterior, against closed forms and PyMC's own functions."""
+
+from functools import cache
+
+import arviz as az
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+from scipy.stats import norm
+
+import prbayes as prb
+from prbayes.posterior import groups
+
+OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
+QUIET = {"progressbar": False, "random_seed": 1}
+
+
+def known_sd(propagation: prb.propagation.Propagation | None = None) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 0.2), 0.5)
+        prb.Simulator(
+            "y", lambda x: x, x, metric=prb.AreaMetric(), observed=OBSERVED,
+            propagation=propagation or prb.Reweighted(256),
+        )  # fmt: skip
+    return model
+
+
+@cache
+def adjusted() -> tuple[pm.Model, prb.Optimum, xr.DataTree]:
+    model = known_sd()
+    optimum = prb.minimize(model, progressbar=False)
+    return model, optimum, prb.sample_smc(500, chains=2, model=model, optimum=optimum, **QUIET)
+
+
+def test_groups_and_attributes_are_those_of_arviz() -> None:
+    tree = adjusted()[2]
+    for group in ("posterior_predictive", "prior", "prior_predictive", "log_prior"):
+        assert tree[group].attrs["inference_library"] == "prbayes"
+    assert {"created_at", "creation_library", "sampling_time"} <= set(tree.posterior.attrs)
+    assert tree.prior["mu"].sizes == {"chain": 1, "draw": 500}
+    np.testing.assert_allclose(tree.prior["mu"].std(), 0.2, rtol=0.15)  # four standard errors
+
+
+def test_the_log_prior_is_that_of_the_user_s_own_units() -> None:
+    model, _, tree = adjusted()
+    draws = tree.posterior["mu"].values
+    np.testing.assert_allclose(tree.log_prior["mu"], norm.logpdf(draws, 0, 0.2), rtol=1e-9)
+    theirs = pm.stats.compute_log_prior(
+        tree.copy(), model=model, progressbar=False, extend_inferencedata=False
+    )
+    np.testing.assert_allclose(tree.log_prior["mu"].values, theirs["mu"].values, rtol=1e-9)
+
+
+def test_the_likelihood_of_adjusted_draws_is_a_normal_one_about_the_estimate() -> None:
+    """Prior times likelihood is the density of the draws: here a normal one, with a prior that counts."""
+    _, optimum, tree = adjusted()
+    mu = tree.posterior["mu"].values.ravel()
+    log = sum(tree.log_likelihood[name].values.ravel() for name in tree.log_likelihood.data_vars)
+    inner = np.abs(mu - np.median(mu)) < 2 * mu.std()
+    curvature, slope, _ = np.polyfit(mu[inner], log[inner], 2)
+    sd, centre = (-2 * curvature) ** -0.5, -slope / (2 * curvature)
+    # The pseudo-posterior is normal up to a few percent of its curvature.
+    np.testing.assert_allclose(sd, float(optimum.stderr["mu"]), rtol=0.2)
+    assert abs(centre - float(optimum.point["mu"])) < 0.5 * sd
+    # That of the draws before, which an adjustment did not change, is another one.
+    own = tree.log_likelihood["one_number_for_all_specimens"].values.ravel()
+    assert own.max() < 0
+    assert np.ptp(tree.log_likelihood["adjustment_of_it"].values) > 0.1
+
+
+def test_draws_that_no_affine_map_made_have_no_likelihood_here() -> None:
+    before = np.random.default_rng(1).normal(size=(200, 2))
+    matrix = np.array([[1.2, 0.3], [0.0, 0.8]])
+    assert groups._is_affine(before, before @ matrix + 1)
+    assert not groups._is_affine(before, np.sinh(before))
+    assert not groups._is_affine(before[:5], before[:5])
+    two = np.where(before[:, :1] > 0, before + 5, before)
+    assert not groups._is_affine(before, two)
+
+
+def test_leaving_one_out_of_one_number_is_refused() -> None:
+    tree = adjusted()[2]
+    with pytest.raises(TypeError, match="one_number_for_all_specimens"):
+        az.loo(tree)
+    assert "power-scaling" in tree.log_likelihood.attrs["note"]
+
+
+def test_power_scaling_sees_a_prior_that_holds_the_answer_back() -> None:
+    tree = adjusted()[2]
+    table = az.psense_summary(tree)
+    # The prior is about as wide as twice the standard error, with a mean five of them away.
+    assert table.loc["mu", "prior"] > 0.05
+    assert table.loc["mu", "likelihood"] > 0.05
+
+
+def test_predictive_draws_are_those_of_pymc_s_own_function() -> None:
+    model, _, tree = adjusted()
+    ours = tree.posterior_predictive["y"]
+    assert ours.sizes == {"chain": 2, "draw": 500, "y_dim_0": 40}
+    theirs = pm.sample_posterior_predictive(tree, model=model, **QUIET).posterior_predictive["y"]
+    # 40 000 values of 1000 populations: standard errors of .003 and .002.
+    assert abs(float(ours.mean() - theirs.mean())) < 0.02
+    np.testing.assert_allclose(ours.std(), theirs.std(), rtol=0.03)
+    # Each row is of its own draw.
+    row = ours.mean("y_dim_0").values.ravel()
+    assert np.corrcoef(row, tree.posterior["mu"].values.ravel())[0, 1] > 0.4
+    assert float(tree.prior_predictive["y"].std()) == pytest.approx(np.hypot(0.2, 0.5), rel=0.1)
+
+
+def test_many_numbers_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, optimum, tree = adjusted()
+    monkeypatch.setattr(groups, "AT_ONCE", 2 * 500 * 40 // 4)
+    rng = np.random.default_rng(1)
+    thetas = tree.calibration["theta"].values
+    found = groups._predictive(optimum.evaluator, thetas, rng)
+    assert found["y"].sizes["draw"] == 125
+    assert found.coords["draw"].values[:3].tolist() == [0, 4, 8]
+
+
+def test_points_without_a_response_are_never_drawn() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
+        prb.Simulator(
+            "y", lambda x: np.where(x > 2.5, np.nan, x), x, metric=prb.AreaMetric(),
+            observed=[-1.0, 0.0, 1.0, 0.5], epsilon=0.1,
+            propagation=prb.Reweighted(256, max_lost=0.5),
+        )  # fmt: skip
+    tree = prb.sample_smc(20, chains=1, model=model, **QUIET)
+    assert np.isfinite(tree.prior_predictive["y"]).all()
+    assert float(tree.prior_predictive["y"].max()) <= 2.5
+
+
+def test_responses_that_cost_are_not_computed_for_it() -> None:
+    model = known_sd(prb.Resimulated(32))
+    tree = prb.sample_smc(20, chains=1, model=model, epsilon=0.1, **QUIET)
+    assert "posterior_predictive" not in tree
+    assert {"prior", "log_prior", "log_likelihood"} <= set(tree.children)
