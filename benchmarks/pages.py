@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks import record
+from benchmarks.scoreboard import table as scoreboard
+from benchmarks.scoreboard.problems import PROBLEMS
 
 PAGES = Path(__file__).parents[1] / "docs"
 METRICS = {
@@ -541,6 +544,16 @@ def libraries() -> Iterator[Row]:
         yield [label, *errors, short(float(np.median(taken))), size]
 
 
+def _matrix(key: str, several: bool) -> Iterator[Row]:
+    """Return the rows of rivals over the problems of the scoreboard."""
+    return scoreboard.matrix(found("scoreboard"), key, several)
+
+
+def _scoreboard(problem: str) -> Iterator[Row]:
+    """Return the rows of a problem of the scoreboard."""
+    return scoreboard.rows(found("scoreboard"), problem)
+
+
 # Where the rows of each table are from; the first two lines of it are the page's.
 TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "coverage, pooled": pooled,
@@ -582,7 +595,15 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "thermal, risk": thermal_risk,
     "thermal, shares": thermal_shares,
     "thermal, tests": thermal_tests,
+    "scoreboard, errors, one output": lambda: _matrix("rms", several=False),
+    "scoreboard, errors, several outputs": lambda: _matrix("rms", several=True),
+    "scoreboard, widths, one output": lambda: _matrix("width", several=False),
+    "scoreboard, widths, several outputs": lambda: _matrix("width", several=True),
+    "scoreboard, cannot": lambda: scoreboard.cannot(found("scoreboard")),
+    "scoreboard, yields": scoreboard.yields,
 }
+for _name in PROBLEMS:
+    TABLES[f"scoreboard, {_name}"] = partial(_scoreboard, _name)
 _MARKED = re.compile(
     r"(<!-- table: (?P<name>[^>]+) -->\n\n(?:\|[^\n]*\n){2})(?:\|[^\n]*\n)*(\n<!-- end -->)"
 )

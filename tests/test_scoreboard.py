@@ -21,8 +21,11 @@ from benchmarks.scoreboard.problem import (
     Problem,
     Reference,
     Response,
+    capped,
+    components,
     half_normal,
     normal,
+    statistics,
     truncated,
     uniform,
 )
@@ -150,11 +153,43 @@ def test_responses_are_what_they_say() -> None:
     assert np.allclose([first, second], np.sqrt(values) / 2 / np.pi)
     assert share == pytest.approx(shape[1] / shape.sum())
     assert np.isnan(frame.formula(np, np.array(-1.0), np.array(upper))[0])
-    # The eigenvalues of three masses add up to the trace.
-    case = three_masses.CLOSE
-    *eigenvalues, component = three_masses.formula(case, np, *np.array([[8.0], [2.0], [2.1]]))
-    assert sum(eigenvalues)[0] == pytest.approx(2 + 1 + (8 + 2 + 2.1) / 4 + 2.1 + 1)
-    assert 0 < component[0] < 1
+
+
+def _by_matrix(case: three_masses.Case, springs: Any) -> Any:
+    """Return eigenvalues and the first mode's first component of three masses, by linear algebra."""
+    k = dict(case.fixed) | dict(zip(case.uncertain, springs, strict=True))
+    stiffness = [
+        [k[1] + k[4] + k[6], -k[4], -k[6]],
+        [-k[4], k[2] + k[4] + k[5], -k[5]],
+        [-k[6], -k[5], k[3] + k[5] + k[6]],
+    ]
+    root = 1 / np.sqrt(case.masses)
+    values, vectors = np.linalg.eigh(np.array(stiffness) * root * root[:, None])
+    first = vectors[:, 0] * root
+    return [*values, abs(first[0]) / np.linalg.norm(first)]
+
+
+@pytest.mark.parametrize("case", [three_masses.SEPARATED, three_masses.CLOSE])
+def test_three_masses_are_those_of_their_matrices(case: three_masses.Case) -> None:
+    low, high = np.transpose(case.box)
+    springs = np.random.default_rng(1).uniform(low, high, (20, 3))
+    found = np.stack(three_masses.formula(case, np, *springs.T), axis=-1)
+    assert np.allclose(found, [_by_matrix(case, one) for one in springs], rtol=1e-10)
+
+
+@EVERY
+def test_a_formula_takes_pytensor(name: str) -> None:
+    import pytensor.tensor as pt
+
+    problem = PROBLEMS[name]
+    drawn = problem.prior_draws(np.random.default_rng(1), 1)
+    inputs = problem.population(drawn, np.full((1, 1, len(problem.inputs)), 0.2))
+    expected = problem.formula(np, *inputs)
+    found = problem.formula(pt, *map(pt.as_tensor_variable, inputs))
+    if type(expected) is not list:
+        found, expected = [found], [expected]
+    for one, value in zip(found, expected, strict=True):
+        assert np.allclose(one.eval(mode="FAST_COMPILE"), value)
 
 
 def test_real_data_are_those_of_the_package() -> None:
@@ -190,6 +225,36 @@ def test_tension_curves_are_fitted_and_thinned(tmp_path: Path) -> None:
     assert (name, size, rate) == ("one", "small", 0.01)
     expected = [30 + 100 * e for e in tension_304l.STRAINS if e < 0.05]
     assert found[: len(expected)] == pytest.approx(expected, abs=2e-3)
+
+
+def test_the_spread_of_a_predicted_yield() -> None:
+    draws = {"mean yield": np.array([31.0, 33.0]), "sd yield": np.array([1.0, 2.0])}
+    told = tension_304l.told(draws)
+    assert told[tension_304l.PREDICTIVE] == pytest.approx(np.sqrt(2.5 + 1))
+    alone = tension_304l.told({"mean yield": 31.0, "sd yield": 1.5})
+    assert alone[tension_304l.PREDICTIVE] == pytest.approx(1.5)
+    # Where the offset line meets the curve, as the page says.
+    center = tension_304l.reference(8, 0).center
+    assert center[tension_304l.PREDICTIVE] == pytest.approx(1.07, abs=0.005)
+
+
+def test_data_sets_are_told_by_sorted_outputs_and_failures_stand_above() -> None:
+    y = np.array([[3.0, 10.0], [1.0, 30.0], [2.0, 20.0]])
+    rho = np.sqrt(3) * np.corrcoef(y.T)[0, 1]
+    assert statistics(y) == pytest.approx([1, 2, 3, 10, 20, 30, rho])
+    assert statistics(np.stack([y, -y]))[1] == pytest.approx([-3, -2, -1, -30, -20, -10, rho])
+    simulated = np.array([[2.0, np.nan], [np.inf, 5.0], [-1.0, 1e9]])
+    assert capped(simulated, y).tolist() == [[2, 300], [30, 5], [-1, 300]]
+
+
+def test_components_of_the_data_have_unit_spread_and_no_correlation() -> None:
+    problem = frame.PROBLEM
+    y = problem.data(50, 0)
+    parts = components(problem, y)
+    assert parts(y).shape == (50, 2)
+    assert np.cov(parts(y).T, bias=True) == pytest.approx(np.eye(2), abs=1e-9)
+    assert parts(y).mean(axis=0) == pytest.approx(0, abs=1e-9)
+    assert np.allclose(parts(np.stack([y, 2 * y]))[1], parts(2 * y))
 
 
 def test_gross_values_are_in_the_data_and_not_in_the_reference() -> None:
@@ -316,9 +381,54 @@ def test_a_rival_that_cannot_says_why_in_its_cell(tmp_path: Path) -> None:
         study.study(rival, linear.PROBLEM, [20], 2, tmp_path)
     found = table.scores(tmp_path)
     assert found["linear"]["20"]["two"]["data sets"] == 2
-    rows = [line for line in table.page(found) if line.startswith(("| one", "| two"))]
-    assert rows[0].startswith("| one | one output only |")
-    assert rows[-1].count("|") == rows[0].count("|") == len(table.HEAD) + 1
+    assert list(table.cannot(found)) == [["one", "linear", "one output only"]]
+
+
+def _cell(*values: tuple[float, float | None], sets: int = 1, failures: int = 0) -> dict[str, Any]:
+    names = [f"h{k}" for k in range(len(values))]
+    told = {
+        name: {"bias": -rms, "rms": rms, "width": width, "coverage": 0.8}
+        for name, (rms, width) in zip(names, values, strict=True)
+    }
+    return told | {"data sets": sets, "failures": failures, "runs": 1024.0, "cpu": 2.345}
+
+
+def test_the_tables_tell_the_worst_hyperparameter() -> None:
+    found = {
+        "linear": {
+            "20": {
+                "prbayes PR": _cell((0.1, 1.2), (0.5, 0.5), sets=3, failures=1),
+                "mud": _cell((0.3, None)),
+                "sbi": _cell(sets=2, failures=2) | {"runs": None, "cpu": None},
+                "stock PyMC": {"cannot": "why"},
+            },
+            "50": {"prbayes PR": _cell((0.7, 1.0), sets=20)},
+        }
+    }
+    errors = dict(table.matrix(found, "rms", several=False))
+    assert errors["prbayes PR"] == ".50 (2)"
+    assert errors["*specimens*"] == "20"
+    assert errors["stock PyMC"] == "cannot"
+    assert errors["sbi"] == "fails"
+    assert "pyABC adaptive" not in errors, "it was not run"
+    widths = dict(table.matrix(found, "width", several=False))
+    assert (widths["prbayes PR"], widths["mud"]) == (".50 (2)", "one number")
+    told = list(table.rows(found, "linear"))
+    assert [row[:2] for row in told] == [
+        ["20", "prbayes PR"], ["20", "sbi"], ["20", "mud"], ["50", "prbayes PR"]
+    ]  # fmt: skip
+    assert told[0][2:] == ["-.10, -.50", ".50", "1.20, .50", "", "1,000", "2.3", "3, 1 failed"]
+    assert told[-1][5] == ".80", "coverage is told from twenty data sets on"
+
+
+def test_the_scores_are_those_of_the_stored_results() -> None:
+    scores = json.loads(study.STORE.with_suffix(".json").read_text(encoding="utf-8"))["found"]
+    for one in table.stored(study.STORE):
+        assert one["rival"] in table.RIVALS
+        for size in {row["size"] for row in one["rows"]}:
+            count = sum(row["size"] == size for row in one["rows"])
+            told = scores[one["problem"]][str(size)][one["rival"]]
+            assert told["data sets"] == count, "run python -m benchmarks.scoreboard.table"
 
 
 # -- rivals ----------------------------------------------------------------------------------------

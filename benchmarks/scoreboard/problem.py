@@ -94,7 +94,6 @@ class Problem:
     told: Callable[[Draws], Draws] = dict  # what is told of hyperparameters
     degrees: int | None = None  # of freedom of outputs that are readings of a curve, with errors
     error: float | None = None  # sd of a reading, where it is known
-    symbolic: bool = True  # whether the formula takes PyTensor in NumPy's place
     published: tuple[str, ...] = ()  # results of others, with their source
     correlation: str = ""  # the hyperparameter that correlates the first two inputs, if one does
 
@@ -124,6 +123,36 @@ class Problem:
 
 def _column(value: Any) -> Any:
     return np.asarray(value, dtype=float)[..., None]
+
+
+def capped(simulated: Any, observed: Any) -> Any:
+    """Return responses, those of specimens that have failed far above all measured ones."""
+    return np.minimum(np.where(np.isnan(simulated), np.inf, simulated), 10 * observed.max(axis=0))
+
+
+def components(problem: Problem, observed: Any) -> Callable[[Any], Any]:
+    """Return the map of outputs (..., m) to principal components of the data, (..., k).
+
+    There are as many as inputs, each with a standard deviation of one in the data.
+    """
+    center, unit = observed.mean(axis=0), observed.std(axis=0)
+    _, size, directions = np.linalg.svd((observed - center) / unit, full_matrices=False)
+    count = len(problem.inputs)
+    kept = directions[:count].T / size[:count] * np.sqrt(len(observed))
+    return lambda y: (y - center) / unit @ kept
+
+
+def statistics(y: Any) -> Any:
+    """Return what tells data sets (..., N, m): sorted values of each output, and correlations.
+
+    A correlation is multiplied by the root of N, to count as much as a mean of N values does.
+    """
+    ordered = np.swapaxes(np.sort(y, axis=-2), -2, -1).reshape(*y.shape[:-2], -1)
+    first, second = np.triu_indices(y.shape[-1], 1)
+    centred = y - y.mean(axis=-2, keepdims=True)
+    centred = centred / np.sqrt((centred**2).sum(axis=-2, keepdims=True))
+    correlations = (centred[..., first] * centred[..., second]).sum(axis=-2)
+    return np.concatenate([ordered, np.sqrt(y.shape[-2]) * correlations], axis=-1)
 
 
 class Response:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ def data(size: int, replicate: int) -> Any:
     return values
 
 
+@cache
 def reference(size: int, replicate: int) -> Reference:
     """Return the exact posterior of the specimens before the gross values came."""
     likelihood = exact.normal_log_likelihood(clean(size, replicate))

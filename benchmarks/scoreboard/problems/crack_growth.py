@@ -7,6 +7,7 @@ are relative to the notch of 0.90 inch, and were read to 0.01 inch. The exponent
 from __future__ import annotations
 
 import csv
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ def coefficients(y: Any) -> Any:
     return (1 - y**-p) / (p * CYCLES)
 
 
+@cache
 def reference(size: int, replicate: int) -> Reference:
     """Return the exact posterior: the response is monotone."""
     likelihood = exact.normal_log_likelihood(np.log(coefficients(data(size, replicate))))

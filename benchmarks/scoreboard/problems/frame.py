@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,7 @@ def data(size: int, replicate: int) -> Any:
     return np.stack(formula(np, *stiffnesses(size, replicate).T), axis=-1)
 
 
+@cache
 def reference(size: int, replicate: int) -> Reference:
     """Return the exact posterior: the outputs tell both stiffnesses of a specimen."""
     x, names = stiffnesses(size, replicate), list(PRIORS)

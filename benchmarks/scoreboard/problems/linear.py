@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ def data(size: int, replicate: int) -> Any:
     return np.random.default_rng([1, size, replicate]).normal(10.0, 1.0, size)
 
 
+@cache
 def reference(size: int, replicate: int) -> Reference:
     """Return the exact posterior."""
     likelihood = exact.normal_log_likelihood(data(size, replicate))

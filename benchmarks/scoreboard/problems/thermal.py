@@ -8,6 +8,7 @@ the capacity does not depend within its scatter.
 from __future__ import annotations
 
 import csv
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ def data(size: int, replicate: int) -> Any:
     return np.array([float(row["rhoCp_J_per_m3C"]) for row in rows])[:size]
 
 
+@cache
 def reference(size: int, replicate: int) -> Reference:
     """Return the exact posterior."""
     likelihood = exact.normal_log_likelihood(data(size, replicate))

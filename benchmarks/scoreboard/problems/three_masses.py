@@ -39,22 +39,27 @@ CLOSE = Case(
 
 
 def formula(case: Case, xp: Any, *springs: Any) -> list[Any]:
-    """Return three eigenvalues and the first mode's first component."""
-    shape = np.shape(springs[0])
-    flat = [np.ravel(spring) for spring in springs]
-    k = {number: np.full(flat[0].size, float(value)) for number, value in case.fixed.items()}
-    k |= dict(zip(case.uncertain, flat, strict=True))
-    stiffness = np.zeros((flat[0].size, 3, 3))
-    stiffness[:, 0, 0] = k[1] + k[4] + k[6]
-    stiffness[:, 1, 1] = k[2] + k[4] + k[5]
-    stiffness[:, 2, 2] = k[3] + k[5] + k[6]
-    for i, j, number in ((0, 1, 4), (0, 2, 6), (1, 2, 5)):
-        stiffness[:, i, j] = stiffness[:, j, i] = -k[number]
-    root = 1 / np.sqrt(case.masses)
-    values, vectors = np.linalg.eigh(stiffness * root * root[:, None])
-    first = vectors[:, :, 0] * root
-    component = np.abs(first[:, 0]) / np.linalg.norm(first, axis=1)
-    return [output.reshape(shape) for output in (*values.T, component)]
+    """Return three eigenvalues and the first mode's first component, in closed form."""
+    k: dict[int, Any] = dict(case.fixed) | dict(zip(case.uncertain, springs, strict=True))
+    m1, m2, m3 = case.masses
+    # The stiffness matrix, divided by the roots of the masses on either side.
+    a, b, c = (k[1] + k[4] + k[6]) / m1, (k[2] + k[4] + k[5]) / m2, (k[3] + k[5] + k[6]) / m3
+    ab, ac, bc = k[4] ** 2 / m1 / m2, k[6] ** 2 / m1 / m3, k[5] ** 2 / m2 / m3
+    # Its eigenvalues, by the trigonometric solution of the cubic equation.
+    middle = (a + b + c) / 3
+    u, v, w = a - middle, b - middle, c - middle
+    radius = xp.sqrt((u**2 + v**2 + w**2 + 2 * (ab + ac + bc)) / 6)
+    triple = -2 * k[4] * k[5] * k[6] / (m1 * m2 * m3)
+    determinant = u * v * w + triple - u * bc - v * ac - w * ab
+    angle = xp.arccos(xp.clip(determinant / radius**3 / 2, -1, 1)) / 3
+    high = middle + 2 * radius * xp.cos(angle)
+    low = middle + 2 * radius * xp.cos(angle + 2 * np.pi / 3)
+    # Squares of an eigenvector's components are as the cofactors of the diagonal.
+    first = ((b - low) * (c - low) - bc) / m1
+    second = ((a - low) * (c - low) - ac) / m2
+    third = ((a - low) * (b - low) - ab) / m3
+    component = xp.sqrt(first / (first + second + third))
+    return [low, 3 * middle - low - high, high, component]
 
 
 def springs(case: Case, size: int, replicate: int) -> Any:
@@ -108,7 +113,6 @@ def _problem(name: str, case: Case, published: tuple[str, ...]) -> Problem:
         data=partial(data, case),
         reference=partial(reference, case),
         truth=dict(zip(priors, ends, strict=True)),
-        symbolic=False,
         published=published,
     )
 

@@ -6,6 +6,7 @@ unit is the standard deviation of the same quantile under the exact posterior of
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ def told(draws: Draws) -> Draws:
     return {name: mu + sigma * stats.norm.ppf(level) for name, level in LEVELS.items()}
 
 
+@cache
 def reference(size: int, replicate: int) -> Reference:
     """Return the true quantiles, in units of the normal family's exact posterior."""
     likelihood = exact.normal_log_likelihood(data(size, replicate))

@@ -17,14 +17,12 @@ import pytensor.tensor as pt
 
 from benchmarks.scoreboard import in_pymc
 from benchmarks.scoreboard.problem import Draws
-from benchmarks.scoreboard.study import CannotError, Rival, Task, main
+from benchmarks.scoreboard.study import Rival, Task, main
 
 
 def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
     """Return draws of the hyperparameters."""
     problem, y = task.problem, task.observed
-    if not problem.symbolic:
-        raise CannotError("the response is not written in PyTensor")
     error = problem.error or settings["error"] * y.std(axis=0)
     with pm.Model():
         values = in_pymc.hyperparameters(problem)

@@ -2,7 +2,8 @@
 
 Inputs are drawn from the prior's population; the density of the data is a Gaussian kernel estimate,
 with SciPy's default bandwidth on both sides. The updated density of the inputs is told by its mean
-and standard deviation, where these are the hyperparameters: one number each, no width.
+and standard deviation, where these are the hyperparameters: one number each, no width. Of more
+outputs than inputs as many principal components are taken as there are inputs.
 
     python -m benchmarks.scoreboard.rivals.mud
 """
@@ -29,6 +30,13 @@ class _Kernel:
         return self.estimate(y.T)[:, None]
 
 
+def _components(outputs: Any, y: Any, count: int) -> tuple[Any, Any]:
+    """Return principal components of predicted outputs, and the data's in the same directions."""
+    center, unit = outputs.mean(axis=0), outputs.std(axis=0)
+    directions = np.linalg.svd((outputs - center) / unit, full_matrices=False)[2][:count].T
+    return (outputs - center) / unit @ directions, (y - center) / unit @ directions
+
+
 def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
     """Return the moments of the updated population of inputs."""
     problem, y = task.problem, task.observed.reshape(len(task.observed), -1)
@@ -48,6 +56,8 @@ def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
     X = np.stack(columns, axis=1)
     there = np.isfinite(outputs).all(axis=1)
     X, outputs = X[there], outputs[there]
+    if y.shape[1] > X.shape[1]:
+        outputs, y = _components(outputs, y, X.shape[1])
     density = DensityProblem(X, outputs)
     density.set_initial(_Kernel(X))
     density.set_predicted(bw_method=settings["bandwidth"])

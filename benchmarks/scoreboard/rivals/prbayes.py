@@ -1,5 +1,7 @@
 """prbayes at its defaults, with each metric: the optimum, then `sample_smc`.
 
+"given estimate" is the probability residual with the other adjustment of the draws.
+
 uv run python -m benchmarks.scoreboard.rivals.prbayes
 """
 
@@ -30,7 +32,13 @@ def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
         response = _of_vector(task) if task.problem.correlation else task.response
         prb.Simulator("y", response, *inputs, metric=metric, observed=task.observed)
     optimum = prb.minimize(model, progressbar=False)
-    tree = prb.sample_smc(optimum=optimum, model=model, random_seed=task.seed, progressbar=False)
+    # What is not named is left to `sample_smc`.
+    adjustment: dict[str, Any] = (
+        {"adjust": prb.posterior.GivenEstimate()} if "adjust" in settings else {}
+    )
+    tree = prb.sample_smc(
+        optimum=optimum, model=model, random_seed=task.seed, progressbar=False, **adjustment
+    )
     return in_pymc.draws(tree.posterior, task.problem)
 
 
@@ -41,10 +49,12 @@ METRICS = {
     "area": "AreaMetric",
     "log-likelihood": "LogLikelihood",
 }
-RIVALS = tuple(
+_DEFAULT = tuple(
     Rival(f"prbayes {name}", PACKAGES, {"metric": metric}, calibrate)
     for name, metric in METRICS.items()
 )
+_GIVEN = {"metric": "ProbabilityResidual", "adjust": "GivenEstimate"}
+RIVALS = (*_DEFAULT, Rival("prbayes PR given estimate", PACKAGES, _GIVEN, calibrate))
 
 if __name__ == "__main__":
     main(RIVALS)
