@@ -40,7 +40,6 @@ RIVALS = (
     "prbayes KLD",
     "prbayes area",
     "prbayes log-likelihood",
-    "prbayes PR given estimate",
     "hierarchical PyMC",
     "stock PyMC",
     "pyABC Wasserstein",

@@ -1,7 +1,5 @@
 """prbayes at its defaults, with each metric: the optimum, then `sample_smc`.
 
-"given estimate" is the probability residual with the other adjustment of the draws.
-
 uv run python -m benchmarks.scoreboard.rivals.prbayes
 """
 
@@ -32,13 +30,7 @@ def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
         response = _of_vector(task) if task.problem.correlation else task.response
         prb.Simulator("y", response, *inputs, metric=metric, observed=task.observed)
     optimum = prb.minimize(model, progressbar=False)
-    # What is not named is left to `sample_smc`.
-    adjustment: dict[str, Any] = (
-        {"adjust": prb.posterior.GivenEstimate()} if "adjust" in settings else {}
-    )
-    tree = prb.sample_smc(
-        optimum=optimum, model=model, random_seed=task.seed, progressbar=False, **adjustment
-    )
+    tree = prb.sample_smc(optimum=optimum, model=model, random_seed=task.seed, progressbar=False)
     return in_pymc.draws(tree.posterior, task.problem)
 
 
@@ -49,12 +41,12 @@ METRICS = {
     "area": "AreaMetric",
     "log-likelihood": "LogLikelihood",
 }
-_DEFAULT = tuple(
-    Rival(f"prbayes {name}", PACKAGES, {"metric": metric}, calibrate)
+# What the defaults were, so that results of other defaults are not gone on with.
+_DEFAULTS = {"adjust": "given the estimate"}
+RIVALS = tuple(
+    Rival(f"prbayes {name}", PACKAGES, {"metric": metric} | _DEFAULTS, calibrate)
     for name, metric in METRICS.items()
 )
-_GIVEN = {"metric": "ProbabilityResidual", "adjust": "GivenEstimate"}
-RIVALS = (*_DEFAULT, Rival("prbayes PR given estimate", PACKAGES, _GIVEN, calibrate))
 
 if __name__ == "__main__":
     main(RIVALS)
