@@ -28,7 +28,7 @@ METRICS = {
 POSTERIORS = {
     "Gibbs, calibrated epsilon": "plain",
     "sandwich": "sandwich",
-    "**adjusted (default)**": "affine",
+    "**straight line**": "affine",
     "bootstrap": "bootstrap",
     "exact": "exact",
 }

@@ -284,7 +284,7 @@ def seed_number(random_seed: object, name: str = "random_seed") -> int:
 
 def refuse_single_precision(caller: str, dtype: str) -> None:
     """Raise if hyperparameters are numbers of single precision."""
-    if dtype not in ("float64", "longdouble"):
+    if dtype in ("float16", "float32"):
         raise TypeError(
             f"{caller}: got hyperparameters of {dtype}, expected float64, without which "
             "differences between populations are lost in rounding; set "

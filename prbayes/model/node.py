@@ -289,7 +289,7 @@ def _log_density(
         "prb.sample_smc, which calibrates it"
     )
     if np.isnan(node.epsilon_value):
-        _log.warning("%s", unset)  # nutpie tells no more of an error than its number
+        _log.info("%s", unset)  # nutpie tells no more of an error than its number
     check = CheckParameterValue(unset)
     epsilon = check(node.epsilon, pt.gt(node.epsilon, 0.0))
     inputs = node.bound.inputs

@@ -80,6 +80,8 @@ class Adjusted:
     # Of estimates as far out as that of the data, among those that the prior leads to.
     prior_probability: float = np.nan
     warnings: tuple[str, ...] = ()
+    # Of the draws, up to a constant, shape (...,); None where it is not known.
+    log_likelihood: Floats | None = None
 
     @property
     def note(self) -> str:
@@ -287,6 +289,10 @@ class Affine:
         moves = _moves(draws, out)
         # Of several modes the one that the prior allows most.
         allowed = max((found.allowed for found in mapped), key=least_probability)
+        # Of several modes the constants between them are not known.
+        likelihood = mapped[0].log_likelihood if len(modes) == 1 else None
+        if likelihood is not None:
+            likelihood = likelihood.reshape(thetas.shape[:-1])
         return Adjusted(
             out.reshape(thetas.shape),
             self._said(mapped, len(modes), len(draws), design_variance),
@@ -301,6 +307,7 @@ class Affine:
                 *_of_noise(center_error, width_error, self._refits),
                 *of_another_family(mapped[0].fit_probability),
             ),
+            log_likelihood=likelihood,
         )
 
     @property
@@ -356,6 +363,7 @@ class Mapped:
     allowed: dict[str, float]  # as in `_Told`
     given: bool = False  # whether they are draws given the estimate, and not only mapped
     doubts: tuple[str, ...] = ()  # what speaks against them
+    log_likelihood: Floats | None = None  # (n,): of the draws, where it is known
 
 
 _UNADJUSTED = "the draws are not adjusted: {}; their width is epsilon's"

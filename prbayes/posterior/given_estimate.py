@@ -159,6 +159,7 @@ class GivenEstimate(Affine):
             center_error=center_error,
             width_error=width_error,
             doubts=self._doubts(look, found),
+            log_likelihood=look.log_likelihood(found.model, found.draws),
         )
 
     def _followed(self, look: _Look, draws: Floats, rng: np.random.Generator) -> _Found:
@@ -361,6 +362,10 @@ class _Look:
             return np.where(np.isnan(total), -np.inf, total)
 
         return _walked(log_density, draws, rng)
+
+    def log_likelihood(self, model: SamplingModel, draws: Floats) -> Floats:
+        """Return the log-density of the estimate at draws, (n,)."""
+        return model.log_likelihood(self.kinds(draws), self.estimate, self.variance)
 
     def strain(self, model: SamplingModel, draws: Floats) -> float:
         """Return how far out the estimate is for a typical draw, in standard deviations."""

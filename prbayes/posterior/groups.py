@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import xarray as xr
 
@@ -29,6 +31,7 @@ def arviz_groups(
     particles: Floats,
     discrepancies: Floats,
     thetas: Floats,
+    known: Floats | None,
     seed: int | None,
 ) -> dict[str, xr.Dataset]:
     """Return groups that cost no response.
@@ -43,6 +46,8 @@ def arviz_groups(
         Those of them.
     thetas : ndarray, shape (chains, draws, d)
         Draws after it, or the same.
+    known : ndarray, shape (chains, draws), or None
+        Their log-likelihood, where the adjustment knows it.
     seed : int or None
 
     Returns
@@ -60,7 +65,7 @@ def arviz_groups(
         "prior": _variables(evaluator, prior[None]),
         "log_prior": _log_prior(evaluator, thetas),
     }
-    likelihood = _log_likelihood(evaluator, particles, discrepancies, thetas)
+    likelihood = _log_likelihood(evaluator, particles, discrepancies, thetas, known)
     if likelihood is not None:
         groups["log_likelihood"] = likelihood
     groups["posterior_predictive"] = _predictive(evaluator, thetas, rng)
@@ -85,16 +90,22 @@ def _predictive(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) 
     At every draw, or, where these are more numbers than are held at once, at some of them.
     """
     chains, draws, d = thetas.shape
-    stored = [k for k, node in enumerate(evaluator.nodes) if node.bound.n_per_theta == 0]
-    numbers = sum(evaluator.nodes[k].target.observed.size for k in stored)
-    every = -(-chains * draws * numbers // AT_ONCE) or 1
-    some = thetas[:, ::every]
+    nodes = evaluator.nodes
+    stored = [k for k, node in enumerate(nodes) if node.bound.n_per_theta == 0]
+    of_one = sum(nodes[k].target.observed.size for k in stored)
+    numbers = chains * draws * of_one
+    every = max(1, math.ceil(numbers / AT_ONCE))
+    kept = np.arange(draws)[::every]
+    some = thetas[:, kept]
+    leading = some.shape[:2]
+    rows = some.reshape(-1, d)
     drawn = {}
     for k in stored:
-        values = _specimens(evaluator, k, some.reshape(-1, d), rng)
-        drawn[evaluator.nodes[k].name] = values.reshape(*some.shape[:2], *values.shape[1:])
-    found = labelled_responses(evaluator, drawn, some.shape[:2])
-    return found.assign_coords(draw=np.arange(draws)[::every])
+        values = _specimens(evaluator, k, rows, rng)
+        by_chain = values.reshape(*leading, *values.shape[1:])
+        drawn[nodes[k].name] = by_chain
+    found = labelled_responses(evaluator, drawn, leading)
+    return found.assign_coords(draw=kept)
 
 
 def _log_prior(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
@@ -111,14 +122,18 @@ def _log_prior(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
 
 
 def _log_likelihood(
-    evaluator: Evaluator, particles: Floats, discrepancies: Floats, thetas: Floats
+    evaluator: Evaluator,
+    particles: Floats,
+    discrepancies: Floats,
+    thetas: Floats,
+    known: Floats | None,
 ) -> xr.Dataset | None:
     r"""Return the log-likelihood that the draws are of, up to a constant, in two parts.
 
     An adjustment maps draws of :math:`p(\theta) e^{\ell(\theta)}` by an affine
     :math:`\theta' = T(\theta)`, so that theirs is
     :math:`\ell'(\theta') = \ell(\theta) + \log p(\theta) - \log p(\theta')`. None, where the map
-    was another one.
+    was another one, and the adjustment does not know it.
     """
     chains, draws, d = thetas.shape
     before, after = particles.reshape(-1, d), thetas.reshape(-1, d)
@@ -128,7 +143,9 @@ def _log_likelihood(
     there = Evaluation(log_prior, evaluator.log_other(before), found, np.full_like(found, np.nan))
     own = there.log_likelihood(evaluator.epsilon)
     adjustment = np.zeros(len(after))
-    if thetas is not particles:
+    if known is not None:
+        own = known.ravel()
+    elif thetas is not particles:
         if not _is_affine(before, after):
             return None
         adjustment = log_prior - evaluator.hyperparameters.log_prior(after)
@@ -145,12 +162,21 @@ def _is_affine(before: Floats, after: Floats) -> bool:
     if n <= 2 * (d + 1):
         return False
     # Of those in the middle: a few far out are drawn in.
-    away = np.abs(before - np.median(before, axis=0)) / np.maximum(before.std(axis=0), 1e-300)
-    middle = np.argsort(away.max(axis=1))[: n // 2]
+    away = _farthest(before - np.median(before, axis=0), before)
+    nearest = np.argsort(away)
+    middle = nearest[: n // 2]
     terms = np.column_stack([np.ones(n), before])
-    coefficients = np.linalg.lstsq(terms[middle], after[middle])[0]
-    off = np.abs(after - terms @ coefficients) / np.maximum(after.std(axis=0), 1e-300)
-    return bool((off.max(axis=1) > _OFF_THE_MAP).mean() <= _FAR_OUT_DRAWS)
+    coefficients, *_ = np.linalg.lstsq(terms[middle], after[middle])
+    off = _farthest(after - terms @ coefficients, after)
+    far = off > _OFF_THE_MAP
+    return bool(far.mean() <= _FAR_OUT_DRAWS)
+
+
+def _farthest(shifts: Floats, draws: Floats) -> Floats:
+    """Return the largest element of each shift, (n, d), in standard deviations of draws, (n,)."""
+    unit = np.maximum(draws.std(axis=0), 1e-300)
+    relative = np.abs(shifts) / unit
+    return np.asarray(relative.max(axis=1))
 
 
 def _specimens(evaluator: Evaluator, k: int, thetas: Floats, rng: np.random.Generator) -> Floats:
@@ -159,7 +185,8 @@ def _specimens(evaluator: Evaluator, k: int, thetas: Floats, rng: np.random.Gene
     They are specimens of the population's points, by weight and with replacement.
     """
     node = evaluator.nodes[k]
-    size, event = len(node.target.observed), node.target.event
+    size = len(node.target.observed)
+    event = node.target.event
     drawn = np.full((len(thetas), size, *event), np.nan)
     step = max(1, AT_ONCE // node.bound.n_points)
     for first in range(0, len(thetas), step):
@@ -168,9 +195,13 @@ def _specimens(evaluator: Evaluator, k: int, thetas: Floats, rng: np.random.Gene
         if not where.size:
             continue
         values, weights = node.bound.populations([root[where] for root in roots])
-        for place, points, mass in zip(first + where, values, weights, strict=True):
-            edges = np.cumsum(np.where(lacking(points), 0.0, mass))
-            if edges[-1] > 0:
-                uniform = rng.random(size) * edges[-1]
-                drawn[place] = points[np.searchsorted(edges, uniform, side="right")]
+        places = first + where
+        for place, points, mass in zip(places, values, weights, strict=True):
+            counted = np.where(lacking(points), 0.0, mass)
+            edges = np.cumsum(counted)
+            total = edges[-1]
+            if total > 0:
+                uniform = rng.random(size) * total
+                chosen = np.searchsorted(edges, uniform, side="right")
+                drawn[place] = points[chosen]
     return drawn

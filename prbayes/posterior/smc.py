@@ -279,6 +279,7 @@ def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
                     particles.thetas,
                     particles.discrepancies,
                     found.thetas,
+                    found.log_likelihood,
                     asked.random_seed,
                 )
             return posterior_tree(
@@ -431,6 +432,11 @@ class _Draws:
     def note(self) -> str:
         """What the adjustment did, or why nothing."""
         return "none" if self.adjusted is None else self.adjusted.note
+
+    @property
+    def log_likelihood(self) -> Floats | None:
+        """That of the draws, (chains, draws), where the adjustment knows it."""
+        return None if self.adjusted is None else self.adjusted.log_likelihood
 
     @property
     def reason(self) -> str | None:

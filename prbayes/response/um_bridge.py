@@ -201,9 +201,12 @@ class RemoteModel:
         parts = [np.ravel(x).astype(np.float64) for x in inputs]
         self._refuse_inputs(self.model, [part.size for part in parts])
         ends = np.cumsum(self.inputs)[:-1]
-        vectors = [vector.tolist() for vector in np.split(np.concatenate(parts), ends)]
-        asked = {"name": self.model, "input": vectors, "config": json.loads(self.config)}
-        values = self._read(self.server.evaluated(asked).get("output"))
+        numbers = np.concatenate(parts)
+        vectors = [vector.tolist() for vector in np.split(numbers, ends)]
+        config = json.loads(self.config)
+        asked = {"name": self.model, "input": vectors, "config": config}
+        answer = self.server.evaluated(asked)
+        values = self._read(answer.get("output"))
         return values if sum(self.outputs) > 1 else float(values[0])
 
     def refuse_misfit(self, name: str, sizes: Sequence[int], outputs: Outputs | None) -> None:

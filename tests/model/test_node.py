@@ -383,7 +383,8 @@ def test_data_that_do_not_fit_what_goes_with_them_are_refused() -> None:
 def test_an_epsilon_that_is_not_set_is_told_when_the_density_is_made(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    build(prb.Reweighted(64), epsilon=None).logp()
+    with caplog.at_level("INFO", "prbayes"):
+        build(prb.Reweighted(64), epsilon=None).logp()
     assert "y: epsilon is not set; call prb.set_epsilon(model" in caplog.text
 
 

@@ -368,7 +368,9 @@ def test_responses_are_counted_under_other_propagations() -> None:
 
 def test_the_tree_is_complete() -> None:
     model, idata = area_run()
-    assert set(idata.children) == {"posterior", "sample_stats", "calibration", "observed_data"}
+    own = {"posterior", "sample_stats", "calibration", "observed_data"}
+    of_arviz = {"prior", "log_prior", "log_likelihood", "posterior_predictive", "prior_predictive"}
+    assert set(idata.children) == own | of_arviz
     assert idata.posterior.sizes == {"chain": 4, "draw": 500}
     stats = idata.sample_stats
     for row in stats["beta"].values:
