@@ -9,17 +9,77 @@ if TYPE_CHECKING:
 
 __version__ = version("prbayes")
 
+# Names of `_public`, each there when it is asked for.
+__all__ = [  # noqa: F405
+    "AreaMetric",
+    "Diagnosis",
+    "Fresh",
+    "FunctionMetric",
+    "GaussianKDE",
+    "Histogram",
+    "Joint",
+    "KullbackLeibler",
+    "LogLikelihood",
+    "MarginalCorrelation",
+    "Metric",
+    "Optimum",
+    "ProbabilityResidual",
+    "Report",
+    "Resimulated",
+    "Reweighted",
+    "Simulator",
+    "Surrogate",
+    "abc_distance",
+    "adjust",
+    "area_test",
+    "bootstrap",
+    "calibrate_epsilon",
+    "command",
+    "compare",
+    "cost",
+    "cross_validate",
+    "datasets",
+    "decision",
+    "diagnose",
+    "exceedance",
+    "fmu",
+    "metrics",
+    "minimize",
+    "plan",
+    "plot_comparison",
+    "plot_landscape",
+    "plot_optimizer",
+    "plot_outputs",
+    "plot_population",
+    "plot_posterior",
+    "plot_responses",
+    "plot_stages",
+    "plot_validity",
+    "plots",
+    "posterior",
+    "predict",
+    "propagation",
+    "refine",
+    "reports",
+    "response",
+    "sample_smc",
+    "scalar",
+    "sensitivity",
+    "set_epsilon",
+    "simulation_based_calibration",
+    "surrogate",
+    "umbridge",
+    "validation",
+]
+
 
 def __getattr__(name: str) -> Any:
     """Load the public names when the first is asked for: the command line answers before."""
-    # What Python itself looks for in any module is none of them.
-    if name == "__all__" or not name.startswith("_"):
-        public = import_module("prbayes._public")
-        if hasattr(public, name):
-            return getattr(public, name)
+    if name in __all__:
+        return getattr(import_module("prbayes._public"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
     """Return what there is, for completion."""
-    return [*globals(), *__getattr__("__all__")]
+    return [*globals(), *__all__]

@@ -1,122 +1,61 @@
 """What users type: the public names of the package, which it loads when the first is asked for."""
 
-from prbayes import (
-    datasets,
-    decision,
-    metrics,
-    plots,
-    posterior,
-    propagation,
-    reports,
-    response,
-    surrogate,
-    validation,
-)
-from prbayes._compare import compare
-from prbayes._diagnose import Diagnosis, diagnose
-from prbayes._predict import predict
-from prbayes.decision.influence import sensitivity
-from prbayes.decision.planning import plan
-from prbayes.decision.tail import exceedance
-from prbayes.estimate.minimization import minimize, refine
-from prbayes.estimate.optimum import Optimum
-from prbayes.metrics.area import AreaMetric
-from prbayes.metrics.base import Metric
-from prbayes.metrics.correlation import MarginalCorrelation
-from prbayes.metrics.density import GaussianKDE, Histogram
-from prbayes.metrics.divergence import KullbackLeibler
-from prbayes.metrics.function import FunctionMetric
-from prbayes.metrics.joint import Joint
-from prbayes.metrics.likelihood import LogLikelihood
-from prbayes.metrics.residual import ProbabilityResidual
-from prbayes.model.costing import cost
-from prbayes.model.epsilon import set_epsilon
-from prbayes.model.simulator import Simulator
-from prbayes.model.stock import abc_distance
-from prbayes.plots.comparison import plot_comparison
-from prbayes.plots.landscape import plot_landscape
-from prbayes.plots.optimizer import plot_optimizer
-from prbayes.plots.outputs import plot_outputs
-from prbayes.plots.population import plot_population
-from prbayes.plots.posterior import plot_posterior
-from prbayes.plots.responses import plot_responses
-from prbayes.plots.stages import plot_stages
-from prbayes.plots.validity import plot_validity
-from prbayes.posterior.adjusting import adjust
-from prbayes.posterior.bootstrapping import bootstrap
-from prbayes.posterior.epsilon import calibrate_epsilon
-from prbayes.posterior.sbc import simulation_based_calibration
-from prbayes.posterior.smc import sample_smc
-from prbayes.propagation.fresh import Fresh
-from prbayes.propagation.resimulated import Resimulated
-from prbayes.propagation.reweighted import Reweighted
-from prbayes.reports.report import Report
-from prbayes.response.calling import scalar
-from prbayes.response.mock_up import fmu
-from prbayes.response.program import command
-from prbayes.response.um_bridge import umbridge
-from prbayes.surrogate.surrogate import Surrogate
-from prbayes.validation.cross_validation import cross_validate
-from prbayes.validation.validity import area_test
-
-__all__ = [
-    "AreaMetric",
-    "Diagnosis",
-    "Fresh",
-    "FunctionMetric",
-    "GaussianKDE",
-    "Histogram",
-    "Joint",
-    "KullbackLeibler",
-    "LogLikelihood",
-    "MarginalCorrelation",
-    "Metric",
-    "Optimum",
-    "ProbabilityResidual",
-    "Report",
-    "Resimulated",
-    "Reweighted",
-    "Simulator",
-    "Surrogate",
-    "abc_distance",
-    "adjust",
-    "area_test",
-    "bootstrap",
-    "calibrate_epsilon",
-    "command",
-    "compare",
-    "cost",
-    "cross_validate",
-    "datasets",
-    "decision",
-    "diagnose",
-    "exceedance",
-    "fmu",
-    "metrics",
-    "minimize",
-    "plan",
-    "plot_comparison",
-    "plot_landscape",
-    "plot_optimizer",
-    "plot_outputs",
-    "plot_population",
-    "plot_posterior",
-    "plot_responses",
-    "plot_stages",
-    "plot_validity",
-    "plots",
-    "posterior",
-    "predict",
-    "propagation",
-    "refine",
-    "reports",
-    "response",
-    "sample_smc",
-    "scalar",
-    "sensitivity",
-    "set_epsilon",
-    "simulation_based_calibration",
-    "surrogate",
-    "umbridge",
-    "validation",
-]
+from prbayes import datasets as datasets
+from prbayes import decision as decision
+from prbayes import metrics as metrics
+from prbayes import plots as plots
+from prbayes import posterior as posterior
+from prbayes import propagation as propagation
+from prbayes import reports as reports
+from prbayes import response as response
+from prbayes import surrogate as surrogate
+from prbayes import validation as validation
+from prbayes._compare import compare as compare
+from prbayes._diagnose import Diagnosis as Diagnosis
+from prbayes._diagnose import diagnose as diagnose
+from prbayes._predict import predict as predict
+from prbayes.decision.influence import sensitivity as sensitivity
+from prbayes.decision.planning import plan as plan
+from prbayes.decision.tail import exceedance as exceedance
+from prbayes.estimate.minimization import minimize as minimize
+from prbayes.estimate.minimization import refine as refine
+from prbayes.estimate.optimum import Optimum as Optimum
+from prbayes.metrics.area import AreaMetric as AreaMetric
+from prbayes.metrics.base import Metric as Metric
+from prbayes.metrics.correlation import MarginalCorrelation as MarginalCorrelation
+from prbayes.metrics.density import GaussianKDE as GaussianKDE
+from prbayes.metrics.density import Histogram as Histogram
+from prbayes.metrics.divergence import KullbackLeibler as KullbackLeibler
+from prbayes.metrics.function import FunctionMetric as FunctionMetric
+from prbayes.metrics.joint import Joint as Joint
+from prbayes.metrics.likelihood import LogLikelihood as LogLikelihood
+from prbayes.metrics.residual import ProbabilityResidual as ProbabilityResidual
+from prbayes.model.costing import cost as cost
+from prbayes.model.epsilon import set_epsilon as set_epsilon
+from prbayes.model.simulator import Simulator as Simulator
+from prbayes.model.stock import abc_distance as abc_distance
+from prbayes.plots.comparison import plot_comparison as plot_comparison
+from prbayes.plots.landscape import plot_landscape as plot_landscape
+from prbayes.plots.optimizer import plot_optimizer as plot_optimizer
+from prbayes.plots.outputs import plot_outputs as plot_outputs
+from prbayes.plots.population import plot_population as plot_population
+from prbayes.plots.posterior import plot_posterior as plot_posterior
+from prbayes.plots.responses import plot_responses as plot_responses
+from prbayes.plots.stages import plot_stages as plot_stages
+from prbayes.plots.validity import plot_validity as plot_validity
+from prbayes.posterior.adjusting import adjust as adjust
+from prbayes.posterior.bootstrapping import bootstrap as bootstrap
+from prbayes.posterior.epsilon import calibrate_epsilon as calibrate_epsilon
+from prbayes.posterior.sbc import simulation_based_calibration as simulation_based_calibration
+from prbayes.posterior.smc import sample_smc as sample_smc
+from prbayes.propagation.fresh import Fresh as Fresh
+from prbayes.propagation.resimulated import Resimulated as Resimulated
+from prbayes.propagation.reweighted import Reweighted as Reweighted
+from prbayes.reports.report import Report as Report
+from prbayes.response.calling import scalar as scalar
+from prbayes.response.mock_up import fmu as fmu
+from prbayes.response.program import command as command
+from prbayes.response.um_bridge import umbridge as umbridge
+from prbayes.surrogate.surrogate import Surrogate as Surrogate
+from prbayes.validation.cross_validation import cross_validate as cross_validate
+from prbayes.validation.validity import area_test as area_test

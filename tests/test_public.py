@@ -6,6 +6,7 @@ import sys
 import pytest
 
 import prbayes as prb
+from prbayes import _public
 
 
 def test_nothing_is_loaded_before_a_public_name_is_asked_for() -> None:
@@ -27,3 +28,8 @@ def test_what_there_is_not_is_told_by_the_package_s_own_name() -> None:
             getattr(prb, name)
     assert {"minimize", "decision", "__version__"} <= set(dir(prb))
     assert not hasattr(prb, "Nothing")
+
+
+def test_all_names_that_are_loaded_are_public_and_no_others() -> None:
+    loaded = {name for name in vars(_public) if not name.startswith("_")}
+    assert loaded == set(prb.__all__)
