@@ -28,7 +28,7 @@ METRICS = {
 POSTERIORS = {
     "Gibbs, calibrated epsilon": "plain",
     "sandwich": "sandwich",
-    "**straight line**": "affine",
+    "**adjusted (default)**": "affine",
     "bootstrap": "bootstrap",
     "exact": "exact",
 }

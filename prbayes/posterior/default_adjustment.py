@@ -1,4 +1,4 @@
-"""How draws are adjusted where nobody chose: given the estimate, or not at all where none need be.
+"""How draws are adjusted where nobody chose: by the straight map, or not at all where none need be.
 
 The choice rests on ``benchmarks/posterior.py``.
 """
@@ -15,7 +15,6 @@ from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.adjustment import Adjusted, Affine, Mapped
-from prbayes.posterior.given_estimate import GivenEstimate
 
 # How results say that nothing had to be done.
 NONE_NEEDED = "none needed: the draws of the log-likelihood are the posterior"
@@ -34,11 +33,11 @@ class _LikelihoodDraws(Affine):
     ) -> Adjusted:
         """Return the draws, with what refits tell.
 
-        Where designs leave the estimate uncertain, `GivenEstimate` widens the draws by that.
+        Where designs leave the estimate uncertain, `Affine` widens the draws by that.
         """
         if AGREE < design_error < np.inf:
-            given = GivenEstimate(self.n_sets, self.random_seed)
-            return given(evaluator, thetas, optima, design_error)
+            affine = Affine(self.n_sets, self.random_seed)
+            return affine(evaluator, thetas, optima, design_error)
         found = super().__call__(evaluator, thetas, optima, design_error)
         if found.reason is not None:  # nothing could be refitted
             return Adjusted(thetas, NONE_NEEDED)
@@ -54,7 +53,7 @@ class _LikelihoodDraws(Affine):
 
 def default_adjustment(evaluator: Evaluator) -> Affine:
     """Return what adjusts the draws of a model by default."""
-    return _LikelihoodDraws() if _is_likelihood(evaluator) else GivenEstimate()
+    return _LikelihoodDraws() if _is_likelihood(evaluator) else Affine()
 
 
 def _is_likelihood(evaluator: Evaluator) -> bool:

@@ -63,6 +63,8 @@ class GivenEstimate(Affine):
     its bias, spread and skewness, each changing with them. The density of the estimate that was
     found is a likelihood, to which the prior is added exactly, and draws are made from both.
 
+    Where a response is folded, the width of the draws depends on ``random_seed``: compare two.
+
     Where responses are not stored, or too few of these fits arrive, the draws are those of
     `Affine`, and the result says so.
 
