@@ -101,14 +101,14 @@ def sample_smc(
     refine : bool
         Whether designs of `Reweighted` that do not support the posterior get more points.
     start : mapping or sequence of mapping, optional
-        Particles to begin with, for all chains or for each: arrays (draws, *shape) by the names of
+        Particles to begin with, for all chains or for each: arrays, (draws, ...), by the names of
         the free variables, or of their transformed values, such as ``sigma_log__``. They have to
         be draws of the prior, as they are by default: others lead to another posterior.
     cores : int, optional
         Most threads that linear algebra takes. Particles are evaluated in batches in this process,
         one chain after the other; responses are computed by a propagation's ``executor``.
     return_inferencedata : bool
-        With False a `pymc.backends.base.MultiTrace` of the draws alone.
+        With False a ``pymc.backends.base.MultiTrace`` of the draws alone.
     idata_kwargs : dict, optional
         ``log_likelihood=False`` and ``log_prior=False`` leave these groups out; ``dims`` and
         ``coords`` name dimensions and coordinates that the model does not name.
