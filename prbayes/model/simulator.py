@@ -84,8 +84,8 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         Measured responses, of at least two specimens. Several outputs of each, (N, m), go with a
         metric that sees them together, such as `Joint`: an array, a DataFrame whose columns are
         outputs, a DataArray with specimens first, or a mapping of arrays. NaN is an output that was
-        not measured, +inf a specimen that had failed. After ``pymc.set_data`` or ``pymc.observe`` the
-        metric is prepared against the new values, and no response is computed anew.
+        not measured, +inf a specimen that had failed. After ``pymc.set_data`` or ``pymc.observe``
+        the metric is prepared against the new values, and no response is computed anew.
     epsilon : float, optional
         Scale of the discrepancy. 1/N for metrics on the scale of a likelihood, N the effective
         number of specimens; unset for the others, until `calibrate_epsilon` and `set_epsilon`, or
