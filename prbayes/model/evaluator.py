@@ -96,8 +96,9 @@ class Evaluator:
     @property
     def is_current(self) -> bool:
         """Whether the model has the data that this was made with: `pymc.set_data` changes them."""
-        now = required_nodes(self.model).values()
-        return all(a is b for a, b in zip(now, self.nodes, strict=True))
+        now = list(required_nodes(self.model).values())
+        same = zip(now, self.nodes, strict=False)
+        return len(now) == len(self.nodes) and all(a is b for a, b in same)
 
     @property
     def names(self) -> list[str]:

@@ -64,7 +64,8 @@ def adjust(
     -------
     xarray.DataTree
         Groups ``posterior``, the draws where they should be, with the attribute ``adjustment`` and
-        those that `sample_smc` gives besides; ``unadjusted``, those that were given;
+        those that `sample_smc` gives besides; ``unadjusted``, those that were given, if an
+        adjustment was needed and could be made;
         ``calibration`` and ``observed_data``, as of `sample_smc`; and those given that do not
         depend on the draws, or tell how they were drawn (``sample_stats``, ``prior`` and the
         like). Predictions and log-likelihoods of the draws before are left out.
@@ -114,6 +115,7 @@ def adjust(
     _refuse_other(idata)
     require_of_model(idata, model, "adjust", Level.OPTIMUM)
     evaluator = evaluator_of(model, optimum, "adjust")
+    _require_same_data(idata, evaluator)
     obstacle = refit_obstacle(evaluator)
     if obstacle is not None:
         raise ValueError(f"adjust: the draws cannot be adjusted: {obstacle}")
@@ -135,6 +137,29 @@ def _refuse_other(idata: object) -> None:
             f"adjust: got draws that were adjusted before ({before}), expected those of a sampler; "
             "they are in the group `unadjusted`"
         )
+
+
+def _require_same_data(idata: xr.DataTree, evaluator: Evaluator) -> None:
+    """Raise if the draws are given other data than the model's, as far as they tell.
+
+    A simulator goes by its name, or, where there is one on either side, by that.
+    """
+    if "observed_data" not in idata.children:
+        return
+    given = idata["observed_data"].to_dataset()
+    names = list(given.data_vars)
+    for node in evaluator.nodes:
+        only = len(names) == len(evaluator.nodes) == 1
+        name = names[0] if only else node.name
+        if name not in given:
+            continue
+        values = given[name].values
+        same = values.shape == node.target.observed.shape
+        if not same or not np.allclose(values, node.target.observed, rtol=1e-6, equal_nan=True):
+            raise ValueError(
+                f"adjust: idata: got draws given other data ({name}) than {node.name} observes, "
+                "expected those of the model; pass the model that was sampled"
+            )
 
 
 def _thetas(idata: xr.DataTree, evaluator: Evaluator) -> Floats:
@@ -203,8 +228,8 @@ def _adjusted(
         return adjusted_tree(
             evaluator,
             idata,
-            draws.thetas,
             found.thetas,
+            unadjusted=None if found.thetas is draws.thetas else draws.thetas,
             adjustment=found.note,
             measured=found.measured,
             warnings=(*optimum.warnings, *found.warnings),

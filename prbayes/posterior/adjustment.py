@@ -242,6 +242,27 @@ class Affine:
         -------
         Adjusted
         """
+        chosen = self._serving(evaluator, design_error)
+        if chosen is not self:
+            return chosen(evaluator, thetas, optima, design_error)
+        return self._concluded(self._of_modes(evaluator, thetas, optima, design_error), thetas)
+
+    def _serving(self, evaluator: Evaluator, design_error: float) -> Affine:
+        """Return the adjustment that can be made: this one, or one that asks for less."""
+        return self
+
+    def _concluded(self, found: Adjusted, given: Floats) -> Adjusted:
+        """Return what is said of draws that were given."""
+        return found
+
+    def _of_modes(
+        self,
+        evaluator: Evaluator,
+        thetas: Floats,
+        optima: Sequence[Floats],
+        design_error: float,
+    ) -> Adjusted:
+        """Map the draws of each mode, or say why not."""
         obstacle = refit_obstacle(evaluator)
         if obstacle is not None:
             return Adjusted(thetas, reason=obstacle)

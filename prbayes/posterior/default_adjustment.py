@@ -5,7 +5,6 @@ The choice rests on ``benchmarks/posterior.py``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,24 +23,17 @@ NONE_NEEDED = "none needed: the draws of the log-likelihood are the posterior"
 class _LikelihoodDraws(Affine):
     """Draws that stay as they are; refits only tell whether the family of the inputs fits."""
 
-    def __call__(
-        self,
-        evaluator: Evaluator,
-        thetas: Floats,
-        optima: Sequence[Floats],
-        design_error: float = 0.0,
-    ) -> Adjusted:
-        """Return the draws, with what refits tell.
-
-        Where designs leave the estimate uncertain, `Affine` widens the draws by that.
-        """
+    def _serving(self, evaluator: Evaluator, design_error: float) -> Affine:
+        """Return this, or `Affine`, which widens draws where designs leave estimates uncertain."""
         if AGREE < design_error < np.inf:
-            affine = Affine(self.n_sets, self.random_seed)
-            return affine(evaluator, thetas, optima, design_error)
-        found = super().__call__(evaluator, thetas, optima, design_error)
-        if found.reason is not None:  # nothing could be refitted
-            return Adjusted(thetas, NONE_NEEDED)
-        return replace(found, thetas=thetas, done=NONE_NEEDED)
+            return Affine(self.n_sets, self.random_seed)
+        return self
+
+    def _concluded(self, found: Adjusted, given: Floats) -> Adjusted:
+        """Return the draws as they were given, with what refits tell if anything was refitted."""
+        if found.reason is not None:
+            return Adjusted(given, NONE_NEEDED)
+        return replace(found, thetas=given, done=NONE_NEEDED)
 
     def _mapped(
         self, sampling: SamplingDistribution, draws: Floats, design_variance: float

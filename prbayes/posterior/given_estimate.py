@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +15,6 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.support import TOLERABLE, supports_each
 from prbayes.posterior.adjustment import (
     WEAKEST,
-    Adjusted,
     Affine,
     Mapped,
     UnsettledError,
@@ -98,33 +97,11 @@ class GivenEstimate(Affine):
     def _refits(self) -> str:
         return f"GivenEstimate(n_fits={self.n_fits})"
 
-    def __call__(
-        self,
-        evaluator: Evaluator,
-        thetas: Floats,
-        optima: Sequence[Floats],
-        design_error: float = 0.0,
-    ) -> Adjusted:
-        """Draw from the posterior given the estimate, around each mode by itself.
-
-        Parameters
-        ----------
-        evaluator : Evaluator
-            With the epsilons of the draws.
-        thetas : ndarray, shape (..., d)
-        optima : sequence of ndarray, shapes (d,)
-        design_error : float
-            As for `Affine`.
-
-        Returns
-        -------
-        Adjusted
-        """
+    def _serving(self, evaluator: Evaluator, design_error: float) -> Affine:
+        """Return this, or `Affine` where data sets along the posterior would cost responses."""
         if all(node.bound.stored for node in evaluator.nodes):
-            return super().__call__(evaluator, thetas, optima, design_error)
-        # Data sets along the posterior would cost a response for each of their specimens.
-        affine = Affine(self.n_sets, self.random_seed)
-        return affine(evaluator, thetas, optima, design_error)
+            return self
+        return Affine(self.n_sets, self.random_seed)
 
     def _distrust(self, moves: Floats, mapped: list[Mapped], names: list[str]) -> list[str]:
         """Say where draws rest on an extrapolation, or are not where they should be."""

@@ -118,9 +118,9 @@ _OF_DRAWS = ("posterior_predictive", "predictions", "log_likelihood", "log_prior
 def adjusted_tree(
     evaluator: Evaluator,
     given: xr.DataTree,
-    before: Floats,
     thetas: Floats,
     *,
+    unadjusted: Floats | None,
     adjustment: str,
     measured: dict[str, float],
     warnings: tuple[str, ...],
@@ -133,9 +133,8 @@ def adjusted_tree(
     evaluator : Evaluator
     given : DataTree
         The sampler's.
-    before, thetas : ndarray, shapes (chains, draws, d)
-        The draws before and after the adjustment.
-    adjustment, measured, warnings
+    thetas : ndarray, shape (chains, draws, d)
+    unadjusted, adjustment, measured, warnings
         As in `posterior_tree`.
     seconds : float
     """
@@ -154,9 +153,10 @@ def adjusted_tree(
     attrs = {str(name): value for name, value in given["posterior"].attrs.items()}
     own = {
         "posterior": _posterior(evaluator, thetas, {**attrs, **told}),
-        "unadjusted": _draws(evaluator, before),
         "calibration": calibration.assign_attrs(told),
     }
+    if unadjusted is not None:
+        own["unadjusted"] = _draws(evaluator, unadjusted)
     coords = given["posterior"].coords
     where = {name: coords[name].values for name in ("chain", "draw") if name in coords}
     groups = {name: group.assign_coords(where) for name, group in own.items()}

@@ -273,13 +273,30 @@ class Corrected:
                 f"{self.__name__}: got a mapping, expected an array of outputs, each of which has "
                 "a condition"
             )
+        response = np.asarray(response)
         coefficients = np.asarray(coefficients)
+        self._refuse_outputs(response, coefficients.ndim - len(self.inadequacy.event))
         if self.condition.ndim:
             # Outputs are the last axis, behind which the coefficients are.
             place = coefficients.ndim - len(self.inadequacy.event)
             coefficients = np.expand_dims(coefficients, place)
         value = self.inadequacy.value(coefficients, self.condition)
-        return self.inadequacy.combined(np.asarray(response), value)
+        return self.inadequacy.combined(response, value)
+
+    def _refuse_outputs(self, response: Floats, batch: int) -> None:
+        """Raise unless a response has the outputs that have conditions.
+
+        ``batch`` is the number of axes of specimens that coefficients have; common ones have none.
+        """
+        outputs = self.condition.shape
+        axes = response.ndim - len(outputs)
+        as_many = response.shape[axes:] == outputs
+        common = batch == 0 and axes == 1
+        if response.ndim and not (as_many and (axes == batch or common)):
+            raise ValueError(
+                f"{self.__name__}: got a response of shape {response.shape}, expected "
+                f"{('...', *outputs)}: one output, or one for each condition"
+            )
 
 
 def corrected(function: Callable[..., Any]) -> bool:

@@ -416,3 +416,15 @@ def test_an_evaluator_of_other_data_travels_with_them() -> None:
         assert back.objective(prior=False, gradient=False)(thetas[0], scales) == expected
     assert other.model is evaluator.model
     assert other.nodes[0].bound is evaluator.nodes[0].bound
+
+
+def test_an_evaluator_of_a_model_that_got_another_simulator_is_not_current() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
+        given = {"metric": prb.AreaMetric(), "observed": [0.0, 1.0, 2.0]}
+        prb.Simulator("y", lambda x: x, x, **given)
+    evaluator = Evaluator(model)
+    assert evaluator.is_current
+    with model:
+        prb.Simulator("z", lambda x: 2 * x, x, **given)
+    assert not evaluator.is_current

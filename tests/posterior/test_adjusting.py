@@ -143,3 +143,33 @@ def test_what_cannot_be_adjusted_is_refused_before_any_work() -> None:
     stripped = xr.DataTree.from_dict({"posterior": plain["posterior"].to_dataset().drop_attrs()})
     with pytest.raises(ValueError, match="the draws cannot be adjusted: "):
         prb.adjust(stripped, model=fresh)
+
+
+def test_draws_of_a_likelihood_stay_and_nothing_says_that_they_were_adjusted() -> None:
+    model = build("ll")
+    plain = smc(model, False)
+    same_draws = prb.adjust(plain, model=model)
+    np.testing.assert_allclose(same_draws.posterior["mu"], plain.posterior["mu"], rtol=1e-12)
+    assert "unadjusted" not in same_draws.children
+    assert same_draws.posterior.attrs["adjustment"].startswith("none needed")
+    text = prb.Report("A", posterior=same_draws, pictures=False)._repr_html_()
+    assert "as they were sampled" in text
+    # What is as it was can be adjusted by choice.
+    by = prb.posterior.Affine(n_sets=20)
+    assert "unadjusted" in prb.adjust(same_draws, model=model, by=by).children
+
+
+def test_draws_given_other_data_are_refused() -> None:
+    model = build()
+    draws = smc(model, False)
+    stock = xr.DataTree.from_dict(
+        {
+            "posterior": draws.posterior.to_dataset().drop_attrs(),
+            "observed_data": xr.Dataset({"stock": ("n", TWENTY + 0.1)}),
+        }
+    )
+    with pytest.raises(ValueError, match=r"other data \(stock\) than y observes"):
+        prb.adjust(stock, model=model)
+    stock["observed_data"] = xr.Dataset({"stock": ("n", TWENTY)})
+    by = prb.posterior.Affine(n_sets=20)
+    assert "unadjusted" in prb.adjust(stock, model=model, by=by).children

@@ -127,3 +127,26 @@ def test_predictions_say_that_they_extrapolate(caplog: pytest.LogCaptureFixture)
 def test_it_can_be_pickled() -> None:
     again = pickle.loads(pickle.dumps(prb.response.Additive(TIMES).of(curve, TIMES)))
     np.testing.assert_allclose(again(1.0, 3.0), [1.0, 3.0, 7.0])
+
+
+@pytest.mark.parametrize(
+    ("condition", "response", "coefficients"),
+    [
+        # As many specimens as conditions, or as outputs: nothing may be broadcast by chance.
+        ([0.0, 1.0, 2.0], np.ones(3), np.ones(3)),
+        (1.0, np.ones((3, 3)), np.ones(3)),
+        ([0.0, 1.0, 2.0], np.ones((3, 2)), np.ones(3)),
+        (1.0, np.ones((4, 3)), np.float64(1.0)),
+    ],
+)
+def test_outputs_that_are_not_those_of_the_conditions_are_refused(
+    condition: Any, response: Any, coefficients: Any
+) -> None:
+    corrected = prb.response.Additive([0.0, 2.0]).of(lambda x: response, condition)
+    with pytest.raises(ValueError, match="one output, or one for each condition"):
+        corrected(0.0, coefficients)
+
+
+def test_a_response_that_is_the_same_for_all_specimens_has_its_inadequacy_too() -> None:
+    corrected = prb.response.Additive([0.0, 2.0]).of(lambda: 5.0, 2.0)
+    np.testing.assert_array_equal(corrected(np.array([1.0, 2.0])), [6.0, 7.0])
