@@ -45,7 +45,17 @@ from prbayes.estimate.refinement import (
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.estimate.rivals import Rival, excluded, rivals
 from prbayes.estimate.sampling import Local
-from prbayes.estimate.search import Approach, Run, Search, Trace, approach, minimise, settle
+from prbayes.estimate.search import (
+    Approach,
+    Run,
+    Search,
+    Trace,
+    apart_from_data,
+    approach,
+    best_or_nearest,
+    minimise,
+    settle,
+)
 from prbayes.estimate.search import start as begin
 from prbayes.estimate.solution import assemble, rival_record
 from prbayes.model.evaluator import Evaluator
@@ -487,8 +497,8 @@ def _states(plan: _Plan, begun: _Beginning) -> Iterator[_State]:
     rounds = 0
     while (state := _judged(plan, state, rounds)).restart is not None:
         rounds += 1
-        restart, trace = state.restart, state.run.trace
-        state = yield from _minimised(plan, restart, state.scales, trace, state.cloud)
+        led = _led(plan, state.restart, state)
+        state = yield from _minimised(plan, led.theta, state.scales, led.trace, state.cloud)
     yield state
     # Terminate: other optima, stalled line searches, the error of the design where it ended
     state = _against_rivals(plan, state)
@@ -512,6 +522,11 @@ def _minimised(
     return _State(run.best, scales, run, sampling, cloud=cloud)
 
 
+def _led(plan: _Plan, theta: Floats, state: _State) -> Approach:
+    """Return where the area metric leads from theta; theta itself where the data are near."""
+    return approach(plan.search, theta, state.scales, plan.seed, state.run.trace)
+
+
 def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
     """Judge the designs; where they are not enough, add points and say where to begin again.
 
@@ -532,6 +547,11 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
     short = shortcomings(evaluator, near) or shortcomings(evaluator, state.theta[None])
     if not short:
         # Enough for the populations; for the optimum?
+        if rounds < MAX_ROUNDS and apart_from_data(evaluator, state.theta):
+            # Enough for a minimum that is no fit: on, the way that the area metric leads.
+            ahead = _led(plan, state.theta, state).theta
+            grown = refine_at(evaluator, ahead[None])
+            return replace(state, restart=ahead) if grown else state
         if state.sampling is None:
             return state
         errors = state.sampling.design_error()
@@ -555,7 +575,7 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
             refine_at(evaluator, state.theta[None], again=again)
     # What looked best on a thin design may be an artefact of it.
     candidates = np.vstack([state.theta, near])
-    return replace(state, restart=plan.search.best_of(candidates, state.scales))
+    return replace(state, restart=best_or_nearest(plan.search, candidates, state.scales))
 
 
 def _runs(evaluator: Evaluator) -> int:

@@ -65,6 +65,10 @@ class Trace:
         )
 
 
+# Of a minimisation that has not begun.
+_NOTHING = Trace()
+
+
 @dataclass(frozen=True)
 class Search:
     """What is minimised, and how."""
@@ -258,11 +262,13 @@ class Approach:
     """Where the area metric led."""
 
     theta: Floats  # (d,)
-    trace: Trace
+    trace: Trace  # with the points of those before it
     remark: str = ""  # that it did; empty if there was no need
 
 
-def approach(search: Search, theta: Floats, scales: Floats, seed: int) -> Approach:
+def approach(
+    search: Search, theta: Floats, scales: Floats, seed: int, trace: Trace = _NOTHING
+) -> Approach:
     """Go to where simulated responses overlap with the data, by the area metric.
 
     Without overlap a density metric hardly changes, or changes so that populations get wider
@@ -271,7 +277,7 @@ def approach(search: Search, theta: Floats, scales: Floats, seed: int) -> Approa
     """
     evaluator = search.evaluator
     if not _astray(evaluator, theta):
-        return Approach(theta, Trace())
+        return Approach(theta, trace)
     guide = _Guide(evaluator, scales)
     if not evaluator.responses_per_theta:
         points = evaluator.prior_points(THETAS, seed)
@@ -279,7 +285,8 @@ def approach(search: Search, theta: Floats, scales: Floats, seed: int) -> Approa
         theta = candidates[np.argmin(guide(candidates))]
     function = differences(guide, _STEP * search.prior_sd)
     size = len(evaluator.nodes)
-    objective = Objective(function, theta, search.prior_sd, size, gradient=True, most=search.most)
+    most = search.most - trace.count
+    objective = Objective(function, theta, search.prior_sd, size, gradient=True, most=most)
 
     def stop_where_near(t: Floats) -> None:
         if guide.overlap_at(theta + t * search.prior_sd) > _ENOUGH:
@@ -301,7 +308,7 @@ def approach(search: Search, theta: Floats, scales: Floats, seed: int) -> Approa
         " At the start hardly any simulated response was near the data: the area metric led from "
         f"there, in {objective.count} evaluations."
     )
-    return Approach(reached, Trace().then(objective), remark)
+    return Approach(reached, trace.then(objective), remark)
 
 
 def _astray(evaluator: Evaluator, theta: Floats) -> bool:
@@ -350,6 +357,17 @@ class _Guide:
     def objective_at(self, theta: Floats) -> float:
         """Return the model's own objective at a theta that was asked for."""
         return self._known[theta.tobytes()][1]
+
+
+def best_or_nearest(search: Search, thetas: Floats, scales: Floats) -> Floats:
+    """Return the theta with the smallest objective, or area where no population meets the data.
+
+    Without overlap density metrics are the same everywhere, up to rounding.
+    """
+    if not all(apart_from_data(search.evaluator, theta) for theta in thetas):
+        return search.best_of(thetas, scales)
+    areas = _Guide(search.evaluator, scales)(thetas)
+    return np.asarray(thetas[np.argmin(areas)])
 
 
 def overlap(evaluator: Evaluator, values: list[Floats], weights: list[Floats]) -> Floats:
