@@ -405,7 +405,40 @@ def table() -> dict[str, Any]:
                 f"{k} {v:.3f}" for k, v in pooled[f"{posterior}, N = {size}"].items()
             )
             print(f"{posterior}, N = {size}".ljust(24), figures)
-    return {"cells": found, "pooled": pooled}
+    compared = nearer(found)
+    print("nearer to the exact posterior than Affine:", compared)
+    return {"cells": found, "pooled": pooled, "nearer": compared}
+
+
+def nearer(found: dict[str, Any]) -> dict[str, Any]:
+    """Count where `GivenEstimate` is nearer to the exact posterior than `Affine`, where it serves."""
+    names = [
+        key.removesuffix("/given")
+        for key in found
+        if key.endswith("/given")
+        and "/log-likelihood/" not in key
+        and not PROBLEMS[key.split("/")[0]].used
+    ]
+    by = {}
+    for posterior in ("given", "affine"):
+        chosen = [found[f"{name}/{posterior}"] for name in names]
+        by[posterior] = (
+            np.concatenate([cell["sd over exact sd"] for cell in chosen]),
+            np.abs(np.concatenate([cell["off"] for cell in chosen])),
+        )
+    given_width, given_off = by["given"]
+    affine_width, affine_off = by["affine"]
+    widths = np.abs(np.log(given_width)) < np.abs(np.log(affine_width))
+    return {
+        "cells": len(names),
+        "hyperparameters": widths.size,
+        "widths": int(widths.sum()),
+        "centres": int((given_off < affine_off).sum()),
+        "given: narrowest and widest": [given_width.min(), given_width.max()],
+        "affine: narrowest and widest": [affine_width.min(), affine_width.max()],
+        "given: farthest off": given_off.max(),
+        "affine: farthest off": affine_off.max(),
+    }
 
 
 def main() -> None:

@@ -84,10 +84,10 @@ class GivenEstimate(Affine):
     Examples
     --------
     >>> GivenEstimate()
-    GivenEstimate(n_sets=200, random_seed=0, n_fits=1000)
+    GivenEstimate(n_sets=200, random_seed=0, n_fits=2000)
     """
 
-    n_fits: int = 1000
+    n_fits: int = 2000
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -17,7 +17,9 @@ from prbayes.posterior.log_gamma import LogGamma
 
 # Refits for each coefficient of a mean, from which on it has squares and products.
 _PER_COEFFICIENT = 10
-# Standard deviations of the hyperparameters within which means are curved; straight beyond.
+# Standard deviations of the hyperparameters within which means are curved and spreads change;
+# beyond, means are straight and spreads the same. A spread that grew on would make estimates likely
+# from hyperparameters far out, where hardly a refit tells what it is.
 _BENT = 2.0
 # Rounds of weighted least squares and of its weights, and the change of a log standard deviation
 # at which they end: a thousandth of the width.
@@ -56,15 +58,18 @@ class _Terms:
         standardised = (points - self.middle) / self.spread
         return np.column_stack([np.ones(len(points)), standardised])
 
+    def near(self, points: Floats) -> Floats:
+        """Return these, (n, 1 + d), of coordinates drawn in from far out."""
+        return np.clip(self.linear(points), -_BENT, _BENT)
+
     def all(self, points: Floats) -> Floats:
-        """Return these, and squares and products, of coordinates that are not far out.
+        """Return one, the coordinates, and squares and products of those drawn in from far out.
 
         A parabola would bend back there.
         """
-        linear = self.linear(points)
-        near = np.clip(linear[:, 1:], -_BENT, _BENT)
+        near = self.near(points)[:, 1:]
         products = near[:, self.pairs[:, 0]] * near[:, self.pairs[:, 1]]
-        return np.column_stack([linear, products])
+        return np.column_stack([self.linear(points), products])
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +94,7 @@ class _Element:
 
     terms: int  # which coordinates its terms are of
     mean: Floats  # coefficients of the terms, and of the residuals of elements before
-    log_sd: Floats  # (1 + d,): of the linear terms
+    log_sd: Floats  # (1 + d,): of the linear terms, drawn in from far out
     noise: LogGamma
     log_likelihood: float  # of the estimates that it was fitted to
 
@@ -149,7 +154,7 @@ class SamplingModel:
                 own = terms[which]
                 kind = points[which]
                 every = np.column_stack([own.all(kind), before])
-                fit = _Fit(every, own.linear(kind), seen[:, k], side[:, k], weights)
+                fit = _Fit(every, own.near(kind), seen[:, k], side[:, k], weights)
                 fits.append(fit.element(which, start))
             element, residuals = max(fits, key=lambda found: found[0].log_likelihood)
             elements.append(element)
@@ -166,14 +171,14 @@ class SamplingModel:
         (seen,), (side,) = self.sight.seen(estimate[None])
         kinds = list(zip(self.terms, points, strict=True))
         every = [own.all(kind) for own, kind in kinds]
-        linear = [own.linear(kind) for own, kind in kinds]
+        near = [own.near(kind) for own, kind in kinds]
         before = np.empty((len(points[0]), 0))
         noise = []
         known = []
         for k, element in enumerate(self.elements):
             own = np.column_stack([every[element.terms], before])
             residuals = seen[k] - own @ element.mean
-            log_sd = linear[element.terms] @ element.log_sd
+            log_sd = near[element.terms] @ element.log_sd
             by_design = variance * np.exp(-2 * log_sd)
             log_sd = log_sd + 0.5 * np.log1p(by_design)
             z = residuals * np.exp(-log_sd)
@@ -209,14 +214,14 @@ class _Fit:
     """What one element is fitted to."""
 
     every: Floats  # (n, c): all terms of the mean
-    linear: Floats  # (n, 1 + d): those of the log standard deviation
+    near: Floats  # (n, 1 + d): those of the log standard deviation
     seen: Floats  # (n,): estimates, or the bound beyond which they are
     side: Floats  # (n,)
     weights: Floats  # (n,)
 
     def element(self, which: int, start: _Element | None) -> tuple[_Element, Floats]:
         """Return the model, and residuals of its mean, (n,), expected ones where out of sight."""
-        log_sd = np.zeros(self.linear.shape[1])
+        log_sd = np.zeros(self.near.shape[1])
         spread = max(self.seen.std(), 1e-300)
         log_sd[0] = np.log(spread)
         values = self.seen
@@ -225,7 +230,7 @@ class _Fit:
             values, _ = self._completed(self.every @ start.mean, log_sd)
         for _ in range(_WEIGHINGS):
             before = log_sd
-            weights = self.weights * np.exp(-2 * self.linear @ log_sd)
+            weights = self.weights * np.exp(-2 * self.near @ log_sd)
             mean = _least_squares(self.every, values, weights)
             fitted = self.every @ mean
             values, squared = self._completed(fitted, log_sd)
@@ -233,7 +238,7 @@ class _Fit:
             if np.abs(log_sd - before).max() < _STILL:
                 break
         residuals = values - fitted
-        log_spread = self.linear @ log_sd
+        log_spread = self.near @ log_sd
         z = (self.seen - fitted) * np.exp(-log_spread)
         noise = LogGamma.fit(z, self.side, self.weights) if start is None else start.noise
         density = noise.log_likelihood(z, self.side)
@@ -243,7 +248,7 @@ class _Fit:
 
     def _completed(self, fitted: Floats, log_sd: Floats) -> tuple[Floats, Floats]:
         """Return estimates, expected ones where out of sight, and their squared noise, (n,)."""
-        spread = np.exp(self.linear @ log_sd)
+        spread = np.exp(self.near @ log_sd)
         z, squared = _expected((self.seen - fitted) / spread, self.side)
         return fitted + spread * z, squared
 
@@ -253,8 +258,8 @@ class _Fit:
         Of the normal likelihood (Harvey 1976, doi:10.2307/1913974).
         """
         counted = np.minimum(squared, _SQUARED)
-        slope = self.linear.T @ (self.weights * (counted - 1))
-        information = self.linear.T @ (2 * self.weights[:, None] * self.linear)
+        slope = self.near.T @ (self.weights * (counted - 1))
+        information = self.near.T @ (2 * self.weights[:, None] * self.near)
         return np.asarray(before + np.linalg.solve(information, slope))
 
 

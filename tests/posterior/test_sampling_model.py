@@ -1,6 +1,7 @@
 """The model of an estimate's distribution, against distributions that are known."""
 
 import numpy as np
+import pytest
 from scipy import stats
 
 from prbayes._checks import Floats
@@ -96,6 +97,17 @@ def test_a_parabola_does_not_bend_back_far_out() -> None:
     at = np.linspace(0.5, 9, 30)[:, None]
     known = model.log_likelihood([at], np.array([0.4]))
     assert (np.diff(known[2:]) < 0).all()
+
+
+def test_a_spread_does_not_grow_on_far_out() -> None:
+    rng = np.random.default_rng(6)
+    points = rng.standard_normal((4000, 1))
+    estimates = points + 0.3 * np.exp(0.4 * points) * rng.standard_normal((4000, 1))
+    sight = Sight(np.array([-99.0]), np.array([99.0]))
+    model = SamplingModel.fit([points], estimates, np.ones(4000), sight)
+    strain = model.strain([np.linspace(3, 9, 7)[:, None]], np.array([0.0]))
+    np.testing.assert_allclose(np.diff(strain), np.diff(strain)[0], rtol=1e-6)
+    assert np.diff(strain)[0] == pytest.approx(1 / (0.3 * np.exp(0.4 * 2)), rel=0.15)
 
 
 def test_a_wider_estimate_is_likelier_far_out_and_strain_says_how_far() -> None:
