@@ -6,6 +6,7 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -58,3 +59,15 @@ def test_the_readme_tells_the_cost_of_sampling_that_was_found() -> None:
         f"pyABC {other['responses']:,} and".replace(",", " "),
     ):
         assert told in README
+
+
+def test_the_thermal_page_tells_the_correlation_of_the_coupons() -> None:
+    path = ROOT / "examples" / "thermal" / "material.csv"
+    columns = np.genfromtxt(path, delimiter=",", names=True, usecols=(1, 2, 3))
+    temperature, *measured = (columns[name] for name in columns.dtype.names)
+    lines = [np.polynomial.Polynomial.fit(temperature, values, 1) for values in measured]
+    residuals = [v - line(temperature) for v, line in zip(measured, lines, strict=True)]
+    found = float(np.corrcoef(residuals)[0, 1])
+    error = np.sqrt((1 - found**2) / (len(temperature) - 2))
+    told = f"a correlation of {found:.2f}, with a standard error of {error:.2f}".replace("0.", ".")
+    assert told in (ROOT / "docs" / "thermal_challenge.md").read_text(encoding="utf-8")
