@@ -20,15 +20,18 @@ from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual
 from prbayes.model.elements import (
+    coordinates,
     element_names,
     single_elements,
     split_elements,
     stacked_draws,
     told_elements,
     told_of,
+    with_coordinates,
 )
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import as_attributes, require_together
+from prbayes.model.labels import labelled
 from prbayes.model.node import nodes
 from prbayes.model.support import shortcomings
 from prbayes.model.turns import in_turn
@@ -99,7 +102,8 @@ def compare(
         )
     identities = {label: identity_in(result) for label, result in results.items()}
     identity = require_together(identities, "compare", model=model)
-    columns = {label: _column(label, result) for label, result in results.items()}
+    naming = model or _model_among(results)
+    columns = {label: _column(label, result, naming) for label, result in results.items()}
     every = _shared(list(columns.values()), model)
     told = set.intersection(*(column.told for column in columns.values()))
     names = [name for name in every if name in told]
@@ -165,15 +169,26 @@ def _table(columns: Mapping[str, _Column], names: Sequence[str]) -> Floats:
     return np.array([[column.elements[name] for name in names] for column in columns.values()])
 
 
-def _column(label: str, result: Any) -> _Column:
-    """Read a result of any kind."""
+def _model_among(results: Mapping[str, Any]) -> pm.Model | None:
+    """Return the model of the first result that has it."""
+    return next((each.model for each in results.values() if isinstance(each, Optimum)), None)
+
+
+def _column(label: str, result: Any, naming: pm.Model | None) -> _Column:
+    """Read a result of any kind; draws without coordinates have those of a model."""
     if isinstance(result, Optimum):
         cost = float(result.n_responses), result.seconds
-        return _of_optimum(result.point, result.stderr, cost)
+        evaluator = result.evaluator
+        point = labelled(evaluator, result.point, {})
+        stderr = labelled(evaluator, result.stderr, {})
+        return _of_optimum(point.data_vars, stderr.data_vars, cost)
     if isinstance(result, xr.DataTree) and "posterior" in result.children:
         posterior = result["posterior"]
-        told = told_elements(stacked_draws(posterior))
-        return _Column(_of_draws(posterior), set(told), *_cost(posterior.attrs))
+        draws = stacked_draws(posterior)
+        if naming is not None:
+            draws = with_coordinates(draws, naming)
+        told = told_elements(draws)
+        return _Column(_of_draws(draws), set(told), *_cost(posterior.attrs))
     if isinstance(result, xr.DataTree) and "optimum" in result.children:
         optimum = result["optimum"]
         return _of_optimum(optimum.data_vars, result["stderr"].data_vars, _cost(optimum.attrs))
@@ -183,11 +198,11 @@ def _column(label: str, result: Any) -> _Column:
     )
 
 
-def _of_draws(posterior: Any) -> dict[str, _Estimate]:
+def _of_draws(draws: Mapping[str, xr.DataArray]) -> dict[str, _Estimate]:
     """Return mean, standard deviation and equal-tailed interval by element."""
     tails = [(1 - INTERVAL) / 2, (1 + INTERVAL) / 2]
     found = {}
-    for element, x in split_elements(stacked_draws(posterior)).items():
+    for element, x in split_elements(draws).items():
         lower, upper = np.quantile(x, tails)
         found[element] = _Estimate(float(x.mean()), float(x.std(ddof=1)), lower, upper)
     return found
@@ -256,7 +271,7 @@ def _thetas(evaluator: Evaluator, names: list[str], estimates: Floats) -> Floats
     values = []
     for rv in evaluator.model.free_RVs:
         shape = event_shape(rv)
-        elements = element_names(str(rv.name), shape)
+        elements = element_names(str(rv.name), shape, coordinates(evaluator.model, str(rv.name)))
         if not set(elements) <= set(names):
             return None
         places = [names.index(element) for element in elements]

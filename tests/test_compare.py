@@ -51,7 +51,7 @@ def test_compare_sets_optimum_and_posterior_side_by_side(
 ) -> None:
     table = prb.compare({"optimum": optimum, "ABC": idata}, model=model)
     assert list(table["result"].values) == ["optimum", "ABC"]
-    names = ["mean[0]", "mean[1]", "sigma", "variance"]
+    names = ["mean[north]", "mean[south]", "sigma", "variance"]
     assert list(table["hyperparameter"].values) == names
     z = norm.ppf(0.945)
     best = table.sel(result="optimum")
@@ -129,7 +129,11 @@ def test_compare_without_a_model_shows_all_that_is_shared(
     optimum: prb.Optimum, idata: xr.DataTree
 ) -> None:
     table = prb.compare({"a": optimum, "b": idata})
-    assert list(table["hyperparameter"].values) == ["mean[0]", "mean[1]", "sigma", "variance"]
+    names = ["mean[north]", "mean[south]", "sigma", "variance"]
+    assert list(table["hyperparameter"].values) == names
+    bare = xr.DataTree.from_dict({"posterior": idata["posterior"].to_dataset().drop_vars("lab")})
+    for together in ({"a": optimum, "b": bare}, {"b": bare, "a": optimum}):
+        assert list(prb.compare(together)["hyperparameter"].values) == names
 
 
 def tree_of(**values: Floats) -> xr.DataTree:

@@ -17,7 +17,7 @@ from prbayes.decision.quantities import Quantity, refuse_quantity
 from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.model.elements import split_elements, told_elements
 from prbayes.model.identity import as_attributes, identity_of_model
-from prbayes.model.labels import versions
+from prbayes.model.labels import labelled, versions
 from prbayes.model.turns import in_turn
 
 # Draws that are made narrower: standard deviations are then known to two percent.
@@ -167,7 +167,9 @@ class _Outlook:
     def sd(self, information: Floats) -> dict[str, float]:
         """Return standard deviations by name, after so much information, (d, d)."""
         thetas = self.belief.after(information)
-        values = self.populations.evaluator.constrained(thetas)
+        evaluator = self.populations.evaluator
+        own = evaluator.constrained(thetas)
+        values = labelled(evaluator, own, {"draw": len(thetas)}).data_vars
         elements = split_elements(values)
         found = {name: float(elements[name].std()) for name in told_elements(values)}
         if self.quantity is not None:

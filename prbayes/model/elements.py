@@ -1,17 +1,19 @@
-"""Elements of variables, such as 'mu[1]': their names, and values by name."""
+"""Elements of variables, such as 'mu[1]' or 'mu[Adler]': their names, and values by name."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from prbayes._checks import Floats
 
 
-def element_name(name: str, index: tuple[int, ...]) -> str:
-    """Return the name of an element, such as 'mu[1]' or 'cov[0,1]'.
+def element_name(name: str, index: Sequence[object]) -> str:
+    """Return the name of an element, such as 'mu[1]', 'cov[0,1]' or 'mu[Adler]'.
 
     Of a scalar, the variable's own.
     """
@@ -21,17 +23,65 @@ def element_name(name: str, index: tuple[int, ...]) -> str:
     return f"{name}[{places}]"
 
 
-def element_names(name: str, shape: Sequence[int]) -> list[str]:
-    """Return the names of all elements of a variable, in the order of its raveled values."""
-    return [element_name(name, index) for index in np.ndindex(*shape)]
+def element_names(name: str, shape: Sequence[int], labels: Sequence[Any] = ()) -> list[str]:
+    """Return the names of all elements of a variable, in the order of its raveled values.
+
+    Parameters
+    ----------
+    name : str
+    shape : sequence of int
+    labels : sequence
+        Of each axis: its coordinate, or None. Where that does not name each place of the axis by a
+        text of its own, the number does.
+    """
+    given = labels if len(labels) == len(shape) else [None] * len(shape)
+    axes = [_places(size, own) for size, own in zip(shape, given, strict=True)]
+    return [element_name(name, index) for index in product(*axes)]
+
+
+def _places(size: int, labels: Any) -> Sequence[object]:
+    """Return what the places along an axis are called."""
+    texts = [] if labels is None else list(map(str, np.asarray(labels).tolist()))
+    return texts if len(set(texts)) == len(texts) == size else range(size)
+
+
+def coordinates(model: Any, name: str) -> tuple[Any, ...]:
+    """Return the coordinate of each axis of a variable of a model, None where it has none."""
+    dims = model.named_vars_to_dims.get(name) or ()
+    known = model.coords
+    return tuple(known.get(dim) for dim in dims)
+
+
+def with_coordinates(draws: Mapping[str, xr.DataArray], model: Any) -> dict[str, xr.DataArray]:
+    """Return draws, (n, *shape) by variable, where they carry none with a model's coordinates."""
+    found = {}
+    for name, values in draws.items():
+        own = coordinates(model, name)
+        pairs = list(zip(values.dims[1:], values.shape[1:], strict=True))
+        fits = len(own) == len(pairs)
+        for (dim, size), labels in zip(pairs, own, strict=True) if fits else ():
+            if labels is not None and dim not in values.coords and len(labels) == size:
+                values = values.assign_coords({dim: np.asarray(labels)})
+        found[name] = values
+    return found
+
+
+def _carried(value: Any) -> tuple[Any, ...]:
+    """Return the coordinate of each axis that an array carries; none of a plain one."""
+    if not isinstance(value, xr.DataArray):
+        return ()
+    return tuple(value.coords[d].values if d in value.coords else None for d in value.dims)
 
 
 def split_elements(values: Mapping[Any, Any]) -> dict[str, Floats]:
-    """Return arrays (n,) by the names of elements, of arrays (n, *shape) by variable."""
+    """Return arrays (n,) by the names of elements, of arrays (n, *shape) by variable.
+
+    Coordinates that they carry are in the names.
+    """
     found: dict[str, Floats] = {}
     for name, value in values.items():
         array = np.asarray(value)
-        names = element_names(str(name), array.shape[1:])
+        names = _names(name, value)
         columns = array.reshape(len(array), len(names))
         found |= dict(zip(names, columns.T, strict=True))
     return found
@@ -39,8 +89,16 @@ def split_elements(values: Mapping[Any, Any]) -> dict[str, Floats]:
 
 def single_elements(values: Mapping[Any, Any]) -> dict[str, float]:
     """Return numbers by the names of elements, of one value of each variable."""
-    rows = {name: np.asarray(value)[None] for name, value in values.items()}
-    return {name: float(row[0]) for name, row in split_elements(rows).items()}
+    found: dict[str, float] = {}
+    for name, value in values.items():
+        names = element_names(str(name), np.shape(value), _carried(value))
+        found |= dict(zip(names, np.ravel(value).astype(float).tolist(), strict=True))
+    return found
+
+
+def _names(name: Any, value: Any) -> list[str]:
+    """Return the names of the elements of arrays, (n, *shape)."""
+    return element_names(str(name), np.shape(value)[1:], _carried(value)[1:])
 
 
 def told_elements(values: Mapping[Any, Any]) -> list[str]:
@@ -51,23 +109,24 @@ def told_elements(values: Mapping[Any, Any]) -> list[str]:
     """
     found = []
     for name, value in values.items():
-        array = np.asarray(value)
-        told = _told(array)
-        own = split_elements({name: array})
-        found += [element for element, kept in zip(own, told.ravel(), strict=True) if kept]
+        told = _told(np.asarray(value)).ravel()
+        own = _names(name, value)
+        found += [element for element, kept in zip(own, told, strict=True) if kept]
     return found
 
 
 def told_of(point: Mapping[Any, Any], stderr: Mapping[Any, Any]) -> list[str]:
     """Return the same of an optimum, with the standard error of each element."""
-    values = {}
+    found = []
     for name, value in point.items():
         at = np.asarray(value)
         error = np.asarray(stderr[name])
         # Any number stands for an error that is not known: it is not zero.
         known = np.where(np.isfinite(error), error, 1.0)
-        values[name] = np.stack([at - known, at + known])
-    return told_elements(values)
+        told = _told(np.stack([at - known, at + known])).ravel()
+        own = element_names(str(name), at.shape, _carried(value))
+        found += [element for element, kept in zip(own, told, strict=True) if kept]
+    return found
 
 
 def _told(array: Floats) -> Any:
@@ -94,7 +153,8 @@ def finite_draws(posterior: Any, names: Sequence[str]) -> dict[str, Floats]:
     ValueError
         If one is no finite number: no population belongs to it.
     """
-    found = stacked_draws(posterior, names)
+    stacked = stacked_draws(posterior, names)
+    found = {name: draws.values for name, draws in stacked.items()}
     for name, draws in found.items():
         known = np.isfinite(draws).reshape(len(draws), -1).all(axis=1)
         if not known.all():
@@ -105,10 +165,17 @@ def finite_draws(posterior: Any, names: Sequence[str]) -> dict[str, Floats]:
     return found
 
 
-def stacked_draws(posterior: Any, names: Iterable[str] | None = None) -> dict[str, Floats]:
-    """Return the draws of variables, (chains x draws, *shape), of a group with these dimensions."""
+def stacked_draws(posterior: Any, names: Iterable[str] | None = None) -> dict[str, xr.DataArray]:
+    """Return the draws of variables, (chains x draws, *shape), of a group with these dimensions.
+
+    They carry the coordinates of their other dimensions.
+    """
     found = {}
     for name in posterior.data_vars if names is None else names:
-        values = posterior[name].transpose("chain", "draw", ...).values
-        found[str(name)] = values.reshape(-1, *values.shape[2:])
+        variable = posterior[name].transpose("chain", "draw", ...)
+        values = variable.values
+        flat = values.reshape(-1, *values.shape[2:])
+        own = variable.dims[2:]
+        coords = {dim: variable.coords[dim].values for dim in own if dim in variable.coords}
+        found[str(name)] = xr.DataArray(flat, coords, ["draws", *own])
     return found

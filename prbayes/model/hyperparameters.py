@@ -16,7 +16,7 @@ from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.replace import graph_replace, vectorize_graph
 
 from prbayes._checks import Floats, called, real_array, refuse_single_precision
-from prbayes.model.elements import element_names
+from prbayes.model.elements import coordinates, element_names
 from prbayes.propagation.points import sobol
 from prbayes.response.compilation import compiled, interpreted, ninf_for_invalid
 from prbayes.response.distributions import PriorPoints, PriorSampler
@@ -75,8 +75,16 @@ class Hyperparameters:
 
     @property
     def names(self) -> list[str]:
-        """Names of the elements of theta, such as 'sigma_log__' or 'mu[1]'."""
+        """Names of the elements of theta, such as 'sigma_log__', 'mu[1]' or 'mu[Adler]'."""
         return self._elements(list(self.shapes))
+
+    @property
+    def plain_names(self) -> list[str]:
+        """The same with places instead of coordinates: they order elements, whatever these are."""
+        found: list[str] = []
+        for name, shape in self.shapes.items():
+            found += element_names(name, shape)
+        return found
 
     @property
     def readable_names(self) -> list[str]:
@@ -84,13 +92,18 @@ class Hyperparameters:
 
         They are transformed nevertheless.
         """
-        rvs = [self.model.values_to_rvs[v] for v in self.model.value_vars]
-        return self._elements([str(rv.name) for rv in rvs])
+        return self._elements(self._own_names)
+
+    @property
+    def _own_names(self) -> list[str]:
+        """Names of the variables themselves, in the order of theta."""
+        return [str(self.model.values_to_rvs[v].name) for v in self.model.value_vars]
 
     def _elements(self, names: list[str]) -> list[str]:
         found: list[str] = []
-        for name, shape in zip(names, self.shapes.values(), strict=True):
-            found += element_names(name, shape)
+        shapes = self.shapes.values()
+        for name, own, shape in zip(names, self._own_names, shapes, strict=True):
+            found += element_names(name, shape, coordinates(self.model, own))
         return found
 
     # Functions of theta.
@@ -260,7 +273,7 @@ class Hyperparameters:
         """
         if self._points is None:
             offsets = sobol(size, self.size, seed=0) - 0.5
-            return self.initial + _by_name(offsets, self.names)
+            return self.initial + _by_name(offsets, self.plain_names)
         names: list[str] = []
         for rv in self.model.free_RVs:
             names += element_names(rv.name, event_shape(rv))

@@ -146,7 +146,7 @@ def identity_of(evaluator: Evaluator, *, prior_minimised: bool | None = None) ->
     # A change that leaves the values at all of them as they are is none that matters. A power of
     # two, as Sobol points are balanced then.
     thetas = evaluator.hyperparameters.fixed_points(4)
-    by_name = np.argsort(evaluator.names)
+    by_name = np.argsort(evaluator.hyperparameters.plain_names)
     simulators = []
     for k, node in enumerate(evaluator.nodes):
         free = node.bound.stored

@@ -10,6 +10,7 @@ from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.elements import single_elements
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.labels import labelled
 from prbayes.plots._ensemble import supported
 from prbayes.plots._names import variable_of
 from prbayes.plots._objective import free_elements, objective
@@ -130,7 +131,8 @@ def _plane(optimum: Optimum, evaluator: Evaluator, names: list[str]) -> _Plane:
 
 def _standard_error(optimum: Optimum, name: str, bulk: Floats) -> float:
     """Return the standard error, or if it is unknown what makes the axis as wide as the prior."""
-    error = single_elements(optimum.stderr)[name]
+    errors = labelled(optimum.evaluator, optimum.stderr, {})
+    error = single_elements(errors.data_vars)[name]
     if np.isfinite(error) and error > 0:
         return error
     low, high = bulk

@@ -11,6 +11,7 @@ from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
 from prbayes.model.elements import split_elements, told_of
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.labels import labelled
 
 # What a reader calls a metric of the package; any other one goes by the name of its class.
 METRIC_LABELS = {
@@ -66,11 +67,12 @@ def free_elements(evaluator: Evaluator, thetas: Floats) -> dict[str, Floats]:
     """Return the free variables' elements in the user's own units, shape (P,), by element name."""
     values = evaluator.constrained(thetas)
     names = [str(rv.name) for rv in evaluator.model.free_RVs]
-    return split_elements({name: values[name] for name in names})
+    some = {name: values[name] for name in names}
+    return split_elements(labelled(evaluator, some, {"draw": len(thetas)}).data_vars)
 
 
 def free_names(optimum: Optimum) -> list[str]:
     """Return the names of the same, without what is the same everywhere, as zeros of a factor."""
     names = [str(rv.name) for rv in optimum.model.free_RVs]
-    point, stderr = optimum.point, optimum.stderr
-    return told_of({n: point[n] for n in names}, {n: stderr[n] for n in names})
+    point = {name: optimum.point[name] for name in names}
+    return told_of(labelled(optimum.evaluator, point, {}).data_vars, optimum.stderr)

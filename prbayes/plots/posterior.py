@@ -21,6 +21,7 @@ from prbayes.model.elements import (
 )
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level, require_together
+from prbayes.model.labels import labelled
 from prbayes.plots._canvas import (
     BLUE,
     DASHED,
@@ -161,15 +162,16 @@ def _read_hyperparameters(
 
     best, errors = {}, {}
     if optimum is not None:
-        best = single_elements(optimum.point)
-        errors = single_elements(optimum.stderr)
+        best = single_elements(labelled(optimum.evaluator, optimum.point, {}).data_vars)
+        errors = single_elements(labelled(optimum.evaluator, optimum.stderr, {}).data_vars)
         shared &= set(best)
     prior: dict[str, Floats] = {}
     if model is not None:
         evaluator = Evaluator(model)
         # So many tell a normal density's peak within 2%.
         thetas = evaluator.prior_thetas(4000, 0)
-        prior = split_elements(evaluator.constrained(thetas))
+        drawn = labelled(evaluator, evaluator.constrained(thetas), {"draw": len(thetas)})
+        prior = split_elements(drawn.data_vars)
         shared &= set(prior)
 
     found = {}

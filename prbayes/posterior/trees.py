@@ -373,7 +373,7 @@ def _envelopes(ranks: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
 
     probability = 0.95  # that of ArviZ's own pictures of ranks
     rows, names = {}, []
-    values = {name: variable.values[0] for name, variable in ranks.data_vars.items()}
+    values = {name: variable[0] for name, variable in ranks.data_vars.items()}
     for name, column in split_elements(values).items():
         x, ecdf, lower, upper = ecdf_pit(  # type: ignore[no-untyped-call]
             column, probability, n_simulations=1000, rng=np.random.default_rng(0)

@@ -18,6 +18,7 @@ from prbayes.model.elements import (
     told_elements,
     told_of,
 )
+from prbayes.model.labels import labelled
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import NOTHING, alike, counted, number, places
 from prbayes.reports.section import Section
@@ -30,7 +31,10 @@ def optima(m: Material) -> list[Section]:
     for label, tree in m.optima.items():
         text = [_how_it_ended(tree["optimum"].attrs)]
         if label in m.found:
-            text += [_other_optimum(rival) for rival in m.found[label].rivals]
+            evaluator = m.found[label].evaluator
+            for rival in m.found[label].rivals:
+                point = labelled(evaluator, rival["point"], {}).data_vars
+                text.append(_other_optimum(rival, point))
         text.append(
             "Standard errors are those of the estimator over repeated sets of as many specimens."
         )
@@ -62,9 +66,11 @@ def _how_it_ended(attrs: Mapping[Any, Any]) -> str:
     )
 
 
-def _other_optimum(rival: Mapping[str, Any]) -> str:
-    scalars = {name: value for name, value in rival["point"].items() if np.ndim(value) == 0}
-    shown = scalars or single_elements(rival["point"])
+def _other_optimum(rival: Mapping[str, Any], point: Mapping[Any, Any]) -> str:
+    """Say where another optimum is."""
+    elements = single_elements(point)
+    scalars = {name: value for name, value in elements.items() if name in point}
+    shown = scalars or elements
     at = ", ".join(f"{name} = {number(value)}" for name, value in shown.items())
     discrepancy = number(float(rival["discrepancy"]))
     if rival["comparable"]:
@@ -92,7 +98,7 @@ def _posterior_rows(tree: xr.DataTree) -> list[dict[str, Any]]:
     arviz: Any = import_module("arviz")  # heavy, and partly annotated
     with np.errstate(all="ignore"):  # a variable that never moves
         table = arviz.summary(tree, kind="all", ci_prob=INTERVAL, ci_kind="eti", round_to="none")
-    # ArviZ names elements by their coordinates; all else in a report does by their place.
+    # Elements are called as in all else of a report, where ArviZ has ways of its own.
     draws = stacked_draws(tree["posterior"])
     names = list(split_elements(draws))
     told = told_elements(draws)

@@ -94,3 +94,29 @@ def test_of_an_optimum_the_standard_errors_tell_what_is_constant(error: float) -
     point = {"r": np.array([[1.0, 0.5], [0.5, 1.0]]), "mu": 2.0}
     stderr = {"r": np.array([[0.0, error], [error, 0.0]]), "mu": 0.0}
     assert told_of(point, stderr) == ["r[0,1]", "mu"]
+
+
+def test_elements_are_called_by_their_coordinates() -> None:
+    assert element_names("mu", (2,), [["Adler", "Busch"]]) == ["mu[Adler]", "mu[Busch]"]
+    assert element_names("c", (2, 2), [None, [1.5, 2]]) == [
+        "c[0,1.5]",
+        "c[0,2.0]",
+        "c[1,1.5]",
+        "c[1,2.0]",
+    ]
+    # What does not name each place by itself is left out: two elements of one name would be one.
+    assert element_names("mu", (2,), [["a", "a"]]) == ["mu[0]", "mu[1]"]
+    assert element_names("p_simplex__", (1,), [["a", "b"]]) == ["p_simplex__[0]"]
+    assert element_names("c", (2, 2), [["a", "b"]])[0] == "c[0,0]"
+
+
+def test_draws_and_points_carry_their_coordinates() -> None:
+    coords = {"supplier": ["Adler", "Busch"]}
+    mu = xr.DataArray(np.arange(12.0).reshape(2, 2, 3), coords, ["supplier", "draw", "chain"])
+    stacked = stacked_draws(xr.Dataset({"mu": mu}))
+    np.testing.assert_array_equal(split_elements(stacked)["mu[Busch]"], mu.values[1].T.ravel())
+    assert told_elements(stacked) == ["mu[Adler]", "mu[Busch]"]
+    point = xr.Dataset({"mu": ("supplier", [1.0, 2.0])}, coords).data_vars
+    assert single_elements(point) == {"mu[Adler]": 1.0, "mu[Busch]": 2.0}
+    assert told_of(point, {"mu": [0.1, 0.2]}) == ["mu[Adler]", "mu[Busch]"]
+    assert type(finite_draws(xr.Dataset({"mu": mu}), ["mu"])["mu"]) is np.ndarray

@@ -32,6 +32,17 @@ def test_names_and_shapes() -> None:
     assert found.size == 3
 
 
+def test_names_have_the_coordinates_of_the_model_and_its_order_has_not() -> None:
+    with pm.Model(coords={"supplier": ["Adler", "Busch"]}) as model:
+        pm.HalfNormal("sigma", 3.0, dims="supplier")
+        pm.Dirichlet("p", np.ones(2), dims="supplier")
+    found = Hyperparameters(model)
+    # A variable that has fewer places unconstrained than in its own units is numbered.
+    assert found.names == ["sigma_log__[Adler]", "sigma_log__[Busch]", "p_simplex__[0]"]
+    assert found.readable_names == ["sigma[Adler]", "sigma[Busch]", "p[0]"]
+    assert found.plain_names == ["sigma_log__[0]", "sigma_log__[1]", "p_simplex__[0]"]
+
+
 def test_the_log_prior_has_the_jacobian() -> None:
     found = Hyperparameters(model_of()).log_prior(THETAS)
     normal = stats.norm([1.0, 5.0], 2.0).logpdf(THETAS[:, :2]).sum(axis=1)
