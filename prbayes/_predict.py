@@ -37,6 +37,7 @@ from prbayes.propagation.reweighted import Design, UntoldError
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import PopulationSampler, quantiles
 from prbayes.response.failures import Abort, ResponseError
+from prbayes.response.grouping import is_group
 from prbayes.response.inadequacy import caveats_of
 from prbayes.response.inputs import Inputs, read_inputs
 from prbayes.response.outputs import Outputs, lacking
@@ -112,7 +113,8 @@ def predict(
     -------
     xarray.DataArray
         Dims (chain, draw, sample), and for several outputs a last one, with their names where they
-        are known: those of the simulator with this response, or the keys of a mapping. Attributes:
+        are known: those of the simulator with this response, or the keys of a mapping. Where inputs
+        depend on `prbayes.response.group`, that dimension is before the samples. Attributes:
         ``source`` (how specimens were made), ``responses``
         (how many were computed), ``nan`` (how many values are NaN), ``caveats`` (what the response
         says of itself, such as that its inadequacy extrapolates), ``specimens_id`` (equal for
@@ -175,21 +177,22 @@ def predict(
     seed = None if random_seed is None else seed_number(random_seed)
     rng = np.random.default_rng(seed)
     node = serving(found, responses) if stored else None
+    groups = sorted_inputs.groups
     with shown(progressbar):
-        if node is None:
-            drawn = _new_responses(label, responses, points, n_samples, rng)
-        else:
-            drawn = _resampled_responses(node, responses, points, n_samples, rng)
+        drawn = _drawn(node, responses, _in_groups(points, sorted_inputs), n_samples, rng)
     if max_lost is None:
         max_lost = max((node.bound.max_lost for node in found), default=MAX_LOST)
     missing = _count_missing(label, drawn.values, max_lost)
-    event = drawn.values.shape[2:]
+    among = () if groups is None else (len(groups.labels),)
+    event = drawn.values.shape[2 + len(among) :]
     outputs = responses.outputs or Outputs(tuple(range(event[0] if event else 0)))
     last = {outputs.dim: list(outputs.labels)} if event else {}
+    own = {} if groups is None else {groups.dim: list(groups.labels)}
+    leading = (len(coords["chain"]), len(coords["draw"]), *among)
     return xr.DataArray(
-        drawn.values.reshape(len(coords["chain"]), len(coords["draw"]), n_samples, *event),
-        dims=("chain", "draw", "sample", *last),
-        coords={**coords, "sample": np.arange(n_samples), **last},
+        drawn.values.reshape(*leading, n_samples, *event),
+        dims=("chain", "draw", *own, "sample", *last),
+        coords={**coords, **own, "sample": np.arange(n_samples), **last},
         name=label,
         attrs={
             "source": drawn.source,
@@ -216,11 +219,42 @@ def model_of(result: Any, model: pm.Model | None, caller: str) -> pm.Model:
     return model
 
 
+def _in_groups(points: dict[str, Floats], inputs: Inputs) -> list[dict[str, Floats]]:
+    """Return the populations of each group, or all as they are where there are none."""
+    if inputs.groups is None:
+        return [points]
+    size = len(next(iter(points.values())))
+    (index,) = [str(root.name) for root in inputs.roots if is_group(root)]
+    places = range(len(inputs.groups.labels))
+    return [{**points, index: np.full(size, place)} for place in places]
+
+
+def _drawn(
+    node: Node | None,
+    responses: Responses,
+    of_groups: list[dict[str, Floats]],
+    n: int,
+    rng: np.random.Generator,
+) -> _Drawn:
+    """Return responses of n specimens from each population, of one group after the other."""
+    each = []
+    for points in of_groups:
+        if node is None:
+            each.append(_new_responses(responses.name, responses, points, n, rng))
+        else:
+            each.append(_resampled_responses(node, responses, points, n, rng))
+    if len(each) == 1:
+        return each[0]
+    specimens = [x for one in each for x in one.specimens]
+    return _Drawn(np.stack([one.values for one in each], axis=1), specimens, each[0].source)
+
+
 @dataclass(frozen=True, eq=False)
 class _Drawn:
     """Responses of specimens."""
 
-    values: Floats  # (k, n), or (k, n, m) of several outputs: by population
+    # (k, n), or (k, n, m) of several outputs: by population; of groups (k, groups, n) and so on.
+    values: Floats
     specimens: list[Floats]  # (k, n, *event): aleatory inputs
     source: str  # how specimens were made
 

@@ -404,6 +404,7 @@ INNER = {
         "pymc.pytensorf.join_nonshared_inputs",
         "pytensor.graph.replace.graph_replace",
         "pytensor.graph.replace.vectorize_graph",
+        "pytensor.graph.traversal.ancestors",
     },
     "model.identity": {"pymc.printing.str_for_dist"},
     "model.node": {
@@ -475,6 +476,11 @@ INNER = {
         "pytensor.graph.traversal.ancestors",
         "pytensor.graph.utils.MissingInputError",
         "pytensor.tensor.random.type.RandomGeneratorType",
+        "pytensor.tensor.variable.TensorVariable",
+    },
+    "response.grouping": {
+        "pytensor.graph.basic.Variable",
+        "pytensor.tensor.random.op.RandomVariable",
         "pytensor.tensor.variable.TensorVariable",
     },
     "response.inputs": {

@@ -26,6 +26,7 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.points import sobol
 from prbayes.propagation.reweighted import Design
+from prbayes.response.grouping import refuse_groups
 from prbayes.response.inputs import read_inputs
 from prbayes.response.outputs import Outputs, lacking
 from prbayes.response.response import Responses
@@ -69,10 +70,12 @@ class Populations:
     ) -> Responses:
         """Return a response with its inputs."""
         label = str(getattr(response, "__name__", type(response).__name__))
+        sorted_inputs = read_inputs(label, inputs, self.evaluator.model)
+        refuse_groups(f"{self.caller}: {label}", sorted_inputs.roots)
         return Responses(
             label,
             response,
-            read_inputs(label, inputs, self.evaluator.model),
+            sorted_inputs,
             outputs=known_outputs(self.evaluator.nodes, response),
             **calling,
         )

@@ -10,7 +10,7 @@ from prbayes._checks import Floats
 from prbayes._weighted import distribution_function, quantile
 from prbayes.estimate.confounding import confounded
 from prbayes.estimate.differences import cross
-from prbayes.estimate.identifiability import unidentified_directions
+from prbayes.estimate.identifiability import unidentified_directions, without
 from prbayes.estimate.projections import one_dimensional
 from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.rivals import Rival
@@ -227,7 +227,8 @@ def caveats(
             lines.append(_of_rival(evaluator, rival))
     if local is not None:
         names = evaluator.readable_names
-        directions = unidentified_directions(local.unidentified, names)
+        hidden = without(local.unidentified, evaluator.told_by_prior)
+        directions = unidentified_directions(hidden, names)
         lines += [_of_direction(direction) for direction in directions]
         lines += confounded(evaluator, local)
     return tuple(lines)

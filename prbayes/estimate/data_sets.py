@@ -89,13 +89,25 @@ def groups(nodes: list[Node]) -> list[list[int]]:
 
 
 def siblings(nodes: list[Node], names: set[str]) -> set[str]:
-    """Return names with those of simulators that share specimens, and so a design, with them."""
+    """Return names with those of simulators that share specimens, or are of groups of the same.
+
+    They share a design.
+    """
     found = set(names)
-    for group in groups(nodes):
+    for group in [*groups(nodes), *families(nodes)]:
         together = {nodes[k].name for k in group}
-        if together & names:
+        if together & found:
             found |= together
     return found
+
+
+def families(nodes: list[Node]) -> list[list[int]]:
+    """Return simulators by position, those together whose specimens are of groups of the same."""
+    found: dict[int, list[int]] = {}
+    for k, node in enumerate(nodes):
+        if node.group:
+            found.setdefault(id(node.bound.inputs), []).append(k)
+    return list(found.values())
 
 
 def aligned(nodes: list[Node]) -> bool:

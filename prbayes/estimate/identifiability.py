@@ -45,6 +45,16 @@ def unidentified_directions(unidentified: Floats, names: list[str]) -> list[str]
     return found
 
 
+def without(unidentified: Floats, elements: NDArray[np.bool_]) -> Floats:
+    """Return directions not identified, (d, q), without those of elements, (d,), among them."""
+    if not elements.any():
+        return unidentified
+    left = unidentified * ~elements[:, None]
+    axes, strength, _ = np.linalg.svd(left, full_matrices=False)
+    # One, or zero up to rounding, of elements on which nothing depends.
+    return np.asarray(axes[:, strength > 0.5])
+
+
 def named_direction(direction: Floats, names: list[str]) -> str:
     """Name a direction by its largest elements, relative to the largest: 'mu - 0.8 sigma'."""
     largest = np.argmax(np.abs(direction))

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes.estimate.data_sets import siblings
+from prbayes.estimate.data_sets import families, siblings
 from prbayes.estimate.refit import DesignErrors
 from prbayes.estimate.sandwich import Information
 from prbayes.model.evaluator import Evaluator
@@ -153,10 +153,17 @@ def _add(evaluator: Evaluator, thetas: Floats, names: set[str], factor: float = 
         room = design.max_points - now
         size = min(batches * first, room)
         if size > 0:
-            design.add(evaluator.roots(thetas, k), size)
+            design.add(_components(evaluator, thetas, k), size)
             added = True
             _log.info("%s: refined to %d responses", node.name, design.n_runs)
     return added
+
+
+def _components(evaluator: Evaluator, thetas: Floats, k: int) -> list[Floats]:
+    """Return the populations at thetas for which a design has points: those of all its groups."""
+    own = next((family for family in families(evaluator.nodes) if k in family), [k])
+    of_each = [evaluator.roots(thetas, member) for member in own]
+    return [np.concatenate(values) for values in zip(*of_each, strict=True)]
 
 
 def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
@@ -219,7 +226,7 @@ def _reach(
     """Let clouds reach the populations at thetas; return whether there are any."""
     clouds = list(_clouds(evaluator, names))
     for k, design in clouds:
-        design.reach(evaluator.roots(thetas, k), on_the_way=on_the_way)
+        design.reach(_components(evaluator, thetas, k), on_the_way=on_the_way)
     return bool(clouds)
 
 
@@ -229,7 +236,7 @@ def _widened(
     """Draw larger clouds for the populations at thetas; return whether any could be."""
     grown = False
     for k, design in _clouds(evaluator, names):
-        grown |= design.widen(evaluator.roots(thetas, k), on_the_way=on_the_way)
+        grown |= design.widen(_components(evaluator, thetas, k), on_the_way=on_the_way)
     return grown
 
 

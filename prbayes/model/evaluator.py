@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
+from numpy.typing import NDArray
 
 from prbayes._checks import AT_ONCE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
@@ -145,6 +146,15 @@ class Evaluator:
             params = rv.owner.op.dist_params(rv.owner)
             found.append(node.bound.inputs.core(params))
         return found
+
+    @cached_property
+    def told_by_prior(self) -> NDArray[np.bool_]:
+        """Which elements of theta no input depends on but through others, shape (d,).
+
+        Such as the spread between groups, of which their hyperparameters tell by the prior.
+        """
+        params = [p for own in self._params() for p in own]
+        return self.hyperparameters.above(params)
 
     def _graphs(self) -> list[Any]:
         graphs = []

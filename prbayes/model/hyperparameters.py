@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
+from numpy.typing import NDArray
 from pymc.pytensorf import join_nonshared_inputs
 from pytensor.graph.replace import graph_replace, vectorize_graph
+from pytensor.graph.traversal import ancestors
 
 from prbayes._checks import Floats, called, real_array, refuse_single_precision
 from prbayes.model.elements import coordinates, element_names
@@ -105,6 +107,15 @@ class Hyperparameters:
         for name, own, shape in zip(names, self._own_names, shapes, strict=True):
             found += element_names(name, shape, coordinates(self.model, own))
         return found
+
+    def above(self, graphs: Sequence[Any]) -> NDArray[np.bool_]:
+        """Return which elements of theta are above graphs through other variables only, (d,)."""
+        free = set(self.model.free_RVs)
+        blocked = [v for v in ancestors(graphs, blockers=free) if v in free]
+        every = set(ancestors(blocked))
+        hidden = {str(rv.name) for rv in free & every if rv not in blocked}
+        sizes = [int(np.prod(shape, dtype=int)) for shape in self.shapes.values()]
+        return np.repeat([name in hidden for name in self._own_names], sizes)
 
     # Functions of theta.
 

@@ -52,6 +52,7 @@ class Node:
     # Names of the simulators before it in the model that have a ``.dist()`` of its inputs.
     same_inputs: tuple[str, ...] = ()
     outputs: Outputs = ONE  # of a run
+    group: str = ""  # the name of the group whose specimens it has, if it is of one
 
     @property
     def metric(self) -> Metric:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -39,8 +40,9 @@ from prbayes.model.node import (
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.response.compilation import PLAIN
+from prbayes.response.grouping import Groups, is_group, places_of
 from prbayes.response.inputs import Inputs, is_labelled, read_inputs
-from prbayes.response.outputs import Outputs, read_observed
+from prbayes.response.outputs import ONE, Outputs, read_observed
 from prbayes.response.response import Responses, refuse_uncallable
 
 _log = logging.getLogger("prbayes")
@@ -58,7 +60,7 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     dims: str | Sequence[str] | None = None,
     propagation: Propagation | None = None,
     progressbar: bool = True,
-) -> TensorVariable:
+) -> TensorVariable | tuple[TensorVariable, ...]:
     r"""Add an observed node whose log-density is -discrepancy / epsilon to the current model.
 
     Parameters
@@ -85,7 +87,8 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         metric that sees them together, such as `Joint`: an array, a DataFrame whose columns are
         outputs, a DataArray with specimens first, or a mapping of arrays. NaN is an output that was
         not measured, +inf a specimen that had failed. After ``pymc.set_data`` or ``pymc.observe``
-        the metric is prepared against the new values, and no response is computed anew.
+        the metric is prepared against the new values, and no response is computed anew. With the
+        group of each specimen where inputs depend on `prbayes.response.group`.
     epsilon : float, optional
         Scale of the discrepancy. 1/N for metrics on the scale of a likelihood, N the effective
         number of specimens; unset for the others, until `calibrate_epsilon` and `set_epsilon`, or
@@ -106,11 +109,12 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
 
     Returns
     -------
-    TensorVariable
-        The observed variable. PyMC's predictive sampling draws N specimens for it: new ones under
-        `Fresh`, else from the population's points, by weight and with replacement, so that one may
-        come twice; and independent of those of other variables, of which a warning is logged where
-        simulators share inputs (`predict` draws the same specimens for them).
+    TensorVariable, or a tuple of them
+        The observed variable, or that of each group, called ``y[Adler]`` and so on. PyMC's
+        predictive sampling draws N specimens for it: new ones under `Fresh`, else from the
+        population's points, by weight and with replacement, so that one may come twice; and
+        independent of those of other variables, of which a warning is logged where simulators share
+        inputs (`predict` draws the same specimens for them).
 
     Raises
     ------
@@ -141,23 +145,66 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     # A model within another one puts its own name before those of its variables.
     name = pm.modelcontext(None).name_for(plain_text(name, "prb.Simulator: name"))
     _refuse_name(name, model)
-    values, outputs = read_observed(name, _data(name, observed))
+    refuse_uncallable(name, response)
+    sorted_inputs = read_inputs(name, inputs, model)
+    for root in sorted_inputs.roots:
+        refuse_single_precision(f"{name}: {root.name}", root.dtype)
+    places, measured = _grouped(name, sorted_inputs, observed)
+    values, outputs = read_observed(name, _data(name, measured))
     target = _target(name, metric, values, weights)
     propagation = _propagation(name, propagation)
     size = len(target.observed)
     labels = None if specimens is None else sample_labels(specimens, size, f"{name}: specimens")
-    before = list(nodes(model).values())
-    others = [other for other in before if other.specimens is not None]
+    others = [other for other in nodes(model).values() if other.specimens is not None]
     if labels is not None:
         _refuse_alike_labels(name, labels, others)
     dims = _checked_dims(name, dims, target.observed.shape, model)
     if epsilon is not None:
         positive_number(epsilon, f"{name}: epsilon")
-    refuse_uncallable(name, response)
-    sorted_inputs = read_inputs(name, inputs, model)
-    for root in sorted_inputs.roots:
-        refuse_single_precision(f"{name}: {root.name}", root.dtype)
-    responses = _responses(name, response, sorted_inputs, propagation, outputs)
+    # As a constant, in which PyMC does not look for missing values to impute.
+    data: Any = target.observed
+    if isinstance(observed, Variable):
+        data = observed
+    elif np.isnan(target.observed).any():
+        data = pt.constant(target.observed)
+    whole = _Term(name, target, labels, data, dims)
+    terms = [whole]
+    groups = sorted_inputs.groups
+    if groups is not None and places is not None:
+        _refuse_dims_of_groups(name, dims, groups)
+        terms = _of_groups(whole, groups, places)
+    made = []
+    for term in terms:
+        responses = _responses(term.name, response, sorted_inputs, propagation, outputs)
+        made.append(_observed_term(term, model, responses, propagation, epsilon, progressbar))
+    return made[0] if groups is None else tuple(made)
+
+
+@dataclass(frozen=True, eq=False)
+class _Term:
+    """What is compared with one population: all that was observed, or that of a group."""
+
+    name: str
+    target: Discrepancy
+    labels: NDArray[Any] | None  # of specimens
+    data: Any  # what PyMC is to hold as observed
+    dims: tuple[str, ...] | None
+    group: str = ""
+    place: int = 0  # of the group
+
+
+def _observed_term(
+    term: _Term,
+    model: pm.Model,
+    responses: Responses,
+    propagation: Propagation,
+    epsilon: float | None,
+    progressbar: bool,
+) -> TensorVariable:
+    """Add an observed variable to a model."""
+    name, target, sorted_inputs = term.name, term.target, responses.inputs
+    before = list(nodes(model).values())
+    others = [other for other in before if other.specimens is not None]
     asked = listening()
     if asked is not None:
         others_asked = [(one.propagation, one.responses) for one in asked]
@@ -178,27 +225,72 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         bound.aim(target.beside(bound.first_responses, bound.dimensions))
         target = bound.target
     if epsilon is None:
-        epsilon = 1 / effective_specimens(target, labels) if target.likelihood else np.nan
+        epsilon = 1 / effective_specimens(target, term.labels) if target.likelihood else np.nan
     node = Node(
         name,
         target,
         bound,
         propagation,
         shared_epsilon(name, epsilon),
-        labels,
-        _with_inputs(bound, before),
-        outputs,
+        term.labels,
+        _with_inputs(bound, before, term.group),
+        responses.outputs or ONE,
+        term.group,
     )
     _warn_of_shared_specimens(node, others)
-    # As a constant, in which PyMC does not look for missing values to impute.
-    data: Any = target.observed
-    if isinstance(observed, Variable):
-        data = observed
-    elif np.isnan(target.observed).any():
-        data = pt.constant(target.observed)
-    rv = SimulatorDistribution(name, *sorted_inputs.roots, node=node, observed=data, dims=dims)
+    place = pt.constant(term.place, dtype="int64")
+    params = [place if is_group(v) else v for v in sorted_inputs.roots]
+    given = {"node": node, "observed": term.data, "dims": term.dims}
+    rv = SimulatorDistribution(name, *params, **given)
     rv.owner.op.own_node(rv.owner)
     return rv
+
+
+def _grouped(name: str, inputs: Inputs, observed: Any) -> tuple[NDArray[np.intp] | None, Any]:
+    """Return the place of each specimen's group, if inputs have groups, and what was observed."""
+    groups = inputs.groups
+    return (None, observed) if groups is None else places_of(name, observed, groups)
+
+
+def _refuse_dims_of_groups(name: str, dims: tuple[str, ...] | None, groups: Groups) -> None:
+    """Raise if dimensions are given, which would be those of each group."""
+    if dims is not None:
+        raise ValueError(
+            f"{name}: dims: got {list(dims)}, expected none: specimens are divided into the groups "
+            f"{groups.names}, each with observed values of its own; leave dims= out"
+        )
+
+
+def _of_groups(whole: _Term, groups: Groups, places: NDArray[np.intp]) -> list[_Term]:
+    """Return the term of each group."""
+    target = whole.target
+    if whole.labels is not None:
+        _refuse_label_of_two_groups(whole.name, whole.labels, places, groups)
+    terms = []
+    for place, label in enumerate(groups.names):
+        own = places == place
+        name = groups.name(whole.name, place)
+        weights = target.weights[own] if np.ptp(target.weights) > 0 else None
+        part = _target(name, target.metric, target.observed[own], weights)
+        data = pt.constant(part.observed) if np.isnan(part.observed).any() else part.observed
+        labels = None if whole.labels is None else whole.labels[own]
+        terms.append(_Term(name, part, labels, data, None, label, place))
+    return terms
+
+
+def _refuse_label_of_two_groups(
+    name: str, labels: NDArray[Any], places: NDArray[np.intp], groups: Groups
+) -> None:
+    """Raise if a specimen is of two groups."""
+    seen: dict[object, int] = {}
+    for label, place in zip(labels.tolist(), places.tolist(), strict=True):
+        first = seen.setdefault(label, place)
+        if first != place:
+            raise ValueError(
+                f"{name}: specimens: got the label {label!r} in {groups.names[first]} and in "
+                f"{groups.names[place]}, expected each specimen in one group; write labels that "
+                "are different"
+            )
 
 
 def _data(name: str, observed: Any) -> Any:
@@ -321,10 +413,14 @@ def _checked_dims(
     return tuple(names)
 
 
-def _with_inputs(bound: Bound, others: list[Node]) -> tuple[str, ...]:
-    """Return the names of the simulators that have an aleatory input of this one."""
+def _with_inputs(bound: Bound, others: list[Node], group: str) -> tuple[str, ...]:
+    """Return the names of the simulators that have an aleatory input of this one.
+
+    Specimens of another group are others.
+    """
     own = {id(dist) for dist in bound.inputs.aleatory}
-    theirs = {other.name: map(id, other.bound.inputs.aleatory) for other in others}
+    alike = [other for other in others if other.group == group]
+    theirs = {other.name: map(id, other.bound.inputs.aleatory) for other in alike}
     return tuple(name for name, inputs in theirs.items() if not own.isdisjoint(inputs))
 
 

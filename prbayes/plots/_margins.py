@@ -34,6 +34,7 @@ class Margin:
     node: int
     position: int
     index: tuple[int, ...]  # element of a multivariate input
+    group: str = ""  # whose population it is, where there are groups
 
     @property
     def discrete(self) -> bool:
@@ -50,15 +51,16 @@ def margins(evaluator: Evaluator) -> list[Margin]:
         inputs = node.bound.inputs
         names = aleatory_names(inputs, node.bound.responses.function)
         for position, dist in enumerate(inputs.aleatory):
-            if any(margin.dist is dist for margin in found):
+            if any(margin.dist is dist and margin.group == node.group for margin in found):
                 continue
+            own = [node.group] if node.group else []
             name = names[position]
-            if name in taken:
+            if element_name(name, own) in taken:
                 name = f"{name} of {node.name}"
-            taken.add(name)
+            taken.add(element_name(name, own))
             for index in np.ndindex(inputs.event_shapes[position]):
-                element = element_name(name, index)
-                found.append(Margin(element, dist, k, position, index))
+                element = element_name(name, [*own, *index])
+                found.append(Margin(element, dist, k, position, index, node.group))
     return found
 
 

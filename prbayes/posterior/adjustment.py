@@ -17,6 +17,7 @@ from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.refit import ARRIVED, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
+from prbayes.posterior.pooling import pooled
 
 # Standard errors from which on a minimiser is elsewhere than where its sampling distribution was
 # taken: an optimum by itself is within a hundredth of one, one that the prior held may be far off.
@@ -105,17 +106,21 @@ class _Told:
     allowed: dict[str, float]  # by the prior, as `prior_probabilities` says
     design_variance: float = 0.0  # of the minimiser, by the design's error
 
-    def combined(self, shifts: Floats) -> tuple[Floats, Floats]:
-        """Return the centre (r,) and covariance (r, r) that draws should have."""
+    def of_data(self, shifts: Floats) -> tuple[Floats, Floats]:
+        """Return the centre (r,) that the data tell, without bias, and their information (r, r)."""
         # What the data tell: the minimiser's information and its bias, which as a median is the
         # same in every parametrisation, as where a scale comes near zero.
         information = _precision(shifts, self.center.size)
         if self.design_variance:
             unknown = self.design_variance * np.eye(self.center.size)
             information = np.linalg.inv(np.linalg.inv(information) + unknown)
-        bias = np.median(shifts, axis=0)
+        return self.center - np.median(shifts, axis=0), information
+
+    def combined(self, shifts: Floats) -> tuple[Floats, Floats]:
+        """Return the centre (r,) and covariance (r, r) that draws should have."""
+        told, information = self.of_data(shifts)
         covariance = np.linalg.inv(information + self.prior_precision)
-        from_data = information @ (self.center - bias)
+        from_data = information @ told
         from_prior = self.prior_precision @ self.prior_mean
         return covariance @ (from_data + from_prior), covariance
 
@@ -338,7 +343,9 @@ class Affine:
 
     def _distrust(self, moves: Floats, mapped: list[Mapped], names: list[str]) -> list[str]:
         """Say where the map is not to be relied on, given how far each median moved, (d,)."""
-        return _of_motion(moves, names)
+        doubts = [doubt for mode in mapped for doubt in mode.doubts]
+        exact = all(mode.given for mode in mapped)
+        return doubts if exact else [*doubts, *_of_motion(moves, names)]
 
     def _said(self, mapped: list[Mapped], modes: int, draws: int, design_variance: float) -> str:
         """Return what was done, in words."""
@@ -364,10 +371,15 @@ class Affine:
     ) -> Mapped:
         x, remainder = sampling.coordinates(draws)
         told = replace(self._told(sampling), design_variance=design_variance)
+        errors = told.errors(self.random_seed)
+        if sampling.evaluator.told_by_prior.any():
+            center, information = told.of_data(told.shifts)
+            found, doubts = pooled(sampling, center, information, draws, self.random_seed)
+            mapped = Mapped(found, 0, *errors, told.fit_probability, told.allowed)
+            return replace(mapped, given=True, doubts=doubts)
         center, covariance = told.combined(told.shifts)
         out = transported(sampling, x, remainder, center, covariance)
         outside = drawn_in(x, _FAR) != x
-        errors = told.errors(self.random_seed)
         far = int(outside.any(axis=1).sum())
         return Mapped(out, far, *errors, told.fit_probability, told.allowed)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,7 +20,7 @@ from prbayes.posterior.adjustment import (
     among,
 )
 from prbayes.posterior.sampling_model import SamplingModel, Sight
-from prbayes.posterior.smc_kernel import Normal, correlation
+from prbayes.posterior.walk import REMEMBERED, WALK, walked
 
 # How much wider than the draws so far the hyperparameters are spread that data sets are drawn at:
 # the model of the estimates has to hold in the tails of the posterior as well.
@@ -44,12 +43,6 @@ _STRAINED = 3.5
 # Resamples of the refits that tell the Monte Carlo error, and draws that they are told on.
 _RESAMPLED = 30
 _TOLD_ON = 500
-# Steps of the draws, and their mean absolute correlation with where they began, at which they end.
-_WALK = 200
-_AT_LEAST = 20
-_FORGOTTEN = 0.05
-# The same, from which on it is told. By judgement.
-_REMEMBERED = 0.2
 
 
 @dataclass(frozen=True)
@@ -174,10 +167,10 @@ class GivenEstimate(Affine):
                 f"adjust=prb.posterior.GivenEstimate(n_fits={2 * self.n_fits}), or look at the "
                 "prior"
             )
-        if found.memory > _REMEMBERED:
+        if found.memory > REMEMBERED:
             doubts.append(
-                f"after {_WALK} steps the draws still have a correlation of {found.memory:.2f} "
-                f"with where they began, expected at most {_REMEMBERED}, so that they are not yet "
+                f"after {WALK} steps the draws still have a correlation of {found.memory:.2f} "
+                f"with where they began, expected at most {REMEMBERED}, so that they are not yet "
                 "those of the posterior given the estimate; compare with adjust="
                 "prb.posterior.Affine()"
             )
@@ -340,7 +333,7 @@ class _Look:
             total[near] = log_prior + likelihood
             return np.where(np.isnan(total), -np.inf, total)
 
-        return _walked(log_density, draws, rng)
+        return walked(log_density, draws, rng)
 
     def log_likelihood(self, model: SamplingModel, draws: Floats) -> Floats:
         """Return the log-density of the estimate at draws, (n,)."""
@@ -423,40 +416,3 @@ def _own_values(evaluator: Evaluator, thetas: Floats) -> Floats:
     own = evaluator.constrained(thetas)
     columns = [np.reshape(values, (len(thetas), -1)) for values in own.values()]
     return np.column_stack(columns)
-
-
-def _walked(
-    log_density: Callable[[Floats], Floats], start: Floats, rng: np.random.Generator
-) -> tuple[Floats, float]:
-    """Return draws of a density, each of which walked from a start of its own, (n, d).
-
-    And the mean absolute correlation that they still have with where they began.
-
-    Independent proposals from a normal fitted to all, in turn with random walks, by the rule of
-    Metropolis and Hastings.
-    """
-    here = start.copy()
-    density = log_density(here)
-    scale = 2.38 / np.sqrt(here.shape[1])
-    memory = 1.0
-    for step in range(_WALK):
-        fitted = Normal.of(here)
-        noise = rng.standard_normal(here.shape)
-        if step % 2:
-            there, log_ratio = fitted.independent(here, noise)
-        else:
-            there = here + scale * noise @ fitted.root.T
-            log_ratio = np.zeros(len(here))
-        other = log_density(there)
-        with np.errstate(invalid="ignore"):
-            gain = other - density + log_ratio
-        accepted = np.log(rng.random(len(here))) < np.nan_to_num(gain, nan=-np.inf)
-        here[accepted] = there[accepted]
-        density[accepted] = other[accepted]
-        if step % 2 == 0:
-            scale *= np.exp(accepted.mean() - 0.3)
-            continue
-        memory = correlation(start, here)
-        if memory < _FORGOTTEN and step > _AT_LEAST:
-            break
-    return here, memory

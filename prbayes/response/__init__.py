@@ -3,6 +3,7 @@
 from prbayes.response.budget import BudgetError
 from prbayes.response.costs import Cost
 from prbayes.response.failures import Abort, Replace, ResponseError, Retry
+from prbayes.response.grouping import group
 from prbayes.response.inadequacy import Additive, Multiplicative
 from prbayes.response.store import Store, StoreError
 
@@ -17,4 +18,5 @@ __all__ = [
     "Retry",
     "Store",
     "StoreError",
+    "group",
 ]

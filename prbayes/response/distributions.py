@@ -247,8 +247,9 @@ class PriorSampler:
         try:
             # Variables that depend on no other are drawn n times; the others follow.
             batches = {}
-            for root in roots:
-                if not any(a in roots for a in ancestors([root]) if a is not root):
+            drawn = [*roots, *_model_variables_above(roots)]
+            for root in drawn:
+                if not any(a in drawn for a in ancestors([root]) if a is not root):
                     batches[root] = change_dist_size(root, (n,), expand=True)
             outputs = vectorize_graph(list(roots), batches)
             with interpreted():
@@ -277,6 +278,13 @@ class PriorSampler:
                 "pm.HalfNormal"
             ) from None
         return [np.array(column) for column in zip(*draws, strict=True)]
+
+
+def _model_variables_above(roots: Sequence[TensorVariable]) -> list[TensorVariable]:
+    """Return the other random variables of a model that variables depend on."""
+    # PyMC gives a `str_repr` to the variables of a model.
+    above = [v for v in ancestors(roots) if hasattr(v, "str_repr") and is_random(v)]
+    return [v for v in above if v not in roots]
 
 
 def prior_draws(roots: Sequence[TensorVariable], k: int, seed: int) -> list[Floats]:

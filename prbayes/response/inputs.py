@@ -20,6 +20,7 @@ from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import real_array
 from prbayes.response.compilation import PLAIN, interpreted
+from prbayes.response.grouping import Groups, groups_of, is_group
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +49,11 @@ class Inputs:
             if hasattr(variable, "get_value") and isinstance(variable, TensorVariable):
                 found[str(variable.name or f"shared variable {i}")] = variable
         return found
+
+    @property
+    def groups(self) -> Groups | None:
+        """The groups that the inputs depend on, of which each specimen has one."""
+        return groups_of("", self.roots)
 
     def roots_above(self, positions: Sequence[int]) -> tuple[TensorVariable, ...]:
         """Return the roots above some arguments, by their positions; none above constants."""
@@ -109,7 +115,7 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
         If one is none of the three, if none is aleatory, or if no model variable is above any of
         them.
     """
-    known = set(model.basic_RVs)
+    known: set[Variable] = set(model.basic_RVs)
     arguments: list[Any] = []
     aleatory: list[TensorVariable] = []
     roots: dict[TensorVariable, None] = {}
@@ -119,6 +125,7 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
         if not isinstance(x, Variable):
             arguments.append(_constant(x, label))
             continue
+        known.update(filter(is_group, _ancestry(x, known)))
         above = _ancestry(x, known)
         _refuse_labelled(above, label)
         roots.update((v, None) for v in above if v in known)
@@ -136,7 +143,9 @@ def read_inputs(name: str, inputs: Sequence[Any], model: pm.Model) -> Inputs:
             aleatory.append(x)
             within.append(set(latent) - {x})
         arguments.append(aleatory.index(x))
-    _refuse_too_little(name, len(inputs), bool(aleatory), bool(roots))
+    groups_of(name, roots)
+    hyperparameters = [root for root in roots if not is_group(root)]
+    _refuse_too_little(name, len(inputs), bool(aleatory), bool(hyperparameters))
     nested = any(
         parts and not _marginal(x, parts) for x, parts in zip(aleatory, within, strict=True)
     )

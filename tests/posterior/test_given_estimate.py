@@ -121,28 +121,6 @@ def test_where_too_few_refits_arrive_it_is_the_straight_map_and_says_so(
     np.testing.assert_array_equal(given.posterior["mu"], straight.posterior["mu"])
 
 
-def test_draws_walk_to_the_density_that_they_are_of_and_forget_where_they_began() -> None:
-    rng = np.random.default_rng(3)
-    start = rng.normal(2, 3, (2000, 2))
-    draws, memory = given_estimate._walked(lambda x: -0.5 * (x**2).sum(axis=1), start, rng)
-    assert memory < 0.05
-    np.testing.assert_allclose(draws.mean(axis=0), 0, atol=0.1)
-    np.testing.assert_allclose(draws.std(axis=0), 1, rtol=0.06)
-
-
-def test_draws_that_stay_where_they_were_remember_it() -> None:
-    rng = np.random.default_rng(3)
-    start = rng.normal(0, 1, (50, 1))
-    known = {float(x) for x in start[:, 0]}
-
-    def nowhere_else(x: Floats) -> Floats:
-        return np.array([0.0 if float(row[0]) in known else -np.inf for row in x])
-
-    draws, memory = given_estimate._walked(nowhere_else, start, rng)
-    np.testing.assert_array_equal(draws, start)
-    assert memory > 0.99
-
-
 @pytest.mark.parametrize(
     ("strain", "moved", "memory", "words"),
     [

@@ -421,7 +421,7 @@ def test_named_dimensions_arrive_in_the_posterior() -> None:
     np.testing.assert_allclose(
         posterior["gap"], posterior["mean"].diff("axis").squeeze("axis", drop=True)
     )
-    assert list(vector_run().calibration["element"].values) == ["mean[0]", "mean[1]"]
+    assert list(vector_run().calibration["element"].values) == ["mean[a]", "mean[b]"]
     for i, name in enumerate("ab"):
         data = vector_run().observed_data[("first", "second")[i]].values
         h2 = vector_run_bandwidth(i) ** 2

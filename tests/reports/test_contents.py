@@ -72,7 +72,11 @@ def test_several_simulators_and_vectors(tmp_path: Path, section: Any, parse: Any
     made = prb.Report("x", model=model, optimum=optimum, pictures=False)
     data = cells(section(made, "Data").table)
     assert [r[:2] for r in data.rows] == [("first", "4"), ("second", "3")]
-    assert [r[0] for r in cells(section(made, "Optimum").table).rows] == ["mu[0]", "mu[1]", "k"]
+    assert [r[0] for r in cells(section(made, "Optimum").table).rows] == [
+        "mu[shaft]",
+        "mu[disk]",
+        "k",
+    ]
     assert [
         p for p in section(made, "Metric and epsilon").text if p.startswith("first: AreaMetric(")
     ]
