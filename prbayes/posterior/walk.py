@@ -11,7 +11,7 @@ from prbayes.posterior.smc_kernel import Normal, correlation
 
 # Steps of the draws, and their mean absolute correlation with where they began, at which they end.
 WALK = 200
-_AT_LEAST = 20
+AT_LEAST = 20
 _FORGOTTEN = 0.05
 # The same, from which on it is told. By judgement.
 REMEMBERED = 0.2
@@ -22,6 +22,7 @@ def walked(
     start: Floats,
     rng: np.random.Generator,
     steps: int = WALK,
+    at_least: int = AT_LEAST,
 ) -> tuple[Floats, float]:
     """Return draws of a density, each of which walked from a start of its own, (n, d).
 
@@ -52,6 +53,6 @@ def walked(
             scale *= np.exp(accepted.mean() - 0.3)
             continue
         memory = correlation(start, here)
-        if memory < _FORGOTTEN and step > _AT_LEAST:
+        if memory < _FORGOTTEN and step > at_least:
             break
     return here, memory

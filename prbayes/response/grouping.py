@@ -14,7 +14,7 @@ from pytensor.graph.basic import Variable
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import called, plain_text, real_array
+from prbayes._checks import plain_text, real_array
 
 
 class GroupRV(RandomVariable):  # type: ignore[misc]
@@ -201,8 +201,8 @@ def _labelled(name: str, observed: Any, dim: str) -> tuple[list[Any], Any]:
     if dim in getattr(index, "names", ()) and not hasattr(observed, "columns"):
         return list(index.get_level_values(dim)), real_array(observed, name)
     raise TypeError(
-        f"{name}: got {called(observed)} without the group of each specimen, expected a DataArray "
-        f"with a coordinate {dim!r} along the specimens, a DataFrame with a column of that name, "
-        "or a Series with it in its index, since an input depends on "
+        f"{name}: got {type(observed).__name__} without the group of each specimen, expected a "
+        f"DataArray with a coordinate {dim!r} along the specimens, a DataFrame with a column of "
+        "that name, or a Series with it in its index, since an input depends on "
         f"prb.response.group({dim!r})"
     )
