@@ -106,6 +106,40 @@ def samplers() -> Iterator[Row]:
         ]
 
 
+def partial_pooling() -> Iterator[Row]:
+    """Return the rows of groups beside the exact posterior."""
+    table = found("partial_pooling")
+    for name in ("m", "tau", "sigma", "mu"):
+        row = table[name]
+        error = row["scatter of shifts"] / np.sqrt(table["data sets"])
+        yield [
+            "each `mu`" if name == "mu" else f"`{name}`",
+            f"{row['mean']:.3f}",
+            f"{row['exact mean']:.3f}",
+            f"{row['shift']:+.2f} ± {error:.2f}",
+            f"{row['ratio of sd']:.2f}",
+            f"{row['held']:.0%}",
+        ]
+
+
+def measurement_error() -> Iterator[Row]:
+    """Return the rows of readings with an error."""
+    table = found("measurement_error")
+    ways = {"ignored": "ignored", "known": "known", "estimated": "from repeats"}
+    truth = {"mu": ("mean", 0.0), "sigma": ("standard deviation", 0.3)}
+    for (way, label), (name, (told, value)) in product(ways.items(), truth.items()):
+        row = table[f"{way}/{name}"]
+        yield [
+            label,
+            told,
+            f"{value:g}",
+            f"{row['mean']:.3f}",
+            f"{row['sd']:.3f}",
+            f"{row['held']:.0%}",
+            str(row["data sets"]),
+        ]
+
+
 def sizes() -> Iterator[Row]:
     """Return the rows of the area test's size."""
     table = found("validity")["size"]
@@ -568,6 +602,8 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "case study, Monte Carlo": lambda: case_study("monte carlo"),
     "case study, evaluations": evaluations,
     "scale factor": scale_factor,
+    "partial pooling": partial_pooling,
+    "measurement error": measurement_error,
     "landscapes": landscapes,
     "wrong families, many data": lambda: families((100_000,)),
     "wrong families, few data": lambda: families((20, 50)),

@@ -674,16 +674,30 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State) -> Optimum:
     for line in warnings:
         _log.warning("%s", line)
     ran_out = f" {', '.join(edge)} ran to the edge of the support." if edge else ""
+    told = _told_of_designs(evaluator, state.design_error)
+    told += "" if found.prior else _told_by_prior(evaluator)
     return replace(
         found,
         converged=found.converged and not edge,
-        message=found.message + ran_out + _told_of_designs(evaluator, state.design_error),
+        message=found.message + ran_out + told,
         seconds=time.perf_counter() - plan.clock,
         design_error=state.design_error,
         rivals=tuple(rival_record(evaluator, o) for o in state.others),
         warnings=warnings,
         at_edge=edge,
         at_jump=jump,
+    )
+
+
+def _told_by_prior(evaluator: Evaluator) -> str:
+    """Say which hyperparameters the data tell through others only, by the prior."""
+    names = evaluator.readable_names
+    above = [name for name, own in zip(names, evaluator.told_by_prior, strict=True) if own]
+    if not above:
+        return ""
+    return (
+        f" Of {', '.join(above)} the data tell through other hyperparameters and the prior, which "
+        "is not minimised: they are anywhere here, and prb.sample_smc finds them."
     )
 
 

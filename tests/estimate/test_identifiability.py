@@ -11,6 +11,7 @@ from prbayes.estimate.identifiability import (
     identified_by_area,
     identified_by_curvature,
     unidentified_directions,
+    without,
 )
 from prbayes.estimate.sandwich import Information
 from prbayes.model.evaluator import Evaluator
@@ -161,3 +162,14 @@ def test_of_a_sum_of_two_means_an_area_identifies_only_the_sum() -> None:
     assert seen.shape == (2, 1)
     # In units of the priors' spreads, which are known from draws to some per cent.
     assert abs(seen[:, 0] @ np.sqrt([0.5, 0.5])) > 0.99
+
+
+def test_directions_of_other_elements_are_left_out() -> None:
+    # The first two elements are not identified, and the sum of the others is not.
+    hidden = np.zeros((4, 3))
+    hidden[:2, :2] = [[0.6, 0.8], [-0.8, 0.6]]
+    hidden[2:, 2] = np.sqrt(0.5)
+    others = np.array([True, True, False, False])
+    left = without(hidden, others)
+    assert unidentified_directions(left, ["m", "tau", "a", "b"]) == ["a + b"]
+    assert without(hidden, np.zeros(4, dtype=bool)) is hidden
