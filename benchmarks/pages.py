@@ -119,6 +119,7 @@ def partial_pooling() -> Iterator[Row]:
             f"{row['shift']:+.2f} ± {error:.2f}",
             f"{row['ratio of sd']:.2f}",
             f"{row['held']:.0%}",
+            str(table["data sets"]),
         ]
 
 

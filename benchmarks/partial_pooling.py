@@ -13,17 +13,13 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import prbayes as prb
-from benchmarks import record
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
-import suppliers
+from benchmarks import record, suppliers
 
 OUT = record.RESULTS / "partial_pooling.json"
 NAMES = ("m", "tau", "sigma", "mu")
@@ -38,7 +34,7 @@ def one(seed: int) -> dict[str, list[Any]]:
         500, chains=2, model=model, optimum=optimum, random_seed=seed, progressbar=False
     ).posterior
     exact = suppliers.exact(observed)
-    truth = {"m": 0.0, "tau": 0.3, "sigma": suppliers.SIGMA}
+    truth: dict[str, Any] = {"m": 0.0, "tau": 0.3, "sigma": suppliers.SIGMA}
     # The means come first of all that the seed gives.
     truth["mu"] = np.random.default_rng(seed).normal(0, truth["tau"], len(suppliers.NAMES))
     rows: dict[str, list[Any]] = {}
@@ -48,9 +44,9 @@ def one(seed: int) -> dict[str, list[Any]]:
         low, high = np.quantile(draws, [0.055, 0.945], axis=0)
         held = (low <= truth[name]) & (truth[name] <= high)
         of_mean = (draws.mean(axis=0) - mean) / sd
-        columns = [of_mean, draws.std(axis=0) / sd, held, draws.mean(axis=0), mean * np.ones(1)]
-        rows[name] = np.broadcast_arrays(*columns)
-    return {name: np.stack(columns, axis=1).tolist() for name, columns in rows.items()}
+        columns = [of_mean, draws.std(axis=0) / sd, held, draws.mean(axis=0), mean]
+        rows[name] = np.stack(columns, axis=1).tolist()
+    return rows
 
 
 def main() -> None:
