@@ -220,6 +220,19 @@ def simulator(**given: Any) -> Any:
             assert [rv.name for rv in made.basic_RVs][1:] in ([], ["y"])
 
 
+def in_groups(labels: Sequence[Any]) -> xr.DataArray:
+    return xr.DataArray(OBSERVED, {"supplier": ("specimen", labels)}, "specimen")
+
+
+def group(**given: Any) -> Any:
+    labels = ["a", "b"] * 15
+    with pm.Model(coords=given.get("coords", {"supplier": ["a", "b"]})):
+        mu = pm.Normal("mu", 1, 1, shape=2)
+        x = pm.Normal.dist(mu[prb.response.group(given.get("dim", "supplier"))], 1.0)
+        observed = given.get("observed", in_groups(labels))
+        return prb.Simulator("y", line, x, metric=prb.AreaMetric(), observed=observed, **QUIET)
+
+
 def metric_called(**given: Any) -> Any:
     simulated, observed = given.pop("simulated", OBSERVED), given.pop("observed", OBSERVED)
     return prb.AreaMetric()(simulated, observed, **given)
@@ -341,6 +354,26 @@ TABLE: dict[str, Row] = {
             "shape": (3, "line", lambda c: np.nan * c, lambda c: 1.0),
         },
         {"seen": [0.0, 1.0]},
+    ),
+    "response.group": Row(
+        group,
+        {
+            "dim": (None, 3, "", "batch", ["supplier"]),
+            "coords": (
+                {"supplier": ["a"]},
+                {"supplier": ["a", "a"]},
+                {"supplier": ["a/b", "c"]},
+                {"other": ["a", "b"]},
+            ),
+            "observed": (
+                OBSERVED,
+                OBSERVED.tolist(),
+                in_groups(["a"] * 30),
+                in_groups(["a"] * 29 + ["b"]),
+                in_groups(["a", "b", "c"] * 10),
+                in_groups([None] * 30),
+            ),
+        },
     ),
     "response.Multiplicative": Row(
         prb.response.Multiplicative,

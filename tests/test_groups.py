@@ -11,9 +11,9 @@ import pymc as pm
 import pytest
 import xarray as xr
 from pymc.model.fgraph import clone_model
+from suppliers import labelled
 
 import prbayes as prb
-from benchmarks.suppliers import labelled
 from prbayes.estimate.refinement import _add
 from prbayes.model.description import describe
 from prbayes.model.evaluator import Evaluator

@@ -119,8 +119,8 @@ def group(dim: str) -> TensorVariable:
     # A slash ends a name in a file.
     if len(texts) < 2 or len(set(texts)) < len(texts) or any("/" in text for text in texts):
         raise ValueError(
-            f"{caller}: dim: got the groups {texts}, expected two or more different names without "
-            "a slash"
+            f"{caller}: coords: got the groups {texts} of {dim!r}, expected two or more different "
+            "names without a slash"
         )
     op = GroupRV(dim=dim, labels=found.labels)
     rng = pt.random.shared_rng(seed=None)

@@ -8,9 +8,9 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from suppliers import EACH, NAMES, exact, hierarchy, measured
 
 import prbayes as prb
-from benchmarks.suppliers import EACH, NAMES, exact, hierarchy, measured
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.adjustment import WEAKEST

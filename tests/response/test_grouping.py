@@ -9,9 +9,9 @@ import pandas as pd
 import pymc as pm
 import pytest
 import xarray as xr
+from suppliers import labelled
 
 import prbayes as prb
-from benchmarks.suppliers import labelled
 from prbayes.response.compilation import PLAIN
 from prbayes.response.grouping import Groups, groups_of, is_group, places_of, refuse_groups
 
