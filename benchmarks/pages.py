@@ -83,6 +83,29 @@ def outliers() -> Iterator[Row]:
         ]
 
 
+def folded() -> Iterator[Row]:
+    """Return the rows of widths and centres where a response is folded."""
+    for metric, row in found("folded").items():
+        for name, given in row["given"].items():
+            affine = row["affine"]
+            yield [
+                metric,
+                name,
+                f"{affine['width'][name]:.2f}",
+                f"{given['width']:.2f} ± {given['width, sd over seeds']:.2f}",
+                f"{affine['off'][name]:+.2f}",
+                f"{given['off']:+.2f}",
+            ]
+
+
+def given_the_estimate() -> Iterator[Row]:
+    """Return the rows of the straight map and of draws given the estimate, beside exact ones."""
+    nearer = found("posterior")["nearer"]
+    for label, name in {"straight map": "affine", "given the estimate": "given"}.items():
+        low, high = nearer[f"{name}: narrowest and widest"]
+        yield [label, f"{low:.2f} to {high:.2f}", f"{nearer[f'{name}: farthest off']:.2f}"]
+
+
 def samplers() -> Iterator[Row]:
     """Return the rows of sampling beside other packages."""
     table = found("smc")
@@ -594,6 +617,8 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "coverage, pooled": pooled,
     "coverage, by problem": coverage,
     "outliers": outliers,
+    "given the estimate": given_the_estimate,
+    "given the estimate, folded": folded,
     "samplers": samplers,
     "size": sizes,
     "size, through prbayes": sizes_through,
