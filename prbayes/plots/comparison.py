@@ -10,7 +10,7 @@ import xarray as xr
 
 from prbayes._checks import Floats, flag
 from prbayes.plots._canvas import BLUE, DOTTED, GREY, INK, Canvas, Panel, refuse_look
-from prbayes.plots._names import named
+from prbayes.plots._names import named, refuse_labels
 from prbayes.plots._ticks import round_ticks
 
 # What a comparison has by result besides scores.
@@ -39,7 +39,8 @@ def plot_comparison(
     backend : {"matplotlib", "bokeh", "plotly"}, optional
         That of ArviZ's settings by default.
     **pc_kwargs
-        For ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
+        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
 
     Returns
     -------
@@ -74,6 +75,7 @@ def plot_comparison(
     else:
         names = [str(name) for name in comparison.hyperparameter.values]
     row_names = [named(str(result), labels) for result in comparison.result.values]
+    refuse_labels(labels, [*names, *map(str, comparison.result.values)])
     count = len(row_names)
     rows = np.arange(count - 1.0, -1.0, -1.0)  # the first on top
     limits = (-0.6, count - 0.4)
