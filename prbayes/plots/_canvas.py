@@ -6,7 +6,7 @@ Plotting libraries are imported when a canvas is made.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -95,8 +95,10 @@ def _figure_settings(backend: str, width: float, height: float, rows: int) -> di
     return {"figsize": (across, down), "figsize_units": "dots"}
 
 
-def refuse_look(labels: object, backend: object) -> None:
-    """Raise if labels are no texts by name, or there is no such backend; before anything is done.
+def refuse_look(labels: object, backend: object, pc_kwargs: Mapping[str, Any]) -> None:
+    """Raise if labels are no texts by name, a size is none, or there is no such backend.
+
+    Before anything is done.
 
     Raises
     ------
@@ -105,6 +107,7 @@ def refuse_look(labels: object, backend: object) -> None:
     """
     if labels is not None:
         texts(labels, "labels")
+    figure_size(pc_kwargs.get("figsize"))
     if backend is not None and backend not in _BACKENDS:
         raise ValueError(f"backend: got {backend!r:.60}, expected one of {', '.join(_BACKENDS)}")
 

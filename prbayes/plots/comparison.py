@@ -65,7 +65,7 @@ def plot_comparison(
     >>> list(prb.plot_comparison(table, backend="none").viz["estimate"])
     ['mu']
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     flag(scores, "scores")
     if not _is_comparison(comparison):
         got = type(comparison).__name__

@@ -73,7 +73,7 @@ def plot_sensitivity(
     >>> sorted(prb.plots.plot_sensitivity(table, backend="none").viz["first"])
     ['hyperparameter', 'input']
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     needed = {"first", "total"}
     if not isinstance(table, xr.Dataset) or not needed <= set(table.data_vars):
         got = type(table).__name__

@@ -91,7 +91,7 @@ def plot_landscape(
     >>> prb.plot_landscape(prb.minimize(model), backend="none").viz["optimum"].name
     'optimum'
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     positive_integer(responses, "responses", minimum=0)
     check_optimum(optimum, "plot_landscape")
     evaluator = _evaluator_of(optimum, model)

@@ -71,7 +71,7 @@ def plot_optimizer(
     >>> list(prb.plot_optimizer(prb.minimize(model), backend="none").viz["asked"])
     ['discrepancy', 'mu']
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     check_optimum(optimum, "plot_optimizer")
     path = free_elements(optimum.evaluator, optimum.trace["theta"])
     final = free_elements(optimum.evaluator, optimum.theta[None])

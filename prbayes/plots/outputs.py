@@ -117,7 +117,7 @@ def plot_outputs(
     >>> list(prb.plot_outputs(prb.minimize(model), backend="none").viz["measured"])
     ['life, load']
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     if draws is not None:
         positive_integer(draws, "draws")
     shown = read_result(result, model, "prb.plot_outputs", draws)

@@ -79,7 +79,7 @@ def plot_population(
     >>> list(prb.plot_population(prb.minimize(model), backend="none").viz["after"])
     ['load']
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     if draws is not None:
         positive_integer(draws, "draws")
     share(level, "level")

@@ -100,7 +100,7 @@ def plot_posterior(
     >>> list(prb.plot_posterior(posterior, optimum, model=model, backend="none").viz["posterior"])
     ['mu']
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     _check_results(posterior, optimum, model)
     share(level, "level")
     found = _read_hyperparameters(posterior, optimum, model)

@@ -116,7 +116,7 @@ def plot_responses(
     >>> prb.plot_responses(prb.minimize(model), backend="none").viz["after"].name
     'after'
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     flag(ecdf, "ecdf")
     if draws is not None:
         positive_integer(draws, "draws")

@@ -66,7 +66,7 @@ def plot_stages(
     >>> "chain_1" in prb.plot_stages(posterior, backend="none").viz
     True
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     known = _read_statistics(posterior)
     # Those of the last stage only come last
     statistics = sorted(known, key=lambda statistic: statistic.once)

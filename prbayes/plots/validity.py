@@ -71,7 +71,7 @@ def plot_validity(
     >>> prb.plot_validity(test, backend="none").viz["ecdf"].name
     'ecdf'
     """
-    refuse_look(None, backend)
+    refuse_look(None, backend, pc_kwargs)
     by_name = _by_name(tests)
     # The panel of a test alone has a name nevertheless
     panels = [name or "u" for name in by_name]

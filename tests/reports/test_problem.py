@@ -132,7 +132,7 @@ def test_a_result_alone_tells_the_same_of_outputs(frame: Any) -> None:
     report = prb.Report("Frame", optimum=optimum, model=frame, pictures=False)
     assert (
         "on 20 specimens with 2 outputs of frame, by the joint probability residual"
-        in (report.sections[0].text[0])
+        in (report.sections[0].text[1])
     )
 
 
