@@ -134,7 +134,7 @@ def test_a_design_that_grows_tells_its_error_and_the_runs_that_are_left(
     text = " ".join(screen.getvalue().split())
     assert optimum.n_responses > 64
     assert ("runs to go" in text) == visible
-    assert ("standard errors of 0.1" in text) == visible
+    assert ("0.1 are wanted" in text) == visible
 
 
 @pytest.mark.parametrize("visible", [True, False])
