@@ -37,6 +37,15 @@ def _console() -> Console:
 
 CONSOLE = _console()  # one for all, so that a bar inside another is drawn below it
 
+
+def live() -> bool:
+    """Return whether a bar can move: in a terminal, or in a notebook with widgets.
+
+    Elsewhere, as in a log or an executed page, it would be a line of its last state.
+    """
+    return CONSOLE.is_terminal or CONSOLE.is_jupyter
+
+
 _hidden: ContextVar[bool] = ContextVar("hidden", default=False)
 
 
@@ -69,7 +78,7 @@ def progress(what: str, total: int | None = None) -> Iterator[Callable[[int, str
     task = bar.add_task("", total=total, note="")
     clock = time.perf_counter()
     completed = 0
-    settled = _hidden.get()  # whether there is a bar, or never will be
+    settled = _hidden.get() or not live()  # whether there is a bar, or never will be
 
     def advance(done: int, note: str) -> None:
         nonlocal completed, settled

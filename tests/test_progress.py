@@ -170,3 +170,15 @@ def test_a_notebook_without_widgets_gets_plain_bars(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
     monkeypatch.setitem(sys.modules, "ipywidgets", None)
     assert not prbayes._progress._console().is_jupyter
+
+
+def test_what_cannot_move_is_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a log, or an executed page, a bar would be a line of its last state."""
+    text = io.StringIO()
+    console = Console(file=text, force_terminal=False, force_jupyter=False)
+    monkeypatch.setattr(prbayes._progress, "CONSOLE", console)
+    monkeypatch.setattr(prbayes._progress, "_SHOWN_FROM", 0.0)
+    with progress("walking", 3) as report:
+        time.sleep(0.02)
+        report(1, "on foot")
+    assert text.getvalue() == ""
