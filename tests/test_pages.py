@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -87,3 +88,14 @@ def test_the_readme_links_to_files() -> None:
     links = re.findall(r"\]\(((?!http)[^)#]+)", README)
     assert links
     assert not [link for link in links if not (ROOT / link).exists()]
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "examples" / "notebooks").glob("*.ipynb")))
+def test_notebooks_are_kept_without_results(path: Path) -> None:
+    """They are executed by .ci/notebooks; results of some machine would be noise in their history."""
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert code
+    assert not any(cell["outputs"] or cell["execution_count"] for cell in code)
+    for cell in code:
+        compile("".join(cell["source"]), str(path), "exec")

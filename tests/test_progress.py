@@ -3,6 +3,7 @@
 import io
 import sys
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -182,3 +183,19 @@ def test_what_cannot_move_is_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
         time.sleep(0.02)
         report(1, "on foot")
     assert text.getvalue() == ""
+
+
+def test_a_kernel_without_widgets_is_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kernels ask for colours, which rich takes for a terminal."""
+
+    class ZMQInteractiveShell:
+        pass
+
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setattr(prbayes._progress, "find_spec", lambda _: None)
+    assert prbayes._progress._console().is_terminal
+    shell = SimpleNamespace(get_ipython=ZMQInteractiveShell)
+    monkeypatch.setitem(sys.modules, "IPython", shell)
+    console = prbayes._progress._console()
+    assert not console.is_terminal
+    assert not console.is_jupyter
