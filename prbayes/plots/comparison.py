@@ -11,6 +11,7 @@ import xarray as xr
 from prbayes._checks import Floats, flag
 from prbayes.plots._canvas import BLUE, DOTTED, GREY, INK, Canvas, Panel, refuse_look
 from prbayes.plots._names import named, refuse_labels
+from prbayes.plots._objective import METRIC_LABELS
 from prbayes.plots._ticks import round_ticks
 
 # What a comparison has by result besides scores.
@@ -95,7 +96,7 @@ def plot_comparison(
             _draw_intervals(panel, row, rows, _interval_text(comparison))
         covered = _covered(shown)
         panel.axes(
-            x=named(name, labels),
+            x=named(name, METRIC_LABELS | dict(labels or {})),
             xlim=covered,
             ylim=limits,
             xticks=round_ticks(*covered),
