@@ -1,6 +1,8 @@
 """Configuration of the pages: `uv run --group docs sphinx-build -W docs docs/_build/html`."""
 
+import sys
 from inspect import isclass, ismodule
+from pathlib import Path
 from shutil import which
 
 from docutils import nodes
@@ -9,6 +11,8 @@ from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
 
 import prbayes
+
+sys.path.insert(0, str(Path(__file__).parent / "_extensions"))
 
 
 def public_names() -> dict[str, str]:
@@ -34,13 +38,15 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.intersphinx",
-    "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
     "numpydoc",
     "myst_nb",
+    "notebooks",
+    "offline_math",
 ]
+html_math_renderer = "mathml"
 templates_path = ["_templates"]
-exclude_patterns = ["_build", "inventories"]
+exclude_patterns = ["_build", "_extensions", "inventories"]
 html_theme = "furo"
 html_title = "prbayes"
 html_static_path = ["_static"]
@@ -55,7 +61,7 @@ nb_execution_timeout = 600
 nb_merge_streams = True
 # A page that runs a program which is not here is shown as it is written.
 nb_execution_excludepatterns = [] if which("ccx") else ["finite_elements.md"]
-myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_enable_extensions = ["attrs_block", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4
 
 autosummary_generate = True

@@ -32,6 +32,16 @@ EXPONENT = 2.6
 # Million cycles: the last reading before cracks fail is at 0.08, so that all are known at both, and
 # the test is one of extrapolation.
 CALIBRATED_AT, TESTED_AT = 0.05, 0.08
+CONDITION = "80 000 cycles"
+
+# What a reader of the report calls what is in it.
+LABELS = {
+    "mu": "mean of log C",
+    "sigma": "standard deviation of log C",
+    "C": "Paris' coefficient C",
+    "crack": "crack length / notch length, 50 000 cycles",
+    CONDITION: "crack length / notch length, 80 000 cycles",
+}
 
 
 def relative_length(million_cycles: float) -> Callable[[Any, Any], Any]:
@@ -77,6 +87,8 @@ def run_demo(folder: Path, *, draws: int = 1000, chains: int = 4, seed: int = 1)
         optimum=optimum,
         posterior=posterior,
         validity=test,
+        validation={CONDITION: (_measured(fresh), later)},
+        labels=LABELS,
     )
     trees: dict[str, xr.DataTree | xr.Dataset] = {
         "results.nc": posterior,
@@ -132,7 +144,10 @@ def _model(used: _Specimens) -> tuple[pm.Model, Any]:
 
 
 def _tested(fresh: _Specimens, predicted: Any) -> ValidityTest:
-    measured = fresh.at(TESTED_AT)
-    # A specimen without a length has failed: its crack is longer than all others.
-    lengths = np.where(np.isnan(measured), np.inf, measured)
-    return area_test(lengths, predicted, specimens=fresh.labels)
+    return area_test(_measured(fresh), predicted, specimens=fresh.labels)
+
+
+def _measured(fresh: _Specimens) -> Floats:
+    """Return the lengths of the test; without one a specimen has failed: it is longer than all."""
+    lengths = fresh.at(TESTED_AT)
+    return np.where(np.isnan(lengths), np.inf, lengths)

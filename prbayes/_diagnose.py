@@ -12,6 +12,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._checks import Floats
+from prbayes._html import view
 from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.disagreement import disagreement
 from prbayes.estimate.goodness import UNLIKELY, Refitted, of_another_family, of_held_away
@@ -71,6 +72,14 @@ class Diagnosis:
 
     def __str__(self) -> str:
         return "\n".join([*(self.messages or ["No problem was found."]), *self.notes])
+
+    def _repr_html_(self) -> str:
+        """Show the sentences in a notebook, what is wrong first."""
+        if self.ok:
+            return view("Diagnosis: no problem was found", sentences=self.notes)
+        count = len(self.messages)
+        heading = f"Diagnosis: {count} problem{'s' if count > 1 else ''}"
+        return view(heading, sentences=[*self.messages, *self.notes])
 
 
 @in_turn

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -28,14 +29,35 @@ _log = logging.getLogger("prbayes")
 _SHOWN_FROM = 2.0
 
 
+def _in_kernel() -> bool:
+    """Return whether this is a process behind a notebook."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return type(shell).__name__ == "ZMQInteractiveShell"
+
+
 def _console() -> Console:
-    """Return a console on stderr; one of a notebook only with widgets, without which rich warns."""
-    as_rich_finds = None
-    has_widgets = find_spec("ipywidgets") is not None
-    return Console(stderr=True, force_jupyter=as_rich_finds if has_widgets else False)
+    """Return a console on stderr; one of a notebook only with widgets, without which rich warns.
+
+    A kernel without widgets is no terminal either, although its environment asks for colours: each
+    move of a bar would be a line.
+    """
+    if find_spec("ipywidgets") is not None:
+        return Console(stderr=True)
+    forced = False if _in_kernel() else None
+    return Console(stderr=True, force_jupyter=False, force_terminal=forced)
 
 
 CONSOLE = _console()  # one for all, so that a bar inside another is drawn below it
+
+
+def live() -> bool:
+    """Return whether a bar can move: in a terminal, or in a notebook with widgets.
+
+    Elsewhere, as in a log or an executed page, it would be a line of its last state.
+    """
+    return CONSOLE.is_terminal or CONSOLE.is_jupyter
+
 
 _hidden: ContextVar[bool] = ContextVar("hidden", default=False)
 
@@ -69,7 +91,7 @@ def progress(what: str, total: int | None = None) -> Iterator[Callable[[int, str
     task = bar.add_task("", total=total, note="")
     clock = time.perf_counter()
     completed = 0
-    settled = _hidden.get()  # whether there is a bar, or never will be
+    settled = _hidden.get() or not live()  # whether there is a bar, or never will be
 
     def advance(done: int, note: str) -> None:
         nonlocal completed, settled

@@ -191,7 +191,8 @@ PROPAGATION: dict[str, Sequence[Any]] = {
 }
 PICTURE: dict[str, Sequence[Any]] = {
     "backend": ("gnuplot", 3, ""),
-    "labels": ("mu", 3, ["mu"], {"mu": 3}, {3: "mu"}),
+    "labels": ("mu", 3, ["mu"], {"mu": 3}, {3: "mu"}, {"no such name": "mean"}),
+    "figsize": (3, "wide", (3,), (0, 4), (np.inf, 4), ("a", 4)),
     "model": (3, "model"),
 }
 
@@ -748,10 +749,20 @@ TABLE: dict[str, Row] = {
             "steps": (*COUNT, 1),
         },
     ),
+    "plots.plot_prediction": Row(
+        prb.plots.plot_prediction,
+        {
+            **{k: PICTURE[k] for k in ("backend", "labels", "figsize")},
+            "measured": ("a", None, [], np.ones((3, 2)), {"a": [1.0]}),
+            "predicted": (3, None, np.ones((2, 3)), {"a": 3}),
+            "level": SHARE,
+        },
+        {"measured": FRESH_DATA, "predicted": Name("predicted")},
+    ),
     "plots.plot_sensitivity": Row(
         prb.plots.plot_sensitivity,
         {
-            **{k: PICTURE[k] for k in ("backend", "labels")},
+            **{k: PICTURE[k] for k in ("backend", "labels", "figsize")},
             "table": (None, 3, xr.Dataset(), Name("comparison"), Name("posterior")),
         },
         {"table": xr.Dataset({"first": 1.0, "total": 1.0})},
@@ -893,6 +904,8 @@ TABLE: dict[str, Row] = {
             "comparison": (3, "table", Name("optimum"), xr.Dataset()),
             "decision": (3, "risk", xr.Dataset(), {"a": 3}, Name("comparison")),
             "pictures": FLAG,
+            "validation": (3, [1], {"a": 3}, {3: ([1.0], Name("predicted"))}, {"a": ([1.0], 3)}),
+            "labels": ("mu", {"mu": 3}, {"no such name": "mean"}),
         },
     ),
     "Report.to_html": Row(lambda path: report().to_html(path), {"path": (3, None, True, "/", "")}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -14,7 +15,8 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import pages  # noqa: E402
 
-README = re.sub(r"\s+", " ", (ROOT / "README.md").read_text(encoding="utf-8"))
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+FEATURES = re.sub(r"\s+", " ", (ROOT / "docs" / "features.md").read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("path", sorted(pages.PAGES.glob("*.md")), ids=lambda path: path.stem)
@@ -37,7 +39,7 @@ def test_every_table_is_on_a_page() -> None:
     assert set(re.findall(r"<!-- table: (.+) -->", told)) == set(pages.TABLES)
 
 
-def test_the_readme_tells_the_coverage_that_was_found() -> None:
+def test_the_features_tell_the_coverage_that_was_found() -> None:
     found = pages.found("coverage")
     rows = found["pooled"]
     own, exact = rows["all, affine, N >= 50"], rows["all, exact, N >= 50"]
@@ -47,10 +49,10 @@ def test_the_readme_tells_the_coverage_that_was_found() -> None:
         f"89% intervals contain the truth in {own['mean_coverage_89']:.1%} of {replicates} data sets "
         f"each, on average over all cells ({lowest:.1%} to {highest:.1%}); those of the exact "
         f"posterior, on the same data, in {exact['mean_coverage_89']:.1%}"
-    ) in README
+    ) in FEATURES
 
 
-def test_the_readme_tells_the_cost_of_sampling_that_was_found() -> None:
+def test_the_features_tell_the_cost_of_sampling_that_was_found() -> None:
     found = pages.found("smc")
     own, stock, other = (found[f"linear {name}"] for name in ("reweighted", "pymc", "pyabc"))
     for told in (
@@ -58,7 +60,7 @@ def test_the_readme_tells_the_cost_of_sampling_that_was_found() -> None:
         f"{stock['responses']:,} responses and {stock['cpu']:.1f} s".replace(",", " "),
         f"pyABC {other['responses']:,} and".replace(",", " "),
     ):
-        assert told in README
+        assert told in FEATURES
 
 
 def test_the_thermal_page_tells_the_correlation_of_the_coupons() -> None:
@@ -71,3 +73,29 @@ def test_the_thermal_page_tells_the_correlation_of_the_coupons() -> None:
     error = np.sqrt((1 - found**2) / (len(temperature) - 2))
     told = f"a correlation of {found:.2f}, with a standard error of {error:.2f}".replace("0.", ".")
     assert told in (ROOT / "docs" / "thermal_challenge.md").read_text(encoding="utf-8")
+
+
+def test_sentences_of_the_readme_are_short() -> None:
+    """Of 40 words at most: a reader has a minute."""
+    prose = re.sub(r"```.*?```", "", README, flags=re.DOTALL)
+    parts = [part for part in prose.split("\n\n") if not part.startswith(("|", "#", "!"))]
+    sentences = re.split(r"(?<=[.:])\s|\n- ", "\n\n".join(parts))
+    long = [sentence for sentence in sentences if len(sentence.split()) > 40]
+    assert not long
+
+
+def test_the_readme_links_to_files() -> None:
+    links = re.findall(r"\]\(((?!http)[^)#]+)", README)
+    assert links
+    assert not [link for link in links if not (ROOT / link).exists()]
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "examples" / "notebooks").glob("*.ipynb")))
+def test_notebooks_are_kept_without_results(path: Path) -> None:
+    """They are executed by .ci/notebooks; results of some machine would be noise in their history."""
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert code
+    assert not any(cell["outputs"] or cell["execution_count"] for cell in code)
+    for cell in code:
+        compile("".join(cell["source"]), str(path), "exec")

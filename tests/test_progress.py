@@ -3,6 +3,7 @@
 import io
 import sys
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -134,7 +135,7 @@ def test_a_design_that_grows_tells_its_error_and_the_runs_that_are_left(
     text = " ".join(screen.getvalue().split())
     assert optimum.n_responses > 64
     assert ("runs to go" in text) == visible
-    assert ("standard errors of 0.1" in text) == visible
+    assert ("0.1 are wanted" in text) == visible
 
 
 @pytest.mark.parametrize("visible", [True, False])
@@ -170,3 +171,31 @@ def test_a_notebook_without_widgets_gets_plain_bars(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
     monkeypatch.setitem(sys.modules, "ipywidgets", None)
     assert not prbayes._progress._console().is_jupyter
+
+
+def test_what_cannot_move_is_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a log, or an executed page, a bar would be a line of its last state."""
+    text = io.StringIO()
+    console = Console(file=text, force_terminal=False, force_jupyter=False)
+    monkeypatch.setattr(prbayes._progress, "CONSOLE", console)
+    monkeypatch.setattr(prbayes._progress, "_SHOWN_FROM", 0.0)
+    with progress("walking", 3) as report:
+        time.sleep(0.02)
+        report(1, "on foot")
+    assert text.getvalue() == ""
+
+
+def test_a_kernel_without_widgets_is_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kernels ask for colours, which rich takes for a terminal."""
+
+    class ZMQInteractiveShell:
+        pass
+
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setattr(prbayes._progress, "find_spec", lambda _: None)
+    assert prbayes._progress._console().is_terminal
+    shell = SimpleNamespace(get_ipython=ZMQInteractiveShell)
+    monkeypatch.setitem(sys.modules, "IPython", shell)
+    console = prbayes._progress._console()
+    assert not console.is_terminal
+    assert not console.is_jupyter

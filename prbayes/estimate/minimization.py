@@ -559,7 +559,8 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
         if not errors.whole > AGREE:
             return state
         left = runs_left(evaluator, errors)
-        note = f"error {errors.whole:.2f} standard errors of {AGREE}, about {left} runs to go"
+        note = f"error {errors.whole:.2f} standard errors, {AGREE} are wanted"
+        note += f", about {left} runs to go" if left else ", no more runs are needed"
         before = _runs(evaluator)
         if not grow(evaluator, near, errors):
             return state

@@ -10,6 +10,7 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._checks import Floats
+from prbayes._html import view
 from prbayes.estimate.caveats import breakdown
 from prbayes.estimate.obstacles import refit_obstacle, sampling_obstacle
 from prbayes.estimate.refit import SamplingDistribution
@@ -26,6 +27,9 @@ from prbayes.model.identity import (
 )
 from prbayes.model.labels import failures_dataset, labelled, observed_dataset, versions
 from prbayes.model.turns import in_turn
+
+# What is less is written as 0.0%.
+_TOLD_SHARE = 5e-4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -129,16 +133,29 @@ class Optimum:
             f"{name} = {_short(value)} ± {_short(self.stderr[name])}"
             for name, value in self.point.items()
         ]
+        return "\n  ".join([self._heading(), *found, *self._shares(), *self.warnings])
+
+    def _repr_html_(self) -> str:
+        """Show the same in a notebook, as a table."""
+        rows = []
+        for name, value in self.point.items():
+            rows.append([name, _short(value), _short(self.stderr[name])])
+        header = ["", "estimate", "standard error"]
+        sentences = [*self._shares(), *self.warnings]
+        return view(self._heading(), header=header, rows=rows, sentences=sentences)
+
+    def _heading(self) -> str:
+        """Say how good it is, and what it cost."""
         state = "converged" if self.converged else "NOT converged"
         what = "Optimum with the prior" if self.prior else "Optimum"
         head = f"{what}: discrepancy {self.discrepancy:.4g} after"
-        cost = f"{self.n_evaluations} evaluations, {self.n_responses} responses, {state}"
-        return "\n  ".join([f"{head} {cost}", *found, *self._shares(), *self.warnings])
+        return f"{head} {self.n_evaluations} evaluations, {self.n_responses} responses, {state}"
 
     def _shares(self) -> list[str]:
         """Say which share of the specimens fails, where some do."""
         shares = {name: each.get("failed_mass", 0.0) for name, each in self.support.items()}
-        return [f"{name}: {share:.1%} of specimens fail" for name, share in shares.items() if share]
+        told = {name: share for name, share in shares.items() if share >= _TOLD_SHARE}
+        return [f"{name}: {share:.1%} of specimens fail" for name, share in told.items()]
 
     @property
     def model(self) -> pm.Model:

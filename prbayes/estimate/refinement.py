@@ -98,7 +98,8 @@ def grow(evaluator: Evaluator, thetas: Floats, errors: DesignErrors) -> bool:
         Whether any were added.
     """
     _log.info(
-        "independent designs would differ by %.2f standard errors, expected at most %.2f",
+        "the optima of independent designs would differ by %.2f standard errors, more than the "
+        "%.2f that are left to them: designs are refined",
         errors.whole,
         AGREE,
     )
@@ -142,7 +143,7 @@ def _add(evaluator: Evaluator, thetas: Floats, names: set[str], factor: float = 
     Returns whether ``max_points`` left room for any.
     """
     names = siblings(evaluator.nodes, names)
-    added = False
+    added: list[str] = []
     for k, node in enumerate(evaluator.nodes):
         design = node.design
         if design is None or node.name not in names:
@@ -154,9 +155,10 @@ def _add(evaluator: Evaluator, thetas: Floats, names: set[str], factor: float = 
         size = min(batches * first, room)
         if size > 0:
             design.add(_components(evaluator, thetas, k), size)
-            added = True
-            _log.info("%s: refined to %d responses", node.name, design.n_runs)
-    return added
+            added.append(f"{node.name} from {now} to {design.n_runs}")
+    if added:
+        _log.info("refined: %s runs", ", ".join(added))
+    return bool(added)
 
 
 def _components(evaluator: Evaluator, thetas: Floats, k: int) -> list[Floats]:

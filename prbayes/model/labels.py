@@ -97,9 +97,21 @@ def labelled_responses(
     sizes = dict(zip(("chain", "draw"), leading, strict=False))
     data = labelled(evaluator, values, sizes)
     for node in evaluator.nodes:
-        if node.name in values and node.outputs.event:
+        if node.name not in values:
+            continue
+        if node.outputs.event:
             data = _with_outputs(data, node.name, node.outputs)
+        else:
+            _tell_units(data, node.name, node.outputs)
     return data
+
+
+def _tell_units(data: xr.Dataset, name: str, outputs: Outputs) -> None:
+    """Note the units of one simulator's outputs, where they are known."""
+    if outputs.units:
+        different = list(dict.fromkeys(outputs.units))
+        units = different[0] if len(different) == 1 else list(outputs.units)
+        data[name].attrs["units"] = units
 
 
 def _with_outputs(data: xr.Dataset, name: str, outputs: Outputs) -> xr.Dataset:
@@ -112,10 +124,7 @@ def _with_outputs(data: xr.Dataset, name: str, outputs: Outputs) -> xr.Dataset:
             dim = f"{name}_{dim}"  # another simulator has other outputs
         renamed = data[name].rename({last: dim})
         data = data.drop_vars(name).assign({name: renamed}).assign_coords({dim: labels})
-    if outputs.units:
-        different = list(dict.fromkeys(outputs.units))
-        units = different[0] if len(different) == 1 else list(outputs.units)
-        data[name].attrs["units"] = units
+    _tell_units(data, name, outputs)
     return data
 
 

@@ -290,7 +290,9 @@ def _log_density(
         "prb.sample_smc, which calibrates it"
     )
     if np.isnan(node.epsilon_value):
-        _log.info("%s", unset)  # nutpie tells no more of an error than its number
+        # nutpie tells no more of an error than its number; nobody else has to be told who may yet
+        # calibrate it
+        _log.debug("%s", unset)
     check = CheckParameterValue(unset)
     epsilon = check(node.epsilon, pt.gt(node.epsilon, 0.0))
     inputs = node.bound.inputs

@@ -5,7 +5,8 @@ Plotting libraries are imported when a canvas is made.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -14,6 +15,7 @@ import numpy as np
 import xarray as xr
 
 from prbayes._checks import Floats, texts
+from prbayes.plots._colours import ColourScale, draw_colour_bar
 from prbayes.plots._legends import draw_legend, legend_entry
 from prbayes.plots._ticks import Ticks
 
@@ -46,13 +48,37 @@ def grid_settings(
 
     # Three panels a row; four make a square
     settings = {"cols": ["__variable__"], "col_wrap": 2 if panels == 4 else 3, **pc_kwargs}
+    whole = figure_size(settings.pop("figsize", None))
     columns = min(panels, settings["col_wrap"])
     rows = -(-panels // columns)
 
     width, height = size
-    figure = _figure_settings(backend, width * columns, height * rows, rows)
+    across, down = whole or (width * columns, height * rows)
+    figure = _figure_settings(backend, across, down, rows)
     figure |= settings.get("figure_kwargs", {})
     return settings | {"backend": backend, "figure_kwargs": figure}
+
+
+def figure_size(given: Any) -> tuple[float, float] | None:
+    """Return width and height in inches, as given, or raise.
+
+    Raises
+    ------
+    ValueError
+        If they are not two positive numbers.
+    """
+    if given is None:
+        return None
+    try:
+        width, height = map(float, given)
+    except (TypeError, ValueError):
+        width = height = math.nan
+    if not (0 < width < math.inf and 0 < height < math.inf):
+        raise ValueError(
+            f"figsize: got {given!r:.60}, expected width and height of the picture in inches, such "
+            "as (8, 5)"
+        )
+    return width, height
 
 
 def _figure_settings(backend: str, width: float, height: float, rows: int) -> dict[str, Any]:
@@ -69,8 +95,10 @@ def _figure_settings(backend: str, width: float, height: float, rows: int) -> di
     return {"figsize": (across, down), "figsize_units": "dots"}
 
 
-def refuse_look(labels: object, backend: object) -> None:
-    """Raise if labels are no texts by name, or there is no such backend; before anything is done.
+def refuse_look(labels: object, backend: object, pc_kwargs: Mapping[str, Any]) -> None:
+    """Raise if labels are no texts by name, a size is none, or there is no such backend.
+
+    Before anything is done.
 
     Raises
     ------
@@ -79,6 +107,7 @@ def refuse_look(labels: object, backend: object) -> None:
     """
     if labels is not None:
         texts(labels, "labels")
+    figure_size(pc_kwargs.get("figsize"))
     if backend is not None and backend not in _BACKENDS:
         raise ValueError(f"backend: got {backend!r:.60}, expected one of {', '.join(_BACKENDS)}")
 
@@ -135,6 +164,7 @@ class Canvas:
         self._calls: dict[str, dict[str, _Call]] = {}
         self._legend: set[str] = set()
         self._empty: list[str] = []
+        self._scales: dict[tuple[str, str], ColourScale] = {}  # by visual and panel
 
     def panel(self, name: str) -> Panel:
         """Return the panel of a name, to draw on."""
@@ -161,10 +191,19 @@ class Canvas:
         """Plan to show nothing of a panel, not even its axes."""
         self._empty.append(panel)
 
+    def tell_colours(self, panel: str, visual: str, scale: ColourScale) -> None:
+        """Plan a bar that says what the colours of ``visual`` mean."""
+        self._scales[visual, panel] = scale
+
     def finish(self) -> Any:
         """Draw everything, with a legend below the panels, and return the `PlotCollection`."""
         for visual, by_panel in self._calls.items():
             self._draw(visual, by_panel)
+        for (visual, name), scale in self._scales.items():
+            figure = self._collection.viz["figure"].item()
+            target = self._collection.get_target(name, {})
+            artist = self._collection.viz[visual][name].item()
+            draw_colour_bar(self.backend, figure, target, artist, scale)
         for name in self._empty:
             _hide(self.backend, self._collection.get_target(name, {}))
         if self._legend and self.backend != "none":
@@ -273,11 +312,20 @@ class Panel:
             size=size,
         )
 
-    def heights(self, visual: str, axes: tuple[Floats, Floats], z: Floats, levels: Floats) -> None:
+    def heights(
+        self,
+        visual: str,
+        axes: tuple[Floats, Floats],
+        z: Floats,
+        levels: Floats,
+        scale: ColourScale,
+    ) -> None:
         """Draw heights over a plane, z of shape (x, y): colours from dark to light, and contours.
 
-        The levels are even; what is above the last has the colour of the last.
+        The levels are even; what is above the last has the colour of the last. A bar says what the
+        colours mean.
         """
+        self.canvas.tell_colours(self.name, visual, scale)
         how: dict[str, Any] = {"levels": levels, "cmap": "cividis", "alpha": 0.45}
         if self.canvas.backend == "plotly":  # would choose levels of its own
             how["contours"] = {

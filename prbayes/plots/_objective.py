@@ -51,7 +51,7 @@ def check_optimum(optimum: Any, caller: str) -> None:
 def objective_label(optimum: Optimum) -> str:
     """Return what a reader calls the objective."""
     if len(optimum.scales) > 1:
-        return "sum of d / s"
+        return "sum of scaled discrepancies"
     metric = optimum.evaluator.nodes[0].metric
     known = repr(metric) if metric.takes_outputs else type(metric).__name__
     return f"discrepancy ({metric_label(known)})"

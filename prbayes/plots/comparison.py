@@ -10,7 +10,8 @@ import xarray as xr
 
 from prbayes._checks import Floats, flag
 from prbayes.plots._canvas import BLUE, DOTTED, GREY, INK, Canvas, Panel, refuse_look
-from prbayes.plots._names import named
+from prbayes.plots._names import named, refuse_labels
+from prbayes.plots._objective import METRIC_LABELS
 from prbayes.plots._ticks import round_ticks
 
 # What a comparison has by result besides scores.
@@ -39,7 +40,8 @@ def plot_comparison(
     backend : {"matplotlib", "bokeh", "plotly"}, optional
         That of ArviZ's settings by default.
     **pc_kwargs
-        For ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
+        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
 
     Returns
     -------
@@ -64,7 +66,7 @@ def plot_comparison(
     >>> list(prb.plot_comparison(table, backend="none").viz["estimate"])
     ['mu']
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     flag(scores, "scores")
     if not _is_comparison(comparison):
         got = type(comparison).__name__
@@ -74,6 +76,7 @@ def plot_comparison(
     else:
         names = [str(name) for name in comparison.hyperparameter.values]
     row_names = [named(str(result), labels) for result in comparison.result.values]
+    refuse_labels(labels, [*names, *map(str, comparison.result.values)])
     count = len(row_names)
     rows = np.arange(count - 1.0, -1.0, -1.0)  # the first on top
     limits = (-0.6, count - 0.4)
@@ -93,7 +96,7 @@ def plot_comparison(
             _draw_intervals(panel, row, rows, _interval_text(comparison))
         covered = _covered(shown)
         panel.axes(
-            x=named(name, labels),
+            x=named(name, METRIC_LABELS | dict(labels or {})),
             xlim=covered,
             ylim=limits,
             xticks=round_ticks(*covered),

@@ -19,7 +19,7 @@ from prbayes.plots._canvas import (
     Panel,
     refuse_look,
 )
-from prbayes.plots._names import named
+from prbayes.plots._names import named, refuse_labels
 
 _PANELS = {
     "hyperparameter": "share of the quantity's variance",
@@ -49,7 +49,8 @@ def plot_sensitivity(
     backend : {"matplotlib", "bokeh", "plotly"}, optional
         That of ArviZ's settings by default.
     **pc_kwargs
-        For ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
+        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
 
     Returns
     -------
@@ -72,7 +73,7 @@ def plot_sensitivity(
     >>> sorted(prb.plots.plot_sensitivity(table, backend="none").viz["first"])
     ['hyperparameter', 'input']
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     needed = {"first", "total"}
     if not isinstance(table, xr.Dataset) or not needed <= set(table.data_vars):
         got = type(table).__name__
@@ -80,6 +81,7 @@ def plot_sensitivity(
             f"plot_sensitivity: table: got {got}, expected the Dataset of prb.sensitivity"
         )
     by_panel = {kind: table.sel(factor=(table.kind == kind).values) for kind in _PANELS}
+    refuse_labels(labels, map(str, table.factor.values))
     count = max(own.sizes["factor"] for own in by_panel.values())
     top = count - 1.0
     limits = (-0.6, top + 0.6)

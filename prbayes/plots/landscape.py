@@ -14,8 +14,9 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level
 from prbayes.model.turns import in_turn
 from prbayes.plots._canvas import BLUE, CROSS, DIAMOND, INK, VERMILION, Canvas, Panel, refuse_look
+from prbayes.plots._colours import ColourScale
 from prbayes.plots._grid import Landscape, landscape, rooted
-from prbayes.plots._names import named
+from prbayes.plots._names import named, refuse_labels
 from prbayes.plots._objective import check_optimum, free_names, objective_label
 
 # Points along each axis, by the number of hyperparameters: contours of 41 look smooth, and as many
@@ -39,7 +40,7 @@ def plot_landscape(
     """Draw the objective around the optimum over two hyperparameters, with the optimiser's path.
 
     Darker is lower; contours are at even steps of the root of the objective over its lowest value,
-    so that they crowd towards the optimum; the title has the values at the ends. With one
+    so that they crowd towards the optimum; a bar has the values. With one
     hyperparameter, or one name, it is a curve. All other hyperparameters stand at the optimum, as
     the title says. Where stored responses do not support a population the picture is blank. Path
     and other optima are those of all hyperparameters, projected.
@@ -64,7 +65,8 @@ def plot_landscape(
     backend : {"matplotlib", "bokeh", "plotly"}, optional
         That of ArviZ's settings by default.
     **pc_kwargs
-        For ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
+        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
 
     Returns
     -------
@@ -89,12 +91,13 @@ def plot_landscape(
     >>> prb.plot_landscape(prb.minimize(model), backend="none").viz["optimum"].name
     'optimum'
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     positive_integer(responses, "responses", minimum=0)
     check_optimum(optimum, "plot_landscape")
     evaluator = _evaluator_of(optimum, model)
     known = free_names(optimum)
     names = _chosen(pair, known)
+    refuse_labels(labels, known, evaluator=evaluator)
     if points is None:
         points = _ALONG_AXIS[len(names)]
     else:
@@ -119,12 +122,11 @@ def plot_landscape(
         _draw_curve(panel, found, alone=not others)
         panel.axes(x=x, y=height, title=held, xlim=_ends(found.axes[0]))
     else:
-        low, high = _draw_plane(panel, found)
-        colours = f"{height}: {low:.3g} dark, {high:.3g} light"
+        _draw_plane(panel, found, height)
         panel.axes(
             x=x,
             y=named(names[1], labels),
-            title=f"{colours}\n{held}" if held else colours,
+            title=held,
             xlim=_ends(found.axes[0]),
             ylim=_ends(found.axes[1]),
         )
@@ -177,16 +179,20 @@ def _ends(axis: Floats) -> tuple[float, float]:
     return float(axis[0]), float(axis[-1])
 
 
-def _draw_plane(panel: Panel, found: Landscape) -> tuple[float, float]:
-    """Draw the objective over two hyperparameters; return its values at the ends of the colours."""
+def _draw_plane(panel: Panel, found: Landscape, height: str) -> None:
+    """Draw the objective over two hyperparameters, with a bar of its values by its name."""
     roots, low, high = rooted(found.heights)
     first, second = found.axes
-    panel.heights("landscape", (first, second), roots, np.linspace(0, 1, 11))
+    levels = np.linspace(0, 1, 11)
+    told = levels[::2]
+    values = low + told**2 * (high - low)
+    texts = tuple(f"{value:.3g}" for value in values)
+    scale = ColourScale(tuple(told.tolist()), texts, height)
+    panel.heights("landscape", (first, second), roots, levels, scale)
     x, y = found.path.T
     panel.line("path", x, y, INK, width=1.0)
     panel.points("asked", x, y, INK, size=14, legend=_PATH)
     _draw_optima(panel, found.optimum.T, found.rivals.T)
-    return low, high
 
 
 def _draw_curve(panel: Panel, found: Landscape, *, alone: bool) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
 from prbayes.plots._canvas import BLUE, DASHED, GREY, VERMILION, Canvas, Panel, refuse_look
-from prbayes.plots._names import named
+from prbayes.plots._names import named, refuse_labels
 from prbayes.plots._objective import (
     check_optimum,
     free_elements,
@@ -46,7 +46,8 @@ def plot_optimizer(
     backend : {"matplotlib", "bokeh", "plotly"}, optional
         That of ArviZ's settings by default.
     **pc_kwargs
-        For ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
+        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
 
     Returns
     -------
@@ -70,12 +71,13 @@ def plot_optimizer(
     >>> list(prb.plot_optimizer(prb.minimize(model), backend="none").viz["asked"])
     ['discrepancy', 'mu']
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     check_optimum(optimum, "plot_optimizer")
     path = free_elements(optimum.evaluator, optimum.trace["theta"])
     final = free_elements(optimum.evaluator, optimum.theta[None])
     hyperparameters = free_names(optimum)
     names = ["discrepancy", *hyperparameters]
+    refuse_labels(labels, hyperparameters, evaluator=optimum.evaluator)
     canvas = Canvas(names, size=(4.6, 3.4), backend=backend, pc_kwargs=pc_kwargs)
     evaluations = optimum.trace["evaluations"].astype(np.float64)
     _draw_objective(canvas.panel("discrepancy"), optimum, evaluations)

@@ -20,6 +20,7 @@ from prbayes.model.turns import in_turn
 from prbayes.plots._canvas import BLUE, DASHED, INK, VERMILION, Canvas, Limits, Panel, refuse_look
 from prbayes.plots._curves import central_range
 from prbayes.plots._ensemble import read_before, read_result, supported
+from prbayes.plots._names import refuse_labels
 from prbayes.plots._panels import Output, outputs_of
 from prbayes.plots._regions import outlines
 from prbayes.plots._ticks import round_ticks
@@ -76,7 +77,8 @@ def plot_outputs(
     backend : {"matplotlib", "bokeh", "plotly"}, optional
         That of ArviZ's settings by default.
     **pc_kwargs
-        For ``arviz.PlotCollection.wrap``, such as ``figure_kwargs``.
+        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
+        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
 
     Returns
     -------
@@ -115,7 +117,7 @@ def plot_outputs(
     >>> list(prb.plot_outputs(prb.minimize(model), backend="none").viz["measured"])
     ['life, load']
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     if draws is not None:
         positive_integer(draws, "draws")
     shown = read_result(result, model, "prb.plot_outputs", draws)
@@ -123,6 +125,7 @@ def plot_outputs(
     start, what = read_before(result, evaluator, before)
     k = _simulator(evaluator, simulator)
     chosen = _chosen(evaluator, k, outputs)
+    refuse_labels(labels, evaluator.nodes[k].outputs.names, evaluator=evaluator)
     if len(start) and not supported(evaluator, start)[0]:
         _log.warning(
             "plot_outputs: before (%s): left out, because stored responses do not reach there",

@@ -14,7 +14,7 @@ from prbayes.model.turns import in_turn
 from prbayes.plots._canvas import Canvas, refuse_look
 from prbayes.plots._ensemble import read_result
 from prbayes.plots._margins import chosen, margin_densities, margins
-from prbayes.plots._names import named
+from prbayes.plots._names import named, refuse_labels
 from prbayes.plots._populations import calibrated, draw_calibrated
 
 
@@ -54,7 +54,8 @@ def plot_population(
     backend : {"matplotlib", "bokeh", "plotly"}, optional
         That of ArviZ's settings by default.
     **pc_kwargs
-        For ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
+        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
 
     Returns
     -------
@@ -78,7 +79,7 @@ def plot_population(
     >>> list(prb.plot_population(prb.minimize(model), backend="none").viz["after"])
     ['load']
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     if draws is not None:
         positive_integer(draws, "draws")
     share(level, "level")
@@ -86,6 +87,7 @@ def plot_population(
     wanted = chosen(margins(shown.evaluator), inputs)
     found = margin_densities(shown.evaluator, wanted, shown.every)
     names = [margin.name for margin in wanted]
+    refuse_labels(labels, names, evaluator=shown.evaluator)
     canvas = Canvas(names, size=(4.6, 3.9), backend=backend, pc_kwargs=pc_kwargs)
     for margin in wanted:
         panel = canvas.panel(margin.name)

@@ -34,7 +34,7 @@ from prbayes.plots._canvas import (
     refuse_look,
 )
 from prbayes.plots._curves import bounded_density, central_levels
-from prbayes.plots._names import named
+from prbayes.plots._names import named, refuse_labels
 from prbayes.plots._ticks import round_ticks
 
 
@@ -70,7 +70,8 @@ def plot_posterior(
     backend : {"matplotlib", "bokeh", "plotly"}, optional
         That of ArviZ's settings by default.
     **pc_kwargs
-        For ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
+        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
 
     Returns
     -------
@@ -99,10 +100,12 @@ def plot_posterior(
     >>> list(prb.plot_posterior(posterior, optimum, model=model, backend="none").viz["posterior"])
     ['mu']
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     _check_results(posterior, optimum, model)
     share(level, "level")
     found = _read_hyperparameters(posterior, optimum, model)
+    evaluator = None if model is None else Evaluator(model)
+    refuse_labels(labels, map(str, posterior["posterior"].data_vars), evaluator=evaluator)
     canvas = Canvas(list(found), size=(4.6, 3.6), backend=backend, pc_kwargs=pc_kwargs)
     for name, hyperparameter in found.items():
         panel = canvas.panel(name)

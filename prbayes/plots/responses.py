@@ -26,6 +26,7 @@ from prbayes.plots._curves import (
 )
 from prbayes.plots._ensemble import Ensemble, read_before, read_result, supported
 from prbayes.plots._lines import LEVELS, Axis, draw_lines, quantiles
+from prbayes.plots._names import refuse_labels
 from prbayes.plots._panels import Output, in_one_panel, panels_of
 from prbayes.plots._populations import calibrated, draw_calibrated
 
@@ -81,7 +82,8 @@ def plot_responses(
     backend : {"matplotlib", "bokeh", "plotly"}, optional
         That of ArviZ's settings by default.
     **pc_kwargs
-        For ``arviz.PlotCollection.wrap``, such as ``figure_kwargs`` or ``col_wrap``.
+        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
+        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
 
     Returns
     -------
@@ -114,7 +116,7 @@ def plot_responses(
     >>> prb.plot_responses(prb.minimize(model), backend="none").viz["after"].name
     'after'
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     flag(ecdf, "ecdf")
     if draws is not None:
         positive_integer(draws, "draws")
@@ -129,6 +131,7 @@ def plot_responses(
         start = start[:0]
     by_simulator = panels_of(shown.evaluator.nodes)
     names = [output.name for panels in by_simulator for output in panels]
+    refuse_labels(labels, names, evaluator=shown.evaluator)
     lines = any(in_one_panel(node.outputs) for node in shown.evaluator.nodes)
     size = (7.2, 4.8) if lines else (5.4, 4.2)
     canvas = Canvas(names, size=size, backend=backend, pc_kwargs=pc_kwargs)

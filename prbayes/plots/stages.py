@@ -11,16 +11,9 @@ import xarray as xr
 
 from prbayes._checks import Floats
 from prbayes.plots._canvas import CYCLE, DASHDOT, DASHED, DOTTED, SOLID, Canvas, Panel, refuse_look
-from prbayes.plots._names import named
+from prbayes.plots._names import STATISTIC_LABELS, named, refuse_labels
 from prbayes.plots._ticks import Ticks, log_ticks, spans_decades
 
-# What a reader calls a statistic, if he does not say.
-_LABELS = {
-    "beta": "beta (1: posterior)",
-    "accept_rate": "acceptance rate",
-    "n_steps": "steps per stage",
-    "log_marginal_likelihood": "log marginal likelihood",
-}
 # Chains differ in colour and in style; five times four before they repeat.
 _STYLES = (SOLID, DASHED, DOTTED, DASHDOT)
 
@@ -48,7 +41,8 @@ def plot_stages(
     backend : {"matplotlib", "bokeh", "plotly"}, optional
         That of ArviZ's settings by default.
     **pc_kwargs
-        For ``arviz.PlotCollection.wrap``.
+        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
+        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
 
     Returns
     -------
@@ -72,13 +66,14 @@ def plot_stages(
     >>> "chain_1" in prb.plot_stages(posterior, backend="none").viz
     True
     """
-    refuse_look(labels, backend)
+    refuse_look(labels, backend, pc_kwargs)
     known = _read_statistics(posterior)
     # Those of the last stage only come last
     statistics = sorted(known, key=lambda statistic: statistic.once)
     names = [statistic.name for statistic in statistics]
     canvas = Canvas(names, size=(4.6, 3.4), backend=backend, pc_kwargs=pc_kwargs)
-    all_labels = _LABELS | dict(labels or {})
+    all_labels = STATISTIC_LABELS | dict(labels or {})
+    refuse_labels(labels, names)
     for statistic in statistics:
         panel = canvas.panel(statistic.name)
         _draw(panel, statistic, named(statistic.name, all_labels))

@@ -48,7 +48,8 @@ def plot_validity(
     backend : {"matplotlib", "bokeh", "plotly"}, optional
         That of ArviZ's settings by default.
     **pc_kwargs
-        For ``arviz.PlotCollection.wrap``, such as ``figure_kwargs`` or ``col_wrap``.
+        ``figsize=(8, 5)``, in inches, of the whole picture; others go to
+        ``arviz.PlotCollection.wrap``, such as ``col_wrap``.
 
     Returns
     -------
@@ -70,7 +71,7 @@ def plot_validity(
     >>> prb.plot_validity(test, backend="none").viz["ecdf"].name
     'ecdf'
     """
-    refuse_look(None, backend)
+    refuse_look(None, backend, pc_kwargs)
     by_name = _by_name(tests)
     # The panel of a test alone has a name nevertheless
     panels = [name or "u" for name in by_name]

@@ -10,7 +10,7 @@ import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from prbayes._checks import Floats
-from prbayes._progress import CONSOLE, shown
+from prbayes._progress import CONSOLE, live, shown
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.checkpoint import Checkpoint
 from prbayes.posterior.smc_kernel import BatchedKernel
@@ -86,7 +86,7 @@ class Chains:
         stopped = ""
         with (
             shown(progressbar) as visible,
-            Progress(*columns, console=CONSOLE, disable=not visible) as progress,
+            Progress(*columns, console=CONSOLE, disable=not (visible and live())) as progress,
         ):
             for chain, seed in enumerate(seeds):
                 task = progress.add_task("", total=1.0, chain=chain, rate=0.0)

@@ -352,7 +352,9 @@ class Design(Bound):
 
     def _warn_of_thin_support(self, size: float) -> None:
         # With more inputs weights become so uneven that something else is better (docs/choose.md).
+        level = logging.WARNING
         if self.dimensions <= 4:
+            level = logging.INFO  # mended on most ways from here, without the user
             advice = (
                 "prb.minimize and prb.sample_smc refine it themselves, "
                 "before pm.sample call prb.refine(model)"
@@ -363,9 +365,10 @@ class Design(Bound):
                 f"{self.dimensions} inputs are many for stored responses alone: {leave}use "
                 "propagation=prb.Resimulated(n), which has no design"
             )
-        _log.warning(
-            "%s: the design of %d responses supports a typical population of the prior with a "
-            "weight effective sample size of %.0f, expected %.0f; %s",
+        _log.log(
+            level,
+            "%s: the design of %d runs supports a typical population of the prior with a weight "
+            "effective sample size of %.0f, where %.0f make its error small; %s",
             self.name,
             self.config.n,
             size,

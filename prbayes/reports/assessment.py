@@ -11,12 +11,15 @@ import xarray as xr
 
 from prbayes._diagnose import Diagnosis
 from prbayes._weighted import INTERVAL
+from prbayes.plots._names import named
 from prbayes.plots.validity import in_directions
 from prbayes.reports.material import Material
 from prbayes.reports.numbers import alike, number, percentage, plus_minus, shown, span
+from prbayes.reports.problem import described
 from prbayes.reports.section import Section
 from prbayes.reports.summary import verdict
 from prbayes.reports.tables import rows_table
+from prbayes.validation.side_by_side import Comparable, comparables
 from prbayes.validation.validity import ValidityTest
 
 # -- comparison ------------------------------------------------------------------------------
@@ -191,9 +194,10 @@ def _failure_rows(failures: xr.Dataset) -> list[dict[str, Any]]:
 
 
 def validity(m: Material) -> list[Section]:
-    """Return the verdicts of the validity tests."""
+    """Return the verdicts of the validity tests, and their data."""
     if not m.tests:
-        return []
+        data = _validation_data(m)
+        return [Section("Validity", "No test of validity was given."), *data] if data else []
     rows = []
     for label, test in m.tests.items():
         name = label if len(m.tests) > 1 else "area test"
@@ -214,7 +218,43 @@ def validity(m: Material) -> list[Section]:
         )
     verdicts = [verdict(label, test, m) for label, test in m.tests.items()]
     assumed = dict.fromkeys(f"Held to be true: {test.null}." for test in m.tests.values())
-    return [Section("Validity", (*verdicts, about, *assumed), rows_table(rows))]
+    sections = [Section("Validity", (*verdicts, about, *assumed), rows_table(rows))]
+    return [*sections, *_validation_data(m)]
+
+
+def _validation_data(m: Material) -> list[Section]:
+    """Return what was measured on other specimens, and what was predicted of it."""
+    rows = []
+    for condition, (measured, predicted) in m.validation.items():
+        pairs = comparables({condition: measured}, {condition: predicted}, "Report: validation")
+        rows += [_measured_and_predicted(pair, m) for pair in pairs]
+    if not rows:
+        return []
+    for key in ("failed", "missing"):
+        if any(row[key] for row in rows):
+            rows = [row | {key: row[key] or "0"} for row in rows]
+    about = (
+        "Specimens that the calibration has not seen, and what was predicted of them: the median, "
+        f"and the range that holds {INTERVAL:.0%} of the predicted responses. ∞ is a failure."
+    )
+    return [Section("Data of the test", about, rows_table(rows), level=3)]
+
+
+def _measured_and_predicted(pair: Comparable, m: Material) -> dict[str, Any]:
+    """Return the row of one output under one condition."""
+    known = pair.predicted[~np.isnan(pair.predicted)]
+    levels = [0.5, (1 - INTERVAL) / 2, (1 + INTERVAL) / 2]
+    median, low, high = np.quantile(known, levels, method="inverted_cdf").tolist()
+    finite = pair.measured[np.isfinite(pair.measured)]
+    sd = float(finite.std(ddof=1)) if finite.size > 1 else math.nan
+    middle, lower, upper = alike((median, low, high), sd)
+    return {
+        "condition": named(pair.name, m.labels),
+        **described(pair.measured),
+        "predicted": middle,
+        f"{INTERVAL:.0%} from": lower,
+        "to": upper,
+    }
 
 
 def _tested(test: ValidityTest) -> dict[str, Any]:

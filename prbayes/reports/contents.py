@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from prbayes.reports.assessment import comparison as comparison_of
@@ -12,15 +13,24 @@ from prbayes.reports.decision import refuse_decisions
 from prbayes.reports.estimates import optima, posteriors
 from prbayes.reports.illustrations import illustrate, with_graph
 from prbayes.reports.material import Material, gather
+from prbayes.reports.next_steps import next_steps
 from prbayes.reports.problem import data, metric
 from prbayes.reports.problem import model as model_of
 from prbayes.reports.section import Section
-from prbayes.reports.summary import summary
+from prbayes.reports.summary import answers, summary
+from prbayes.reports.tables import rows_table
 
 
 def _summary(m: Material) -> list[Section]:
-    something = m.results or m.tests or m.description
-    return [Section("Summary", summary(m))] if something else []
+    if not (m.results or m.tests or m.description):
+        return []
+    rows = answers(m)
+    table = rows_table(rows) if rows else None
+    sections = [Section("Summary", summary(m), table)]
+    steps = next_steps(m)
+    if steps:
+        sections.append(Section("What to do next", steps, level=3))
+    return sections
 
 
 # In the order of the report; each returns no section where it has nothing to say.
@@ -47,12 +57,15 @@ def contents(
     validity: Any,
     comparison: Any,
     decision: Any = None,
+    validation: Any = None,
     *,
+    labels: Mapping[str, str] | None = None,
     pictures: bool,
 ) -> tuple[Section, ...]:
     """Return the sections that the results allow, with pictures if wanted."""
     refuse_decisions(decision)
-    material = gather(model, optimum, posterior, validity, comparison, decision)
+    results = (model, optimum, posterior, validity, comparison, decision, validation)
+    material = gather(*results, labels=labels)
     sections = tuple(section for part in _PARTS for section in part(material))
     if not pictures:
         return sections

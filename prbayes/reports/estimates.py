@@ -87,7 +87,33 @@ def posteriors(m: Material) -> list[Section]:
         text = [_size(tree["posterior"]), *_width(tree)]
         title = _titled("Posterior", label, m.posteriors)
         sections.append(Section(title, text, rows_table(_posterior_rows(tree))))
+        rows = _correlation_rows(tree)
+        if rows:
+            about = "Correlations of the draws: what is 1 or -1 the data hardly tell apart."
+            title = _titled("Correlations of the hyperparameters", label, m.posteriors)
+            sections.append(Section(title, about, rows_table(rows), level=3))
     return sections
+
+
+# Columns of correlations that fit on a page of A4 in print.
+_MOST_CORRELATED = 8
+
+
+def _correlation_rows(tree: xr.DataTree) -> list[dict[str, str]]:
+    """Return the correlations of the draws; none of one variable, or of more than fit."""
+    draws = stacked_draws(tree["posterior"])
+    values = split_elements(draws)
+    told = [name for name in told_elements(draws) if np.ptp(values[name]) > 0]
+    if not 2 <= len(told) <= _MOST_CORRELATED:
+        return []
+    r = np.corrcoef([values[name] for name in told])
+    rows = []
+    for i, name in enumerate(told):
+        row = {"": name}
+        for j, other in enumerate(told):
+            row[other] = "1" if i == j else f"{r[i, j] + 0.0:.2f}"
+        rows.append(row)
+    return rows
 
 
 def _titled(what: str, label: str, among: Mapping[str, Any]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from subprocess import CalledProcessError
@@ -12,6 +12,7 @@ from typing import Any
 import pymc as pm
 
 from prbayes.model.node import nodes
+from prbayes.plots._names import variable_of
 from prbayes.plots.comparison import plot_comparison
 from prbayes.plots.influences import plot_sensitivity
 from prbayes.plots.landscape import plot_landscape
@@ -19,6 +20,7 @@ from prbayes.plots.optimizer import plot_optimizer
 from prbayes.plots.outputs import plot_outputs
 from prbayes.plots.population import plot_population
 from prbayes.plots.posterior import plot_posterior
+from prbayes.plots.prediction import plot_prediction
 from prbayes.plots.responses import plot_responses
 from prbayes.plots.stages import plot_stages
 from prbayes.plots.validity import plot_validity
@@ -79,7 +81,23 @@ def _population(m: Material) -> Request:
     answer = _first(m.posteriors | m.found)
     if m.model is None or answer is None:
         return None
-    return Call((answer,), {"model": m.model})
+    return _labelled(m, (answer,), {"model": m.model})
+
+
+def _labelled(
+    m: Material, arguments: tuple[Any, ...], keywords: dict[str, Any] | None = None
+) -> Call:
+    """Return the arguments of a picture, with the labels if there are any."""
+    # Of the model's own things: it knows no conditions of a test
+    own = {name: text for name, text in m.labels.items() if name not in m.validation}
+    return Call(arguments, (keywords or {}) | ({"labels": own} if own else {}))
+
+
+def _own_labels(m: Material, names: Iterable[Any]) -> dict[str, Any]:
+    """Return as keywords the labels of what a picture shows that does not know the model."""
+    shown = {variable_of(str(name)) for name in names}
+    own = {name: text for name, text in m.labels.items() if variable_of(name) in shown}
+    return {"labels": own} if own else {}
 
 
 def _responses(m: Material) -> Request:
@@ -98,7 +116,11 @@ def _outputs(m: Material) -> Request:
 def _posterior(m: Material) -> Request:
     if not m.posteriors:
         return None
-    return Call((_first(m.posteriors), _first(m.found)), {"model": m.model})
+    if m.model is None:
+        names = _first(m.posteriors)["posterior"].data_vars
+        own = _own_labels(m, names)
+        return Call((_first(m.posteriors), _first(m.found)), {"model": None, **own})
+    return _labelled(m, (_first(m.posteriors), _first(m.found)), {"model": m.model})
 
 
 def _stages(m: Material) -> Request:
@@ -109,17 +131,19 @@ def _stages(m: Material) -> Request:
 
 
 def _optimizer(m: Material) -> Request:
-    return Call((_first(m.found),), {"col_wrap": 2}) if m.found else None
+    return _labelled(m, (_first(m.found),), {"col_wrap": 2}) if m.found else None
 
 
 def _landscape(m: Material) -> Request:
     if m.model is None or not m.found:
         return None
-    return Call((_first(m.found),), {"model": m.model})
+    return _labelled(m, (_first(m.found),), {"model": m.model})
 
 
 def _comparison(m: Material) -> Request:
-    return None if m.comparison is None else Call((m.comparison,))
+    if m.comparison is None:
+        return None
+    return Call((m.comparison,), _own_labels(m, m.comparison["hyperparameter"].values))
 
 
 def _validity(m: Material) -> Request:
@@ -131,7 +155,15 @@ def _validity(m: Material) -> Request:
 def _decision(m: Material) -> Request:
     tables = m.decisions.values()
     found = [table for table in tables if kind_of_decision(table) == "sensitivity"]
-    return Call((found[0],)) if found else None
+    return Call((found[0],), _own_labels(m, found[0]["factor"].values)) if found else None
+
+
+def _prediction(m: Material) -> Request:
+    if not m.validation:
+        return None
+    measured = {name: pair[0] for name, pair in m.validation.items()}
+    predicted = {name: pair[1] for name, pair in m.validation.items()}
+    return Call((measured, predicted), _own_labels(m, m.validation))
 
 
 # In the order of the report, and within a section in this order.
@@ -203,6 +235,16 @@ ILLUSTRATIONS = (
         title="Estimates side by side",
         alt="Estimate and interval of each result, one panel per hyperparameter.",
         caption="Estimates with their intervals.",
+    ),
+    Illustration(
+        after="Validity",
+        function=plot_prediction,
+        request=_prediction,
+        title="Measured and predicted responses",
+        alt="Distribution functions of the measured responses, as steps, and of the predicted ones "
+        "with a band, one panel per condition or output.",
+        caption="Specimens that were not used in the calibration, beside what was predicted of "
+        "them; the band holds 89% of the populations that the calibration leaves possible.",
     ),
     Illustration(
         after="Validity",
@@ -292,21 +334,19 @@ def _drawn(illustration: Illustration, call: Call) -> bytes | NotDrawn:
 
 
 def with_graph(sections: tuple[Section, ...], m: Material) -> tuple[Section, ...]:
-    """Add the model's graph after the parts of the section on the model."""
-    if m.model is None:
+    """Add the model's graph after the parts of the section on the model, where it can be drawn."""
+    drawn = None if m.model is None else _graph(m.model)
+    if drawn is None:
         return sections
     titles = [section.title for section in sections]
     place = titles.index("Model") + 1
     while place < len(sections) and sections[place].level == 3:
         place += 1
-    return (*sections[:place], _graph_section(m.model, m.variables), *sections[place:])
+    return (*sections[:place], _graph_section(drawn, m.variables), *sections[place:])
 
 
-def _graph_section(model: pm.Model, variables: list[dict[str, Any]]) -> Section:
-    """Return the model's graph, or why there is none."""
-    drawn = _graph(model)
-    if isinstance(drawn, NotDrawn):
-        return Section("Graph", f"The model's graph is not drawn: {drawn.reason}.", level=3)
+def _graph_section(drawn: bytes, variables: list[dict[str, Any]]) -> Section:
+    """Return the model's graph."""
     names = ", ".join(variable["name"] for variable in variables)
     return Section(
         "Graph",
@@ -317,19 +357,26 @@ def _graph_section(model: pm.Model, variables: list[dict[str, Any]]) -> Section:
     )
 
 
-def _graph(model: pm.Model) -> bytes | NotDrawn:
+def _graph(model: pm.Model) -> bytes | None:
+    """Return the model's graph; None where Graphviz is not here, which is no reader's affair.
+
+    Nor is it drawn where that would compute responses, or Graphviz does not take a name.
+    """
+    if _computes_responses(model):  # PyMC draws each variable once for its shape
+        _log.info("report: no graph: PyMC would compute responses for it")
+        return None
     try:
         graphviz: Any = import_module("graphviz")  # a package that users may lack
     except ImportError:
-        return NotDrawn("there is no Python package graphviz")
-    if _computes_responses(model):  # PyMC draws each variable once for its shape
-        return NotDrawn("PyMC would compute responses for it. See pm.model_to_graphviz(model)")
+        _log.info("report: no graph: there is no Python package graphviz")
+        return None
     try:
         return _svg(model)
     except (graphviz.ExecutableNotFound, OSError):
-        return NotDrawn("there is no program dot of Graphviz")
+        _log.info("report: no graph: there is no program dot of Graphviz")
     except CalledProcessError:
-        return NotDrawn("Graphviz does not take a name in it")
+        _log.info("report: no graph: Graphviz does not take a name in it")
+    return None
 
 
 def _svg(model: pm.Model) -> bytes:

@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, called, texts
 from prbayes._compare import compare
 from prbayes._diagnose import Diagnosis, diagnose
 from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.model.description import describe, from_attributes
-from prbayes.model.identity import Level, differences, identity_of_model, require_together
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.identity import (
+    Level,
+    differences,
+    identity_of_model,
+    require_together,
+)
+from prbayes.model.identity import from_attributes as identity_of_attributes
 from prbayes.model.node import nodes
+from prbayes.plots._names import refuse_labels
 from prbayes.response.outputs import ONE, Outputs, read_observed
+from prbayes.validation.side_by_side import comparables
 from prbayes.validation.validity import ValidityTest
 
 
@@ -36,6 +45,10 @@ class Material:
     outputs: dict[str, Outputs]  # of a run, by simulator
     diagnoses: dict[str, Diagnosis | None]
     decisions: dict[str, xr.Dataset]
+    # Of other specimens, by condition: what was measured, and what was predicted of it.
+    validation: dict[str, tuple[Any, xr.DataArray]] = field(default_factory=dict)
+    # What a reader calls variables, inputs, simulators and outputs, with units.
+    labels: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def results(self) -> dict[str, xr.DataTree]:
@@ -72,7 +85,14 @@ class Material:
 
 
 def gather(
-    model: Any, optimum: Any, posterior: Any, validity: Any, comparison: Any, decision: Any = None
+    model: Any,
+    optimum: Any,
+    posterior: Any,
+    validity: Any,
+    comparison: Any,
+    decision: Any = None,
+    validation: Any = None,
+    labels: Mapping[str, str] | None = None,
 ) -> Material:
     """Check what was given.
 
@@ -90,6 +110,9 @@ def gather(
     # Refuse what is not as described
     _require_model(model)
     _require_comparison(comparison)
+    _require_validation(validation)
+    if labels is not None:
+        texts(labels, "Report: labels")
     _require_different_names(given, posteriors)
     for label, test in tests.items():
         _require_test(label, test)
@@ -105,6 +128,8 @@ def gather(
     identities = {label: identity_in(result) for label, result in (results | found).items()}
     identities |= {label: test.identity for label, test in tests.items()}
     identities |= {label: identity_in(table) for label, table in decisions.items()}
+    for label, (_, predicted) in (validation or {}).items():
+        identities[f"validation, {label}"] = identity_of_attributes(predicted.attrs)
     identities["comparison"] = identity_in(comparison)
     require_together(identities, "Report", model=model)
 
@@ -113,6 +138,7 @@ def gather(
     if comparison is None and len(results) > 1:
         comparison = _free_only(compare(results | found, model=model), description)
     observed, outputs = _observed(model, results)
+    _require_known_labels(labels, model, description, outputs, validation)
     diagnoses = {}
     for label, result in (results | found).items():
         diagnoses[label] = _diagnosis(result, model)
@@ -128,6 +154,8 @@ def gather(
         outputs=outputs,
         diagnoses=diagnoses,
         decisions=decisions,
+        validation=dict(validation or {}),
+        labels=dict(labels or {}),
     )
 
 
@@ -145,6 +173,41 @@ def _labelled(given: Any, kind: str) -> dict[str, Any]:
 def _require_model(model: Any) -> None:
     if model is not None and not isinstance(model, pm.Model):
         raise TypeError(f"Report: model: got {type(model).__name__}, expected a pm.Model")
+
+
+def _require_validation(validation: Any) -> None:
+    """Refuse what is no data with a prediction of them, by condition."""
+    if validation is None:
+        return
+    expected = (
+        "expected by condition what was measured and what prb.predict says of it, such as "
+        '{"80 000 cycles": (lengths, prb.predict(...))}'
+    )
+    if not isinstance(validation, Mapping):
+        raise TypeError(f"Report: validation: got {called(validation)}, {expected}")
+    for condition, pair in validation.items():
+        if not isinstance(condition, str) or not isinstance(pair, tuple) or len(pair) != 2:
+            raise TypeError(f"Report: validation: {condition}: got {called(pair)}, {expected}")
+        comparables({condition: pair[0]}, {condition: pair[1]}, "Report: validation")
+
+
+def _require_known_labels(
+    labels: Mapping[str, str] | None,
+    model: pm.Model | None,
+    description: dict[str, Any] | None,
+    outputs: Mapping[str, Outputs],
+    validation: Mapping[str, Any] | None,
+) -> None:
+    """Refuse labels of what the report does not have, where it is known what it has."""
+    if not labels or (description is None and model is None):
+        return
+    known = set(validation or {})
+    for simulator, own in outputs.items():
+        known |= {simulator, *own.names}
+    if description is not None:
+        known |= {str(variable["name"]) for variable in description["variables"]}
+    evaluator = None if model is None else Evaluator(model)
+    refuse_labels(labels, sorted(known), evaluator=evaluator)
 
 
 def _require_comparison(comparison: Any) -> None:
@@ -246,7 +309,9 @@ def _observed(
 def _stored_observed(name: str, values: xr.DataArray) -> tuple[Floats, Outputs]:
     """Return the measured responses of a simulator, and what their columns are, from a result."""
     if values.ndim != 2:
-        return np.ravel(values.values), ONE
+        unit = values.attrs.get("units")
+        outputs = Outputs(units=(unit,)) if isinstance(unit, str) and unit else ONE
+        return np.ravel(values.values), outputs
     units = values.attrs.get("units")
     if units is not None and not isinstance(units, str):  # of each output
         values = values.assign_coords(units=(values.dims[1], np.asarray(units)))

@@ -22,7 +22,10 @@ def model(m: Material) -> list[Section]:
     """Return the variables of the model, and its simulators."""
     if m.description is None:
         return []
-    variables = [_named(v, "variable", "role", "distribution") for v in m.description["variables"]]
+    variables = []
+    for v in m.description["variables"]:
+        own = _named(v, "variable", "role", "distribution")
+        variables.append(own | {"meaning": m.labels.get(v["name"], "")})
     about = (
         "Hyperparameters describe how the inputs vary from specimen to specimen, "
         "and have prior distributions."
@@ -38,9 +41,9 @@ def model(m: Material) -> list[Section]:
     return sections
 
 
-def _named(described: dict[str, Any], kind: str, *keys: str) -> dict[str, Any]:
+def _named(facts: dict[str, Any], kind: str, *keys: str) -> dict[str, Any]:
     """Return some facts of what has a name."""
-    return {kind: described["name"]} | {key: described[key] for key in keys}
+    return {kind: facts["name"]} | {key: facts[key] for key in keys}
 
 
 def data(m: Material) -> list[Section]:
@@ -80,12 +83,17 @@ def _rows_of(name: str, m: Material) -> list[dict[str, Any]]:
     y = m.observed[name]
     outputs = m.outputs.get(name, ONE)
     if y.ndim == 1:
-        return [{"simulator": name, "output": "", "units": ""} | _described(y)]
+        units = outputs.units[0] if outputs.units else ""
+        meaning = m.labels.get(name, "")
+        about = {"simulator": name, "meaning": meaning, "output": "", "units": units}
+        return [about | described(y)]
     rows = []
     for j in _told(y):
         units = outputs.units[j] if outputs.units else ""
-        about = {"simulator": name, "output": outputs.names[j], "units": units}
-        rows.append(about | _described(y[:, j]))
+        own = outputs.names[j]
+        meaning = m.labels.get(f"{name}[{own}]", m.labels.get(own, ""))
+        about = {"simulator": name, "meaning": meaning, "output": own, "units": units}
+        rows.append(about | described(y[:, j]))
     return rows
 
 
@@ -103,13 +111,16 @@ def _untold(name: str, m: Material) -> str:
     return f"{name}: {told} of {all_of_them} outputs are told." if told < all_of_them else ""
 
 
-def _described(y: Floats) -> dict[str, Any]:
+def described(y: Floats) -> dict[str, Any]:
     """Describe one output: NaN was not measured, +inf has failed."""
     measured = y[~np.isnan(y)]
     finite = measured[np.isfinite(measured)]
     failed, missing = measured.size - finite.size, y.size - measured.size
     sd = float(finite.std(ddof=1)) if finite.size > 1 else math.nan
-    low, high, mean, spread = alike((finite.min(), finite.max(), finite.mean(), sd), sd)
+    told = [math.nan] * 3
+    if finite.size:
+        told = [float(finite.min()), float(finite.max()), float(finite.mean())]
+    low, high, mean, spread = alike((*told, sd), sd)
     return {
         "N": measured.size,
         "failed": str(failed) if failed else "",

@@ -116,11 +116,14 @@ class _Document:
         for i, section in enumerate(self.sections, 1):
             if section.level == 2 and i > 1:  # the summary comes before the list of contents
                 chapters.append((i, section.title))
+        # With its parts the first section is a page of its own
+        front = chapters[0][0] - 1 if chapters else len(self.sections)
         rendered: str = environment.get_template("report.html.j2").render(
             report=self,
             byline=self._byline,
-            style=environment.get_template("report.css").render(),
+            style=environment.get_template("report.css").render(running=_in_css(self.title)),
             contents=chapters,
+            front=front,
             cells=cells,
             base64=_base64,
         )
@@ -160,6 +163,12 @@ class Report(_Document):
         From `exceedance`, `sensitivity` or `plan`; several by name.
     pictures : bool
         Whether pictures are made of the results.
+    validation : mapping, optional
+        What validity was tested on, by condition: a pair of what was measured on other specimens
+        and what `predict` says of it. It becomes a table and a picture.
+    labels : mapping, optional
+        What a reader calls hyperparameters, inputs, simulators and outputs, by their names, with
+        units: ``{"mu": "mean of log C", "crack": "crack length / notch length"}``.
 
     Attributes
     ----------
@@ -198,6 +207,8 @@ class Report(_Document):
         comparison: xr.Dataset | None = None,
         decision: xr.Dataset | Mapping[str, xr.Dataset] | None = None,
         pictures: bool = True,
+        validation: Mapping[str, tuple[Any, xr.DataArray]] | None = None,
+        labels: Mapping[str, str] | None = None,
     ) -> None:
         if not isinstance(title, str) or not title.strip():
             raise TypeError(f"Report: title: got {title!r:.60}, expected a text")
@@ -210,8 +221,8 @@ class Report(_Document):
             )
         made = tuple(sections)
         if not made:
-            results = (model, optimum, posterior, validity, comparison, decision)
-            made = contents(*results, pictures=pictures)
+            results = (model, optimum, posterior, validity, comparison, decision, validation)
+            made = contents(*results, labels=labels, pictures=pictures)
         for section in made:
             if not isinstance(section, Section):
                 got = type(section).__name__
@@ -264,6 +275,19 @@ def _escaped_start(found: re.Match[str]) -> str:
     # Of '1.' the point is escaped, as digits cannot be.
     start = found[0]
     return f"{start}\\" if start.isdigit() else f"\\{start}"
+
+
+# A running title longer than this would meet the page's number on A4, 178 mm wide between margins.
+_RUNNING = 80
+
+
+def _in_css(text: str) -> str:
+    """Return a text for a string of CSS, escaped but for letters and digits (CSS 2.1, 4.1.3)."""
+    line = " ".join(visible(text).split())
+    if len(line) > _RUNNING:
+        line = line[: _RUNNING - 1] + "…"
+    plain = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789 "
+    return "".join(c if c in plain else f"\\{ord(c):x} " for c in line)
 
 
 def _base64(picture: bytes) -> str:

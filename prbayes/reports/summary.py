@@ -14,22 +14,60 @@ from prbayes.model.elements import (
     told_elements,
     told_of,
 )
+from prbayes.plots._names import named
 from prbayes.plots._objective import metric_label
 from prbayes.plots.validity import in_directions
 from prbayes.reports.material import Material
-from prbayes.reports.numbers import counted, number, percentage, plus_minus
+from prbayes.reports.numbers import alike, counted, number, percentage, plus_minus
 from prbayes.validation.validity import ValidityTest
 
 # More hyperparameters than this make a list, which a table shows better: by judgement.
 _MOST_NAMES = 6
+# More rows than these leave no room for the rest on the first page: by judgement.
+_MOST_ROWS_IN_SUMMARY = 10
 
 
 def summary(m: Material) -> list[str]:
     """Return the sentences, as paragraphs."""
-    paragraphs = [_what_was_calibrated(m), f"{_answer(m)} {_agreement(m)}", _trust(m)]
+    paragraphs = [_verdict(m), _what_was_calibrated(m), f"{_answer(m)} {_agreement(m)}", _trust(m)]
     paragraphs += [verdict(label, test, m) for label, test in m.tests.items()]
     stripped = map(str.strip, paragraphs)
     return list(filter(None, stripped))
+
+
+def answers(m: Material) -> list[dict[str, str]]:
+    """Return the rows of a table: the hyperparameters, what they are called, what is known."""
+    if not m.results:
+        return []
+    label = next(iter(m.posteriors or m.optima))
+    spread = "sd" if m.posteriors else "standard error"
+    rows = []
+    for name, (value, sd) in _estimates(m, label).items():
+        estimate, error = alike((value, sd), sd, 2)
+        meaning = named(name, m.labels)
+        rows.append(
+            {
+                "hyperparameter": name,
+                "meaning": "" if meaning == name else meaning,
+                "estimate": estimate,
+                spread: error,
+            }
+        )
+    return rows if len(rows) <= _MOST_ROWS_IN_SUMMARY else []
+
+
+def _verdict(m: Material) -> str:
+    """Return in one sentence whether the calibration may be used."""
+    if not m.results:
+        return ""
+    problems = any(found is not None and not found.ok for found in m.diagnoses.values())
+    if any(test.rejected for test in m.tests.values()):
+        return "Verdict: the calibrated model is rejected by data that it has not seen."
+    if problems:
+        return "Verdict: not to be used before the problems under Diagnostics are removed."
+    if not m.tests:
+        return "Verdict: calibrated, and not tested on data that it has not seen."
+    return "Verdict: calibrated, and not rejected by data that it has not seen."
 
 
 def verdict(label: str, test: ValidityTest, m: Material) -> str:

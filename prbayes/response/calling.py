@@ -556,7 +556,7 @@ def _one_by_one(
 
 def _of_one(result: Any, outputs: Outputs | None) -> Floats:
     """Return what a function of one specimen returned, shape (*event)."""
-    one = outputs == ONE or (outputs is None and np.ndim(result) == 0)
+    one = np.ndim(result) == 0 if outputs is None else not outputs.event
     if one and not isinstance(result, Mapping):
         return np.asarray(float(result))
     return checked(result, (), (), outputs)

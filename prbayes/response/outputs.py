@@ -107,11 +107,17 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
         observed = np.ma.filled(np.ma.asarray(observed, dtype=np.float64), np.nan)
     values = observed if np.ma.is_masked(observed) else real_array(observed, label)
     if np.ndim(values) != 2:
-        return values, ONE
+        return values, _of_one(observed)
     _, m = values.shape
     if not m:
         raise ValueError(f"{label}: got shape {values.shape}, expected one output at least")
     return values, _of_columns(observed, m)
+
+
+def _of_one(observed: Any) -> Outputs:
+    """Return what a DataArray of one output says of its units."""
+    unit = getattr(observed, "attrs", {}).get("units") if hasattr(observed, "dims") else None
+    return Outputs(units=(str(unit),)) if unit else ONE
 
 
 def _of_columns(observed: Any, m: int) -> Outputs:

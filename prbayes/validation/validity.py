@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats, Seed, share
+from prbayes._html import view
 from prbayes._predict import data_digest
 from prbayes._progress import shown
 from prbayes.model.identity import Identity, as_attributes
@@ -77,6 +78,11 @@ class ValidityTest:
             f"  {values} values of {specimens} specimens, {conditions} condition(s)\n"
             f"  null: {self.null}"
         )
+
+    def _repr_html_(self) -> str:
+        """Show the verdict in a notebook."""
+        heading, *sentences = repr(self).splitlines()
+        return view(heading, sentences=sentences)
 
     def to_dataset(self) -> xr.Dataset:
         """Return the result as a Dataset, which ``to_netcdf`` saves.

@@ -383,9 +383,11 @@ def test_data_that_do_not_fit_what_goes_with_them_are_refused() -> None:
 def test_an_epsilon_that_is_not_set_is_told_when_the_density_is_made(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    with caplog.at_level("INFO", "prbayes"):
+    with caplog.at_level("DEBUG", "prbayes"):
         build(prb.Reweighted(64), epsilon=None).logp()
     assert "y: epsilon is not set; call prb.set_epsilon(model" in caplog.text
+    told = [record for record in caplog.records if "epsilon is not set" in record.getMessage()]
+    assert {record.levelname for record in told} == {"DEBUG"}, "nothing is wrong yet"
 
 
 def test_the_value_that_a_log_density_is_asked_at_has_to_be_the_data() -> None:

@@ -86,8 +86,9 @@ def test_labels_reach_the_axes(picture: str, pictures: dict[str, Callable[..., A
         "accept_rate": "RATE",
         "AreaMetric": "AREA",
         "sigma": "SD",
-        "first": "FIRST",
     }
+    if picture == "outputs":
+        labels = {"frame": "FRAME", "first": "FIRST", "mu": "MEAN"}
     pc = pictures[picture](backend="none", labels=labels)
     panels = [pc.get_target(name, {}) for name in pc.data.data_vars]
     calls = [call for panel in panels for call in panel]
@@ -102,3 +103,12 @@ def test_settings_of_the_collection_are_passed_on(posterior: xr.DataTree) -> Non
     )
     assert tuple(pc.viz["figure"].item().get_size_inches()) == (3, 7)
     assert pc.viz["row_index"]["sigma"].item() == 1
+
+
+def test_the_size_is_in_inches_on_every_backend(posterior: xr.DataTree) -> None:
+    figure = prb.plot_posterior(posterior, backend="matplotlib", figsize=(9, 3)).viz["figure"]
+    assert tuple(figure.item().get_size_inches()) == (9, 3)
+    figure = prb.plot_posterior(posterior, backend="plotly", figsize=(9, 3)).viz["figure"]
+    assert figure.item().layout.width == 900
+    with pytest.raises(ValueError, match=r"figsize: got 'wide', expected width and height"):
+        prb.plot_posterior(posterior, backend="none", figsize="wide")

@@ -1,5 +1,8 @@
 """Names of elements: one rule in both directions."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -27,3 +30,24 @@ def test_values_are_split_along_all_axes_but_the_first() -> None:
     found = split_elements({"mu": np.arange(3.0), "cov": cov})
     assert list(found) == ["mu", "cov[0,0]", "cov[0,1]", "cov[1,0]", "cov[1,1]"]
     np.testing.assert_array_equal(found["cov[0,1]"], cov[:, 0, 1])
+
+
+PICTURES = ("responses", "population", "posterior", "optimizer", "landscape", "comparison")
+
+
+@pytest.mark.parametrize("picture", PICTURES)
+def test_a_label_of_nothing_is_refused(
+    picture: str, pictures: dict[str, Callable[..., Any]]
+) -> None:
+    with pytest.raises(KeyError, match=r"labels: got 'crak', which is no name of this picture"):
+        pictures[picture](backend="none", labels={"crak": "crack length (mm)"})
+
+
+def test_one_mapping_serves_all_pictures_of_a_model(
+    pictures: dict[str, Callable[..., Any]],
+) -> None:
+    labels = {"mu": "mean", "y": "response", "x": "input"}
+    for picture in PICTURES:
+        pictures[picture](backend="none", labels=labels)
+    with pytest.raises(KeyError, match="'nu'"):
+        pictures["responses"](backend="none", labels=labels | {"nu": "typing error"})

@@ -25,7 +25,10 @@ def test_the_objective_is_the_discrepancy_over_its_scale(optimum: prb.Optimum) -
 
 def test_the_objective_is_called_by_its_metric(optimum: prb.Optimum) -> None:
     assert objective_label(optimum) == "discrepancy (area metric)"
-    assert objective_label(replace(optimum, scales={"y": 1.0, "z": 1.0})) == "sum of d / s"
+    assert (
+        objective_label(replace(optimum, scales={"y": 1.0, "z": 1.0}))
+        == "sum of scaled discrepancies"
+    )
 
 
 def test_elements_are_in_the_users_own_units(optimum: prb.Optimum) -> None:

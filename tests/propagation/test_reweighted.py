@@ -337,7 +337,7 @@ def test_refinement_of_two_correlated_inputs(caplog: pytest.LogCaptureFixture) -
     assert np.median(ess) < 50  # a single batch from the prior predictive does not do
     with caplog.at_level(logging.INFO, logger="prbayes"):
         points = prb.refine(model, thetas)
-    assert "refined to 1024 responses" in caplog.text
+    assert "to 1024 runs" in caplog.text
     assert not shortcomings(evaluator, thetas)
     for name, response in zip(("sum", "difference"), responses, strict=True):
         assert points[name] == response.count == design(model, name).n_points

@@ -94,7 +94,8 @@ def test_each_illustration_gets_what_it_needs(
     assert set(called) == names - {
         "plot_outputs",
         "plot_sensitivity",
-    }  # for several outputs; for a decision
+        "plot_prediction",
+    }  # for several outputs; for a decision; for data of a test
     assert called["plot_responses"] == called["plot_population"] == (posterior, model)
     assert called["plot_posterior"] == (posterior, optimum, model)
     assert called["plot_optimizer"] == (optimum, 2)
@@ -135,7 +136,7 @@ def test_a_report_computes_no_response(monkeypatch: pytest.MonkeyPatch, section:
     before, counted = calls, optimum.evaluator.n_responses
     made = prb.Report("x", model=model, optimum=optimum)
     assert (calls, optimum.evaluator.n_responses) == (before, counted)
-    assert "PyMC would compute responses" in section(made, "Graph").text[0]
+    assert "Graph" not in [s.title for s in made.sections]
     text = section(made, "Measured and calibrated responses").text
     assert text == (
         "This picture could not be made: it would compute responses anew; "
@@ -147,32 +148,35 @@ def test_a_report_computes_no_response(monkeypatch: pytest.MonkeyPatch, section:
     ("lacking", "words"),
     [("package", "no Python package graphviz"), ("program", "no program dot")],
 )
-def test_without_graphviz_a_sentence_says_so(
+def test_without_graphviz_there_is_no_graph(
     lacking: str,
     words: str,
     monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
     tmp_path: Path,
     calibrated: Any,
-    section: Any,
 ) -> None:
+    """A reader of the report is not told what the writer's machine lacks; the log says it."""
     if lacking == "package":
         monkeypatch.setitem(sys.modules, "graphviz", None)
     else:
         monkeypatch.setenv("PATH", str(tmp_path))
-    found = section(prb.Report("x", model=calibrated.model), "Graph")
-    assert found.picture is None
-    assert words in found.text[0]
+    with caplog.at_level("INFO", "prbayes"):
+        made = prb.Report("x", model=calibrated.model)
+    assert "Graph" not in [section.title for section in made.sections]
+    assert words in caplog.text
+    assert words not in made._html()
 
 
 def test_a_name_that_graphviz_does_not_take(
-    monkeypatch: pytest.MonkeyPatch, calibrated: Any, section: Any
+    monkeypatch: pytest.MonkeyPatch, calibrated: Any
 ) -> None:
     def fails(_: Any) -> bytes:
         raise subprocess.CalledProcessError(1, "dot")
 
     monkeypatch.setattr(illustrations, "_svg", fails)
-    found = section(prb.Report("x", model=calibrated.model), "Graph")
-    assert found.text == ("The model's graph is not drawn: Graphviz does not take a name in it.",)
+    made = prb.Report("x", model=calibrated.model)
+    assert "Graph" not in [section.title for section in made.sections]
 
 
 def needs_dot() -> None:
@@ -262,3 +266,42 @@ def test_pairs_of_outputs_are_drawn_where_responses_are_stored(
         assert [section.title for section in made[1:]] == (
             ["Measured and calibrated responses", "Pairs of outputs"][: max(count, 1)]
         )
+
+
+def test_labels_reach_the_pictures_that_know_the_names(
+    monkeypatch: pytest.MonkeyPatch, calibrated: Any
+) -> None:
+    model, optimum, posterior, test = calibrated
+    given: dict[str, Any] = {}
+
+    class Picture:
+        def savefig(self, path: Path, **_: Any) -> None:
+            path.write_bytes(b"<svg/>")
+
+    def drawn(name: str) -> Any:
+        def made(*_: Any, labels: Any = None, **__: Any) -> Picture:
+            given[name] = labels
+            return Picture()
+
+        return made
+
+    names = {i.function.__name__ for i in illustrations.ILLUSTRATIONS}
+    drawn_by(monkeypatch, {name: drawn(name) for name in names})
+    x = pm.Normal.dist(model["mu"], model["sigma"])
+    later = prb.predict(posterior, np.positive, x, model=model, draws=20)
+    labels = {"mu": "mean", "y": "stiffness (N/mm)", "hot": "at 200 °C"}
+    of_model = {"mu": "mean", "y": "stiffness (N/mm)"}
+    prb.Report(
+        "x",
+        model=model,
+        optimum=optimum,
+        posterior=posterior,
+        validity=test,
+        validation={"hot": (np.array([1.0, 2.0, 2.5]), later)},
+        labels=labels,
+    )
+    assert given["plot_responses"] == given["plot_landscape"] == of_model
+    assert given["plot_comparison"] == {"mu": "mean"}
+    assert given["plot_prediction"] == {"hot": "at 200 °C"}
+    with pytest.raises(KeyError, match="labels: got 'nu'"):
+        prb.Report("x", model=model, optimum=optimum, labels={"nu": "typing error"})

@@ -132,7 +132,7 @@ def test_a_result_alone_tells_the_same_of_outputs(frame: Any) -> None:
     report = prb.Report("Frame", optimum=optimum, model=frame, pictures=False)
     assert (
         "on 20 specimens with 2 outputs of frame, by the joint probability residual"
-        in (report.sections[0].text[0])
+        in (report.sections[0].text[1])
     )
 
 
@@ -149,3 +149,19 @@ def test_of_a_curve_some_outputs_have_a_row(calibrated: Any) -> None:
     assert len(rows) == len(cells(correlations.table).rows) == 12
     assert [rows[0][1], rows[-1][1]] == ["0", "19.5"]
     assert "y: 12 of 40 outputs are told." in about.text
+
+
+def test_one_output_tells_its_units_from_memory_and_from_a_result() -> None:
+    values = xr.DataArray([1.0, 2.0, 4.0], dims="specimen", attrs={"units": "N/mm"})
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 2, 1), 1.0)
+        prb.Simulator(
+            "k", np.positive, x, metric=prb.AreaMetric(), observed=values,
+            propagation=prb.Reweighted(64),
+        )  # fmt: skip
+    optimum = prb.minimize(model)
+    for given in ((model, None), (None, optimum.to_datatree())):
+        (section,) = data(gather(*given, None, None, None))
+        assert section.table["units"].tolist() == ["N/mm"]
+    picture = prb.plot_responses(optimum, backend="matplotlib")
+    assert picture.viz["plot"]["k"].item().get_xlabel() == "k (N/mm)"

@@ -170,9 +170,10 @@ def test_a_section_of_the_users_own(
     assert report.with_section(mine).sections[-1] is mine
     part = dataclasses.replace(mine, title="Part", level=3)
     inside = report.with_section(part, after="Model").sections
-    assert [s.title for s in inside][:4] == ["Summary", "Model", "Part", "Simulators"]
-    few = dataclasses.replace(report, title="Two", sections=report.sections[:2])
-    assert [s.title for s in few.sections] == ["Summary", "Model"]
+    beginning = ["Summary", "What to do next", "Model", "Part", "Simulators"]
+    assert [s.title for s in inside][:5] == beginning
+    few = dataclasses.replace(report, title="Two", sections=report.sections[:3])
+    assert [s.title for s in few.sections] == ["Summary", "What to do next", "Model"]
     with pytest.raises(KeyError, match="expected the title of a section"):
         report.with_section(mine, after="Nothing")
 
@@ -274,3 +275,31 @@ def test_bare_links_and_unseen_characters_of_a_text_are_shown_as_text(tmp_path: 
     assert "http\\://evil.example/x" in markdown
     assert "www\\.evil.example" in markdown
     assert "http://" not in markdown
+
+
+def test_the_running_title_is_text(parse: Any) -> None:
+    """In print a style has the title: nothing in it may end a string or the style."""
+    title = '"}</style><script>alert(1)</script>\\"' + "x" * 100
+    text = prb.Report(title, (prb.reports.Section("A", "a"),))._html()
+    css = parse(text).text("style")
+    (running,) = re.findall(r'@bottom-left \{ content: "([^"]*)"', css)
+    undone = re.sub(r"\\([0-9a-f]+) ", lambda found: chr(int(found[1], 16)), running)
+    assert undone == title[:79] + "…"
+    assert "counter(page)" in css
+
+
+def test_the_summary_and_what_to_do_are_a_page(report: prb.Report, page: Any) -> None:
+    classes = [attrs["class"] or "" for tag, attrs in page.tags if tag == "section"]
+    titles = [section.title for section in report.sections]
+    assert [t for t, c in zip(titles, classes, strict=True) if "lead" in c] == [
+        "Summary",
+        "What to do next",
+    ]
+    assert [t for t, c in zip(titles, classes, strict=True) if "chapter" in c] == ["Model"]
+
+
+def test_it_has_colours_for_the_dark(page: Any) -> None:
+    css = page.text("style")
+    dark = css[css.index("prefers-color-scheme: dark") :]
+    names = set(re.findall(r"(--[a-z]+):", css))
+    assert names == set(re.findall(r"(--[a-z]+):", dark[: dark.index("figure")]))

@@ -1,0 +1,71 @@
+"""What a calibration has not seen, beside what it predicts."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import prbayes as prb
+
+RNG = np.random.default_rng(5)
+PREDICTED = xr.DataArray(
+    RNG.normal(RNG.normal(0, 0.3, (2, 50, 1)), 1.0, (2, 50, 400)),
+    dims=("chain", "draw", "sample"),
+    name="later",
+)
+MEASURED = np.array([-1.0, 0.2, 0.4, 1.5])
+
+
+def test_steps_and_curve_are_distribution_functions(read: SimpleNamespace) -> None:
+    pc = prb.plots.plot_prediction(MEASURED, PREDICTED, backend="matplotlib")
+    x, y = read.xy(pc, "measured", "later")
+    for value, below, above in zip(
+        MEASURED, (0, 0.25, 0.5, 0.75), (0.25, 0.5, 0.75, 1), strict=True
+    ):
+        assert set(y[x == value]) == {below, above}
+    x, y = read.xy(pc, "predicted", "later")
+    pooled = np.sort(PREDICTED.values.ravel())
+    expected = np.searchsorted(pooled, x, side="right") / pooled.size
+    np.testing.assert_allclose(y, expected, atol=1e-9)
+
+
+def test_the_band_holds_its_share_of_the_populations(read: SimpleNamespace) -> None:
+    pc = prb.plots.plot_prediction(MEASURED, PREDICTED, level=0.5, backend="matplotlib")
+    x, _ = read.xy(pc, "predicted", "later")
+    at = x[[100, 128, 150]]
+    low, high = read.sides(pc, "band", "later", at)
+    shares = (PREDICTED.values.reshape(100, -1)[:, :, None] <= at).mean(axis=1)
+    np.testing.assert_allclose(low, np.quantile(shares, 0.25, axis=0))
+    np.testing.assert_allclose(high, np.quantile(shares, 0.75, axis=0))
+
+
+def test_what_failed_and_what_is_missing(read: SimpleNamespace) -> None:
+    predicted = PREDICTED.copy()
+    predicted[:, :, :40] = np.inf  # a tenth fails
+    predicted[:, :, 40:80] = np.nan
+    measured = np.append(MEASURED, [np.inf, np.nan])
+    pc = prb.plots.plot_prediction(measured, predicted, backend="matplotlib")
+    assert read.xy(pc, "measured", "later")[1].max() == pytest.approx(0.8)
+    assert read.xy(pc, "predicted", "later")[1].max() <= 1 - 40 / 360 + 1e-9
+    title = pc.viz["plot"]["later"].item().get_title()
+    assert title == "5 measured values, 1 failed"
+
+
+def test_conditions_and_outputs_have_panels() -> None:
+    both = xr.concat([PREDICTED, 2 * PREDICTED], "part").transpose("chain", "draw", "sample", ...)
+    both = both.assign_coords(part=["shaft", "disk"])
+    measured = np.column_stack([MEASURED, 2 * MEASURED])
+    pc = prb.plots.plot_prediction(
+        {"cold": MEASURED, "hot": measured}, {"cold": PREDICTED, "hot": both}, backend="none"
+    )
+    assert list(pc.viz["measured"]) == ["cold", "hot[shaft]", "hot[disk]"]
+
+
+def test_what_does_not_belong_together_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"got shape \(4, 2\), expected \(n\)"):
+        prb.plots.plot_prediction(np.ones((4, 2)), PREDICTED)
+    with pytest.raises(ValueError, match="expected values under the names of the predictions"):
+        prb.plots.plot_prediction({"hot": MEASURED}, {"cold": PREDICTED})
+    with pytest.raises(TypeError, match=r"expected the DataArray of prb\.predict"):
+        prb.plots.plot_prediction(MEASURED, np.ones((3, 4)))

@@ -1,0 +1,44 @@
+"""What to do next follows from what was found."""
+
+import dataclasses
+from typing import Any
+
+import prbayes as prb
+from prbayes.reports.material import gather
+from prbayes.reports.next_steps import next_steps
+
+
+def steps(calibrated: Any, **given: Any) -> str:
+    nothing = dict.fromkeys(("model", "optimum", "posterior", "validity", "comparison"))
+    found = next_steps(gather(**(nothing | {"model": calibrated.model} | given)))
+    assert [step.partition(". ")[0] for step in found] == [str(i + 1) for i in range(len(found))]
+    return " ".join(found)
+
+
+def test_an_optimum_alone_wants_a_posterior_and_a_test(calibrated: Any) -> None:
+    found = steps(calibrated, optimum=calibrated.optimum)
+    assert "prb.sample_smc" in found
+    assert "prb.area_test" in found
+    assert "prb.sample_smc" not in steps(calibrated, posterior=calibrated.posterior)
+
+
+def test_a_rejected_model_is_to_be_corrected(calibrated: Any) -> None:
+    rejected = dataclasses.replace(calibrated.test, p_value=0.001)
+    found = steps(calibrated, posterior=calibrated.posterior, validity=rejected)
+    assert found.startswith("1. Do not use the model beyond")
+    assert "folded=True" not in found
+    assert "folded=True" in steps(
+        calibrated, posterior=calibrated.posterior, validity=calibrated.test
+    )
+
+
+def test_problems_come_first(calibrated: Any) -> None:
+    posterior = calibrated.posterior.copy(deep=True)
+    posterior["posterior"]["mu"][0] += 5.0
+    assert steps(calibrated, posterior=posterior).startswith("1. Remove the problems")
+
+
+def test_without_a_result_there_is_nothing_to_do(calibrated: Any) -> None:
+    assert steps(calibrated) == ""
+    report = prb.Report("x", model=calibrated.model, pictures=False)
+    assert "What to do next" not in [section.title for section in report.sections]

@@ -1,0 +1,47 @@
+"""Results in a notebook."""
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+
+import prbayes as prb
+from prbayes._html import view
+
+
+def test_texts_are_escaped() -> None:
+    text = view("<b>", header=["", "<i>"], rows=[["a<u>", "1 < 2"]], sentences=["x & y"])
+    for tag in ("<i>", "<u>", "1 < 2", "x & y"):
+        assert tag not in text
+    assert "&lt;b&gt;" in text
+    assert "1 &lt; 2" in text
+
+
+def test_an_optimum_is_a_table() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        prb.Simulator(
+            "y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0],
+            propagation=prb.Reweighted(64),
+        )  # fmt: skip
+    optimum = prb.minimize(model)
+    text = optimum._repr_html_()
+    assert ">mu</th>" in text
+    assert f"{optimum.n_evaluations} evaluations" in text
+    assert "standard error" in text
+    assert "0.0% of specimens fail" not in repr(optimum)
+
+
+def test_a_diagnosis_says_what_is_wrong_first() -> None:
+    support = xr.Dataset()
+    bad = prb.Diagnosis(("do this", "do that"), support, ("by the way",))
+    text = bad._repr_html_()
+    assert "2 problems" in text
+    assert text.index("do this") < text.index("do that") < text.index("by the way")
+    assert "no problem" in prb.Diagnosis((), support)._repr_html_()
+
+
+def test_a_test_of_validity_shows_its_verdict() -> None:
+    rng = np.random.default_rng(1)
+    predicted = rng.normal(rng.normal(0, 0.2, (50, 1)), 1.0, (50, 200))
+    test = prb.area_test(rng.normal(2, 1, 20), predicted)
+    assert "ValidityTest: rejected at level 0.05" in test._repr_html_()
