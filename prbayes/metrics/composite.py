@@ -215,7 +215,10 @@ class CompositeDiscrepancy(Discrepancy):
 
     def overlap(self, simulated: Floats, weights: Floats) -> Floats:
         """Return the smallest overlap of any part, (..., n, m) -> (...)."""
-        overlaps = [target.overlap(y, weights) for target, y in seen_by(self.members, simulated)]
+        overlaps = []
+        for target, seen in seen_by(self.members, simulated):
+            overlap = target.overlap(seen, weights)
+            overlaps.append(overlap)
         return np.min(overlaps, axis=0)
 
     @cached_property
@@ -270,9 +273,10 @@ class CompositeDiscrepancy(Discrepancy):
             values = np.broadcast_to(values, (*weights.shape, *self.event))
             return self.features(values, weights, xp)
         divided = self._divided(basis)
-        found = [
-            g.from_basis(weights, own, xp) for g, own in zip(self._groups, divided, strict=True)
-        ]
+        found = []
+        for group, own in zip(self._groups, divided, strict=True):
+            features = group.from_basis(weights, own, xp)
+            found.append(features)
         return sum(found, ())
 
     def outer(self, *features: Any, xp: Any) -> Any:
@@ -286,7 +290,11 @@ class CompositeDiscrepancy(Discrepancy):
     def _divided(self, arrays: tuple[Any, ...]) -> list[tuple[Any, ...]]:
         """Return the arrays of each group: one each, and for the last all others."""
         last = len(self._groups) - 1
-        return [arrays[i : i + 1] if i < last else arrays[i:] for i in range(last + 1)]
+        found = []
+        for place in range(last):
+            found.append(arrays[place : place + 1])
+        found.append(arrays[last:])
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,7 +336,12 @@ class _Group(ABC):
     def _of_each(self, arrays: tuple[Any, ...]) -> list[tuple[Any, ...]]:
         """Return the arrays of each part, of which all have as many."""
         size = len(arrays) // len(self.parts)
-        return [arrays[k * size : (k + 1) * size] for k in range(len(self.parts))]
+        found = []
+        for k in range(len(self.parts)):
+            begin = k * size
+            own = arrays[begin : begin + size]
+            found.append(own)
+        return found
 
 
 class _Each(_Group):
@@ -345,14 +358,20 @@ class _Each(_Group):
 
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return the features of all parts."""
-        every = zip(self.parts, self._of_each(basis), strict=True)
-        return sum((part.target.from_basis(weights, own, xp) for part, own in every), ())
+        found = []
+        for part, own in zip(self.parts, self._of_each(basis), strict=True):
+            features = part.target.from_basis(weights, own, xp)
+            found.append(features)
+        return sum(found, ())
 
     def outer(self, features: tuple[Any, ...], shares: Floats, xp: Any) -> Any:
         """Return the sum of the parts."""
         total: Any = 0.0
-        for k, (part, own) in enumerate(zip(self.parts, self._of_each(features), strict=True)):
-            total = total + shares[..., k] * part.target.outer(*own, xp=xp)
+        divided = self._of_each(features)
+        for k, part in enumerate(self.parts):
+            own = divided[k]
+            value = part.target.outer(*own, xp=xp)
+            total = total + shares[..., k] * value
         return total
 
 

@@ -34,15 +34,23 @@ def element_names(name: str, shape: Sequence[int], labels: Sequence[Any] = ()) -
         Of each axis: its coordinate, or None. Where that does not name each place of the axis by a
         text of its own, the number does.
     """
-    given = labels if len(labels) == len(shape) else [None] * len(shape)
-    axes = [_places(size, own) for size, own in zip(shape, given, strict=True)]
-    return [element_name(name, index) for index in product(*axes)]
+    unknown = [None] * len(shape)
+    given = labels if len(labels) == len(shape) else unknown
+    axes = []
+    for size, own in zip(shape, given, strict=True):
+        axes.append(_places(size, own))
+    indices = product(*axes)
+    return [element_name(name, index) for index in indices]
 
 
 def _places(size: int, labels: Any) -> Sequence[object]:
     """Return what the places along an axis are called."""
-    texts = [] if labels is None else list(map(str, np.asarray(labels).tolist()))
-    return texts if len(set(texts)) == len(texts) == size else range(size)
+    if labels is None:
+        return range(size)
+    values = np.asarray(labels).tolist()
+    texts = list(map(str, values))
+    distinct = len(set(texts))
+    return texts if distinct == len(texts) == size else range(size)
 
 
 def coordinates(model: Any, name: str) -> tuple[Any, ...]:
@@ -57,20 +65,35 @@ def with_coordinates(draws: Mapping[str, xr.DataArray], model: Any) -> dict[str,
     found = {}
     for name, values in draws.items():
         own = coordinates(model, name)
-        pairs = list(zip(values.dims[1:], values.shape[1:], strict=True))
-        fits = len(own) == len(pairs)
-        for (dim, size), labels in zip(pairs, own, strict=True) if fits else ():
-            if labels is not None and dim not in values.coords and len(labels) == size:
-                values = values.assign_coords({dim: np.asarray(labels)})
+        dims = values.dims[1:]
+        fits = len(own) == len(dims)
+        known = zip(dims, own, strict=True) if fits else ()
+        for dim, labels in known:
+            values = _with_coordinate(values, dim, labels)
         found[name] = values
     return found
+
+
+def _with_coordinate(values: xr.DataArray, dim: Any, labels: Any) -> xr.DataArray:
+    """Return an array with labels along a dimension, where it has none and they fit."""
+    if labels is None or dim in values.coords:
+        return values
+    if len(labels) != values.sizes[dim]:
+        return values
+    coordinate = np.asarray(labels)
+    return values.assign_coords({dim: coordinate})
 
 
 def _carried(value: Any) -> tuple[Any, ...]:
     """Return the coordinate of each axis that an array carries; none of a plain one."""
     if not isinstance(value, xr.DataArray):
         return ()
-    return tuple(value.coords[d].values if d in value.coords else None for d in value.dims)
+    found = []
+    for dim in value.dims:
+        known = dim in value.coords
+        labels = value.coords[dim].values if known else None
+        found.append(labels)
+    return tuple(found)
 
 
 def split_elements(values: Mapping[Any, Any]) -> dict[str, Floats]:
@@ -91,14 +114,18 @@ def single_elements(values: Mapping[Any, Any]) -> dict[str, float]:
     """Return numbers by the names of elements, of one value of each variable."""
     found: dict[str, float] = {}
     for name, value in values.items():
-        names = element_names(str(name), np.shape(value), _carried(value))
-        found |= dict(zip(names, np.ravel(value).astype(float).tolist(), strict=True))
+        shape = np.shape(value)
+        names = element_names(str(name), shape, _carried(value))
+        numbers = np.ravel(value).astype(float)
+        found |= dict(zip(names, numbers.tolist(), strict=True))
     return found
 
 
 def _names(name: Any, value: Any) -> list[str]:
     """Return the names of the elements of arrays, (n, *shape)."""
-    return element_names(str(name), np.shape(value)[1:], _carried(value)[1:])
+    _, *shape = np.shape(value)
+    labels = _carried(value)
+    return element_names(str(name), shape, labels[1:])
 
 
 def told_elements(values: Mapping[Any, Any]) -> list[str]:

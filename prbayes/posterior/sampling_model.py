@@ -47,7 +47,8 @@ class _Terms:
         variance = share @ (points - middle) ** 2
         spread = np.sqrt(np.maximum(variance, 1e-300))
         every = np.column_stack(np.triu_indices(d))
-        squares = every[every[:, 0] == every[:, 1]]
+        twice = every[:, 0] == every[:, 1]
+        squares = every[twice]
         for pairs in (every, squares):
             if n >= _PER_COEFFICIENT * (1 + d + len(pairs)):
                 return cls(middle, spread, pairs)
@@ -68,8 +69,10 @@ class _Terms:
         A parabola would bend back there.
         """
         near = self.near(points)[:, 1:]
-        products = near[:, self.pairs[:, 0]] * near[:, self.pairs[:, 1]]
-        return np.column_stack([self.linear(points), products])
+        first, second = self.pairs.T
+        products = near[:, first] * near[:, second]
+        linear = self.linear(points)
+        return np.column_stack([linear, products])
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +87,11 @@ class Sight:
 
     def seen(self, estimates: Floats) -> tuple[Floats, Floats]:
         """Return estimates, (n, r), drawn in to their bounds, and the side on which they are."""
-        side = np.sign(np.maximum(estimates - self.high, 0) - np.maximum(self.low - estimates, 0))
-        return np.clip(estimates, self.low, self.high), side
+        above = np.maximum(estimates - self.high, 0)
+        below = np.maximum(self.low - estimates, 0)
+        side = np.sign(above - below)
+        inside = np.clip(estimates, self.low, self.high)
+        return inside, side
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,10 +159,12 @@ class SamplingModel:
             for which in tried:
                 own = terms[which]
                 kind = points[which]
-                every = np.column_stack([own.all(kind), before])
-                fit = _Fit(every, own.near(kind), seen[:, k], side[:, k], weights)
-                fits.append(fit.element(which, start))
-            element, residuals = max(fits, key=lambda found: found[0].log_likelihood)
+                mean = np.column_stack([own.all(kind), before])
+                spread = own.near(kind)
+                fit = _Fit(mean, spread, seen[:, k], side[:, k], weights)
+                found = fit.element(which, start)
+                fits.append(found)
+            element, residuals = max(fits, key=_how_likely)
             elements.append(element)
             before = np.column_stack([before, residuals])
         return cls(sight, terms, elements)
@@ -169,15 +177,18 @@ class SamplingModel:
         By element, shapes (n, r).
         """
         (seen,), (side,) = self.sight.seen(estimate[None])
-        kinds = list(zip(self.terms, points, strict=True))
-        every = [own.all(kind) for own, kind in kinds]
-        near = [own.near(kind) for own, kind in kinds]
+        every = []
+        near = []
+        for own, kind in zip(self.terms, points, strict=True):
+            every.append(own.all(kind))
+            near.append(own.near(kind))
         before = np.empty((len(points[0]), 0))
         noise = []
         known = []
         for k, element in enumerate(self.elements):
-            own = np.column_stack([every[element.terms], before])
-            residuals = seen[k] - own @ element.mean
+            terms = np.column_stack([every[element.terms], before])
+            fitted = terms @ element.mean
+            residuals = seen[k] - fitted
             log_sd = near[element.terms] @ element.log_sd
             by_design = variance * np.exp(-2 * log_sd)
             log_sd = log_sd + 0.5 * np.log1p(by_design)
@@ -189,7 +200,8 @@ class SamplingModel:
             known.append(density)
             noise.append(z)
             expected, _ = _expected(z, sides)
-            completed = expected * np.exp(log_sd)
+            sd = np.exp(log_sd)
+            completed = expected * sd
             before = np.column_stack([before, completed])
         return np.column_stack(noise), np.column_stack(known)
 
@@ -242,14 +254,17 @@ class _Fit:
         z = (self.seen - fitted) * np.exp(-log_spread)
         noise = LogGamma.fit(z, self.side, self.weights) if start is None else start.noise
         density = noise.log_likelihood(z, self.side)
-        known = density - np.where(self.side == 0, log_spread, 0.0)
+        in_sight = self.side == 0
+        known = density - np.where(in_sight, log_spread, 0.0)
         total = float(self.weights @ known)
-        return _Element(which, mean, log_sd, noise, total), residuals
+        element = _Element(which, mean, log_sd, noise, total)
+        return element, residuals
 
     def _completed(self, fitted: Floats, log_sd: Floats) -> tuple[Floats, Floats]:
         """Return estimates, expected ones where out of sight, and their squared noise, (n,)."""
         spread = np.exp(self.near @ log_sd)
-        z, squared = _expected((self.seen - fitted) / spread, self.side)
+        residuals = self.seen - fitted
+        z, squared = _expected(residuals / spread, self.side)
         return fitted + spread * z, squared
 
     def _log_sd(self, squared: Floats, before: Floats) -> Floats:
@@ -258,17 +273,30 @@ class _Fit:
         Of the normal likelihood (Harvey 1976, doi:10.2307/1913974).
         """
         counted = np.minimum(squared, _SQUARED)
-        slope = self.near.T @ (self.weights * (counted - 1))
-        information = self.near.T @ (2 * self.weights[:, None] * self.near)
-        return np.asarray(before + np.linalg.solve(information, slope))
+        excess = self.weights * (counted - 1)
+        slope = self.near.T @ excess
+        twice = 2 * self.weights[:, None]
+        information = self.near.T @ (twice * self.near)
+        step = np.linalg.solve(information, slope)
+        return np.asarray(before + step)
 
 
 def _expected(z: Floats, side: Floats) -> tuple[Floats, Floats]:
     """Return expectations of noise and its square; of that beyond z, as of a normal variable."""
-    ratio = np.exp(-0.5 * (z**2 + np.log(2 * np.pi)) - log_ndtr(-side * z))
-    mean = np.where(side == 0, z, side * ratio)
-    square = np.where(side == 0, z**2, 1 + side * z * ratio)
+    in_sight = side == 0
+    log_density = -0.5 * (z**2 + np.log(2 * np.pi))
+    log_beyond = log_ndtr(-side * z)
+    ratio = np.exp(log_density - log_beyond)
+    signed = side * ratio
+    mean = np.where(in_sight, z, signed)
+    square = np.where(in_sight, z**2, 1 + z * signed)
     return mean, square
+
+
+def _how_likely(fitted: tuple[_Element, Floats]) -> float:
+    """Return the log-likelihood of an element that was fitted."""
+    element, _ = fitted
+    return element.log_likelihood
 
 
 def _least_squares(terms: Floats, values: Floats, weights: Floats) -> Floats:
