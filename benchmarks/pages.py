@@ -98,14 +98,6 @@ def folded() -> Iterator[Row]:
             ]
 
 
-def given_the_estimate() -> Iterator[Row]:
-    """Return the rows of the straight map and of draws given the estimate, beside exact ones."""
-    nearer = found("posterior")["nearer"]
-    for label, name in {"straight map": "affine", "given the estimate": "given"}.items():
-        low, high = nearer[f"{name}: narrowest and widest"]
-        yield [label, f"{low:.2f} to {high:.2f}", f"{nearer[f'{name}: farthest off']:.2f}"]
-
-
 def samplers() -> Iterator[Row]:
     """Return the rows of sampling beside other packages."""
     table = found("smc")
@@ -617,7 +609,6 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "coverage, pooled": pooled,
     "coverage, by problem": coverage,
     "outliers": outliers,
-    "given the estimate": given_the_estimate,
     "given the estimate, folded": folded,
     "samplers": samplers,
     "size": sizes,
