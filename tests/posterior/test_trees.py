@@ -68,7 +68,7 @@ def test_the_tree_of_an_optimum() -> None:
     calibration = tree["calibration"]
     assert calibration["covariance"].dims == ("element", "other_element")
     assert (
-        calibration["covariance"].sel(element="mean[1]", other_element="sigma_log__")
+        calibration["covariance"].sel(element="mean[south]", other_element="sigma_log__")
         == optimum().covariance[1, 2]
     )
     assert (
