@@ -53,7 +53,7 @@ def drawn(truth: str, variation: float, n: int, rng: np.random.Generator) -> Any
 
 def calibrated(family: str, response: str, metric: str, data: Any) -> prb.Optimum:
     """Return the optimum of a family."""
-    with pm.Model() as model:
+    with pm.Model():
         mean = pm.TruncatedNormal("mean", 1.0, 0.5, lower=0.1)
         sd = pm.HalfNormal("sd", 0.7)
         x = pm.Normal.dist(mean, sd)
