@@ -134,14 +134,17 @@ def _require_same(one: xr.Dataset, other: xr.Dataset, label: str, first: str) ->
     """Raise unless two cross-validations are of the same data, folds and seed."""
     simulators = [each["simulator"].values.tolist() for each in (one, other)]
     if simulators[0] != simulators[1]:
-        differ = f"has simulators {simulators[0]} and {first} has {simulators[1]}"
-        raise ValueError(f"{_CALLER}: {label} {differ}, expected the same names in the same order")
+        raise ValueError(
+            f"{_CALLER}: got {label} with simulators {simulators[0]} and {first} with "
+            f"{simulators[1]}, expected the same names in the same order"
+        )
     same = one["data"].values == other["data"].values
     if not same.all():
         names = ", ".join(one["simulator"].values[~same].tolist())
         raise ValueError(
-            f"{_CALLER}: {label} and {first} have other observed values, weights or labels of "
-            f"{names}, or in another order; expected the same data"
+            f"{_CALLER}: got {label} and {first} with different observed values, weights or "
+            f"labels of {names}, or in another order, expected the same data; build the models of "
+            "one array"
         )
     for what, a, b in (
         ("folds", one.sizes["fold"], other.sizes["fold"]),
@@ -149,8 +152,8 @@ def _require_same(one: xr.Dataset, other: xr.Dataset, label: str, first: str) ->
     ):
         if a != b:
             raise ValueError(
-                f"{_CALLER}: {label} has {what} {a} and {first} has {b}, expected the same; pass "
-                "the optima, which are then cross-validated alike"
+                f"{_CALLER}: got {label} with {what} {a} and {first} with {b}, expected the same; "
+                "pass the optima, which are then cross-validated alike"
             )
 
 
@@ -159,9 +162,9 @@ def _require_scores(one: xr.Dataset, label: str) -> None:
     missing = int(np.isnan(one["score"].values).sum())
     if missing:
         raise ValueError(
-            f"{_CALLER}: {label} has no score of {missing} of {one.sizes['specimen']} specimens, "
-            "expected one of each: the observed values have no density, as where all are equal, or "
-            "the population of a fold has no response; compare the discrepancies of "
+            f"{_CALLER}: got {label} without a score of {missing} of {one.sizes['specimen']} "
+            "specimens, expected one of each: the observed values have no density, as where all are "
+            "equal, or the population of a fold has no response; compare the discrepancies of "
             "prb.cross_validate instead"
         )
 

@@ -238,15 +238,19 @@ def test_refusals() -> None:
         compare({"a": first})
     with pytest.raises(TypeError, match=r"candidates: b: got .*expected an Optimum or what"):
         compare({"a": first, "b": first[["discrepancy"]]})
-    with pytest.raises(ValueError, match="b has folds 4 and a has 5, expected the same"):
+    with pytest.raises(ValueError, match="got b with folds 4 and a with 5, expected the same"):
         compare({"a": first, "b": validated("lognormal", 4)})
-    with pytest.raises(ValueError, match="b has random_seed 1 and a has 0, expected the same"):
+    with pytest.raises(
+        ValueError, match="got b with random_seed 1 and a with 0, expected the same"
+    ):
         compare({"a": first, "b": validated("lognormal", 5, 1)})
     other = prb.cross_validate(minimized(normal, SKEWED[::-1]), **QUIET)
-    with pytest.raises(ValueError, match="other observed values, weights or labels of y, or in"):
+    with pytest.raises(
+        ValueError, match="b and a with different observed values, weights or labels of y, or in"
+    ):
         compare({"a": first, "b": other})
     renamed = first.assign_coords(simulator=["z"])
-    with pytest.raises(ValueError, match=r"b has simulators \['z'\] and a has \['y'\]"):
+    with pytest.raises(ValueError, match=r"b with simulators \['z'\] and a with \['y'\]"):
         compare({"a": first, "b": renamed})
     model = _with_propagation(prb.Fresh(60))
     fresh = prb.minimize(model, method="Nelder-Mead", starts=0, **QUIET)
@@ -271,5 +275,5 @@ def test_equal_observations_have_no_score() -> None:
     found = prb.cross_validate(prb.minimize(model, refine=False, **QUIET), **QUIET)
     assert found.score.isnull().all()
     assert found.discrepancy.notnull().all()
-    with pytest.raises(ValueError, match="a has no score of 12 of 12 specimens"):
+    with pytest.raises(ValueError, match="a without a score of 12 of 12 specimens"):
         compare({"a": found, "b": found})
