@@ -163,8 +163,8 @@ def _require_scores(one: xr.Dataset, label: str) -> None:
     if missing:
         raise ValueError(
             f"{_CALLER}: got {label} without a score of {missing} of {one.sizes['specimen']} "
-            "specimens, expected one of each: the observed values have no density, as where all are "
-            "equal, or the population of a fold has no response; compare the discrepancies of "
+            "specimens, expected one of each: the observed values have no density, as where all "
+            "are equal, or the population of a fold has no response; compare the discrepancies of "
             "prb.cross_validate instead"
         )
 

@@ -232,11 +232,11 @@ def test_any_metric_and_propagation_that_can_be_refitted() -> None:
 
 def test_refusals() -> None:
     first = validated("normal")
-    with pytest.raises(TypeError, match=r"candidates: got list .*expected a mapping such as"):
+    with pytest.raises(TypeError, match=r"(?s)candidates: got list .*expected a mapping such as"):
         compare([first, first])  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"got \['a'\], expected at least two"):
         compare({"a": first})
-    with pytest.raises(TypeError, match=r"candidates: b: got .*expected an Optimum or what"):
+    with pytest.raises(TypeError, match=r"(?s)candidates: b: got .*expected an Optimum or what"):
         compare({"a": first, "b": first[["discrepancy"]]})
     with pytest.raises(ValueError, match="got b with folds 4 and a with 5, expected the same"):
         compare({"a": first, "b": validated("lognormal", 4)})
