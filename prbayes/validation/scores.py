@@ -25,7 +25,7 @@ from prbayes.metrics.likelihood import LogLikelihood
 _GROSS = 0.1
 # Its Student's t distribution has tails that exceed those of all common families, but a mean and a
 # variance.
-_DEGREES = 3
+_WIDE_DEGREES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,4 +92,4 @@ def _wide(target: Discrepancy, points: Floats) -> Floats:
     """Return the density at points of what is spread widely over the observed values."""
     observed, weights = target.observed, target.weights
     middle = quantile(observed, weights, 0.5)
-    return np.asarray(student.pdf(points, _DEGREES, middle, spread(observed, weights)))
+    return np.asarray(student.pdf(points, _WIDE_DEGREES, middle, spread(observed, weights)))
