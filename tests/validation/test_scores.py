@@ -58,6 +58,17 @@ def test_rows_are_scored_by_themselves() -> None:
     np.testing.assert_array_equal(scoring.scores(POPULATION, ALIKE, rows), every[rows])
 
 
+def test_a_specimen_keeps_its_score_in_any_order() -> None:
+    observed = RNG.normal(size=(40, 2))
+    observed[[1, 5, 6, 20, 33], 0] = np.nan
+    simulated = RNG.normal(size=(20_000, 2))
+    found = Scoring.of(observed, EQUAL).scores(simulated, ALIKE, EVERY)
+    order = RNG.permutation(40)
+    again = Scoring.of(observed[order], EQUAL).scores(simulated, ALIKE, EVERY)
+    np.testing.assert_allclose(again, found[order], atol=1e-6)
+    assert np.ptp(found) > 1
+
+
 def test_one_specimen_far_out_costs_a_bounded_amount() -> None:
     far = np.append(DATA, 60.0)
     found = Scoring.of(far, np.full(41, 1 / 41)).scores(POPULATION, ALIKE, np.arange(41))
