@@ -84,7 +84,7 @@ def compare_candidates(
     >>> for family in (pm.Normal, pm.LogNormal):
     ...     with pm.Model() as model:
     ...         x = family.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 2))
-    ...         prb.Simulator("y", np.positive, x, metric=prb.KullbackLeibler(), observed=data)
+    ...         y = prb.Simulator("y", np.positive, x, metric=prb.KullbackLeibler(), observed=data)
     ...     optima[family.__name__] = prb.minimize(model)
     >>> table = prb.validation.compare_candidates(optima)
     >>> table.candidate.values.tolist(), bool(table.told_apart[1])
