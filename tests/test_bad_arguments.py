@@ -115,6 +115,18 @@ def surrogate() -> prb.Surrogate:
     return prb.Surrogate.fit(np.square, {"x": (0, 1)}, 20, **QUIET)
 
 
+def one_candidate() -> Any:
+    return {"a": optimum()}
+
+
+def candidates_of_other_types() -> Any:
+    return {"a": optimum(), "b": comparison()}
+
+
+def candidates_without_names() -> Any:
+    return {1: optimum(), 2: optimum()}
+
+
 class Name(str):
     """What is made when it is needed: the name of a function of this module."""
 
@@ -832,6 +844,25 @@ TABLE: dict[str, Row] = {
         of_optimum(prb.cross_validate),
         {
             "optimum": NO_OPTIMUM,
+            "folds": (*COUNT, 1, 29),
+            "random_seed": SEED,
+            "progressbar": FLAG,
+        },
+    ),
+    "validation.compare_candidates": Row(
+        lambda **given: prb.validation.compare_candidates(
+            **{"candidates": {"a": optimum(), "b": optimum()}} | QUIET | given
+        ),
+        {
+            "candidates": (
+                Name("optimum"),
+                Name("one_candidate"),
+                Name("candidates_of_other_types"),
+                Name("candidates_without_names"),
+                {},
+                [],
+                None,
+            ),
             "folds": (*COUNT, 1, 29),
             "random_seed": SEED,
             "progressbar": FLAG,

@@ -211,6 +211,7 @@ SLOW = (
     "refine",
     "sample_smc",
     "simulation_based_calibration",
+    "validation.compare_candidates",
 )
 SIGNATURES = {
     name: inspect.signature(value)

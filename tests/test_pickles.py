@@ -121,6 +121,9 @@ RESULTS: dict[str, Callable[[], Any]] = {
     "bootstrap": lambda: prb.bootstrap(optimum(), 10, **QUIET),
     "compare": lambda: prb.compare({"optimum": optimum(), "ABC": posterior()}),
     "cross_validate": lambda: prb.cross_validate(optimum(), **QUIET),
+    "compare_candidates": lambda: prb.validation.compare_candidates(
+        {"a": optimum(), "b": optimum()}, **QUIET
+    ),
     "sampling": lambda: optimum().sampling(),
     "to_datatree": lambda: optimum().to_datatree(),
 }

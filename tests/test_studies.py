@@ -10,7 +10,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks import contamination, coverage
+from benchmarks import contamination, coverage, families
 
 pytestmark = pytest.mark.slow
 
@@ -85,3 +85,22 @@ def test_contamination_of_the_probability_residual() -> None:
     mu, sigma = np.mean(shifts, axis=0)
     assert abs(mu) < 0.3
     assert abs(sigma) < 1.3
+
+
+# The bound was set before the study, which tells the normal family in .40 of 25 data sets of 50.
+_LESS_OFTEN = pytest.mark.xfail(reason="a normal truth is told in fewer than half of data sets")
+
+
+@pytest.mark.parametrize("truth", ["lognormal", pytest.param("normal", marks=_LESS_OFTEN)])
+def test_families(truth: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(families, "SIZES", (50,))
+    # At 40 data sets the standard error of a share is at most .08, of one of 5% .035, and that of a
+    # standard deviation .11.
+    chosen = (families.LINEAR, "KullbackLeibler", truth)
+    (wide,) = families.case((*chosen, 0.6), 40)
+    assert wide["right"] > 0.5
+    assert wide["wrong"] <= 0.025 + 4 * 0.025
+    (narrow,) = families.case((*chosen, 0.1), 40)
+    assert narrow["right"] + narrow["wrong"] <= 0.25
+    for found in (wide, narrow):
+        assert 0.8 - 4 * 0.09 < found["z_sd"] < 1.25 + 4 * 0.14

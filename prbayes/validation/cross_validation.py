@@ -1,7 +1,8 @@
-"""Cross-validation of a discrepancy: `cross_validate`."""
+"""Cross-validation of a discrepancy, and scores of specimens left out: `cross_validate`."""
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import versions
 from prbayes.model.node import Node
 from prbayes.model.turns import in_turn
+from prbayes.validation.scores import Scoring
 
 
 @in_turn
@@ -30,6 +32,9 @@ def cross_validate(
     Only discrepancies of the same metric, data and folds are to be compared: between families,
     responses or inputs, not between metrics. Minimisations start at the optimum and, with
     `Reweighted`, compute no response.
+
+    Each specimen left out has a score as well, by which `prb.validation.compare_candidates` tells
+    which of several models predicts better, and whether the data can tell.
 
     Parameters
     ----------
@@ -47,7 +52,12 @@ def cross_validate(
     xarray.Dataset
         Dims (fold, simulator): ``discrepancy`` of the specimens left out, ``calibrated`` of the
         others, in units of the metric; ``n_held_out``; and ``converged`` by fold. Where a fold has
-        no observation of a simulator its discrepancy is NaN.
+        no observation of a simulator its discrepancy is NaN. Dim (specimen), in the order of the
+        observations: ``score``, the log density of what was left out under the population of the
+        others, whatever the metric, of which a hundredth is spread widely over the data; and
+        ``weight``, how many observations the specimen counts for. A specimen that several
+        simulators have seen has the sum of its scores; of several outputs a score is the mean over
+        directions, as in `Joint`. Scores are NaN where the data have no density.
 
     Raises
     ------
@@ -88,6 +98,7 @@ def cross_validate(
     # Compare what was found with both parts.
     left_out = _discrepancies(evaluator, thetas, parts.left_out)
     calibrated = _discrepancies(evaluator, thetas, parts.kept)
+    scores, weights = _scores(evaluator, thetas, parts.left_out)
 
     where = ["fold", "simulator"]
     return xr.Dataset(
@@ -96,6 +107,9 @@ def cross_validate(
             "calibrated": (where, calibrated),
             "n_held_out": (where, parts.sizes),
             "converged": ("fold", converged),
+            "score": ("specimen", scores),
+            "weight": ("specimen", weights),
+            "data": ("simulator", [_digest(node) for node in evaluator.nodes]),
         },
         coords={
             "fold": np.arange(folds),
@@ -173,6 +187,45 @@ def _discrepancies(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> 
             column.append(found)
         columns.append(column)
     return np.array(columns).T
+
+
+def _scores(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> tuple[Floats, Floats]:
+    """Return score and weight of each specimen, (specimens,), under the population of the others.
+
+    Arguments are those of `_discrepancies`.
+    """
+    numbers, total = specimens(evaluator.nodes)
+    scores = np.zeros(total)
+    counted = np.zeros(total)
+    for k, node in enumerate(evaluator.nodes):
+        weights = node.target.weights
+        counted += np.bincount(numbers[k], weights * weights.size, total)
+        own = _observation_scores(evaluator, thetas, data[k], k)
+        scores += np.bincount(numbers[k], own, total)
+    return scores, counted
+
+
+def _observation_scores(evaluator: Evaluator, thetas: Floats, data: Floats, k: int) -> Floats:
+    """Return the scores of the k-th simulator's observations, (n_k,); NaN without a density."""
+    target = evaluator.nodes[k].target
+    scores = np.zeros(len(target.observed))
+    try:
+        scoring = Scoring.of(target.observed, target.weights)
+    except ValueError:  # as where all observations are equal
+        return np.full(scores.shape, np.nan)
+    values, weights = evaluator.populations(thetas, k)
+    for i, left_out in enumerate(data):
+        rows = np.flatnonzero(left_out)
+        scores[rows] = scoring.scores(values[i], weights[i], rows)
+    return scores
+
+
+def _digest(node: Node) -> str:
+    """Return what observed values, weights and labels of a simulator are known by, in order."""
+    target = node.target
+    labels = [] if node.specimens is None else node.specimens.tolist()
+    content = target.observed.tobytes() + target.weights.tobytes() + repr(labels).encode()
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def _discrepancy(target: Discrepancy, data: Floats, values: Floats, weights: Floats) -> float:

@@ -29,7 +29,7 @@ def test_each_fold_is_a_calibration_on_the_other_specimens() -> None:
     before = optimum().evaluator.n_responses
     found = prb.cross_validate(optimum(), folds=4, random_seed=3)
     assert optimum().evaluator.n_responses == before
-    assert found.sizes == {"fold": 4, "simulator": 1}
+    assert found.sizes == {"fold": 4, "simulator": 1, "specimen": 60}
     assert found.n_held_out.values.ravel().tolist() == [15] * 4
     assert found.converged.all()
     fold = np.random.default_rng([3, 3]).permutation(np.arange(60) % 4)
