@@ -3,7 +3,8 @@
 Responses are lognormal, of one input with mean 0 and standard deviation .3; readings of 50 specimens
 have a normal error with standard deviation .25. 200 data sets, each calibrated by `minimize` and
 `sample_smc` in three ways: without the error, with it as another input of known spread, and with a
-prior of that spread from 20 differences of repeats. How often 89% intervals hold the truth.
+prior of that spread from 20 differences of repeats. How often 89% intervals hold the truth. The
+command goes on after the data sets that its file has.
 
     uv run python -m benchmarks.measurement_error [--data-sets 200]
 """
@@ -66,26 +67,39 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=OUT)
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
-    rows: dict[str, list[Any]] = {}
-    for seed in range(arguments.data_sets):
-        rng = np.random.default_rng(seed)
-        readings = np.exp(rng.normal(TRUTH["mu"], TRUTH["sigma"], N)) + rng.normal(0, ERROR, N)
-        differences = np.sqrt(2) * rng.normal(0, ERROR, REPEATS)
-        for way in WAYS:
-            draws = posterior(way, readings, differences, seed)
-            for name, truth in TRUTH.items():
-                values = draws[name].values
-                low, high = np.quantile(values, [0.055, 0.945])
-                row = [values.mean(), values.std(), low <= truth <= high]
-                rows.setdefault(f"{way}/{name}", []).append(row)
+    found = record.load(arguments.out, {})
+    done = min((cell["data sets"] for cell in found.values()), default=0)
+    for seed in range(done, arguments.data_sets):
+        for key, row in _of_one(seed).items():
+            found[key] = _with(found.get(key), row)
+        record.save(arguments.out, found)
         if seed % 20 == 19:
-            shares = {key: np.mean(each, axis=0).round(3).tolist() for key, each in rows.items()}
-            print(seed + 1, shares, flush=True)
-    found = {}
-    for key, each in rows.items():
-        mean, sd, held = np.mean(each, axis=0)
-        found[key] = {"mean": mean, "sd": sd, "held": held, "data sets": len(each)}
-    record.save(arguments.out, found)
+            print(seed + 1, found, flush=True)
+
+
+def _of_one(seed: int) -> dict[str, dict[str, float]]:
+    """Return what each way finds of one data set."""
+    rng = np.random.default_rng(seed)
+    readings = np.exp(rng.normal(TRUTH["mu"], TRUTH["sigma"], N)) + rng.normal(0, ERROR, N)
+    differences = np.sqrt(2) * rng.normal(0, ERROR, REPEATS)
+    rows = {}
+    for way in WAYS:
+        draws = posterior(way, readings, differences, seed)
+        for name, truth in TRUTH.items():
+            values = draws[name].values
+            low, high = np.quantile(values, [0.055, 0.945])
+            held = float(low <= truth <= high)
+            rows[f"{way}/{name}"] = {"mean": values.mean(), "sd": values.std(), "held": held}
+    return rows
+
+
+def _with(before: dict[str, float] | None, row: dict[str, float]) -> dict[str, float]:
+    """Return means over one data set more."""
+    if before is None:
+        return {**row, "data sets": 1}
+    n = before["data sets"]
+    joined = {key: (n * before[key] + value) / (n + 1) for key, value in row.items()}
+    return {**joined, "data sets": n + 1}
 
 
 if __name__ == "__main__":
