@@ -95,6 +95,32 @@ def adjusted() -> xr.DataTree:
 
 
 @cache
+def two_outputs() -> pm.Model:
+    with pm.Model() as made:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
+        data = {"first": OBSERVED, "second": np.square(OBSERVED)}
+        given = {"metric": prb.Joint(prb.AreaMetric()), "observed": data}
+        cheap = prb.Resimulated(64)
+        prb.Simulator("y", _two_outputs, x, **given, propagation=cheap, **QUIET)
+    return made
+
+
+@cache
+def of_two_outputs() -> prb.Optimum:
+    given = {"method": "Nelder-Mead", "refine": False, "starts": 0}
+    return prb.minimize(two_outputs(), **given, **QUIET)
+
+
+def _two_outputs(x: Any) -> dict[str, Any]:
+    return {"first": x, "second": np.square(x)}
+
+
+@cache
+def influences() -> xr.Dataset:
+    return prb.sensitivity(posterior(), prb.decision.Mean(line, specimen()), model=model())
+
+
+@cache
 def predicted() -> xr.DataArray:
     return prb.predict(posterior(), line, specimen(), model=model(), n_samples=50, **QUIET)
 
@@ -775,9 +801,12 @@ TABLE: dict[str, Row] = {
         prb.plots.plot_sensitivity,
         {
             **{k: PICTURE[k] for k in ("backend", "labels", "figsize")},
-            "table": (None, 3, xr.Dataset(), Name("comparison"), Name("posterior")),
+            "table": (
+                *(None, 3, xr.Dataset(), xr.Dataset({"first": 1.0, "total": 1.0})),
+                *(Name("comparison"), Name("posterior")),
+            ),
         },
-        {"table": xr.Dataset({"first": 1.0, "total": 1.0})},
+        {"table": Name("influences")},
     ),
     "validation.u_values": Row(
         prb.validation.u_values,
@@ -1000,13 +1029,13 @@ TABLE: dict[str, Row] = {
         prb.plot_outputs,
         {
             **PICTURE,
-            "result": NO_RESULT,
+            "result": [bad for bad in NO_RESULT if bad != Name("comparison")],
             "simulator": (3, "zz", ["y"]),
             "outputs": (3, "zz", [], [3], ["zz", "y"]),
             "before": ("prior", 3, {"zz": 1.0}),
             "draws": (0, 1.5, "a", True),
         },
-        {"result": Name("posterior"), "model": Name("model")},
+        {"result": Name("of_two_outputs"), "model": Name("two_outputs")},
     ),
     "plot_population": Row(
         prb.plot_population,

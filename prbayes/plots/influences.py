@@ -74,8 +74,8 @@ def plot_sensitivity(
     ['hyperparameter', 'input']
     """
     refuse_look(labels, backend, pc_kwargs)
-    needed = {"first", "total"}
-    if not isinstance(table, xr.Dataset) or not needed <= set(table.data_vars):
+    needed = {"first", "total", "first_error", "total_error", "factor", "kind"}
+    if not isinstance(table, xr.Dataset) or not needed <= set(table.variables):
         got = type(table).__name__
         raise TypeError(
             f"plot_sensitivity: table: got {got}, expected the Dataset of prb.sensitivity"

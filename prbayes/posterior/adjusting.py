@@ -134,8 +134,8 @@ def _refuse_other(idata: object) -> None:
     before = str(idata["posterior"].attrs.get("adjustment", "none"))
     if "unadjusted" in idata.children or not before.startswith("none"):
         raise ValueError(
-            f"adjust: got draws that were adjusted before ({before}), expected those of a sampler; "
-            "they are in the group `unadjusted`"
+            f"adjust: idata: got draws that were adjusted before ({before}), expected those of a "
+            "sampler; they are in the group `unadjusted`"
         )
 
 

@@ -42,6 +42,12 @@ def comparables(measured: Any, predicted: Any, caller: str) -> list[Comparable]:
     if not isinstance(predicted, Mapping):
         name = getattr(predicted, "name", None) or "response"
         measured, predicted = {str(name): measured}, {str(name): predicted}
+    for name, prediction in predicted.items():
+        if not isinstance(prediction, xr.DataArray) or "sample" not in prediction.dims:
+            raise TypeError(
+                f"{caller}: {name}: predicted: got {called(prediction)}, expected the DataArray of "
+                "prb.predict"
+            )
     if not isinstance(measured, Mapping) or list(map(str, measured)) != list(map(str, predicted)):
         got = list(measured) if isinstance(measured, Mapping) else called(measured)
         raise ValueError(
@@ -54,13 +60,10 @@ def comparables(measured: Any, predicted: Any, caller: str) -> list[Comparable]:
     return found
 
 
-def _of_condition(name: str, measured: Any, predicted: Any, caller: str) -> list[Comparable]:
+def _of_condition(
+    name: str, measured: Any, predicted: xr.DataArray, caller: str
+) -> list[Comparable]:
     """Return the outputs of one condition."""
-    if not isinstance(predicted, xr.DataArray) or "sample" not in predicted.dims:
-        raise TypeError(
-            f"{caller}: {name}: predicted: got {called(predicted)}, expected the DataArray of "
-            "prb.predict"
-        )
     values = real_array(measured, f"{caller}: {name}: measured")
     others = [dim for dim in predicted.dims if dim not in ("chain", "draw", "sample")]
     event = tuple(predicted.sizes[dim] for dim in others)
