@@ -110,7 +110,7 @@ def test_a_normal_population_gets_mean_and_sd_of_the_data(name: str, tolerance: 
 def residual(mu: Any, sigma: Any) -> Any:
     """The probability residual of a normal population, in closed form, without grid or design."""
     h = node(fitted("pr").model).target.cells.bandwidth
-    scale = 100.0 ** -np.floor(np.log10(_kde(h).max()))
+    scale = _scale(h)
     cross = norm.pdf(OBSERVED - mu[..., None], scale=np.sqrt(sigma**2 + 2 * h**2)[..., None]).mean(
         axis=-1
     )
@@ -118,9 +118,11 @@ def residual(mu: Any, sigma: Any) -> Any:
     return scale * (1 / np.sqrt(4 * np.pi * (sigma**2 + h**2)) - 2 * cross + data)
 
 
-def _kde(h: float) -> Any:
+@cache
+def _scale(h: float) -> Any:
     z = np.linspace(-2, 4, 4001)
-    return norm.pdf(z[:, None] - OBSERVED, scale=h).mean(axis=1)
+    density = norm.pdf(z[:, None] - OBSERVED, scale=h).mean(axis=1)
+    return 100.0 ** -np.floor(np.log10(density.max()))
 
 
 def area(mu: Any, sigma: Any, observed: Floats = OBSERVED, points: int = 4000) -> Any:
