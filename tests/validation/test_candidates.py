@@ -253,7 +253,7 @@ def test_refusals() -> None:
     with pytest.raises(ValueError, match=r"b with simulators \['z'\] and a with \['y'\]"):
         compare({"a": first, "b": renamed})
     model = _with_propagation(prb.Fresh(60))
-    fresh = prb.minimize(model, method="Nelder-Mead", starts=0, **QUIET)
+    fresh = prb.minimize(model, method="Nelder-Mead", max_evaluations=50, **QUIET)
     with pytest.raises(ValueError, match=r"cross_validate: .*cannot be calibrated anew"):
         compare({"a": fresh, "b": fresh})
 

@@ -71,6 +71,7 @@ def test_refusals() -> None:
         prb.cross_validate(optimum(), folds=1)
     with pytest.raises(ValueError, match="folds: got 40 for 60 specimens, expected at most 30"):
         prb.cross_validate(optimum(), folds=40)
-    fresh = prb.minimize(build(propagation=prb.Fresh(60)), method="Nelder-Mead", starts=0)
+    few = {"method": "Nelder-Mead", "starts": 0, "max_evaluations": 50}
+    fresh = prb.minimize(build(propagation=prb.Fresh(60)), **few)
     with pytest.raises(ValueError, match="cannot be calibrated anew"):
         prb.cross_validate(fresh)
