@@ -113,7 +113,8 @@ def compare(
             "expected the same model"
         )
     table = _table(columns, names)
-    estimates, sds = table[..., 0], table[..., 1]
+    estimates = table[..., 0]
+    sds = table[..., 1]
     with np.errstate(divide="ignore", invalid="ignore"):  # a result without spread
         shift = (estimates - estimates[0]) / sds
     shift[0] = 0.0

@@ -117,7 +117,8 @@ def _specimens() -> tuple[_Specimens, _Specimens]:
     lengths = data.crack_length_inch / data.notch_inch
     order = np.random.default_rng(0).permutation(data.specimen.size)
     # About half of the 21 are for the calibration.
-    used, fresh = np.sort(order[:11]), np.sort(order[11:])
+    used = np.sort(order[:11])
+    fresh = np.sort(order[11:])
     parts = [
         _Specimens(data.specimen.values[some], lengths.isel(specimen=some))
         for some in (used, fresh)

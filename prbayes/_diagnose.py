@@ -318,7 +318,8 @@ def _convergence(posterior: xr.Dataset) -> list[str]:
 
 
 def _disagreement(posterior: xr.Dataset) -> list[str]:
-    chains, draws = posterior.sizes["chain"], posterior.sizes["draw"]
+    chains = posterior.sizes["chain"]
+    draws = posterior.sizes["draw"]
     if chains == 1:
         return []
     # Recommended by Vehtari et al. (2021).
@@ -472,7 +473,8 @@ def _stored(calibration: xr.Dataset) -> _Designs:
     needs = {}
     for name in names:
         own = calibration.sel(simulator=name)
-        ess, max_lost = float(own["required_ess"]), float(own["max_lost"])
+        ess = float(own["required_ess"])
+        max_lost = float(own["max_lost"])
         needs[name] = _Needs(ess, max_lost, int(own["n_points"]))
     stacked = {}
     for key in _SUPPORT:

@@ -116,7 +116,8 @@ def p_box(
         lows.append([low, lowest])
         highs.append([high, highest])
         means.append(functions.mean(axis=0))
-    lower, upper = np.min(lows, axis=0), np.max(highs, axis=0)
+    lower = np.min(lows, axis=0)
+    upper = np.max(highs, axis=0)
     data: dict[str, Any] = {
         "lower": (["band", "y"], lower),
         "upper": (["band", "y"], upper),

@@ -55,7 +55,8 @@ def first_order(values: Floats, same: Floats) -> Floats:
     """
     values, same = _both_known(values, same)
     mean = np.nanmean(values + same, axis=1, keepdims=True) / 2
-    away, away_too = values - mean, same - mean
+    away = values - mean
+    away_too = same - mean
     covariance = np.nanmean(away * away_too, axis=1)
     variance = np.nanmean(away**2 + away_too**2, axis=1) / 2
     return _share(covariance, variance)

@@ -109,7 +109,8 @@ def fisher_information(told: Told) -> Floats:
     the response of that of the inputs, the derivative of their log weights. Of several outputs that
     of the inputs themselves, which bounds it.
     """
-    evaluator, center = told.populations.evaluator, told.populations.center
+    evaluator = told.populations.evaluator
+    center = told.populations.center
     unit = evaluator.prior_sd
     step = _LOG_WEIGHT_STEP * unit
     around = cross(center, step)
@@ -151,7 +152,8 @@ def _at_most(information: Floats, bound: Floats) -> Floats:
 
 def _ideal(told: Told, n: int) -> Floats:
     """Return n specimens at equal steps of probability of the population at the centre."""
-    evaluator, center = told.populations.evaluator, told.populations.center
+    evaluator = told.populations.evaluator
+    center = told.populations.center
     _, weights = told.design.populations(evaluator.roots(center[None], told.k))
     seen = observable(told.every)
     values = told.every[seen]

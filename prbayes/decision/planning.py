@@ -198,7 +198,8 @@ class _Outlook:
         # Twice as many until it is reached, and then halves of the gap.
         short, enough = 0, 1
         while self._of_one(enough * each, name) > target:
-            short, enough = enough, 2 * enough
+            short = enough
+            enough = 2 * enough
             if short > _MOST_SPECIMENS:
                 return np.inf
         while enough - short > 1:

@@ -142,7 +142,8 @@ def _on_a_line(told: Told, x: Floats) -> Floats:
     (at,) = told.design.contents.table.points
     values = told.column(told.every)
     order = np.argsort(at)
-    at, values = at[order], values[order]
+    at = at[order]
+    values = values[order]
     known = np.isfinite(values)
     found = np.interp(x, at[known], values[known])
     # Where the nearest run failed, or has no response, there is none.

@@ -151,7 +151,8 @@ def emulated_without_each(
 ) -> Iterator[Floats]:
     """Yield the same, (k, m), from surfaces that lack a block of the runs each."""
     every = runs.among(np.ones(len(runs.x), dtype=bool))
-    x, points = runs.scaled(runs.x[every]), runs.scaled(at)
+    x = runs.scaled(runs.x[every])
+    points = runs.scaled(at)
     blocks = np.array(list(each_block(runs)))
     known = {}  # by output, (k, B)
     for k, model in enumerate(models):
@@ -182,7 +183,8 @@ def _bounded(
 ) -> Floats:
     """Return values, (k, m), not far beyond those of the runs; failed where the nearest did."""
     y = runs.y[rows]
-    lowest, highest = y.min(axis=0), y.max(axis=0)
+    lowest = y.min(axis=0)
+    highest = y.max(axis=0)
     reach = highest - lowest
     values = np.clip(values, lowest - reach, highest + reach)
     if not runs.good[kept].all():
@@ -276,7 +278,8 @@ class _Best:
 
     def take(self, models: Sequence[Any]) -> None:
         """Take models of the outputs for which they are better."""
-        runs, rows = self.runs, self.rows
+        runs = self.runs
+        rows = self.rows
         said = left_out(models, runs)
         # Some of the importance is the same for all: that of a few would be luck.
         importance = runs.importance[rows] + 0.1 / len(runs.y)
@@ -312,14 +315,16 @@ def _try_following(
     assert runs.coarse is not None
     known = best.rows[np.isfinite(runs.coarse[best.rows]).all(axis=1)]
     in_a_block = max(int(block[known].sum()) for block in each_block(runs))
-    fewest, dimensions = known.size - in_a_block, runs.x.shape[1] + joined
+    fewest = known.size - in_a_block
+    dimensions = runs.x.shape[1] + joined
     if not all(enough(model, fewest, dimensions) for model in models):
         return
     some = _most_important(runs, known)
     x = runs.scaled(runs.x[some])
     found = []
     for k, model in enumerate(models):
-        y, coarse = runs.y[some, k], runs.coarse[some, k]
+        y = runs.y[some, k]
+        coarse = runs.coarse[some, k]
         tuned = tuned_beside(model, x, y, coarse, joined=joined)
         found.append(Following(tuned, otherwise[k], joined))
     with suppress(np.linalg.LinAlgError):

@@ -114,7 +114,8 @@ def predicted(
         return fitted(model, x, y)(at)
     assert coarse is not None
     assert coarse_at is not None
-    known, there = np.isfinite(coarse), np.isfinite(coarse_at)
+    known = np.isfinite(coarse)
+    there = np.isfinite(coarse_at)
     surface = followed(model.model, x[known], y[known], coarse[known], joined=model.joined)
     found = np.empty(len(at))
     found[there] = surface(at[there], coarse_at[there])

@@ -227,7 +227,8 @@ class Likelihood:
         from scipy.linalg import cholesky
 
         n = len(self.x)
-        lengths, nugget = np.exp(parameters[:-1]), np.exp(parameters[-1])
+        lengths = np.exp(parameters[:-1])
+        nugget = np.exp(parameters[-1])
         scaled = self.x / lengths
         square = _squares(scaled, scaled)
         np.fill_diagonal(square, 0)

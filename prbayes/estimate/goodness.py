@@ -144,7 +144,8 @@ class _Populations:
         if k not in self.around:
             return found
         r = self.center.size
-        ahead, behind = found[1 : 1 + r], found[1 + r :]
+        ahead = found[1 : 1 + r]
+        behind = found[1 + r :]
         slopes = (ahead - behind) / 2
         away = x - self.center
         linear = found[0] + away @ slopes

@@ -285,7 +285,8 @@ def refuse_lost(evaluator: Evaluator, lost: Mapping[str, float]) -> None:
     Of designs, refinement says it.
     """
     for node in evaluator.nodes:
-        share, most = lost.get(node.name, 0.0), node.bound.max_lost
+        share = lost.get(node.name, 0.0)
+        most = node.bound.max_lost
         if node.design is None and share > most:
             raise DesignError(
                 f"{node.name}: lost mass: got {share:.1%} of the population without a response "

@@ -85,7 +85,8 @@ class Stencil:
     def _moves_of(self, values: Floats) -> Floats:
         """Return the same for numbers of each specimen, shape (s, n)."""
         d = self.step.size
-        center, own = values[0], self.weights[0]
+        center = values[0]
+        own = self.weights[0]
         known = np.isfinite(center) & (own > 0)
         if not known.any():
             return np.zeros(d)

@@ -49,7 +49,9 @@ def assemble(
     stopped : str
         Which budget ended the search; no response is computed then.
     """
-    evaluator, theta, scales = search.evaluator, run.best, run.scales
+    evaluator = search.evaluator
+    theta = run.best
+    scales = run.scales
     point, stderr = point_and_stderr(evaluator, theta, covariance, functions)
     affordable = not (stopped and evaluator.responses_per_theta)
     nowhere = _nowhere(evaluator, theta, covariance)

@@ -52,7 +52,8 @@ class AreaDiscrepancy(Discrepancy):
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
         """Return F - S_N on each interval of the pooled values, and the interval's length."""
-        observed, u = self.observed, self.weights
+        observed = self.observed
+        u = self.weights
         if xp is np:
             batch = simulated.shape[:-1]
             observed = np.broadcast_to(observed, (*batch, observed.size))

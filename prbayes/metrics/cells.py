@@ -156,7 +156,8 @@ class KernelCells(Cells):
         # Where the points are: a node, and a fraction of a step beyond it.
         t = points / self.step - self._low
         last = self.centers.size - 2
-        below, above = t < 1, t >= last
+        below = t < 1
+        above = t >= last
         inside = (t >= 1) & (t < last)
         t = np.where(inside, t, 1.0)
         node = t.astype(np.intp)
@@ -285,7 +286,9 @@ class BinCells(Cells):
     def _cell(self, sample: Floats) -> NDArray[np.intp]:
         """Return cell numbers: bins, then below, above, and NaN."""
         bins = self.centers.size
-        below, above, nowhere = bins, bins + 1, bins + 2
+        below = bins
+        above = bins + 1
+        nowhere = bins + 2
         # Where the values are, in widths from the lower edge.
         width = self.widths[0]
         low = self.centers[0] - width / 2

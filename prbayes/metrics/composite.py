@@ -81,7 +81,8 @@ def seen_by(
             yield part.target, part.of(simulated, xp)
             continue
         if view.centered is not shared:
-            shared, outputs = view.centered, view.centered.of(simulated, xp)
+            shared = view.centered
+            outputs = view.centered.of(simulated, xp)
         yield part.target, outputs @ view.direction
 
 

@@ -95,7 +95,8 @@ class MarginalCorrelation(LiftedMetric):
         m = observed.shape[1]
         of_marginals, of_correlations = self.weights
         parts: list[Part] = []
-        center, unit = np.empty(m), np.empty(m)
+        center = np.empty(m)
+        unit = np.empty(m)
         for j in range(m):
             only = np.array([j])
             finite = np.isfinite(observed[:, j])

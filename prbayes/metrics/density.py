@@ -231,7 +231,8 @@ class Histogram(DensityEstimator):
     def cells(self, observed: Floats, weights: Floats) -> Cells:
         """Return equal bins over the observed range, and one bin's width for either outside."""
         observed, weights = _with_weight(observed, weights)
-        low, high = float(observed.min()), float(observed.max())
+        low = float(observed.min())
+        high = float(observed.max())
         if high <= low:
             raise ValueError(
                 f"histogram: got {observed.size} observed values, all {low:g}, expected at least "

@@ -195,7 +195,8 @@ def _identity(model: pm.Model, simulators: Sequence[SimulatorIdentity], **others
 
 
 def _simulator(node: Node, discrepancies: Floats) -> SimulatorIdentity:
-    observed, weights = node.target.observed, node.target.weights
+    observed = node.target.observed
+    weights = node.target.weights
     order = np.lexsort((weights, *observed.reshape(len(observed), -1).T[::-1]))
     labels = []
     if node.specimens is not None:
@@ -492,7 +493,8 @@ def _minimised_differences(got: bool | None, expected: bool | None) -> list[str]
 def _discrepancy_differences(a: SimulatorIdentity, b: SimulatorIdentity) -> list[str]:
     found = []
     for what in ("metric", "propagation"):
-        one, other = getattr(a, what), getattr(b, what)
+        one = getattr(a, what)
+        other = getattr(b, what)
         if one != other:
             found.append(_told(f"{what} of {a.name}", one, other))
     known = bool(a.discrepancies and b.discrepancies)

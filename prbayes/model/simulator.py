@@ -202,7 +202,9 @@ def _observed_term(
     progressbar: bool,
 ) -> TensorVariable:
     """Add an observed variable to a model."""
-    name, target, sorted_inputs = term.name, term.target, responses.inputs
+    name = term.name
+    target = term.target
+    sorted_inputs = responses.inputs
     before = list(nodes(model).values())
     others = [other for other in before if other.specimens is not None]
     asked = listening()

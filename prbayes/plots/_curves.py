@@ -63,7 +63,8 @@ def densities(values: Floats, weights: Floats, grid: Floats, bandwidth: float) -
     # Linear between them
     at = np.searchsorted(centers, grid) - 1
     at = np.clip(at, 0, centers.size - 2)
-    left, right = found[..., at], found[..., at + 1]
+    left = found[..., at]
+    right = found[..., at + 1]
     widths = np.diff(centers)
     share = (grid - centers[at]) / widths[at]
     between = left * (1 - share) + right * share
@@ -82,7 +83,8 @@ def bounded_density(draws: Floats, grid: Floats) -> Floats:
         return np.full(grid.shape, np.nan)
 
     # Mirrored draws have their own weight: the area within the range is one
-    low, high = float(draws.min()), float(draws.max())
+    low = float(draws.min())
+    high = float(draws.max())
     at_low = 2 * low - draws
     at_high = 2 * high - draws
     mirrored = np.concatenate([draws, at_low, at_high])
@@ -148,7 +150,8 @@ def _one_bar(middle: float, area: float) -> tuple[Floats, Floats]:
     """Return the corners of a bar around equal values, as wide as a fiftieth of them."""
     half = max(abs(middle), 1.0) / 100
     height = area / (2 * half)
-    left, right = middle - half, middle + half
+    left = middle - half
+    right = middle + half
     x = np.array([left, left, right, right])
     return x, np.array([0.0, height, height, 0.0])
 

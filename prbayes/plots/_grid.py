@@ -142,8 +142,10 @@ def _standard_error(optimum: Optimum, name: str, bulk: Floats) -> float:
 def _ends(center: Floats, error: float, marked: Floats) -> tuple[float, float]:
     """Return where an axis should end: beyond some standard errors, and beyond what is marked."""
     reach = _STANDARD_ERRORS * error
-    first, last = center[0] - reach, center[0] + reach
-    lowest, highest = marked.min(), marked.max()
+    first = center[0] - reach
+    last = center[0] + reach
+    lowest = marked.min()
+    highest = marked.max()
     # About the size of a marker.
     margin = 0.04 * (max(last, highest) - min(first, lowest))
     low = min(first, lowest - margin)

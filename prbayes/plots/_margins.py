@@ -160,7 +160,8 @@ def _axis(margin: Margin, values: Floats) -> Floats:
     # Beyond these ends a density is hardly above zero.
     low, high = central_range(values, _equal_weights(values), tail=0.002)
     if margin.discrete:
-        first, last = np.floor(low), np.ceil(high)
+        first = np.floor(low)
+        last = np.ceil(high)
         return np.arange(first, last + 1)
     return np.linspace(low, high, GRID_POINTS)
 

@@ -61,7 +61,8 @@ class Output:
 
     def measured(self) -> tuple[Floats, Floats]:
         """Return what was measured of one output, without NaN, and weights that sum to one."""
-        values, weights = self.of(self.node.target.observed), self.node.target.weights
+        values = self.of(self.node.target.observed)
+        weights = self.node.target.weights
         known = ~np.isnan(values)
         if known.all():
             return values, weights

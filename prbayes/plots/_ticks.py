@@ -41,10 +41,12 @@ def log_ticks(values: Floats) -> Ticks:
     """Return ticks of positive values: positions as base-10 logarithms, labels of the values."""
     finite = values[np.isfinite(values)]
     shown = np.log10(finite[finite > 0])
-    low, high = shown.min(), shown.max()
+    low = shown.min()
+    high = shown.max()
 
     # Powers of ten, some of them where there are more than six; 1, 2, 5 where there are few
-    first, last = np.floor(low), np.ceil(high)
+    first = np.floor(low)
+    last = np.ceil(high)
     powers = np.arange(first, last + 1)
     every = -(-powers.size // 6)
     factors = (1, 2, 5) if high - low < 2 else (1,)

@@ -130,7 +130,8 @@ def _interval_text(comparison: xr.Dataset) -> str:
 
 def _draw_scores(panel: Panel, scores: Floats, rows: Floats) -> None:
     known = np.isfinite(scores)
-    x, y = scores[known], rows[known]
+    x = scores[known]
+    y = rows[known]
     panel.points("score", x, y, BLUE, size=45)
 
 
@@ -157,7 +158,8 @@ def _covered(shown: Floats) -> tuple[float, float]:
     known = shown[np.isfinite(shown)]
     low, high = 0.0, 1.0
     if known.size:
-        low, high = known.min(), known.max()
+        low = known.min()
+        high = known.max()
     margin = 0.06 * (high - low)  # markers at the ends are whole
     if not margin:
         margin = 0.01 * max(abs(low), 1.0)

@@ -112,7 +112,8 @@ def _draw_objective(panel: Panel, optimum: Optimum, evaluations: Floats) -> None
         best = np.log10(best)
 
     known = np.isfinite(shown)
-    x, y = evaluations[known], shown[known]
+    x = evaluations[known]
+    y = shown[known]
     panel.points("asked", x, y, GREY, size=16, legend="evaluated")
     # Values of different scales cannot be compared
     if free or len(optimum.scales) == 1:

@@ -152,14 +152,16 @@ def plot_outputs(
         if j > i:
             panel.blank()
             continue
-        x, y = chosen[j], chosen[i + 1]
+        x = chosen[j]
+        y = chosen[i + 1]
         if earlier is not None:
             _draw_regions(panel, "before", earlier, (x, y), VERMILION, DASHED, f"before: {what}")
         text = f"calibrated: {shown.label}, {_SHARES[0]:.0%} and {_SHARES[1]:.0%}"
         calibrated = _draw_regions(panel, "after", after, (x, y), BLUE, "C0", text)
         measured = _draw_measured(panel, x, y)
         # Names on the left and below all panels
-        across, up = limits[x.name], limits[y.name]
+        across = limits[x.name]
+        up = limits[y.name]
         panel.axes(
             x=x.text(labels) if i == size - 1 else "",
             y=y.text(labels) if j == 0 else "",
@@ -255,7 +257,8 @@ class _Population:
         """Return the k-th simulator's population at thetas, one for all of them."""
         values, weights = evaluator.populations(thetas, k)
         if evaluator.nodes[k].bound.stored:
-            values, weights = values[0], weights.mean(axis=0)
+            values = values[0]
+            weights = weights.mean(axis=0)
         else:
             values = values.reshape(-1, values.shape[-1])
             weights = weights.ravel() / len(thetas)
@@ -295,7 +298,8 @@ def _covered(output: Output, after: _Population, earlier: _Population | None) ->
 
 def _draw_measured(panel: Panel, x: Output, y: Output) -> float:
     """Draw the specimens that have both outputs; return their correlation."""
-    observed, weights = x.node.target.observed, x.node.target.weights
+    observed = x.node.target.observed
+    weights = x.node.target.weights
     points = np.column_stack([x.of(observed), y.of(observed)])
     known = np.isfinite(points).all(axis=1)
     points = points[known]

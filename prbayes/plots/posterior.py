@@ -198,7 +198,8 @@ def _read_hyperparameters(
 
 def _draw(panel: Panel, hyperparameter: _Hyperparameter, level: float) -> float:
     """Draw densities, and the intervals below them; return how high the posterior reaches."""
-    draws, best = hyperparameter.draws, hyperparameter.best
+    draws = hyperparameter.draws
+    best = hyperparameter.best
     grid = hyperparameter.grid
     density = bounded_density(draws, grid)
     top = float(density.max())

@@ -122,10 +122,12 @@ def _draw(panel: Panel, statistic: _Statistic, label: str) -> None:
     # Beta starts at a small value and grows by orders of magnitude
     ticks, rows = None, statistic.rows
     if statistic.name == "beta" and spans_decades(rows):
-        ticks, rows = log_ticks(rows), np.log10(rows)
+        ticks = log_ticks(rows)
+        rows = np.log10(rows)
 
     for c, chain in enumerate(statistic.chains):
-        visual, text = f"chain_{chain}", f"chain {chain}"
+        visual = f"chain_{chain}"
+        text = f"chain {chain}"
         color = CYCLE[c % len(CYCLE)]
         known = np.flatnonzero(np.isfinite(rows[c]))
         y = rows[c][known]

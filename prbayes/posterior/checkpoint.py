@@ -103,7 +103,8 @@ class Checkpoint:
             raise StoreError(self._refusal("was written by another version of prbayes"))
         other = differences(problem, self.problem, Level.RUN)
         for key in sorted({*settings, *self.settings}):
-            got, expected = settings.get(key), self.settings.get(key)
+            got = settings.get(key)
+            expected = self.settings.get(key)
             if got != expected:
                 other.append(f"{key}: got {got}, expected {expected}")
         if other:

@@ -136,7 +136,8 @@ def _log_likelihood(
     was another one, and the adjustment does not know it.
     """
     chains, draws, d = thetas.shape
-    before, after = particles.reshape(-1, d), thetas.reshape(-1, d)
+    before = particles.reshape(-1, d)
+    after = thetas.reshape(-1, d)
     k = discrepancies.shape[-1]
     log_prior = evaluator.hyperparameters.log_prior(before)
     found = discrepancies.reshape(-1, k)

@@ -68,9 +68,11 @@ class Missing:
 
         A specimen failed if an output of it did.
         """
-        unknown, broken = np.isnan(values), np.isposinf(values)
+        unknown = np.isnan(values)
+        broken = np.isposinf(values)
         if values.ndim > weights.ndim:
-            unknown, broken = unknown.any(axis=-1), broken.any(axis=-1)
+            unknown = unknown.any(axis=-1)
+            broken = broken.any(axis=-1)
         lost = np.where(unknown, weights, 0.0).sum(axis=-1)
         failed = np.where(broken, weights, 0.0).sum(axis=-1)
         known = np.maximum(1 - lost, np.finfo(float).tiny)

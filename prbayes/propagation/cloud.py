@@ -127,7 +127,8 @@ class Emulation:
         coarse : ndarray, shape (n, m), optional
             A coarse response at the runs.
         """
-        x, y = columns(points), values.reshape(len(values), -1)
+        x = columns(points)
+        y = values.reshape(len(values), -1)
         runs = Runs(x, y, weights.mean(axis=0), blocks, coarse)
         try:
             tried = candidates(*x.shape) if isinstance(emulator, str) else [emulator]
@@ -177,7 +178,8 @@ class Emulation:
 
     def joined(self, cloud: Cloud, said: Floats, runs: Table) -> Table:
         """Return cloud and runs as one table, in which the runs have their share."""
-        m, n = len(cloud), len(runs.log_g)
+        m = len(cloud)
+        n = len(runs.log_g)
         blocks = np.arange(m) * N_BLOCKS // m
         if not self.share:
             return Table(cloud.points, said, cloud.log_g, blocks)
@@ -196,7 +198,8 @@ class Emulation:
 def _error(runs: Runs, said: Floats, importance: Floats) -> float:
     """Return the relative error of the worst output at runs that were left out."""
     known = runs.good & np.isfinite(said).all(axis=1)
-    y, importance = runs.y[known], importance[known]
+    y = runs.y[known]
+    importance = importance[known]
     total = importance.sum()
     if not total > 0:
         return np.nan

@@ -93,7 +93,8 @@ class ResponseOp(OwnOp):
         k = len(self.responses.inputs.aleatory)
         batch = batch_shape(inputs, self.event_ndims)
         full = broadcast_batch(inputs, self.event_ndims, batch)
-        aleatory, epistemic = full[:k], full[k:]
+        aleatory = full[:k]
+        epistemic = full[k:]
 
         # A population is left out if one of its inputs is finite at none of its specimens.
         specimens = len(batch)

@@ -433,7 +433,8 @@ class Design(Bound):
         emulation = self.contents.emulation
         if self._coarse is None or emulation is None:
             return ""
-        number, outputs = emulation.following, len(emulation.models)
+        number = emulation.following
+        outputs = len(emulation.models)
         if not number:
             return " It does not follow the coarse response, which tells nothing more."
         some = f" in {number} of {outputs} outputs" if number < outputs else ""
@@ -786,7 +787,8 @@ class Design(Bound):
 
     @contextmanager
     def _instead(self, contents: Contents) -> Iterator[None]:
-        before, kept = self.contents, self._held()
+        before = self.contents
+        kept = self._held()
         self._contents = contents
         self._share(self._arrays())
         try:

@@ -182,7 +182,8 @@ def failures(m: Material) -> list[Section]:
 
 
 def _failure_rows(failures: xr.Dataset) -> list[dict[str, Any]]:
-    names, reasons = failures["simulator"].values, failures["reason"].values
+    names = failures["simulator"].values
+    reasons = failures["reason"].values
     found = []
     for name, inputs, reason in zip(names, failures["inputs"].values, reasons, strict=True):
         at = ", ".join(f"{x:.6g}" for x in inputs[~np.isnan(inputs)])

@@ -86,7 +86,8 @@ def _shares(table: xr.Dataset) -> list[dict[str, Any]]:
 
 
 def _share(table: xr.Dataset, key: str, i: int) -> str:
-    value, error = float(table[key][i]), float(table[f"{key}_error"][i])
+    value = float(table[key][i])
+    error = float(table[f"{key}_error"][i])
     return f"{value:.2f} ± {error:.2f}" if np.isfinite(value) else ""
 
 

@@ -115,7 +115,8 @@ def described(y: Floats) -> dict[str, Any]:
     """Describe one output: NaN was not measured, +inf has failed."""
     measured = y[~np.isnan(y)]
     finite = measured[np.isfinite(measured)]
-    failed, missing = measured.size - finite.size, y.size - measured.size
+    failed = measured.size - finite.size
+    missing = y.size - measured.size
     sd = float(finite.std(ddof=1)) if finite.size > 1 else math.nan
     told = [math.nan] * 3
     if finite.size:
@@ -134,7 +135,8 @@ def described(y: Floats) -> dict[str, Any]:
 
 def _correlations(name: str, m: Material) -> Section:
     """Return the correlations of outputs, each of the specimens that have both."""
-    y, names = m.observed[name], m.outputs[name].names
+    y = m.observed[name]
+    names = m.outputs[name].names
     told = _told(y)
     rows = []
     for i in told:

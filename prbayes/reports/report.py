@@ -69,7 +69,8 @@ class _Document:
         if not isinstance(section, Section):
             raise TypeError(f"section: got {called(section)}, expected a prb.reports.Section")
         place = len(self.sections) if after is None else self._end_of(after, section.level)
-        before, behind = self.sections[:place], self.sections[place:]
+        before = self.sections[:place]
+        behind = self.sections[place:]
         return replace(self, sections=(*before, section, *behind))
 
     def _end_of(self, title: str, level: int) -> int:

@@ -401,7 +401,8 @@ def chunks(
     BudgetError
         After everything else, if a budget was spent.
     """
-    work, room = _work(calling), capacity(calling.executor)
+    work = _work(calling)
+    room = capacity(calling.executor)
     pool = Pool(calling.name, calling.executor)
     suspects: list[Rows] = []  # what was at work when a worker was lost
     loss: BaseException | None = None
@@ -426,7 +427,8 @@ def chunks(
                     error = error or spent
                     left = left[:0]
                     break
-                some, left = left[:size], left[size:]
+                some = left[:size]
+                left = left[size:]
                 begun[pool.submitted(work, points.at(some), tolerant)] = some
             # Take what is done.
             done = []
@@ -541,7 +543,8 @@ def _one_by_one(
     outputs: Outputs | None,
 ) -> tuple[Floats, dict[int, str]]:
     event = () if outputs is None else outputs.event
-    values, raised = np.full((len(points), *event), np.nan), {}
+    values = np.full((len(points), *event), np.nan)
+    raised = {}
     for i in range(len(points)):
         try:
             with np.errstate(all="ignore"), limited(timeout):

@@ -27,7 +27,8 @@ _OPERANDS = 30
 
 def _sums_of_sums(fgraph: Any, node: Any) -> Any:
     """Divide what has too many terms, or factors, into several of as many as there may be."""
-    op, terms = node.op, node.inputs
+    op = node.op
+    terms = node.inputs
     if len(terms) <= _OPERANDS or not op.scalar_op.associative:
         return False
     parts = []

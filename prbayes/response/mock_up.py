@@ -175,9 +175,11 @@ def _names(inputs: object) -> tuple[str, ...]:
 def _labelled(outputs: object) -> dict[str, str]:
     """Return variables by the names of the outputs."""
     if isinstance(outputs, Mapping):
-        labels, names = list(outputs), list(outputs.values())
+        labels = list(outputs)
+        names = list(outputs.values())
     elif isinstance(outputs, Sequence) and not isinstance(outputs, str):
-        labels, names = list(outputs), list(outputs)
+        labels = list(outputs)
+        names = list(outputs)
     else:
         labels, names = [], []
     if not labels or not _are_names(labels) or not all(isinstance(name, str) for name in names):
@@ -372,7 +374,8 @@ class MockUp:
     def _simulated(self, slave: Any, given: list[tuple[Variable, Value]]) -> list[list[float]]:
         """Return the outputs at each time."""
         clock = time.monotonic()
-        grid, stop = self.grid, self.grid.marks[-1]
+        grid = self.grid
+        stop = self.grid.marks[-1]
         stated = {"tolerance": grid.tolerance, "startTime": grid.start, "stopTime": stop}
         if self.unit.version == 2:
             slave.setupExperiment(**stated)

@@ -245,7 +245,8 @@ class Responses:
 
     def same_as(self, other: Responses) -> bool:
         """Return whether another has the same function, inputs and constants, and output order."""
-        mine, others = self.inputs.arguments, other.inputs.arguments
+        mine = self.inputs.arguments
+        others = other.inputs.arguments
         if self.function is not other.function or len(mine) != len(others):
             return False
         # A mapping's arrays are put together in the order of what was observed.

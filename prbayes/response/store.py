@@ -360,7 +360,8 @@ class Store:
 
     def _refuse_other_outputs(self, session: _Session, value: bytes) -> None:
         """Raise if a stored run has another number of outputs."""
-        found, width = len(value) // len(_NAN), self._width(session)
+        found = len(value) // len(_NAN)
+        width = self._width(session)
         if (session.known and found != width) or self.outputs not in (None, found):
             got = f"which holds runs with {found} outputs for simulator {self.name!r}"
             todo = "nothing was changed: pass version= with a name for the response as it is now"

@@ -77,7 +77,8 @@ def _by_injection(seconds: float) -> Iterator[None]:
     """Raise inside, in any thread, such as those of Dask, as soon as it runs in Python."""
     thread = ctypes.c_ulong(threading.get_ident())
     inject = ctypes.pythonapi.PyThreadState_SetAsyncExc
-    turn, over = threading.Lock(), threading.Event()
+    turn = threading.Lock()
+    over = threading.Event()
 
     def late() -> None:
         with turn:

@@ -295,7 +295,8 @@ class _Server:
         """Raise if there is no server, or none of UM-Bridge, or it has no such model."""
         try:
             found = self.asked("/Info", None)
-            version, models = found["protocolVersion"], [str(name) for name in found["models"]]
+            version = found["protocolVersion"]
+            models = [str(name) for name in found["models"]]
         except (RuntimeError, KeyError, TypeError) as error:
             raise ConnectionError(
                 f"umbridge: url: got {self.url}, where something else answers ({error!s:.200}), "
@@ -333,7 +334,9 @@ class _Server:
 
         A specimen may be sent again: a server keeps nothing of it.
         """
-        name, lost, until = body["name"], 0, 0.0
+        name = body["name"]
+        lost = 0
+        until = 0.0
         pause = _FIRST_PAUSE
         while True:
             try:
@@ -346,7 +349,10 @@ class _Server:
                     f"{name}: no response within timeout = {self.timeout:g} s from {self.url}"
                 ) from None
             except _LostError as error:
-                lost, until, pause, why = lost + 1, 0.0, _FIRST_PAUSE, str(error)
+                lost = lost + 1
+                until = 0.0
+                pause = _FIRST_PAUSE
+                why = str(error)
                 if lost > _SENT_AGAIN:
                     raise ConnectionError(
                         f"{name}: the server at {self.url} was lost {lost} times while it was at "

@@ -108,7 +108,8 @@ class Ranges:
             if not wrong.size:
                 continue
             got = f"{wrong.min():.6g} to {wrong.max():.6g}"
-            lowest, highest = np.min(one.low), np.max(one.high)
+            lowest = np.min(one.low)
+            highest = np.max(one.high)
             expected = f"{lowest:.6g} to {highest:.6g}"
             said.append(f"{one.name} from {got}, expected {expected}")
         bad = out.any(axis=1).sum()

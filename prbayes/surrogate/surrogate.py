@@ -528,7 +528,8 @@ def _best(
 
     None if it is not; else whether it is among the inputs of the surface, too.
     """
-    least, choice = cross_validated(model, x, y, seed), None
+    least = cross_validated(model, x, y, seed)
+    choice = None
     if coarse is None:
         return least, choice
     known = int(np.isfinite(coarse).sum())

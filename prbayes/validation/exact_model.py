@@ -120,7 +120,8 @@ def _refuse_dependent(case: Case) -> None:
 def _refuse_few(case: Case) -> None:
     """Raise if a population has too few values to be taken as exact."""
     for condition in case.conditions:
-        predicted, observed = condition.predicted.size, condition.observed.size
+        predicted = condition.predicted.size
+        observed = condition.observed.size
         # With m times as many the pool itself adds 1 / m to the variance of an ECDF: a tenth makes
         # a test at 5% reject in some 6% of cases.
         if predicted < 10 * observed:

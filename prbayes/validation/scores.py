@@ -88,6 +88,7 @@ def _logs(part: Part, points: Floats, simulated: Floats, weights: Floats) -> Flo
 
 def _wide(target: Discrepancy, points: Floats) -> Floats:
     """Return the density at points of what is spread widely over the observed values."""
-    observed, weights = target.observed, target.weights
+    observed = target.observed
+    weights = target.weights
     middle = quantile(observed, weights, 0.5)
     return np.asarray(student.pdf(points, _WIDE_DEGREES, middle, spread(observed, weights)))

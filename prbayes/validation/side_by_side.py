@@ -41,7 +41,8 @@ def comparables(measured: Any, predicted: Any, caller: str) -> list[Comparable]:
     """
     if not isinstance(predicted, Mapping):
         name = getattr(predicted, "name", None) or "response"
-        measured, predicted = {str(name): measured}, {str(name): predicted}
+        measured = {str(name): measured}
+        predicted = {str(name): predicted}
     for name, prediction in predicted.items():
         if not isinstance(prediction, xr.DataArray) or "sample" not in prediction.dims:
             raise TypeError(
