@@ -149,12 +149,12 @@ class Evaluator:
 
     @cached_property
     def told_by_prior(self) -> NDArray[np.bool_]:
-        """Which elements of theta no input depends on but through others, shape (d,).
+        """Which elements of theta the data tell by others and the prior alone, shape (d,).
 
-        Such as the spread between groups, of which their hyperparameters tell by the prior.
+        Such as the spread between groups, or the mean of a group that was not measured.
         """
         params = [p for own in self._params() for p in own]
-        return self.hyperparameters.above(params)
+        return self.hyperparameters.beyond_others(params)
 
     def _graphs(self) -> list[Any]:
         graphs = []

@@ -108,12 +108,19 @@ class Hyperparameters:
             found += element_names(name, shape, coordinates(self.model, own))
         return found
 
-    def above(self, graphs: Sequence[Any]) -> NDArray[np.bool_]:
-        """Return which elements of theta are above graphs through other variables only, (d,)."""
+    def beyond_others(self, graphs: Sequence[Any]) -> NDArray[np.bool_]:
+        """Return which elements of theta hang together with graphs by other variables only, (d,).
+
+        Those above others that the graphs are of, and those below any of these.
+        """
         free = set(self.model.free_RVs)
-        blocked = [v for v in ancestors(graphs, blockers=free) if v in free]
-        every = set(ancestors(blocked))
-        hidden = {str(rv.name) for rv in free & every if rv not in blocked}
+        direct = {v for v in ancestors(graphs, blockers=free) if v in free}
+        joined = free & set(ancestors(list(direct)))
+        # A variable comes after those that it depends on.
+        for rv in self.model.free_RVs:
+            if joined.intersection(ancestors([rv])):
+                joined.add(rv)
+        hidden = {str(rv.name) for rv in joined - direct}
         sizes = [int(np.prod(shape, dtype=int)) for shape in self.shapes.values()]
         return np.repeat([name in hidden for name in self._own_names], sizes)
 

@@ -73,10 +73,21 @@ def test_a_walk_that_gets_nowhere_says_so(monkeypatch: pytest.MonkeyPatch) -> No
     assert "expected at most 0.2, so that they are not yet" in doubt
 
 
-def test_elements_above_others_are_told_by_the_prior() -> None:
+def test_elements_that_hang_on_others_are_told_by_the_prior() -> None:
     _, evaluator, _ = case()
     names = np.array(evaluator.readable_names)
     assert list(names[evaluator.told_by_prior]) == ["m", "tau"]
+    with pm.Model() as more:
+        mean = pm.Normal("mean")
+        x = pm.Normal.dist(pm.Normal("mu", mean), 1.0)
+        fresh = pm.Normal("fresh", mean)
+        pm.Deterministic("twice", 2 * fresh)
+        pm.Normal("of fresh", 2 * fresh)
+        pm.Normal("of nothing", pm.Normal("beside"))
+        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0])
+    found = Evaluator(more)
+    told = np.array(found.readable_names)[found.told_by_prior]
+    assert list(told) == ["mean", "fresh", "of fresh"]
     with pm.Model() as flat:
         x = pm.Normal.dist(pm.Normal("mu"), pm.HalfNormal("sigma"))
         pm.Normal("beside")
