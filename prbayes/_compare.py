@@ -101,7 +101,12 @@ def compare(
             "compare: got no results, expected a dict such as {'optimum': optimum, 'ABC': idata}"
         )
     identities = {label: identity_in(result) for label, result in results.items()}
-    identity = require_together(identities, "compare", model=model)
+    try:
+        identity = require_together(identities, "compare", model=model)
+    except ValueError as error:
+        raise ValueError(
+            f"{error}; models of the same data are compared by prb.validation.compare_candidates"
+        ) from None
     naming = model or _model_among(results)
     columns = {label: _column(label, result, naming) for label, result in results.items()}
     every = _shared(list(columns.values()), model)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from enum import IntEnum
@@ -456,11 +457,16 @@ def _population_differences(
         )
         if one != other
     ]
-    if a.inputs != b.inputs:
+    if _without_names(a.inputs) != _without_names(b.inputs):
         found.append(_told(f"inputs of {a.name}", a.inputs, b.inputs))
     elif comparable and not _close(a.responses, b.responses):
         found.append(f"the response of {a.name} has other values at the same points")
     return found
+
+
+def _without_names(inputs: str) -> str:
+    """Return inputs as they are distributed: what they are called makes no other population."""
+    return re.sub(r"(^|, )[^,()~]+ ~ ", r"\1", inputs)
 
 
 def _prior_differences(got: Identity, expected: Identity) -> list[str]:

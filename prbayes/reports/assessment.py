@@ -311,10 +311,10 @@ def _cost(m: Material, label: str) -> dict[str, Any]:
 
 
 def _versions(attrs: Mapping[Any, Any]) -> dict[str, str]:
-    """Return the versions of packages; not that of the library that ArviZ is told of."""
+    """Return the versions of packages; not those of libraries that ArviZ is told of."""
     found = {}
     for key, value in attrs.items():
         name = str(key).removesuffix("_version")
-        if name not in (str(key), "inference_library"):
+        if name not in (str(key), "inference_library", "creation_library"):
             found[name] = str(value)
     return found

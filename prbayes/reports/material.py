@@ -17,17 +17,24 @@ from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.model.description import describe, from_attributes
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import (
+    Identity,
     Level,
     differences,
     identity_of_model,
+    require_same,
     require_together,
 )
 from prbayes.model.identity import from_attributes as identity_of_attributes
 from prbayes.model.node import nodes
 from prbayes.plots._names import refuse_labels
 from prbayes.response.outputs import ONE, Outputs, read_observed
+from prbayes.validation.probability_transform import u_values
 from prbayes.validation.side_by_side import comparables
 from prbayes.validation.validity import ValidityTest
+
+# Measured values are rounded, or predicted ones for a test: by far less than this in half of the
+# u-values, while those of other data are apart by .3 on average.
+_ROUNDING = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +139,8 @@ def gather(
         identities[f"validation, {label}"] = identity_of_attributes(predicted.attrs)
     identities["comparison"] = identity_in(comparison)
     require_together(identities, "Report", model=model)
+    _require_prior({label: identities[label] for label in posteriors}, model)
+    _require_tested(validation or {}, tests)
 
     # Find out what was not given
     description = _stored_description(results) if model is None else describe(model)
@@ -189,6 +198,47 @@ def _require_validation(validation: Any) -> None:
         if not isinstance(condition, str) or not isinstance(pair, tuple) or len(pair) != 2:
             raise TypeError(f"Report: validation: {condition}: got {called(pair)}, {expected}")
         comparables({condition: pair[0]}, {condition: pair[1]}, "Report: validation")
+
+
+def _require_prior(identities: Mapping[str, Identity | None], model: pm.Model | None) -> None:
+    """Refuse draws none of which is under the prior of the model, which the report prints."""
+    if model is None or not nodes(model):
+        return
+    expected = identity_of_model(model)
+    found = {}
+    for label, identity in identities.items():
+        if identity is not None:
+            found[label] = differences(identity, expected, Level.PRIORS)
+    if found and all(found.values()):
+        label = next(iter(found))
+        require_same(identities[label], expected, f"Report: {label}", Level.PRIORS)
+
+
+def _require_tested(
+    validation: Mapping[str, tuple[Any, xr.DataArray]], tests: Mapping[str, ValidityTest]
+) -> None:
+    """Refuse validation data that are not those of a test, where there are tests."""
+    known: list[Floats] = []
+    for test in tests.values():
+        known.append(test.u_values)
+        for condition in np.unique(test.conditions):
+            known.append(test.u_values[test.conditions == condition])
+    for condition, (measured, predicted) in validation.items():
+        u = u_values({condition: measured}, {condition: predicted})
+        if known and not any(_alike(u, own) for own in known):
+            raise ValueError(
+                f"Report: validation: {condition}: got {u.size} values other than those of the "
+                f"tests in validity=, expected what prb.area_test was given; test them too, or "
+                "leave validity= out"
+            )
+
+
+def _alike(u: Floats, tested: Floats) -> bool:
+    """Return whether u-values are those of a test, up to rounding and ties, in their order."""
+    folded = np.abs(2 * u - 1)
+    return u.shape == tested.shape and any(
+        np.median(np.abs(own - tested)) < _ROUNDING for own in (u, folded)
+    )
 
 
 def _require_known_labels(

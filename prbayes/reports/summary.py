@@ -23,6 +23,8 @@ from prbayes.validation.validity import ValidityTest
 
 # More hyperparameters than this make a list, which a table shows better: by judgement.
 _MOST_NAMES = 6
+# More conditions than this make a sentence too long to read: by judgement.
+_MOST_CONDITIONS = 4
 # More rows than these leave no room for the rest on the first page: by judgement.
 _MOST_ROWS_IN_SUMMARY = 10
 
@@ -67,7 +69,10 @@ def _verdict(m: Material) -> str:
         return "Verdict: not to be used before the problems under Diagnostics are removed."
     if not m.tests:
         return "Verdict: calibrated, and not tested on data that it has not seen."
-    return "Verdict: calibrated, and not rejected by data that it has not seen."
+    return (
+        "Verdict: calibrated, and not rejected by data that it has not seen, which does not prove "
+        "it right."
+    )
 
 
 def verdict(label: str, test: ValidityTest, m: Material) -> str:
@@ -79,6 +84,11 @@ def verdict(label: str, test: ValidityTest, m: Material) -> str:
     values = counted(test.u_values.size, "value")
     if directions:
         values = f"several outputs, seen in {counted(directions, 'direction')}"
+    conditions = test.of_conditions
+    # One alone may be called after a function only.
+    told = len(conditions) > 1 or conditions[0] in {*m.validation, *m.labels}
+    if told and len(conditions) <= _MOST_CONDITIONS:
+        values += f": {_enumerated([named(name, m.labels) for name in conditions])}"
     area = "mean area" if directions else "area"
     found = "is rejected" if test.rejected else "is not rejected"
     sign = ">" if test.statistic > test.critical_value else "≤"

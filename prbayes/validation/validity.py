@@ -16,7 +16,7 @@ from prbayes._progress import shown
 from prbayes.model.identity import Identity, as_attributes
 from prbayes.model.labels import versions
 from prbayes.model.turns import in_turn
-from prbayes.validation.conditions import Case, Condition, Predicted, read_case
+from prbayes.validation.conditions import DIRECTION, Case, Condition, Predicted, read_case
 from prbayes.validation.exact_model import ExactModel
 from prbayes.validation.nulls import Null, PosteriorNull
 
@@ -64,6 +64,12 @@ class ValidityTest:
     def rejected(self) -> bool:
         """Whether the model is rejected at the level."""
         return self.p_value <= self.level
+
+    @property
+    def of_conditions(self) -> list[str]:
+        """The conditions that were tested, each once, in their order."""
+        names = [name.split(DIRECTION)[0] for name in self.conditions.tolist()]
+        return list(dict.fromkeys(names))
 
     def __repr__(self) -> str:
         verdict = "rejected" if self.rejected else "not rejected"

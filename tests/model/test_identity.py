@@ -142,6 +142,19 @@ def test_the_same_model_built_again_is_the_same_problem() -> None:
     assert identity_of(Evaluator(Problem().model())) == identity()
 
 
+def test_what_an_input_is_called_makes_no_other_problem() -> None:
+    named = Problem(inputs=_Named).model()
+    assert differences(identity_of_model(named), identity(), Level.RUN) == []
+
+
+class _Named:
+    """Distributions of inputs that have a name."""
+
+    @staticmethod
+    def dist(*parameters: Any) -> Any:
+        return pm.Normal.dist(*parameters, name="spring rate")
+
+
 def test_clones_and_copies_are_the_same_problem() -> None:
     for other in (clone_model(base()), cloudpickle.loads(cloudpickle.dumps(base()))):
         found = identity_of(Evaluator(other))
@@ -460,7 +473,7 @@ PAIRS: dict[str, tuple[Level, Callable[[str], Any]]] = {
         lambda change: prb.compare({"a": posterior(), "b": other_optimum(change)}),
     ),
     "Report: posterior, model": (
-        Level.POPULATIONS,
+        Level.PRIORS,
         lambda change: report(posterior=posterior(), model=other_model(change)),
     ),
     "Report: optimum, model": (

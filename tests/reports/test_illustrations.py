@@ -289,6 +289,8 @@ def test_labels_reach_the_pictures_that_know_the_names(
     drawn_by(monkeypatch, {name: drawn(name) for name in names})
     x = pm.Normal.dist(model["mu"], model["sigma"])
     later = prb.predict(posterior, np.positive, x, model=model, draws=20)
+    warm = np.array([1.0, 2.0, 2.5])
+    test = prb.area_test(warm, later, null=prb.validation.PosteriorNull(199))
     labels = {"mu": "mean", "y": "stiffness (N/mm)", "hot": "at 200 °C"}
     of_model = {"mu": "mean", "y": "stiffness (N/mm)"}
     prb.Report(
@@ -297,7 +299,7 @@ def test_labels_reach_the_pictures_that_know_the_names(
         optimum=optimum,
         posterior=posterior,
         validity=test,
-        validation={"hot": (np.array([1.0, 2.0, 2.5]), later)},
+        validation={"hot": (warm, later)},
         labels=labels,
     )
     assert given["plot_responses"] == given["plot_landscape"] == of_model

@@ -4,10 +4,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pymc as pm
 import pytest
 import xarray as xr
 
 import prbayes as prb
+from prbayes.model.node import nodes
 from prbayes.reports.material import gather
 from prbayes.reports.tables import cells
 
@@ -77,6 +80,52 @@ def test_what_is_given_as_something_else_is_refused(
     nothing = dict.fromkeys(("model", "optimum", "posterior", "validity", "comparison"))
     with pytest.raises((TypeError, ValueError), match=words):
         gather(**(nothing | {kind: wrong}))
+
+
+def test_draws_under_another_prior_are_refused_beside_the_model(calibrated: Any) -> None:
+    with pm.Model() as narrow:
+        mu = pm.Normal("mu", 1.5, 0.01)
+        sigma = pm.HalfNormal("sigma", 1)
+        pm.Deterministic("cv", sigma / mu)
+        given = {"metric": prb.KullbackLeibler(), "observed": nodes_data(calibrated.model)}
+        x = pm.Normal.dist(mu, sigma, name="stiffness")
+        labels = np.arange(100, 130)
+        prb.Simulator(
+            "y", np.positive, x, **given, specimens=labels, propagation=prb.Reweighted(256)
+        )
+    with pytest.raises(ValueError, match="posterior: got a result of another problem: prior of mu"):
+        prb.Report("x", model=narrow, posterior=calibrated.posterior, pictures=False)
+    # Beside draws of the model's own prior others may be shown.
+    other = calibrated.posterior.copy()
+    both = {"own": calibrated.posterior, "other": other}
+    prb.Report("x", model=calibrated.model, posterior=both, pictures=False)
+
+
+def nodes_data(model: pm.Model) -> Any:
+    (node,) = nodes(model).values()
+    return node.target.observed
+
+
+def test_validation_data_are_those_of_the_test(calibrated: Any) -> None:
+    model, _, posterior, _ = calibrated
+    x = pm.Normal.dist(model["mu"], model["sigma"])
+    later = prb.predict(posterior, np.positive, x, model=model, random_seed=1)
+    fresh = np.random.default_rng(4).normal(2.0, 0.6, 12)
+    fewer = {"null": prb.validation.PosteriorNull(199)}
+    given: dict[str, Any] = {"model": model, "posterior": posterior, "pictures": False}
+    for test in (
+        prb.area_test(fresh, later, **fewer),
+        prb.area_test(fresh, later, folded=True, **fewer),
+        prb.area_test({"a": fresh, "b": 2 * fresh}, {"a": later, "b": 2 * later}, **fewer),
+    ):
+        report = prb.Report("x", validity=test, validation={"hot": (fresh, later)}, **given)
+        named = "(24 values: a and b)" in " ".join(report.sections[0].text)
+        assert named == (len(test.of_conditions) == 2)
+        prb.Report("x", validity=test, validation={"hot": (fresh.round(2), later)}, **given)
+        for wrong in (fresh[:7], fresh + 1.0, fresh[::-1]):
+            with pytest.raises(ValueError, match=r"hot: got .* values other than those of the t"):
+                prb.Report("x", validity=test, validation={"hot": (wrong, later)}, **given)
+    prb.Report("x", validation={"hot": (fresh[:7], later)}, **given)
 
 
 def test_a_name_is_given_once(calibrated: Any) -> None:
