@@ -17,6 +17,7 @@ from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
 from prbayes.metrics.divergence import KullbackLeibler
+from prbayes.metrics.joint import Joint
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.residual import ProbabilityResidual
 from prbayes.model.elements import (
@@ -32,7 +33,7 @@ from prbayes.model.elements import (
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import as_attributes, require_together
 from prbayes.model.labels import labelled
-from prbayes.model.node import nodes
+from prbayes.model.node import Node, nodes
 from prbayes.model.support import shortcomings
 from prbayes.model.turns import in_turn
 from prbayes.response.inputs import event_shape
@@ -254,7 +255,6 @@ def _scores(
     evaluator = Evaluator(model)
     if metrics is None and evaluator.responses_per_theta:
         return {}  # a comparison that was not asked for scores computes no response
-    metrics = _METRICS if metrics is None else metrics
     thetas = _thetas(evaluator, names, estimates)
     if thetas is None:
         return {}
@@ -264,12 +264,24 @@ def _scores(
         supported = np.array([node.name not in lacking for lacking in thin])
         roots = evaluator.roots(thetas, k)
         before = f"{node.name} " if len(evaluator.nodes) > 1 else ""
-        for metric in metrics:
+        for metric in _usual(node) if metrics is None else metrics:
             target = metric.against(node.target.observed, node.target.weights)
             scores = node.bound.discrepancies(roots, target)
-            key = f"{before}{type(metric).__name__}"
+            key = f"{before}{_class_of(metric)}"
             found[key] = np.where(supported, scores, np.nan)
     return found
+
+
+def _usual(node: Node) -> Sequence[Metric]:
+    """Return the metrics of all, or of several outputs the same in all directions."""
+    return [Joint(own) for own in _METRICS] if node.target.observed.ndim > 1 else _METRICS
+
+
+def _class_of(metric: Metric) -> str:
+    """Return the class of a metric, with that of the one that it is made of."""
+    inner = getattr(metric, "metric", None)
+    own = type(metric).__name__
+    return f"{own}({type(inner).__name__})" if isinstance(inner, Metric) else own
 
 
 def _thetas(evaluator: Evaluator, names: list[str], estimates: Floats) -> Floats | None:

@@ -203,6 +203,25 @@ def test_the_interval_of_an_optimum_is_that_of_a_normal(optimum: prb.Optimum) ->
         np.testing.assert_allclose(covered, 0.055 if bound == "lower" else 0.945, rtol=1e-10)
 
 
+def test_several_outputs_are_scored_by_joint_metrics() -> None:
+    def response(a: Any, b: Any) -> Any:
+        return np.stack([a + b, a * b], axis=-1)
+
+    data = response(*np.random.default_rng(1).normal([[2.0], [3.0]], 0.2, (2, 20)))
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("mu", 2.0, 0.5), 0.2)
+        b = pm.Normal.dist(3.0, 0.2)
+        joint = prb.Joint(prb.AreaMetric())
+        given: dict[str, Any] = {"metric": joint, "observed": data}
+        prb.Simulator("y", response, a, b, **given, propagation=prb.Reweighted(64))
+    optimum = prb.minimize(model, refine=False, starts=0)
+    table = prb.compare({"optimum": optimum}, model=model)
+    names = ["ProbabilityResidual", "KullbackLeibler", "AreaMetric", "LogLikelihood"]
+    assert {f"Joint({name})" for name in names} <= set(table.data_vars)
+    assert float(table["Joint(AreaMetric)"][0]) == pytest.approx(optimum.discrepancy)
+    prb.plot_comparison(table, backend="none")
+
+
 def test_scores_need_every_hyperparameter(model: pm.Model) -> None:
     table = prb.compare({"part": tree_of(sigma=np.ones((1, 5)))}, model=model)
     assert list(table["hyperparameter"].values) == ["sigma"]

@@ -34,7 +34,7 @@ from prbayes.validation.validity import ValidityTest
 
 # Measured values are rounded, or predicted ones for a test: by far less than this in half of the
 # u-values, while those of other data are apart by .3 on average.
-_ROUNDING = 0.02
+_ROUNDED_BY = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +237,7 @@ def _alike(u: Floats, tested: Floats) -> bool:
     """Return whether u-values are those of a test, up to rounding and ties, in their order."""
     folded = np.abs(2 * u - 1)
     return u.shape == tested.shape and any(
-        np.median(np.abs(own - tested)) < _ROUNDING for own in (u, folded)
+        np.median(np.abs(own - tested)) < _ROUNDED_BY for own in (u, folded)
     )
 
 
