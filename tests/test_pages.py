@@ -16,6 +16,11 @@ sys.path.insert(0, str(ROOT))
 from benchmarks import pages  # noqa: E402
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+# The site shows 90 characters of code in a line on a desktop; a reader's font or half a screen shows
+# fewer. 79 is what Python's own style guide holds code to, for such readers.
+CODE_WIDTH = 79
+BLOCK = re.compile(r"^```(?:python|bash|text|\{code-cell\} ipython3)\n(.*?)^```$", re.S | re.M)
+UNSEEN = re.compile(r"\A:tags: \[.*remove-(?:cell|input)")
 FEATURES = re.sub(r"\s+", " ", (ROOT / "docs" / "features.md").read_text(encoding="utf-8"))
 
 
@@ -32,6 +37,35 @@ def test_files_that_a_page_names_are_there(path: Path) -> None:
     page = path.read_text(encoding="utf-8")
     named = re.findall(r"\b(?:tests|benchmarks|examples|prbayes)/[\w/]+\.(?:py|json|csv)\b", page)
     assert not [name for name in named if not (ROOT / name).exists()]
+
+
+def wide_lines(page: str) -> list[str]:
+    """Return the lines of code that a reader sees and has to scroll for."""
+    seen = [block for block in BLOCK.findall(page) if not UNSEEN.match(block)]
+    return [line for block in seen for line in block.splitlines() if len(line) > CODE_WIDTH]
+
+
+@pytest.mark.parametrize(
+    "path", [ROOT / "README.md", *sorted(pages.PAGES.glob("*.md"))], ids=lambda path: path.stem
+)
+def test_code_fits_on_the_page(path: Path) -> None:
+    assert not wide_lines(path.read_text(encoding="utf-8"))
+
+
+def test_a_wide_line_of_code_is_found() -> None:
+    wide = "x" * (CODE_WIDTH + 1)
+    assert wide_lines(f"```python\n{wide}\n```\n") == [wide]
+    assert wide_lines(f"```{{code-cell}} ipython3\n:tags: [hide-input]\n{wide}\n```\n") == [wide]
+    assert not wide_lines(f"```python\n{wide[1:]}\n```\n{wide}\n")
+    assert not wide_lines(f"```{{code-cell}} ipython3\n:tags: [remove-cell]\n{wide}\n```\n")
+
+
+def test_fractions_in_formulas_have_braces() -> None:
+    """The writer of MathML takes 13 for one number in TeX's short form of a third."""
+    written = [*pages.PAGES.glob("*.md"), *(ROOT / "prbayes").rglob("*.py")]
+    bare = re.compile(r"\\[dt]?frac(?!\{[^{}]+\}\{)")
+    assert bare.search(r"\frac13 - \frac{x}{L}")
+    assert not [path.name for path in written if bare.search(path.read_text(encoding="utf-8"))]
 
 
 def test_every_table_is_on_a_page() -> None:
