@@ -63,7 +63,7 @@ def test_a_wide_line_of_code_is_found() -> None:
 def test_fractions_in_formulas_have_braces() -> None:
     """The writer of MathML takes 13 for one number in TeX's short form of a third."""
     written = [*pages.PAGES.glob("*.md"), *(ROOT / "prbayes").rglob("*.py")]
-    bare = re.compile(r"\\[dt]?frac(?!\{[^{}]+\}\{)")
+    bare = re.compile(r"\\[dt]?frac(?!\{)")
     assert bare.search(r"\frac13 - \frac{x}{L}")
     assert not [path.name for path in written if bare.search(path.read_text(encoding="utf-8"))]
 
