@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 import sys
@@ -133,3 +134,24 @@ def test_notebooks_are_kept_without_results(path: Path) -> None:
     assert not any(cell["outputs"] or cell["execution_count"] for cell in code)
     for cell in code:
         compile("".join(cell["source"]), str(path), "exec")
+
+
+def pages_of_messages() -> list[str]:
+    """Return all pages that messages name, each with the heading to look under."""
+    found = set()
+    for path in (ROOT / "prbayes").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "more_in":
+                (argument,) = node.args
+                found.add(ast.literal_eval(argument))
+    return sorted(found)
+
+
+@pytest.mark.parametrize("named", pages_of_messages())
+def test_what_a_message_names_is_there(named: str) -> None:
+    name, _, anchor = named.partition("#")
+    page = (pages.PAGES / name).read_text(encoding="utf-8")
+    headings = re.findall(r"^##+ (.+)$", page, re.MULTILINE)
+    # As GitHub and the site make them of headings
+    anchors = [re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in headings]
+    assert anchor in anchors
