@@ -40,6 +40,13 @@ def test_files_that_a_page_names_are_there(path: Path) -> None:
     assert not [name for name in named if not (ROOT / name).exists()]
 
 
+@pytest.mark.parametrize("path", sorted(pages.PAGES.glob("*.md")), ids=lambda path: path.stem)
+def test_tests_that_a_page_names_are_there(path: Path) -> None:
+    named = re.findall(r"(tests/[\w/]+\.py)::(test_\w+)", path.read_text(encoding="utf-8"))
+    for file, test in named:
+        assert f"\ndef {test}(" in (ROOT / file).read_text(encoding="utf-8"), test
+
+
 def wide_lines(page: str) -> list[str]:
     """Return the lines of code that a reader sees and has to scroll for."""
     seen = [block for block in BLOCK.findall(page) if not UNSEEN.match(block)]
