@@ -45,7 +45,7 @@ _ALL_DIFFERENT = 50
 _SAME_DIGITS = 1e-12
 
 # Where the numbers behind sentences about draws are.
-_OF_DRAWS = more_in("validity.md#diagnostics-of-the-sampler")
+_IN_NUMBERS = more_in("validity.md#diagnostics-of-the-sampler")
 
 _SUPPORT = ("weight_ess", "mean_weight", "lost_mass")
 
@@ -339,7 +339,7 @@ def _disagreement(posterior: xr.Dataset) -> list[str]:
         f"R-hat is {_listed(high, '.2f')}, expected at most {limit:.2f}: the chains disagree, "
         "look at az.plot_rank(idata). "
         "Pass more draws, or with prb.sample_smc a threshold of 0.8; "
-        f"if the chains sit in separate modes, state a prior that excludes one{_OF_DRAWS}."
+        f"if the chains sit in separate modes, state a prior that excludes one{_IN_NUMBERS}."
     ]
 
 
@@ -354,7 +354,7 @@ def _dependence(posterior: xr.Dataset) -> list[str]:
         return []
     return [
         f"The effective sample size is {_listed(low, '.0f')} of {total} draws: "
-        f"too few for means and intervals. Pass more draws{_OF_DRAWS}."
+        f"too few for means and intervals. Pass more draws{_IN_NUMBERS}."
     ]
 
 
@@ -400,7 +400,7 @@ def _copies(draws: xr.Dataset) -> list[str]:
         f"Of {draws.sizes['draw']} draws only {min(counts)} differ in {chains} {', '.join(few)}, "
         f"expected at least {expected}: few particles, or one, survived, and the width of the "
         "draws means nothing. Pass more draws, priors nearer to the data, or a larger epsilon"
-        f"{_OF_DRAWS}."
+        f"{_IN_NUMBERS}."
     ]
 
 
@@ -426,7 +426,7 @@ def _motion(result: xr.DataTree) -> list[str]:
         "so that many draws are the same. "
         f"The discrepancy is too noisy{why}, or epsilon too small: "
         "use prb.Reweighted or prb.Resimulated instead of prb.Fresh, "
-        f"or pass a larger n or epsilon{_OF_DRAWS}."
+        f"or pass a larger n or epsilon{_IN_NUMBERS}."
     ]
 
 
