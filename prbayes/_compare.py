@@ -38,7 +38,8 @@ from prbayes.model.support import shortcomings
 from prbayes.model.turns import in_turn
 from prbayes.response.inputs import event_shape
 
-_COSTS = ("n_responses", "seconds")
+# What a comparison has by result besides scores.
+COSTS = ("n_responses", "seconds")
 _METRICS = (ProbabilityResidual(), KullbackLeibler(), AreaMetric(), LogLikelihood())
 
 
@@ -131,7 +132,7 @@ def compare(
     for i, key in enumerate(_Estimate._fields):
         data[key] = (dims, table[..., i])
     data["shift"] = (dims, shift)
-    for key in _COSTS:
+    for key in COSTS:
         data[key] = ("result", [getattr(column, key) for column in columns.values()])
     if model is not None and nodes(model):
         scored = _table(columns, every)[..., 0]
@@ -170,7 +171,7 @@ class Comparison(xr.Dataset):
         """Return a sentence for each metric."""
         lines = []
         for key, scores in self.data_vars.items():
-            if scores.dims != ("result",) or key in _COSTS:
+            if scores.dims != ("result",) or key in COSTS:
                 continue
             each = scores.to_series().items()
             told = ", ".join(f"{label} {score:.4g}" for label, score in each)

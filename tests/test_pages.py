@@ -68,6 +68,17 @@ def test_a_wide_line_of_code_is_found() -> None:
     assert not wide_lines(f"```{{code-cell}} ipython3\n:tags: [remove-cell]\n{wide}\n```\n")
 
 
+def test_executed_pages_are_notebooks() -> None:
+    """Without a name to show, the format of notebooks has no kernel, and jupytext refuses a page."""
+    kernel = "kernelspec:\n  name: python3\n  display_name: Python 3\n"
+    written = [path.read_text(encoding="utf-8") for path in pages.PAGES.glob("*.md")]
+    executed = [page.split("---\n")[1] for page in written if "{code-cell}" in page]
+    assert len(executed) > 20
+    for header in executed:
+        assert "file_format: mystnb\n" in header
+        assert kernel in header
+
+
 def test_fractions_in_formulas_have_braces() -> None:
     """The writer of MathML takes 13 for one number in TeX's short form of a third."""
     written = [*pages.PAGES.glob("*.md"), *(ROOT / "prbayes").rglob("*.py")]
