@@ -143,7 +143,7 @@ def compare(
     return Comparison(data, coords=coords, attrs=attrs)
 
 
-class Comparison(xr.Dataset):
+class Comparison(xr.Dataset):  # type: ignore[no-untyped-call]
     """A dataset like any other, which notebooks show as a table."""
 
     __slots__ = ()
