@@ -12,6 +12,7 @@ import xarray as xr
 from scipy.stats import norm
 
 from prbayes._checks import Floats, called
+from prbayes._html import view
 from prbayes._weighted import INTERVAL
 from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.metrics.area import AreaMetric
@@ -38,6 +39,8 @@ from prbayes.model.support import shortcomings
 from prbayes.model.turns import in_turn
 from prbayes.response.inputs import event_shape
 
+# What a comparison has by result besides scores.
+COSTS = ("n_responses", "seconds")
 _METRICS = (ProbabilityResidual(), KullbackLeibler(), AreaMetric(), LogLikelihood())
 
 
@@ -73,7 +76,7 @@ def compare(
         result's sd); and by result: ``n_responses`` and ``seconds``, NaN where a result does not
         tell, and the discrepancy of the estimate's population under each metric, by the metric's
         class, with the simulator's name before it if there are several; NaN where stored responses
-        do not support it.
+        do not support it. A notebook shows it as a table.
 
     Raises
     ------
@@ -130,15 +133,51 @@ def compare(
     for i, key in enumerate(_Estimate._fields):
         data[key] = (dims, table[..., i])
     data["shift"] = (dims, shift)
-    data["n_responses"] = ("result", [column.n_responses for column in columns.values()])
-    data["seconds"] = ("result", [column.seconds for column in columns.values()])
+    for key in COSTS:
+        data[key] = ("result", [getattr(column, key) for column in columns.values()])
     if model is not None and nodes(model):
         scored = _table(columns, every)[..., 0]
         for key, scores in _scores(model, every, scored, metrics).items():
             data[key] = ("result", scores)
     coords = {"result": list(columns), "hyperparameter": names}
     attrs = {"interval": INTERVAL, **as_attributes(identity)}
-    return xr.Dataset(data, coords=coords, attrs=attrs)
+    return Comparison(data, coords=coords, attrs=attrs)
+
+
+class Comparison(xr.Dataset):  # type: ignore[no-untyped-call]
+    """A dataset like any other, which notebooks show as a table."""
+
+    __slots__ = ()
+
+    def _repr_html_(self) -> str:
+        """Show estimates as a table, and scores as sentences; a part of it as xarray does."""
+        whole = set(self.dims) == {"result", "hyperparameter"}
+        if not (whole and set(_Estimate._fields) <= set(self.data_vars)):
+            return super()._repr_html_()
+        rows = [
+            self._row(name, label)
+            for name in self["hyperparameter"].values
+            for label in self["result"].values
+        ]
+        header = ["", "result", "estimate", "sd", f"{INTERVAL:.0%} interval"]
+        return view("Comparison", header=header, rows=rows, sentences=self._scores())
+
+    def _row(self, name: str, label: str) -> list[str]:
+        """Return the cells of one hyperparameter and result."""
+        own = self.sel(hyperparameter=name, result=label)
+        estimate, sd, lower, upper = (f"{float(own[key]):.4g}" for key in _Estimate._fields)
+        return [str(name), str(label), estimate, sd, f"{lower} to {upper}"]
+
+    def _scores(self) -> list[str]:
+        """Return a sentence for each metric."""
+        lines = []
+        for key, scores in self.data_vars.items():
+            if scores.dims != ("result",) or key in COSTS:
+                continue
+            each = scores.to_series().items()
+            told = ", ".join(f"{label} {score:.4g}" for label, score in each)
+            lines.append(f"Discrepancy by {key}: {told}.")
+        return lines
 
 
 def _refuse_metrics(metrics: object) -> None:

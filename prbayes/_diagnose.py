@@ -13,6 +13,7 @@ import xarray as xr
 
 from prbayes._checks import Floats
 from prbayes._html import view
+from prbayes._pages import more_in
 from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.disagreement import disagreement
 from prbayes.estimate.goodness import UNLIKELY, Refitted, of_another_family, of_held_away
@@ -42,6 +43,9 @@ _ALL_DIFFERENT = 50
 # Part of their size below which draws are the same: thousands of times rounding, and far below the
 # width of any posterior from measured data.
 _SAME_DIGITS = 1e-12
+
+# Where the numbers behind sentences about draws are.
+_IN_NUMBERS = more_in("validity.md#diagnostics-of-the-sampler")
 
 _SUPPORT = ("weight_ess", "mean_weight", "lost_mass")
 
@@ -230,13 +234,15 @@ def _failed(failures: xr.Dataset) -> list[str]:
         found.append(
             f"The response of {name} failed at {own.sizes['failure']} point(s), the first at "
             f"({at}): {own['reason'].values[0]}; what took its place is no result. Look at "
-            "optimum.failures, or the group failures of a result, and repair the response."
+            "optimum.failures, or the group failures of a result, and repair the response"
+            f"{more_in('expensive.md#when-a-run-fails')}."
         )
     return found
 
 
 def _not_converged(message: str) -> str:
-    return f"The optimiser did not converge ({message}); try another start or method."
+    more = more_in("choose.md#optimiser-or-sampler")
+    return f"The optimiser did not converge ({message}); try another start or method{more}."
 
 
 # -- draws -----------------------------------------------------------------------------------
@@ -274,7 +280,8 @@ def _unadjusted(attrs: Mapping[Any, Any]) -> tuple[str, ...]:
         return ()
     return (
         "The draws are those of exp(-discrepancy / epsilon), as wide as epsilon makes them; "
-        "prb.adjust brings them to the width that the data warrant.",
+        "prb.adjust brings them to the width that the data warrant"
+        f"{more_in('choose.md#epsilon-and-the-width-of-the-posterior')}.",
     )
 
 
@@ -332,7 +339,7 @@ def _disagreement(posterior: xr.Dataset) -> list[str]:
         f"R-hat is {_listed(high, '.2f')}, expected at most {limit:.2f}: the chains disagree, "
         "look at az.plot_rank(idata). "
         "Pass more draws, or with prb.sample_smc a threshold of 0.8; "
-        "if the chains sit in separate modes, state a prior that excludes one."
+        f"if the chains sit in separate modes, state a prior that excludes one{_IN_NUMBERS}."
     ]
 
 
@@ -347,7 +354,7 @@ def _dependence(posterior: xr.Dataset) -> list[str]:
         return []
     return [
         f"The effective sample size is {_listed(low, '.0f')} of {total} draws: "
-        "too few for means and intervals. Pass more draws."
+        f"too few for means and intervals. Pass more draws{_IN_NUMBERS}."
     ]
 
 
@@ -392,7 +399,8 @@ def _copies(draws: xr.Dataset) -> list[str]:
     return [
         f"Of {draws.sizes['draw']} draws only {min(counts)} differ in {chains} {', '.join(few)}, "
         f"expected at least {expected}: few particles, or one, survived, and the width of the "
-        "draws means nothing. Pass more draws, priors nearer to the data, or a larger epsilon."
+        "draws means nothing. Pass more draws, priors nearer to the data, or a larger epsilon"
+        f"{_IN_NUMBERS}."
     ]
 
 
@@ -418,7 +426,7 @@ def _motion(result: xr.DataTree) -> list[str]:
         "so that many draws are the same. "
         f"The discrepancy is too noisy{why}, or epsilon too small: "
         "use prb.Reweighted or prb.Resimulated instead of prb.Fresh, "
-        "or pass a larger n or epsilon."
+        f"or pass a larger n or epsilon{_IN_NUMBERS}."
     ]
 
 
@@ -501,6 +509,7 @@ def _unsupported(designs: _Designs) -> list[str]:
         if lacking:
             messages.append(
                 f"{name}: the design does not support the answer: {lacking}. "
-                "Call prb.refine(model) and sample again, or use prb.Resimulated."
+                "Call prb.refine(model) and sample again, or use prb.Resimulated"
+                f"{more_in('choose.md#the-propagation')}."
             )
     return messages

@@ -179,7 +179,8 @@ def test_a_stored_optimum_tells_what_the_optimum_does() -> None:
     memory, stored = prb.diagnose(lost), prb.diagnose(lost.to_datatree())
     assert memory.messages == stored.messages
     assert memory.messages[:2] == ("It is flat.", "So so.")
-    assert "did not converge (stopped); try another start or method." in memory.messages[2]
+    said = "did not converge (stopped); try another start or method; see docs/choose.md"
+    assert said in memory.messages[2]
     assert memory.support.sizes == {"simulator": 1, "sample": 1}
 
 

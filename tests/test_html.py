@@ -1,5 +1,7 @@
 """Results in a notebook."""
 
+import pickle
+
 import numpy as np
 import pymc as pm
 import xarray as xr
@@ -38,6 +40,27 @@ def test_a_diagnosis_says_what_is_wrong_first() -> None:
     assert "2 problems" in text
     assert text.index("do this") < text.index("do that") < text.index("by the way")
     assert "no problem" in prb.Diagnosis((), support)._repr_html_()
+
+
+def test_a_comparison_is_a_table_and_a_part_of_it_a_dataset() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        prb.Simulator(
+            "y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0],
+            propagation=prb.Reweighted(64),
+        )  # fmt: skip
+    table = prb.compare({"the optimum": prb.minimize(model)}, model=model)
+    for shown in (table, pickle.loads(pickle.dumps(table)), table.copy()):
+        text = shown._repr_html_()
+        own = table.sel(result="the optimum", hyperparameter="mu")
+        assert text.count("<tr>") == 2
+        for key in ("estimate", "sd", "lower", "upper"):
+            assert f"{float(own[key]):.4g}" in text
+        assert ">the optimum</td>" in text
+        assert f"Discrepancy by AreaMetric: the optimum {float(own['AreaMetric']):.4g}." in text
+        assert "seconds" not in text
+    for part in (table[["estimate"]], own, table.drop_vars("lower")):
+        assert "xarray" in part._repr_html_()
 
 
 def test_a_test_of_validity_shows_its_verdict() -> None:

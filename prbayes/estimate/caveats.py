@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from prbayes._checks import Floats
+from prbayes._pages import more_in
 from prbayes._weighted import distribution_function, quantile
 from prbayes.estimate.confounding import confounded
 from prbayes.estimate.differences import cross
@@ -40,6 +41,8 @@ _DIFFERENT = 0.02
 # 1.5 and 1.9, of lognormal ones with a spread of 1, 2 and 2.5 2.4, 1.3 and 1.1.
 _TAIL = 0.02
 _NO_MEAN = 1.1
+# Where metrics are chosen by what data are like.
+_OF_METRICS = more_in("choosing_metric.md#advice")
 # Halvings of the way back to the middle of the prior: a thousandth of it is a tenth of a spread
 # where an optimum is a hundred spreads out.
 _HALVINGS = 10
@@ -53,14 +56,14 @@ def breakdown(at_edge: tuple[str, ...], at_jump: tuple[str, ...]) -> list[str]:
         lines.append(
             f"{names} ran to the edge of the support, where the discrepancy no longer changes; "
             "perhaps the population has collapsed within the bandwidth of the metric: use a "
-            "smaller bandwidth, or prb.AreaMetric(), which has none"
+            f"smaller bandwidth, or prb.AreaMetric(), which has none{_OF_METRICS}"
         )
     if at_jump:
         names = ", ".join(at_jump)
         lines.append(
             f"{names}: points lose their response at the optimum, and the discrepancy jumps "
             "there by more than it changes otherwise: use prb.AreaMetric(), prb.Reweighted(), or "
-            "more responses"
+            f"more responses{more_in('choose.md#the-propagation')}"
         )
     return lines
 
@@ -187,7 +190,7 @@ def heavy_tails(evaluator: Evaluator, theta: Floats) -> list[str]:
                 f"{index:.2f}, of which one or less has no mean) that the area between "
                 "distribution functions is infinite, or rests on responses beyond all that were "
                 "computed: use prb.ProbabilityResidual() or prb.KullbackLeibler(), inputs with a "
-                "mean, or the logarithm of the response"
+                f"mean, or the logarithm of the response{_OF_METRICS}"
             )
     return lines
 
@@ -239,7 +242,7 @@ def _of_design(evaluator: Evaluator, error: float) -> str:
     return (
         f"the optimum of another design would differ by about {error:.2f} standard errors, "
         f"expected at most {AGREE}; pass a larger n or max_points to prb.Reweighted (now {points} "
-        "runs)"
+        f"runs){more_in('choose.md#how-many-responses')}"
     )
 
 
@@ -254,12 +257,14 @@ def _of_rival(evaluator: Evaluator, rival: Rival) -> str:
     return (
         f"the data could as well come from {place}: another optimum, or mirror "
         "solution, whose discrepancy differs by no more than sampling noise; state a prior that "
-        "excludes one, or report both"
+        f"excludes one, or report both{more_in('optimum_or_abc.md#two-answers')}"
     )
 
 
 def _of_direction(direction: str) -> str:
+    more = more_in("optimum_or_abc.md#no-answer")
     return (
         f"the data tell less than the prior about {direction} (in units of the priors' standard "
-        "deviations): it is not identified by them, and its posterior rests on the prior"
+        "deviations): it is not identified by them, and its posterior rests on the prior; measure "
+        f"more outputs or conditions, or state what is known{more}"
     )

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
+from prbayes._pages import more_in
 from prbayes.estimate.goodness import UNLIKELY
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.hyperparameters import THETAS
@@ -106,4 +107,5 @@ def of_conflict(probabilities: dict[str, float]) -> list[str]:
         f"prior and data contradict each other ({what}): estimates as far out as that of the data "
         f"are {probability:.1%} of those that the prior leads to, expected at least "
         f"{UNLIKELY:.0%}; look at the prior, and at prb.minimize without it"
+        f"{more_in('optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something')}"
     ]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
+from prbayes._pages import more_in
 from prbayes.estimate.identifiability import named_direction
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
@@ -42,6 +43,7 @@ def confounded(evaluator: Evaluator, local: Local) -> list[str]:
             lines.append(
                 f"{node.name}: the data do not tell the model inadequacy from the inputs: {found}; "
                 "measure under more conditions, state narrower priors, or leave one of them out"
+                f"{more_in('inadequacy.md#can-it-be-told-from-the-scatter-of-the-inputs')}"
             )
     return lines
 

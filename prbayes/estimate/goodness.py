@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
+from prbayes._pages import more_in
 from prbayes.estimate.data_sets import DataSets, observed_set, simulated_sets
 from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.projections import number_parts
@@ -232,4 +233,5 @@ def of_another_family(probability: float) -> list[str]:
         f"the data are farther from the best population than {1 - probability:.1%} of data sets "
         "that the model draws there are from theirs: the inputs probably have another family, or "
         "the response an error; look at prb.plot_responses, and at outliers"
+        f"{more_in('choosing_metric.md#a-wrong-family')}"
     ]

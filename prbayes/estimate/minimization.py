@@ -23,6 +23,7 @@ from prbayes._checks import (
     real_array,
     seed_number,
 )
+from prbayes._pages import more_in
 from prbayes._progress import progress, shown
 from prbayes.estimate.caveats import breakdown, caveats, elements_at_edge, heavy_tails
 from prbayes.estimate.data_sets import SETS
@@ -727,7 +728,7 @@ def _stopped(plan: _Plan, begun: _Beginning, state: _State, reason: str) -> Opti
     line = (
         f"{reason} before the minimisation was finished, so that this is no answer yet; "
         f"{kept(plan.evaluator)}; call prb.minimize with a larger budget, on a model that is built "
-        "again, to go on"
+        f"again, to go on{more_in('expensive.md#a-night-is-not-enough')}"
     )
     _log.warning("%s", line)
     return replace(found, seconds=time.perf_counter() - plan.clock, warnings=(line,))

@@ -25,7 +25,7 @@ from prbayes.metrics.density import (
 
 @dataclass(frozen=True)
 class LogLikelihood(Metric):
-    r"""Negative mean log-likelihood of the observed values, :math:`-\frac1N \sum_i \log p(z_i)`.
+    r"""Negative mean log-likelihood of observed values, :math:`-\frac{1}{N} \sum_i \log p(z_i)`.
 
     Only the simulated side is smoothed, which makes the fitted population narrower by about
     :math:`h^2/(2\sigma^2)`; the default bandwidth keeps that below a tenth of the sampling error.

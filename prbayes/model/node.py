@@ -29,6 +29,7 @@ from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats, called
+from prbayes._pages import more_in
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Design, design_of
@@ -288,6 +289,7 @@ def _log_density(
         f"{node.name}: epsilon is not set; call prb.set_epsilon(model, "
         "prb.calibrate_epsilon(prb.minimize(model))), pass epsilon= to prb.Simulator, or use "
         "prb.sample_smc, which calibrates it"
+        f"{more_in('choose.md#epsilon-and-the-width-of-the-posterior')}"
     )
     if np.isnan(node.epsilon_value):
         # nutpie tells no more of an error than its number; nobody else has to be told who may yet

@@ -147,6 +147,7 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     _refuse_name(name, model)
     refuse_uncallable(name, response)
     sorted_inputs = read_inputs(name, inputs, model)
+    _refuse_simulators(name, sorted_inputs, model)
     for root in sorted_inputs.roots:
         refuse_single_precision(f"{name}: {root.name}", root.dtype)
     places, measured = _grouped(name, sorted_inputs, observed)
@@ -424,6 +425,17 @@ def _with_inputs(bound: Bound, others: list[Node], group: str) -> tuple[str, ...
     alike = [other for other in others if other.group == group]
     theirs = {other.name: map(id, other.bound.inputs.aleatory) for other in alike}
     return tuple(name for name, inputs in theirs.items() if not own.isdisjoint(inputs))
+
+
+def _refuse_simulators(name: str, inputs: Inputs, model: pm.Model) -> None:
+    """Refuse a simulator above another one: its value is measured data, and no hyperparameter."""
+    for other in nodes(model):
+        if other in inputs.roots:
+            raise TypeError(
+                f"{name}: got inputs that depend on the simulator {other.name}, expected "
+                "hyperparameters; let one response call the other, or return the outputs of both "
+                "from one response, with prb.Joint(metric)"
+            )
 
 
 def _refuse_alike_labels(name: str, labels: NDArray[Any], others: list[Node]) -> None:

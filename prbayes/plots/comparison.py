@@ -9,13 +9,11 @@ import numpy as np
 import xarray as xr
 
 from prbayes._checks import Floats, flag
+from prbayes._compare import COSTS
 from prbayes.plots._canvas import BLUE, DOTTED, GREY, INK, Canvas, Panel, refuse_look
 from prbayes.plots._names import named, refuse_labels
 from prbayes.plots._objective import METRIC_LABELS
 from prbayes.plots._ticks import round_ticks
-
-# What a comparison has by result besides scores.
-_COSTS = ("n_responses", "seconds")
 
 
 def plot_comparison(
@@ -115,7 +113,7 @@ def _scores(comparison: xr.Dataset) -> list[str]:
     """Return the names of the scores."""
     found = []
     for name, values in comparison.data_vars.items():
-        if values.dims == ("result",) and name not in _COSTS:
+        if values.dims == ("result",) and name not in COSTS:
             found.append(str(name))
     if not found:
         raise ValueError(

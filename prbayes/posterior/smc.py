@@ -16,6 +16,7 @@ import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from prbayes._checks import Floats, Seed, file_path, flag, positive_integer, seed_number, share
+from prbayes._pages import more_in
 from prbayes._progress import shown
 from prbayes.estimate.minimization import Minimisation, find_optimum, require_finished
 from prbayes.estimate.obstacles import refit_obstacle
@@ -315,6 +316,7 @@ def _of_budget(stopped: str, particles: Particles, asked: Sampling) -> list[str]
     line = (
         f"{stopped}, so that {len(particles.stats)} of {asked.chains} chains are here, and what "
         f"would have cost responses is left out; call prb.sample_smc with a larger budget{again}"
+        f"{more_in('expensive.md#a-night-is-not-enough')}"
     )
     _log.warning("%s", line)
     return [line]
@@ -347,7 +349,7 @@ def _of_lost(evaluator: Evaluator, particles: Particles) -> list[str]:
                 f"{node.name}: lost mass: of {share:.0%} of the draws more than max_lost = "
                 f"{most:.1%} of the population has no response (NaN), so that they rest on the "
                 "specimens that have one; repair the response, return +inf for specimens that "
-                "fail, or narrow the priors"
+                f"fail, or narrow the priors{more_in('expensive.md#when-a-run-fails')}"
             )
     for line in lines:
         _log.warning("%s", line)
@@ -451,7 +453,11 @@ class _Draws:
     def warn(self) -> None:
         """Say it in the log."""
         if self.reason is not None:
-            _log.warning("the draws are not adjusted: %s; their width is epsilon's", self.reason)
+            _log.warning(
+                "the draws are not adjusted: %s; their width is epsilon's%s",
+                self.reason,
+                more_in("choose.md#epsilon-and-the-width-of-the-posterior"),
+            )
             return
         for line in self.warnings:
             _log.warning("%s", line)

@@ -15,6 +15,7 @@ from pytensor.compile import function
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import AT_ONCE, Floats, positive_integer
+from prbayes._pages import more_in
 from prbayes.metrics.base import Discrepancy
 from prbayes.propagation.base import (
     BY_EVALUATIONS,
@@ -124,11 +125,12 @@ class ResimulatedBound(Bound):
                 "%s: the log-likelihood of %d resimulated responses sees too little of the tails: "
                 "its standard errors and posterior come out too narrow, expected at least "
                 "%.0f responses, %d for each observation; use prb.Reweighted(n), "
-                "prb.KullbackLeibler() or a larger n",
+                "prb.KullbackLeibler() or a larger n%s",
                 self.name,
                 self.n_per_theta,
                 enough,
                 per_observation,
+                more_in("choose.md#how-many-responses"),
             )
 
     def _accepts_tensors(

@@ -21,7 +21,7 @@ def u_values(
 
     This is the probability integral transform:
 
-    .. math:: u_i = \tfrac12 \{ P(Y < y_i) + P(Y \le y_i) \}
+    .. math:: u_i = \tfrac{1}{2} \{ P(Y < y_i) + P(Y \le y_i) \}
 
     over all draws and samples of the prediction together. Several conditions pool their u-values.
 

@@ -204,7 +204,8 @@ def test_a_hyperparameter_without_effect_is_named_and_makes_no_rivals() -> None:
     assert optimum.rivals == ()
     (line,) = optimum.warnings
     assert "about idle (" in line
-    assert line.endswith("it is not identified by them, and its posterior rests on the prior")
+    assert "it is not identified by them, and its posterior rests on the prior; measure" in line
+    assert line.endswith("; see docs/optimum_or_abc.md#no-answer")
 
 
 def test_rivals_stand_where_the_optimum_does_along_unidentified_directions() -> None:

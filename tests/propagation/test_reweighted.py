@@ -609,7 +609,7 @@ def test_diagnose_says_what_to_do() -> None:
         assert message.startswith(
             f"{name}: the design does not support the answer: weight effective sample size"
         )
-        assert "Call prb.refine(model) and sample again, or use prb.Resimulated." in message
+        assert "Call prb.refine(model) and sample again, or use prb.Resimulated; see" in message
     assert float(found.support["weight_ess"].max()) < 5
 
 

@@ -1,0 +1,135 @@
+"""Ideas of PyMC's own tests of `pymc.Simulator` and of SMC, carried over; the rest stands elsewhere.
+
+`docs/pymc_and_arviz.md` lists all of them, each with the test that holds it.
+"""
+
+from __future__ import annotations
+
+import random
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+from pytensor.tensor.random.type import RandomType
+
+import prbayes as prb
+from prbayes.response.compilation import PLAIN
+
+OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 40)
+CALLS: list[int] = []
+
+
+def response(x: Any) -> Any:
+    CALLS.append(np.size(x))
+    return np.positive(x)
+
+
+def build(propagation: Any = None, name: str = "", epsilon: float = 0.05) -> pm.Model:
+    """Return the model of a normal population, with starting values of its own."""
+    with pm.Model(name=name) as model:
+        a = pm.Normal("a", 0, 1, initval=0.75)
+        b = pm.HalfNormal("b", 1, initval=0.5)
+        prb.Simulator(
+            "s",
+            response,
+            pm.Normal.dist(a, b),
+            metric=prb.AreaMetric(),
+            observed=OBSERVED,
+            epsilon=epsilon,
+            propagation=prb.Reweighted(64) if propagation is None else propagation,
+        )
+    return model
+
+
+@cache
+def named() -> pm.Model:
+    return build(name="outer")
+
+
+def draws(model: pm.Model) -> Any:
+    found = prb.sample_smc(
+        20, chains=2, model=model, epsilon=0.05, adjust=False, random_seed=1, progressbar=False
+    )
+    return found.posterior
+
+
+@pytest.mark.parametrize("propagation", [prb.Reweighted(64), prb.Resimulated(64)])
+def test_a_log_density_has_no_randomness_of_its_own(propagation: Any) -> None:
+    """Unlike that of PyMC's simulator, which is another one at each call."""
+    model = build(propagation)
+    density = model.compile_logp(mode=PLAIN)
+    point = model.initial_point()
+    assert density(point) == density(point)
+    assert not [v for v in density.f.get_shared() if isinstance(v.type, RandomType)]
+
+
+def test_a_log_density_of_fresh_responses_is_another_one_each_time() -> None:
+    model = build(prb.Fresh(64))
+    density = model.compile_logp(mode=PLAIN)
+    point = model.initial_point()
+    assert density(point) != density(point)
+
+
+def test_a_named_model_has_named_results() -> None:
+    names = {"outer::a", "outer::b"}
+    assert set(draws(named()).data_vars) == names
+    assert set(prb.minimize(named(), starts=0, progressbar=False).point) == names
+
+
+def test_a_potential_bounds_the_draws() -> None:
+    model = build()
+    with model:
+        pm.Potential("above", pm.math.switch(model["a"] > 0.95, 0.0, -np.inf))
+    found = draws(model)["a"].values
+    assert found.min() > 0.95
+    # Without it, half of them are below
+    assert np.mean(draws(named())["outer::a"].values < 0.95) > 0.2
+
+
+def test_global_random_states_are_left_alone() -> None:
+    before = np.random.get_state()[1].tolist(), random.getstate()  # noqa: NPY002
+    draws(build())
+    after = np.random.get_state()[1].tolist(), random.getstate()  # noqa: NPY002
+    assert before == after
+
+
+def test_starting_values_are_the_users_and_cost_no_response() -> None:
+    model = build()
+    before = len(CALLS)
+    point = model.initial_point()
+    assert len(CALLS) == before
+    assert point["a"] == 0.75
+    assert np.exp(point["b_log__"]) == pytest.approx(0.5)
+
+
+def test_one_number_is_no_sample() -> None:
+    with pm.Model():
+        x = pm.Normal.dist(pm.Normal("a", 0, 1), 1.0)
+        with pytest.raises(ValueError, match=r"s: observed: got an array of shape \(\), expected"):
+            prb.Simulator("s", response, x, metric=prb.AreaMetric(), observed=5.0)
+
+
+def test_a_simulator_above_another_is_refused_before_its_response_is_computed() -> None:
+    with build() as model:
+        before = len(CALLS)
+        for above in (model["s"], model["s"].mean()):
+            x = pm.Normal.dist(above, 1.0)
+            with pytest.raises(TypeError, match=r"t: got inputs that depend on the simulator s"):
+                prb.Simulator("t", response, x, metric=prb.AreaMetric(), observed=OBSERVED)
+    assert len(CALLS) == before
+
+
+@pytest.mark.parametrize("call", [prb.sample_smc, prb.minimize])
+def test_discrete_hyperparameters_are_refused(call: Any) -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(2.0 * pm.Bernoulli("z", 0.5) - 1.0, 0.5)
+        prb.Simulator("s", response, x, metric=prb.AreaMetric(), observed=OBSERVED)
+    with pytest.raises(TypeError, match=r"got discrete hyperparameters \['z'\], expected"):
+        call(model=model)
+
+
+def test_too_few_draws_are_refused() -> None:
+    with pytest.raises(ValueError, match="draws: got 5, expected an integer >= 10"):
+        prb.sample_smc(5, model=named())
