@@ -636,10 +636,19 @@ def checked(
     event = array.shape[len(batch) :]
     wanted = event[:1] if outputs is None else outputs.event
     if array.shape != batch + wanted:
+        remedy = (
+            "reduce over the event axis only (the last one), or wrap a function of one specimen in "
+            "prb.scalar"
+        )
+        if event and event in {np.shape(a)[len(batch) :] for a in arguments}:
+            remedy = (
+                "it is as long as an input, which has several elements; reduce over them, or where "
+                "they are of groups, such as suppliers, index their hyperparameters by "
+                "prb.response.group"
+            )
         raise ResponseError(
             f"the response returned shape {array.shape} for inputs of shapes {shapes(arguments)}, "
-            f"expected {batch + wanted}: {_each(wanted)}; reduce over the event axis only (the "
-            "last one), or wrap a function of one specimen in prb.scalar"
+            f"expected {batch + wanted}: {_each(wanted)}; {remedy}"
         )
     values = array.astype(np.float64)
     if wanted:

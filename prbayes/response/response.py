@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -66,6 +67,24 @@ def refuse_misfit(
     refuse = getattr(getattr(function, "function", None), "refuse_misfit", None)
     if refuse is not None:
         refuse(name, sizes(), outputs)
+
+
+def _refuse_other_number(name: str, function: object, inputs: Inputs) -> None:
+    """Raise if a function says that it takes more or fewer arguments than there are inputs."""
+    own: Any = getattr(function, "function", function)
+    try:
+        # Of a decorated function: what it takes itself.
+        signature = inspect.signature(own, follow_wrapped=False)
+    except (TypeError, ValueError):
+        return
+    try:
+        signature.bind(*inputs.arguments)
+    except TypeError as error:
+        raise TypeError(
+            f"{name}: response: got inputs of {_sizes(inputs)} numbers for "
+            f"a function of {signature} ({error}), expected an input for each argument; a "
+            "multivariate input is one argument, an array with an axis for its elements"
+        ) from None
 
 
 def refuse_calling(executor: object, store: object, version: object, on_failure: object) -> None:
@@ -176,6 +195,7 @@ class Responses:
         outputs: Outputs | None = ONE,
     ) -> None:
         refuse_uncallable(name, function)
+        _refuse_other_number(name, function, inputs)
         refuse_misfit(name, function, partial(_sizes, inputs), outputs)
         for caveat in caveats_of(function):
             _log.warning("%s", caveat)

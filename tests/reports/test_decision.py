@@ -61,7 +61,7 @@ def test_the_picture_is_of_the_shares() -> None:
 def test_what_is_no_decision_or_another_problem_s_is_refused() -> None:
     with pytest.raises(TypeError, match=r"decision: got int, expected the Dataset"):
         report(decision={"a": 3})
-    with pytest.raises(TypeError, match="got Dataset"):
+    with pytest.raises(TypeError, match="got Comparison"):
         report(decision=prb.compare({"optimum": optimum()}))
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("tau", 0, 1), 1.0)

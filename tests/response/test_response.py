@@ -116,20 +116,43 @@ def test_two_responses_are_the_same_by_function_inputs_and_constants() -> None:
         other = pm.Normal.dist(MU, 1.0)
 
     def same(function: Any, *given: Any) -> bool:
-        one = Responses("y", weighted, inputs(PAIR, 2.0, X))
+        one = Responses("y", of_any, inputs(PAIR, 2.0, X))
         return one.same_as(Responses("z", function, inputs(*given)))
 
-    assert same(weighted, PAIR, 2.0, X)
-    assert not same(by_rows, PAIR, 2.0, X)
-    assert not same(weighted, PAIR, 3.0, X)
-    assert not same(weighted, X, 2.0, PAIR)
-    assert not same(weighted, PAIR, 2.0, other)
-    assert not same(weighted, PAIR, 2.0)
-    assert not same(weighted, PAIR, X, X)
+    assert same(of_any, PAIR, 2.0, X)
+    assert not same(first_of_any, PAIR, 2.0, X)
+    assert not same(of_any, PAIR, 3.0, X)
+    assert not same(of_any, X, 2.0, PAIR)
+    assert not same(of_any, PAIR, 2.0, other)
+    assert not same(of_any, PAIR, X, X)
+    assert not same(of_any, PAIR, 2.0)
     # A variable that is common to all specimens is the same input if it is the same variable.
-    epistemic = Responses("y", weighted, inputs(X, MU))
-    assert epistemic.same_as(Responses("y", weighted, inputs(X, MU)))
-    assert not epistemic.same_as(Responses("y", weighted, inputs(X, 2.0)))
+    epistemic = Responses("y", of_any, inputs(X, MU))
+    assert epistemic.same_as(Responses("y", of_any, inputs(X, MU)))
+    assert not epistemic.same_as(Responses("y", of_any, inputs(X, 2.0)))
+
+
+def of_any(*values: Any) -> Any:
+    return values[0]
+
+
+def first_of_any(*values: Any) -> Any:
+    return values[0]
+
+
+def test_a_function_of_other_arguments_is_refused_before_it_is_called() -> None:
+    def wrapped(x: Any) -> Any:
+        return of_any(x)
+
+    Responses("y", wrapped, inputs(X))
+    # What a decorator says of the function inside is not what is called.
+    wrapped.__wrapped__ = lambda a, b: a  # type: ignore[attr-defined]
+    Responses("y", wrapped, inputs(X))
+    Responses("y", np.exp, inputs(X))
+    told = r"y: response: got inputs of \[2\] numbers for a function of \(a, b\) \(missing"
+    for function in (lambda a, b: a, scalar(lambda a, b: a)):
+        with pytest.raises(TypeError, match=told):
+            Responses("y", function, inputs(PAIR))
 
 
 @pytest.mark.exact
