@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import tracemalloc
+import weakref
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from line_problem import OBSERVED, line
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.node import nodes
 
 MIB = 1 << 20
 GROWTH = """
@@ -83,6 +85,20 @@ def test_an_evaluator_goes_with_its_last_user() -> None:
     for _ in range(2):
         prb.minimize(model, progressbar=False)
     assert alive() <= before
+
+
+def test_a_design_goes_with_its_model_and_stays_with_what_was_compiled() -> None:
+    model = build()
+    prb.minimize(model, progressbar=False)
+    drawn = pm.compile([model["mu"], model["sigma"]], model["y"])
+    (node,) = nodes(model).values()
+    design = weakref.ref(node.bound)
+    del model, node
+    gc.collect()
+    assert drawn(2.0, 1.0).shape == OBSERVED.shape
+    del drawn
+    gc.collect()
+    assert design() is None
 
 
 @linux

@@ -154,6 +154,10 @@ class SimulatorRV(RandomVariable):
     Two of them are equal if they carry the same node, so that no rewrite of a graph takes one
     simulator for another.
 
+    PyTensor's rewriters remember every operation that they have met, as long as the process lasts.
+    So the node, with all stored responses, is held by the applications of the operation, which live
+    as long as a model or a compiled function, and not by the operation itself.
+
     Attributes
     ----------
     node : Node
@@ -173,9 +177,34 @@ class SimulatorRV(RandomVariable):
         # What pictures of the model show.
         told = f"Simulator of {_plain_name(node)} by {type(node.metric).__name__}"
         super().__init__(name=name or told, signature=signature, dtype=dtype, inplace=inplace)
-        self.node = node
+        self._node = weakref.ref(node)
         self._owner: weakref.ref[Any] | None = None
         self._warned = False
+
+    @property
+    def node(self) -> Node:
+        """The simulator."""
+        found = self._node()
+        if found is None:
+            raise RuntimeError(f"{self}: got an operation of a model that is gone")
+        return found
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether it is of the same node, and applied alike."""
+        return type(self) is type(other) and self._told() == other._told()
+
+    def __hash__(self) -> int:
+        """Return a number that stays when the node is gone."""
+        return hash((type(self), self.name, self.signature, self.dtype, self.inplace))
+
+    def _told(self) -> tuple[Any, ...]:
+        return self.name, self.signature, self.dtype, self.inplace, self._node
+
+    def make_node(self, *inputs: Any, **keywords: Any) -> Apply[Any, Any]:
+        """Apply the operation; copies of the application hold the node as well."""
+        apply = super().make_node(*inputs, **keywords)
+        apply.tag.simulator = self.node
+        return apply
 
     def __str__(self) -> str:
         """Show the name and the signature, without what the node holds."""
@@ -190,7 +219,12 @@ class SimulatorRV(RandomVariable):
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the owner: a copy that is unpickled belongs to a model of its own."""
-        return {**self.__dict__, "_owner": None}
+        return {**self.__dict__, "_owner": None, "_node": self.node}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take what was left in."""
+        self.__dict__.update(state)
+        self._node = weakref.ref(state["_node"])
 
     def own_node(self, apply: Apply[Any, Any]) -> Node:
         """Return the node that belongs to an application of this operation in a model.
@@ -209,6 +243,7 @@ class SimulatorRV(RandomVariable):
         """Let an application in a model have an operation of its own, which carries a node."""
         own = SimulatorRV(**{**self._props_dict(), "node": node})
         apply.op = own
+        apply.tag.simulator = node
         return own.own_node(apply)
 
     def rng_fn(self, rng: np.random.Generator, *arguments: Any) -> Floats:
