@@ -457,3 +457,16 @@ def test_traces_of_pymc_take_points_of_value_variables() -> None:
     held.setup(1, 0)
     held.record({"sigma_log__": np.asarray(0.0)}, in_warmup=False)
     assert MultiTrace([held])["sigma"].tolist() == [1.0]
+
+
+def test_a_copy_of_a_function_takes_other_shared_variables() -> None:
+    from pytensor.tensor.sharedvar import TensorSharedVariable
+
+    nothing, mine = pytensor.shared(np.zeros(0)), pytensor.shared(np.arange(3.0))
+    assert all(isinstance(v, TensorSharedVariable) for v in (nothing, mine))
+    assert mine.default_update is None
+    function = pytensor.function([], [nothing.sum()])
+    copied = function.copy(swap={nothing: mine})
+    assert (function()[0], copied()[0]) == (0, 3)
+    mine.set_value(np.ones(2))
+    assert copied()[0] == 2

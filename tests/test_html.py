@@ -10,6 +10,16 @@ import prbayes as prb
 from prbayes._html import view
 
 
+def build() -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        prb.Simulator(
+            "y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0],
+            propagation=prb.Reweighted(64),
+        )  # fmt: skip
+    return model
+
+
 def test_texts_are_escaped() -> None:
     text = view("<b>", header=["", "<i>"], rows=[["a<u>", "1 < 2"]], sentences=["x & y"])
     for tag in ("<i>", "<u>", "1 < 2", "x & y"):
@@ -19,13 +29,7 @@ def test_texts_are_escaped() -> None:
 
 
 def test_an_optimum_is_a_table() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-        prb.Simulator(
-            "y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0],
-            propagation=prb.Reweighted(64),
-        )  # fmt: skip
-    optimum = prb.minimize(model)
+    optimum = prb.minimize(build())
     text = optimum._repr_html_()
     assert ">mu</th>" in text
     assert f"{optimum.n_evaluations} evaluations" in text
@@ -43,12 +47,7 @@ def test_a_diagnosis_says_what_is_wrong_first() -> None:
 
 
 def test_a_comparison_is_a_table_and_a_part_of_it_a_dataset() -> None:
-    with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
-        prb.Simulator(
-            "y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0],
-            propagation=prb.Reweighted(64),
-        )  # fmt: skip
+    model = build()
     table = prb.compare({"the optimum": prb.minimize(model)}, model=model)
     for shown in (table, pickle.loads(pickle.dumps(table)), table.copy()):
         text = shown._repr_html_()

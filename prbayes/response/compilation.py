@@ -18,6 +18,7 @@ from pytensor.graph.replace import graph_replace, vectorize_graph
 from pytensor.graph.rewriting.basic import node_rewriter, out2in
 from pytensor.graph.traversal import ancestors, toposort
 from pytensor.tensor.elemwise import Elemwise
+from pytensor.tensor.sharedvar import TensorSharedVariable
 from pytensor.tensor.variable import TensorVariable
 
 # Operands of a sum: NumPy has 32 for one operation, the result among them, and PyTensor puts all
@@ -92,21 +93,40 @@ def compiled(
 
     The second evaluator of a model, and of a model that was built again, asks for what the first
     one did. It gets a copy of that function, with a memory of its own: two threads may call both.
+    Shared variables are those of the one who asks; what is kept has others, of no values.
     """
+    shared = _shared(outputs)
     try:
-        key = (allow_input_downcast, _structure(inputs, outputs))
+        key = (allow_input_downcast, _structure([*inputs, *shared], outputs))
     except _NotKeptError:
         return _function(inputs, outputs, allow_input_downcast)
     with _lock:
-        if key in _known:
+        known = _known.get(key)
+        if known is not None:
             _known.move_to_end(key)
-            return _known[key].copy()
-    function = _function(inputs, outputs, allow_input_downcast)
+    if known is None:
+        empty = {variable: _empty(variable) for variable in shared}
+        graphs = graph_replace(list(outputs), empty, strict=False) if empty else outputs
+        known = _function(inputs, graphs, allow_input_downcast), list(empty.values())
+    function, of_nothing = known
     with _lock:
-        _known[key] = function
+        _known[key] = known
         while len(_known) > _KEPT:
             _known.popitem(last=False)
-        return function.copy()
+        return function.copy(swap=dict(zip(of_nothing, shared, strict=True)))
+
+
+def _shared(outputs: Sequence[TensorVariable]) -> list[Any]:
+    """Return the shared variables of a graph, but not generators of random numbers."""
+    found = ancestors(outputs)
+    return [v for v in found if isinstance(v, TensorSharedVariable) and v.default_update is None]
+
+
+def _empty(variable: Any) -> Any:
+    """Return a shared variable of the same type that holds next to nothing."""
+    shape = variable.type.shape
+    nothing = np.zeros([size or 0 for size in shape], dtype=variable.dtype)
+    return pytensor.shared(nothing, shape=shape)
 
 
 def _function(
@@ -134,7 +154,7 @@ def _structure(
     Raises
     ------
     _NotKeptError
-        If the graph has shared variables, operations of a user's or of ours, or many constants.
+        If the graph has random numbers, operations of a user's or of ours, or many constants.
     """
     number: dict[Variable, int] = {}
     said: list[Hashable] = []

@@ -71,7 +71,7 @@ def refuse_misfit(
 
 def _refuse_other_number(name: str, function: object, inputs: Inputs) -> None:
     """Raise if a function says that it takes more or fewer arguments than there are inputs."""
-    own: Any = getattr(function, "function", function)
+    own: Any = function.function if isinstance(function, scalar) else function
     try:
         # Of a decorated function: what it takes itself.
         signature = inspect.signature(own, follow_wrapped=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -159,11 +161,43 @@ class Theirs(Op):
         outputs[0][0] = 2 * inputs[0]
 
 
-@pytest.mark.parametrize("what", ["shared", "operation", "inside", "large"])
+@pytest.mark.parametrize("shape", [(None,), (3,)], ids=["of any length", "of three"])
+def test_shared_variables_are_those_of_the_one_who_asks(
+    shape: tuple[int | None], compilations: list[Any]
+) -> None:
+    def total(held: Any, scale: Any) -> Any:
+        x = pt.dscalar()
+        return compiled([x], [x * scale * pt.exp(held).sum()])
+
+    mine, other = (pytensor.shared(np.full(3, value), shape=shape) for value in (0.0, 1.0))
+    double = pytensor.shared(2.0)
+    first, second = total(mine, double), total(other, double)
+    assert len(compilations) == 1
+    np.testing.assert_allclose([first(1.0)[0], second(1.0)[0]], [6, 6 * np.e])
+    mine.set_value(np.full(3, -1.0))
+    np.testing.assert_allclose([first(1.0)[0], second(1.0)[0]], [6 / np.e, 6 * np.e])
+    # Which one goes where is a part of what the graph is, and so is their type.
+    assert total(mine, mine)(1.0)[0].shape == (3,)
+    total(pytensor.shared(np.zeros((3, 1))), double)
+    assert len(compilations) == 3
+
+
+def test_values_that_are_shared_go_with_the_last_function(compilations: list[Any]) -> None:
+    values = pytensor.shared(np.zeros(5))
+    x = pt.dscalar()
+    function = compiled([x], [x + values])
+    gone = weakref.ref(values)
+    del values, function
+    gc.collect()
+    assert gone() is None
+    assert len(compilation._known) == len(compilations) == 1
+
+
+@pytest.mark.parametrize("what", ["generator", "operation", "inside", "large"])
 def test_what_may_be_a_users_is_not_kept(what: str, compilations: list[Any]) -> None:
     x = pt.dvector()
     graph = {
-        "shared": lambda: x + pytensor.shared(np.ones(2)),
+        "generator": lambda: x + pt.random.normal(rng=pytensor.shared(np.random.default_rng(0))),
         "operation": lambda: Theirs()(x),
         "inside": lambda: pt.vectorize(Theirs(), signature="(n)->(n)")(pt.stack([x, x])),
         "large": lambda: x.sum() + np.arange(1e4),

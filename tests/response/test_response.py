@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
@@ -153,6 +155,25 @@ def test_a_function_of_other_arguments_is_refused_before_it_is_called() -> None:
     for function in (lambda a, b: a, scalar(lambda a, b: a)):
         with pytest.raises(TypeError, match=told):
             Responses("y", function, inputs(PAIR))
+
+
+class Meshed:
+    """A user's model: what it was made of has other arguments than a call of it."""
+
+    def __init__(self, function: Any) -> None:
+        self.function = function
+
+    def __call__(self, x: Any) -> Any:
+        return self.function(x, 2.0)
+
+
+def test_a_model_that_keeps_a_function_is_asked_for_its_own_arguments() -> None:
+    Responses("y", Meshed(lambda x, mesh: mesh * x), inputs(X))
+
+
+@pytest.mark.parametrize("wrap", [np.vectorize, functools.lru_cache, numba.njit])
+def test_a_function_that_does_not_say_its_arguments_is_taken(wrap: Any) -> None:
+    Responses("y", wrap(lambda x: 2.0 * x), inputs(X))
 
 
 @pytest.mark.exact
