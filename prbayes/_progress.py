@@ -27,6 +27,8 @@ _log = logging.getLogger("prbayes")
 
 # Expected seconds from which there is a bar. By judgement: as long as one waits without wondering.
 _SHOWN_FROM = 2.0
+# Seconds between lines where no bar can move. By judgement: a log of a night is not all bars.
+_LINE_EVERY = 60.0
 
 
 def _in_kernel() -> bool:
@@ -59,6 +61,24 @@ def live() -> bool:
     return CONSOLE.is_terminal or CONSOLE.is_jupyter
 
 
+def lines() -> Callable[[str], None]:
+    """Return a function that writes a text where no bar can move, as in a log, once in a minute.
+
+    In a notebook without widgets, such as an executed page, it writes nothing.
+    """
+    silent = live() or _hidden.get() or _in_kernel()
+    last = time.perf_counter()
+
+    def write(text: str) -> None:
+        nonlocal last
+        now = time.perf_counter()
+        if not silent and now - last >= _LINE_EVERY:
+            last = now
+            CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    return write
+
+
 _hidden: ContextVar[bool] = ContextVar("hidden", default=False)
 
 
@@ -78,7 +98,7 @@ def progress(what: str, total: int | None = None) -> Iterator[Callable[[int, str
     """Give a function (done, note) to be called as work gets done; only long work shows a bar.
 
     The bar appears when two seconds are expected. Without a total nothing is known of what is left,
-    and it appears when two seconds have passed.
+    and it appears when two seconds have passed. Where no bar can move there is a line each minute.
 
     Parameters
     ----------
@@ -91,12 +111,15 @@ def progress(what: str, total: int | None = None) -> Iterator[Callable[[int, str
     task = bar.add_task("", total=total, note="")
     clock = time.perf_counter()
     completed = 0
+    of_total = "" if total is None else f"/{total}"
+    write = lines()
     settled = _hidden.get() or not live()  # whether there is a bar, or never will be
 
     def advance(done: int, note: str) -> None:
         nonlocal completed, settled
         completed += done
         bar.update(task, advance=done, note=note)
+        write(f"{what} {completed}{of_total} {note}".rstrip())
         elapsed = time.perf_counter() - clock
         if not settled and _expected(elapsed, completed, total) > _SHOWN_FROM:
             settled = True

@@ -61,6 +61,58 @@ def test_short_work_shows_nothing(
     assert screen.getvalue() == ""
 
 
+@pytest.fixture
+def log(screen: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
+    """No terminal: a line for each hundredth of a second."""
+    monkeypatch.setattr(prbayes._progress, "CONSOLE", Console(file=screen, force_terminal=False))
+    monkeypatch.setattr(prbayes._progress, "_LINE_EVERY", 0.01)
+    return screen
+
+
+def test_where_no_bar_can_move_there_is_a_line_each_minute(log: io.StringIO) -> None:
+    with progress("walking", 3) as report:
+        report(1, "on foot")
+        assert log.getvalue() == ""
+        time.sleep(0.02)
+        report(1, "[on foot]")
+        report(1, "on foot")
+    with progress("looking") as report:
+        time.sleep(0.02)
+        report(1, "")
+    assert log.getvalue() == "walking 2/3 [on foot]\nlooking 1\n"
+
+
+def test_a_sampler_without_a_terminal_says_where_it_is(
+    log: io.StringIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(prbayes._progress, "_LINE_EVERY", 0.0)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        prb.Simulator(
+            "y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0],
+            epsilon=0.1, propagation=prb.Reweighted(64),
+        )  # fmt: skip
+    quiet = {"chains": 2, "model": model, "random_seed": 1, "adjust": False}
+    prb.sample_smc(50, progressbar=False, **quiet)
+    assert log.getvalue() == ""
+    prb.sample_smc(50, **quiet)
+    said = [line for line in log.getvalue().splitlines() if line.startswith("SMC")]
+    assert said[-1] == "SMC chain 2 of 2: beta 1 of 1"
+    assert said[0].startswith("SMC chain 1 of 2: beta 0.")
+
+
+@pytest.mark.parametrize("where", ["hidden", "page"])
+def test_no_lines_where_they_are_not_wanted(
+    where: str, log: io.StringIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if where == "page":
+        monkeypatch.setattr(prbayes._progress, "_in_kernel", lambda: True)
+    with shown(where == "page"), progress("walking", 2) as report:
+        time.sleep(0.02)
+        report(1, "")
+    assert log.getvalue() == ""
+
+
 def test_the_seconds_left_are_those_at_the_pace_so_far() -> None:
     assert _expected(3.0, 1, 4) == 9.0
     assert _expected(3.0, 4, 4) == 0.0

@@ -10,7 +10,7 @@ import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from prbayes._checks import Floats
-from prbayes._progress import CONSOLE, live, shown
+from prbayes._progress import CONSOLE, lines, live, shown
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.checkpoint import Checkpoint
 from prbayes.posterior.smc_kernel import BatchedKernel
@@ -88,6 +88,7 @@ class Chains:
             shown(progressbar) as visible,
             Progress(*columns, console=CONSOLE, disable=not (visible and live())) as progress,
         ):
+            write = lines()
             for chain, seed in enumerate(seeds):
                 task = progress.add_task("", total=1.0, chain=chain, rate=0.0)
                 finished = self._finished(chain)
@@ -100,6 +101,7 @@ class Chains:
                     for _ in self._stages(kernel, stages):
                         self._save(done, [*stats, stages], kernel)
                         progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
+                        write(f"SMC chain {chain + 1} of {len(seeds)}: beta {kernel.beta:.3g} of 1")
                 except BudgetError as spent:
                     stopped = f"{spent} in chain {chain + 1} of {len(seeds)}"
                     break
