@@ -17,8 +17,6 @@ a = time.perf_counter()
 import pymc
 b = time.perf_counter()
 import prbayes
-
-from benchmarks import record
 c = time.perf_counter()
 print(b - a, c - b)
 """

@@ -27,7 +27,7 @@ README_SCRIPT = re.findall(r"^```python\n(.*?)^```", README, re.MULTILINE | re.D
 
 # Each floor may import from those before it; rooms of one floor do not import each other.
 LAYERS = (
-    ("_checks", "_envelope", "_html", "_pages", "_progress", "_weighted", "datasets"),
+    ("_checks", "_envelope", "_html", "_pages", "_progress", "_threads", "_weighted", "datasets"),
     ("metrics", "response", "emulators"),
     ("propagation",),
     ("model",),
@@ -41,7 +41,7 @@ LAYERS = (
 FLOOR = {room: floor for floor, rooms in enumerate(LAYERS) for room in rooms}
 # Rooms of one floor that may see each other: what is below everything, verbs, and the command line's two files.
 TOGETHER = (
-    {"_checks", "_envelope", "_html", "_pages", "_progress", "_weighted", "datasets"},
+    {"_checks", "_envelope", "_html", "_pages", "_progress", "_threads", "_weighted", "datasets"},
     {"_demo", "__main__"},
 )
 
@@ -474,6 +474,7 @@ INNER = {
         "pytensor.graph.traversal.ancestors",
         "pytensor.graph.traversal.toposort",
         "pytensor.tensor.elemwise.Elemwise",
+        "pytensor.tensor.sharedvar.TensorSharedVariable",
         "pytensor.tensor.variable.TensorVariable",
     },
     "response.distributions": {

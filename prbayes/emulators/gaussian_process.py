@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
+from prbayes._threads import one_thread
 from prbayes.emulators.surfaces import Predict, Surface
 
 # Points on which lengths are found: half leaves errors six times as large on eight inputs, twice
@@ -49,19 +49,6 @@ KERNELS: dict[str, Kernel] = {
     "squared_exponential": squared_exponential,
     "matern": matern,
 }
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Do linear algebra in one thread, inside or in the function that this decorates.
-
-    Several gain nothing on matrices of a few hundred rows, and take ten times as long where
-    something else computes as well.
-    """
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(1, user_api="blas"):
-        yield
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
+from prbayes._threads import one_thread
 from prbayes.estimate.data_sets import DataSets
 from prbayes.metrics.base import Discrepancy
 from prbayes.model.evaluator import Evaluator
@@ -66,6 +67,7 @@ class BatchObjective:
         """Number of data sets."""
         return len(self.targets[0].weights)
 
+    @one_thread()
     def __call__(self, thetas: Floats, rows: Any) -> Floats:
         """Return the values for data sets ``rows`` at several thetas each, (A, s, d) -> (A, s).
 

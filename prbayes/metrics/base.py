@@ -490,7 +490,7 @@ class DensityDiscrepancy(Discrepancy):
 
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return the density on the cells."""
-        return (weights @ basis[0],)
+        return (product(weights, *basis) if xp is np else weights @ basis[0],)
 
     @property
     def density_cells(self) -> Cells:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
+from prbayes._threads import one_thread
 from prbayes.emulators.emulator import (
     Runs,
     candidates,
@@ -18,7 +19,6 @@ from prbayes.emulators.emulator import (
     emulated_without_each,
 )
 from prbayes.emulators.following import Following
-from prbayes.emulators.gaussian_process import one_thread
 from prbayes.emulators.share import share_of_runs
 from prbayes.propagation.base import N_BLOCKS
 

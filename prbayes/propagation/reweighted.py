@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, ClassVar, Self
@@ -22,6 +22,7 @@ from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import AT_ONCE, Floats, positive_integer
+from prbayes._threads import one_thread
 from prbayes.emulators.emulator import MOST_RUNS
 from prbayes.emulators.surfaces import Surface
 from prbayes.metrics.base import Discrepancy
@@ -79,6 +80,11 @@ _MOST_NUMBERS = 1 << 27
 # Share that an emulator of another response may want to leave to runs that do not have it. By
 # judgement: its bias is then as large as what weighted runs would scatter by.
 _TRUSTED = 0.5
+# Weights of a block of populations, 2 MiB, which a processor keeps at hand, but of no fewer
+# populations than these: a product of matrices reads all stored responses for each block. Ratios of
+# times for other blocks: benchmarks/blocks.py.
+_BLOCK = 1 << 18
+_AT_LEAST = 64
 # Populations whose weights tell how far an emulator is trusted.
 _WEIGHED = 32
 # Neighbours on either side in the cells of an input whose support moves, beside other inputs: its
@@ -1117,14 +1123,20 @@ class Design(Bound):
 
     def populations(self, params: Sequence[Any]) -> tuple[Floats, Floats]:
         """Return the stored responses and their weights at given roots."""
+        weights, _ = self._weights(params)
+        return np.broadcast_to(self.values, weights.shape + self.values.shape[1:]), weights
+
+    def _weights(self, params: Sequence[Any]) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return weights of sum one, (k, n), and which rows have any, (k,): others are NaN."""
         (logs,) = self._log_weights(*params)
         top = logs.max(axis=-1, keepdims=True)
         top = np.where(np.isfinite(top), top, 0.0)
         weights = np.exp(logs - top)
         total = weights.sum(axis=-1, keepdims=True)
         with np.errstate(invalid="ignore"):
-            weights = weights / total
-        return np.broadcast_to(self.values, weights.shape + self.values.shape[1:]), weights
+            weights /= total
+        supported = np.isfinite(total) & (total > 0)
+        return weights, supported[:, 0]
 
     def discrepancies(self, params: Sequence[Any], target: Discrepancy) -> Floats:
         """Return the discrepancies of the populations at given roots, shape (k,).
@@ -1136,12 +1148,19 @@ class Design(Bound):
             made = target.stored(self.values)
             self._basis = (*wanted, made)
         *_, basis = self._basis
-        _, weights = self.populations(params)
-        supported = np.isfinite(weights).all(axis=-1)
-        weights = np.where(supported[:, None], weights, 1 / self.n_points)
-        features = target.from_basis(weights, basis, np)
-        found = target.outer(*features, xp=np)
-        return np.where(supported, found, np.inf)
+
+        size = len(params[0])
+        step = max(_AT_LEAST, _BLOCK // self.n_points)
+        found = []
+        # Of one population linear algebra has little to do.
+        with one_thread() if size > 1 else nullcontext():
+            for first in range(0, max(1, size), step):
+                weights, supported = self._weights([p[first : first + step] for p in params])
+                weights[~supported] = 1 / self.n_points
+                features = target.from_basis(weights, basis, np)
+                each = target.outer(*features, xp=np)
+                found.append(np.where(supported, each, np.inf))
+        return np.concatenate(found)
 
     def support(self, params: Sequence[Any]) -> dict[str, Floats]:
         """Say how well the design supports the populations at given roots, shapes (k,).

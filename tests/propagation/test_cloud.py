@@ -19,6 +19,7 @@ from prbayes.propagation.base import DesignError
 from prbayes.propagation.cloud import CLOUD, columns, mixture_of
 from prbayes.propagation.reweighted import Design, UntoldError
 from prbayes.response.budget import BudgetError
+from prbayes.response.compilation import PLAIN
 
 AT = np.array([[1.1, 0.9, -0.2, -0.5]])
 
@@ -261,7 +262,7 @@ def test_a_discrepancy_follows_the_cloud_that_was_drawn_last() -> None:
     evaluator, design = design_of(build())
     thetas = theta_of(evaluator)
     before = evaluator(thetas).discrepancies
-    compiled = evaluator.model.compile_logp(vars=[evaluator.model["y"]])
+    compiled = evaluator.model.compile_logp(vars=[evaluator.model["y"]], mode=PLAIN)
     design.reach(evaluator.roots(thetas, 0))
     after = evaluator(thetas).discrepancies
     assert 0 < abs(after - before)[0, 0] < 0.05 * before[0, 0]

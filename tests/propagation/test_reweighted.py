@@ -209,6 +209,26 @@ def test_two_seeds_agree_in_the_discrepancy() -> None:
 # -------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("metric", [prb.AreaMetric(), prb.KullbackLeibler()])
+def test_blocks_of_populations_change_nothing(
+    metric: prb.Metric, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pm.Model() as model:
+        x = pm.Uniform.dist(pm.Normal("low", 0, 1), 2.0)
+        prb.Simulator(
+            "y", same, x, metric=metric, observed=[0.5, 1.0, 1.5], propagation=prb.Reweighted(64)
+        )
+    evaluator = Evaluator(model)
+    thetas = np.linspace(-1.0, 1.5, 11)[:, None]
+    thetas[4] = 3.0  # no population at all
+    whole = evaluator.discrepancies(thetas, 0)
+    monkeypatch.setattr("prbayes.propagation.reweighted._BLOCK", 1)
+    monkeypatch.setattr("prbayes.propagation.reweighted._AT_LEAST", 3)
+    np.testing.assert_allclose(evaluator.discrepancies(thetas, 0), whole, rtol=1e-12)
+    assert np.flatnonzero(np.isinf(whole)).tolist() == [4]
+    assert evaluator.discrepancies(thetas[:0], 0).shape == (0,)
+
+
 def test_an_input_without_inverse_distribution_function() -> None:
     data = np.random.default_rng(2).normal(1.0, 0.3, 40) + np.random.default_rng(3).exponential(
         0.5, 40
