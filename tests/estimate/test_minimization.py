@@ -21,6 +21,7 @@ from prbayes.estimate.search import Approach, Trace
 from prbayes.metrics.density import GaussianKDE
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import nodes
+from prbayes.response.compilation import PLAIN
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N, MEAN, SD = OBSERVED.size, float(OBSERVED.mean()), float(OBSERVED.std())
@@ -224,7 +225,7 @@ def test_other_terms_are_weighed_by_epsilon_or_refused(term: str) -> None:
     for epsilon in (0.02, 0.2):
         model = with_term(WEIGHING[term], epsilon)
         optimum = prb.minimize(model, starts=0)
-        density = model.compile_logp(vars=model.observed_RVs + model.potentials)
+        density = model.compile_logp(vars=model.observed_RVs + model.potentials, mode=PLAIN)
         grid = np.linspace(MEAN - 1, 4, 401)
         best = grid[np.argmax([density({"mu": mu}) for mu in grid])]
         assert abs(optimum.point["mu"] - best) < 0.02
@@ -248,7 +249,11 @@ def test_a_prior_without_epsilon_to_weigh_it_against_is_refused() -> None:
 def test_prior_true_is_find_map() -> None:
     model = fitted("kl").model
     mode = pm.find_MAP(
-        model=model, progressbar=False, return_inferencedata=True, jitter=False
+        model=model,
+        progressbar=False,
+        return_inferencedata=True,
+        jitter=False,
+        compile_kwargs={"mode": PLAIN},
     ).posterior
     optimum = prb.minimize(model, prior=True)
     for name in NORMAL:
