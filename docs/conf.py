@@ -1,4 +1,4 @@
-"""Configuration of the pages: `uv run --group docs sphinx-build -W docs docs/_build/html`."""
+"""Configuration of the pages: the README says how to build them."""
 
 import sys
 from inspect import isclass, ismodule
