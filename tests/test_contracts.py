@@ -134,6 +134,7 @@ def test_replacement_without_strictness_ignores_what_is_not_there() -> None:
     assert found.eval({z: 2.0}) == 3.0
 
 
+@pytest.mark.long
 def test_graphs_are_vectorized_over_leading_axes() -> None:
     x = pt.vector("x")
     batch = pt.matrix("batch")

@@ -315,6 +315,7 @@ def test_arviz_summary_has_r_hat_and_ess() -> None:
     assert list(summary.index) == ["mu", "sigma"]
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_loo_speaks_of_one_observation() -> None:
     """A discrepancy is one value per draw, as the docs warn, and `az.loo` does not refuse it."""

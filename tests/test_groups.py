@@ -98,6 +98,7 @@ def test_each_group_is_compared_with_its_own_population() -> None:
     assert before[1] != after[1]
 
 
+@pytest.mark.long
 def test_groups_are_those_of_simulators_written_one_by_one() -> None:
     _, optimum = case()
     with pm.Model() as alone:
@@ -189,6 +190,7 @@ def test_other_propagations_have_groups_as_well(propagation: Any) -> None:
     assert far_of_one[0] < 5 * near_both[0] + 1
 
 
+@pytest.mark.long
 def test_several_outputs_have_groups_as_well() -> None:
     noise = np.random.default_rng(6).normal(0, 0.2, 50)
     values = np.stack([DATA.values, DATA.values + noise], axis=1)

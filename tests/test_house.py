@@ -270,6 +270,7 @@ def test_every_module_has_a_test_file_of_its_name() -> None:
     assert not missing
 
 
+@pytest.mark.long
 def test_the_package_imports_nothing_that_draws_or_renders() -> None:
     code = "import sys, prbayes; prbayes.minimize; print({'arviz', 'arviz_plots', 'graphviz', 'jinja2', 'matplotlib'} & set(sys.modules))"
     assert (
@@ -294,6 +295,7 @@ def test_public_names_are_in_the_reference() -> None:
     assert listed == expected
 
 
+@pytest.mark.long
 def test_the_first_script_of_the_readme_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

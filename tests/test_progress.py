@@ -168,6 +168,7 @@ def test_the_optimiser_shows_its_evaluations(screen: io.StringIO, visible: bool)
     assert ("discrepancy" in screen.getvalue()) == visible
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("visible", [True, False])
 def test_a_design_that_grows_tells_its_error_and_the_runs_that_are_left(
     screen: io.StringIO, visible: bool

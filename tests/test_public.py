@@ -9,6 +9,7 @@ import prbayes as prb
 from prbayes import _public
 
 
+@pytest.mark.long
 def test_nothing_is_loaded_before_a_public_name_is_asked_for() -> None:
     code = (
         "import sys, prbayes\n"

@@ -84,6 +84,7 @@ def test_a_problem_is_whole(name: str) -> None:
     assert problem.licence
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [n for n, p in PROBLEMS.items() if p.replicates > 1])
 def test_the_reference_is_of_the_data(name: str) -> None:
     # Over twenty data sets the exact posterior has the truth within its spread: the mean of squares

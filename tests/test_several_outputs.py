@@ -80,6 +80,7 @@ def of_one_by_name(a, b):
 NAMED = {"sum": observed()[:, 0], "difference": observed()[:, 1]}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("response", "data"),
     [
@@ -249,6 +250,7 @@ def test_the_log_density_is_that_of_the_metric_and_its_gradient_exact(mode):
         assert total[i] == pytest.approx(difference, rel=1e-5)
 
 
+@pytest.mark.long
 def test_predictive_draws_have_the_shape_of_the_data():
     model = model_of()
     drawn = pm.draw(model["y"], draws=3, random_seed=1)
@@ -258,6 +260,7 @@ def test_predictive_draws_have_the_shape_of_the_data():
     assert inputs.std() == pytest.approx(0.36, abs=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "metric",
     [

@@ -76,6 +76,7 @@ def answers(kind: str, factor: float) -> dict[str, Any]:
     }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("factor", [1e-6])
 @pytest.mark.parametrize(
     "kind",

@@ -58,6 +58,7 @@ def test_a_mean_at_the_bound_of_its_prior_is_at_no_edge(out: float) -> None:
     assert edges(model, out, -1.0) == ()
 
 
+@pytest.mark.long
 def test_an_area_of_a_population_without_a_mean_is_warned_of() -> None:
     def minimum(metric: prb.Metric, make: Any, observed: Any) -> prb.Optimum:
         with pm.Model() as model:

@@ -93,6 +93,7 @@ def test_of_right_data_nothing_is_named() -> None:
     assert told(drawn()).startswith("y: no output by itself, and no correlation of two, disagrees")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "wrong", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["wrong", "right"]
 )

@@ -102,6 +102,7 @@ def test_a_metric_that_declares_nothing_has_the_standard_errors_of_its_twin() ->
     np.testing.assert_allclose(other, one, rtol=0.2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("unit", [pytest.param(1e3, marks=pytest.mark.slow), 1e-3])
 def test_a_kolmogorov_distance_is_the_same_in_every_unit(unit: float) -> None:
     one = fitted(KS)

@@ -216,6 +216,7 @@ WEIGHING: dict[str, Callable[[Any], Any]] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("term", WEIGHING)
 def test_other_terms_are_weighed_by_epsilon_or_refused(term: str) -> None:
     with pytest.raises(
@@ -358,6 +359,7 @@ def priors(kind: str) -> tuple[Any, Any]:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["uniform", "beta", "untransformed"])
 def test_the_optimum_does_not_depend_on_how_hyperparameters_are_constrained(kind: str) -> None:
     with pm.Model() as model:
@@ -514,6 +516,7 @@ def test_standard_errors_are_those_of_where_the_simplex_ended() -> None:
     np.testing.assert_array_equal(optimum.sampling().local.in_theta, hood.local.in_theta)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["kl", "pr"])
 def test_a_jump_that_hardly_matters_leaves_standard_errors_alone(name: str) -> None:
     """A response that is lost beyond three standard deviations, from a hundred thousand points, and one that is not."""
@@ -783,6 +786,7 @@ def test_fresh_draws_have_no_gradient_and_no_standard_errors() -> None:
     )  # the noise of 200 draws is half that of the data
 
 
+@pytest.mark.long
 def test_a_users_own_metric_is_minimised_and_has_standard_errors() -> None:
     metric = prb.FunctionMetric(
         lambda z, observed, w: (

@@ -43,6 +43,7 @@ print(repr(float(tree["posterior"]["mu"].mean())))
 """
 
 
+@pytest.mark.long
 def test_an_optimum_survives_plain_pickle_into_a_fresh_process(tmp_path: Path) -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)

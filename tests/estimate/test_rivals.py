@@ -220,6 +220,7 @@ def test_rivals_stand_where_the_optimum_does_along_unidentified_directions() -> 
     assert len(optimum.warnings) == 2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("slope", "comparable"), [(0.25, False), pytest.param(0.0, True, marks=pytest.mark.slow)]
 )

@@ -46,6 +46,7 @@ def by_fmu(folder: Path) -> Iterator[prb.scalar]:
     yield prb.scalar(lambda x: unit.function(1000.0 if x == 3 else x) / 1.5 * 2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "adapter", [by_command, by_umbridge, pytest.param(by_fmu, marks=pytest.mark.slow)]
 )

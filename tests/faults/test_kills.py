@@ -70,6 +70,7 @@ def killed(folder: Path, kind: str, at: int) -> str:
     return out
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "at"),
     [

@@ -38,6 +38,7 @@ SLOW = pytest.mark.slow
 NEEDED = {"loky": "joblib.externals.loky", "dask": "distributed"}
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
 @pytest.mark.parametrize(
     "where",

@@ -147,6 +147,7 @@ def test_populations_of_inputs(name: str, propagation: Propagation) -> None:
     )
 
 
+@pytest.mark.long
 @pytest.mark.exact
 @pytest.mark.parametrize(
     "propagation",

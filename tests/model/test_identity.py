@@ -318,6 +318,7 @@ def test_sample_smc_takes_a_clones_optimum_and_the_clones_own_epsilon() -> None:
     assert float(tree["calibration"]["epsilon"][0]) == 0.3
 
 
+@pytest.mark.long
 def test_the_optimum_is_taken_to_the_order_of_a_clone() -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1))

@@ -100,6 +100,7 @@ def test_conditioned_models_have_the_same_discrepancy(name: str) -> None:
         np.testing.assert_allclose(log_density(clone)(at), -expected / 0.1, **tolerance)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "way", [way if " " not in way else pytest.param(way, marks=pytest.mark.slow) for way in COPIES]
 )
@@ -208,6 +209,7 @@ print(repr(prb.minimize(model, starts=0, progressbar=False).point["mu"]))
 """
 
 
+@pytest.mark.long
 def test_a_model_unpickled_in_a_fresh_process_works_without_any_help(tmp_path: Path) -> None:
     model = build(prb.Reweighted(64))
     file = tmp_path / "model.pkl"
@@ -334,6 +336,7 @@ def _theta(model: pm.Model) -> Floats:
     return np.array([[AT[name] for name in Evaluator(model).names]])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("metric", [prb.AreaMetric(), prb.LogLikelihood()])
 def test_data_that_are_set_anew_are_those_of_a_model_made_with_them(metric: prb.Metric) -> None:
     model, new = with_data(metric, OBSERVED), with_data(metric, NEW)

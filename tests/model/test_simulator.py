@@ -134,6 +134,7 @@ def draws_of(name: str, sampler: str) -> Any:
     return SAMPLERS[sampler](model_of(name)[0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "sampler"),
     [
@@ -168,6 +169,7 @@ def test_samplers_find_the_posterior(name: str, sampler: str) -> None:
         assert 0.7 < draws.std() / sd < 1.35 * blur, key
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["Reweighted", "strong prior", "Resimulated", "black box"])
 def test_find_map_agrees_with_minimize(name: str) -> None:
     model = model_of(name)[0]
@@ -260,6 +262,7 @@ def test_predictive_draws_are_different_specimens(name: str, kind: str) -> None:
         assert np.isin(sets, model_of(name)[1].bound.values).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["Reweighted", "Resimulated"])
 def test_the_same_seed_gives_the_same_prediction(name: str) -> None:
     first = predictive(name, "prior")
@@ -268,6 +271,7 @@ def test_the_same_seed_gives_the_same_prediction(name: str) -> None:
     assert not np.array_equal(predictive(name, "prior", seed=2), first)
 
 
+@pytest.mark.long
 def test_reweighted_calls_the_response_n_times_in_all() -> None:
     for sampler in ("NUTS", "stock SMC, two cores", "batched kernel, two cores", "prbayes SMC"):
         draws_of("Reweighted", sampler)
@@ -336,6 +340,7 @@ def test_the_posterior_is_that_of_sample_smc(sampler: str, metric: prb.Metric) -
         np.testing.assert_allclose(nuts.posterior[name].std(), sd, rtol=0.2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("propagation", [prb.Reweighted(64), prb.Resimulated(64)])
 def test_simulators_of_submodels_have_names_and_variables_of_their_own(propagation: Any) -> None:
     observed = np.linspace(0, 2, 20)

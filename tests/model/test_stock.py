@@ -32,6 +32,7 @@ STOCK = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", STOCK)
 def test_stock_simulator_with_our_metrics(name: str) -> None:
     metric, epsilon = STOCK[name]

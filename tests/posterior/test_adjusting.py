@@ -37,6 +37,7 @@ def moments(result: xr.DataTree) -> Floats:
     return np.array(found)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "by",
     [
@@ -61,6 +62,7 @@ def test_draws_of_the_package_s_own_sampler_come_out_as_it_gives_them(by: Any) -
     xr.testing.assert_identical(later.sample_stats.to_dataset(), at_once.sample_stats.to_dataset())
 
 
+@pytest.mark.long
 def test_draws_of_nuts_get_the_width_that_the_data_warrant(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -121,6 +123,7 @@ def model_epsilon(model: pm.Model) -> float:
     return float(Evaluator(model).epsilon[0])
 
 
+@pytest.mark.long
 def test_what_cannot_be_adjusted_is_refused_before_any_work() -> None:
     model = build()
     plain = smc(model, False)
@@ -145,6 +148,7 @@ def test_what_cannot_be_adjusted_is_refused_before_any_work() -> None:
         prb.adjust(stripped, model=fresh)
 
 
+@pytest.mark.long
 def test_draws_of_a_likelihood_stay_and_nothing_says_that_they_were_adjusted() -> None:
     model = build("ll")
     plain = smc(model, False)

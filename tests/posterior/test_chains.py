@@ -70,6 +70,7 @@ def stages_of(particles: Particles) -> list[int]:
     return [len(stages["beta"]) for stages in particles.stats]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PROPAGATIONS)
 @pytest.mark.parametrize("where", ["in the first", "between", "in the last"])
 def test_a_chain_that_was_killed_gives_the_same_particles(

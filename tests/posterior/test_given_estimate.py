@@ -53,6 +53,7 @@ def moments(idata: xr.DataTree) -> Floats:
     return np.array(found)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sd", [pytest.param(2.0, marks=pytest.mark.slow), 0.3])
 def test_of_ten_specimens_it_is_about_the_exact_posterior(sd: float) -> None:
     # The divergence uses nearly all of the data; the sharp prior pulls sigma by a third.

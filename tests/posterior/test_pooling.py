@@ -34,6 +34,7 @@ def thetas_of(evaluator: Evaluator, mu: np.ndarray, sigma: float) -> np.ndarray:
     return evaluator.unconstrained(values)
 
 
+@pytest.mark.long
 def test_prior_and_estimate_are_those_of_the_exact_posterior() -> None:
     """With the means and the spread of the data as estimate, and their own information."""
     observed, evaluator, sampling = case()

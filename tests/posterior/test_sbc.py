@@ -75,6 +75,7 @@ def executors() -> Iterator[dict[str, Executor]]:
         yield {"threads": threads, "processes": processes}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "response"),
     [

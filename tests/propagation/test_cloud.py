@@ -168,6 +168,7 @@ def test_a_part_of_a_cloud_is_a_cloud_of_its_own_for_a_while() -> None:
     np.testing.assert_array_equal(evaluator.populations(theta, 0)[1], weights)
 
 
+@pytest.mark.long
 def test_the_error_of_emulators_is_measured_by_runs_that_are_left_out() -> None:
     errors = {}
     for kind, response in {"smooth": smooth, "kink": lambda a, b: np.abs(a - 1) + b}.items():

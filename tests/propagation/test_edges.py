@@ -125,6 +125,7 @@ def test_a_discrete_support_that_moves_is_refused() -> None:
         stored(lambda: pm.DiscreteUniform.dist(pm.Poisson("a", 3.0), 20))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("metric", METRICS, ids=of_kind)
 def test_the_gradient_is_that_of_the_discrepancy_where_an_edge_is(metric: prb.Metric) -> None:
     evaluator = Evaluator(uniform(metric))
@@ -137,6 +138,7 @@ def test_the_gradient_is_that_of_the_discrepancy_where_an_edge_is(metric: prb.Me
         assert gradient[i] == pytest.approx(float(up[0] - down[0]) / (2 * step), rel=1e-4, abs=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("metric", METRICS, ids=of_kind)
 def test_the_optimum_and_its_standard_errors_are_those_of_a_fine_resimulation(
     metric: prb.Metric,

@@ -46,6 +46,7 @@ METRICS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", METRICS)
 def test_the_graph_of_a_metric_agrees_with_its_direct_call(name: str) -> None:
     sample, weights = pt.dvector(), pt.dvector()
@@ -55,6 +56,7 @@ def test_the_graph_of_a_metric_agrees_with_its_direct_call(name: str) -> None:
     assert compiled(SAMPLE, WEIGHTS) == pytest.approx(direct, rel=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["PR", "KLD", "area"])
 def test_gradients_in_values_and_weights_are_those_of_differences(name: str) -> None:
     sample, weights = pt.dvector(), pt.dvector()
@@ -168,6 +170,7 @@ def test_jax_refuses_densities_of_simulated_values(propagation: Any) -> None:
         model.compile_logp(mode="JAX")(model.initial_point())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["PR", "KLD", "bins"])
 def test_features_of_compact_values_are_those_of_a_basis_and_so_are_their_derivatives(
     name: str,

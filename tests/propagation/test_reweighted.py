@@ -510,6 +510,7 @@ def far_from_the_prior(response: Any, metric: prb.Metric, prior_sd: float) -> pm
     return model
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("metric", [KL, PR])
 @pytest.mark.parametrize("prior_sd", [0.1, 1.0])
 @pytest.mark.parametrize("off", [0.0, 1e-12, -1e-12])
@@ -523,6 +524,7 @@ def test_data_that_no_population_of_the_prior_reaches_are_walked_to(
     assert optimum.n_responses <= 1024
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("metric", [KL, PR])
 @pytest.mark.parametrize("prior_sd", [0.1, 1.0])
 def test_data_that_no_population_reaches_are_never_silent(
@@ -647,6 +649,7 @@ def test_diagnose_needs_the_models_variables() -> None:
         prb.diagnose(posterior(mu=np.zeros((1, 5))))
 
 
+@pytest.mark.long
 def test_a_log_likelihood_of_few_resimulated_responses_is_warned_of(
     caplog: pytest.LogCaptureFixture,
 ) -> None:

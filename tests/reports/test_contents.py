@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
+import pytest
 
 import prbayes as prb
 from prbayes.reports.tables import cells
@@ -56,6 +57,7 @@ def test_a_hostile_model_is_reported(row: Any, parse: Any) -> None:
         assert "<b>" not in text
 
 
+@pytest.mark.long
 def test_several_simulators_and_vectors(tmp_path: Path, section: Any, parse: Any) -> None:
     with pm.Model(coords={"part": ["shaft", "disk"]}) as model:
         mu = pm.Normal("mu", 1, 1, dims="part")

@@ -98,6 +98,7 @@ def processes() -> Iterator[Executor]:
         yield pool
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("response", [times, slow_times, prb.scalar(times), lambda x, a: a * x])
 def test_executors_give_the_same_responses(response: Any, processes: Executor) -> None:
     np.testing.assert_array_equal(stored(model(response)), EXPECTED)

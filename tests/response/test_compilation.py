@@ -182,6 +182,7 @@ def test_shared_variables_are_those_of_the_one_who_asks(
     assert len(compilations) == 3
 
 
+@pytest.mark.long
 def test_values_that_are_shared_go_with_the_last_function(compilations: list[Any]) -> None:
     values = pytensor.shared(np.zeros(5))
     x = pt.dscalar()

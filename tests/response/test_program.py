@@ -169,6 +169,7 @@ def ended(pids: list[int]) -> bool:
     return not any(map(alive, pids))
 
 
+@pytest.mark.long
 @SEES_PROCESSES
 def test_the_time_limit_of_a_worker_s_thread_ends_the_program(tmp_path: Path) -> None:
     code = "import os, time; print(os.getpid(), {x}, flush=True); time.sleep(600)"
@@ -187,6 +188,7 @@ def test_the_time_limit_of_a_worker_s_thread_ends_the_program(tmp_path: Path) ->
     assert ended([int((kept / "stdout.txt").read_text().split()[0])])
 
 
+@pytest.mark.long
 @SEES_PROCESSES
 def test_a_time_limit_ends_the_program_and_what_it_started(tmp_path: Path) -> None:
     code = (

@@ -201,6 +201,7 @@ def responses(response: Any, **settings: Any) -> tuple[np.ndarray[Any, Any], Any
     return node.bound.values, node
 
 
+@pytest.mark.long
 @pytest.mark.exact
 def test_a_server_that_dies_and_comes_back_in_mid_study_loses_nothing(tmp_path: Path) -> None:
     server = Real(tmp_path)

@@ -71,6 +71,7 @@ def scored(scores: Any, weights: Any = None) -> xr.Dataset:
     )
 
 
+@pytest.mark.long
 def test_the_right_family_is_told_and_families_alike_are_not() -> None:
     table = compare(skewed(), **QUIET)
     assert table.candidate.values.tolist() == ["lognormal", "normal"]
@@ -168,6 +169,7 @@ def test_more_candidates_ask_for_more() -> None:
     assert three.attrs["verdict"].count("cannot tell") == 2
 
 
+@pytest.mark.long
 def test_two_responses_of_several_simulators_with_labels_and_weights() -> None:
     def bent(x: Any) -> Any:
         return 1.5 * x**2

@@ -25,6 +25,7 @@ def optimum(family: Any = pm.LogNormal) -> prb.Optimum:
     return prb.minimize(build(family=family))
 
 
+@pytest.mark.long
 def test_each_fold_is_a_calibration_on_the_other_specimens() -> None:
     before = optimum().evaluator.n_responses
     found = prb.cross_validate(optimum(), folds=4, random_seed=3)
