@@ -47,6 +47,8 @@ from prbayes.estimate.refit import SamplingDistribution
 from prbayes.estimate.rivals import Rival, excluded, rivals
 from prbayes.estimate.sampling import Local
 from prbayes.estimate.search import (
+    ENOUGH,
+    OVERLAP,
     Approach,
     Run,
     Search,
@@ -383,6 +385,7 @@ class _State:
     cloud: Floats | None = None
     # (d,), or None: where to minimise again, on a design that has grown.
     restart: Floats | None = None
+    left: Floats | None = None  # (d,), or None: an optimum that was left, and may be the better one
     others: tuple[Rival, ...] = ()  # other optima
 
     @property
@@ -498,8 +501,11 @@ def _states(plan: _Plan, begun: _Beginning) -> Iterator[_State]:
     rounds = 0
     while (state := _judged(plan, state, rounds)).restart is not None:
         rounds += 1
+        left = state.left
         led = _led(plan, state.restart, state)
         state = yield from _minimised(plan, led.theta, state.scales, led.trace, state.cloud)
+        if left is not None and _is_better(plan, left, state):
+            state = yield from _minimised(plan, left, state.scales, state.run.trace, state.cloud)
     yield state
     # Terminate: other optima, stalled line searches, the error of the design where it ended
     state = _against_rivals(plan, state)
@@ -523,9 +529,15 @@ def _minimised(
     return _State(run.best, scales, run, sampling, cloud=cloud)
 
 
-def _led(plan: _Plan, theta: Floats, state: _State) -> Approach:
+def _led(plan: _Plan, theta: Floats, state: _State, least: float = OVERLAP) -> Approach:
     """Return where the area metric leads from theta; theta itself where the data are near."""
-    return approach(plan.search, theta, state.scales, plan.seed, state.run.trace)
+    return approach(plan.search, theta, state.scales, plan.seed, state.run.trace, least)
+
+
+def _is_better(plan: _Plan, theta: Floats, state: _State) -> bool:
+    """Return whether the objective at theta is below that where the minimisation stands."""
+    there, here = plan.evaluator.total(np.array([theta, state.theta]), state.scales)
+    return bool(there < here)
 
 
 def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
@@ -548,11 +560,15 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
     short = shortcomings(evaluator, near) or shortcomings(evaluator, state.theta[None])
     if not short:
         # Enough for the populations; for the optimum?
-        if rounds < MAX_ROUNDS and apart_from_data(evaluator, state.theta):
-            # Enough for a minimum that is no fit: on, the way that the area metric leads.
-            ahead = _led(plan, state.theta, state).theta
-            grown = refine_at(evaluator, ahead[None])
-            return replace(state, restart=ahead) if grown else state
+        apart = apart_from_data(evaluator, state.theta)
+        if rounds < MAX_ROUNDS and apart_from_data(evaluator, state.theta, ENOUGH):
+            # Enough for a minimum that is no fit, or a poor one, where a thin design may end: on,
+            # the way that the area metric leads.
+            ahead = _led(plan, state.theta, state, ENOUGH).theta
+            if refine_at(evaluator, ahead[None]):
+                return replace(state, restart=ahead, left=None if apart else state.theta)
+        if apart:
+            return state
         if state.sampling is None:
             return state
         errors = state.sampling.design_error()

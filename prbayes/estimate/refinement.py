@@ -11,6 +11,7 @@ from prbayes._checks import Floats
 from prbayes.estimate.data_sets import families, siblings
 from prbayes.estimate.refit import DesignErrors
 from prbayes.estimate.sandwich import Information
+from prbayes.estimate.search import apart_from_data, areas
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
 from prbayes.model.support import Shortcoming, shortcomings
@@ -188,6 +189,10 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         value = total - found.log_other
         value = np.where(np.isfinite(found.log_prior), value, np.inf)
         order = np.argsort(value)[:THETAS]
+        apart = apart_from_data(evaluator, thetas[order[0]])
+        if apart:
+            # The discrepancy is then the same everywhere, up to rounding.
+            order = np.argsort(areas(evaluator, scales, thetas))[:THETAS]
         best = thetas[order]
         # Let the designs reach them.
         thin = _thin(evaluator, best)
@@ -197,7 +202,7 @@ def pilot(evaluator: Evaluator, scales: Floats, *, seed: int = 0) -> Floats:
         # Stop where sampling explains the differences that are left.
         spread = value[order[-1]] - value[order[0]]
         noise = sum(noise_floors(evaluator, best[0], FEW_SETS) / scales)
-        if not thin and spread < noise:
+        if not (thin or apart) and spread < noise:
             break
         # Step on, from each of them at random.
         covariance = np.atleast_2d(np.cov(best, rowvar=False))

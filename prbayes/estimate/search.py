@@ -35,8 +35,8 @@ _STALLED = 15
 _STEP = 1e-4
 # Overlap of two densities below which the area metric leads, and from which on the metric itself
 # is followed; from far starts both lead to the same optima (benchmarks/landscapes.py).
-_OVERLAP = 0.02
-_ENOUGH = 0.5
+OVERLAP = 0.02
+ENOUGH = 0.5
 # Weight effective sample size below which a design does not reach a population at all.
 _THIN = 2.0
 # Methods whose line searches are stopped where they gain nothing.
@@ -267,16 +267,22 @@ class Approach:
 
 
 def approach(
-    search: Search, theta: Floats, scales: Floats, seed: int, trace: Trace = _NOTHING
+    search: Search,
+    theta: Floats,
+    scales: Floats,
+    seed: int,
+    trace: Trace = _NOTHING,
+    least: float = OVERLAP,
 ) -> Approach:
     """Go to where simulated responses overlap with the data, by the area metric.
 
     Without overlap a density metric hardly changes, or changes so that populations get wider
     without end; the gradient of the area metric does not vanish. Where a theta costs no response,
-    points of the prior are looked at first. Returns theta itself where there is overlap.
+    points of the prior are looked at first. Returns theta itself where there is overlap, of more
+    than ``least``.
     """
     evaluator = search.evaluator
-    if not _astray(evaluator, theta):
+    if not _astray(evaluator, theta, least):
         return Approach(theta, trace)
     guide = _Guide(evaluator, scales)
     if not evaluator.responses_per_theta:
@@ -289,7 +295,7 @@ def approach(
     objective = Objective(function, theta, search.prior_sd, size, gradient=True, most=most)
 
     def stop_where_near(t: Floats) -> None:
-        if guide.overlap_at(theta + t * search.prior_sd) > _ENOUGH:
+        if guide.overlap_at(theta + t * search.prior_sd) > ENOUGH:
             raise StopIteration
 
     _scipy(
@@ -311,14 +317,14 @@ def approach(
     return Approach(reached, trace.then(objective), remark)
 
 
-def _astray(evaluator: Evaluator, theta: Floats) -> bool:
+def _astray(evaluator: Evaluator, theta: Floats, least: float) -> bool:
     """Return whether hardly a response of the population at theta is near the data."""
     thin = any(s["weight_ess"][0] < _THIN for s in evaluator.support(theta[None]).values())
     if any(n.bound.random for n in evaluator.nodes):
         return False
     if thin:
         return True
-    return not overlap(evaluator, *_populations(evaluator, theta[None]))[0] > _OVERLAP
+    return not overlap(evaluator, *_populations(evaluator, theta[None]))[0] > least
 
 
 class _Guide:
@@ -366,8 +372,12 @@ def best_or_nearest(search: Search, thetas: Floats, scales: Floats) -> Floats:
     """
     if not all(apart_from_data(search.evaluator, theta) for theta in thetas):
         return search.best_of(thetas, scales)
-    areas = _Guide(search.evaluator, scales)(thetas)
-    return np.asarray(thetas[np.argmin(areas)])
+    return np.asarray(thetas[np.argmin(areas(search.evaluator, scales, thetas))])
+
+
+def areas(evaluator: Evaluator, scales: Floats, thetas: Floats) -> Floats:
+    """Return the areas between populations at thetas, (P, d), and the data, summed, (P,)."""
+    return _Guide(evaluator, scales)(thetas)
 
 
 def overlap(evaluator: Evaluator, values: list[Floats], weights: list[Floats]) -> Floats:
@@ -378,8 +388,10 @@ def overlap(evaluator: Evaluator, values: list[Floats], weights: list[Floats]) -
     return np.min([np.ones(len(values[0])), *overlaps], axis=0)
 
 
-def apart_from_data(evaluator: Evaluator, theta: Floats) -> bool:
+def apart_from_data(evaluator: Evaluator, theta: Floats, least: float = OVERLAP) -> bool:
     """Return whether stored responses, with the weights of theta, are nowhere near any data.
+
+    Their densities then overlap by less than ``least``.
 
     False where that would compute responses, and where a metric compares no densities.
     """
@@ -387,7 +399,7 @@ def apart_from_data(evaluator: Evaluator, theta: Floats) -> bool:
         return False
     values, weights = _populations(evaluator, theta[None])
     every = zip(evaluator.nodes, values, weights, strict=True)
-    return all(node.target.overlap(v, w)[0] < _OVERLAP for node, v, w in every)
+    return all(node.target.overlap(v, w)[0] < least for node, v, w in every)
 
 
 def _populations(evaluator: Evaluator, thetas: Floats) -> tuple[list[Floats], list[Floats]]:

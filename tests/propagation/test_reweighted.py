@@ -500,13 +500,13 @@ def test_minimize_refines_where_the_answer_is_far_out_in_the_prior() -> None:
     assert prb.diagnose(optimum, model=model).ok
 
 
-def far_from_the_prior(response: Any, metric: prb.Metric, prior_sd: float) -> pm.Model:
+def far_from_the_prior(
+    response: Any, metric: prb.Metric, prior_sd: float, n: int = 128
+) -> pm.Model:
     data = np.random.default_rng(1).normal(10.0, 0.5, 30)
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, prior_sd), 0.5)
-        prb.Simulator(
-            "y", response, x, metric=metric, observed=data, propagation=prb.Reweighted(128)
-        )
+        prb.Simulator("y", response, x, metric=metric, observed=data, propagation=prb.Reweighted(n))
     return model
 
 
@@ -522,6 +522,21 @@ def test_data_that_no_population_of_the_prior_reaches_are_walked_to(
     assert optimum.converged
     assert abs(optimum.point["mu"] - 10) < 0.2
     assert optimum.n_responses <= 1024
+
+
+def test_the_way_to_far_data_does_not_hang_on_rounding() -> None:
+    # Far from them the discrepancy is the same everywhere, up to rounding.
+    found = []
+    for off in (0.0, 1e-12, -1e-12):
+        optimum = prb.minimize(far_from_the_prior(lambda x, off=off: x * (1 + off), PR, 1.0))
+        found.append([optimum.point["mu"], optimum.n_responses])
+    np.testing.assert_allclose(found, [found[0]] * 3, rtol=1e-6)
+
+
+def test_a_thin_design_does_not_make_a_poor_minimum_the_answer() -> None:
+    # At mu = 8 the design ends, and populations that would be nearer the data have no points.
+    optimum = prb.minimize(far_from_the_prior(same, PR, 2.0, n=512))
+    assert abs(optimum.point["mu"] - 10) < 0.2
 
 
 @pytest.mark.long
