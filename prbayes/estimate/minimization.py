@@ -47,8 +47,8 @@ from prbayes.estimate.refit import SamplingDistribution
 from prbayes.estimate.rivals import Rival, excluded, rivals
 from prbayes.estimate.sampling import Local
 from prbayes.estimate.search import (
-    ENOUGH,
     OVERLAP,
+    OVERLAP_ENOUGH,
     Approach,
     Run,
     Search,
@@ -561,10 +561,10 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
     if not short:
         # Enough for the populations; for the optimum?
         apart = apart_from_data(evaluator, state.theta)
-        if rounds < MAX_ROUNDS and apart_from_data(evaluator, state.theta, ENOUGH):
+        if rounds < MAX_ROUNDS and apart_from_data(evaluator, state.theta, OVERLAP_ENOUGH):
             # Enough for a minimum that is no fit, or a poor one, where a thin design may end: on,
             # the way that the area metric leads.
-            ahead = _led(plan, state.theta, state, ENOUGH).theta
+            ahead = _led(plan, state.theta, state, OVERLAP_ENOUGH).theta
             if refine_at(evaluator, ahead[None]):
                 return replace(state, restart=ahead, left=None if apart else state.theta)
         if apart:

@@ -36,7 +36,7 @@ _STEP = 1e-4
 # Overlap of two densities below which the area metric leads, and from which on the metric itself
 # is followed; from far starts both lead to the same optima (benchmarks/landscapes.py).
 OVERLAP = 0.02
-ENOUGH = 0.5
+OVERLAP_ENOUGH = 0.5
 # Weight effective sample size below which a design does not reach a population at all.
 _THIN = 2.0
 # Methods whose line searches are stopped where they gain nothing.
@@ -295,7 +295,7 @@ def approach(
     objective = Objective(function, theta, search.prior_sd, size, gradient=True, most=most)
 
     def stop_where_near(t: Floats) -> None:
-        if guide.overlap_at(theta + t * search.prior_sd) > ENOUGH:
+        if guide.overlap_at(theta + t * search.prior_sd) > OVERLAP_ENOUGH:
             raise StopIteration
 
     _scipy(

@@ -57,7 +57,7 @@ def test_a_pilot_goes_towards_data_that_are_far() -> None:
             lambda x: x * 1.0,
             x,
             metric=prb.ProbabilityResidual(),
-            observed=np.linspace(9, 11, 20),
+            observed=np.linspace(14, 15, 20),
             propagation=prb.Reweighted(128),
         )
     # Of 1024 draws of the prior the best quarter lies above .67.
