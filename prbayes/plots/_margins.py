@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -35,6 +35,11 @@ class Margin:
     position: int
     index: tuple[int, ...]  # element of a multivariate input
     group: str = ""  # whose population it is, where there are groups
+
+    @property
+    def axis(self) -> Hashable:
+        """What the margins have in common that are drawn over the same values."""
+        return (self.dist, self.index) if self.group else self.name
 
     @property
     def discrete(self) -> bool:
@@ -104,21 +109,28 @@ def margin_densities(
     """Return by margin a grid, shape (g,), and densities at thetas, shape (P, g); or probabilities.
 
     They are exact where the input has an elementwise density or is a multivariate normal, and else
-    kernel densities, or shares, of random draws. No response is computed.
+    kernel densities, or shares, of random draws. No response is computed. The populations of
+    several groups have one grid.
     """
-    found: dict[str, tuple[Floats, Floats]] = {}
+    drawn = {}
     for k in sorted({margin.node for margin in wanted}):
-        inputs = evaluator.nodes[k].bound.inputs
-        roots = evaluator.roots(thetas, k)
-        drawn = _Draws(PopulationSampler(inputs), roots)
-        for margin in wanted:
-            if margin.node == k:
-                grid = _axis(margin, _values(drawn.few, margin))
-                y = None if inputs.nested else _exact(inputs, margin, roots, grid)
-                if y is None:
-                    y = _estimated(margin, _values(drawn.many, margin), grid)
-                found[margin.name] = grid, y
-    return {margin.name: found[margin.name] for margin in wanted}
+        sampler = PopulationSampler(evaluator.nodes[k].bound.inputs)
+        drawn[k] = _Draws(sampler, evaluator.roots(thetas, k))
+    ranges: dict[Any, tuple[float, float]] = {}
+    for margin in wanted:
+        own = _range(_values(drawn[margin.node].few, margin))
+        low, high = ranges.get(margin.axis, own)
+        ranges[margin.axis] = min(low, own[0]), max(high, own[1])
+    found = {}
+    for margin in wanted:
+        of_node = drawn[margin.node]
+        inputs = evaluator.nodes[margin.node].bound.inputs
+        grid = _grid(margin, *ranges[margin.axis])
+        y = None if inputs.nested else _exact(inputs, margin, of_node.roots, grid)
+        if y is None:
+            y = _estimated(margin, _values(of_node.many, margin), grid)
+        found[margin.name] = grid, y
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,10 +167,13 @@ def _equal_weights(values: Floats) -> Floats:
     return np.full(values.shape, 1 / values.shape[1])
 
 
-def _axis(margin: Margin, values: Floats) -> Floats:
-    """Return where a density is evaluated: over most draws, or at the whole numbers there."""
-    # Beyond these ends a density is hardly above zero.
-    low, high = central_range(values, _equal_weights(values), tail=0.002)
+def _range(values: Floats) -> tuple[float, float]:
+    """Return between which ends a density of draws is hardly zero."""
+    return central_range(values, _equal_weights(values), tail=0.002)
+
+
+def _grid(margin: Margin, low: float, high: float) -> Floats:
+    """Return where a density is evaluated: between two ends, or at the whole numbers there."""
     if margin.discrete:
         first = np.floor(low)
         last = np.ceil(high)

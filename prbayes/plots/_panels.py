@@ -33,6 +33,11 @@ class Output:
         own = self.node.outputs.names[self.column].replace("/", "\u2215")
         return f"{self.node.name}[{own}]"
 
+    @property
+    def axis(self) -> str:
+        """What the panels have in common that are drawn over the same values: those of groups."""
+        return self.name.replace(f"[{self.node.group}]", "", 1) if self.node.group else self.name
+
     def text(self, labels: Mapping[str, str] | None) -> str:
         """Return what a reader calls it: a label that was given, or its own name with the unit."""
         given = labels or {}

@@ -136,18 +136,25 @@ def plot_responses(
     size = (7.2, 4.8) if lines else (5.4, 4.2)
     canvas = Canvas(names, size=size, backend=backend, pc_kwargs=pc_kwargs)
     drawing = _Drawing(shown, what, level, labels, ecdf=ecdf)
+    covered: dict[str, tuple[float, float]] = {}
+    drawn = []
     for k, panels in enumerate(by_simulator):
-        earlier = None
-        if len(start):
-            earlier = _simulate(shown.evaluator, start, k)
-        after = _simulate(shown.evaluator, shown.every, k)
+        every = _simulate(shown.evaluator, shown.every, k)
+        first = _simulate(shown.evaluator, start, k) if len(start) else None
         for output in panels:
-            panel = canvas.panel(output.name)
-            if after.values.ndim > 2 and output.column is None:
-                drawing.lines(panel, output, after, earlier)
-            else:
-                before_it = None if earlier is None else earlier.of(output)
-                drawing.distribution(panel, output, after.of(output), before_it)
+            after = every.of(output)
+            earlier = None if first is None else first.of(output)
+            drawn.append((output, after, earlier))
+            if after.values.ndim == 2:
+                own = _covered(output.measured()[0], after, earlier)
+                low, high = covered.get(output.axis, own)
+                covered[output.axis] = min(low, own[0]), max(high, own[1])
+    for output, after, earlier in drawn:
+        panel = canvas.panel(output.name)
+        if after.values.ndim == 2:
+            drawing.distribution(panel, output, after, earlier, covered[output.axis])
+        else:
+            drawing.lines(panel, output, after, earlier)
     return canvas.finish()
 
 
@@ -162,11 +169,15 @@ class _Drawing:
     ecdf: bool
 
     def distribution(
-        self, panel: Panel, output: Output, after: _Simulated, earlier: _Simulated | None
+        self,
+        panel: Panel,
+        output: Output,
+        after: _Simulated,
+        earlier: _Simulated | None,
+        covered: tuple[float, float],
     ) -> None:
         """Draw the distribution of one output, from the data to what explains them."""
         observed, weights = output.measured()
-        covered = _covered(observed, after, earlier)
         grid = np.linspace(*covered, GRID_POINTS)
 
         curves = after.curves(grid, ecdf=self.ecdf)

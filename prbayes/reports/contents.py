@@ -17,6 +17,7 @@ from prbayes.reports.next_steps import next_steps
 from prbayes.reports.problem import data, metric
 from prbayes.reports.problem import model as model_of
 from prbayes.reports.section import Section
+from prbayes.reports.specimens import specimens
 from prbayes.reports.summary import answers, summary
 from prbayes.reports.tables import rows_table
 
@@ -45,6 +46,7 @@ _PARTS = (
     diagnostics,
     failures,
     validity_of,
+    specimens,
     decision_of,
     origin,
 )

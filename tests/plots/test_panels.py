@@ -4,8 +4,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pymc as pm
 import pytest
+import xarray as xr
 
+import prbayes as prb
 from prbayes.plots._panels import Output, is_curve, panels_of
 from prbayes.response.outputs import ONE, Outputs
 
@@ -66,3 +69,25 @@ def test_what_was_not_measured_is_left_out() -> None:
     values, weights = Output(y, 1, True).measured()
     np.testing.assert_array_equal(values, [5.0, np.inf])
     np.testing.assert_allclose(weights, [0.6, 0.4])
+
+
+def test_groups_have_the_same_axis() -> None:
+    sizes = np.repeat(["a", "b"], 10)
+    values = np.append(np.linspace(0, 1, 10), np.linspace(7, 9, 10))
+    measured = xr.DataArray(values, coords={"kind": ("specimen", sizes)}, dims="specimen")
+    with pm.Model(coords={"kind": ["a", "b"]}) as model:
+        mu = pm.Normal("mu", 4, 4, dims="kind")
+        x = pm.Normal.dist(mu[prb.response.group("kind")], 0.5, name="x")
+        y: dict[str, Any] = {"metric": prb.AreaMetric(), "observed": measured}
+        prb.Simulator("y", lambda x: x + 0.0, x, **y)
+        z = pm.Normal.dist(100 * pm.Normal("nu", 1, 1), 1, name="z")
+        prb.Simulator("far", lambda z: z, z, metric=prb.AreaMetric(), observed=[99.0, 101])
+    optimum = prb.minimize(model)
+    for plot in (prb.plot_responses, prb.plot_population):
+        pc = plot(optimum, backend="matplotlib")
+        ends = [panel.item().get_xlim() for panel in pc.viz["plot"].data_vars.values()]
+        first, second, other = ends
+        assert first == second
+        assert first[0] < 1
+        assert first[1] > 8
+        assert other[0] > 50
