@@ -103,6 +103,7 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
     label = f"{name}: observed"
     if isinstance(observed, Mapping):
         return _of_mapping(label, observed)
+    _refuse_texts(label, observed)
     if np.ma.is_masked(observed) and np.ndim(observed) == 2:
         observed = np.ma.filled(np.ma.asarray(observed, dtype=np.float64), np.nan)
     values = observed if np.ma.is_masked(observed) else real_array(observed, label)
@@ -112,6 +113,23 @@ def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:
     if not m:
         raise ValueError(f"{label}: got shape {values.shape}, expected one output at least")
     return values, _of_columns(observed, m)
+
+
+def _refuse_texts(label: str, observed: Any) -> None:
+    """Raise if columns of a DataFrame are no numbers, such as names of groups."""
+    if not hasattr(observed, "columns") or not hasattr(observed, "dtypes"):
+        return
+    others = []
+    for place, (name, kind) in enumerate(zip(observed.columns, observed.dtypes, strict=True)):
+        if kind.kind not in "biufO" or any(isinstance(v, str) for v in observed.iloc[:, place]):
+            others.append(name)
+    if others:
+        raise TypeError(
+            f"{label}: got a DataFrame whose columns {others} hold no numbers, expected a column "
+            "of measured responses for each output; leave others out, as in df['life'], and where "
+            "one names groups, such as suppliers, index hyperparameters by "
+            f"prb.response.group({str(others[0])!r})"
+        )
 
 
 def _of_one(observed: Any) -> Outputs:

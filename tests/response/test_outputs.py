@@ -1,6 +1,7 @@
 """What the outputs of a run are called, and how they are put together."""
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 
@@ -26,6 +27,21 @@ def test_columns_without_names_are_numbered():
 def test_a_mask_is_a_missing_output():
     values, _ = read_observed("y", np.ma.masked_array(TABLE, TABLE == 3.0))
     np.testing.assert_array_equal(np.isnan(values), TABLE == 3.0)
+
+
+@pytest.mark.parametrize(
+    "names", [["A", "B"], pd.Categorical(["A", "B"]), pd.to_datetime(["2020-01-01", "2020-01-02"])]
+)
+def test_a_column_of_no_numbers_is_named(names):
+    table = pd.DataFrame({"supplier": names, "life": [1.0, 2.0]})
+    with pytest.raises(
+        TypeError, match=r"y: .*columns \['supplier'\] hold no numbers.*group\('sup"
+    ):
+        read_observed("y", table)
+    # Numbers may be objects.
+    values, outputs = read_observed("y", table[["life"]].astype(object))
+    assert values.tolist() == [[1.0], [2.0]]
+    assert outputs.labels == ("life",)
 
 
 def test_a_data_array_tells_labels_and_units():
