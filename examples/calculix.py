@@ -21,9 +21,11 @@ import pymc as pm
 
 import prbayes as prb
 
-LENGTH, WIDTH = 200.0, 30.0  # mm; with MPa and t/mm3 frequencies are in Hz
+LENGTH = 200.0  # mm; with MPa and t/mm3 frequencies are in Hz
+WIDTH = 30.0
 DENSITY = 2.7e-9  # t/mm3
-ALONG, ACROSS = 20, 3  # elements
+ALONG = 20  # elements
+ACROSS = 3  # elements
 TRUTH = {"mean_gpa": 71.0, "sd_gpa": 1.5, "mean_mm": 2.95, "sd_mm": 0.05}
 MEASURED = 40
 MOST_RUNS = 150 - MEASURED
@@ -31,12 +33,15 @@ MOST_RUNS = 150 - MEASURED
 
 def input_file():
     """Return the input of a plate of shell elements, with the properties as fields."""
-    number, nodes, elements = {}, [], []
+    number = {}
+    nodes = []
+    elements = []
     for i in range(2 * ALONG + 1):
         for j in range(2 * ACROSS + 1):
             if i % 2 == 0 or j % 2 == 0:  # elements of eight nodes have none in their middle
                 number[i, j] = len(nodes) + 1
-                x, y = LENGTH * i / (2 * ALONG), WIDTH * j / (2 * ACROSS)
+                x = LENGTH * i / (2 * ALONG)
+                y = WIDTH * j / (2 * ACROSS)
                 nodes.append(f"{number[i, j]}, {x:.6f}, {y:.6f}, 0.0")
     around = [(0, 0), (2, 0), (2, 2), (0, 2), (1, 0), (2, 1), (1, 2), (0, 1)]
     for i in range(0, 2 * ALONG, 2):
@@ -63,7 +68,8 @@ def frequencies(folder):
     text = (folder / "plate.dat").read_text()
     values = table(text, "E I G E N V A L U E   O U T P U T")
     masses = table(text, "E F F E C T I V E   M O D A L   M A S S")
-    in_plane, across = masses[:, 2].argmax(), masses[:, 3].argmax()
+    in_plane = masses[:, 2].argmax()
+    across = masses[:, 3].argmax()
     return {"across_hz": values[across, 3], "in_plane_hz": values[in_plane, 3]}
 
 

@@ -68,7 +68,9 @@ def picture(observed, log_c, results, path):
     figure, axes = plt.subplot_mosaic(
         [["left", "top"], ["left", "bottom"]], figsize=(11, 4.4), layout="constrained"
     )
-    left, top, bottom = axes["left"], axes["top"], axes["bottom"]
+    left = axes["left"]
+    top = axes["top"]
+    bottom = axes["bottom"]
     steps = np.linspace(0, 1, observed.size + 1)
     left.step(
         np.r_[observed.min(), np.sort(observed)],

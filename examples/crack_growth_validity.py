@@ -88,7 +88,8 @@ def one_exponent(who):
 
 def fits(who):
     """Fit log C and m to each specimen's whole record by least squares, shape (specimens, 2)."""
-    cycles, found = DATA.million_cycles.values, []
+    cycles = DATA.million_cycles.values
+    found = []
     for lengths in INCH.values[who]:
         use = np.isfinite(lengths) & (cycles > 0)
 
@@ -103,9 +104,12 @@ def fits(who):
 def random_exponent(who):
     """Return the same with exponents that vary: populations of them by least squares."""
     found = fits(who)
-    mean, sd, rho = found[:, 1].mean(), found[:, 1].std(ddof=1), np.corrcoef(found.T)[0, 1]
+    mean = found[:, 1].mean()
+    sd = found[:, 1].std(ddof=1)
+    rho = np.corrcoef(found.T)[0, 1]
     with pm.Model() as model:
-        mu, sigma = pm.Normal("mu", 1.1, 0.5), pm.HalfNormal("sigma", 0.5)
+        mu = pm.Normal("mu", 1.1, 0.5)
+        sigma = pm.HalfNormal("sigma", 0.5)
         covariance = pt.stacklists([[sigma**2, rho * sigma * sd], [rho * sigma * sd, sd**2]])
         z = pm.MvNormal.dist(pt.stack([mu, mean]), covariance)
         prb.Simulator(
@@ -158,7 +162,8 @@ def main():
     for label, build in (("one exponent", one_exponent), ("exponents vary", random_exponent)):
         for split in range(arguments.splits):
             order = np.random.default_rng(split).permutation(LABELS.size)
-            calibrating, others = np.sort(order[:11]), np.sort(order[11:])
+            calibrating = np.sort(order[:11])
+            others = np.sort(order[11:])
             print(f"{label}, calibrated on specimens {' '.join(map(str, LABELS[calibrating]))}")
             model, inputs, wrap = build(calibrating)
             posterior = prb.sample_smc(

@@ -23,7 +23,8 @@ def main():
     """Calibrate with and without labels; print standard deviations of the mean and sd of log C."""
     data = prb.datasets.crack_growth()
     lengths = data.crack_length_inch / data.notch_inch
-    early, late = lengths.sel(million_cycles=0.05), lengths.sel(million_cycles=0.08)
+    early = lengths.sel(million_cycles=0.05)
+    late = lengths.sel(million_cycles=0.08)
     print(
         "rank correlation of the two lengths: "
         f"{spearmanr(early, late, nan_policy='omit').statistic:.2f}"

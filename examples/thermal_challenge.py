@@ -21,7 +21,8 @@ import prbayes as prb
 DATA = Path(__file__).with_name("thermal")
 START = 25.0  # C: of a slab
 TEMPERATURES = [20.0, 250.0, 500.0, 750.0, 1000.0]  # C: of the coupons
-LIMIT, ALLOWED = 900.0, 0.01  # C, and how often it may be exceeded
+LIMIT = 900.0  # C
+ALLOWED = 0.01  # share of specimens that may exceed it
 TERMS = 40  # of the series: what is left out is below 0.1 C from 10 s on
 
 # A slab's conductivity is that at 20 C, and what it gains until 1000 C.
@@ -57,7 +58,8 @@ def differences(conductivity, rise, capacity, flux, thickness, seconds, cells=40
     Backward Euler; the conductivity is that of the step's own end, found by repetition.
     """
     conductivity, rise, capacity = np.broadcast_arrays(conductivity, rise, capacity)
-    width, step = thickness / cells, seconds / steps
+    width = thickness / cells
+    step = seconds / steps
     volumes = np.full((cells + 1, 1), width)
     volumes[[0, -1]] /= 2
     shape = conductivity.shape
@@ -158,11 +160,14 @@ def population():
     """Return the model, and its inputs: conductivity at 20 C, rise, heat capacity."""
     observed, labels = coupons()
     with pm.Model() as model:
-        mean, sd = pm.Normal("mean k", 0.05, 0.005), pm.HalfNormal("sd k", 0.005)
+        mean = pm.Normal("mean k", 0.05, 0.005)
+        sd = pm.HalfNormal("sd k", 0.005)
         conductivity = pm.Normal.dist(mean, sd, name="conductivity at 20 C")
-        mean, sd = pm.Normal("mean rise", 0.02, 0.01), pm.HalfNormal("sd rise", 0.005)
+        mean = pm.Normal("mean rise", 0.02, 0.01)
+        sd = pm.HalfNormal("sd rise", 0.005)
         rise = pm.Normal.dist(mean, sd, name="rise")
-        mean, sd = pm.Normal("mean rhoCp", 4e5, 4e4), pm.HalfNormal("sd rhoCp", 6e4)
+        mean = pm.Normal("mean rhoCp", 4e5, 4e4)
+        sd = pm.HalfNormal("sd rhoCp", 6e4)
         capacity = pm.Normal.dist(mean, sd, name="heat capacity")
         # The sixth output, the heat capacity, has no inadequacy.
         prb.Simulator(
@@ -217,7 +222,8 @@ def tested(seconds, observed, predicted, slabs):
 
     Places have temperatures (slabs, times), and predictions with times last.
     """
-    measured, populations = {}, {}
+    measured = {}
+    populations = {}
     for place, values in observed.items():
         for i, second in enumerate(seconds):
             condition = f"{place}, {second:.0f} s"
@@ -398,7 +404,8 @@ def picture(kept, path):
     from matplotlib.figure import Figure
 
     posterior, seconds, slabs, predicted, values = kept
-    blue, red = "#0072B2", "#D55E00"
+    blue = "#0072B2"
+    red = "#D55E00"
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
 

@@ -120,7 +120,8 @@ def main(out):
     # What had grown beyond the record counts as its end, measured as simulated.
     at = lengths.sel(kilocycles=TIMES).fillna(36.6)
     order = np.random.default_rng(1).permutation(lengths.sizes["specimen"])
-    kept_back, used = np.sort(order[:KEPT_BACK]), np.sort(order[KEPT_BACK:])
+    kept_back = np.sort(order[:KEPT_BACK])
+    used = np.sort(order[KEPT_BACK:])
     model, x, optimum, posterior = calibrate(at.isel(specimen=used))
 
     print(f"{used.size} specimens, {optimum.n_responses} runs, {time.perf_counter() - clock:.0f} s")

@@ -71,13 +71,16 @@ class Shaft:
             (44 + 77 * p + 35 * p**2) * el,
             108 + 252 * p + 140 * p**2,
         )
-        m4, m5 = -(26 + 63 * p + 35 * p**2) * el, (8 + 14 * p + 7 * p**2) * el**2
+        m4 = -(26 + 63 * p + 35 * p**2) * el
+        m5 = (8 + 14 * p + 7 * p**2) * el**2
         m6 = -(6 + 14 * p + 7 * p**2) * el**2
         translation = np.array(
             [[m1, m2, m3, m4], [m2, m5, -m4, m6], [m3, -m4, m1, -m2], [m4, m6, -m2, m5]]
         )
-        m7, m8 = 36.0, (3 - 15 * p) * el
-        m9, m10 = (4 + 5 * p + 10 * p**2) * el**2, (-1 - 5 * p + 5 * p**2) * el**2
+        m7 = 36.0
+        m8 = (3 - 15 * p) * el
+        m9 = (4 + 5 * p + 10 * p**2) * el**2
+        m10 = (-1 - 5 * p + 5 * p**2) * el**2
         rotation = np.array(
             [[m7, m8, -m7, m8], [m8, m9, -m8, m10], [-m7, -m8, m7, -m8], [m8, m10, -m8, m9]]
         )
@@ -130,7 +133,9 @@ class Rotor:
         """Return mass, gyroscopic and stiffness matrices, and the bearings' pattern."""
         lengths = np.repeat([self.overhang / 2, self.span / 16, self.overhang / 2], [2, 16, 2])
         mass, gyro, stiffness = assemble(self.shaft, lengths)
-        r, h, at = self.disc_radius, self.disc_thickness, 2 * self.disc
+        r = self.disc_radius
+        h = self.disc_thickness
+        at = 2 * self.disc
         mass[at, at] += self.disc_mass
         mass[at + 1, at + 1] += self.disc_mass * (3 * r**2 + h**2) / 12
         gyro[at + 1, at + 1] += self.disc_mass * r**2 / 2
@@ -169,7 +174,8 @@ class Rotor:
     def state_matrix(self, k, c, speed):
         """Return the matrices of the state (deflection, velocity), shape (n, 2r, 2r), complex."""
         gyro, damping, stiffness, bearing, _ = self.reduced()
-        k, c = k[:, None, None], c[:, None, None]
+        k = k[:, None, None]
+        c = c[:, None, None]
         r = len(gyro)
         a = np.zeros((len(k), 2 * r, 2 * r), dtype=complex)
         a[:, :r, r:] = np.eye(r)
@@ -188,7 +194,8 @@ def first_frequency(k, c, rotor=ROTOR):
     positive.
     """
     k, c = np.broadcast_arrays(np.asarray(k, dtype=float), np.asarray(c, dtype=float))
-    flat_k, flat_c = k.ravel(), c.ravel()
+    flat_k = k.ravel()
+    flat_c = c.ravel()
     ok = (flat_k > 0) & (flat_c >= 0)
     found = np.full(k.size, np.nan)
     values = np.linalg.eigvals(rotor.state_matrix(1e3 * flat_k[ok], flat_c[ok], 0.0))
@@ -217,7 +224,8 @@ def vibration(k, c, contact, unbalance=0.45, rotor=ROTOR, substeps=1):
     # from 0 to 1.
     rises = (step - 1 - z) / z**2 * dt
     falls = (step - 1) / z * dt - rises
-    old, new = falls * force, rises * force
+    old = falls * force
+    new = rises * force
     give = (see[0] * new).sum(axis=1).real  # deflection at the end of a step for a unit force there
     turning = 1e-3 * unbalance * rotor.unbalance_radius * rotor.speed**2
     whirl = (
@@ -226,7 +234,8 @@ def vibration(k, c, contact, unbalance=0.45, rotor=ROTOR, substeps=1):
     orbit = (see[0] * whirl).sum(axis=1), (see[1] * whirl).sum(axis=1)
     q = np.zeros_like(values)
     f = np.zeros(len(k))
-    settle, samples = round(rotor.settling * rotor.sampling), round(rotor.record * rotor.sampling)
+    settle = round(rotor.settling * rotor.sampling)
+    samples = round(rotor.record * rotor.sampling)
     found = np.empty((len(k), samples))
     soft = contact / (1 + contact * give)
     for i in range(1, (settle + samples) * substeps + 1):

@@ -23,7 +23,8 @@ from scipy.stats import gaussian_kde, norm
 
 import prbayes as prb
 
-FREQUENCY, CREST = (45.69, 0.19), (1.73, 0.14)  # stated means and standard deviations
+FREQUENCY = (45.69, 0.19)  # stated mean and standard deviation
+CREST = (1.73, 0.14)  # likewise
 INITIAL = {
     "k": (266.0, 26.6),
     "c": (10.55, 1.055),
@@ -95,9 +96,11 @@ def rub(metric, observed, surrogate, first, knowledge):
         sd_r = pm.HalfNormal("sd_r", 0.3)
         contact = pm.TruncatedNormal.dist(mu_r, sd_r, lower=0)
         if knowledge == "means":
-            k, c = k0, c0
+            k = k0
+            c = c0
         elif knowledge == "population":
-            k, c = pm.Gamma.dist(mu=k0, sigma=s0), pm.Gamma.dist(mu=c0, sigma=0.1 * c0)
+            k = pm.Gamma.dist(mu=k0, sigma=s0)
+            c = pm.Gamma.dist(mu=c0, sigma=0.1 * c0)
         else:
             # The recipe: a normal distribution, in unconstrained space, of the draws of step 1 is
             # the prior of step 2.
@@ -161,7 +164,8 @@ def fit_to_stated(metric):
         )
     frequency = moments(prb.minimize(model, progressbar=False), first_frequency, (k, 10.55))
     with pm.Model() as model:
-        mu, sd = pm.Normal("mu", 0.5, 0.3), pm.HalfNormal("sd", 0.3)
+        mu = pm.Normal("mu", 0.5, 0.3)
+        sd = pm.HalfNormal("sd", 0.3)
         contact = pm.TruncatedNormal.dist(mu, sd, lower=0)
         prb.Simulator(
             "r", crest_factor, 266.0, 10.55, contact, metric=metric, observed=stated_values(*CREST)
@@ -219,7 +223,8 @@ def density(axis, grid, values, color, label, *, band=True):
 def picture_calibration(path, observed, stated, before, after, best, label):
     """Save a response before and after calibration (the paper's figures 17 and 18)."""
     figure, axis = plt.subplots(figsize=(6.4, 4), layout="constrained")
-    low, high = stated[0] - 5 * stated[1], stated[0] + 5 * stated[1]
+    low = stated[0] - 5 * stated[1]
+    high = stated[0] + 5 * stated[1]
     grid = np.linspace(low, high, 300)
     axis.hist(
         observed, bins=7, density=True, color="0.85", label=f"{observed.size} tests (synthetic)"
@@ -244,7 +249,8 @@ def picture_validity(path, fresh, predicted, test, exact):
     left.set(xlabel="crest factor at 0.95 g", ylabel="density", title="(a) responses")
     left.legend(frameon=False, fontsize=9)
     u = np.sort(test.u_values)
-    x, y = np.repeat(np.r_[0, u, 1], 2)[1:-1], np.repeat(np.arange(u.size + 1) / u.size, 2)
+    x = np.repeat(np.r_[0, u, 1], 2)[1:-1]
+    y = np.repeat(np.arange(u.size + 1) / u.size, 2)
     fine = np.linspace(0, 1, 2001)
     steps = np.searchsorted(u, fine, side="right") / u.size
     middle.fill_between(
@@ -331,7 +337,9 @@ def main():
     print(
         f"surrogate: {frequency.n_runs} model runs; cross-validated error {frequency.error}, in Hz"
     )
-    steps, frequency_moments, first_inputs = {}, {}, {}
+    steps = {}
+    frequency_moments = {}
+    first_inputs = {}
     for label, metric in METRICS.items():
         model, inputs = bearings(metric, frequencies, frequency)
         optimum = prb.minimize(model, progressbar=False)
@@ -354,7 +362,9 @@ def main():
         crest_factor, RANGES | {"contact": (0, 2.5)}, 128, model=prb.surrogate.Polynomial(4)
     )
     print(f"had its ranges gone up to 2.5 MN/m, where the vibration jumps: {wide.error}")
-    crest_moments, known, whole = {}, {}, {}
+    crest_moments = {}
+    known = {}
+    whole = {}
     for label, metric in METRICS.items():
         known[label], whole[label] = carried_through(metric, crests, surrogate, steps[label][0][1])
         model, inputs, optimum = known[label]
