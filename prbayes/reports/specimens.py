@@ -17,7 +17,7 @@ from prbayes.validation.probability_transform import u_values
 from prbayes.validation.side_by_side import Comparable, comparables
 
 # A page; of more the first ones are told.
-_MOST = 40
+_MOST_SPECIMENS = 40
 
 
 def specimens(m: Material) -> list[Section]:
@@ -29,8 +29,12 @@ def specimens(m: Material) -> list[Section]:
         "u is the share of the predicted responses below the measured one: a specimen with a u "
         "near 0 or 1 is at the edge of what was predicted."
     )
-    more = "" if len(rows) <= _MOST else f" The first {_MOST} of {len(rows)} values are told."
-    table = rows_table(rows[:_MOST])
+    more = (
+        ""
+        if len(rows) <= _MOST_SPECIMENS
+        else f" The first {_MOST_SPECIMENS} of {len(rows)} values are told."
+    )
+    table = rows_table(rows[:_MOST_SPECIMENS])
     return [Section("Specimens of the test", about + more, table, level=3)]
 
 

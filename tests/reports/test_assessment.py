@@ -71,7 +71,8 @@ def test_validity(calibrated: Any, page: Any, row: Any) -> None:
     assert found["verdict"] == ("rejected" if test.rejected else "not rejected")
     rejected = dataclasses.replace(test, p_value=0.01, statistic=0.4)
     both = prb.Report("x", validity={"early": test, "late": rejected}, pictures=False)
-    summary, tested = both.sections
+    summary, tested, specimens = both.sections
+    assert len(cells(specimens.table).rows) == test.u_values.size
     found_by = [("is rejected" in p, p.split(":")[0]) for p in summary.text]
     assert found_by == [(False, "early"), (True, "late")]
     rows = cells(tested.table).rows
