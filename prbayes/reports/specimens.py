@@ -17,7 +17,7 @@ from prbayes.validation.probability_transform import u_values
 from prbayes.validation.side_by_side import Comparable, comparables
 
 # A page; of more the first ones are told.
-_MOST_SPECIMENS = 40
+_ON_A_PAGE = 40
 
 
 def specimens(m: Material) -> list[Section]:
@@ -31,10 +31,10 @@ def specimens(m: Material) -> list[Section]:
     )
     more = (
         ""
-        if len(rows) <= _MOST_SPECIMENS
-        else f" The first {_MOST_SPECIMENS} of {len(rows)} values are told."
+        if len(rows) <= _ON_A_PAGE
+        else f" The first {_ON_A_PAGE} of {len(rows)} values are told."
     )
-    table = rows_table(rows[:_MOST_SPECIMENS])
+    table = rows_table(rows[:_ON_A_PAGE])
     return [Section("Specimens of the test", about + more, table, level=3)]
 
 
