@@ -229,12 +229,16 @@ def caveats(
         if rival.comparable:
             lines.append(_of_rival(evaluator, rival))
     if local is not None:
-        names = evaluator.readable_names
-        hidden = without(local.unidentified, evaluator.told_by_prior)
-        directions = unidentified_directions(hidden, names)
-        lines += [_of_direction(direction) for direction in directions]
+        lines += not_identified(evaluator, local)
         lines += confounded(evaluator, local)
     return tuple(lines)
+
+
+def not_identified(evaluator: Evaluator, local: Local) -> list[str]:
+    """Say about which directions the data tell less than the prior."""
+    hidden = without(local.unidentified, evaluator.told_by_prior)
+    directions = unidentified_directions(hidden, evaluator.readable_names)
+    return [_of_direction(direction) for direction in directions]
 
 
 def _of_design(evaluator: Evaluator, error: float) -> str:

@@ -25,7 +25,13 @@ from prbayes._checks import (
 )
 from prbayes._pages import more_in
 from prbayes._progress import progress, shown
-from prbayes.estimate.caveats import breakdown, caveats, elements_at_edge, heavy_tails
+from prbayes.estimate.caveats import (
+    breakdown,
+    caveats,
+    elements_at_edge,
+    heavy_tails,
+    not_identified,
+)
 from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.methods import Method
 from prbayes.estimate.obstacles import sampling_obstacle
@@ -583,7 +589,9 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
             return state
         plan.advance(_runs(evaluator) - before, note)
     elif rounds == MAX_ROUNDS:
-        refuse(short, evaluator)
+        # A search follows what is not identified until no design supports it.
+        known = [] if state.local is None else not_identified(evaluator, state.local)
+        refuse(short, evaluator, known)
     elif state.cloud is None:
         near = pilot(evaluator, state.scales, seed=plan.seed)
         state = replace(state, cloud=near)

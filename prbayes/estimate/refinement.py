@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -270,17 +270,21 @@ def noise_floors(evaluator: Evaluator, theta: Floats, n_sets: int) -> Floats:
     return np.array(floors)
 
 
-def refuse(short: Mapping[str, Shortcoming], evaluator: Evaluator) -> None:
-    """Raise for designs that still fall short."""
+def refuse(
+    short: Mapping[str, Shortcoming], evaluator: Evaluator, caveats: Iterable[str] = ()
+) -> None:
+    """Raise for designs that still fall short, with what else is known of where they do."""
     if not short:
         return
     what = "; ".join(
         f"{name}: the design does not support the answer: {s}" for name, s in short.items()
     )
     design = evaluator.designs[next(iter(short))]
+    known = "".join(f". There {line}" for line in caveats)
     raise DesignError(
         f"{what}; narrow the priors, pass a larger prb.Reweighted(n) (now {design.n_runs} runs "
         f"in all, of at most {design.max_points}), or use prb.Resimulated(n), which has no design"
+        f"{known}"
     )
 
 

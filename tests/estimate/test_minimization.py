@@ -849,3 +849,20 @@ def test_the_scale_base_changes_the_residual_and_not_its_minimiser() -> None:
     ratio = node(fitted("pr").model).target.scale_factor / node(other.model).target.scale_factor
     np.testing.assert_allclose(ratio, 10.0)
     np.testing.assert_allclose(fitted("pr").discrepancy, ratio * other.discrepancy, rtol=1e-6)
+
+
+@pytest.mark.long
+def test_a_search_that_follows_what_is_not_identified_names_it() -> None:
+    rng = np.random.default_rng(1)
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("mu_a", 10, 2), pm.HalfNormal("sd_a", 1))
+        b = pm.Normal.dist(pm.Normal("mu_b", 2, 0.4), pm.HalfNormal("sd_b", 0.3))
+        prb.Simulator(
+            "y",
+            lambda a, b: a / b,
+            *(a, b),
+            metric=prb.ProbabilityResidual(),
+            observed=rng.normal(10, 0.5, 40) / rng.normal(2, 0.1, 40),
+        )
+    with pytest.raises(prb.DesignError, match="There the data tell less than the prior about"):
+        prb.minimize(model, progressbar=False)
