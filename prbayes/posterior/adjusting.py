@@ -99,7 +99,7 @@ def adjust(
     ...     idata = pm.sample(50, tune=100, chains=2, cores=1, random_seed=1, **quiet)
     >>> adjusted = prb.adjust(idata, model=model, progressbar=False)
     >>> adjusted.posterior.attrs["adjustment"]
-    'Affine(n_sets=200, random_seed=0)'
+    'GivenEstimate(n_sets=200, random_seed=0, n_fits=2000)'
     """
     model = model_on_context(model, "prb.adjust")
     if by is not None and not isinstance(by, Affine):

@@ -1,4 +1,4 @@
-"""How draws are adjusted where nobody chose: by the straight map, or not at all where none need be.
+"""How draws are adjusted where nobody chose: given the estimate, or not at all where none need be.
 
 The choice rests on ``benchmarks/posterior.py``.
 """
@@ -14,6 +14,7 @@ from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.adjustment import Adjusted, Affine, Mapped
+from prbayes.posterior.given_estimate import GivenEstimate
 
 # How results say that nothing had to be done.
 NONE_NEEDED = "none needed: the draws of the log-likelihood are the posterior"
@@ -24,9 +25,9 @@ class _LikelihoodDraws(Affine):
     """Draws that stay as they are; refits only tell whether the family of the inputs fits."""
 
     def _serving(self, evaluator: Evaluator, design_error: float) -> Affine:
-        """Return this, or `Affine`, which widens draws where designs leave estimates uncertain."""
+        """Return this, or `GivenEstimate`, which knows that designs leave estimates uncertain."""
         if AGREE < design_error < np.inf:
-            return Affine(self.n_sets, self.random_seed)
+            return GivenEstimate(self.n_sets, self.random_seed)
         return self
 
     def _concluded(self, found: Adjusted, given: Floats) -> Adjusted:
@@ -45,7 +46,7 @@ class _LikelihoodDraws(Affine):
 
 def default_adjustment(evaluator: Evaluator) -> Affine:
     """Return what adjusts the draws of a model by default."""
-    return _LikelihoodDraws() if _is_likelihood(evaluator) else Affine()
+    return _LikelihoodDraws() if _is_likelihood(evaluator) else GivenEstimate()
 
 
 def _is_likelihood(evaluator: Evaluator) -> bool:

@@ -127,6 +127,7 @@ class GivenEstimate(Affine):
         return replace(
             first,
             given=True,
+            outside=0,
             draws=found.draws,
             center_error=center_error,
             width_error=width_error,

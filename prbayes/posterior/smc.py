@@ -93,7 +93,7 @@ def sample_smc(
         Where to calibrate epsilon, and the centre of the adjustment; `minimize` finds it if needed.
     adjust : Affine or bool
         Whether, and how, the draws are brought to the width that the data warrant. By default by
-        ``prb.posterior.Affine()``, and not where they are the posterior as they are, as
+        ``prb.posterior.GivenEstimate()``, and not where they are the posterior as they are, as
         those of `LogLikelihood` with one simulator, stored responses and epsilon = 1/N; nor where
         an epsilon was given, which is then taken at its word. An `Affine` or `GivenEstimate` that
         is given adjusts in any case.

@@ -163,7 +163,7 @@ def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
 def test_each_mode_is_adjusted_by_itself(name: str) -> None:
     optimum, idata = fit(name), posterior(name)
     assert idata.posterior.attrs["adjustment"].startswith(
-        "Affine(n_sets=200, random_seed=0), 2 modes each by itself"
+        "GivenEstimate(n_sets=200, random_seed=0, n_fits=2000), 2 modes each by itself"
     )
     mu, before = idata.posterior["mu"].values.ravel(), idata.unadjusted["mu"].values.ravel()
     # No draw changes sides; 1000 of them keep the shares to 1.6%, and resampling adds drift.

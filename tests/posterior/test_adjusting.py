@@ -69,7 +69,7 @@ def test_draws_of_nuts_get_the_width_that_the_data_warrant(
     model = build()
     expected = moments(smc(model, True))
     with caplog.at_level(logging.INFO, "prbayes"):
-        prb.set_epsilon(model, {"y": 0.05})
+        prb.set_epsilon(model, {"y": 0.08})
     assert "prb.adjust" in caplog.text
     with model:
         idata = pm.sample(

@@ -329,7 +329,7 @@ def test_hyperparameters_absent_from_the_response_keep_their_prior(name: str) ->
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
         prb.Simulator("y", same, x, metric=METRICS[name], observed=OBSERVED, propagation=R256)
     idata = sample(model, 500)
-    assert idata.posterior.attrs["adjustment"].startswith("Affine")
+    assert idata.posterior.attrs["adjustment"].startswith("GivenEstimate")
     assert_quantiles(idata.posterior["idle"], norm(3, 20), 1000)
     assert_quantiles(idata.posterior["rate"], gamma(2), 1000)
     # While the others were adjusted.
@@ -374,7 +374,8 @@ def test_a_given_epsilon_is_taken_at_its_word() -> None:
     optimum = prb.minimize(build(METRICS["kl"], sd=0.5))
     short = {"draws": 60, "optimum": optimum}
     assert (
-        adjustment(sample(optimum.model, **short)) == "Affine(n_sets=200, random_seed=0)"
+        adjustment(sample(optimum.model, **short))
+        == "GivenEstimate(n_sets=200, random_seed=0, n_fits=2000)"
     )  # 1/N, which nobody gave
     assert adjustment(sample(optimum.model, epsilon=0.01, **short)) == "none"
     assert (
@@ -500,7 +501,7 @@ def test_a_metric_of_ones_own_is_adjusted_to_the_width_of_its_refits() -> None:
     own = prb.FunctionMetric(lambda z, y, w: np.abs((z * w).sum(-1) - y.mean()), weighted=True)
     optimum = prb.minimize(build(own, sd=0.5), starts=0)
     idata = sample(optimum.model, optimum=optimum)
-    assert adjustment(idata).startswith("Affine")
+    assert adjustment(idata).startswith("GivenEstimate")
     # The mean of normal data with known spread and a wide prior; 200 data sets: 5%, 600 draws: 3%.
     np.testing.assert_allclose(idata.posterior["mu"].std(), 0.5 / N**0.5, rtol=4 * 0.06)
     # Epsilon alone came near it.
@@ -584,7 +585,7 @@ def test_shared_specimens_do_not_count_twice(name: str) -> None:
         optimum = prb.minimize(two_responses(METRICS[name], labels=labels), method="Nelder-Mead")
         stderr.append(optimum.stderr["mu"])
         idata = sample(optimum.model, optimum=optimum)
-        assert adjustment(idata).startswith("Affine")
+        assert adjustment(idata).startswith("GivenEstimate")
         widths.append(float(idata.posterior["mu"].std()))
         bootstrapped.append(float(prb.bootstrap(optimum, 400).posterior["mu"].std()))
     # Standard deviations of 200 data sets, twice: 5% each, 7% the ratio; of 400: 5%.

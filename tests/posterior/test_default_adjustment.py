@@ -12,7 +12,7 @@ import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.metrics.joint import Joint
 from prbayes.model.evaluator import Evaluator
-from prbayes.posterior import Affine
+from prbayes.posterior import Affine, GivenEstimate
 from prbayes.posterior.default_adjustment import NONE_NEEDED, default_adjustment
 
 OBSERVED = np.random.default_rng(2).normal(1.0, 0.5, 30)
@@ -30,11 +30,11 @@ def chosen(metric: prb.Metric, observed: Floats = OBSERVED, **keywords: Any) -> 
     return default_adjustment(Evaluator(build(metric, observed, **keywords)))
 
 
-def test_draws_are_mapped_but_for_those_of_a_likelihood() -> None:
+def test_draws_are_those_given_the_estimate_but_for_a_likelihood() -> None:
     for name in ("pr", "kl", "area"):
-        assert chosen(METRICS[name]) == Affine()
+        assert chosen(METRICS[name]) == GivenEstimate()
     for metric in (METRICS["ll"], Joint(METRICS["ll"])):
-        assert chosen(metric) != Affine()
+        assert not isinstance(chosen(metric), GivenEstimate)
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def test_draws_are_mapped_but_for_those_of_a_likelihood() -> None:
     ids=["wide kernel", "an epsilon", "specimens", "not stored"],
 )
 def test_what_is_not_quite_a_likelihood_is_adjusted(keywords: dict[str, Any]) -> None:
-    assert chosen(**{"metric": METRICS["ll"]} | keywords) == Affine()
+    assert chosen(**{"metric": METRICS["ll"]} | keywords) == GivenEstimate()
 
 
 def sample(model: pm.Model, **keywords: Any) -> xr.DataTree:

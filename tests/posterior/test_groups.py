@@ -1,6 +1,7 @@
 """What ArviZ looks for beside the posterior, against closed forms and PyMC's own functions."""
 
 from functools import cache
+from typing import Any
 
 import arviz as az
 import numpy as np
@@ -52,29 +53,30 @@ def test_the_log_prior_is_that_of_the_user_s_own_units() -> None:
     np.testing.assert_allclose(tree.log_prior["mu"].values, theirs["mu"].values, rtol=1e-9)
 
 
-def test_the_likelihood_of_adjusted_draws_is_a_normal_one_about_the_estimate() -> None:
-    """Prior times likelihood is the density of the draws: here a normal one, with a prior that counts."""
-    _, optimum, tree = adjusted()
+@pytest.mark.parametrize("by", [prb.posterior.GivenEstimate(), prb.posterior.Affine()])
+def test_the_likelihood_of_adjusted_draws_times_the_prior_is_their_density(by: Any) -> None:
+    """Here a normal one, with a prior that counts."""
+    model, optimum, tree = adjusted()
+    if by != prb.posterior.GivenEstimate():  # the default
+        tree = prb.sample_smc(500, chains=2, model=model, optimum=optimum, adjust=by, **QUIET)
     mu = tree.posterior["mu"].values.ravel()
     log = sum(tree.log_likelihood[name].values.ravel() for name in tree.log_likelihood.data_vars)
     inner = np.abs(mu - np.median(mu)) < 2 * mu.std()
     curvature, slope, _ = np.polyfit(mu[inner], log[inner], 2)
     sd, centre = (-2 * curvature) ** -0.5, -slope / (2 * curvature)
-    # The pseudo-posterior is normal up to a few percent of its curvature.
-    np.testing.assert_allclose(sd, float(optimum.stderr["mu"]), rtol=0.2)
-    assert abs(centre - float(optimum.point["mu"])) < 0.5 * sd
-    # That of the draws before, which an adjustment did not change, is another one.
+    precision = sd**-2 + 0.2**-2
+    # Of 1000 draws a standard deviation has an error of 2%; the tails are not quite normal.
+    np.testing.assert_allclose(mu.std(), precision**-0.5, rtol=0.1)
+    np.testing.assert_allclose(mu.mean(), centre * sd**-2 / precision, atol=0.2 * sd)
+    # About the estimate, as wide as it scatters; both are uncertain where the prior is five of its
+    # standard deviations away.
+    np.testing.assert_allclose(sd, optimum.stderr["mu"], rtol=0.3)
+    assert abs(centre - optimum.point["mu"]) < sd
+    # That of the draws before, which a straight map alone leaves in need of another term.
     own = tree.log_likelihood["one_number_for_all_specimens"].values.ravel()
-    assert own.max() < 0
-    assert np.ptp(tree.log_likelihood["adjustment_of_it"].values) > 0.1
-    # Given the estimate it is known by itself.
-    by = prb.posterior.GivenEstimate()
-    given = prb.sample_smc(
-        500, chains=2, model=optimum.model, optimum=optimum, adjust=by, **QUIET
-    ).log_likelihood
-    assert np.ptp(given["adjustment_of_it"].values) == 0
-    own = given["one_number_for_all_specimens"].values
-    assert np.ptp(own) > 2
+    assert own.max() < (0 if by == prb.posterior.Affine() else 2)
+    added = np.ptp(tree.log_likelihood["adjustment_of_it"].values)
+    assert added > 0.1 if by == prb.posterior.Affine() else added == 0
 
 
 def test_draws_that_no_affine_map_made_have_no_likelihood_here() -> None:
