@@ -190,7 +190,9 @@ def table(rows: dict[str, Any]) -> list[str]:
             ]
             for posterior in POSTERIORS:
                 if chosen:
-                    lines.append(f"{name:22s}{metric:16s}{posterior:14s}{_shown(chosen, posterior)}")
+                    lines.append(
+                        f"{name:22s}{metric:16s}{posterior:14s}{_shown(chosen, posterior)}"
+                    )
     return lines
 
 

@@ -28,11 +28,14 @@ METRICS = {
 POSTERIORS = {
     "Gibbs, calibrated epsilon": "plain",
     "sandwich": "sandwich",
-    "**adjusted (default)**": "affine",
+    "straight map": "affine",
     "bootstrap": "bootstrap",
     "exact": "exact",
 }
-Row = Iterable[str]
+# Metrics whose draws are given the estimate by default.
+SEEN = ("PR", "KLD", "area")
+WAYS = {"affine": "straight map", "given": "given the estimate", "exact": "exact posterior"}
+Row = Iterable[Any]
 
 
 def found(name: str) -> Any:
@@ -96,6 +99,78 @@ def folded() -> Iterator[Row]:
                 f"{affine['off'][name]:+.2f}",
                 f"{given['off']:+.2f}",
             ]
+
+
+def _in_estimates(posterior: str, *, problem: str = "", size: int = 0) -> tuple[Any, Any, Any]:
+    """Return coverage, width over the exact one and distance of centres of cells, (n,) each."""
+    chosen = []
+    for key, cell in found("posterior")["cells"].items():
+        of_problem, of_size, metric, of = key.split("/")
+        asked = problem in ("", of_problem) and size in (0, int(of_size))
+        if asked and of == posterior and metric in SEEN:
+            chosen.append(cell)
+    names = ("coverage", "sd over exact sd", "off")
+    coverage, width, off = (np.concatenate([cell[name] for cell in chosen]) for name in names)
+    return coverage, width, np.abs(off)
+
+
+def given_estimate() -> Iterator[Row]:
+    """Return the rows of the posterior given the estimate, over problems that set no constant."""
+    sets = [cell["data sets"] for cell in found("posterior")["cells"].values()]
+    for size, (name, label) in product((10, 20, 50, 200), WAYS.items()):
+        coverage, width, off = _in_estimates(name, size=size)
+        yield [
+            size,
+            label,
+            f"{short(coverage.mean(), 3)} ({short(coverage.min())} to {short(coverage.max())})",
+            f"{_mean_ratio(width)} ({short(width.min())} to {short(width.max())})",
+            f"{short(off.mean())} ({short(off.max())})",
+            f"{min(sets)} to {max(sets)}",
+        ]
+
+
+def given_estimate_by_problem() -> Iterator[Row]:
+    """Return the same rows by problem."""
+    problems = {
+        "gamma": "gamma",
+        "weibull": "Weibull",
+        "folded": "folded, |x|",
+        "threshold": "threshold",
+    }
+    for (problem, label), size in product(problems.items(), (10, 20, 50, 200)):
+        row = [label, size]
+        for name in ("affine", "given"):
+            coverage, width, off = _in_estimates(name, problem=problem, size=size)
+            row += [short(coverage.mean()), _mean_ratio(width), short(off.mean())]
+        yield row
+
+
+def _mean_ratio(ratios: Any) -> str:
+    return short(float(np.exp(np.log(ratios).mean())))
+
+
+def hard_posteriors() -> Iterator[Row]:
+    """Return the rows of posteriors where a straight line is not enough."""
+    from benchmarks.hard_posteriors import CASES, METRICS, summary
+
+    rows = found("hard_posteriors")
+    for case, metric in product(CASES, METRICS):
+        of_cell = [row for key, row in rows.items() if key.startswith(f"{case}/{metric}/")]
+        done = [row for row in of_cell if "refused" not in row]
+        if not done:
+            yield [case, metric, "refused", "", "", "refused", "", ""]
+            continue
+        row = [case, metric]
+        for posterior in ("Affine", "GivenEstimate"):
+            one = summary(done, posterior)
+            row += [
+                " / ".join(f"{value:+.2f}" for value in one["off"]),
+                " / ".join(f"{value:.2f}" for value in one["width"]),
+                f"{one['said']} of {len(done)}",
+            ]
+        if len(done) < len(of_cell):
+            row[-1] += f", {len(of_cell) - len(done)} refused"
+        yield row
 
 
 def samplers() -> Iterator[Row]:
@@ -610,6 +685,9 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "coverage, by problem": coverage,
     "outliers": outliers,
     "given the estimate, folded": folded,
+    "given the estimate, pooled": given_estimate,
+    "given the estimate, by problem": given_estimate_by_problem,
+    "hard posteriors": hard_posteriors,
     "samplers": samplers,
     "size": sizes,
     "size, through prbayes": sizes_through,
