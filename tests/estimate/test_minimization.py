@@ -864,5 +864,7 @@ def test_a_search_that_follows_what_is_not_identified_names_it() -> None:
             metric=prb.ProbabilityResidual(),
             observed=rng.normal(10, 0.5, 40) / rng.normal(2, 0.1, 40),
         )
-    with pytest.raises(prb.propagation.DesignError, match="There the data tell less than the prior about"):
+    with pytest.raises(
+        prb.propagation.DesignError, match="There the data tell less than the prior about"
+    ):
         prb.minimize(model, progressbar=False)
