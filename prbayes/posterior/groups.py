@@ -15,6 +15,7 @@ from prbayes.model.labels import (
     labelled_responses,
     observed_dataset,
 )
+from prbayes.response.compilation import untraced
 from prbayes.response.outputs import lacking
 
 # The names that ArviZ's functions which want a number for each observation show when they refuse.
@@ -118,8 +119,10 @@ def _log_prior(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
     """Return the log prior density of each variable in the user's own units, by draw."""
     chains, draws, d = thetas.shape
     free = evaluator.model.free_RVs
-    graphs = evaluator.model.logp(vars=free, jacobian=False, sum=False)
-    values = evaluator.hyperparameters.compile(graphs)(thetas.reshape(-1, d))
+    with untraced():
+        graphs = evaluator.model.logp(vars=free, jacobian=False, sum=False)
+        density = evaluator.hyperparameters.compile(graphs)
+    values = density(thetas.reshape(-1, d))
     found = {}
     for rv, value in zip(free, values, strict=True):
         total = np.reshape(value, (chains * draws, -1)).sum(axis=1)
