@@ -1,5 +1,6 @@
 """Configuration of the pages: the README says how to build them."""
 
+import os
 import sys
 from inspect import isclass, ismodule
 from pathlib import Path
@@ -51,6 +52,10 @@ html_theme = "furo"
 html_title = "prbayes"
 html_static_path = ["_static"]
 html_css_files = ["prbayes.css"]
+
+# Pages run side by side, one on a processor: threads within one would wait for those of others.
+for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(threads, "1")
 
 # Pages are notebooks: a page whose code fails stops the build. Results are kept, so that only
 # changed pages run again.

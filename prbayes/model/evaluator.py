@@ -21,7 +21,7 @@ from prbayes.model.hyperparameters import Hyperparameters
 from prbayes.model.node import Node, log_kernel, required_nodes
 from prbayes.propagation.reweighted import Design
 from prbayes.response.budget import budget
-from prbayes.response.compilation import compiled, ninf_for_invalid
+from prbayes.response.compilation import compiled, ninf_for_invalid, untraced
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,8 @@ class Evaluator:
         """
         asked = (prior, gradient)
         if asked not in self._objectives:
-            self._objectives[asked] = self._objective(prior=prior, gradient=gradient)
+            with untraced():
+                self._objectives[asked] = self._objective(prior=prior, gradient=gradient)
         return self._objectives[asked]
 
     def _objective(self, *, prior: bool, gradient: bool) -> Any:

@@ -20,7 +20,7 @@ from pytensor.graph.traversal import ancestors
 from prbayes._checks import Floats, called, real_array, refuse_single_precision
 from prbayes.model.elements import coordinates, element_names
 from prbayes.propagation.points import sobol
-from prbayes.response.compilation import compiled, interpreted, ninf_for_invalid
+from prbayes.response.compilation import compiled, interpreted, ninf_for_invalid, untraced
 from prbayes.response.distributions import PriorPoints, PriorSampler
 from prbayes.response.inputs import event_shape
 
@@ -136,14 +136,16 @@ class Hyperparameters:
 
         Where a parameter of a distribution is invalid, the result is -inf for that theta alone.
         """
-        outputs, theta = self.joined(graphs)
-        batch = pt.dmatrix("thetas")
-        batched = vectorize_graph(ninf_for_invalid(outputs), {theta: batch})
-        return compiled([batch], batched)
+        with untraced():
+            outputs, theta = self.joined(graphs)
+            batch = pt.dmatrix("thetas")
+            batched = vectorize_graph(ninf_for_invalid(outputs), {theta: batch})
+            return compiled([batch], batched)
 
     @cached_property
     def _log_prior(self) -> Any:
-        return self.compile([self.model.varlogp])
+        with untraced():
+            return self.compile([self.model.varlogp])
 
     def log_prior(self, thetas: Floats) -> Floats:
         """Return the log prior density with the Jacobian of the transforms, shape (P,)."""
@@ -156,7 +158,8 @@ class Hyperparameters:
 
     @cached_property
     def _constrain(self) -> Any:
-        return self.compile(self.model.replace_rvs_by_values(self.model.unobserved_RVs))
+        with untraced():
+            return self.compile(self.model.replace_rvs_by_values(self.model.unobserved_RVs))
 
     def constrained(self, thetas: Floats) -> dict[str, Floats]:
         """Return variables and deterministics, shapes (P, *shape), in the user's own units."""

@@ -9,15 +9,22 @@ import xarray as xr
 
 from prbayes._checks import AT_ONCE, Floats
 from prbayes.model.evaluator import Evaluation, Evaluator
-from prbayes.model.labels import arviz_attributes, labelled, labelled_responses
+from prbayes.model.labels import (
+    arviz_attributes,
+    labelled,
+    labelled_responses,
+    observed_dataset,
+)
+from prbayes.response.compilation import untraced
 from prbayes.response.outputs import lacking
 
 # The names that ArviZ's functions which want a number for each observation show when they refuse.
 _LIKELIHOOD = ("one_number_for_all_specimens", "adjustment_of_it")
 _NOTE = (
     "The log-density of all specimens together, and what the adjustment of the draws adds to it: "
-    "one number for each draw, for power-scaling (psense). loo, compare and khat want one for each "
-    "observation and have no meaning here; use prb.cross_validate."
+    "one number for each draw, for power-scaling (psense), of one place for specimens. loo, "
+    "compare and khat want one for each observation and have no meaning here; use "
+    "prb.cross_validate."
 )
 # Draws farther than this share of a standard deviation from where an affine map would have them
 # were mapped by another one; rounding is far below.
@@ -112,8 +119,10 @@ def _log_prior(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
     """Return the log prior density of each variable in the user's own units, by draw."""
     chains, draws, d = thetas.shape
     free = evaluator.model.free_RVs
-    graphs = evaluator.model.logp(vars=free, jacobian=False, sum=False)
-    values = evaluator.hyperparameters.compile(graphs)(thetas.reshape(-1, d))
+    with untraced():
+        graphs = evaluator.model.logp(vars=free, jacobian=False, sum=False)
+        density = evaluator.hyperparameters.compile(graphs)
+    values = density(thetas.reshape(-1, d))
     found = {}
     for rv, value in zip(free, values, strict=True):
         total = np.reshape(value, (chains * draws, -1)).sum(axis=1)
@@ -134,6 +143,9 @@ def _log_likelihood(
     :math:`\theta' = T(\theta)`, so that theirs is
     :math:`\ell'(\theta') = \ell(\theta) + \log p(\theta) - \log p(\theta')`. None, where the map
     was another one, and the adjustment does not know it.
+
+    Along each dimension of specimens there is one place: ArviZ would take a number without such a
+    dimension for that of each specimen, as in `loo_expectations`.
     """
     chains, draws, d = thetas.shape
     before = particles.reshape(-1, d)
@@ -150,11 +162,21 @@ def _log_likelihood(
         if not _is_affine(before, after):
             return None
         adjustment = log_prior - evaluator.hyperparameters.log_prior(after)
+    together = _dims_of_specimens(evaluator)
+    dims = ["chain", "draw", *together]
+    shape = (chains, draws, *[1] * len(together))
     parts = {}
     for name, values in zip(_LIKELIHOOD, (own, adjustment), strict=True):
-        parts[name] = (["chain", "draw"], values.reshape(chains, draws))
+        parts[name] = (dims, values.reshape(shape))
     coords = {"chain": np.arange(chains), "draw": np.arange(draws)}
     return xr.Dataset(parts, coords=coords, attrs={"note": _NOTE})
+
+
+def _dims_of_specimens(evaluator: Evaluator) -> list[str]:
+    """Return the names of the dimensions along which the simulators' specimens are, each once."""
+    observed = observed_dataset(evaluator)
+    firsts = [str(observed[node.name].dims[0]) for node in evaluator.nodes]
+    return list(dict.fromkeys(firsts))
 
 
 def _is_affine(before: Floats, after: Floats) -> bool:

@@ -74,8 +74,18 @@ def interpreted() -> Iterator[None]:
     It calls one for the inside of a loop, whatever the mode: ten seconds for a prior of
     correlations, and a warning where there is no BLAS to link to.
     """
-    # The flag is one for all threads: each has to find it as it was.
-    with _flags, pytensor.config.change_flags(cxx=""):
+    with untraced(), pytensor.config.change_flags(cxx=""):
+        yield
+
+
+@contextmanager
+def untraced() -> Iterator[None]:
+    """Build the graphs inside without a note in each node of the lines that made it.
+
+    PyTensor reads those lines from files: a seventh of a calibration, for notes on our own code.
+    """
+    # The flags are the same for all threads: each has to find them as they were.
+    with _flags, pytensor.config.change_flags(traceback__limit=0):
         yield
 
 
@@ -226,7 +236,8 @@ def compile_batched(
     extra: Sequence[TensorVariable] = (),
 ) -> Any:
     """Compile a graph for a batch: core inputs get a leading axis, ``extra`` ones do not."""
-    outputs = ninf_for_invalid(core_outputs)
-    batched = with_leading_axis(core_inputs)
-    vectorized = vectorize_graph(outputs, dict(zip(core_inputs, batched, strict=True)))
-    return compiled([*batched, *extra], vectorized, allow_input_downcast=True)
+    with untraced():
+        outputs = ninf_for_invalid(core_outputs)
+        batched = with_leading_axis(core_inputs)
+        vectorized = vectorize_graph(outputs, dict(zip(core_inputs, batched, strict=True)))
+        return compiled([*batched, *extra], vectorized, allow_input_downcast=True)

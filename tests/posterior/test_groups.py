@@ -96,6 +96,41 @@ def test_leaving_one_out_of_one_number_is_refused() -> None:
     assert "power-scaling" in tree.log_likelihood.attrs["note"]
 
 
+def labelled_and_two() -> pm.Model:
+    """Labelled specimens of two outputs, and another simulator with specimens of its own."""
+    coords = {"plate": [f"S{i}" for i in range(20)], "out": ["a", "b"]}
+    with pm.Model(coords=coords) as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 0.2), 0.5)
+        both = np.column_stack([OBSERVED[:20], OBSERVED[:20] ** 2])
+        prb.Simulator(
+            "two", lambda x: np.stack([x, x**2], axis=-1), x,
+            metric=prb.Joint(prb.AreaMetric()), observed=both, dims=("plate", "out"), epsilon=0.1,
+        )  # fmt: skip
+        prb.Simulator("y", lambda x: x, x, metric=prb.AreaMetric(), observed=OBSERVED, epsilon=0.1)
+    return model
+
+
+def test_one_number_is_not_taken_for_that_of_each_specimen() -> None:
+    """It has one place along the specimens, which ArviZ does not align with all of them."""
+    for tree, names in (
+        (adjusted()[2], ["y"]),
+        (prb.sample_smc(20, chains=2, model=labelled_and_two(), **QUIET), ["two", "y"]),
+    ):
+        for group in tree.log_likelihood.data_vars.values():
+            assert group.sizes == {"chain": 2, "draw": tree.posterior.sizes["draw"]} | {
+                tree.observed_data[name].dims[0]: 1 for name in names
+            }
+        for name in names:
+            for given in (None, "one_number_for_all_specimens"):
+                with pytest.raises(ValueError, match="conflicting dimension sizes"):
+                    az.loo_expectations(tree, var_name=name, log_likelihood_var_name=given)
+            with pytest.raises(ValueError, match="conflicting dimension sizes"):
+                az.loo_metrics(tree, var_name=name)
+        for refuses in (az.loo_expectations, az.loo_metrics, az.loo_influence):
+            with pytest.raises((TypeError, ValueError)):
+                refuses(tree)
+
+
 def test_power_scaling_sees_a_prior_that_holds_the_answer_back() -> None:
     tree = adjusted()[2]
     table = az.psense_summary(tree)

@@ -23,9 +23,23 @@ from prbayes.response.compilation import (
     compile_batched,
     compiled,
     ninf_for_invalid,
+    untraced,
     with_leading_axis,
 )
 from prbayes.response.distributions import PriorSampler
+
+
+def test_our_own_graphs_have_no_notes_of_lines_and_others_have() -> None:
+    x = pt.dscalar("x")
+    with pytensor.config.change_flags(traceback__limit=8):
+        with untraced():
+            ours = x + 1.0
+        theirs = x + 2.0
+        with pytest.raises(ZeroDivisionError), untraced():
+            raise ZeroDivisionError
+        assert pytensor.config.traceback__limit == 8
+    assert not any(getattr(ours.tag, "trace", ()))
+    assert any(getattr(theirs.tag, "trace", ()))
 
 
 def test_a_batch_gives_what_single_calls_do() -> None:
