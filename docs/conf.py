@@ -42,6 +42,7 @@ extensions = [
     "sphinx.ext.viewcode",
     "numpydoc",
     "myst_nb",
+    "alt_texts",
     "notebooks",
     "offline_math",
 ]

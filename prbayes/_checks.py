@@ -69,10 +69,12 @@ def _describe(values: object, array: NDArray[Any]) -> str:
 
 
 def called(value: object) -> str:
-    """Return what an argument is, for a message."""
+    """Return what an argument is, for a message: on one line, also of an array or a table."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
-    return f"{type(value).__name__} {value!r:.60}"
+    words = repr(value).split()
+    on_one_line = " ".join(words)
+    return f"{type(value).__name__} {on_one_line:.60}"
 
 
 def observed_sample(values: ArrayLike, name: str = "observed", *, minimum: int = 1) -> Floats:

@@ -8,6 +8,7 @@ import pytest
 import xarray as xr
 
 from prbayes._checks import (
+    called,
     observed_sample,
     positive_integer,
     positive_number,
@@ -254,3 +255,11 @@ def test_single_precision_is_refused() -> None:
         TypeError, match=r"model: got hyperparameters of float32, expected float64.*floatX"
     ):
         refuse_single_precision("model", "float32")
+
+
+def test_an_argument_is_told_on_one_line() -> None:
+    told = called(xr.DataArray([1.0, 2.0], dims="specimen"))
+    assert told.startswith("DataArray <xarray.DataArray (specimen: 2)>")
+    assert "\n" not in told
+    assert called(2.5) == "float 2.5"
+    assert called(float) == "the class float"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from prbayes.plots.validity import in_directions
 from prbayes.reports.decision import kind_of_decision
 from prbayes.reports.material import Material
 
@@ -38,8 +39,8 @@ def _of_validity(m: Material) -> list[str]:
             "correct the response, let another input vary, or calibrate what the response leaves "
             "out (prb.response.Additive, prb.response.Multiplicative)."
         ]
-    folded = any(test.folded for test in m.tests.values())
-    if folded:
+    # In directions of several outputs the area of |2u - 1| is a part of the statistic.
+    if any(test.folded or in_directions(test) for test in m.tests.values()):
         return []
     return [
         "Test the spread as well: prb.area_test(..., folded=True), each of the two tests at half "

@@ -82,7 +82,7 @@ def interpreted() -> Iterator[None]:
 def untraced() -> Iterator[None]:
     """Build the graphs inside without a note in each node of the lines that made it.
 
-    PyTensor reads those lines from files: a seventh of a calibration, for notes on our own code.
+    PyTensor reads those lines from files: about a tenth of a short calibration.
     """
     # The flags are the same for all threads: each has to find them as they were.
     with _flags, pytensor.config.change_flags(traceback__limit=0):

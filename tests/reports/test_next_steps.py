@@ -3,9 +3,12 @@
 import dataclasses
 from typing import Any
 
+import numpy as np
+
 import prbayes as prb
 from prbayes.reports.material import gather
 from prbayes.reports.next_steps import next_steps
+from prbayes.validation.conditions import DIRECTION
 
 
 def steps(calibrated: Any, **given: Any) -> str:
@@ -30,6 +33,12 @@ def test_a_rejected_model_is_to_be_corrected(calibrated: Any) -> None:
     assert "folded=True" in steps(
         calibrated, posterior=calibrated.posterior, validity=calibrated.test
     )
+
+
+def test_the_spread_of_several_outputs_is_tested_already(calibrated: Any) -> None:
+    names = np.array([f"later{DIRECTION}{k % 4 + 1}" for k in range(calibrated.test.u_values.size)])
+    test = dataclasses.replace(calibrated.test, conditions=names)
+    assert "folded=True" not in steps(calibrated, posterior=calibrated.posterior, validity=test)
 
 
 def test_problems_come_first(calibrated: Any) -> None:
