@@ -429,7 +429,7 @@ def _planned(
     """Return what is to be done."""
     clock = time.perf_counter()
     _refuse_random(evaluator, asked.method)
-    stored = _runs(evaluator)
+    stored = evaluator.n_runs
     free = not evaluator.responses_per_theta
     return _Plan(
         search=Search(
@@ -602,10 +602,10 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
         left = runs_left(evaluator, errors)
         note = f"error {errors.whole:.2f} standard errors, {AGREE} are wanted"
         note += f", about {left} runs to go" if left else ", no more runs are needed"
-        before = _runs(evaluator)
+        before = evaluator.n_runs
         if not grow(evaluator, near, errors):
             return state
-        plan.advance(_runs(evaluator) - before, note)
+        plan.advance(evaluator.n_runs - before, note)
     elif rounds == MAX_ROUNDS:
         # A search follows what is not identified until no design supports it.
         known = [] if state.local is None else not_identified(evaluator, state.local)
@@ -658,11 +658,6 @@ def _likeliest(plan: _Plan, thetas: Floats, scales: Floats) -> Floats:
 def _noise(evaluator: Evaluator, theta: Floats, scales: Floats) -> float:
     """Return the mean of the objective over data sets drawn from the model at theta."""
     return float((noise_floors(evaluator, theta, FEW_SETS) / scales).sum())
-
-
-def _runs(evaluator: Evaluator) -> int:
-    """Return how many runs designs have."""
-    return sum(design.n_runs for design in evaluator.designs.values())
 
 
 def _against_rivals(plan: _Plan, state: _State) -> _State:
