@@ -41,9 +41,11 @@ from pytensor.graph.replace import _vectorize_node, graph_replace, vectorize_gra
 from pytensor.graph.rewriting.basic import node_rewriter, out2in
 from pytensor.graph.traversal import ancestors, toposort, walk
 from pytensor.graph.utils import MissingInputError
+from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.random.type import RandomGeneratorType
+from pytensor.tensor.subtensor import Subtensor
 from pytensor.tensor.variable import TensorVariable
 
 PLAIN = Mode(linker="py", optimizer="fast_run")
@@ -71,6 +73,17 @@ def test_terms_of_a_sum_come_into_one_operation_that_a_late_rewriting_sees() -> 
     xs = [pt.dvector() for _ in range(5)]
     function(xs, sum(xs[1:], start=xs[0]), mode=PLAIN.register((out2in(look), 1000)))
     assert (True, 5) in seen
+
+
+def test_an_element_of_each_row_is_a_loop_over_rows_that_tells_its_operation() -> None:
+    x, i = pt.dvector(), pt.lscalar()
+    (element,) = vectorize_graph([x[i]], {x: pt.dmatrix(), i: pt.lvector()})
+    op = element.owner.op
+    assert isinstance(op, Blockwise)
+    assert isinstance(op.core_op, Subtensor)
+    assert len(op.core_op.idx_list) == 1
+    assert not isinstance(op.core_op.idx_list[0], slice)
+    assert op.batch_ndim(element.owner) == 1
 
 
 def test_variables_of_models_are_tensors_made_by_applications_of_operations() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
+import pytensor.tensor as pt
 import pytest
 from scipy import stats
 
@@ -163,6 +164,74 @@ def test_marginal_responses_tell_the_standard_deviations_and_no_correlation() ->
     # Each is a sample of its own: sd / sqrt(2 N).
     np.testing.assert_allclose(stderr["chol_stds"], SDS / np.sqrt(2 * N), rtol=0.25)
     np.testing.assert_array_equal(stderr["chol_corr"], [[0.0, np.inf], [np.inf, 0.0]])
+
+
+def same(x: Any) -> Any:
+    return x
+
+
+def by_lkj_factor() -> Any:
+    chol, corr, _ = pm.LKJCholeskyCov("c", n=2, eta=1, sd_dist=pm.HalfNormal.dist(2.0, shape=2))
+    pm.Deterministic("rho", corr[0, 1])
+    return pm.MvNormal.dist(pm.Normal("mu", 0, 3, shape=2), chol=chol)
+
+
+def by_correlations() -> Any:
+    factor = pm.LKJCorr("factor", n=2, eta=1)
+    deviations = pm.HalfNormal("sd", 2.0, shape=2)
+    pm.Deterministic("rho", factor[1, 0])
+    return pm.MvNormal.dist(pm.Normal("mu", 0, 3, shape=2), chol=deviations[:, None] * factor)
+
+
+def by_hand() -> Any:
+    deviations = pm.HalfNormal("sd", 2.0, shape=2)
+    rho = pm.Uniform("rho", -1, 1)
+    correlation = pt.stacklists([[1.0, rho], [rho, 1.0]])
+    covariance = pt.outer(deviations, deviations) * correlation
+    return pm.MvNormal.dist(pm.Normal("mu", 0, 3, shape=2), cov=covariance)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("inputs", "rho", "size"),
+    [(by_lkj_factor, 0.6, 50), (by_correlations, 0.95, 20), (by_hand, 0.0, 200)],
+)
+def test_the_correlation_of_two_outputs_is_found_by_default(
+    inputs: Callable[[], Any], rho: float, size: int
+) -> None:
+    covariance = np.outer(SDS, SDS) * np.array([[1.0, rho], [rho, 1.0]])
+    observed = np.random.default_rng(1).multivariate_normal(MEAN, covariance, size)
+    with pm.Model() as model:
+        metric = prb.Joint(prb.ProbabilityResidual())
+        prb.Simulator("y", same, inputs(), metric=metric, observed=observed)
+    optimum = prb.minimize(model, progressbar=False)
+    assert optimum.converged
+    assert not any("less than the prior" in warning for warning in optimum.warnings)
+    found = optimum.point["rho"]
+    exact = (1 - found**2) / np.sqrt(size)
+    # A twentieth to a tenth more than maximum likelihood, and the error of 200 data sets.
+    assert 0.85 < optimum.stderr["rho"] / exact < 1.35
+    of_sample, _ = stats.pearsonr(*observed.T)
+    assert abs(found - of_sample) < 2 * exact
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("inputs", [by_lkj_factor, by_correlations, by_hand])
+def test_a_sum_tells_no_correlation_and_that_is_said(inputs: Callable[[], Any]) -> None:
+    """A search along what the data do not tell ended in a refusal after minutes."""
+    rng = np.random.default_rng(1)
+    observed = rng.multivariate_normal(MEAN, COVARIANCE, N).sum(axis=1)
+    with pm.Model() as model:
+        metric = prb.KullbackLeibler()
+        prb.Simulator("y", response((1.0, 1.0)), inputs(), metric=metric, observed=observed)
+        pm.Deterministic("mean of sums", model["mu"].sum())
+    optimum = prb.minimize(model, progressbar=False)
+    assert optimum.converged
+    assert np.isinf(optimum.stderr["rho"])
+    assert any("the data tell less than the prior" in warning for warning in optimum.warnings)
+    error = observed.std() / np.sqrt(N)
+    assert optimum.stderr["mean of sums"] == pytest.approx(error, rel=0.25)
+    assert abs(optimum.point["mean of sums"] - observed.mean()) < 0.5 * error
 
 
 SETS = 200

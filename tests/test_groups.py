@@ -74,6 +74,7 @@ def test_all_groups_are_of_one_design() -> None:
     # It grows for the populations of both at the same points.
     _add(evaluator, evaluator.prior_thetas(64, 1), {"y[Busch]"})
     assert calls == before + 512
+    assert evaluator.n_runs == evaluator.n_responses == 512
     assert first.same_points(second)
     assert evaluator.nodes[0].design.n_runs == 512
     assert sum(node.bound.responses.computed for node in evaluator.nodes) == 512

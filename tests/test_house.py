@@ -475,8 +475,10 @@ INNER = {
         "pytensor.graph.rewriting.basic.out2in",
         "pytensor.graph.traversal.ancestors",
         "pytensor.graph.traversal.toposort",
+        "pytensor.tensor.blockwise.Blockwise",
         "pytensor.tensor.elemwise.Elemwise",
         "pytensor.tensor.sharedvar.TensorSharedVariable",
+        "pytensor.tensor.subtensor.Subtensor",
         "pytensor.tensor.variable.TensorVariable",
     },
     "response.distributions": {

@@ -34,6 +34,7 @@ from prbayes.estimate.caveats import (
 )
 from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.methods import Method
+from prbayes.estimate.objective import Hold
 from prbayes.estimate.obstacles import sampling_obstacle
 from prbayes.estimate.optimum import Optimum
 from prbayes.estimate.refinement import (
@@ -47,6 +48,7 @@ from prbayes.estimate.refinement import (
     refuse,
     refuse_lost,
     runs_left,
+    spread_along,
     spread_around,
 )
 from prbayes.estimate.refit import SamplingDistribution
@@ -68,6 +70,7 @@ from prbayes.estimate.search import (
 from prbayes.estimate.search import start as begin
 from prbayes.estimate.solution import assemble, rival_record
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.hyperparameters import THETAS
 from prbayes.model.interruption import explained, kept
 from prbayes.model.node import model_on_context
 from prbayes.model.support import shortcomings
@@ -367,6 +370,10 @@ class _Plan:
         """The model's evaluator."""
         return self.search.evaluator
 
+    def held(self, hold: Hold | None) -> Search:
+        """Return the search, kept where it is held."""
+        return replace(self.search, hold=hold)
+
 
 @dataclass(frozen=True)
 class _Beginning:
@@ -389,6 +396,7 @@ class _State:
     design_error: float = np.nan  # of the design, in standard errors; NaN where it is not known
     # (m, d), or None: thetas to which a pilot led, around which the design grows.
     cloud: Floats | None = None
+    hold: Hold | None = None  # what keeps the search where designs support it
     # (d,), or None: where to minimise again, on a design that has grown.
     restart: Floats | None = None
     left: Floats | None = None  # (d,), or None: an optimum that was left, and may be the better one
@@ -421,7 +429,7 @@ def _planned(
     """Return what is to be done."""
     clock = time.perf_counter()
     _refuse_random(evaluator, asked.method)
-    stored = _runs(evaluator)
+    stored = evaluator.n_runs
     free = not evaluator.responses_per_theta
     return _Plan(
         search=Search(
@@ -503,15 +511,17 @@ def _initial_scales(plan: _Plan, *, weighed: bool) -> Floats:
 def _states(plan: _Plan, begun: _Beginning) -> Iterator[_State]:
     """Yield where the minimisation stands after each step; the last is where it ended."""
     # Step: minimise, look at the design, until it is enough
-    state = yield from _minimised(plan, begun.led.theta, begun.scales, begun.led.trace)
+    led = begun.led
+    state = yield from _minimised(plan, led.theta, begun.scales, led.trace)
     rounds = 0
     while (state := _judged(plan, state, rounds)).restart is not None:
         rounds += 1
-        left = state.left
+        before = state
         led = _led(plan, state.restart, state)
-        state = yield from _minimised(plan, led.theta, state.scales, led.trace, state.cloud)
+        state = yield from _minimised(plan, led.theta, state.scales, led.trace, before)
+        left = before.left
         if left is not None and _is_better(plan, left, state):
-            state = yield from _minimised(plan, left, state.scales, state.run.trace, state.cloud)
+            state = yield from _minimised(plan, left, state.scales, state.run.trace, before)
     yield state
     # Terminate: other optima, stalled line searches, the error of the design where it ended
     state = _against_rivals(plan, state)
@@ -520,19 +530,25 @@ def _states(plan: _Plan, begun: _Beginning) -> Iterator[_State]:
 
 
 def _minimised(
-    plan: _Plan, theta: Floats, scales: Floats, trace: Trace, cloud: Floats | None = None
+    plan: _Plan, theta: Floats, scales: Floats, trace: Trace, before: _State | None = None
 ) -> Generator[_State, None, _State]:
-    """Minimise from theta; with several simulators again, with the noise at that pilot optimum."""
-    run = minimise(plan.search, theta, scales, trace)
-    yield _State(run.best, scales, run, None, cloud=cloud)
+    """Minimise from theta; with several simulators again, with the noise at that pilot optimum.
+
+    What led there before, and what holds the search, stays.
+    """
+    cloud = None if before is None else before.cloud
+    hold = None if before is None else before.hold
+    search = plan.held(hold)
+    run = minimise(search, theta, scales, trace)
+    yield _State(run.best, scales, run, None, cloud=cloud, hold=hold)
     unset = np.isnan(plan.evaluator.epsilon)
     if plan.several and unset.any():
         noise = noise_floors(plan.evaluator, run.best, SETS)
         scales = np.where(unset, noise, plan.evaluator.epsilon)
-        run = minimise(plan.search, run.best, scales, run.trace)
-        yield _State(run.best, scales, run, None, cloud=cloud)
+        run = minimise(search, run.best, scales, run.trace)
+        yield _State(run.best, scales, run, None, cloud=cloud, hold=hold)
     sampling = _sampling(plan.evaluator, run.best, scales)
-    return _State(run.best, scales, run, sampling, cloud=cloud)
+    return _State(run.best, scales, run, sampling, cloud=cloud, hold=hold)
 
 
 def _led(plan: _Plan, theta: Floats, state: _State, least: float = OVERLAP) -> Approach:
@@ -562,6 +578,8 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
     if near is None or (emulated and state.local is not None):
         # Points of clouds follow wherever it goes; runs are added where the pilot has led.
         near = spread_around(state.theta, _covariance(state), evaluator.prior_sd, seed=plan.seed)
+    if state.hold is not None and state.local is not None:
+        near = spread_along(state.theta, state.local, seed=plan.seed)
     near = near[evaluator.in_support(near)]
     short = shortcomings(evaluator, near) or shortcomings(evaluator, state.theta[None])
     if not short:
@@ -584,10 +602,10 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
         left = runs_left(evaluator, errors)
         note = f"error {errors.whole:.2f} standard errors, {AGREE} are wanted"
         note += f", about {left} runs to go" if left else ", no more runs are needed"
-        before = _runs(evaluator)
+        before = evaluator.n_runs
         if not grow(evaluator, near, errors):
             return state
-        plan.advance(_runs(evaluator) - before, note)
+        plan.advance(evaluator.n_runs - before, note)
     elif rounds == MAX_ROUNDS:
         # A search follows what is not identified until no design supports it.
         known = [] if state.local is None else not_identified(evaluator, state.local)
@@ -595,6 +613,9 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
     elif state.cloud is None:
         near = pilot(evaluator, state.scales, seed=plan.seed)
         state = replace(state, cloud=near)
+    elif (hold := _holding(plan, state)) is not None:
+        refine_at(evaluator, hold.place[None] if state.hold is None else near)
+        return replace(state, hold=hold, restart=hold.place)
     else:
         again = rounds > 1 and near is state.cloud
         if not refine_at(evaluator, near, again=again):
@@ -604,9 +625,39 @@ def _judged(plan: _Plan, state: _State, rounds: int) -> _State:
     return replace(state, restart=best_or_nearest(plan.search, candidates, state.scales))
 
 
-def _runs(evaluator: Evaluator) -> int:
-    """Return how many runs designs have."""
-    return sum(design.n_runs for design in evaluator.designs.values())
+def _holding(plan: _Plan, state: _State) -> Hold | None:
+    """Return what keeps the search where designs support it, None where the data tell all.
+
+    Along what the data do not tell a search follows the error of the design, and further from the
+    design there is more of it. It is held by as much as sampling noise in a spread of the prior.
+    """
+    evaluator = plan.evaluator
+    if state.cloud is None or plan.search.prior:
+        return None
+    place = state.theta
+    if state.hold is None or shortcomings(evaluator, place[None]):
+        place = _likeliest(plan, state.cloud, state.scales)
+    sampling = _sampling(evaluator, place, state.scales)
+    if sampling is None or not sampling.local.unidentified.size:
+        return None
+    return Hold(place, sampling.local.unidentified, _noise(evaluator, place, state.scales))
+
+
+def _likeliest(plan: _Plan, thetas: Floats, scales: Floats) -> Floats:
+    """Return, of thetas that fit as well as the best, the one closest to the prior's middle."""
+    evaluator = plan.evaluator
+    values = evaluator.total(thetas, scales)
+    best = thetas[np.argmin(values)]
+    as_good = values <= values.min() + _noise(evaluator, best, scales)
+    candidates = thetas[as_good]
+    middle = np.median(evaluator.prior_thetas(THETAS, plan.seed), axis=0)
+    away = (candidates - middle) / evaluator.prior_sd
+    return np.asarray(candidates[np.argmin((away**2).sum(axis=1))])
+
+
+def _noise(evaluator: Evaluator, theta: Floats, scales: Floats) -> float:
+    """Return the mean of the objective over data sets drawn from the model at theta."""
+    return float((noise_floors(evaluator, theta, FEW_SETS) / scales).sum())
 
 
 def _against_rivals(plan: _Plan, state: _State) -> _State:
@@ -617,7 +668,7 @@ def _against_rivals(plan: _Plan, state: _State) -> _State:
     if not others or not others[0].better:
         return replace(state, others=tuple(others))
     better = others[0].theta
-    run = minimise(plan.search, better, state.scales, state.run.trace)
+    run = minimise(plan.held(state.hold), better, state.scales, state.run.trace)
     sampling = _sampling(plan.evaluator, run.best, state.scales)
     state = replace(state, theta=run.best, run=run, sampling=sampling)
     if sampling is None:
@@ -645,6 +696,7 @@ def _rivals(plan: _Plan, state: _State) -> list[Rival]:
             noise,
             starts=plan.starts,
             seed=plan.seed,
+            hold=state.hold,
         )
         matter = [r for r in found if r.better or r.comparable]
         thin = [r for r in matter if shortcomings(evaluator, r.theta[None])]
@@ -658,7 +710,7 @@ def _rivals(plan: _Plan, state: _State) -> list[Rival]:
 def _settled(plan: _Plan, state: _State) -> _State:
     """Settle a line search that gave up; what is known of the optimum is then that of its place."""
     before = state.theta
-    run = settle(plan.search, state.run)
+    run = settle(plan.held(state.hold), state.run)
     state = replace(state, theta=run.best, run=run)
     if state.sampling is None:
         return state
@@ -701,6 +753,7 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State) -> Optimum:
         _log.warning("%s", line)
     ran_out = f" {', '.join(edge)} ran to the edge of the support." if edge else ""
     told = _told_of_designs(evaluator, state.design_error)
+    told += _HELD if state.hold is not None else ""
     told += "" if found.prior else _told_by_prior(evaluator)
     return replace(
         found,
@@ -713,6 +766,12 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State) -> Optimum:
         at_edge=edge,
         at_jump=jump,
     )
+
+
+_HELD = (
+    " Along what the data do not tell the search was held near where designs support populations; "
+    "any other place there would do."
+)
 
 
 def _told_by_prior(evaluator: Evaluator) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,25 @@ class SpentError(Exception):
 
 class StalledError(Exception):
     """A line search has made no progress for some time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hold:
+    """Keeps a search near a place along directions about which the data say next to nothing."""
+
+    place: Floats  # (d,)
+    directions: Floats  # (d, q): orthonormal in units of the prior's spread
+    weight: float  # of half the squared distance, in units of the objective
+
+    def __call__(self, thetas: Floats, prior_sd: Floats) -> Floats:
+        """Return what is added to the objective at thetas, (..., d) -> (...)."""
+        along = (thetas - self.place) / prior_sd @ self.directions
+        return np.asarray(0.5 * self.weight * (along**2).sum(axis=-1))
+
+    def slope(self, theta: Floats, prior_sd: Floats) -> Floats:
+        """Return the gradient of that at a theta, (d,)."""
+        along = (theta - self.place) / prior_sd @ self.directions
+        return np.asarray(self.weight * (self.directions @ along) / prior_sd)
 
 
 class Objective:

@@ -10,6 +10,7 @@ import numpy as np
 from prbayes._checks import Floats
 from prbayes.estimate.data_sets import families, siblings
 from prbayes.estimate.refit import DesignErrors
+from prbayes.estimate.sampling import Local
 from prbayes.estimate.sandwich import Information
 from prbayes.estimate.search import apart_from_data, areas
 from prbayes.model.evaluator import Evaluator
@@ -321,3 +322,13 @@ def spread_around(center: Floats, covariance: Floats, prior_sd: Floats, *, seed:
     z = rng.standard_normal((THETAS, center.size))
     steps = (z * sd) @ vectors.T
     return np.asarray(center + steps * prior_sd)
+
+
+def spread_along(center: Floats, local: Local, *, seed: int = 0) -> Floats:
+    """Return thetas around an optimum along the directions that the data identify, (256, d)."""
+    values, vectors = np.linalg.eigh(local.covariance)
+    sd = np.sqrt(np.clip(values, 0, 1))
+    rng = np.random.default_rng(seed)
+    z = rng.standard_normal((THETAS, sd.size))
+    steps = (z * sd) @ (local.identified @ vectors).T
+    return np.asarray(center + steps * local.prior_sd)

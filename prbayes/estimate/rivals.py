@@ -9,6 +9,7 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.estimate.batch_bfgs import descend
+from prbayes.estimate.objective import Hold
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
 
@@ -44,11 +45,14 @@ class _Objective:
     scales: Floats
     best: Floats
     prior_sd: Floats
+    hold: Hold | None  # what is added to it
 
     def __call__(self, thetas: Floats) -> Floats:
         """Return values of thetas, (..., d) -> (...)."""
         stacked = thetas.reshape(-1, thetas.shape[-1])
         values = self.evaluator.total(stacked, self.scales)
+        if self.hold is not None:
+            values = values + self.hold(stacked, self.prior_sd)
         return values.reshape(thetas.shape[:-1])
 
     def theta(self, x: Floats) -> Floats:
@@ -87,6 +91,7 @@ def rivals(
     *,
     starts: int,
     seed: int,
+    hold: Hold | None = None,
 ) -> list[Rival]:
     """Descend from points of the prior, and return the optima that barriers separate.
 
@@ -102,13 +107,15 @@ def rivals(
         A difference of the objective that sampling explains.
     starts : int
     seed : int
+    hold : Hold, optional
+        What held the search for ``best``: rivals are those of the same objective.
 
     Returns
     -------
     list of Rival
         Sorted by value; without ``best``.
     """
-    objective = _Objective(evaluator, scales, best, local.prior_sd)
+    objective = _Objective(evaluator, scales, best, local.prior_sd, hold)
     starts_at, size = _starts(objective, starts, noise, seed)
     if not size > 0:
         return []

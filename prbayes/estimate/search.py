@@ -17,7 +17,7 @@ from prbayes._checks import Floats
 from prbayes._progress import progress
 from prbayes.estimate.differences import cross, differences
 from prbayes.estimate.methods import Method
-from prbayes.estimate.objective import Objective, SpentError, StalledError
+from prbayes.estimate.objective import Hold, Objective, SpentError, StalledError
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
@@ -79,6 +79,7 @@ class Search:
     prior: bool  # whether minus the log prior is added
     tolerance: float  # of the standardised problem
     most: int  # largest number of evaluations in all
+    hold: Hold | None = None  # what is added to the objective
 
     @property
     def gradient(self) -> bool:
@@ -106,8 +107,21 @@ class Search:
     ) -> Objective:
         """Return the standardised objective around a center."""
         function = self._with_gradient(scales) if gradient else self._without_gradient(scales)
+        if self.hold is not None:
+            function = self._held(function, self.hold)
         most = self.most - spent
         return Objective(function, center, self.prior_sd, size, gradient=gradient, most=most)
+
+    def _held(self, function: Function, hold: Hold) -> Function:
+        """Return theta -> value, gradient, evaluations, with what holds the search."""
+
+        def held(theta: Floats) -> tuple[float, Floats | None, int]:
+            value, gradient, cost = function(theta)
+            if gradient is not None:
+                gradient = gradient + hold.slope(theta, self.prior_sd)
+            return value + float(hold(theta, self.prior_sd)), gradient, cost
+
+        return held
 
     def _with_gradient(self, scales: Floats) -> Function:
         """Return theta -> value, gradient, evaluations.

@@ -126,8 +126,21 @@ class Evaluator:
 
     @property
     def n_responses(self) -> int:
-        """Scalar responses computed so far, over all simulators."""
-        return sum(node.bound.responses.count for node in self.nodes)
+        """Scalar responses computed so far; those that several simulators share count once."""
+        return self._once([node.bound.responses.count for node in self.nodes])
+
+    @property
+    def n_runs(self) -> int:
+        """Runs of all designs; those that several simulators share count once."""
+        return self._once([0 if n.design is None else n.design.n_runs for n in self.nodes])
+
+    def _once(self, counts: list[int]) -> int:
+        """Return the sum of counts by simulator, with one of those that share their runs."""
+        shared: dict[int, int] = {}
+        for node, count in zip(self.nodes, counts, strict=True):
+            runs = id(node.bound.responses.runs)
+            shared[runs] = max(count, shared.get(runs, 0))
+        return sum(shared.values())
 
     @property
     def responses_per_theta(self) -> int:

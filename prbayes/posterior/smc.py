@@ -253,8 +253,7 @@ class Sampling:
 def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     """Do what `sample_smc` does, for an evaluator."""
     clock = time.perf_counter()
-    in_designs = sum(design.n_runs for design in evaluator.designs.values())
-    before = evaluator.n_responses - in_designs
+    before = evaluator.n_responses - evaluator.n_runs
     drawn = [design.n_drawn for design in evaluator.designs.values()]
     with epsilons_restored(evaluator), designs_as_before(evaluator):
         adjustment, optimum = _prepared(evaluator, asked)

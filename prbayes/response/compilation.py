@@ -17,8 +17,10 @@ from pytensor.graph.op import Op
 from pytensor.graph.replace import graph_replace, vectorize_graph
 from pytensor.graph.rewriting.basic import node_rewriter, out2in
 from pytensor.graph.traversal import ancestors, toposort
+from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.sharedvar import TensorSharedVariable
+from pytensor.tensor.subtensor import Subtensor
 from pytensor.tensor.variable import TensorVariable
 
 # Operands of a sum: NumPy has 32 for one operation, the result among them, and PyTensor puts all
@@ -47,6 +49,25 @@ def _softplus_of_arrays(fgraph: Any, node: Any) -> Any:
     return [pt.maximum(x, 0.0) + pt.log1p(pt.exp(-pt.abs(x)))]
 
 
+def _elements_of_rows(fgraph: Any, node: Any) -> Any:
+    """Take x[i] of each row at once, as of the groups' own hyperparameters, where both are batched.
+
+    PyTensor's would loop over rows.
+    """
+    op = node.op.core_op
+    is_element = isinstance(op, Subtensor) and len(op.idx_list) == 1 and len(node.inputs) == 2
+    if not is_element or isinstance(op.idx_list[0], slice):
+        return False
+    x, index = node.inputs
+    if index.ndim != 1 or node.op.batch_ndim(node) != 1:
+        return False
+    if x.type.broadcastable[0]:
+        return [x[0][index]]
+    if index.type.broadcastable[0]:
+        return [x[:, index[0]]]
+    return [x[pt.arange(x.shape[0]), index]]
+
+
 # Batched NumPy calls: nothing here runs often enough to repay a heavy compilation. Without fusion
 # every elementwise operation is one NumPy ufunc; with it, the Python linker would loop over
 # scalars. Sums and the like are divided last, lest they be put together again.
@@ -54,6 +75,7 @@ PLAIN = (
     Mode(linker="py", optimizer="fast_run")
     .excluding("fusion", "inplace", "BlasOpt", "c_blas", "symbolic_op_recognition")
     .register((out2in(node_rewriter([Elemwise])(_softplus_of_arrays)), 1000))
+    .register((out2in(node_rewriter([Blockwise])(_elements_of_rows)), 1000))
     .register((out2in(node_rewriter([Elemwise])(_sums_of_sums)), 1001))
 )
 

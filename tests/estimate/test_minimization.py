@@ -852,19 +852,29 @@ def test_the_scale_base_changes_the_residual_and_not_its_minimiser() -> None:
 
 
 @pytest.mark.long
-def test_a_search_that_follows_what_is_not_identified_names_it() -> None:
+def test_a_search_is_held_where_the_data_do_not_tell_and_names_what_it_is() -> None:
+    """Of a ratio the quotient of means is known, and neither of them."""
     rng = np.random.default_rng(1)
     with pm.Model() as model:
-        a = pm.Normal.dist(pm.Normal("mu_a", 10, 2), pm.HalfNormal("sd_a", 1))
-        b = pm.Normal.dist(pm.Normal("mu_b", 2, 0.4), pm.HalfNormal("sd_b", 0.3))
-        prb.Simulator(
-            "y",
-            lambda a, b: a / b,
-            *(a, b),
-            metric=prb.ProbabilityResidual(),
-            observed=rng.normal(10, 0.5, 40) / rng.normal(2, 0.1, 40),
-        )
-    with pytest.raises(
-        prb.propagation.DesignError, match="There the data tell less than the prior about"
-    ):
-        prb.minimize(model, progressbar=False)
+        mu_a = pm.Normal("mu_a", 10, 2)
+        mu_b = pm.Normal("mu_b", 2, 0.4)
+        a = pm.Normal.dist(mu_a, pm.HalfNormal("sd_a", 1))
+        b = pm.Normal.dist(mu_b, pm.HalfNormal("sd_b", 0.3))
+        pm.Deterministic("ratio", mu_a / mu_b)
+        observed = rng.normal(10, 0.5, 40) / rng.normal(2, 0.1, 40)
+        metric = prb.ProbabilityResidual()
+        prb.Simulator("y", lambda a, b: a / b, *(a, b), metric=metric, observed=observed)
+    optimum = prb.minimize(model, progressbar=False)
+    assert optimum.converged
+    assert "Along what the data do not tell the search was held" in optimum.message
+    for name in ("mu_a", "sd_a", "mu_b", "sd_b"):
+        assert np.isinf(optimum.stderr[name])
+        assert any("the data tell less than the prior" in w and name in w for w in optimum.warnings)
+        # Within the prior, where populations are supported.
+        prior = optimum.evaluator.constrained(optimum.evaluator.prior_thetas(1000, 1))[name]
+        low, high = np.quantile(prior, [0.01, 0.99])
+        assert low < optimum.point[name] < high
+    error = optimum.stderr["ratio"]
+    # The standard error of a mean, and a few per cent that the residual costs.
+    assert error == pytest.approx(observed.std() / np.sqrt(observed.size), rel=0.3)
+    assert abs(optimum.point["ratio"] - np.median(observed)) < error

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from prbayes._checks import Floats
-from prbayes.estimate.objective import Objective, SpentError, StalledError
+from prbayes.estimate.objective import Hold, Objective, SpentError, StalledError
 
 
 def parabola(theta: Floats) -> Any:
@@ -66,3 +66,18 @@ def test_a_line_search_without_progress_is_stopped() -> None:
         found(np.zeros(1))
     with pytest.raises(StalledError):
         found(np.zeros(1))
+
+
+def test_a_search_is_held_along_its_directions_alone() -> None:
+    units = np.array([0.5, 4.0])
+    direction = np.array([[0.6], [0.8]])
+    hold = Hold(np.array([1.0, 2.0]), direction, 10.0)
+    across = np.array([0.8, -0.6]) * units
+    along = direction[:, 0] * units
+    thetas = hold.place + np.array([across, along, 2 * along])
+    np.testing.assert_allclose(hold(thetas, units), [0.0, 5.0, 20.0], atol=1e-12)
+    # The gradient by differences.
+    at = hold.place + 0.3 * across + 0.7 * along
+    steps = 1e-6 * np.eye(2)
+    slope = (hold(at + steps, units) - hold(at - steps, units)) / 2e-6
+    np.testing.assert_allclose(hold.slope(at, units), slope, rtol=1e-6)

@@ -11,6 +11,7 @@ import xarray as xr
 from four_metrics import METRICS, R256, same, slow
 
 import prbayes as prb
+from prbayes.estimate.objective import Hold
 from prbayes.estimate.rivals import rivals
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
@@ -153,6 +154,9 @@ def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
     arguments = (evaluator, optimum.theta, np.ones(1), local)
     assert rivals(*arguments, 1e-3, starts=16, seed=0)
     assert rivals(*arguments, 1e3, starts=16, seed=0) == []
+    # Nor is there one where a search that is held cannot go.
+    hold = Hold(optimum.theta, np.eye(2), 1e3)
+    assert rivals(*arguments, 1e-3, starts=16, seed=0, hold=hold) == []
 
 
 # -- the posterior of two modes

@@ -15,6 +15,8 @@ import pytensor.tensor as pt
 import pytest
 from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
+from pytensor.tensor.blockwise import Blockwise
+from pytensor.tensor.subtensor import Subtensor
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
@@ -285,3 +287,36 @@ def test_softplus_takes_whole_arrays_and_is_right_everywhere() -> None:
     at = np.array([-800.0, -40.0, -1e-3, 0.0, 0.3, 17.9, 18.1, 40.0, 800.0])
     for found, scale in zip(function(at), (1.0, 2.0), strict=True):
         np.testing.assert_allclose(found, np.logaddexp(0, scale * at), rtol=1e-15)
+
+
+def test_an_element_of_each_row_is_taken_at_once() -> None:
+    rng = np.random.default_rng(1)
+    vector, matrix, i = pt.dvector("vector"), pt.dmatrix("matrix"), pt.lscalar("i")
+    function = compile_batched([vector, matrix, i], [2 * vector[i], matrix[i]])
+    names = [str(node.op) for node in function.maker.fgraph.toposort()]
+    assert not any("Blockwise" in name for name in names)
+    rows = rng.normal(size=(50, 4))
+    tables = rng.normal(size=(50, 4, 3))
+    which = rng.integers(-4, 4, 50)
+    of_rows, of_tables = function(rows, tables, which)
+    np.testing.assert_array_equal(of_rows, [2 * row[k] for row, k in zip(rows, which, strict=True)])
+    each = [table[k] for table, k in zip(tables, which, strict=True)]
+    np.testing.assert_array_equal(of_tables, each)
+    with pytest.raises(IndexError):
+        function(rows, tables, which + 4)
+
+
+@pytest.mark.parametrize("one", ["vector", "index"])
+def test_an_element_of_one_row_is_that_of_all(one: str) -> None:
+    shapes = {"vector": (None, 4), "index": (None,)}
+    shapes[one] = (1, *shapes[one][1:])
+    rows = pt.tensor("rows", shape=shapes["vector"])
+    which = pt.tensor("which", shape=shapes["index"], dtype="int64")
+    element = Blockwise(Subtensor([0]), signature="(n),()->()")(rows, which)
+    function = compiled([rows, which], [element])
+    assert not any("Blockwise" in str(node.op) for node in function.maker.fgraph.toposort())
+    values = np.arange(4.0) + 10 * np.arange(1 if one == "vector" else 3)[:, None]
+    places = np.array([2] if one == "index" else [0, 3, 2])
+    each = np.broadcast_arrays(values[:, 0], places)
+    expected = np.broadcast_to(values, (3, 4))[np.arange(3), each[1]]
+    np.testing.assert_array_equal(function(values, places), [expected])
