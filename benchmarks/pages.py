@@ -35,7 +35,7 @@ POSTERIORS = {
 # Metrics whose draws are given the estimate by default.
 SEEN = ("PR", "KLD", "area")
 WAYS = {"affine": "straight map", "given": "given the estimate", "exact": "exact posterior"}
-Row = Iterable[Any]
+Row = Iterable[str]
 
 
 def found(name: str) -> Any:
@@ -120,7 +120,7 @@ def given_estimate() -> Iterator[Row]:
     for size, (name, label) in product((10, 20, 50, 200), WAYS.items()):
         coverage, width, off = _in_estimates(name, size=size)
         yield [
-            size,
+            str(size),
             label,
             f"{short(coverage.mean(), 3)} ({short(coverage.min())} to {short(coverage.max())})",
             f"{_mean_ratio(width)} ({short(width.min())} to {short(width.max())})",
@@ -134,11 +134,11 @@ def given_estimate_by_problem() -> Iterator[Row]:
     problems = {
         "gamma": "gamma",
         "weibull": "Weibull",
-        "folded": "folded, |x|",
+        "folded": "absolute value",
         "threshold": "threshold",
     }
     for (problem, label), size in product(problems.items(), (10, 20, 50, 200)):
-        row = [label, size]
+        row = [label, str(size)]
         for name in ("affine", "given"):
             coverage, width, off = _in_estimates(name, problem=problem, size=size)
             row += [short(coverage.mean()), _mean_ratio(width), short(off.mean())]

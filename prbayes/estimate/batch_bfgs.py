@@ -25,13 +25,16 @@ class _Problem:
     value: Callable[[Floats, Any], Floats]
     step: float
     stencil: Floats
+    one_sided: bool
 
     @classmethod
-    def of(cls, value: Callable[[Floats, Any], Floats], r: int, step: float) -> _Problem:
+    def of(
+        cls, value: Callable[[Floats, Any], Floats], r: int, step: float, *, one_sided: bool
+    ) -> _Problem:
         unit = np.eye(r)
         here = np.zeros((1, r))
-        around = np.concatenate([here, unit, -unit])
-        return cls(value, step, step * around)
+        around = np.concatenate([here, unit] if one_sided else [here, unit, -unit])
+        return cls(value, step, step * around, one_sided)
 
     def __call__(self, x: Floats, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
         """Return values (A,) and gradients (A, r) of some rows at one point each, (A, r)."""
@@ -39,9 +42,10 @@ class _Problem:
         points = x[:, None] + self.stencil
         found = self.value(points, rows)
         up = found[:, 1 : 1 + r]
-        down = found[:, 1 + r :]
+        down = found[:, :1] if self.one_sided else found[:, 1 + r :]
+        apart = self.step if self.one_sided else 2 * self.step
         with np.errstate(invalid="ignore"):
-            gradients = (up - down) / (2 * self.step)
+            gradients = (up - down) / apart
         return found[:, 0], gradients
 
 
@@ -78,10 +82,11 @@ def descend(
     step: float,
     tolerance: float,
     max_iterations: int = 40,
+    one_sided: bool = False,
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Minimise B functions of r parameters of order one, each from its own start, all in step.
 
-    Gradients are central differences. A row has converged when its next step promises to gain less
+    Gradients are differences. A row has converged when its next step promises to gain less
     than ``tolerance``, or when no shorter step gains anything.
 
     Parameters
@@ -96,6 +101,9 @@ def descend(
     tolerance : float
         In units of the functions.
     max_iterations : int
+    one_sided : bool
+        Whether differences are one-sided instead of central: half of the calls, and minima are off
+        by half of ``step``.
 
     Returns
     -------
@@ -118,7 +126,7 @@ def descend(
     np.True_
     """
     size, r = start.shape
-    problem = _Problem.of(value, r, step)
+    problem = _Problem.of(value, r, step, one_sided=one_sided)
     x = start.copy()
     inverse = np.repeat(inverse_hessian[None], size, axis=0)
     active = np.arange(size)
