@@ -6,13 +6,15 @@ have a normal error with standard deviation .25. 200 data sets, each calibrated 
 prior of that spread from 20 differences of repeats. How often 89% intervals hold the truth. The
 command goes on after the data sets that its file has.
 
-    uv run python -m benchmarks.measurement_error [--data-sets 200]
+    OMP_NUM_THREADS=1 uv run python -m benchmarks.measurement_error [--data-sets 200] [--workers 2]
 """
 
 from __future__ import annotations
 
 import argparse
 import logging
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -64,21 +66,22 @@ def main() -> None:
     """Compute, print and save."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data-sets", type=int, default=200)
+    parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, default=OUT)
     arguments = parser.parse_args()
-    logging.getLogger("prbayes").setLevel(logging.ERROR)
-    found = record.load(arguments.out, {})
-    done = min((cell["data sets"] for cell in found.values()), default=0)
-    for seed in range(done, arguments.data_sets):
-        for key, row in _of_one(seed).items():
-            found[key] = _with(found.get(key), row)
-        record.save(arguments.out, found)
-        if seed % 20 == 19:
-            print(seed + 1, found, flush=True)
+    rows = record.load(arguments.out, {}).get("rows", {})
+    missing = [seed for seed in range(arguments.data_sets) if str(seed) not in rows]
+    with ProcessPoolExecutor(arguments.workers, mp_context=get_context("spawn")) as pool:
+        futures = {pool.submit(_of_one, seed): seed for seed in missing}
+        for future in as_completed(futures):
+            rows[str(futures[future])] = future.result()
+            record.save(arguments.out, {**_summary(list(rows.values())), "rows": rows})
+    print(_summary(list(rows.values())))
 
 
 def _of_one(seed: int) -> dict[str, dict[str, float]]:
     """Return what each way finds of one data set."""
+    logging.getLogger("prbayes").setLevel(logging.ERROR)
     rng = np.random.default_rng(seed)
     readings = np.exp(rng.normal(TRUTH["mu"], TRUTH["sigma"], N)) + rng.normal(0, ERROR, N)
     differences = np.sqrt(2) * rng.normal(0, ERROR, REPEATS)
@@ -89,17 +92,19 @@ def _of_one(seed: int) -> dict[str, dict[str, float]]:
             values = draws[name].values
             low, high = np.quantile(values, [0.055, 0.945])
             held = float(low <= truth <= high)
-            rows[f"{way}/{name}"] = {"mean": values.mean(), "sd": values.std(), "held": held}
+            moments = {"mean": float(values.mean()), "sd": float(values.std())}
+            rows[f"{way}/{name}"] = {**moments, "held": held}
     return rows
 
 
-def _with(before: dict[str, float] | None, row: dict[str, float]) -> dict[str, float]:
-    """Return means over one data set more."""
-    if before is None:
-        return {**row, "data sets": 1}
-    n = before["data sets"]
-    joined = {key: (n * before[key] + value) / (n + 1) for key, value in row.items()}
-    return {**joined, "data sets": n + 1}
+def _summary(rows: list[dict[str, dict[str, float]]]) -> dict[str, Any]:
+    """Return means over data sets, by way and hyperparameter."""
+    found: dict[str, Any] = {}
+    for key in rows[0]:
+        cells = [row[key] for row in rows]
+        means = {name: float(np.mean([cell[name] for cell in cells])) for name in cells[0]}
+        found[key] = {**means, "data sets": len(rows)}
+    return found
 
 
 if __name__ == "__main__":
