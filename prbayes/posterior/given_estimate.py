@@ -58,8 +58,9 @@ class GivenEstimate(Affine):
     By ``random_seed`` the width of the draws varies by 2 to 6% where a response is folded
     (``benchmarks/folded.py``), and more where prior and data contradict each other.
 
-    Where responses are not stored, or too few of these fits arrive, the draws are those of
-    `Affine`, and the result says so.
+    Where responses are not stored, the optimum is at an edge, as where a standard deviation is
+    about zero, or too few of these fits arrive, the draws are those of `Affine`, and the result
+    says so.
 
     Parameters
     ----------
@@ -109,7 +110,7 @@ class GivenEstimate(Affine):
         done = super()._said(mapped, modes, draws, design_variance)
         if all(mode.given for mode in mapped):
             return done
-        return f"{done}, as Affine does where too few refits arrived"
+        return f"{done}, as Affine does where refits tell no density of the estimate"
 
     def _mapped(
         self, sampling: SamplingDistribution, draws: Floats, design_variance: float
@@ -214,14 +215,21 @@ class _Look:
 
     @classmethod
     def at(cls, sampling: SamplingDistribution, draws: Floats, variance: float) -> _Look:
-        """Return it for a mode; along the hyperparameters where all are identified."""
+        """Return it for a mode; along the hyperparameters where all are identified.
+
+        Raises
+        ------
+        UnsettledError
+            If the optimum is at an edge, where estimates pile up and have no density.
+        """
         if sampling.local.unidentified.size:
-            # An optimum at an edge, as where a standard deviation is about zero, sees less than
-            # the middle of the draws does.
             middle = np.median(draws, axis=0)
             within = SamplingDistribution.of(sampling.evaluator, middle, sampling.scales, WEAKEST)
             if within.stderr.size > sampling.stderr.size:
-                sampling = within
+                raise UnsettledError(
+                    "the optimum is at an edge, as where a standard deviation is about zero: the "
+                    "data tell less there than at the middle of the draws, and estimates pile up"
+                )
         sampling = _along_elements(sampling)
         (estimate,), _ = sampling.refit(observed_set(sampling.evaluator))
         own = _own_values(sampling.evaluator, draws)

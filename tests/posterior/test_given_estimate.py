@@ -117,7 +117,7 @@ def test_where_too_few_refits_arrive_it_is_the_straight_map_and_says_so(
         given = sample(model, GivenEstimate(), draws=200)
     assert "3 of 500 refits converged; the draws are those of prb.posterior.Affine()" in caplog.text
     assert given.posterior.attrs["adjustment"].endswith(
-        "as Affine does where too few refits arrived"
+        "as Affine does where refits tell no density of the estimate"
     )
     np.testing.assert_array_equal(given.posterior["mu"], straight.posterior["mu"])
 
@@ -162,3 +162,24 @@ def test_it_depends_on_its_seed_alone() -> None:
 def test_too_few_fits_are_refused() -> None:
     with pytest.raises(ValueError, match="GivenEstimate: n_fits"):
         GivenEstimate(n_fits=10)
+
+
+@pytest.mark.long
+def test_where_the_optimum_is_at_an_edge_it_is_the_straight_map_and_says_so(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    # The readings scatter less than their error alone does.
+    observed = stats.norm.ppf((np.arange(20) + 0.5) / 20, 0, 0.9)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        error = pm.Normal.dist(0, 1)
+        prb.Simulator(
+            "y", lambda x, e: x + e, x, error, metric=METRICS["pr"], observed=observed,
+            propagation=prb.Reweighted(1024, emulator=None),
+        )  # fmt: skip
+    optimum = prb.minimize(model, progressbar=False)
+    with caplog.at_level(logging.WARNING, "prbayes"):
+        given = sample(model, GivenEstimate(n_fits=300), draws=200, optimum=optimum)
+    straight = sample(model, prb.posterior.Affine(), draws=200, optimum=optimum)
+    assert "the optimum is at an edge" in caplog.text
+    np.testing.assert_array_equal(given.posterior["mu"], straight.posterior["mu"])
