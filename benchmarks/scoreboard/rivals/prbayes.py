@@ -42,7 +42,7 @@ METRICS = {
     "log-likelihood": "LogLikelihood",
 }
 # What the defaults were, so that results of other defaults are not gone on with.
-_DEFAULTS = {"adjust": "straight map; a log-likelihood as it is"}
+_DEFAULTS = {"adjust": "given the estimate; a log-likelihood as it is"}
 RIVALS = tuple(
     Rival(f"prbayes {name}", PACKAGES, {"metric": metric} | _DEFAULTS, calibrate)
     for name, metric in METRICS.items()
