@@ -396,3 +396,34 @@ def test_refusals() -> None:
     for keywords, match in (({"n_samples": 1}, "n_samples: got 1"), ({"draws": 0}, "draws: got 0")):
         with pytest.raises(ValueError, match=match):
             prb.predict(POSTERIOR, same, x, model=model, **keywords)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_names_of_a_function_of_one_specimen_are_kept(workers: int) -> None:
+    """In another order of columns a test would reject a true model, and nobody would know why."""
+
+    def one(x: float) -> dict[str, float]:
+        found = {"high": x + 5, "low": x}
+        # A mapping has no order.
+        return found if x > 0 else dict(reversed(found.items()))
+
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        prb.Simulator("y", lambda x: x, x, metric=prb.AreaMetric(), observed=np.arange(-2.0, 3.0))
+    optimum = prb.minimize(model, progressbar=False)
+    with ThreadPoolExecutor(2) as pool:
+        executor = pool if workers else None
+        response = prb.scalar(one)
+        later = prb.predict(optimum, response, x, model=model, executor=executor, random_seed=1)
+    assert sorted(later["output"].values) == ["high", "low"]
+    np.testing.assert_allclose(later.sel(output="high") - later.sel(output="low"), 5)
+
+
+def test_other_keys_for_other_specimens_are_refused() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        prb.Simulator("y", lambda x: x, x, metric=prb.AreaMetric(), observed=np.arange(-2.0, 3.0))
+    optimum = prb.minimize(model, progressbar=False)
+    response = prb.scalar(lambda x: {"a": x, "b": x} if x > 0 else {"a": x, "c": x})
+    with pytest.raises(prb.response.ResponseError, match=r"keys \['a', '[bc]'\]"):
+        prb.predict(optimum, response, x, model=model, random_seed=1)

@@ -74,7 +74,12 @@ class scalar:  # noqa: N801 (reads as a function in a model)
         arrays = np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in inputs))
         columns = [array.ravel() for array in arrays]
         specimens = zip(*columns, strict=True)
-        values = [_of_one(self.function(*specimen), None) for specimen in specimens]
+        outputs: Outputs | None = None
+        values = []
+        for specimen in specimens:
+            result = self.function(*specimen)
+            outputs = _told_by(result, 0, outputs)
+            values.append(_of_one(result, outputs if isinstance(result, Mapping) else None))
         event = np.shape(values[0]) if values else ()
         return np.array(values).reshape(arrays[0].shape + event)
 
@@ -139,6 +144,7 @@ class Chunk:
     values: Floats
     raised: dict[int, str]  # what was raised, in words, by position
     seconds: float  # how long it took
+    named: Outputs | None = None  # what a mapping calls the columns, where nobody knew
 
 
 # A chunk that is done, with the rows of its points.
@@ -177,7 +183,28 @@ class Tally:
     computed: int = 0
     failures: int = 0  # points whose response failed in the end and was replaced
     seconds: float = 0.0  # that one response takes, measured; 0 as long as nothing is known
+    named: Outputs | None = None  # what mappings call the columns, where nobody knew
     failed: dict[bytes, Failure] = field(default_factory=dict)  # by inputs, the first of them
+
+    def aligned(self, chunk: Chunk) -> Floats:
+        """Return the responses of a chunk, with columns in the order of the first one's names.
+
+        Raises
+        ------
+        ResponseError
+            If mappings have other keys than the first one had.
+        """
+        if chunk.named is None:
+            return chunk.values
+        if self.named is None:
+            self.named = chunk.named
+        if set(self.named.labels) != set(chunk.named.labels):
+            raise ResponseError(
+                f"the response returned a mapping with {list(chunk.named.names)}, expected "
+                f"{list(self.named.names)}, as for the first specimen"
+            )
+        order = [chunk.named.labels.index(label) for label in self.named.labels]
+        return chunk.values[..., order]
 
     def take(self, size: int, seconds: float) -> None:
         """Take note of a chunk of so many responses."""
@@ -221,7 +248,7 @@ def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
         raised = {}
         for done in chunks(calling, points, missing, tolerant, tally):
             for rows, chunk in done:
-                values = _filled_in(values, rows, chunk.values)
+                values = _filled_in(values, rows, tally.aligned(chunk))
                 raised.update({int(rows[i]): text for i, text in chunk.raised.items()})
             if calling.store is not None:
                 # NaN is a result, too, after the last try, but not where a chunk broke off.
@@ -529,10 +556,14 @@ def compute(
     """Return the responses at points; unless failures are tolerated, those up to the first one."""
     clock = time.perf_counter()
     if isinstance(function, scalar):
-        values, raised = _one_by_one(function, points, tolerant, timeout, outputs)
+        values, raised, known = _one_by_one(function, points, tolerant, timeout, outputs)
     else:
-        values, raised = _at_once(function, points, tolerant, timeout, outputs)
-    return Chunk(values, raised, time.perf_counter() - clock)
+        values, raised, known = _at_once(function, points, tolerant, timeout, outputs)
+    named = known if outputs is None else None
+    return Chunk(values, raised, time.perf_counter() - clock, named)
+
+
+type _Computed = tuple[Floats, dict[int, str], Outputs | None]
 
 
 def _one_by_one(
@@ -541,7 +572,7 @@ def _one_by_one(
     tolerant: bool,
     timeout: float | None,
     outputs: Outputs | None,
-) -> tuple[Floats, dict[int, str]]:
+) -> _Computed:
     event = () if outputs is None else outputs.event
     values = np.full((len(points), *event), np.nan)
     raised = {}
@@ -549,12 +580,20 @@ def _one_by_one(
         try:
             with np.errstate(all="ignore"), limited(timeout):
                 result = function.function(*points.at(i).handed_out())
+            outputs = _told_by(result, 0, outputs)
             values = _filled_in(values, np.array([i]), _of_one(result, outputs)[None])
         except (Exception, SystemExit) as error:
             raised[i] = _said(error)
             if not tolerant:
                 break
-    return values, raised
+    return values, raised, outputs
+
+
+def _told_by(result: Any, batch_ndim: int, outputs: Outputs | None) -> Outputs | None:
+    """Return the outputs, which a mapping tells where nobody knew them."""
+    if outputs is None and isinstance(result, Mapping):
+        return outputs_of_result(result, batch_ndim)
+    return outputs
 
 
 def _of_one(result: Any, outputs: Outputs | None) -> Floats:
@@ -571,7 +610,7 @@ def _at_once(
     tolerant: bool,
     timeout: float | None,
     outputs: Outputs | None,
-) -> tuple[Floats, dict[int, str]]:
+) -> _Computed:
     size = len(points)
     try:
         with np.errstate(all="ignore"), limited(timeout and timeout * size):
@@ -580,18 +619,19 @@ def _at_once(
         if not tolerant or size == 1:
             event = () if outputs is None else outputs.event
             failed = np.full((size, *event), np.nan)
-            return failed, {0: _said(error)}
+            return failed, {0: _said(error)}, outputs
     else:
+        outputs = _told_by(result, 1, outputs)
         values = checked(result, (size,), points.arguments, outputs)
-        return values, {}
+        return values, {}, outputs
     # Halve until the points that fail are alone.
     values = np.full(size, np.nan)
     raised = {}
     for half in (np.arange(size // 2), np.arange(size // 2, size)):
-        some, said = _at_once(function, points.at(half), tolerant, timeout, outputs)
+        some, said, outputs = _at_once(function, points.at(half), tolerant, timeout, outputs)
         values = _filled_in(values, half, some)
         raised.update({int(half[i]): text for i, text in said.items()})
-    return values, raised
+    return values, raised, outputs
 
 
 def _said(error: BaseException) -> str:

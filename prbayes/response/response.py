@@ -302,6 +302,8 @@ class Responses:
         batch, points = self._rows(given)
         self.count += len(points)
         found = respond(self._calling, points, self._tally)
+        if self.outputs is None:
+            self.outputs = self._tally.named
         return found.reshape(batch + found.shape[1:])
 
     def _rows(self, given: list[Floats]) -> tuple[tuple[int, ...], Points]:
