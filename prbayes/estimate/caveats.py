@@ -12,7 +12,7 @@ from prbayes._weighted import distribution_function, quantile
 from prbayes.estimate.confounding import confounded
 from prbayes.estimate.differences import cross
 from prbayes.estimate.identifiability import unidentified_directions, without
-from prbayes.estimate.projections import one_dimensional
+from prbayes.estimate.projections import number_parts, one_dimensional
 from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.rivals import Rival
 from prbayes.estimate.sampling import Local
@@ -41,6 +41,10 @@ _DIFFERENT = 0.02
 # 1.5 and 1.9, of lognormal ones with a spread of 1, 2 and 2.5 2.4, 1.3 and 1.1.
 _TAIL = 0.02
 _NO_MEAN = 1.1
+# Standard deviations of a kernel within which there is a response where its sum over evenly spaced
+# ones is the density to some per cent: by Poisson's summation 2 exp(-2 (pi / 2.5)^2) = 9% at a
+# spacing of 2.5, and .001% at one of 1.25.
+_APART_BY = 1.25
 # Where metrics are chosen by what data are like.
 _OF_METRICS = more_in("choosing_metric.md#advice")
 # Halvings of the way back to the middle of the prior: a thousandth of it is a tenth of a spread
@@ -213,6 +217,42 @@ def _tail_index(values: Floats, weights: Floats) -> float:
             length = float(mass @ logs)
             found.append(total / max(length, 1e-300))
     return min(found)
+
+
+def between_runs(evaluator: Evaluator, theta: Floats) -> list[str]:
+    """Say which observed values lie where a density is read between responses too far apart.
+
+    Of stored responses only: common points move with theta.
+    """
+    lines = []
+    for k, node in enumerate(evaluator.nodes):
+        if not node.bound.stored:
+            continue
+        values, _ = evaluator.populations(theta[None], k)
+        for part in number_parts(node.target):
+            width = part.target.resolution
+            if not width > 0:
+                continue
+            observed = part.target.observed
+            lonely = np.isfinite(observed)
+            lonely &= _nearest(part.of(values[0]), observed) > _APART_BY * width
+            if lonely.any():
+                told = ", ".join(f"{value:.4g}" for value in observed[lonely][:3])
+                lines.append(
+                    f"{node.name}: {int(lonely.sum())} of {observed.size} observed values ({told}) "
+                    "lie between responses that are farther apart than the kernel is wide, so that "
+                    "their likelihood is not known: pass a larger prb.Reweighted(n), until the "
+                    f"optimum stays, or use prb.KullbackLeibler(){_OF_METRICS}"
+                )
+    return lines
+
+
+def _nearest(values: Floats, places: Floats) -> Floats:
+    """Return how far the nearest of some values is from each place, (n,)."""
+    known = np.sort(values[np.isfinite(values)])
+    ends = np.concatenate([[-np.inf], known, [np.inf]])
+    above = np.searchsorted(ends[1:-1], places) + 1
+    return np.asarray(np.minimum(ends[above] - places, places - ends[above - 1]))
 
 
 def caveats(

@@ -26,6 +26,7 @@ from prbayes._checks import (
 from prbayes._pages import more_in
 from prbayes._progress import progress, shown
 from prbayes.estimate.caveats import (
+    between_runs,
     breakdown,
     caveats,
     elements_at_edge,
@@ -747,6 +748,7 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State) -> Optimum:
     warnings = (
         *breakdown(edge, jump),
         *heavy_tails(evaluator, state.theta),
+        *between_runs(evaluator, state.theta),
         *caveats(evaluator, state.local, state.others, state.design_error),
     )
     for line in warnings:

@@ -190,6 +190,14 @@ class Discrepancy(ABC):
         return False
 
     @property
+    def resolution(self) -> float:
+        """Standard deviation of the kernel by which it reads a density at single observed values.
+
+        Zero unless it does.
+        """
+        return 0.0
+
+    @property
     def additive(self) -> bool:
         """Whether its gradient in the hyperparameters is a mean over observations."""
         return self.metric.additive

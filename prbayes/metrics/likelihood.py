@@ -90,6 +90,11 @@ class LikelihoodDiscrepancy(CellwiseDiscrepancy):
         return bool(self.metric == LogLikelihood())
 
     @property
+    def resolution(self) -> float:
+        """That of a Gaussian kernel; a histogram has none."""
+        return float(getattr(self.cells, "bandwidth", 0.0))
+
+    @property
     def constants(self) -> tuple[Any, ...]:
         """The floor of the density, and how it is read at the observed values."""
         return self.least, self.reading

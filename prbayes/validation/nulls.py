@@ -154,7 +154,7 @@ class PosteriorNull(SimulatedNull):
             source = f"one of {case.draws} populations of the posterior"
         repeated = ""
         if case.dependent:
-            repeated = f", {case.n_specimens} specimens measured {case.size} times"
+            repeated = f", {case.n_specimens} specimens with {case.size} values in all"
         return f"all specimens come from {source}{repeated}"
 
 

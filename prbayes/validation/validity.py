@@ -76,12 +76,14 @@ class ValidityTest:
         what = "area of |2u - 1|" if self.folded else "area"
         values = self.u_values.size
         specimens = np.unique(self.specimens).size
-        conditions = np.unique(self.conditions).size
+        conditions = len(self.of_conditions)
+        directions = np.unique(self.conditions).size
+        seen = f", seen in {directions} directions" if directions > conditions else ""
         return (
             f"ValidityTest: {verdict} at level {self.level:g}\n"
             f"  {what} {self.statistic:.4f}, critical value {self.critical_value:.4f}, "
             f"p-value {self.p_value:.3g}\n"
-            f"  {values} values of {specimens} specimens, {conditions} condition(s)\n"
+            f"  {values} values of {specimens} specimens, {conditions} condition(s){seen}\n"
             f"  null: {self.null}"
         )
 

@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from scipy.stats import norm
 
 import prbayes as prb
-from prbayes.estimate.caveats import breakdown, elements_at_edge
+from prbayes.estimate.caveats import between_runs, breakdown, elements_at_edge
 from prbayes.model.evaluator import Evaluator
 
 
@@ -79,3 +80,22 @@ def test_an_area_of_a_population_without_a_mean_is_warned_of() -> None:
     observed = np.random.default_rng(1).exponential(1.0, 30)
     short = minimum(prb.AreaMetric(), lambda s: pm.Exponential.dist(scale=s), observed)
     assert said not in "".join(short.warnings)
+
+
+@pytest.mark.parametrize(("largest", "said"), [(2.2, False), (9.0, True)])
+def test_a_value_between_responses_far_apart_is_told_of(largest: float, said: bool) -> None:
+    """A kernel as narrow as the data want sees none of the few responses in a long tail."""
+    observed = np.append(np.exp(norm.ppf((np.arange(59) + 0.5) / 59, 0, 0.2)), largest)
+    with pm.Model() as model:
+        x = pm.LogNormal.dist(pm.Normal("mu", 0, 0.5), pm.HalfNormal("sigma", 0.5))
+        prb.Simulator("y", np.positive, x, metric=prb.LogLikelihood(), observed=observed)
+    evaluator = Evaluator(model)
+    found = between_runs(evaluator, np.array([0.0, np.log(0.3)]))
+    assert len(found) == said
+    if said:
+        assert "1 of 60 observed values (9) lie between responses" in found[0]
+    # A metric that smooths both sides takes no value by itself.
+    with pm.Model() as model:
+        x = pm.LogNormal.dist(pm.Normal("mu", 0, 0.5), pm.HalfNormal("sigma", 0.5))
+        prb.Simulator("y", np.positive, x, metric=prb.KullbackLeibler(), observed=observed)
+    assert between_runs(Evaluator(model), np.array([0.0, np.log(0.3)])) == []

@@ -34,7 +34,7 @@ def test_default_nulls(posterior: Posterior) -> None:
     assert "one of 400 populations" in prb.area_test(y, posterior()).null
     assert "is exact" in prb.area_test(y, GRID).null
     assert (
-        "10 specimens measured 20 times"
+        "10 specimens with 20 values in all"
         in prb.area_test(y, GRID, specimens=np.arange(20) // 2).null
     )
 
@@ -227,3 +227,13 @@ def test_power_beside_other_tests() -> None:
         assert abs(shares["none"] - 0.05) < 0.05  # 500 data sets: standard error .01
     for label in ("mean + 0.5 sd", "mean + 0.75 sd", "mean + 1 sd"):
         assert table["area"][label] > table["Kolmogorov-Smirnov"][label] - 0.05
+
+
+def test_directions_of_outputs_are_no_conditions() -> None:
+    rng = np.random.default_rng(1)
+    predicted = rng.normal(0, 1, (1, 50, 40, 2))
+    dims = ("chain", "draw", "sample", "output")
+    test = prb.area_test(rng.normal(0, 1, (9, 2)), xr.DataArray(predicted, dims=dims), null=QUICK)
+    assert len(test.of_conditions) == 1
+    assert "of 9 specimens, 1 condition(s), seen in 4 directions" in repr(test)
+    assert "9 specimens with 36 values in all" in test.null
