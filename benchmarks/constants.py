@@ -254,8 +254,7 @@ def minimised(build: Callable[[], pm.Model], **options: Any) -> prb.Optimum:
 def sampled(optimum: prb.Optimum, random_seed: int) -> dict[str, Any]:
     """Sample, and return all answers."""
     posterior = prb.sample_smc(
-        400, chains=1, model=optimum.model, optimum=optimum, random_seed=random_seed, progressbar=False
-    )  # fmt: skip
+        400, chains=1, model=optimum.model, optimum=optimum, random_seed=random_seed, progressbar=False, adjust=prb.posterior.Affine())  # fmt: skip
     draws = posterior["calibration"].dataset["theta"].values[0]
     return {
         "theta": optimum.theta,
@@ -288,7 +287,13 @@ def validity(case: tuple[Any, ...], random_seed: int) -> dict[str, Any]:
     optimum, surface, x, rng = case
     model = optimum.model
     posterior = prb.sample_smc(
-        200, chains=2, model=model, optimum=optimum, random_seed=random_seed, progressbar=False
+        200,
+        chains=2,
+        model=model,
+        optimum=optimum,
+        random_seed=random_seed,
+        progressbar=False,
+        adjust=prb.posterior.Affine(),
     )
     fresh = np.sinh(1.3 + 0.6 * rng.standard_normal(12))
     best = prb.predict(optimum, surface, x, model=model)

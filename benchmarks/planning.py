@@ -119,7 +119,13 @@ def calibrated(problem: Problem, data: dict[str, Any]) -> tuple[Any, pm.Model, A
             )
     optimum = prb.minimize(model, progressbar=False)
     posterior = prb.sample_smc(
-        500, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False
+        500,
+        chains=2,
+        model=model,
+        optimum=optimum,
+        random_seed=1,
+        progressbar=False,
+        adjust=prb.posterior.Affine(),
     )
     return posterior, model, x
 

@@ -157,7 +157,13 @@ def coverage(data_sets: int) -> dict[str, Any]:
             )
         optimum = prb.minimize(model, progressbar=False)
         posterior = prb.sample_smc(
-            500, chains=2, model=model, optimum=optimum, random_seed=seed, progressbar=False
+            500,
+            chains=2,
+            model=model,
+            optimum=optimum,
+            random_seed=seed,
+            progressbar=False,
+            adjust=prb.posterior.Affine(),
         )
         for name, response, back in (("response", line, line), ("another", later, np.log)):
             box = prb.decision.p_box(posterior, response, x, model=model, level=0.9)

@@ -153,7 +153,13 @@ def with_prbayes(problem: str, propagation: str) -> dict[str, Any]:
     optimum = prb.minimize(model, starts=0)
     setup = clock()
     tree = prb.sample_smc(
-        DRAWS, chains=CHAINS, optimum=optimum, model=model, random_seed=1, progressbar=False
+        DRAWS,
+        chains=CHAINS,
+        optimum=optimum,
+        model=model,
+        adjust=prb.posterior.Affine(),
+        random_seed=1,
+        progressbar=False,
     )
     return _summary(tree.posterior, setup, clock()) | {"responses": optimum.evaluator.n_responses}
 

@@ -175,7 +175,13 @@ def pipeline(n0: int, n: int, replicates: int) -> dict[str, Any]:
         model, x = pipeline_model(data)
         optimum = prb.minimize(model, progressbar=False)
         posterior = prb.sample_smc(
-            400, chains=1, model=model, optimum=optimum, random_seed=i, progressbar=False
+            400,
+            chains=1,
+            model=model,
+            optimum=optimum,
+            random_seed=i,
+            progressbar=False,
+            adjust=prb.posterior.Affine(),
         )
         predicted = prb.predict(posterior, same, x, model=model, random_seed=i)
         best = prb.predict(optimum, same, x, random_seed=i)
