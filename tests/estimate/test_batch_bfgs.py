@@ -73,3 +73,21 @@ def test_a_kink_is_the_end_of_a_line_search() -> None:
     x, _, converged = descend(value, np.zeros((3, 1)), np.eye(1), step=1e-3, tolerance=1e-9)
     assert converged.all()
     np.testing.assert_allclose(x, centers, atol=0.02)
+
+
+def test_one_sided_differences_arrive_within_half_a_step() -> None:
+    centers = np.array([[0.0, 1.0], [2.0, -1.5]])
+    points = []
+
+    def value(x: Floats, rows: Any) -> Floats:
+        points.append(x.shape[1])
+        return np.asarray(((x - centers[rows, None]) ** 2).sum(-1))
+
+    step = 0.02
+    x, _, converged = descend(
+        value, np.zeros((2, 2)), np.eye(2) / 2, step=step, tolerance=1e-9, one_sided=True
+    )
+    assert converged.all()
+    # A slope to one side is that of the middle: the minimum is half a step before its place.
+    np.testing.assert_allclose(x, centers - step / 2, atol=1e-3)
+    assert set(points) == {3}  # here, and one step along each axis
