@@ -203,6 +203,7 @@ def test_the_interval_of_an_optimum_is_that_of_a_normal(optimum: prb.Optimum) ->
         np.testing.assert_allclose(covered, 0.055 if bound == "lower" else 0.945, rtol=1e-10)
 
 
+@pytest.mark.long
 def test_several_outputs_are_scored_by_joint_metrics() -> None:
     def response(a: Any, b: Any) -> Any:
         return np.stack([a + b, a * b], axis=-1)

@@ -69,6 +69,7 @@ def normal_tree(means: Any, draws: int = 500) -> xr.DataTree:
 # -- sentences -------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_silent_when_nothing_is_wrong(tmp_path: Path) -> None:
     model, idata = sampled()
     for found in (prb.diagnose(idata), prb.diagnose(idata, model=model)):
@@ -84,6 +85,7 @@ def test_silent_when_nothing_is_wrong(tmp_path: Path) -> None:
         assert prb.diagnose(few, model=model).ok
 
 
+@pytest.mark.long
 def test_without_a_model_the_sampler_s_own_numbers_serve() -> None:
     model, idata = sampled()
     stored, computed = prb.diagnose(idata).support, prb.diagnose(idata, model=model).support
@@ -228,6 +230,7 @@ def test_acceptance_and_beta_of_each_stage() -> None:
     assert all(row[-1] == 1 and (np.diff(row) > 0).all() for row in last)
 
 
+@pytest.mark.long
 def test_the_evidence_is_a_plain_number_with_its_spread() -> None:
     """It is that of exp(-d / epsilon), averaged over draws from the prior."""
     model, idata = sampled()

@@ -30,6 +30,7 @@ def test_none_is_wrong_or_ends_in_an_error_of_another() -> None:
     assert verdicts == {"works", "refused"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "propagation"), [(name, each) for name, kinds in TELLING.items() for each in kinds]
 )

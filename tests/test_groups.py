@@ -131,6 +131,7 @@ def test_the_density_is_that_of_all_groups_also_in_a_clone() -> None:
         assert np.isfinite(each.compile_dlogp(mode=PLAIN)(point)).all()
 
 
+@pytest.mark.long
 def test_results_keep_the_names(tmp_path: Path) -> None:
     model, optimum = case()
     posterior = draws()
@@ -151,6 +152,7 @@ def test_results_keep_the_names(tmp_path: Path) -> None:
     posterior.to_netcdf(tmp_path / "results.nc")
 
 
+@pytest.mark.long
 def test_predictions_have_a_dimension_of_groups() -> None:
     model, optimum = case()
     before = calls

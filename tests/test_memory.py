@@ -77,6 +77,7 @@ def alive() -> int:
     return sum(issubclass(type(thing), Evaluator) for thing in gc.get_objects())
 
 
+@pytest.mark.long
 def test_an_evaluator_goes_with_its_last_user() -> None:
     gc.freeze()  # what other tests left is not looked at
     model = build()
@@ -87,6 +88,7 @@ def test_an_evaluator_goes_with_its_last_user() -> None:
     assert alive() <= before
 
 
+@pytest.mark.long
 def test_a_design_goes_with_its_model_and_stays_with_what_was_compiled() -> None:
     model = build()
     prb.minimize(model, progressbar=False)

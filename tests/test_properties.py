@@ -315,6 +315,7 @@ def evaluator_of(problem: dict[str, Any], propagation: Any) -> Evaluator:
     return Evaluator(model)
 
 
+@pytest.mark.long
 @few
 @given(problems())
 @pytest.mark.filterwarnings("default")

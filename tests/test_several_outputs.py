@@ -282,6 +282,7 @@ def graph(a, b):
     return a[..., None] * np.ones(2) + b[..., None] * np.array([1.0, -2.0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("response", [two, pytest.param(graph, marks=pytest.mark.slow)])
 def test_resimulated_outputs_give_the_same_optimum(response):
     expected = prb.minimize(model_of())
@@ -316,6 +317,7 @@ def test_specimens_with_missing_outputs_make_the_estimate_better_than_without_th
 # -- predictions, and tests of them ----------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_predictions_have_the_outputs_as_a_dimension():
     optimum = prb.minimize(model_of(as_mapping, NAMED))
     a, b = node_of(optimum.model).bound.inputs.aleatory

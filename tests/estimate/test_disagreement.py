@@ -65,6 +65,7 @@ def with_gaps(data: Any) -> Any:
     return data
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gaps", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_output_with_another_spread_is_named(gaps: bool) -> None:
     data = wrong_output()
@@ -73,6 +74,7 @@ def test_the_output_with_another_spread_is_named(gaps: bool) -> None:
     assert "correlations" not in sentence
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gaps", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_pair_with_another_correlation_is_named(gaps: bool) -> None:
     data = wrong_correlation()
@@ -89,6 +91,7 @@ def test_failures_that_the_model_does_not_predict_are_named() -> None:
     assert "outputs 0 (p" in told(data)
 
 
+@pytest.mark.long
 def test_of_right_data_nothing_is_named() -> None:
     assert told(drawn()).startswith("y: no output by itself, and no correlation of two, disagrees")
 

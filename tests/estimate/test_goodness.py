@@ -55,6 +55,7 @@ def test_a_right_family_is_called_wrong_as_rarely_as_said() -> None:
     assert abs(p.mean() - 0.5) < 0.16
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [pytest.param("area", marks=pytest.mark.slow), "kl"])
 def test_a_population_with_two_modes_is_no_normal_one(name: str) -> None:
     assert (probabilities(name, "bimodal", 3) < UNLIKELY).all()
@@ -78,6 +79,7 @@ def test_how_often_families_are_called_wrong(
     assert low <= share <= high
 
 
+@pytest.mark.long
 def test_diagnose_says_so_of_optima_and_draws() -> None:
     wrong = optimum("pr", "bimodal", 0)
     said = "the inputs probably have another family"
@@ -118,6 +120,7 @@ def resimulated(family: str, metric: prb.Metric, n: int = 50) -> prb.Optimum:
     return prb.minimize(model, starts=0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["kl", pytest.param("area", marks=pytest.mark.slow)])
 def test_what_is_not_stored_is_known_to_first_order(name: str) -> None:
     right, wrong = (resimulated(f, METRICS[name]).sampling() for f in ("normal", "bimodal"))
@@ -169,6 +172,7 @@ def test_why_it_is_not_looked_at_with_other_terms() -> None:
     assert "the model has likelihood terms or potentials besides its simulators" in note
 
 
+@pytest.mark.long
 def test_an_optimum_that_the_prior_holds_away_from_the_data_is_told() -> None:
     """The residual is flat there: from the draws around it nothing could be seen."""
 

@@ -94,6 +94,7 @@ def test_of_a_sum_of_two_means_only_the_sum_is_identified() -> None:
     assert np.isinf(local.in_theta).all()
 
 
+@pytest.mark.long
 def test_a_metric_that_declares_nothing_has_the_standard_errors_of_its_twin() -> None:
     declared, undeclared = fitted(prb.ProbabilityResidual()), fitted(Undeclared())
     for name in ("mu", "sigma"):
@@ -116,6 +117,7 @@ def test_a_kolmogorov_distance_is_the_same_in_every_unit(unit: float) -> None:
     np.testing.assert_allclose(prb.calibrate_epsilon(other)["y"], epsilon, rtol=0.01)
 
 
+@pytest.mark.long
 def test_a_kolmogorov_distance_knows_less_than_the_likelihood() -> None:
     # The distance has about 90% of the mean's efficiency, 60% of the standard deviation's.
     stderr = fitted(KS).stderr

@@ -658,6 +658,7 @@ def test_standard_errors_of_likelihoods_are_the_textbook_ones(name: str) -> None
     np.testing.assert_allclose(errors(fitted(name)), expected, rtol=0.05)
 
 
+@pytest.mark.long
 def test_standard_errors_of_the_area_metric_against_refitting_500_data_sets() -> None:
     start, rng = pair(fitted("area")), np.random.default_rng(5)
     u = (np.arange(500) + 0.5) / 500
@@ -694,6 +695,7 @@ def test_standard_errors_against_refitting_200_data_sets_with_minimize() -> None
         np.testing.assert_allclose(errors(optimum), np.std(fits, axis=0, ddof=1), rtol=4 * 0.07)
 
 
+@pytest.mark.long
 def test_standard_errors_of_what_the_data_do_not_identify_are_infinite() -> None:
     for metric in (METRICS["kl"], METRICS["area"]):
         with pm.Model() as model:

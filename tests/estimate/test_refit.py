@@ -212,6 +212,7 @@ def test_a_simulator_without_a_design_has_no_design_error() -> None:
     assert np.isnan(sampling.design_error().whole)
 
 
+@pytest.mark.long
 def test_data_that_tell_nothing_leave_nothing_to_refit() -> None:
     with pm.Model() as model:
         mu = pm.Normal("mu", 1, 0.001)  # far better known before than after

@@ -163,6 +163,7 @@ def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
 # --------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [slow("ll"), "pr", "area"])
 def test_each_mode_is_adjusted_by_itself(name: str) -> None:
     optimum, idata = fit(name), posterior(name)

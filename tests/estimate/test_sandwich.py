@@ -139,6 +139,7 @@ def test_noise_floor_of_the_area_metric_is_the_expected_distance_at_the_truth() 
     assert abs(floor - distances.mean()) < 4 * error
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("metric", [prb.ProbabilityResidual(), prb.AreaMetric()])
 def test_a_prior_however_wide_leaves_standard_errors_as_they_are(metric: prb.Metric) -> None:
     """A difference over a share of the prior would step over the population."""

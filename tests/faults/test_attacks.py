@@ -10,6 +10,7 @@ import pytest
 from attacks import ATTACKS, allowed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ATTACKS)
 def test_a_few_of_each_attack_are_survived(name: str, tmp_path: Path) -> None:
     attack, n = ATTACKS[name]

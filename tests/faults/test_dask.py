@@ -154,6 +154,7 @@ def study(code: str, folder: Path, executor: Any, n: int) -> Tally:
     return tally
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
 def test_models_of_other_programs_are_computed_by_a_cluster_s_threads(tmp_path: Path) -> None:
     cluster = distributed.LocalCluster(

@@ -129,6 +129,7 @@ def test_a_response_that_changes_its_arguments_changes_nothing_else(where: str, 
         np.testing.assert_array_equal(respond(calling, points, Tally()), expected)
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado).*")
 @pytest.mark.parametrize("where", ["processes", pytest.param("loky", marks=SLOW)])
 def test_a_response_that_ends_its_worker_aborts_where_the_policy_says_so(

@@ -12,6 +12,7 @@ from attacks import go_on, told, writer
 from prbayes.response.store import Store
 
 
+@pytest.mark.long
 def test_two_processes_of_two_threads_lose_nothing_and_find_all(tmp_path: Path) -> None:
     processes = [writer(tmp_path, number, 60) for number in range(2)]
     # Both make the store, write at the same time, and then look for the other's responses.

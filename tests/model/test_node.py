@@ -412,6 +412,7 @@ def test_the_value_that_a_log_density_is_asked_at_has_to_be_the_data() -> None:
             symbolic.eval({**at, value: other}, mode=PLAIN)
 
 
+@pytest.mark.long
 def test_predictive_draws_of_the_same_specimens_are_warned_of(
     caplog: pytest.LogCaptureFixture,
 ) -> None:

@@ -119,6 +119,7 @@ def test_a_failure_ends_the_turn() -> None:
     assert set(seen) == {1}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "propagation",
     [

@@ -27,6 +27,7 @@ def checked() -> xr.DataTree:
     return idata
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("plot", "keywords"),
     [
@@ -44,6 +45,7 @@ def test_predictive_checks_take_our_trees(
     assert (tmp_path / "figure.png").stat().st_size > 5000
 
 
+@pytest.mark.long
 def test_predictive_draws_are_of_the_right_population() -> None:
     drawn = checked()["posterior_predictive"]["y"]
     assert drawn.sizes["y_dim_0" if "y_dim_0" in drawn.dims else drawn.dims[-1]] == 40

@@ -42,6 +42,7 @@ def two_inputs(propagation: Propagation) -> tuple[pm.Model, list[object]]:
     return model, [load, gap]
 
 
+@pytest.mark.long
 def test_margins_are_the_closed_forms_and_named_as_the_response_names_them() -> None:
     model, (load, gap) = two_inputs(prb.Resimulated(64))
     evaluator = Evaluator(model)

@@ -33,6 +33,7 @@ def test_the_trace_is_in_the_users_units(
     assert (np.diff(y) <= 0).all()
 
 
+@pytest.mark.long
 def test_the_objective_of_a_trace_is_that_of_the_final_scales(
     known: SimpleNamespace, read: SimpleNamespace
 ) -> None:

@@ -112,6 +112,7 @@ def pairs(pc: Any) -> list[str]:
     return list(pc.viz["measured"].data_vars)
 
 
+@pytest.mark.long
 def test_pairs_are_a_triangle(several: SimpleNamespace) -> None:
     how: dict[str, Any] = {"model": several.model, "before": False, "draws": 4}
     pc = prb.plot_outputs(several.posterior, outputs=["p", "r/s", "u"], backend="matplotlib", **how)

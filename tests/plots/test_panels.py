@@ -71,6 +71,7 @@ def test_what_was_not_measured_is_left_out() -> None:
     np.testing.assert_allclose(weights, [0.6, 0.4])
 
 
+@pytest.mark.long
 def test_groups_have_the_same_axis() -> None:
     sizes = np.repeat(["a", "b"], 10)
     values = np.append(np.linspace(0, 1, 10), np.linspace(7, 9, 10))

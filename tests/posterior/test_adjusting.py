@@ -100,6 +100,7 @@ def test_draws_of_nuts_get_the_width_that_the_data_warrant(
     assert "prb.adjust" not in "".join(prb.diagnose(adjusted).notes)
 
 
+@pytest.mark.long
 def test_draws_of_a_stock_simulator_by_a_model_with_the_same_hyperparameters() -> None:
     rng = np.random.default_rng(2)
     wide = {
@@ -163,6 +164,7 @@ def test_draws_of_a_likelihood_stay_and_nothing_says_that_they_were_adjusted() -
     assert "unadjusted" in prb.adjust(same_draws, model=model, by=by).children
 
 
+@pytest.mark.long
 def test_draws_given_other_data_are_refused() -> None:
     model = build()
     draws = smc(model, False)

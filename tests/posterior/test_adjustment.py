@@ -193,6 +193,7 @@ def test_the_posterior_changes_smoothly_as_the_prior_gets_as_tight_as_the_data(n
         assert np.abs(np.diff(means) / sd[1:]).max() < most + 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["pr", slow("kl"), slow("area")])
 def test_a_prior_far_tighter_than_the_data_is_a_constant(name: str) -> None:
     """The optimum is elsewhere along the blind direction, and what is seen has to be judged where the prior is."""
@@ -251,6 +252,7 @@ def test_refits_that_ran_away_do_not_decide_the_width(monkeypatch: pytest.Monkey
 # ----------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [slow("ll"), "kl", slow("pr"), "area"])
 def test_widths_are_those_of_the_bootstrap_with_the_prior(name: str) -> None:
     idata = adjusted(name)
@@ -285,6 +287,7 @@ def test_efficient_estimators_give_the_posterior_of_normal_data(name: str) -> No
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [slow("ll"), "kl", slow("pr"), slow("area")])
 def test_the_bias_is_taken_away(name: str) -> None:
     # Twenty observations spread less around their own centre than around the truth: log sigma is
@@ -321,6 +324,7 @@ def assert_quantiles(draws: Any, distribution: Any, size: int) -> None:
     assert (np.abs(levels - LEVELS) < 4 * error).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [slow("kl"), "area"])
 def test_hyperparameters_absent_from_the_response_keep_their_prior(name: str) -> None:
     with pm.Model() as model:
@@ -497,6 +501,7 @@ def test_what_cannot_be_adjusted_says_so(case: str, caplog: pytest.LogCaptureFix
     assert "not adjusted" not in caplog.text  # nobody asked
 
 
+@pytest.mark.long
 def test_a_metric_of_ones_own_is_adjusted_to_the_width_of_its_refits() -> None:
     own = prb.FunctionMetric(lambda z, y, w: np.abs((z * w).sum(-1) - y.mean()), weighted=True)
     optimum = prb.minimize(build(own, sd=0.5), starts=0)
@@ -578,6 +583,7 @@ def two_responses(metric: prb.Metric, *, labels: bool, same_input: bool = True) 
     return model
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [slow("ll"), "kl", slow("pr"), slow("area")])
 def test_shared_specimens_do_not_count_twice(name: str) -> None:
     stderr, widths, bootstrapped = [], [], []
@@ -731,6 +737,7 @@ def test_a_prior_in_conflict_with_the_data_is_said(
     assert said in str(prb.diagnose(idata))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["area", slow("pr"), slow("kl"), slow("ll")])
 def test_a_prior_six_standard_deviations_off_is_said(name: str) -> None:
     """Draws may be where the adjusted ones are: that alone would not tell."""
@@ -742,6 +749,7 @@ def test_a_prior_six_standard_deviations_off_is_said(name: str) -> None:
     assert "Prior and data contradict each other (mu)" in str(prb.diagnose(idata))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["pr", "area", slow("kl"), slow("ll")])
 def test_a_prior_that_agrees_with_the_data_is_not(name: str) -> None:
     idata = sample(fit(name).model, optimum=fit(name))

@@ -55,6 +55,7 @@ def sample(model: pm.Model, **keywords: Any) -> xr.DataTree:
     return prb.sample_smc(200, chains=2, model=model, random_seed=1, progressbar=False, **keywords)
 
 
+@pytest.mark.long
 def test_draws_of_a_likelihood_stay_and_refits_tell_whether_the_family_fits() -> None:
     model = build(METRICS["ll"])
     optimum = prb.minimize(model, progressbar=False)

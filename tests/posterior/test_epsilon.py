@@ -192,6 +192,7 @@ def test_residual_epsilon_scales_with_the_metric() -> None:
     np.testing.assert_allclose(ten, factor * one, rtol=1e-6)
 
 
+@pytest.mark.long
 def test_a_hyperparameter_that_the_data_do_not_touch_changes_nothing() -> None:
     for metric in (PR, AREA):
         with pm.Model() as model:
@@ -334,6 +335,7 @@ def test_a_likelihood_counts_specimens_and_not_observations(metric: prb.Metric) 
     assert prb.calibrate_epsilon(prb.minimize(model))["y"] == pytest.approx(0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "metric",
     [

@@ -63,6 +63,7 @@ def test_of_ten_specimens_it_is_about_the_exact_posterior(sd: float) -> None:
     np.testing.assert_allclose((found - expected) / widths, 0, atol=0.25)
 
 
+@pytest.mark.long
 def test_a_hyperparameter_that_nothing_tells_keeps_its_prior() -> None:
     with pm.Model() as model:
         pm.Normal("idle", 5, 30)
@@ -103,6 +104,7 @@ def test_where_responses_are_not_stored_it_is_the_straight_map() -> None:
     assert given.posterior.attrs["adjustment"].startswith("Affine(")
 
 
+@pytest.mark.long
 def test_where_too_few_refits_arrive_it_is_the_straight_map_and_says_so(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -34,6 +34,7 @@ def adjusted() -> tuple[pm.Model, prb.Optimum, xr.DataTree]:
     return model, optimum, prb.sample_smc(500, chains=2, model=model, optimum=optimum, **QUIET)
 
 
+@pytest.mark.long
 def test_groups_and_attributes_are_those_of_arviz() -> None:
     tree = adjusted()[2]
     for group in ("posterior_predictive", "prior", "prior_predictive", "log_prior"):
@@ -43,6 +44,7 @@ def test_groups_and_attributes_are_those_of_arviz() -> None:
     np.testing.assert_allclose(tree.prior["mu"].std(), 0.2, rtol=0.15)  # four standard errors
 
 
+@pytest.mark.long
 def test_the_log_prior_is_that_of_the_user_s_own_units() -> None:
     model, _, tree = adjusted()
     draws = tree.posterior["mu"].values

@@ -65,6 +65,7 @@ def test_prior_and_estimate_are_those_of_the_exact_posterior() -> None:
         assert abs(found["mu"][:, g].std() / sd - 1) < 0.1
 
 
+@pytest.mark.long
 def test_a_walk_that_gets_nowhere_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     _, evaluator, sampling = case()
     monkeypatch.setattr("prbayes.posterior.pooling._LONG_WALK", 2)

@@ -36,6 +36,7 @@ def plain() -> xr.DataTree:
     return sample()
 
 
+@pytest.mark.long
 def test_a_multitrace_has_the_same_draws() -> None:
     trace = sample(return_inferencedata=False)
     assert isinstance(trace, pm.backends.base.MultiTrace)
@@ -92,6 +93,7 @@ def test_pymc_s_own_sampler_gives_the_kernel_its_start() -> None:
     np.testing.assert_allclose(kernel.tempered_posterior, [[1.5, 2.5, np.log(0.6)]] * 20)
 
 
+@pytest.mark.long
 def test_another_start_is_another_run_of_a_checkpoint(tmp_path: Any) -> None:
     rng = np.random.default_rng(3)
     prior = {"mu": rng.normal(1, 1, (40, 2)), "sigma": np.abs(rng.normal(size=40))}

@@ -116,6 +116,7 @@ def test_ranks_do_not_depend_on_where_they_are_found(
     )
 
 
+@pytest.mark.long
 def test_the_result_is_complete_and_the_model_as_before() -> None:
     model, result = serial()
     assert set(result.children) == {"prior_sbc", "truth", "posterior_sd", "envelope"}
@@ -142,6 +143,7 @@ def test_the_result_is_complete_and_the_model_as_before() -> None:
     np.testing.assert_array_equal(node.target.observed, OBSERVED[:30])
 
 
+@pytest.mark.long
 def test_data_sets_do_not_depend_on_their_number() -> None:
     model, result = serial()
     few = prb.simulation_based_calibration(model=model, **(RUN | {"n": 3}))
@@ -166,6 +168,7 @@ def test_ranks_count_the_draws_below_the_truth(monkeypatch: pytest.MonkeyPatch) 
     np.testing.assert_allclose(result.posterior_sd["mu"], np.std(np.arange(10) / 5))
 
 
+@pytest.mark.long
 def test_it_can_be_drawn_and_saved(tmp_path: Path) -> None:
     mpl.use("Agg")
     import arviz as az
@@ -285,6 +288,7 @@ def spread(result: xr.DataTree) -> Floats:
     return np.asarray((((ranks - 0.5) ** 2).mean() - 1 / 12) / (180 * ranks.size) ** -0.5)
 
 
+@pytest.mark.long
 def test_overconfidence_shows() -> None:
     # Ten times too small an epsilon: posteriors are too narrow by sqrt(10), and ranks Phi(sqrt(10)
     # z) have a mean square of asin(10/11) / (2 pi) = 0.18, six standard errors of 25 uniform ones

@@ -226,6 +226,7 @@ def test_an_epsilon_is_for_one_run() -> None:
     assert float(wide) > 2 * float(narrow)
 
 
+@pytest.mark.long
 def test_an_unset_epsilon_is_calibrated_for_the_run() -> None:
     model = two_hyperparameters()
     assert np.isnan(epsilon_of(model)).all()

@@ -54,6 +54,7 @@ def idata() -> xr.DataTree:
 # -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_tree_of_an_optimum() -> None:
     tree = optimum().to_datatree()
     assert set(tree.children) == {"optimum", "stderr", "trace", "calibration", "observed_data"}
@@ -89,6 +90,7 @@ def test_the_tree_of_an_optimum() -> None:
     assert versions().items() <= tree["optimum"].attrs.items()
 
 
+@pytest.mark.long
 def test_observed_data_keep_their_labels() -> None:
     for tree in (optimum().to_datatree(), idata()):
         observed = tree["observed_data"]

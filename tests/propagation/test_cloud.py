@@ -126,6 +126,7 @@ def test_the_prior_stays_in_reach() -> None:
     assert np.median(evaluator.support(prior)["y"]["mean_weight"]) == pytest.approx(1, abs=0.05)
 
 
+@pytest.mark.long
 def test_clouds_grow_for_their_points_and_runs_for_what_emulators_say() -> None:
     evaluator, design = design_of(build())
     thetas = theta_of(evaluator) + 0.1 * np.random.default_rng(0).standard_normal((64, 4))
@@ -181,6 +182,7 @@ def test_the_error_of_emulators_is_measured_by_runs_that_are_left_out() -> None:
     assert 0.02 < errors["smooth"].points < 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("lost", "known"), [(3, True), (5, False)])
 def test_parts_of_a_cloud_without_a_minimum_leave_its_error_to_the_others(
     lost: int, known: bool, monkeypatch: pytest.MonkeyPatch
@@ -211,6 +213,7 @@ def rough(a: Any, b: Any) -> Any:
     return np.sin(1e3 * a) + np.sin(1e3 * b)
 
 
+@pytest.mark.long
 def test_another_response_that_no_emulator_tells_is_predicted_from_the_runs() -> None:
     model = build(n=700, known=True, emulator=prb.surrogate.RadialBasis())
     optimum = prb.minimize(model, starts=0, refine=False, progressbar=False)
@@ -234,6 +237,7 @@ def test_another_response_that_no_emulator_tells_is_predicted_from_the_runs() ->
     np.testing.assert_array_equal(optimum.evaluator.populations(optimum.theta[None], 0)[0], values)
 
 
+@pytest.mark.long
 def test_runs_that_are_too_few_for_another_response_are_refused() -> None:
     optimum = prb.minimize(build(), starts=0, refine=False, progressbar=False)
     inputs = optimum.evaluator.nodes[0].bound.inputs.aleatory
@@ -356,6 +360,7 @@ def test_another_response_that_no_surface_follows_is_refused() -> None:
         design.values_of(other)
 
 
+@pytest.mark.long
 def test_simulators_of_the_same_specimens_keep_the_same_points() -> None:
     with pm.Model() as model:
         a = pm.Normal.dist(pm.Normal("ma", 1, 0.5), pm.LogNormal("sa", 0, 0.5))

@@ -235,6 +235,7 @@ def test_a_model_with_one_travels() -> None:
     np.testing.assert_array_equal(design_of(there).values, design_of(model).values)
 
 
+@pytest.mark.long
 def test_an_optimum_is_that_of_many_runs() -> None:
     few = prb.minimize(build(), starts=0, progressbar=False)
     with pm.Model() as model:

@@ -103,6 +103,7 @@ def test_a_sampler_s_seed_decides_the_draws_of_every_run() -> None:
     assert not np.isin(first, other).any()
 
 
+@pytest.mark.long
 def test_prior_predictive_sampling_follows_its_seed() -> None:
     drawn = [
         pm.sample_prior_predictive(3, model=model(), random_seed=seed).prior_predictive["y"].values

@@ -229,6 +229,7 @@ def test_blocks_of_populations_change_nothing(
     assert evaluator.discrepancies(thetas[:0], 0).shape == (0,)
 
 
+@pytest.mark.long
 def test_an_input_without_inverse_distribution_function() -> None:
     data = np.random.default_rng(2).normal(1.0, 0.3, 40) + np.random.default_rng(3).exponential(
         0.5, 40
@@ -451,6 +452,7 @@ def test_the_error_of_a_design_is_measured() -> None:
     assert np.isnan(prb.minimize(once(), starts=0).design_error)  # one input
 
 
+@pytest.mark.long
 def test_a_wide_population_is_refused_where_a_narrow_design_may_not_grow() -> None:
     data = np.random.default_rng(0).normal(0, 5, 200)
     with pm.Model() as model:
@@ -483,6 +485,7 @@ def test_many_inputs_are_told_what_to_use(caplog: pytest.LogCaptureFixture) -> N
         )
 
 
+@pytest.mark.long
 def test_minimize_refines_where_the_answer_is_far_out_in_the_prior() -> None:
     # The area metric says in which direction to go: 20 prior sds away.
     data = np.random.default_rng(1).normal(10.0, 0.5, 30)
@@ -524,6 +527,7 @@ def test_data_that_no_population_of_the_prior_reaches_are_walked_to(
     assert optimum.n_responses <= 1024
 
 
+@pytest.mark.long
 def test_the_way_to_far_data_does_not_hang_on_rounding() -> None:
     # Far from them the discrepancy is the same everywhere, up to rounding.
     found = []
@@ -533,6 +537,7 @@ def test_the_way_to_far_data_does_not_hang_on_rounding() -> None:
     np.testing.assert_allclose(found, [found[0]] * 3, rtol=1e-6)
 
 
+@pytest.mark.long
 def test_a_thin_design_does_not_make_a_poor_minimum_the_answer() -> None:
     # At mu = 8 the design ends, and populations that would be nearer the data have no points.
     optimum = prb.minimize(far_from_the_prior(same, PR, 2.0, n=512))

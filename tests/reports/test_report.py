@@ -237,6 +237,7 @@ def test_a_browser_shows_it(tmp_path: Path, report: prb.Report) -> None:
     assert 3 <= len(re.findall(rb"/Type\s*/Page\b", pdf.read_bytes())) <= 12
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("width", [375, 1000])
 def test_a_browser_needs_no_sideways_scrolling(
     width: int, tmp_path: Path, report: prb.Report, page: Any

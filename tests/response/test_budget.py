@@ -197,6 +197,7 @@ def require_same_draws(a: xr.DataTree, b: xr.DataTree) -> None:
             xr.testing.assert_equal(left[variable], right[variable])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["Reweighted", *map(slow, ("Resimulated", "Fresh"))])
 def test_stages_are_limited_and_go_on(name: str, tmp_path: Path) -> None:
     path = tmp_path / "run.nc"
@@ -208,6 +209,7 @@ def test_stages_are_limited_and_go_on(name: str, tmp_path: Path) -> None:
     require_same_draws(sampled(name, path, model), undisturbed(name))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["Fresh", slow("Resimulated")])
 def test_finished_chains_are_returned_and_the_rest_goes_on(name: str, tmp_path: Path) -> None:
     path = tmp_path / "run.nc"

@@ -154,6 +154,7 @@ if hasattr(os, "fork"):
     assert not list(tmp_path.glob("*fmu*"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("stiffness", "timeout"),
     [

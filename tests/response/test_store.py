@@ -144,6 +144,7 @@ def test_responses_go_to_other_programs_as_a_data_set(folder: Path, tmp_path: Pa
     assert Store(tmp_path / "new", "y", 2).to_dataset()["inputs"].shape == (0, 2)
 
 
+@pytest.mark.long
 def test_a_hundred_thousand_responses_take_a_second_or_two(tmp_path: Path) -> None:
     keys = np.random.default_rng(2).normal(size=(100_000, 5))
     store = Store(tmp_path, "y", 5)

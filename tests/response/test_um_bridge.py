@@ -141,6 +141,7 @@ def test_what_is_no_number_and_what_the_model_raises(real: Real) -> None:
     assert moody(4.0) == 8
 
 
+@pytest.mark.long
 def test_a_request_that_never_returns_is_given_up_and_its_answer_is_nobody_s(real: Real) -> None:
     moody = prb.umbridge(real.url, "moody", timeout=0.3)
     clock = time.monotonic()

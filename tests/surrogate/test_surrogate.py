@@ -156,6 +156,7 @@ def model_with(response: Any, propagation: Any = None) -> pm.Model:
     return model
 
 
+@pytest.mark.long
 def test_a_calibration_through_a_surrogate_agrees_with_one_without() -> None:
     direct = prb.minimize(model_with(lambda x: lambda x: np.exp(0.3 * x)))
     through = prb.minimize(
@@ -168,6 +169,7 @@ def test_a_calibration_through_a_surrogate_agrees_with_one_without() -> None:
     assert through.support["y"]["lost_mass"] < 0.01
 
 
+@pytest.mark.long
 def test_reweighted_refuses_an_answer_that_rests_on_points_outside() -> None:
     narrow = prb.Surrogate.fit(lambda x: np.exp(0.3 * x), {"x": (-1.5, 1.0)}, 24)
     with pytest.raises(DesignError, match="lost mass"):

@@ -87,6 +87,7 @@ def test_the_right_family_is_told_and_families_alike_are_not() -> None:
     )
 
 
+@pytest.mark.long
 def test_optima_are_cross_validated_alike() -> None:
     by_optima = compare(skewed(), folds=5, random_seed=0, **QUIET)
     by_folds = compare({label: validated(label) for label in skewed()})
@@ -95,6 +96,7 @@ def test_optima_are_cross_validated_alike() -> None:
     assert float(other.difference[1]) != float(by_folds.difference[1])
 
 
+@pytest.mark.long
 def test_the_numbers_are_those_of_arviz() -> None:
     found = {label: validated(label) for label in skewed()}
     table = compare(found)
@@ -198,6 +200,7 @@ def test_two_responses_of_several_simulators_with_labels_and_weights() -> None:
     assert table.attrs["n_specimens"] == 60
 
 
+@pytest.mark.long
 def test_several_outputs_with_some_not_measured_and_some_failed() -> None:
     def outputs(x: Any) -> Any:
         return np.stack([x, np.where(x > 2.5, np.inf, x**2)], axis=-1)
@@ -213,6 +216,7 @@ def test_several_outputs_with_some_not_measured_and_some_failed() -> None:
     assert table.attrs["n_specimens"] == 60
 
 
+@pytest.mark.long
 def test_any_metric_and_propagation_that_can_be_refitted() -> None:
     resimulated = prb.Resimulated(2000)
     with pm.Model() as model:

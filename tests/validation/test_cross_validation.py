@@ -44,12 +44,14 @@ def test_each_fold_is_a_calibration_on_the_other_specimens() -> None:
         )
 
 
+@pytest.mark.long
 def test_the_wrong_family_predicts_worse() -> None:
     right, wrong = (prb.cross_validate(optimum(f)) for f in (pm.LogNormal, pm.Normal))
     assert float(wrong.discrepancy.mean()) > 1.1 * float(right.discrepancy.mean())
     assert float(right.discrepancy.mean()) > float(right.calibrated.mean())
 
 
+@pytest.mark.long
 def test_specimens_are_dealt_out_whole() -> None:
     with pm.Model() as model:
         x = pm.LogNormal.dist(pm.Normal("mu", 0.5, 1), pm.HalfNormal("sigma", 1))

@@ -46,6 +46,7 @@ def test_the_table_against_simulation(n: int) -> None:
         assert abs(share - level) < 4.5 * np.sqrt(level * (1 - level) / size)
 
 
+@pytest.mark.long
 def test_the_table_is_what_its_script_makes() -> None:
     sizes, rows = table().sizes, table().quantiles
     for n in (1, 9):

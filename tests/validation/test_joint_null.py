@@ -36,6 +36,7 @@ def calibrated(labelled: bool = False) -> tuple[prb.Optimum, Any]:
     return prb.minimize(model), x
 
 
+@pytest.mark.long
 def test_own_data_take_the_joint_null() -> None:
     optimum, x = calibrated()
     predicted = prb.predict(optimum, same, x, random_seed=1)
@@ -52,6 +53,7 @@ def test_own_data_take_the_joint_null() -> None:
     assert test.p_value > 0.05
 
 
+@pytest.mark.long
 def test_own_specimens_under_another_condition_are_as_close_as_under_their_own() -> None:
     optimum, x = calibrated(labelled=True)
     null = prb.validation.JointNull(optimum, (double, x), replicates=199)
