@@ -18,7 +18,7 @@ from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.disagreement import disagreement
 from prbayes.estimate.goodness import UNLIKELY, Refitted, of_another_family, of_held_away
 from prbayes.estimate.obstacles import refit_obstacle
-from prbayes.estimate.optimum import Optimum, compared_in, require_of_model
+from prbayes.estimate.optimum import NO_RESPONSE, TOLD_SHARE, Optimum, compared_in, require_of_model
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.elements import (
     finite_draws,
@@ -46,6 +46,9 @@ _SAME_DIGITS = 1e-12
 
 # Where the numbers behind sentences about draws are.
 _IN_NUMBERS = more_in("validity.md#diagnostics-of-the-sampler")
+
+# Where it says what NaN and +inf mean.
+_ON_NAN = more_in("distributed.md#when-a-response-fails")
 
 _SUPPORT = ("weight_ess", "mean_weight", "lost_mass")
 
@@ -165,7 +168,8 @@ def _of_optimum(optimum: Optimum) -> Diagnosis:
         messages.append(_not_converged(optimum.message))
     designs = _computed(optimum.evaluator, optimum.theta[None])
     failed = _failed(optimum.failures)
-    notes = (*_compared(optimum.to_datatree()), *notes)
+    lost = {name: each["lost_mass"] for name, each in optimum.support.items()}
+    notes = (*_compared(optimum.to_datatree()), *_left_out(lost), *notes)
     return Diagnosis((*messages, *failed, *_unsupported(designs)), designs.support, notes)
 
 
@@ -215,7 +219,7 @@ def _of_stored_optimum(result: xr.DataTree) -> Diagnosis:
     if not attrs.get("converged", True) and not attrs.get("stopped"):
         messages.append(_not_converged(str(attrs.get("message", ""))))
     refits = _not_looked_at("refits need the model; pass the Optimum itself")
-    notes = (*_compared(result), *refits)
+    notes = (*_compared(result), *_left_out(_lost_in(result)), *refits)
     return Diagnosis((*messages, *_failed_in(result)), xr.Dataset(), notes)
 
 
@@ -238,6 +242,38 @@ def _failed(failures: xr.Dataset) -> list[str]:
             f"{more_in('expensive.md#when-a-run-fails')}."
         )
     return found
+
+
+def _left_out(lost: Mapping[str, float]) -> tuple[str, ...]:
+    """Say which part of the populations has no response, and what that means."""
+    return tuple(
+        f"{name}: {share:.1%} of specimens {NO_RESPONSE}: the population compared is that of the "
+        "others. A response that returns +inf counts as a specimen that failed, and "
+        f"on_failure=prb.response.Abort(on_nan=True) refuses NaN{_ON_NAN}."
+        for name, share in lost.items()
+        if share >= TOLD_SHARE
+    )
+
+
+def _lost_in(result: xr.DataTree) -> dict[str, float]:
+    """Return the share without response by simulator, at the optimum or over the draws."""
+    if "calibration" not in result:
+        return {}
+    calibration = result["calibration"].to_dataset()
+    shares = calibration["lost_mass"].transpose("simulator", ...).values
+    means = shares.reshape(len(shares), -1).mean(axis=1)
+    if "lost_mass_at_best" in calibration:
+        means = np.where(np.isnan(means), calibration["lost_mass_at_best"].values, means)
+    names = calibration["simulator"].values.tolist()
+    return dict(zip(names, means.tolist(), strict=True))
+
+
+def _lost_by(designs: _Designs) -> dict[str, float]:
+    """Return the same of draws of another sampler."""
+    return {
+        name: float(designs.support["lost_mass"].sel(simulator=name).mean())
+        for name in designs.needs
+    }
 
 
 def _not_converged(message: str) -> str:
@@ -267,7 +303,8 @@ def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
         *_unsupported(designs),
     ]
     refits = _of_refits(posterior.attrs, several=_has_several_outputs(result))
-    notes = (*_compared(result), *_unadjusted(posterior.attrs), *refits)
+    lost = _lost_in(result) or _lost_by(designs)
+    notes = (*_compared(result), *_left_out(lost), *_unadjusted(posterior.attrs), *refits)
     return Diagnosis(tuple(messages), designs.support, notes)
 
 

@@ -407,6 +407,31 @@ def test_more_may_be_lost_where_that_is_asked_for_and_is_reported() -> None:
     assert 0.1 < tree["calibration"]["lost_mass_at_best"].item() < 0.9
 
 
+@pytest.mark.parametrize("propagation", [prb.Reweighted(256), prb.Resimulated(256)])
+def test_specimens_without_response_are_told_of(propagation: Any) -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), 0.5)
+        prb.Simulator(
+            "y", lambda x: np.where(x > 2.0, np.nan, x), x,
+            metric=prb.AreaMetric(), observed=OBSERVED, propagation=propagation,
+        )  # fmt: skip
+    optimum = prb.minimize(model, progressbar=False)
+    share = optimum.support["y"]["lost_mass"]
+    assert 0.001 < share < 0.05
+    said = f"y: {share:.1%} of specimens have no response (NaN) and are left out"
+    assert said in repr(optimum)
+    assert said in optimum._repr_html_()
+    tree = prb.sample_smc(50, chains=1, model=model, adjust=False, progressbar=False)
+    for result in (optimum, optimum.to_datatree()):
+        assert [n for n in prb.diagnose(result).notes if n.startswith(said)]
+    for result, own in ((tree, None), (tree, model)):
+        (note,) = [n for n in prb.diagnose(result, model=own).notes if "no response" in n]
+        assert re.match(r"y: \d\.\d% of specimens have no response \(NaN\)", note)
+    report = prb.Report("A", optimum=optimum, posterior=tree, pictures=False)
+    texts = " ".join(text for s in report.sections for text in s.text)
+    assert texts.count("have no response (NaN) and are left out") == 2
+
+
 def test_draws_that_lose_too_much_are_counted_and_told() -> None:
     # The best draws lose next to nothing; those above 1, of which there are some, do.
     model = failing(prb.Resimulated(64, on_failure=REPLACED, max_lost=0.2), limit=1.6)

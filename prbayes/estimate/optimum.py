@@ -29,7 +29,9 @@ from prbayes.model.labels import failures_dataset, labelled, observed_dataset, v
 from prbayes.model.turns import in_turn
 
 # What is less is written as 0.0%.
-_TOLD_SHARE = 5e-4
+TOLD_SHARE = 5e-4
+# How specimens whose response is NaN are told of.
+NO_RESPONSE = "have no response (NaN) and are left out"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -152,10 +154,14 @@ class Optimum:
         return f"{head} {self.n_evaluations} evaluations, {self.n_responses} responses, {state}"
 
     def _shares(self) -> list[str]:
-        """Say which share of the specimens fails, where some do."""
-        shares = {name: each.get("failed_mass", 0.0) for name, each in self.support.items()}
-        told = {name: share for name, share in shares.items() if share >= _TOLD_SHARE}
-        return [f"{name}: {share:.1%} of specimens fail" for name, share in told.items()]
+        """Say which share of the specimens fails, or has no response, where some do."""
+        said = []
+        for name, each in self.support.items():
+            for key, what in (("failed_mass", "fail"), ("lost_mass", NO_RESPONSE)):
+                share = each.get(key, 0.0)
+                if share >= TOLD_SHARE:
+                    said.append(f"{name}: {share:.1%} of specimens {what}")
+        return said
 
     @property
     def model(self) -> pm.Model:
