@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from prbayes._checks import Floats, called
 from prbayes._html import view
 from prbayes._weighted import INTERVAL
 from prbayes.estimate.optimum import Optimum, identity_in
+from prbayes.estimate.refinement import reached
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
 from prbayes.metrics.divergence import KullbackLeibler
@@ -137,7 +139,9 @@ def compare(
         data[key] = ("result", [getattr(column, key) for column in columns.values()])
     if model is not None and nodes(model):
         scored = _table(columns, every)[..., 0]
-        for key, scores in _scores(model, every, scored, metrics).items():
+        # An optimum of this model was found on the designs as they are.
+        here = any(isinstance(each, Optimum) and each.model is model for each in results.values())
+        for key, scores in _scores(model, every, scored, metrics, reach=not here).items():
             data[key] = ("result", scores)
     coords = {"result": list(columns), "hyperparameter": names}
     attrs = {"interval": INTERVAL, **as_attributes(identity)}
@@ -288,15 +292,31 @@ def _shared(columns: list[_Column], model: pm.Model | None) -> list[str]:
 
 
 def _scores(
-    model: pm.Model, names: list[str], estimates: Floats, metrics: Sequence[Metric] | None
+    model: pm.Model,
+    names: list[str],
+    estimates: Floats,
+    metrics: Sequence[Metric] | None,
+    *,
+    reach: bool,
 ) -> dict[str, Floats]:
-    """Return discrepancies of estimates, shape (results, elements), by simulator and metric."""
+    """Return discrepancies of estimates, shape (results, elements), by simulator and metric.
+
+    Where asked, designs that were never led anywhere reach them first.
+    """
     evaluator = Evaluator(model)
     if metrics is None and evaluator.responses_per_theta:
         return {}  # a comparison that was not asked for scores computes no response
     thetas = _thetas(evaluator, names, estimates)
     if thetas is None:
         return {}
+    with reached(evaluator, thetas) if reach else nullcontext():
+        return _scored(evaluator, thetas, metrics)
+
+
+def _scored(
+    evaluator: Evaluator, thetas: Floats, metrics: Sequence[Metric] | None
+) -> dict[str, Floats]:
+    """Return the same of thetas, shape (results, d)."""
     thin = [shortcomings(evaluator, theta[None]) for theta in thetas]
     found = {}
     for k, node in enumerate(evaluator.nodes):

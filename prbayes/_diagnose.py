@@ -287,12 +287,14 @@ def _not_converged(message: str) -> str:
 def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
     posterior = result["posterior"]
     variables = posterior.to_dataset()
-    if model is None and "calibration" in result:
+    if "calibration" in result:
+        # A model that was built again has not yet the designs that these draws are of.
         designs = _stored(result["calibration"].to_dataset())
     else:
         model = model_on_context(model, "prb.diagnose")
         require_of_model(result, model, "diagnose", Level.OPTIMUM)
         designs = _computed(Evaluator(model), _thetas(posterior, model))
+    if model is not None:
         variables = variables[[str(rv.name) for rv in model.free_RVs]]
     messages = [
         *_warnings(posterior.attrs),

@@ -10,6 +10,7 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._checks import Floats
+from prbayes.model.evaluator import Evaluator
 
 DATA = np.random.default_rng(1).normal([1.0, 3.0], 0.5, (40, 2))
 
@@ -201,6 +202,33 @@ def test_the_interval_of_an_optimum_is_that_of_a_normal(optimum: prb.Optimum) ->
     for bound in ("lower", "upper"):
         covered = norm.cdf(best[bound], best["estimate"], best["sd"])
         np.testing.assert_allclose(covered, 0.055 if bound == "lower" else 0.945, rtol=1e-10)
+
+
+def test_scores_of_a_model_that_was_built_again_are_those_of_the_first() -> None:
+    def build() -> pm.Model:
+        with pm.Model() as model:
+            a = pm.Normal.dist(pm.Normal("mu", 0.0, 12.0), 0.2)
+            b = pm.Normal.dist(3.0, 0.2)
+            observed = np.random.default_rng(1).normal([4.0, 3.0], 0.2, (20, 2)).sum(axis=1)
+            prb.Simulator(
+                "y", lambda a, b: a + b, a, b,
+                metric=prb.ProbabilityResidual(), observed=observed,
+                propagation=prb.Reweighted(64),
+            )  # fmt: skip
+        return model
+
+    first = build()
+    optimum = prb.minimize(first)
+    there = prb.compare({"optimum": optimum}, model=first)
+    again = build()
+    design = Evaluator(again).designs["y"]
+    before = design.contents
+    here = prb.compare({"optimum": optimum.to_datatree()}, model=again)
+    for name in ("ProbabilityResidual", "KullbackLeibler", "AreaMetric"):
+        np.testing.assert_allclose(here[name], there[name], rtol=0.1)
+    assert design.contents is before
+    # The compiled graphs read it too.
+    assert prb.minimize(again).discrepancy == optimum.discrepancy
 
 
 @pytest.mark.long

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 
 import numpy as np
 
@@ -236,6 +237,22 @@ def _reach(
     for k, design in clouds:
         design.reach(_components(evaluator, thetas, k), on_the_way=on_the_way)
     return bool(clouds)
+
+
+@contextmanager
+def reached(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
+    """Let clouds of a model that was never calibrated reach the populations at thetas, inside.
+
+    They know the prior alone, and are thin around what was found by another process.
+    """
+    with ExitStack() as stack:
+        names = set()
+        for name, design in evaluator.designs.items():
+            if design.contents.cloud and len(design.contents.groups) == 1:
+                stack.enter_context(design.undone())
+                names.add(name)
+        _reach(evaluator, thetas, names)
+        yield
 
 
 def _widened(
