@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 from pymc.printing import str_for_dist
+from pymc.pytensorf import constant_fold
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
 
@@ -18,6 +19,10 @@ from prbayes.model.node import Node, nodes, response_name
 # What is told of a variable and of a simulator.
 _VARIABLE = ("name", "role", "distribution")
 _SIMULATOR = ("name", "response", "inputs", "metric", "propagation", "n_points", "specimens")
+
+# What PyMC writes for an array, and how many numbers of one are told instead.
+_CONSTANT = "<constant>"
+_MOST_NUMBERS = 6
 
 
 def describe(model: pm.Model) -> dict[str, Any]:
@@ -115,7 +120,29 @@ def _input(argument: Any, aleatory: tuple[Any, ...], known: Set[Any]) -> str:
 
 def _distribution(rv: Any, known: Set[Any]) -> str:
     text: str = str_for_dist(rv, named_vars=known)
-    return text.removeprefix(f"{rv.name} ~ ")
+    text = text.removeprefix(f"{rv.name} ~ ").replace("_lkjcholeskycov(", "LKJCholeskyCov(")
+    # PyMC does not tell the numbers of arrays.
+    arrays = _constants(rv)
+    if text.count(_CONSTANT) != len(arrays):
+        return text
+    for array in arrays:
+        text = text.replace(_CONSTANT, array, 1)
+    return text
+
+
+def _constants(rv: Any) -> list[str]:
+    """Return in words the parameters of a distribution that are arrays of constants."""
+    parameters = getattr(rv.owner.op, "dist_params", lambda node: ())(rv.owner)
+    found = []
+    for value in constant_fold(list(parameters), raise_not_constant=False):
+        if isinstance(value, Variable) or np.size(value) == 1:
+            continue
+        if np.size(value) > _MOST_NUMBERS:
+            found.append(f"{np.size(value)} numbers")
+        else:
+            numbers = ", ".join(f"{number:.4g}" for number in np.ravel(value))
+            found.append(f"[{numbers}]")
+    return found
 
 
 def _above(variable: Any, known: Set[Any]) -> str:

@@ -13,6 +13,7 @@ import logging
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -175,7 +176,8 @@ class SimulatorRV(RandomVariable):
         node: Node,
     ) -> None:
         # What pictures of the model show.
-        told = f"Simulator of {_plain_name(node)} by {type(node.metric).__name__}"
+        response = response_name(node.bound.responses.function)
+        told = f"Simulator of {response} by {type(node.metric).__name__}"
         super().__init__(name=name or told, signature=signature, dtype=dtype, inplace=inplace)
         self._node = weakref.ref(node)
         self._owner: weakref.ref[Any] | None = None
@@ -213,7 +215,8 @@ class SimulatorRV(RandomVariable):
     @property
     def _print_name(self) -> tuple[str, str]:
         """What PyMC prints for the distribution, as text and as LaTeX."""
-        told = f"{_plain_name(self.node)}, {type(self.node.metric).__name__}"
+        response = response_name(self.node.bound.responses.function)
+        told = f"{response}, {type(self.node.metric).__name__}"
         latex = told.replace("_", "\\_")
         return f"Simulator[{told}]", f"\\operatorname{{Simulator}}[\\text{{{latex}}}]"
 
@@ -289,14 +292,12 @@ class SimulatorRV(RandomVariable):
 
 
 def response_name(function: Any) -> str:
-    """Return what a response is called."""
+    """Return what a response is called, or else what it is of."""
     inner = getattr(function, "function", function)  # of what `scalar` wraps
-    return str(getattr(inner, "__name__", type(inner).__name__))
-
-
-def _plain_name(node: Node) -> str:
-    """Return the same without the brackets of a lambda, which pictures take for markup."""
-    return response_name(node.bound.responses.function).strip("<>")
+    name = str(getattr(inner, "__name__", type(inner).__name__))
+    if name != "<lambda>":
+        return name
+    return f"lambda({', '.join(signature(inner).parameters)})"
 
 
 def _own_index(index: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, ...]:

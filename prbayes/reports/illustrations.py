@@ -252,11 +252,11 @@ ILLUSTRATIONS = (
         request=_validity,
         title="Distribution of the u-values",
         alt="Step curve of the sorted u-values against the diagonal, "
-        "with the area between them and an acceptance band.",
+        "with the area between them, and of one output an acceptance band.",
         caption="Where the measured responses stand in the predicted distribution. "
-        "A right model keeps near the diagonal; the shaded area is the statistic, "
-        "and the band holds the whole curve with the stated probability. "
-        "Of several outputs there is a line for each direction in which they are seen.",
+        "A right model keeps near the diagonal; the shaded area is the statistic. "
+        "Of one output, the band holds the whole curve with the stated probability; of several "
+        "there is a line for each direction in which they are seen, and no band.",
     ),
     Illustration(
         after="Decision",

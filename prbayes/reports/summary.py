@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-
 import numpy as np
 
 from prbayes._checks import Floats
@@ -17,7 +15,7 @@ from prbayes.model.elements import (
 from prbayes.plots._names import named
 from prbayes.plots._objective import metric_label
 from prbayes.plots.validity import in_directions
-from prbayes.reports.material import Material
+from prbayes.reports.material import Material, read_variables
 from prbayes.reports.numbers import alike, counted, number, percentage, plus_minus
 from prbayes.validation.validity import ValidityTest
 
@@ -106,7 +104,7 @@ def _what_was_calibrated(m: Material) -> str:
         return ""
     hyperparameters = counted(len(names), "hyperparameter")
     if len(names) <= _MOST_NAMES:
-        hyperparameters += f" ({', '.join(names)})"
+        hyperparameters += f" ({', '.join(_called(name, m) for name in names)})"
     if not m.results:
         return f"The model has {hyperparameters}. No result of a calibration was given."
     were = "was" if len(names) == 1 else "were"
@@ -115,6 +113,12 @@ def _what_was_calibrated(m: Material) -> str:
     metrics = _metrics(m)
     by = f", by the {_enumerated(metrics)}" if metrics else ""
     return f"{hyperparameters} of the model {were} calibrated{on}{by}."
+
+
+def _called(name: str, m: Material) -> str:
+    """Return the name of a variable, after what a reader calls it if that was said."""
+    meaning = named(name, m.labels)
+    return name if meaning == name else f"{meaning}: {name}"
 
 
 def _measured(name: str, y: Floats) -> str:
@@ -156,7 +160,9 @@ def _answer(m: Material) -> str:
     estimates = _estimates(m, label)
     if not estimates or len(estimates) > _MOST_NAMES:
         return f"The answer is in the table of the {kind}."
-    pairs = [f"{name} = {plus_minus(value, sd)}" for name, (value, sd) in estimates.items()]
+    pairs = []
+    for name, (value, sd) in estimates.items():
+        pairs.append(f"{_called(name, m)} = {plus_minus(value, sd)}")
     which = f" of {label}" if len(of_kind) > 1 else ""
     return f"The answer{which} is {', '.join(pairs)} ({what})."
 
@@ -181,20 +187,8 @@ def _estimates(m: Material, label: str) -> dict[str, tuple[float, float]]:
         for name in told_of(optimum, stderr):
             found[name] = (points[name], errors[name])
     variables = {name: name.partition("[")[0] for name in found}
-    known = _read(m.hyperparameters, set(variables.values()))
+    known = read_variables(m.hyperparameters, set(variables.values()))
     return {name: pair for name, pair in found.items() if variables[name] in known}
-
-
-def _read(hyperparameters: Sequence[str], among: Collection[str]) -> list[str]:
-    """Return the variables that are read for hyperparameters.
-
-    For a `pymc.LKJCholeskyCov`, a packed factor, its standard deviations and correlations.
-    """
-    read = []
-    for name in hyperparameters:
-        instead = [f"{name}_stds", f"{name}_corr"]
-        read += instead if set(instead) <= set(among) else [name]
-    return read
 
 
 def _agreement(m: Material) -> str:

@@ -36,6 +36,12 @@ Rows = NDArray[np.intp]
 _ROUNDING = 1e-6
 
 
+_BY_HAND = (
+    "prb.scalar: called by hand, every input is a number; where one is multivariate, call "
+    "response.function(...) with the inputs of one specimen"
+)
+
+
 class scalar:  # noqa: N801 (reads as a function in a model)
     """Turn a function of one specimen's inputs into a response; also for external programs.
 
@@ -52,7 +58,8 @@ class scalar:  # noqa: N801 (reads as a function in a model)
 
     Notes
     -----
-    Called directly, not by a simulator, all inputs are taken as scalar.
+    Called directly, not by a simulator, all inputs are taken as scalar; ``response.function`` is the
+    function of one specimen, whose inputs may be arrays.
 
     Examples
     --------
@@ -77,7 +84,11 @@ class scalar:  # noqa: N801 (reads as a function in a model)
         outputs: Outputs | None = None
         values = []
         for specimen in specimens:
-            result = self.function(*specimen)
+            try:
+                result = self.function(*specimen)
+            except (IndexError, TypeError) as error:
+                error.add_note(_BY_HAND)
+                raise
             outputs = _told_by(result, 0, outputs)
             values.append(_of_one(result, outputs if isinstance(result, Mapping) else None))
         event = np.shape(values[0]) if values else ()

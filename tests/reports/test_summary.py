@@ -10,7 +10,7 @@ import xarray as xr
 
 import prbayes as prb
 from prbayes.reports.material import gather
-from prbayes.reports.summary import _read, summary, verdict
+from prbayes.reports.summary import summary, verdict
 
 
 def test_the_summary_has_the_answer(calibrated: Any, report: prb.Report) -> None:
@@ -91,15 +91,6 @@ def test_a_verdict_names_the_sign(calibrated: Any) -> None:
     assert "is rejected at level 5% (area 0.400 > critical 0.200, p = 0.012)." in text
     below = dataclasses.replace(above, statistic=0.1, p_value=0.4)
     assert "is not rejected at level 5% (area 0.100 ≤ critical 0.200" in verdict("x", below, m)
-
-
-def test_for_a_packed_factor_its_standard_deviations_and_correlations_are_read() -> None:
-    assert _read(["mu", "chol"], {"mu", "chol", "chol_stds", "chol_corr"}) == [
-        "mu",
-        "chol_stds",
-        "chol_corr",
-    ]
-    assert _read(["mu", "chol"], {"mu", "chol", "chol_corr"}) == ["mu", "chol"]
 
 
 def test_a_verdict_on_several_outputs_counts_directions() -> None:

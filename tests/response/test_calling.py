@@ -692,3 +692,11 @@ def test_a_result_that_slipped_away_is_computed_again(policy: Any) -> None:
 def test_a_type_error_of_another_is_no_slip() -> None:
     assert not has_slipped(TypeError("x"))
     assert not has_slipped(None)
+
+
+def test_of_multivariate_inputs_a_call_by_hand_tells_what_to_call() -> None:
+    response = prb.scalar(lambda x: x[0] + x[1])
+    with pytest.raises(IndexError) as caught:
+        response(np.ones((3, 2)))
+    assert "response.function(...)" in caught.value.__notes__[0]
+    assert response.function(np.array([1.0, 2.0])) == 3.0
