@@ -15,6 +15,7 @@ from prbayes.estimate.caveats import breakdown
 from prbayes.estimate.obstacles import refit_obstacle, sampling_obstacle
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.description import as_attribute, without_addresses
+from prbayes.model.elements import coordinates, element_names
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import (
     Identity,
@@ -30,6 +31,8 @@ from prbayes.model.turns import in_turn
 
 # What is less is written as 0.0%.
 TOLD_SHARE = 5e-4
+# Elements of a variable with labels that make as many lines.
+_ONE_BY_ONE = 20
 # How specimens whose response is NaN are told of.
 NO_RESPONSE = "have no response (NaN) and are left out"
 
@@ -131,20 +134,29 @@ class Optimum:
 
     def __repr__(self) -> str:
         """Show the answer, what it cost, and what is to be said of it."""
-        found = [
-            f"{name} = {_short(value)} ± {_short(self.stderr[name])}"
-            for name, value in self.point.items()
-        ]
+        found = [f"{name} = {value} ± {error}" for name, value, error in self._told()]
         return "\n  ".join([self._heading(), *found, *self._shares(), *self.warnings])
 
     def _repr_html_(self) -> str:
         """Show the same in a notebook, as a table."""
-        rows = []
-        for name, value in self.point.items():
-            rows.append([name, _short(value), _short(self.stderr[name])])
+        rows = [list(told) for told in self._told()]
         header = ["", "estimate", "standard error"]
         sentences = [*self._shares(), *self.warnings]
         return view(self._heading(), header=header, rows=rows, sentences=sentences)
+
+    def _told(self) -> list[tuple[str, str, str]]:
+        """Return name, estimate and standard error in words; those with labels one by one."""
+        rows = []
+        for name, value in self.point.items():
+            axes = coordinates(self.model, name)
+            labelled_ones = len(axes) == 1 and axes[0] is not None
+            names, values, errors = [name], [value], [self.stderr[name]]
+            if labelled_ones and np.size(value) <= _ONE_BY_ONE:
+                names = element_names(name, np.shape(value), axes)
+                values, errors = list(value), list(self.stderr[name])
+            for element, estimate, error in zip(names, values, errors, strict=True):
+                rows.append((element, _short(estimate), _short(error)))
+        return rows
 
     def _heading(self) -> str:
         """Say how good it is, and what it cost."""

@@ -58,8 +58,8 @@ class scalar:  # noqa: N801 (reads as a function in a model)
 
     Notes
     -----
-    Called directly, not by a simulator, all inputs are taken as scalar; ``response.function`` is the
-    function of one specimen, whose inputs may be arrays.
+    Called directly, not by a simulator, all inputs are taken as scalar. ``response.function`` is
+    the function of one specimen, whose inputs may be arrays.
 
     Examples
     --------

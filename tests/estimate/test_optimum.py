@@ -67,3 +67,20 @@ def test_an_optimum_survives_plain_pickle_into_a_fresh_process(tmp_path: Path) -
     tree = prb.sample_smc(50, chains=1, model=model, optimum=optimum, progressbar=False)
     assert float(mean) == pytest.approx(float(tree["posterior"]["mu"].mean()), rel=1e-6)
     assert pickle.loads(pickle.dumps(tree)).identical(tree)
+
+
+def test_elements_with_labels_are_shown_one_by_one() -> None:
+    with pm.Model(coords={"supplier": ["A", "B"]}) as model:
+        mu = pm.Normal("mu", 0, 2, dims="supplier")
+        pm.Normal("v", 0, 1, shape=2)
+        for i, label in enumerate("AB"):
+            x = pm.Normal.dist(mu[i], 1.0)
+            data = np.array([0.0, 1.0, 2.0]) + i
+            given = {"metric": prb.AreaMetric(), "observed": data}
+            prb.Simulator(label, np.positive, x, propagation=prb.Reweighted(64), **given)
+    optimum = prb.minimize(model, starts=0, progressbar=False)
+    for lines in (repr(optimum), optimum._repr_html_()):
+        assert lines.index("mu[A]") < lines.index("mu[B]")
+        assert "v[0] =" not in lines
+    assert f"mu[B] = {optimum.point['mu'][1]:.4g} ± {optimum.stderr['mu'][1]:.4g}" in repr(optimum)
+    assert "v = [" in repr(optimum)
