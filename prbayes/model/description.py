@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pymc as pm
 from pymc.printing import str_for_dist
-from pymc.pytensorf import constant_fold
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
 
@@ -22,7 +21,7 @@ _SIMULATOR = ("name", "response", "inputs", "metric", "propagation", "n_points",
 
 # What PyMC writes for an array, and how many numbers of one are told instead.
 _CONSTANT = "<constant>"
-_MOST_NUMBERS = 6
+_TOLD_NUMBERS = 6
 
 
 def describe(model: pm.Model) -> dict[str, Any]:
@@ -134,10 +133,13 @@ def _constants(rv: Any) -> list[str]:
     """Return in words the parameters of a distribution that are arrays of constants."""
     parameters = getattr(rv.owner.op, "dist_params", lambda node: ())(rv.owner)
     found = []
-    for value in constant_fold(list(parameters), raise_not_constant=False):
-        if isinstance(value, Variable) or np.size(value) == 1:
+    for parameter in parameters:
+        while parameter.owner is not None and len(parameter.owner.inputs) == 1:
+            (parameter,) = parameter.owner.inputs  # with other axes
+        value = getattr(parameter, "data", None)
+        if value is None or np.size(value) == 1:
             continue
-        if np.size(value) > _MOST_NUMBERS:
+        if np.size(value) > _TOLD_NUMBERS:
             found.append(f"{np.size(value)} numbers")
         else:
             numbers = ", ".join(f"{number:.4g}" for number in np.ravel(value))
