@@ -31,6 +31,7 @@ from benchmarks import record
 from benchmarks.coverage import normal, proposal, spread
 
 STORE = record.RESULTS / "posterior"
+OUT = record.RESULTS / "posterior.json"
 SIZES = (20, 50, 10, 200)
 METRICS = {
     "PR": "ProbabilityResidual",
@@ -331,8 +332,18 @@ def go_on(problem: str, size: int, metric: str, until: int) -> None:
         except Exception as error:  # a failure is a result
             row = {"error": f"{type(error).__name__}: {error}"[:300]}
         row["truth"] = truth.tolist()
+        row = rounded(row)
         with path(problem, size, metric).open("a") as file:
             file.write(json.dumps(row) + "\n")
+
+
+def rounded(found: Any) -> Any:
+    """Return a row with five digits of each number: the rows are kept beside the results."""
+    if isinstance(found, dict):
+        return {key: rounded(value) for key, value in found.items()}
+    if isinstance(found, list):
+        return [rounded(value) for value in found]
+    return float(f"{found:.5g}") if isinstance(found, float) else found
 
 
 def summarise(rows: list[dict[str, Any]], posterior: str) -> dict[str, Any]:
@@ -359,17 +370,22 @@ def summarise(rows: list[dict[str, Any]], posterior: str) -> dict[str, Any]:
 
 def table() -> dict[str, Any]:
     """Summarise what is stored, and print it."""
+    before = record.load(OUT, {}).get("cells", {})
     found: dict[str, Any] = {}
     print(
         f"{'cell':34s}{'posterior':10s}{'sets':>6s}{'failed':>7s}  coverage  sd/own  sd/exact  off  s"
     )
     for problem, size, metric in cells(list(PROBLEMS), sorted(SIZES), list(METRICS)):
         rows = rows_of(problem, size, metric)
-        if len(rows) < _BLOCK:
-            continue
         for posterior in POSTERIORS:
-            summary = summarise(rows, posterior)
-            found[f"{problem}/{size}/{metric}/{posterior}"] = summary
+            key = f"{problem}/{size}/{metric}/{posterior}"
+            # A summary of more data sets than are stored here stays.
+            summary = before.get(key)
+            if len(rows) >= max(_BLOCK, 0 if summary is None else summary["data sets"]):
+                summary = summarise(rows, posterior)
+            if summary is None:
+                continue
+            found[key] = summary
             shown = "  ".join(
                 "/".join(f"{v:.2f}" for v in summary[key])
                 for key in ("coverage", "sd over own sampling sd", "sd over exact sd", "off")
@@ -456,7 +472,7 @@ def main() -> None:
         for until in range(_BLOCK, arguments.replicates + _BLOCK, _BLOCK):
             for cell in cells(arguments.problems, arguments.sizes, arguments.metrics):
                 go_on(*cell, until=min(until, arguments.replicates))
-    record.save(record.RESULTS / "posterior.json", table())
+    record.save(OUT, table())
 
 
 if __name__ == "__main__":
