@@ -427,3 +427,18 @@ def test_predictive_draws_of_the_same_specimens_are_warned_of(
     pm.sample_prior_predictive(3, model=model, random_seed=1)
     assert caplog.text.count("z has inputs that y has too, the same specimens") == 1
     assert "use prb.predict" in caplog.text
+
+
+@pytest.mark.parametrize("n", [7, 15, 20, 60, 100])
+def test_the_default_epsilon_is_one_for_other_data_too(n: int) -> None:
+    data = np.random.default_rng(1).normal(1.0, 0.5, n)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
+        given = {"observed": data, "propagation": prb.Reweighted(64)}
+        prb.Simulator("y", np.positive, x, metric=prb.KullbackLeibler(), **given)
+    evaluator = Evaluator(model)
+    (other,) = evaluator.observing({"y": data + 1.0}).nodes
+    assert evaluator.nodes[0].epsilon_is_default
+    assert other.epsilon_is_default
+    prb.set_epsilon(model, {"y": 1.01 / n})
+    assert not evaluator.nodes[0].epsilon_is_default
