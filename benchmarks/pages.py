@@ -136,6 +136,7 @@ def given_estimate_by_problem() -> Iterator[Row]:
         "weibull": "Weibull",
         "folded": "absolute value",
         "threshold": "threshold",
+        "product": "product",
     }
     for (problem, label), size in product(problems.items(), (10, 20, 50, 200)):
         row = [label, str(size)]
@@ -143,6 +144,19 @@ def given_estimate_by_problem() -> Iterator[Row]:
             coverage, width, off = _in_estimates(name, problem=problem, size=size)
             row += [short(coverage.mean()), _mean_ratio(width), short(off.mean())]
         yield row
+
+
+def ranks() -> Iterator[Row]:
+    """Return what ranks of simulated truths tell, by model and hyperparameter."""
+    labels = {"gamma": "PR", "weibull": "KLD", "threshold": "area"}
+    for model, summary in found("sbc")["summary"].items():
+        for name, told in summary.items():
+            if name == "failed":
+                continue
+            mean = f"{short(told['mean rank'], 3)} ± {short(told['error of mean rank'], 3)}"
+            within = short(told["share within 89%"], 3)
+            p = short(told["p of Kolmogorov and Smirnov"])
+            yield [model, labels[model], name, str(told["data sets"]), mean, within, p]
 
 
 def _mean_ratio(ratios: Any) -> str:
@@ -687,6 +701,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "given the estimate, folded": folded,
     "given the estimate, pooled": given_estimate,
     "given the estimate, by problem": given_estimate_by_problem,
+    "ranks": ranks,
     "hard posteriors": hard_posteriors,
     "samplers": samplers,
     "size": sizes,

@@ -545,7 +545,14 @@ def _unsupported(designs: _Designs) -> list[str]:
     for name, needs in designs.needs.items():
         own = {key: designs.support[key].sel(simulator=name).values for key in _SUPPORT}
         lacking = shortcoming(own, needs.weight_ess, needs.max_lost, needs.n_points, ENOUGH)
-        if lacking:
+        if lacking.lost is not None:
+            # More points would have no more responses.
+            messages.append(
+                f"{name}: the design does not support the answer: {lacking}. Repair the response "
+                "there, return +inf for specimens that fail, narrow the priors, or raise max_lost"
+                f"{_ON_NAN}."
+            )
+        elif lacking:
             messages.append(
                 f"{name}: the design does not support the answer: {lacking}. "
                 "Call prb.refine(model) and sample again, or use prb.Resimulated"

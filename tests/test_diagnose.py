@@ -362,6 +362,16 @@ def test_an_adjustment_does_not_hide_that_one_particle_survived() -> None:
     assert "Of 500 draws only 1 differ in chain 2, expected at least 50" in text
 
 
+def test_where_responses_are_missing_no_refinement_is_advised() -> None:
+    _, idata = sampled()
+    lossy = idata.copy(deep=True)
+    lossy["calibration"]["lost_mass"].values[:] = 0.2
+    (message,) = [m for m in prb.diagnose(lossy).messages if "lost mass" in m]
+    assert "lost mass: 20.0% of a population's weight" in message
+    assert "Repair the response" in message
+    assert "prb.refine" not in message
+
+
 # -- failures ------------------------------------------------------------------------------------
 
 
