@@ -33,7 +33,7 @@ def describe(model: pm.Model) -> dict[str, Any]:
         ``variables``: name, role and distribution of each; ``simulators``: name, response, inputs,
         metric, propagation, the number of its points, and specimens.
     """
-    known = {*model.basic_RVs, *model.deterministics}
+    known = known_variables(model)
     simulators = nodes(model)
     variables = []
     for rv in model.free_RVs:
@@ -117,9 +117,20 @@ def _input(argument: Any, aleatory: tuple[Any, ...], known: Set[Any]) -> str:
     return f"an array of shape {value.shape}"
 
 
-def _distribution(rv: Any, known: Set[Any]) -> str:
+def known_variables(model: pm.Model) -> set[Any]:
+    """Return the variables that distributions are told by."""
+    return {*model.basic_RVs, *model.deterministics}
+
+
+def as_pymc_writes(rv: Any, known: Set[Any]) -> str:
+    """Return a distribution in PyMC's words, by which results know their model again."""
     text: str = str_for_dist(rv, named_vars=known)
-    text = text.removeprefix(f"{rv.name} ~ ").replace("_lkjcholeskycov(", "LKJCholeskyCov(")
+    return text.removeprefix(f"{rv.name} ~ ")
+
+
+def _distribution(rv: Any, known: Set[Any]) -> str:
+    """Return a distribution in the words of a report."""
+    text = as_pymc_writes(rv, known).replace("_lkjcholeskycov(", "LKJCholeskyCov(")
     # PyMC does not tell the numbers of arrays.
     arrays = _constants(rv)
     if text.count(_CONSTANT) != len(arrays):

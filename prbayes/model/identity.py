@@ -22,7 +22,12 @@ import pymc as pm
 from pymc.printing import str_for_dist
 
 from prbayes._checks import Floats
-from prbayes.model.description import describe, fits_attribute, without_addresses
+from prbayes.model.description import (
+    as_pymc_writes,
+    fits_attribute,
+    known_variables,
+    without_addresses,
+)
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node, nodes
 from prbayes.response.compilation import interpreted
@@ -183,12 +188,10 @@ def identity_of_model(model: pm.Model) -> Identity:
 
 
 def _identity(model: pm.Model, simulators: Sequence[SimulatorIdentity], **others: Any) -> Identity:
-    priors, terms = {}, []
-    for variable in describe(model)["variables"]:
-        if variable["role"] == "hyperparameter":
-            priors[variable["name"]] = variable["distribution"]
-        if variable["role"] == "observed":
-            terms.append(f"{variable['name']} ~ {variable['distribution']}")
+    known = known_variables(model)
+    priors = {str(rv.name): as_pymc_writes(rv, known) for rv in model.free_RVs}
+    observed = [rv for rv in model.observed_RVs if rv not in nodes(model)]
+    terms = [f"{rv.name} ~ {as_pymc_writes(rv, known)}" for rv in observed]
     terms += [str(potential.name) for potential in model.potentials]
     # Clones may order variables in other ways.
     ordered = sorted(simulators, key=lambda simulator: simulator.name)

@@ -104,7 +104,7 @@ def _what_was_calibrated(m: Material) -> str:
         return ""
     hyperparameters = counted(len(names), "hyperparameter")
     if len(names) <= _MOST_NAMES:
-        hyperparameters += f" ({', '.join(_called(name, m) for name in names)})"
+        hyperparameters += f" ({', '.join(named(name, m.labels) for name in names)})"
     if not m.results:
         return f"The model has {hyperparameters}. No result of a calibration was given."
     were = "was" if len(names) == 1 else "were"
@@ -113,12 +113,6 @@ def _what_was_calibrated(m: Material) -> str:
     metrics = _metrics(m)
     by = f", by the {_enumerated(metrics)}" if metrics else ""
     return f"{hyperparameters} of the model {were} calibrated{on}{by}."
-
-
-def _called(name: str, m: Material) -> str:
-    """Return the name of a variable, after what a reader calls it if that was said."""
-    meaning = named(name, m.labels)
-    return name if meaning == name else f"{meaning}: {name}"
 
 
 def _measured(name: str, y: Floats) -> str:
@@ -162,7 +156,7 @@ def _answer(m: Material) -> str:
         return f"The answer is in the table of the {kind}."
     pairs = []
     for name, (value, sd) in estimates.items():
-        pairs.append(f"{_called(name, m)} = {plus_minus(value, sd)}")
+        pairs.append(f"{named(name, m.labels)} = {plus_minus(value, sd)}")
     which = f" of {label}" if len(of_kind) > 1 else ""
     return f"The answer{which} is {', '.join(pairs)} ({what})."
 

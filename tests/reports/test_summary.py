@@ -107,3 +107,13 @@ def test_a_verdict_on_several_outputs_counts_directions() -> None:
     table = made.sections[-1].table
     assert table["of"].tolist() == ["u and |2u - 1|"]
     assert table["directions"].tolist() == ["4"]
+
+
+def test_hyperparameters_are_called_by_their_labels(calibrated: Any) -> None:
+    labels = {"mu": "mean of the exponent"}
+    report = prb.Report(
+        "A", optimum=calibrated.optimum, labels=labels, model=calibrated.model, pictures=False
+    )
+    text = " ".join(report.sections[0].text)
+    assert "mean of the exponent = " in text
+    assert "hyperparameters (mean of the exponent, sigma)" in text
