@@ -257,7 +257,7 @@ def _left_out(lost: Mapping[str, float]) -> tuple[str, ...]:
 
 def _lost_in(result: xr.DataTree) -> dict[str, float]:
     """Return the share without response by simulator, at the optimum or over the draws."""
-    if "calibration" not in result:
+    if "calibration" not in result or "lost_mass" not in result["calibration"]:
         return {}
     calibration = result["calibration"].to_dataset()
     shares = calibration["lost_mass"].transpose("simulator", ...).values

@@ -75,8 +75,8 @@ class Node:
     def epsilon_is_default(self) -> bool:
         """Whether nobody gave epsilon: it is the 1/N of a metric on a likelihood's scale."""
         # Weights that were normalised again differ by rounding.
-        is_default = np.isclose(self.epsilon_value * self.n_specimens, 1.0, rtol=1e-12)
-        return self.target.likelihood and bool(is_default)
+        is_default = abs(self.epsilon_value * self.n_specimens - 1) < 1e-12
+        return self.target.likelihood and is_default
 
     @property
     def n_specimens(self) -> float:
