@@ -142,7 +142,10 @@ def _distribution(rv: Any, known: Set[Any]) -> str:
 
 def _constants(rv: Any) -> list[str]:
     """Return in words the parameters of a distribution that are arrays of constants."""
-    parameters = getattr(rv.owner.op, "dist_params", lambda node: ())(rv.owner)
+    try:
+        parameters = rv.owner.op.dist_params(rv.owner)
+    except (AttributeError, TypeError, ValueError):  # some distributions do not say
+        return []
     found = []
     for parameter in parameters:
         while parameter.owner is not None and len(parameter.owner.inputs) == 1:

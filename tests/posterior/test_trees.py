@@ -213,7 +213,8 @@ def test_an_optimum_shows_its_answer_in_a_few_lines() -> None:
         f"Optimum: discrepancy {found.discrepancy:.4g} after {found.n_evaluations} evaluations"
     )
     assert lines[0].endswith("converged")
-    assert len(lines) == 1 + len(found.point) + len(found.warnings)
+    # The two places have a line each.
+    assert len(lines) == 1 + len(found.point) + 1 + len(found.warnings)
     for line, (name, value) in zip(lines[1:], found.point.items(), strict=False):
         assert line.strip().startswith(f"{name} = ")
         assert f"{np.ravel(value)[0]:.4g}" in line
