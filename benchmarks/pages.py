@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -101,32 +102,54 @@ def folded() -> Iterator[Row]:
             ]
 
 
-def _in_estimates(posterior: str, *, problem: str = "", size: int = 0) -> tuple[Any, Any, Any]:
-    """Return coverage, width over the exact one and distance of centres of cells, (n,) each."""
+@dataclass(frozen=True)
+class _Estimates:
+    """What posteriors of several cells are worth, by cell and hyperparameter, (n,) each."""
+
+    coverage: Any
+    width: Any  # over the exact one
+    scatter: Any  # width over the scatter of the estimates
+    off: Any  # distance of centres from the exact ones
+    sets: list[int]  # data sets, by cell
+
+
+def _in_estimates(
+    posterior: str, *, problem: str = "", size: int = 0, least: int = 0
+) -> _Estimates:
+    """Return those of the cells with enough data sets."""
     chosen = []
     for key, cell in found("posterior")["cells"].items():
         of_problem, of_size, metric, of = key.split("/")
         asked = problem in ("", of_problem) and size in (0, int(of_size))
-        if asked and of == posterior and metric in SEEN:
+        if asked and of == posterior and metric in SEEN and cell["data sets"] >= least:
             chosen.append(cell)
-    names = ("coverage", "sd over exact sd", "off")
-    coverage, width, off = (np.concatenate([cell[name] for cell in chosen]) for name in names)
-    return coverage, width, np.abs(off)
+    names = ("coverage", "sd over exact sd", "sd over own sampling sd", "off")
+    coverage, width, scatter, off = (
+        np.concatenate([cell[name] for cell in chosen]) for name in names
+    )
+    sets = [cell["data sets"] for cell in chosen]
+    return _Estimates(coverage, width, scatter, np.abs(off), sets)
 
 
 def given_estimate() -> Iterator[Row]:
     """Return the rows of the posterior given the estimate, over problems that set no constant."""
-    sets = [cell["data sets"] for cell in found("posterior")["cells"].values()]
+    from benchmarks.posterior import POOLED
+
     for size, (name, label) in product((10, 20, 50, 200), WAYS.items()):
-        coverage, width, off = _in_estimates(name, size=size)
+        of = _in_estimates(name, size=size, least=POOLED)
+        coverage, width, off = of.coverage, of.width, of.off
         yield [
             str(size),
             label,
-            f"{short(coverage.mean(), 3)} ({short(coverage.min())} to {short(coverage.max())})",
-            f"{_mean_ratio(width)} ({short(width.min())} to {short(width.max())})",
+            f"{short(coverage.mean(), 3)} ({_range(coverage)})",
+            f"{_mean_ratio(width)} ({_range(width)})",
             f"{short(off.mean())} ({short(off.max())})",
-            f"{min(sets)} to {max(sets)}",
+            _range(of.scatter),
         ]
+
+
+def _range(values: Any) -> str:
+    return f"{short(values.min())} to {short(values.max())}"
 
 
 def given_estimate_by_problem() -> Iterator[Row]:
@@ -141,8 +164,9 @@ def given_estimate_by_problem() -> Iterator[Row]:
     for (problem, label), size in product(problems.items(), (10, 20, 50, 200)):
         row = [label, str(size)]
         for name in ("affine", "given"):
-            coverage, width, off = _in_estimates(name, problem=problem, size=size)
-            row += [short(coverage.mean()), _mean_ratio(width), short(off.mean())]
+            of = _in_estimates(name, problem=problem, size=size)
+            row += [short(of.coverage.mean()), _mean_ratio(of.width), short(of.off.mean())]
+        row.insert(2, str(min(of.sets)))
         yield row
 
 
@@ -192,6 +216,7 @@ def samplers() -> Iterator[Row]:
     table = found("smc")
     systems = {
         "prbayes, `Reweighted(256)`": "reweighted",
+        "the same, straight map": "straight",
         "prbayes, `Resimulated(256)`": "resimulated",
         "stock PyMC": "pymc",
         "pyABC": "pyabc",

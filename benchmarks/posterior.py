@@ -44,6 +44,7 @@ LEVEL = 0.89
 _DRAWS = 1000
 _PROPOSED = 4096
 _BLOCK = 10  # data sets of a cell before it is the next one's turn
+POOLED = 100  # data sets of a cell, from which on it counts in pooled figures
 
 
 @dataclass(frozen=True)
@@ -395,21 +396,16 @@ def table() -> dict[str, Any]:
             counts = f"{summary['data sets']:6d}{summary['failed']:7d}"
             print(f"{name:34s}{posterior:10s}{counts}  {shown}  {last}")
     pooled = {}
+    several = [(f"N = {size}", (size,)) for size in sorted(SIZES)]
     for posterior in POSTERIORS:
-        for size in sorted(SIZES):
-            chosen = [
-                cell
-                for key, cell in found.items()
-                if key.endswith(f"/{posterior}")
-                and int(key.split("/")[1]) == size
-                and not PROBLEMS[key.split("/")[0]].used
-            ]
+        for name, sizes in (*several, ("N >= 20", (20, 50, 200))):
+            chosen = [cell for key, cell in found.items() if _counts(key, cell, posterior, sizes)]
             if not chosen:
                 continue
             coverage = np.concatenate([cell["coverage"] for cell in chosen])
             widths = np.concatenate([cell["sd over own sampling sd"] for cell in chosen])
             off = np.concatenate([cell["off"] for cell in chosen])
-            pooled[f"{posterior}, N = {size}"] = {
+            pooled[f"{posterior}, {name}"] = {
                 "mean coverage": float(coverage.mean()),
                 "lowest": float(coverage.min()),
                 "highest": float(coverage.max()),
@@ -417,13 +413,18 @@ def table() -> dict[str, Any]:
                 "widest": float(widths.max()),
                 "farthest off": float(np.abs(off).max()),
             }
-            figures = "  ".join(
-                f"{k} {v:.3f}" for k, v in pooled[f"{posterior}, N = {size}"].items()
-            )
-            print(f"{posterior}, N = {size}".ljust(24), figures)
+            figures = "  ".join(f"{k} {v:.3f}" for k, v in pooled[f"{posterior}, {name}"].items())
+            print(f"{posterior}, {name}".ljust(24), figures)
     compared = nearer(found)
     print("nearer to the exact posterior than Affine:", compared)
     return {"cells": found, "pooled": pooled, "nearer": compared}
+
+
+def _counts(key: str, cell: dict[str, Any], posterior: str, sizes: tuple[int, ...]) -> bool:
+    """Return whether a cell counts in pooled figures of a posterior."""
+    problem, size, _, of = key.split("/")
+    asked = of == posterior and int(size) in sizes and not PROBLEMS[problem].used
+    return asked and cell["data sets"] >= POOLED
 
 
 def nearer(found: dict[str, Any]) -> dict[str, Any]:

@@ -29,14 +29,14 @@ from benchmarks.processes import child
 N = 50
 LEVELS = (np.arange(N) + 0.5) / N
 PROBLEMS = ("linear", "quadratic")
-SYSTEMS = ("reweighted", "resimulated", "pymc", "pyabc")
+SYSTEMS = ("reweighted", "straight", "resimulated", "pymc", "pyabc")
 DRAWS, CHAINS = 1000, 4
-# Before the clock starts; the last four are imported by xarray, PyTensor and SciPy when they are
-# first used.
+# Before the clock starts; the package loads its names when the first is asked for, and the last
+# four are imported by xarray, PyTensor and SciPy when they are first used.
 _IMPORTED = (
     "arviz",
     "pymc",
-    "prbayes",
+    "prbayes._public",
     "dask.array",
     "setuptools",
     "scipy.optimize",
@@ -112,6 +112,48 @@ def exact(problem: str) -> dict[str, float]:
     return out
 
 
+def given_the_estimate(n_sets: int = 10_000) -> dict[str, float]:
+    """Return what draws of sigma should be on the first problem: given the area metric's estimate.
+
+    Estimates of a location and a scale are pivots, so that samples of one standard normal tell
+    their distribution at any hyperparameters. The area of two distributions is the mean absolute
+    difference of their quantiles: a regression by absolute values.
+    """
+    from scipy.stats import norm
+
+    levels = (np.arange(20 * N) + 0.5) / (20 * N)
+    z = norm.ppf(levels)
+
+    def estimates(samples: Any) -> tuple[Any, Any]:
+        quantiles = np.repeat(np.sort(samples, axis=1), 20, axis=1)
+        mean, sd = quantiles.mean(axis=1), quantiles.std(axis=1)
+        for _ in range(60):
+            w = 1 / np.maximum(np.abs(quantiles - mean[:, None] - sd[:, None] * z), 1e-4)
+            s, sz, szz = w.sum(axis=1), (w * z).sum(axis=1), (w * z**2).sum(axis=1)
+            t, tz = (w * quantiles).sum(axis=1), (w * quantiles * z).sum(axis=1)
+            determinant = s * szz - sz**2
+            mean, sd = (szz * t - sz * tz) / determinant, (s * tz - sz * t) / determinant
+        return mean, sd
+
+    _, observed, (center, scale) = truth("linear")
+    rng = np.random.default_rng(1)
+    parts = [estimates(rng.normal(size=(500, N))) for _ in range(n_sets // 500)]
+    means, sds = (np.concatenate(one) for one in zip(*parts, strict=True))
+    found_mean, found_sd = (one[0] for one in estimates(observed[None]))
+    sigma = found_sd / sds
+    mu = found_mean - sigma * means
+    # The density of the estimate over that of these draws, and the priors.
+    weights = sigma * np.exp(-(sigma**2) / (2 * scale**2) - (mu - center) ** 2 / (2 * scale**2))
+    weights /= weights.sum()
+    mean = float(weights @ sigma)
+    sd = float(np.sqrt(weights @ (sigma - mean) ** 2))
+    reference = exact("linear")
+    return {
+        "sigma off": (mean - reference["sigma mean"]) / reference["sigma sd"],
+        "sigma sd ratio": sd / reference["sigma sd"],
+    }
+
+
 def _priors(problem: str) -> tuple[Any, Any]:
     import pymc as pm
 
@@ -136,8 +178,11 @@ class Clock:
         return time.perf_counter() - self.wall, time.process_time() - self.cpu
 
 
-def with_prbayes(problem: str, propagation: str) -> dict[str, Any]:
-    """Sample with this package; the model, the optimum and epsilon are set-up."""
+def with_prbayes(problem: str, system: str) -> dict[str, Any]:
+    """Sample with this package, by default settings or the straight map.
+
+    The model, the optimum and epsilon are set-up.
+    """
     import pymc as pm
 
     import prbayes as prb
@@ -146,7 +191,7 @@ def with_prbayes(problem: str, propagation: str) -> dict[str, Any]:
     clock = Clock()
     with pm.Model() as model:
         x = pm.Normal.dist(*_priors(problem))
-        kind = prb.Reweighted(256) if propagation == "reweighted" else prb.Resimulated(256)
+        kind = prb.Resimulated(256) if system == "resimulated" else prb.Reweighted(256)
         prb.Simulator(
             "y", response, x, metric=prb.AreaMetric(), observed=observed, propagation=kind
         )
@@ -157,7 +202,7 @@ def with_prbayes(problem: str, propagation: str) -> dict[str, Any]:
         chains=CHAINS,
         optimum=optimum,
         model=model,
-        adjust=prb.posterior.Affine(),
+        adjust=prb.posterior.Affine() if system == "straight" else True,
         random_seed=1,
         progressbar=False,
     )
@@ -298,7 +343,7 @@ def _import() -> None:
 def one(system: str, problem: str) -> dict[str, Any]:
     """Run one system on one problem in this process."""
     _import()
-    if system in ("reweighted", "resimulated"):
+    if system in ("reweighted", "straight", "resimulated"):
         return with_prbayes(problem, system)
     return with_pymc(problem) if system == "pymc" else with_pyabc(problem)
 
@@ -355,7 +400,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument(
-        "--only", choices=(*SYSTEMS, "10ms"), help="replace these rows of what is in --out"
+        "--only", choices=(*SYSTEMS, "10ms", "given"), help="replace these rows of what is in --out"
     )
     parser.add_argument("--out", type=Path, default=record.RESULTS / "smc.json")
     parser.add_argument("--child", nargs="+", help=argparse.SUPPRESS)
@@ -377,7 +422,7 @@ def main() -> None:
                 for k in runs[0]
                 if "wall" in k or "cpu" in k
             }
-            if system in ("reweighted", "resimulated"):
+            if system in ("reweighted", "straight", "resimulated"):
                 found["wall, cold"] = child("benchmarks.smc", system, problem, cold=True)["wall"]
             off = [
                 (found[f"{n} mean"] - reference[f"{n} mean"]) / reference[f"{n} sd"]
@@ -401,6 +446,9 @@ def main() -> None:
             system: child("benchmarks.smc", system) for system in ("reweighted", "resimulated")
         }
         print("response of 10 ms, two workers:", table["10 ms"])
+    if arguments.only in (None, "given"):
+        table["linear given the estimate"] = given_the_estimate()
+        print("linear, given the estimate:", table["linear given the estimate"])
     record.save(arguments.out, table)
 
 
