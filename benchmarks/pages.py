@@ -423,6 +423,7 @@ def joint() -> Iterator[Row]:
 
     schools = {
         "joint": "`Joint`",
+        "given": "`Joint`, default posterior",
         "correlation": "`MarginalCorrelation`",
         "separate": "separate marginals",
     }

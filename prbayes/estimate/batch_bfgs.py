@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +74,15 @@ class _Accepted:
     stuck: NDArray[np.intp]
 
 
+class Minima(NamedTuple):
+    """Where descents ended."""
+
+    x: Floats  # (B, r)
+    values: Floats  # (B,)
+    converged: NDArray[np.bool_]  # (B,)
+    inverse: Floats  # (B, r, r): what they learned of the inverse Hessians
+
+
 def descend(
     value: Callable[[Floats, Any], Floats],
     start: Floats,
@@ -83,7 +92,7 @@ def descend(
     tolerance: float,
     max_iterations: int = 40,
     one_sided: bool = False,
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+) -> Minima:
     """Minimise B functions of r parameters of order one, each from its own start, all in step.
 
     Gradients are differences. A row has converged when its next step promises to gain less
@@ -94,8 +103,8 @@ def descend(
     value : callable
         ``value(x, rows)``, shapes (A, s, r), (A,) -> (A, s): function ``rows[a]`` at s points each.
     start : ndarray, shape (B, r)
-    inverse_hessian : ndarray, shape (r, r)
-        A first guess, positive definite.
+    inverse_hessian : ndarray, shape (r, r) or (B, r, r)
+        A first guess, positive definite, for all or for each.
     step : float
         Of the differences.
     tolerance : float
@@ -104,12 +113,6 @@ def descend(
     one_sided : bool
         Whether differences are one-sided instead of central: half of the calls, and minima are off
         by half of ``step``.
-
-    Returns
-    -------
-    x : ndarray, shape (B, r)
-    values : ndarray, shape (B,)
-    converged : ndarray of bool, shape (B,)
 
     References
     ----------
@@ -121,14 +124,14 @@ def descend(
     >>> import numpy as np
     >>> centers = np.array([[0.0], [2.0]])
     >>> value = lambda x, rows: ((x - centers[rows, None]) ** 2).sum(-1)
-    >>> x, *_ = descend(value, np.zeros((2, 1)), np.eye(1), step=1e-3, tolerance=1e-9)
-    >>> np.abs(x - centers).max() < 1e-4
+    >>> found = descend(value, np.zeros((2, 1)), np.eye(1), step=1e-3, tolerance=1e-9)
+    >>> np.abs(found.x - centers).max() < 1e-4
     np.True_
     """
     size, r = start.shape
     problem = _Problem.of(value, r, step, one_sided=one_sided)
     x = start.copy()
-    inverse = np.repeat(inverse_hessian[None], size, axis=0)
+    inverse = np.broadcast_to(inverse_hessian, (size, r, r)).copy()
     active = np.arange(size)
     f, g = problem(x, active)
     converged = np.zeros(size, dtype=bool)
@@ -158,7 +161,28 @@ def descend(
         stuck = accepted.stuck
         converged[active[stuck]] = True
         active = np.delete(active, stuck)
-    return x, f, converged
+    return Minima(x, f, converged, inverse)
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """How functions of coordinates are minimised, many at once."""
+
+    inverse: Floats  # (r, r) or (B, r, r): first guesses of inverse Hessians
+    tolerance: float  # gain that is left on the table
+    step: float  # of the differences
+    one_sided: bool = False  # whether the differences are
+
+    def __call__(self, value: Callable[[Floats, Any], Floats], start: Floats) -> Minima:
+        """Return minimisers from starts (B, r) on."""
+        return descend(
+            value,
+            start,
+            self.inverse,
+            step=self.step,
+            tolerance=self.tolerance,
+            one_sided=self.one_sided,
+        )
 
 
 def _planned(active: NDArray[np.intp], inverse: Floats, g: Floats) -> _Steps:

@@ -15,6 +15,9 @@ from prbayes.estimate.data_sets import DataSets
 from prbayes.metrics.base import Discrepancy
 from prbayes.model.evaluator import Evaluator
 
+# Weights that are held at a time.
+_NUMBERS = 1 << 20
+
 
 @dataclass(frozen=True, eq=False)
 class BatchObjective:
@@ -24,6 +27,7 @@ class BatchObjective:
     scales: Floats  # (K,): by simulator of the model
     simulators: tuple[int, ...]  # which of them count
     targets: list[Discrepancy]  # of those, each against all B data sets
+    values: list[Floats]  # (n_k,) or (n_k, m): of those, the stored responses
     bases: list[tuple[NDArray[Any], ...]]  # what turns weights of stored responses into features
     # (n_k,): of those that count: the block that each point of the design belongs to. Where there
     # are several, the b-th data set is compared with the b-th block alone.
@@ -49,6 +53,7 @@ class BatchObjective:
         # Copied row by row: sums over rows then do not depend on how the weights lie in memory.
         rows = np.arange(len(sets.weights[0]))
         targets = []
+        responses = []
         bases = []
         for k in chosen:
             node = evaluator.nodes[k]
@@ -57,10 +62,11 @@ class BatchObjective:
             values = sets.values[k]
             target = node.target.with_observed(values, weights)
             other = stored[k] if stored else None
-            basis = target.stored(design.values if other is None else other)
+            own = design.values if other is None else other
             targets.append(target)
-            bases.append(basis)
-        return cls(evaluator, scales, chosen, targets, bases, blocks)
+            responses.append(own)
+            bases.append(target.stored(own))
+        return cls(evaluator, scales, chosen, targets, responses, bases, blocks)
 
     @property
     def n_sets(self) -> int:
@@ -74,17 +80,31 @@ class BatchObjective:
         With thetas of shape (1, s, d) all data sets are compared with the same populations. What is
         not a number, as where a design has no point, is infinite.
         """
+        most = max(len(values) for values in self.values)
+        at_once = max(1, _NUMBERS // (most * thetas.shape[1]))
+        if len(thetas) <= at_once:
+            return self._values(thetas, rows)
+        # Some data sets at a time, whose weights stay near at hand.
+        numbers = np.arange(self.n_sets)[rows]
+        parts = []
+        for first in range(0, len(thetas), at_once):
+            some = slice(first, first + at_once)
+            parts.append(self._values(thetas[some], numbers[some]))
+        return np.concatenate(parts)
+
+    def _values(self, thetas: Floats, rows: Any) -> Floats:
+        """Return the values for some data sets."""
         total: Any = 0.0
         for i, k in enumerate(self.simulators):
             target = self.targets[i].rows(rows)
-            weights = self._weights(thetas, rows, i)
+            weights = self.weights(thetas, rows, i)
             features = target.from_basis(weights, self.bases[i], np)
             discrepancies = target.outer(*features, xp=np)
             total = total + discrepancies / self.scales[k]
         values = np.nan_to_num(total, nan=np.inf, posinf=np.inf)
         return np.asarray(values)
 
-    def _weights(self, thetas: Floats, rows: Any, i: int) -> Floats:
+    def weights(self, thetas: Floats, rows: Any, i: int) -> Floats:
         """Return weights of the stored responses, (A, s, n), on the whole design or on blocks."""
         stacked = thetas.reshape(-1, thetas.shape[-1])
         k = self.simulators[i]

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from prbayes._checks import AT_ONCE, Floats
 from prbayes._progress import progress
-from prbayes.estimate.batch_bfgs import descend
+from prbayes.estimate.batch_bfgs import Descent
 from prbayes.estimate.batch_objective import BatchObjective
 from prbayes.estimate.batch_simplex import descend_by_simplex
 from prbayes.estimate.curvature import second_differences
 from prbayes.estimate.data_sets import SETS, DataSets, observed_set
+from prbayes.estimate.feature_map import WORTH, Shortcut
 from prbayes.estimate.measured import Refits
 from prbayes.estimate.obstacles import measured_by_refits
 from prbayes.estimate.sampling import Local, first_order_shifts, local_sampling
@@ -169,6 +170,9 @@ class SamplingDistribution:
             return shifts / self.stderr, converged
         n_sets = len(sets.weights[0])
         at_once = self._at_once(sets)
+        begin = np.zeros((n_sets, self.stderr.size)) if start is None else start
+        shortcut = Shortcut(begin, self.thetas) if roughly and self._populous else None
+        descent = None
         minimisers = []
         arrived = []
         with progress("refits", n_sets) as report:
@@ -176,11 +180,16 @@ class SamplingDistribution:
                 weights = [w[i : i + at_once] for w in sets.weights]
                 some = DataSets(sets.values, weights)
                 objective = BatchObjective.of(self.evaluator, self.scales, some)
-                begin = None if start is None else start[i : i + at_once]
-                tolerance = _ROUGHLY if roughly else _TOLERANCE
-                x, converged = self._minimise(
-                    objective, tolerance=tolerance, start=begin, one_sided=roughly
-                )
+                if descent is None:  # that of some serves all of them
+                    descent = self._descent(objective, roughly=roughly, one_sided=roughly)
+                x = begin[i : i + at_once]
+                own = descent
+                if shortcut is not None:
+                    x, inverse = shortcut.begin(objective, x, descent)
+                    own = replace(descent, inverse=inverse)
+                x, converged = self._minimise(objective, own, x)
+                if shortcut is not None:
+                    shortcut.learn(x, converged)
                 minimisers.append(x)
                 arrived.append(converged)
                 report(len(converged), "")
@@ -190,12 +199,16 @@ class SamplingDistribution:
         """Return how many data sets fit into memory."""
         points = 0
         for node, values in zip(self.evaluator.nodes, sets.values, strict=True):
-            here = len(node.target.parts) * node.bound.n_points + len(values)
+            here = len(node.target.parts) * max(node.bound.n_points, len(values))
             points = max(points, here)
-        # Gradients by differences take theta and two neighbours along each axis.
-        stencil = 2 * self.stderr.size + 1
-        # Each part guesses its own curvature: paths differ with their size, not where they lead.
-        return max(1, 2 * AT_ONCE // (points * stencil))
+        return max(1, 2 * AT_ONCE // points)
+
+    @property
+    def _populous(self) -> bool:
+        """Whether populations are so many numbers that it pays to interpolate between some."""
+        nodes = self.evaluator.nodes
+        most = max(len(node.target.parts) * node.bound.n_points for node in nodes)
+        return most >= WORTH and not measured_by_refits(self.evaluator)
 
     def design_error(self) -> DesignErrors:
         """Return how far the optimum of another design would be, by its points and emulators.
@@ -220,13 +233,12 @@ class SamplingDistribution:
             return np.full(self.stderr.size, np.nan)
         observed = observed_set(self.evaluator)
         found = []
-        curvature = None
+        descent = None
         for b in range(number):
             stored = [values[b] if values else None for values in each]
             objective = BatchObjective.of(self.evaluator, self.scales, observed, stored=stored)
-            if curvature is None:
-                curvature = self._curvature(objective)
-            found.append(self._roughly(objective, curvature))
+            descent = descent or self._descent(objective, roughly=True)
+            found.append(self._only(objective, descent))
         return np.asarray(np.sqrt(np.square(found).sum(axis=0)))
 
     def _error_of_points(self) -> Floats:
@@ -249,7 +261,7 @@ class SamplingDistribution:
         repeated = [w[every] for w in observed.weights]
         sets = DataSets(observed.values, repeated)
         objective = BatchObjective.of(self.evaluator, self.scales, sets, blocks=blocks)
-        x, converged = self._minimise(objective)
+        x, converged = self._minimise(objective, self._descent(objective))
         if converged.sum() < N_BLOCKS / 2:
             return np.full(self.stderr.size, np.inf)
         spread = x[converged].std(axis=0, ddof=1)
@@ -259,15 +271,14 @@ class SamplingDistribution:
         """Return by how much the minima of an eighth of the points each scatter, (r,)."""
         designs = list(self.evaluator.designs.values())
         found = []
-        curvature = None
+        descent = None
         for b in range(N_BLOCKS):
             with ExitStack() as parts:
                 for design in designs:
                     parts.enter_context(design.part(design.blocks == b))
                 objective = BatchObjective.of(self.evaluator, self.scales, observed)
-                if curvature is None:
-                    curvature = self._curvature(objective)
-                found.append(self._roughly(objective, curvature))
+                descent = descent or self._descent(objective, roughly=True)
+                found.append(self._only(objective, descent))
         arrived = np.array([x for x in found if np.isfinite(x).all()])
         if len(arrived) < N_BLOCKS / 2:
             return np.full(self.stderr.size, np.inf)
@@ -311,8 +322,10 @@ class SamplingDistribution:
             blocks.append(np.zeros_like(own) if node.bound.is_line else own)
         return blocks
 
-    def _curvature(self, objective: BatchObjective) -> Floats:
-        """Return about the Hessian of an objective at the optimum, along the axes, (r, r)."""
+    def _descent(
+        self, objective: BatchObjective, *, roughly: bool = False, one_sided: bool = False
+    ) -> Descent:
+        """Return how data sets are fitted whose objectives have about the same curvature."""
 
         def typical(x: Floats) -> Floats:
             # The minimiser does not depend on this guess: some data sets will do.
@@ -321,22 +334,18 @@ class SamplingDistribution:
 
         r = self.stderr.size
         if r == 0 or measured_by_refits(self.evaluator):  # then nothing follows it
-            return np.zeros((r, r))
-        return _mean_hessian(typical, r)
+            return Descent(np.zeros((r, r)), 0.0, _REFIT_STEP)
+        curvature = _mean_hessian(typical, r)
+        gain = (_ROUGHLY if roughly else _TOLERANCE) * np.trace(curvature) / r
+        return Descent(np.linalg.inv(curvature), gain, _REFIT_STEP, one_sided)
 
-    def _roughly(self, objective: BatchObjective, curvature: Floats) -> Floats:
+    def _only(self, objective: BatchObjective, descent: Descent) -> Floats:
         """Return the minimiser of one data set along the axes, (r,): inf where none was found."""
-        x, converged = self._minimise(objective, curvature, tolerance=_ROUGHLY)
+        x, converged = self._minimise(objective, descent)
         return x[0] if converged[0] else np.full(self.stderr.size, np.inf)
 
     def _minimise(
-        self,
-        objective: BatchObjective,
-        curvature: Floats | None = None,
-        *,
-        tolerance: float = _TOLERANCE,
-        start: Floats | None = None,
-        one_sided: bool = False,
+        self, objective: BatchObjective, descent: Descent, start: Floats | None = None
     ) -> tuple[Floats, NDArray[np.bool_]]:
         """Return the minimisers of data sets, by default from the optimum on, along the axes."""
 
@@ -352,14 +361,8 @@ class SamplingDistribution:
             # In standard errors; the second one starts where the first has ended.
             x, _, converged = descend_by_simplex(value, start, sizes=(1.0, -0.5))
             return x, converged
-        if curvature is None:
-            curvature = self._curvature(objective)
-        inverse = np.linalg.inv(curvature)
-        gain = tolerance * np.trace(curvature) / r
-        x, _, converged = descend(
-            value, start, inverse, step=_REFIT_STEP, tolerance=gain, one_sided=one_sided
-        )
-        return x, converged
+        found = descent(value, start)
+        return found.x, found.converged
 
 
 def _mean_hessian(value: Callable[[Floats], Floats], r: int) -> Floats:

@@ -121,7 +121,7 @@ def rivals(
         return []
 
     # Descend, all at once.
-    ends, values, _ = descend(
+    ends, values, *_ = descend(
         objective.along,
         starts_at,
         np.eye(best.size) / size,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._checks import Floats, positive_integer
+from prbayes._threads import one_thread
 from prbayes.estimate.data_sets import observed_set, sets_along
 from prbayes.estimate.refit import ARRIVED, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
@@ -112,6 +113,7 @@ class GivenEstimate(Affine):
             return done
         return f"{done}, as Affine does where refits tell no density of the estimate"
 
+    @one_thread()
     def _mapped(
         self, sampling: SamplingDistribution, draws: Floats, design_variance: float
     ) -> Mapped:
