@@ -24,17 +24,17 @@ from prbayes.metrics.base import Discrepancy
 # Populations that are interpolated between. With two hyperparameters minima are then a hundredth
 # of a standard error off, with five two to four hundredths; with nine more than one, and nothing is
 # gained.
-_POPULATIONS = 600
+_BETWEEN = 600
 # Numbers of a population, its points for each part of a discrepancy, from which on it pays.
 WORTH = 8192
 # How much further apart minima are than points at most.
-_WIDEST = 4.0
+_AROUND = 4.0
 # Standard errors between where descents begin by the map and end, up to which it helps.
-_NEAR = 0.3
-# Knots of a distribution function on which it is interpolated.
-_KNOTS = 1024
+_AT_HAND = 0.3
+# Intervals of a distribution function on which it is interpolated.
+_INTERVALS = 1024
 # Share of the features' variance that the principal components they are interpolated by leave out.
-_LEFT_OUT = 1e-10
+_SMALL_SHARE = 1e-10
 
 
 class _UnlikeError(Exception):
@@ -141,7 +141,7 @@ def _features(objective: BatchObjective, thetas: Floats) -> tuple[list[_Piece], 
         for k, part in enumerate(target.parts):
             one = part.target
             seen = part.of(objective.values[i])
-            basis = one.thinned(one.stored(seen), _KNOTS)
+            basis = one.thinned(one.stored(seen), _INTERVALS)
             # Against no data at all: what is left is the population's.
             alone = replace(one, weights=np.zeros(len(one.observed)))
             found, *constants = alone.from_basis(weights, basis, np)
@@ -161,7 +161,7 @@ def _principal(features: Floats) -> tuple[Floats, Floats]:
     """Return scores (P, K) on principal axes (K, c) of centered features, (P, c)."""
     variances, vectors = np.linalg.eigh(features @ features.T)
     left_out = np.cumsum(variances)
-    kept = left_out > _LEFT_OUT * left_out[-1]
+    kept = left_out > _SMALL_SHARE * left_out[-1]
     axes = vectors[:, kept].T @ features
     lengths = np.linalg.norm(axes, axis=1, keepdims=True)
     axes = axes / lengths
@@ -173,13 +173,13 @@ class Shortcut:
 
     def __init__(self, points: Floats, thetas_of: Callable[[Floats], Floats]) -> None:
         """Prepare for data sets drawn at points, (n, r), whose minima scatter by one around."""
-        chosen = np.linspace(0, len(points) - 1, _POPULATIONS).astype(np.intp)
+        chosen = np.linspace(0, len(points) - 1, _BETWEEN).astype(np.intp)
         points = np.unique(points[chosen], axis=0)
         middle = np.median(points, axis=0)
         # That is where minima are, further apart than the points.
         with np.errstate(divide="ignore"):
             wider = np.sqrt(1 + 1 / points.var(axis=0))
-        self._points = middle + np.minimum(wider, _WIDEST) * (points - middle)
+        self._points = middle + np.minimum(wider, _AROUND) * (points - middle)
         self._thetas_of = thetas_of
         self._map: FeatureMap | None = None
         self._helps = True
@@ -208,4 +208,4 @@ class Shortcut:
     def learn(self, x: Floats, converged: NDArray[np.bool_]) -> None:
         """Take note of where the descents ended, (B, r): far away the map does not help."""
         off = np.abs(x - self._begun).max(axis=1)[converged]
-        self._helps = self._helps and (not off.size or float(np.median(off)) < _NEAR)
+        self._helps = self._helps and (not off.size or float(np.median(off)) < _AT_HAND)
