@@ -23,8 +23,9 @@ _REPORT = """examples:
   prbayes report results.nc --markdown docs/crack
 
 Files are netCDF: posteriors (sample_smc(...).to_netcdf), optima
-(minimize(...).to_datatree().to_netcdf) and validity tests
-(area_test(...).to_dataset().to_netcdf), in any number and order. Nothing in them is executed.
+(minimize(...).to_datatree().to_netcdf), validity tests (area_test(...).to_dataset().to_netcdf), and
+tables of exceedance, sensitivity and plan (.to_netcdf), in any number and order. Nothing in them is
+executed. Labels, and pictures that need the model or what was measured in a test, take prb.Report.
 """
 _DEMO = """example:
   prbayes demo --out demo
@@ -76,7 +77,13 @@ def _add_report(commands: Any) -> Any:
         description="Write a report from saved results, without the model that they came from.",
     )
     add = report.add_argument
-    add("files", nargs="+", type=Path, metavar="FILE.nc", help="posteriors, optima, validity tests")
+    add(
+        "files",
+        nargs="+",
+        type=Path,
+        metavar="FILE.nc",
+        help="posteriors, optima, validity tests, decisions",
+    )
     add("--title", help="by default the name of the first file")
     add("--author", default="", help="below the title")
     add("--date", default="", help="below the title; none is made up")
@@ -161,18 +168,27 @@ def _report(given: argparse.Namespace) -> list[Path]:
 
 def _results(files: Sequence[Path]) -> dict[str, Any]:
     """Return what files hold, as keywords of a report."""
+    from prbayes.reports.decision import kind_of_decision
+
     paths = list(dict.fromkeys(files))
     labels = _labels(paths)
-    kinds: dict[str, dict[str, Any]] = {"posterior": {}, "optimum": {}, "validity": {}}
+    kinds: dict[str, dict[str, Any]] = {
+        **{"posterior": {}, "optimum": {}},
+        **{"validity": {}, "decision": {}},
+    }
     for path in paths:
         tree = _opened(path)
         if "posterior" in tree:
             kinds["posterior"][labels[path]] = tree
         elif "optimum" in tree:
             kinds["optimum"][labels[path]] = tree
+        elif kind_of_decision(tree.to_dataset()) is not None:
+            kinds["decision"][labels[path]] = tree.to_dataset()
         else:
             kinds["validity"][labels[path]] = _test_of(path, tree.to_dataset())
-    return {kind: _plain(results, kind) for kind, results in kinds.items()}
+    # A decision keeps the name of its file, which says what was asked.
+    decisions = kinds.pop("decision") or None
+    return {kind: _plain(found, kind) for kind, found in kinds.items()} | {"decision": decisions}
 
 
 def _demo(given: argparse.Namespace) -> list[Path]:
@@ -202,6 +218,7 @@ def _opened(path: Path) -> xr.DataTree:
         raise UserError(f"{path}: there is no such file")
     import xarray as xr
 
+    from prbayes.reports.decision import kind_of_decision
     from prbayes.reports.soundness import complaints
 
     try:
@@ -211,10 +228,11 @@ def _opened(path: Path) -> xr.DataTree:
         raise UserError(
             f"{path}: got no netCDF file that can be read ({_line(error):.100})"
         ) from error
-    if not {"posterior", "optimum"} & set(found.children) and "u" not in found.data_vars:
+    known = "u" in found.data_vars or kind_of_decision(found.to_dataset()) is not None
+    if not known and not {"posterior", "optimum"} & set(found.children):
         raise UserError(
             f"{path}: got groups {sorted(found.children)}, expected results of prbayes: "
-            "a group posterior or optimum, or a validity test"
+            "a group posterior or optimum, a validity test, or a table of a decision"
         )
     complaint = next(complaints(found), None)
     if complaint is not None:

@@ -113,6 +113,48 @@ def test_a_saved_validity_test_comes_back_whole(folder: Path) -> None:
     assert found.attrs["null"] == results()["v.nc"].attrs["null"]
 
 
+@cache
+def decisions() -> dict[str, xr.Dataset]:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        prb.Simulator(
+            "y", lambda x: 2 * x, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0, 4.0, 5.0]
+        )
+    optimum = prb.minimize(model)
+    quantity = prb.decision.Mean(lambda x: 2 * x, x)
+    condition = prb.decision.Condition(lambda x: 2 * x, x)
+    return {
+        "above 7.nc": prb.exceedance(optimum, lambda x: 2 * x, 7.0, x, requirement=0.5),
+        "mean.nc": prb.sensitivity(optimum, quantity, samples=64),
+        "more.nc": prb.plan(optimum, {"here": condition}, [5], quantity=quantity),
+    }
+
+
+def test_saved_decisions_are_reported(folder: Path) -> None:
+    for name, table in decisions().items():
+        table.to_netcdf(folder / name, engine="h5netcdf")
+    given = ["o.nc", *decisions()]
+    assert main(["report", *given, "--no-pictures", "--markdown", "md"]) == 0
+    text = (folder / "md" / "report.md").read_text(encoding="utf-8")
+    for title in ("Probability of exceedance", "What moves it", "What more data would change"):
+        assert f"### {title}\n" in text
+    assert "at most 0.5 is met" in text
+    assert "above 7" in text
+    assert "mean of lambda(x)".replace("(", "\\(") in text or "mean of lambda(x)" in text
+    assert "prb.exceedance" not in text
+
+
+def test_a_damaged_decision_gets_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, table in decisions().items():
+        less = table.drop_attrs().drop_vars("lower", errors="ignore")
+        less.to_netcdf(folder / name, engine="h5netcdf")
+    assert main(["report", "o.nc", "above 7.nc", "--no-pictures"]) == 2
+    error = capsys.readouterr().err
+    assert "above 7.nc: got no ['lower', 'limit', 'below', 'level']" in error
+    assert main(["report", "o.nc", "mean.nc", "--no-pictures"]) == 2
+    assert "expected a table of prb.sensitivity" in capsys.readouterr().err
+
+
 def test_mistakes_get_one_line_and_exit_code_2(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

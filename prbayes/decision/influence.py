@@ -87,7 +87,8 @@ def sensitivity(
         "hyperparameter" or "input". Variables ``first``, ``total`` and ``derivative``, with their
         standard errors ``first_error``, ``total_error`` and ``derivative_error``: shares without a
         unit; NaN where they are not known, as derivatives of whether a specimen is beyond a limit.
-        Attributes: ``quantity``, ``value`` (at the centre, in units of the quantity) and ``sd``
+        Attributes: ``quantity``, ``of_inputs`` (what of a specimen is shared out among the inputs),
+        ``value`` (at the centre, in units of the quantity) and ``sd``
         (by the hyperparameters), ``scatter``, the share of a new specimen's variance that is
         scatter and no lack of knowledge, ``responses`` (how many were computed), ``inputs``, why
         shares of inputs are not known, and ``identity``.
@@ -143,7 +144,7 @@ def sensitivity(
     populations = Populations.of(result, model, _DRAWS, caller)
     told = populations.told(quantity.response, quantity.inputs, quantity.output)
     told.refuse_failed(quantity)
-    own, values = _of_hyperparameters(told, quantity, samples, seed)
+    own = _of_hyperparameters(told, quantity, samples, seed)
     inputs = scatter(told, quantity, samples, seed, computed=computed)
     evaluator = populations.evaluator
     node = evaluator.nodes[told.k]
@@ -161,7 +162,8 @@ def sensitivity(
         attrs={
             "quantity": repr(quantity),
             "value": float(told.at(quantity, populations.center[None])[0]),
-            "sd": float(np.nanstd(values)),
+            "sd": float(np.nanstd(told.at(quantity, populations.thetas))),
+            "of_inputs": quantity.of_inputs,
             "scatter": _share_of_scatter(told, quantity),
             "responses": told.responses.count,
             "inputs": inputs.reason,
@@ -172,10 +174,8 @@ def sensitivity(
     )
 
 
-def _of_hyperparameters(
-    told: Told, quantity: Quantity, samples: int, seed: int
-) -> tuple[Indices, Floats]:
-    """Return the indices of the elements of theta, and the quantity at draws of all of them."""
+def _of_hyperparameters(told: Told, quantity: Quantity, samples: int, seed: int) -> Indices:
+    """Return the indices of the elements of theta."""
     copula = Copula.of(told.populations.thetas)
     d = told.populations.evaluator.size
     n = samples // REPLICATES
@@ -211,7 +211,7 @@ def _of_hyperparameters(
         slopes = change / _WEIGHT_STEP
         derivative.append(derivative_bound((sd * slopes) ** 2, values))
     rows = [np.transpose(each) for each in (first, total, derivative)]
-    return Indices.of(*rows), values
+    return Indices.of(*rows)
 
 
 def _share_of_scatter(told: Told, quantity: Quantity) -> float:

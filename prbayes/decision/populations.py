@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -44,6 +44,7 @@ class Populations:
     thetas: Floats  # (k, d): the posterior's draws, or what an optimum's sampling distribution says
     center: Floats  # (d,): the median, or the optimum
     caller: str  # for messages
+    drawn: bool  # whether thetas are draws, which scatter, and not spread evenly
 
     @classmethod
     def of(cls, result: Any, model: pm.Model | None, draws: int, caller: str) -> Populations:
@@ -59,11 +60,11 @@ class Populations:
             thetas = _normal_thetas(result, draws, caller)
             own = model is result.model
             evaluator = result.evaluator if own else Evaluator(model)
-            return cls(evaluator, thetas, result.theta, caller)
+            return cls(evaluator, thetas, result.theta, caller, drawn=False)
         points, _ = populations_of(result, model, draws, caller)
         evaluator = Evaluator(model)
         thetas = evaluator.thetas_of([points[str(rv.name)] for rv in model.free_RVs])
-        return cls(evaluator, thetas, np.median(thetas, axis=0), caller)
+        return cls(evaluator, thetas, np.median(thetas, axis=0), caller, drawn=True)
 
     def responses(
         self, response: Callable[..., Any], inputs: Sequence[Any], **calling: Any
@@ -163,14 +164,22 @@ class Told:
         with np.errstate(invalid="ignore"):
             return known / known.sum(axis=1, keepdims=True)
 
+    def mean_weights(self, thetas: Floats) -> Floats:
+        """Return the mean of the weights of populations, (k, d) -> (n,), of those there are."""
+        total = np.zeros(self.values.size)
+        for weights in self._some_weights(thetas):
+            total += np.nansum(weights, axis=0)
+        return total / total.sum()
+
     def at(self, quantity: Quantity, thetas: Floats) -> Floats:
         """Return a quantity of populations, (k, d) -> (k,); NaN where there is no population."""
+        return np.concatenate([quantity.of(self.values, w) for w in self._some_weights(thetas)])
+
+    def _some_weights(self, thetas: Floats) -> Iterator[Floats]:
+        """Yield the weights of some populations at a time, as many as fit into memory."""
         step = max(1, AT_ONCE // self.design.n_points)
-        parts = []
         for first in range(0, len(thetas), step):
-            weights = self.weights(thetas[first : first + step])
-            parts.append(quantity.of(self.values, weights))
-        return np.concatenate(parts)
+            yield self.weights(thetas[first : first + step])
 
     def refuse_unsupported(self) -> None:
         """Raise if the design does not support the populations, or they lose too much of it."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._checks import Floats, finite_number, flag, share
+from prbayes.model.node import response_name
 from prbayes.response.response import refuse_uncallable
 
 
@@ -31,10 +32,13 @@ class Quantity(ABC):
     differentiable : bool
         Whether the number of a specimen whose variance is shared out has derivatives where the
         response has.
+    of_inputs : str
+        What that number is, in words.
     """
 
     needs_finite = False
     differentiable = True
+    of_inputs = "the response"
 
     def __init__(self, response: Callable[..., Any], *inputs: Any, output: Any = None) -> None:
         refuse_uncallable(f"prb.decision.{type(self).__name__}", response)
@@ -43,7 +47,7 @@ class Quantity(ABC):
         self.output = output
 
     def __repr__(self) -> str:
-        name = getattr(self.response, "__name__", type(self.response).__name__)
+        name = response_name(self.response)
         return f"{self.told} of {name}" + ("" if self.output is None else f"[{self.output}]")
 
     @property
@@ -136,6 +140,7 @@ class Quantile(Quantity):
     """
 
     differentiable = False
+    of_inputs = "whether a specimen is beyond the quantile"
 
     def __init__(
         self,
@@ -183,6 +188,7 @@ class Exceedance(Quantity):
     """
 
     differentiable = False
+    of_inputs = "whether a specimen is beyond the limit"
 
     def __init__(
         self,

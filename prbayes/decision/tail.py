@@ -30,6 +30,7 @@ from prbayes.decision.specimens import Specimens
 from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.model.identity import as_attributes, identity_of_model
 from prbayes.model.labels import versions
+from prbayes.model.node import response_name
 from prbayes.model.turns import in_turn
 from prbayes.propagation.base import MAX_LOST, N_BLOCKS, DesignError
 from prbayes.response.response import refuse_uncallable
@@ -39,6 +40,8 @@ _log = logging.getLogger("prbayes")
 # Error of a probability, as a share of it, from which on it is said that points are needed. By
 # judgement: a probability is then known to a factor of two, with two errors to either side.
 _ROUGH = 0.3
+# Populations whose weights tell the error of an emulator: they are held at all points.
+_EMULATED_AT = 400
 # Importance points at least: a tenth of them is a step towards the limit, of which a fifth counts.
 _FEWEST_POINTS = 100
 
@@ -53,7 +56,8 @@ def exceedance(
     output: Any = None,
     below: bool = False,
     level: float = 0.9,
-    draws: int = 400,
+    requirement: float | None = None,
+    draws: int = 2000,
     points: int = 0,
     steps: int = 5,
     executor: Executor | None = None,
@@ -87,6 +91,9 @@ def exceedance(
         Whether to look below the limit.
     level : float
         Probability of the interval.
+    requirement : float, optional
+        The largest probability that is accepted. It is met if the whole interval is below it, not
+        met if all of it is above, and not decided in between.
     draws : int
         Largest number of populations, over all chains; the posterior's draws are thinned evenly.
     points : int
@@ -103,11 +110,12 @@ def exceedance(
     xarray.Dataset
         ``probability``, of a new specimen; ``lower`` and ``upper``, the equal-tailed interval of
         the populations' probabilities; ``error``, the standard error of ``probability`` by the
-        points, and the emulator, that it was made from; ``by_draw``, with dimension ``draw``. With
-        intervals ``probability`` and ``error`` have the dimension ``bound``, "lower" and "upper";
-        ``lower`` and ``upper`` are the ends over all places, ``by_draw`` has ``bound`` too, and
-        the attribute ``at`` says where in the intervals the bounds are. Attributes: ``level``,
-        ``responses`` (how many were computed), ``source`` and ``identity``.
+        points, the emulator and the draws that it was made from; ``by_draw``, with dimension
+        ``draw``. With intervals ``probability`` and ``error`` have the dimension ``bound``,
+        "lower" and "upper"; ``lower`` and ``upper`` are the ends over all places, ``by_draw`` has
+        ``bound`` too, and the attribute ``at`` says where in the intervals the bounds are.
+        Attributes: ``level``, ``responses`` (how many were computed), ``source``, ``identity``, and
+        with a requirement ``requirement`` and ``verdict``: "met", "not met" or "not decided".
 
     Raises
     ------
@@ -151,6 +159,8 @@ def exceedance(
     limit = finite_number(limit, "limit")
     flag(below, "below")
     level = share(level, "level")
+    if requirement is not None:
+        requirement = share(requirement, "requirement")
     positive_integer(draws, "draws", minimum=2)
     positive_integer(points, "points", minimum=0)
     if 0 < points < _FEWEST_POINTS:
@@ -196,6 +206,8 @@ def exceedance(
         coords = {"bound": ["lower", "upper"]}
         attrs["at"] = [told_places(inputs, places[end]) for end in ends]
     data |= {"lower": low.min(), "upper": high.max()}
+    if requirement is not None:
+        attrs |= {"requirement": requirement, "verdict": _verdict(data, requirement)}
     return xr.Dataset(data, coords=coords, attrs=attrs)
 
 
@@ -232,7 +244,13 @@ class _Asked:
         quantity = Exceedance(self.response, *inputs, limit=self.limit, below=self.below)
         by_draw = told.at(quantity, self.populations.thetas)
         known = by_draw[np.isfinite(by_draw)]
-        error = np.hypot(_error_of_points(told, quantity), _error_of_emulator(told, quantity))
+        error = np.linalg.norm(
+            [
+                _error_of_points(told, quantity),
+                _error_of_emulator(told, quantity),
+                self._error_of_draws(known),
+            ]
+        )
         source = f"stored responses of {self.populations.evaluator.nodes[told.k].name}"
         return _Found(known, float(error), told.responses.count, source)
 
@@ -266,14 +284,21 @@ class _Asked:
                 f"points whose response is NaN, expected at most {MAX_LOST:.0%}; repair it, or "
                 "return +inf for specimens that fail"
             )
-        return _Found(found.by_draw, found.error, responses.count, "importance points")
+        error = np.hypot(found.error, self._error_of_draws(found.by_draw))
+        return _Found(found.by_draw, float(error), responses.count, "importance points")
+
+    def _error_of_draws(self, by_draw: Floats) -> float:
+        """Return the error of a mean over draws of the posterior, as if they were independent."""
+        if not self.populations.drawn:
+            return 0.0
+        return float(by_draw.std(ddof=1) / np.sqrt(by_draw.size))
 
 
 def _error_of_points(told: Told, quantity: Exceedance) -> float:
     """Return the error of the mean probability, by the jackknife over blocks of the points."""
     thetas = told.populations.thetas
     beyond = quantity.of_specimen(told.values, np.nan)
-    weights = np.nanmean(told.weights(thetas), axis=0)
+    weights = told.mean_weights(thetas)
     if not (weights * beyond).any():
         # No point is there: what a single one stands for where there are some.
         return float(weights.max())
@@ -290,11 +315,20 @@ def _error_of_emulator(told: Told, quantity: Exceedance) -> float:
     said = design.emulated(told.responses, design.contents.table.points)
     if not said:
         return 0.0
-    roots = told.populations.evaluator.roots(told.populations.thetas, told.k)
+    # Of some populations: those emulators differ by far less than populations do.
+    thetas = told.populations.thetas[:: max(1, len(told.populations.thetas) // _EMULATED_AT)]
+    roots = told.populations.evaluator.roots(thetas, told.k)
     _, weights = design.populations(roots)
     mass = np.nanmean(weights, axis=0)
     shares = [mass @ quantity.of_specimen(told.column(values), np.nan) for values in said]
     return float(np.sqrt(np.sum((np.array(shares[1:]) - shares[0]) ** 2)))
+
+
+def _verdict(data: dict[str, Any], requirement: float) -> str:
+    """Return whether a probability is as required, by its interval."""
+    if data["upper"] <= requirement:
+        return "met"
+    return "not met" if data["lower"] > requirement else "not decided"
 
 
 def _tell(response: Any, means: Floats, errors: Floats, points: int) -> None:
@@ -303,11 +337,11 @@ def _tell(response: Any, means: Floats, errors: Floats, points: int) -> None:
     if not rough.any():
         return
     worst = int(np.argmax(errors - _ROUGH * means))
-    name = getattr(response, "__name__", type(response).__name__)
+    name = response_name(response)
     more = f"more than points={points}" if points else "points=1000, which computes as many"
     _log.warning(
-        "%s: a probability of %.2g has a standard error of %.2g by its points; pass %s responses "
-        "where the limit is exceeded",
+        "%s: a probability of %.2g has a standard error of %.2g; pass %s responses where the "
+        "limit is exceeded",
         name,
         means[worst],
         errors[worst],

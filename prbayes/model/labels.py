@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import platform
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
@@ -18,9 +19,9 @@ from prbayes.response.outputs import Outputs
 def versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
     found = {}
-    for name in ("prbayes", "pymc", "numpy"):
+    for name in ("prbayes", "pymc", "pytensor", "arviz", "numpy", "scipy"):
         found[f"{name}_version"] = importlib.metadata.version(name)
-    return found
+    return {**found, "python_version": platform.python_version()}
 
 
 def arviz_attributes() -> dict[str, str]:

@@ -76,6 +76,6 @@ def refuse_labels(
         more = ", ..." if len(own) > _MOST_LISTED else ""
         listed = ", ".join(own[:_MOST_LISTED])
         raise KeyError(
-            f"labels: got {strange[0]!r:.60}, which is no name of this picture; expected some of "
+            f"labels: got {strange[0]!r:.60}, which is no name of what is shown; expected some of "
             f"{listed}{more}"
         )

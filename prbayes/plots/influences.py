@@ -21,10 +21,7 @@ from prbayes.plots._canvas import (
 )
 from prbayes.plots._names import named, refuse_labels
 
-_PANELS = {
-    "hyperparameter": "share of the quantity's variance",
-    "input": "share of the response's variance",
-}
+_PANELS = ("hyperparameter", "input")
 _MARKERS = {"first": CIRCLE, "total": DIAMOND}
 
 
@@ -87,7 +84,11 @@ def plot_sensitivity(
     limits = (-0.6, top + 0.6)
     size = (4.8, 1.6 + 0.4 * count)
     canvas = Canvas(list(_PANELS), size=size, backend=backend, pc_kwargs=pc_kwargs)
-    for kind, title in _PANELS.items():
+    titles = {
+        "hyperparameter": "share of the quantity's variance",
+        "input": f"share of the variance of\n{table.attrs.get('of_inputs', 'the response')}",
+    }
+    for kind, title in titles.items():
         own = by_panel[kind]
         rows = top - np.arange(own.sizes["factor"])
         panel = canvas.panel(kind)

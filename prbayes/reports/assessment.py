@@ -13,8 +13,17 @@ from prbayes._diagnose import Diagnosis
 from prbayes._weighted import INTERVAL
 from prbayes.plots._names import named
 from prbayes.plots.validity import in_directions
+from prbayes.reports.decision import CALLED, kind_of_decision
 from prbayes.reports.material import Material
-from prbayes.reports.numbers import alike, number, percentage, plus_minus, shown, span
+from prbayes.reports.numbers import (
+    alike,
+    number,
+    percentage,
+    plus_minus,
+    probability,
+    shown,
+    span,
+)
 from prbayes.reports.problem import described
 from prbayes.reports.section import Section
 from prbayes.reports.summary import verdict
@@ -270,7 +279,7 @@ def _tested(test: ValidityTest) -> dict[str, Any]:
         "of": of,
         "area": f"{test.statistic:.4f}",
         "critical value": f"{test.critical_value:.4f}",
-        "p-value": f"{test.p_value:.3f}",
+        "p-value": probability(test.p_value).removeprefix("= "),
         "level": percentage(test.level),
         "verdict": "rejected" if test.rejected else "not rejected",
     }
@@ -284,6 +293,10 @@ def origin(m: Material) -> list[Section]:
     if not m.results:
         return []
     rows = [_cost(m, label) for label in m.results]
+    for condition, (_, predicted) in m.validation.items():
+        rows.append(_cost_of(f"prediction, {named(condition, m.labels)}", "predict", predicted))
+    for label, table in m.decisions.items():
+        rows.append(_cost_of(label, CALLED[kind_of_decision(table) or ""], table))
     text = [
         "Responses are evaluations of the simulated response for one specimen, whatever the number "
         "of its outputs; those of a common design are counted in each."
@@ -306,6 +319,18 @@ def _cost(m: Material, label: str) -> dict[str, Any]:
         "by": str(attrs.get("sampler", by)),
         "responses": None if responses is None else str(int(responses)),
         "seconds": None if seconds is None else shown(float(seconds)),
+        "seed": None if seed is None else str(seed),
+    }
+
+
+def _cost_of(label: str, function: str, found: xr.DataArray | xr.Dataset) -> dict[str, Any]:
+    """Return what followed from a result, by which function, and what it took."""
+    responses, seed = (found.attrs.get(key) for key in ("responses", "random_seed"))
+    return {
+        "result": label,
+        "by": function,
+        "responses": None if responses is None else str(int(responses)),
+        "seconds": None,
         "seed": None if seed is None else str(seed),
     }
 

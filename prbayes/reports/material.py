@@ -63,6 +63,11 @@ class Material:
         return self.optima | self.posteriors
 
     @property
+    def rejected(self) -> bool:
+        """Whether a test rejected the model."""
+        return any(test.rejected for test in self.tests.values())
+
+    @property
     def calibrations(self) -> dict[str, xr.Dataset]:
         """Discrepancies, metrics and epsilons, of those results that have them."""
         found = {}

@@ -32,7 +32,7 @@ def _of_validity(m: Material) -> list[str]:
             "Test the calibrated model on specimens that were not used for it: prb.predict for "
             "their condition, then prb.area_test. With few specimens, prb.cross_validate."
         ]
-    if any(test.rejected for test in m.tests.values()):
+    if m.rejected:
         return [
             "Do not use the model beyond the data of its calibration. See under Validity whether "
             "the measured responses lie beside the predicted ones or are scattered more widely; "
@@ -56,7 +56,9 @@ def _of_answers(m: Material) -> list[str]:
 
 
 def _of_decision(m: Material) -> list[str]:
-    """Name the questions of a decision that were not asked."""
+    """Name the questions of a decision that were not asked; none of a model that is rejected."""
+    if m.rejected:
+        return []
     asked = {kind_of_decision(table) for table in m.decisions.values()}
     steps = []
     if "risk" not in asked:

@@ -14,6 +14,8 @@ NOTHING = "\u2013"  # an en dash, as printed tables have it where there is no nu
 # as Python's own "g"; the upper one keeps loads in newtons and cycles to failure readable.
 _SMALLEST_WRITTEN_OUT, _LARGEST_WRITTEN_OUT = -4, 7
 
+_SMALLEST_PROBABILITY = 0.001
+
 
 def number(value: Any, digits: int = 4) -> str:
     """Return a number with so many significant digits, and anything else as its text.
@@ -84,6 +86,14 @@ def plus_minus(value: float, sd: float) -> str:
 def percentage(share: float) -> str:
     """Return a share of one, such as '5%'."""
     return f"{100 * share:g}%"
+
+
+def probability(p: float) -> str:
+    """Return a p-value after its sign, such as '= 0.18' or '< 0.001'.
+
+    The last digit that is told is one that a null distribution of thousands of replicates knows.
+    """
+    return f"= {p:.2g}" if p >= _SMALLEST_PROBABILITY else f"< {_SMALLEST_PROBABILITY:g}"
 
 
 def span(values: Any, form: str) -> str:

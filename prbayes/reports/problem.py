@@ -70,7 +70,33 @@ def data(m: Material) -> list[Section]:
             text.append(untold)
         if y.shape[1] > 1:
             correlations.append(_correlations(name, m))
-    return [Section("Data", tuple(text), rows_table(rows)), *correlations]
+    return [Section("Data", tuple(text), rows_table(rows)), *correlations, *_values(m)]
+
+
+# Measured values of a simulator that are printed: half a page.
+_MOST_VALUES = 300
+
+
+def _values(m: Material) -> list[Section]:
+    """Return the measured values themselves, by which a calibration can be made again."""
+    text = []
+    for name, y in m.observed.items():
+        if y.size > _MOST_VALUES:
+            text.append(f"{name}: {y.size} values, which are too many to print.")
+        elif y.ndim == 1:
+            text.append(f"{name}: {_listed(y)}.")
+        else:
+            names = m.outputs[name].names
+            text += [f"{name}[{names[j]}]: {_listed(y[:, j])}." for j in range(y.shape[1])]
+    about = f"In the order of the specimens; {NOTHING} was not measured, ∞ is a failure."
+    return [Section("Measured values", (about, *text), level=3)]
+
+
+def _listed(y: Floats) -> str:
+    """Return values one after the other, with the digits that their spread warrants."""
+    finite = y[np.isfinite(y)]
+    sd = float(finite.std(ddof=1)) if finite.size > 1 else math.nan
+    return ", ".join(alike(y.tolist(), sd, 4))
 
 
 # Outputs of a simulator that have a row: half a page; of more, as of a curve, some from the first

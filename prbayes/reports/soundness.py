@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from prbayes.reports.decision import CALLED, kind_of_decision
+
 # What a group has to have for those who report it, where there is such a group.
 _OF_POSTERIOR = {
     "calibration": (
@@ -17,6 +19,11 @@ _OF_POSTERIOR = {
 }
 _OF_STAGES = ("beta", "accept_rate", "n_steps")
 _OF_OPTIMUM = {"calibration": ("discrepancy", "metric"), "stderr": ()}
+_OF_DECISION = {
+    "risk": ("lower", "upper", "limit", "below", "level"),
+    "sensitivity": ("factor", "kind", "first_error", "total_error", "quantity", "value", "sd"),
+    "plan": ("name", "candidate", "k"),
+}
 _OF_TEST = ("statistic", "critical_value", "p_value", "level", "folded")
 
 
@@ -27,6 +34,8 @@ def complaints(tree: xr.DataTree) -> Iterator[str]:
         yield from _of_posterior(groups)
     elif "optimum" in groups:
         yield from _of_optimum(groups)
+    elif "u" not in tree.data_vars:
+        yield from _of_decision(tree.to_dataset())
     else:
         yield from _of_test(tree.to_dataset())
     for name in ("posterior", "optimum"):
@@ -79,6 +88,17 @@ def _of_test(test: xr.Dataset) -> Iterator[str]:
     for name in ("statistic", "p_value"):
         if name in test and not np.isfinite(test[name].values).all():
             yield f"{name}: got NaN or an infinite number, expected a finite one"
+
+
+def _of_decision(table: xr.Dataset) -> Iterator[str]:
+    kind = kind_of_decision(table)
+    lacking = [
+        name for name in _OF_DECISION[kind or ""] if name not in (*table.variables, *table.attrs)
+    ]
+    if lacking:
+        yield f"got no {lacking}, expected a table of prb.{CALLED[kind or '']}"
+        return
+    yield from _not_numbers("a decision", table.data_vars)
 
 
 def _of_attributes(group: str, attrs: Mapping[Any, Any]) -> Iterator[str]:

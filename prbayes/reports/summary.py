@@ -15,8 +15,9 @@ from prbayes.model.elements import (
 from prbayes.plots._names import named
 from prbayes.plots._objective import metric_label
 from prbayes.plots.validity import in_directions
+from prbayes.reports.decision import interval_of, kind_of_decision
 from prbayes.reports.material import Material, read_variables
-from prbayes.reports.numbers import alike, counted, number, percentage, plus_minus
+from prbayes.reports.numbers import alike, counted, number, percentage, plus_minus, probability
 from prbayes.validation.validity import ValidityTest
 
 # More hyperparameters than this make a list, which a table shows better: by judgement.
@@ -31,6 +32,7 @@ def summary(m: Material) -> list[str]:
     """Return the sentences, as paragraphs."""
     paragraphs = [_verdict(m), _what_was_calibrated(m), f"{_answer(m)} {_agreement(m)}", _trust(m)]
     paragraphs += [verdict(label, test, m) for label, test in m.tests.items()]
+    paragraphs += _risks(m)
     stripped = map(str.strip, paragraphs)
     return list(filter(None, stripped))
 
@@ -61,7 +63,7 @@ def _verdict(m: Material) -> str:
     if not m.results:
         return ""
     problems = any(found is not None and not found.ok for found in m.diagnoses.values())
-    if any(test.rejected for test in m.tests.values()):
+    if m.rejected:
         return "Verdict: the calibrated model is rejected by data that it has not seen."
     if problems:
         return "Verdict: not to be used before the problems under Diagnostics are removed."
@@ -94,7 +96,7 @@ def verdict(label: str, test: ValidityTest, m: Material) -> str:
         f"{who}On {aspect} of {specimens} ({values}), the calibrated model {found} "
         f"at level {percentage(test.level)} "
         f"({area} {test.statistic:.3f} {sign} critical {test.critical_value:.3f}, "
-        f"p = {test.p_value:.2g})."
+        f"p {probability(test.p_value)})."
     )
 
 
@@ -108,7 +110,7 @@ def _what_was_calibrated(m: Material) -> str:
     if not m.results:
         return f"The model has {hyperparameters}. No result of a calibration was given."
     were = "was" if len(names) == 1 else "were"
-    data = [_measured(name, y) for name, y in m.observed.items()]
+    data = [_measured(named(name, m.labels), y) for name, y in m.observed.items()]
     on = f" on {_enumerated(data)}" if data else ""
     metrics = _metrics(m)
     by = f", by the {_enumerated(metrics)}" if metrics else ""
@@ -133,6 +135,25 @@ def _metrics(m: Material) -> list[str]:
         described = list(map(str, first["metric"].values.tolist()))
     in_words = [metric_label(description) for description in described]
     return list(dict.fromkeys(in_words))
+
+
+def _risks(m: Material) -> list[str]:
+    """Return in a sentence each the probabilities that were asked for; of a rejected model none."""
+    if m.rejected:
+        return ["The questions of a decision are not answered by it."] if m.decisions else []
+    sentences = []
+    for label, table in m.decisions.items():
+        if kind_of_decision(table) != "risk" or table.probability.ndim:
+            continue
+        level = percentage(table.attrs["level"])
+        said = (
+            f"{label}: probability {number(float(table.probability), 2)} ({level} interval "
+            f"{interval_of(table)})"
+        )
+        if "requirement" in table.attrs:
+            said += f"; at most {table.attrs['requirement']:g} is {table.attrs['verdict']}"
+        sentences.append(f"{said}.")
+    return sentences
 
 
 def _enumerated(items: list[str]) -> str:

@@ -14,7 +14,7 @@ import prbayes as prb
 from prbayes.decision.tail import _error_of_points
 
 MU, SIGMA = (posterior().posterior[name].values[0] for name in ("mu", "sigma"))
-THINNED = np.unique(np.linspace(0, 3999, 400).round().astype(int))
+THINNED = np.unique(np.linspace(0, 3999, 2000).round().astype(int))
 
 
 def exact(limit: float, level: float = 0.9) -> tuple[float, Any]:
@@ -50,6 +50,26 @@ def test_from_points_where_it_matters() -> None:
     assert table.attrs["source"] == "importance points"
 
 
+def test_the_error_counts_that_draws_are_few() -> None:
+    few, many = (ask(2.8, points=2000, draws=draws) for draws in (50, 2000))
+    scatter = float(few.by_draw.std(ddof=1)) / np.sqrt(50)
+    assert float(few.error) > scatter > 2 * float(many.error)
+    assert abs(float(few.probability) - exact(2.8)[0]) < 3 * float(few.error)
+
+
+def test_a_requirement_is_met_or_not_or_not_decided() -> None:
+    table = ask(2.0)
+    assert "verdict" not in table.attrs
+    low, high = float(table.lower), float(table.upper)
+    for requirement, verdict in ((1.01 * high, "met"), (0.99 * low, "not met")):
+        assert ask(2.0, requirement=requirement).attrs["verdict"] == verdict
+    for requirement in (1.01 * low, 0.99 * high):
+        assert ask(2.0, requirement=requirement).attrs["verdict"] == "not decided"
+    assert ask(2.0, requirement=0.5).attrs["requirement"] == 0.5
+    with pytest.raises(ValueError, match="requirement"):
+        ask(2.0, requirement=1.5)
+
+
 def test_below_is_above_of_the_opposite() -> None:
     for points in (0, 500):
         below = ask(0.2, below=True, points=points)
@@ -65,7 +85,7 @@ def test_the_error_of_equal_points_is_that_of_their_blocks_means() -> None:
         populations=SimpleNamespace(thetas=thetas),
         values=values,
         blocks=blocks,
-        weights=lambda thetas: np.full((len(thetas), 64), 1 / 64),
+        mean_weights=lambda thetas: np.full(64, 1 / 64),
     )
     quantity = prb.decision.Exceedance(same, normal()[1], limit=42.0)
     means = [(values[blocks == b] > 42).mean() for b in range(8)]

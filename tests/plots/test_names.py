@@ -39,7 +39,7 @@ PICTURES = ("responses", "population", "posterior", "optimizer", "landscape", "c
 def test_a_label_of_nothing_is_refused(
     picture: str, pictures: dict[str, Callable[..., Any]]
 ) -> None:
-    with pytest.raises(KeyError, match=r"labels: got 'crak', which is no name of this picture"):
+    with pytest.raises(KeyError, match=r"labels: got 'crak', which is no name of what is shown"):
         pictures[picture](backend="none", labels={"crak": "crack length (mm)"})
 
 

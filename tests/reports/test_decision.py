@@ -3,6 +3,7 @@
 from functools import cache
 from typing import Any
 
+import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
@@ -16,7 +17,7 @@ def questions() -> dict[str, xr.Dataset]:
     _, x = normal()
     interval = prb.decision.Interval(0.0, 0.2)
     return {
-        "risk": prb.exceedance(optimum(), same, 2.0, x),
+        "risk": prb.exceedance(optimum(), same, 2.0, x, requirement=0.1),
         "bounds": prb.exceedance(optimum(), lambda x, by: x + by, 2.0, x, interval, steps=2),
         "influence": prb.sensitivity(optimum(), prb.decision.Mean(same, x), samples=64),
         "plan": prb.plan(optimum(), {"same": prb.decision.Condition(same, x)}, [5, 20]),
@@ -40,12 +41,38 @@ def test_each_kind_of_question_has_a_table() -> None:
     assert risk.question.tolist() == ["risk", "bounds", "bounds"]
     assert risk["bound"].tolist() == ["", "lower", "upper"]
     assert float(risk.probability[0]) == pytest.approx(
-        float(questions()["risk"].probability), rel=1e-3
+        float(questions()["risk"].probability), rel=0.01
     )
+    assert risk.required.tolist() == ["at most 0.1", "", ""]
+    assert risk["requirement is"].tolist() == ["met", "", ""]
+    assert moved.of[0].startswith("mean of same = 1.0")
+    assert moved.of[2] == "the response"
     assert moved.factor.tolist() == ["mu", "sigma", "x"]
     assert moved["by itself"][0].startswith("1.00 ± ")
     assert more.specimens.tolist() == ["none more", "5 more, same", "20 more, same"]
     assert float(more.mu[2]) < float(more.mu[1]) < float(more.mu[0])
+
+
+def test_the_summary_has_the_probability_and_whether_it_is_accepted() -> None:
+    said = report(decision=questions()).sections[0].text
+    (risk,) = [line for line in said if line.startswith("risk: ")]
+    assert risk.startswith("risk: probability 0.0069 (90% interval 0.00")
+    assert risk.endswith("; at most 0.1 is met.")
+
+
+def test_nothing_is_decided_by_a_model_that_is_rejected() -> None:
+    model, x = normal()
+    predicted = prb.predict(optimum(), same, x, model=model)
+    far = np.random.default_rng(0).normal(4.0, 0.5, 20)
+    test = prb.area_test({"far": far}, {"far": predicted})
+    assert test.rejected
+    sections = report(decision=questions(), validity=test).sections
+    assert not [line for line in sections[0].text if "probability 0" in line]
+    assert "The questions of a decision are not answered by it." in sections[0].text
+    (decision,) = [section for section in sections if section.title == "Decision"]
+    assert decision.text[0].startswith("The calibrated model was rejected")
+    asked = report(validity=test).sections
+    assert not [s for s in asked for line in s.text if "prb.exceedance" in line]
 
 
 def test_there_is_none_unless_asked() -> None:

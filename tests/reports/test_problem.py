@@ -10,6 +10,7 @@ import xarray as xr
 
 import prbayes as prb
 from prbayes.reports.material import gather
+from prbayes.reports.numbers import NOTHING
 from prbayes.reports.problem import data, metric
 from prbayes.reports.tables import cells
 from prbayes.response.outputs import Outputs
@@ -105,7 +106,7 @@ def frame(measured: Any) -> pm.Model:
 
 
 def test_each_output_has_a_row_and_pairs_have_correlations(frame: Any, measured: Any) -> None:
-    about, correlations = data(gather(frame, None, None, None, None))
+    about, correlations, values = data(gather(frame, None, None, None, None))
     table = cells(about.table)
     assert table.header == (
         *("simulator", "output", "units", "N", "failed", "missing"),
@@ -120,15 +121,21 @@ def test_each_output_has_a_row_and_pairs_have_correlations(frame: Any, measured:
     r = np.corrcoef(measured[3:].T)[0, 1]
     assert correlations.title == "Correlations of frame"
     assert cells(correlations.table).rows[0][1:] == ("1", f"{r:.3f}")
+    _, first_listed, second_listed = values.text
+    numbers = first_listed.removeprefix("frame[first]: ").removesuffix(".").split(", ")
+    np.testing.assert_allclose(list(map(float, numbers)), measured[:, 0], atol=1e-3)
+    assert second_listed.removeprefix("frame[second]: ").split(", ")[:3] == [NOTHING, NOTHING, "∞"]
 
 
 def test_a_result_alone_tells_the_same_of_outputs(frame: Any) -> None:
     optimum = prb.minimize(frame)
-    told = [section.table for section in data(gather(frame, None, None, None, None))]
+    told = data(gather(frame, None, None, None, None))
     tree = optimum.to_datatree()
     stored = data(gather(None, tree, None, None, None))
     for one, other in zip(told, stored, strict=True):
-        assert cells(other.table) == cells(one)
+        assert other.text == one.text
+        if one.table is not None:
+            assert cells(other.table) == cells(one.table)
     report = prb.Report("Frame", optimum=optimum, model=frame, pictures=False)
     assert (
         "on 20 specimens with 2 outputs of frame, by the joint probability residual"
@@ -144,11 +151,12 @@ def test_of_a_curve_some_outputs_have_a_row(calibrated: Any) -> None:
         observed={"y": rng.normal(size=(5, 40))},
         outputs={"y": Outputs(tuple(np.arange(40) / 2), "hour")},
     )
-    about, correlations = data(m)
+    about, correlations, values = data(m)
     rows = cells(about.table).rows
     assert len(rows) == len(cells(correlations.table).rows) == 12
     assert [rows[0][1], rows[-1][1]] == ["0", "19.5"]
     assert "y: 12 of 40 outputs are told." in about.text
+    assert len(values.text) == 41  # of few specimens all outputs are listed
 
 
 def test_one_output_tells_its_units_from_memory_and_from_a_result() -> None:
@@ -161,7 +169,8 @@ def test_one_output_tells_its_units_from_memory_and_from_a_result() -> None:
         )  # fmt: skip
     optimum = prb.minimize(model)
     for given in ((model, None), (None, optimum.to_datatree())):
-        (section,) = data(gather(*given, None, None, None))
+        section, values = data(gather(*given, None, None, None))
+        assert values.text[1] == "k: 1.000, 2.000, 4.000."
         assert section.table["units"].tolist() == ["N/mm"]
     picture = prb.plot_responses(optimum, backend="matplotlib")
     assert picture.viz["plot"]["k"].item().get_xlabel() == "k (N/mm)"
