@@ -430,7 +430,7 @@ class Design(Bound):
         return (
             f"{runs}, between which {self.n_points} points are emulated: at runs that were left "
             f"out the emulator is off by {emulation.error:.2g} of the response's spread, and "
-            f"populations are to {emulation.share:.0%} of the runs themselves.{self._following}"
+            f"{emulation.share:.0%} of a population are runs themselves.{self._following}"
         )
 
     @property

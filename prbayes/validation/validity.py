@@ -77,13 +77,14 @@ class ValidityTest:
         values = self.u_values.size
         specimens = np.unique(self.specimens).size
         conditions = len(self.of_conditions)
+        under = "1 condition" if conditions == 1 else f"{conditions} conditions"
         directions = np.unique(self.conditions).size
         seen = f", seen in {directions} directions" if directions > conditions else ""
         return (
             f"ValidityTest: {verdict} at level {self.level:g}\n"
             f"  {what} {self.statistic:.4f}, critical value {self.critical_value:.4f}, "
             f"p-value {self.p_value:.3g}\n"
-            f"  {values} values of {specimens} specimens, {conditions} condition(s){seen}\n"
+            f"  {values} values of {specimens} specimens, {under}{seen}\n"
             f"  null: {self.null}"
         )
 
