@@ -255,9 +255,9 @@ ILLUSTRATIONS = (
         "with the area between them, and of one output an acceptance band.",
         caption="Where the measured responses stand in the predicted distribution. "
         "A right model keeps near the diagonal; the shaded area is the statistic. "
-        "Of one output, the band holds the whole curve of a right model in all but a share of cases "
-        "as large as the test's level; of several there is a line for each direction in which they "
-        "are seen, and no band. Curves of a model that is rejected are red.",
+        "Of one output, the band holds the whole curve of a right model in all but a share of "
+        "cases as large as the test's level; of several there is a line for each direction in "
+        "which they are seen, and no band. Curves of a model that is rejected are red.",
     ),
     Illustration(
         after="Decision",

@@ -123,7 +123,7 @@ def test_the_result_is_readable_and_saved(tmp_path: Path, posterior: Posterior) 
     y = np.random.default_rng(1).normal(3, 1, 12)
     test = prb.area_test({"a": y[:5], "b": y[5:]}, {"a": posterior(), "b": posterior()}, null=QUICK)
     assert "ValidityTest: rejected at level 0.05" in repr(test)
-    assert "12 values of 12 specimens, 2 condition(s)" in repr(test)
+    assert "12 values of 12 specimens, 2 conditions" in repr(test)
     dataset = test.to_dataset()
     dataset.to_netcdf(tmp_path / "test.nc")
     xr.testing.assert_equal(xr.load_dataset(tmp_path / "test.nc"), dataset)
@@ -235,5 +235,5 @@ def test_directions_of_outputs_are_no_conditions() -> None:
     dims = ("chain", "draw", "sample", "output")
     test = prb.area_test(rng.normal(0, 1, (9, 2)), xr.DataArray(predicted, dims=dims), null=QUICK)
     assert len(test.of_conditions) == 1
-    assert "of 9 specimens, 1 condition(s), seen in 4 directions" in repr(test)
+    assert "of 9 specimens, 1 condition, seen in 4 directions" in repr(test)
     assert "9 specimens with 36 values in all" in test.null
