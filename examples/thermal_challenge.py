@@ -258,13 +258,6 @@ def candidates(inputs):
     return found | {"devices at 3500 W/m2": prb.decision.Condition(device, *inputs, metric=one)}
 
 
-def verdict(risk):
-    """Say whether the requirement is met, by the interval of a probability."""
-    if float(risk.lower) > ALLOWED:
-        return "not met"
-    return "met" if float(risk.upper) < ALLOWED else "not decided"
-
-
 def study():
     """Return all figures of the study, and what the picture needs."""
     found = {"capacity": {}}
@@ -321,11 +314,18 @@ def study():
     for response in (device, device_by_differences):
         for points in (0, 1000):
             risk = prb.exceedance(
-                posterior, response, LIMIT, *inputs, model=model, points=points, random_seed=1
+                posterior,
+                response,
+                LIMIT,
+                *inputs,
+                model=model,
+                requirement=ALLOWED,
+                points=points,
+                random_seed=1,
             )
             row = {name: float(risk[name]) for name in ("probability", "lower", "upper", "error")}
             row["above"] = float((risk.by_draw > ALLOWED).mean())
-            row["verdict"] = verdict(risk)
+            row["verdict"] = risk.attrs["verdict"]
             found["risk"][f"{response.__name__}/{points}"] = row
 
     # What it hangs on, and what to test next.

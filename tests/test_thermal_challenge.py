@@ -120,17 +120,6 @@ def test_each_coupon_is_measured_at_its_temperature(example: Any) -> None:
     assert (np.bincount(labels) == 2).all()
 
 
-def test_a_verdict_needs_the_whole_interval(example: Any) -> None:
-    import xarray as xr
-
-    for lower, upper, said in (
-        (0.02, 0.1, "not met"),
-        (0.005, 0.1, "not decided"),
-        (0.001, 0.009, "met"),
-    ):
-        assert example.verdict(xr.Dataset({"lower": lower, "upper": upper})) == said
-
-
 @pytest.mark.slow
 def test_the_study_tells_what_the_page_says(tmp_path: Path) -> None:
     script = ROOT / "examples" / "thermal_challenge.py"
