@@ -138,7 +138,7 @@ def test_saved_decisions_are_reported(folder: Path) -> None:
     text = (folder / "md" / "report.md").read_text(encoding="utf-8")
     for title in ("Probability of exceedance", "What moves it", "What more data would change"):
         assert f"### {title}\n" in text
-    assert "at most 0.5 is met" in text
+    assert "the requirement, at most 0.5, is met" in text
     assert "above 7" in text
     assert "mean of lambda(x)".replace("(", "\\(") in text or "mean of lambda(x)" in text
     assert "prb.exceedance" not in text

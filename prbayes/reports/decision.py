@@ -99,7 +99,6 @@ def _shares(table: xr.Dataset, labels: Mapping[str, str]) -> list[dict[str, Any]
         {
             "of": _of_what(table, str(kind)),
             "factor": named(str(factor), labels),
-            "kind": str(kind),
             "by itself": _share(table, "first", i),
             "with all others known": _share(table, "total", i),
         }

@@ -151,7 +151,8 @@ def _risks(m: Material) -> list[str]:
             f"{interval_of(table)})"
         )
         if "requirement" in table.attrs:
-            said += f"; at most {table.attrs['requirement']:g} is {table.attrs['verdict']}"
+            most = f"at most {table.attrs['requirement']:g}"
+            said += f"; the requirement, {most}, is {table.attrs['verdict']}"
         sentences.append(f"{said}.")
     return sentences
 

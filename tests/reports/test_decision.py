@@ -57,7 +57,7 @@ def test_the_summary_has_the_probability_and_whether_it_is_accepted() -> None:
     said = report(decision=questions()).sections[0].text
     (risk,) = [line for line in said if line.startswith("risk: ")]
     assert risk.startswith("risk: probability 0.0069 (90% interval 0.00")
-    assert risk.endswith("; at most 0.1 is met.")
+    assert risk.endswith("; the requirement, at most 0.1, is met.")
 
 
 def test_nothing_is_decided_by_a_model_that_is_rejected() -> None:
