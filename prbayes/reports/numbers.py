@@ -14,6 +14,8 @@ NOTHING = "\u2013"  # an en dash, as printed tables have it where there is no nu
 # as Python's own "g"; the upper one keeps loads in newtons and cycles to failure readable.
 _SMALLEST_WRITTEN_OUT, _LARGEST_WRITTEN_OUT = -4, 7
 
+# The smallest p-value that is told: of smaller ones a null distribution of 9999 replicates knows
+# not even the first digit.
 _SMALLEST_PROBABILITY = 0.001
 
 
@@ -89,10 +91,7 @@ def percentage(share: float) -> str:
 
 
 def probability(p: float) -> str:
-    """Return a p-value after its sign, such as '= 0.18' or '< 0.001'.
-
-    The last digit that is told is one that a null distribution of thousands of replicates knows.
-    """
+    """Return a p-value after its sign, such as '= 0.18' or '< 0.001'."""
     return f"= {p:.2g}" if p >= _SMALLEST_PROBABILITY else f"< {_SMALLEST_PROBABILITY:g}"
 
 
