@@ -41,7 +41,7 @@ METRICS = {"PR": "ProbabilityResidual", "KLD": "KullbackLeibler", "area": "AreaM
 # estimate of `Joint`, the default.
 SCHOOLS = ("joint", "given", "correlation", "separate")
 METHODS = ("exact", *(f"{school} {metric}" for school in SCHOOLS for metric in METRICS))
-_ENOUGH = 20  # data sets of a cell that is pooled with others
+ENOUGH = 20  # data sets of a cell that is told of, and pooled with others
 _BLOCK = 10  # data sets of a problem before it is the next problem's turn
 _FEW = 8  # specimens of the data sets whose estimates are the populations of the design
 _WIDER = 2.5  # the proposal's covariance, in that of the estimate
@@ -493,7 +493,7 @@ def pooled(cells: dict[str, Any]) -> dict[str, Any]:
             chosen = [
                 cell
                 for key, cell in cells.items()
-                if key.endswith(f"/{size}/{method}") and cell["data sets"] >= _ENOUGH
+                if key.endswith(f"/{size}/{method}") and cell["data sets"] >= ENOUGH
             ]
             if not chosen:
                 continue

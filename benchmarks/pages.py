@@ -419,7 +419,7 @@ def surrogates() -> Iterator[Row]:
 
 def joint() -> Iterator[Row]:
     """Return the rows of joint calibration."""
-    from benchmarks.joint import grouped
+    from benchmarks.joint import ENOUGH, grouped
 
     schools = {
         "joint": "`Joint`",
@@ -435,6 +435,8 @@ def joint() -> Iterator[Row]:
         "four .9": "four normal outputs, .9",
     }
     for key, cell in found("joint")["cells"].items():
+        if cell["data sets"] < ENOUGH:
+            continue
         name, size, method = key.split("/")
         if method == "exact":
             label = "exact posterior"

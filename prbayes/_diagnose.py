@@ -167,9 +167,12 @@ def _of_optimum(optimum: Optimum) -> Diagnosis:
     if not optimum.converged and not told:
         messages.append(_not_converged(optimum.message))
     designs = _computed(optimum.evaluator, optimum.theta[None])
-    failed = _failed(optimum.failures)
-    lost = {name: each["lost_mass"] for name, each in optimum.support.items()}
-    notes = (*_compared(optimum.to_datatree()), *_left_out(lost), *notes)
+    lost, broken = (
+        {name: each[key] for name, each in optimum.support.items()}
+        for key in ("lost_mass", "failed_mass")
+    )
+    failed, harmless = _failed(optimum.failures, lost, broken)
+    notes = (*_compared(optimum.to_datatree()), *_left_out(lost), *harmless, *notes)
     return Diagnosis((*messages, *failed, *_unsupported(designs)), designs.support, notes)
 
 
@@ -219,29 +222,55 @@ def _of_stored_optimum(result: xr.DataTree) -> Diagnosis:
     if not attrs.get("converged", True) and not attrs.get("stopped"):
         messages.append(_not_converged(str(attrs.get("message", ""))))
     refits = _not_looked_at("refits need the model; pass the Optimum itself")
-    notes = (*_compared(result), *_left_out(_lost_in(result)), *refits)
-    return Diagnosis((*messages, *_failed_in(result)), xr.Dataset(), notes)
+    failed, harmless = _failed_in(result)
+    notes = (*_compared(result), *_left_out(_lost_in(result)), *harmless, *refits)
+    return Diagnosis((*messages, *failed), xr.Dataset(), notes)
 
 
-def _failed_in(result: xr.DataTree) -> list[str]:
-    return _failed(result["failures"].to_dataset()) if "failures" in result.children else []
+def _failed_in(result: xr.DataTree) -> tuple[list[str], list[str]]:
+    if "failures" not in result.children:
+        return [], []
+    failures = result["failures"].to_dataset()
+    return _failed(failures, _lost_in(result), _lost_in(result, "failed_mass"))
 
 
-def _failed(failures: xr.Dataset) -> list[str]:
-    """Say which responses failed, and why the first did."""
-    found = []
+def _failed(
+    failures: xr.Dataset, lost: Mapping[str, float], broken: Mapping[str, float]
+) -> tuple[list[str], list[str]]:
+    """Say which responses failed, and why the first did: where it matters, and where it does not.
+
+    It does not where they have next to no weight in the populations that are answered for, by the
+    shares without response and of specimens that failed.
+    """
+    found: list[str] = []
+    harmless: list[str] = []
     names = failures["simulator"].values
     for name in dict.fromkeys(names.tolist()):
         own = failures.isel(failure=np.flatnonzero(names == name))
         inputs = own["inputs"].values[0]
         at = ", ".join(f"{x:.6g}" for x in inputs[~np.isnan(inputs)])
-        found.append(
+        said = (
             f"The response of {name} failed at {own.sizes['failure']} point(s), the first at "
-            f"({at}): {own['reason'].values[0]}; what took its place is no result. Look at "
-            "optimum.failures, or the group failures of a result, and repair the response"
+            f"({at}): {own['reason'].values[0]}; "
+        )
+        if _weight_of(own, lost.get(name, np.nan), broken.get(name, np.nan)) < TOLD_SHARE:
+            harmless.append(f"{said}the populations of the answer have next to no specimens there.")
+            continue
+        found.append(
+            f"{said}what took its place is no result. Look at optimum.failures, or the group "
+            "failures of a result, and repair the response"
             f"{more_in('expensive.md#when-a-run-fails')}."
         )
-    return found
+    return found, harmless
+
+
+def _weight_of(failures: xr.Dataset, lost: float, broken: float) -> float:
+    """Return the share of an answer's populations at failures, at most; NaN if it is not known."""
+    if "instead" not in failures:
+        return np.nan
+    # A number in its place looks like any other response.
+    instead = failures["instead"].values[0]
+    return lost if np.isnan(instead) else broken if np.isposinf(instead) else np.nan
 
 
 def _left_out(lost: Mapping[str, float]) -> tuple[str, ...]:
@@ -255,15 +284,18 @@ def _left_out(lost: Mapping[str, float]) -> tuple[str, ...]:
     )
 
 
-def _lost_in(result: xr.DataTree) -> dict[str, float]:
-    """Return the share without response by simulator, at the optimum or over the draws."""
-    if "calibration" not in result or "lost_mass" not in result["calibration"]:
+def _lost_in(result: xr.DataTree, key: str = "lost_mass") -> dict[str, float]:
+    """Return the share without response by simulator, at the optimum or over the draws.
+
+    Or that of specimens that failed.
+    """
+    if "calibration" not in result or key not in result["calibration"]:
         return {}
     calibration = result["calibration"].to_dataset()
-    shares = calibration["lost_mass"].transpose("simulator", ...).values
+    shares = calibration[key].transpose("simulator", ...).values
     means = shares.reshape(len(shares), -1).mean(axis=1)
-    if "lost_mass_at_best" in calibration:
-        means = np.where(np.isnan(means), calibration["lost_mass_at_best"].values, means)
+    if f"{key}_at_best" in calibration:
+        means = np.where(np.isnan(means), calibration[f"{key}_at_best"].values, means)
     names = calibration["simulator"].values.tolist()
     return dict(zip(names, means.tolist(), strict=True))
 
@@ -296,17 +328,24 @@ def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
         designs = _computed(Evaluator(model), _thetas(posterior, model))
     if model is not None:
         variables = variables[[str(rv.name) for rv in model.free_RVs]]
+    failed, harmless = _failed_in(result)
     messages = [
         *_warnings(posterior.attrs),
         *_convergence(variables),
         *_copies(_before_adjustment(result, variables)),
         *_motion(result),
-        *_failed_in(result),
+        *failed,
         *_unsupported(designs),
     ]
     refits = _of_refits(posterior.attrs, several=_has_several_outputs(result))
     lost = _lost_in(result) or _lost_by(designs)
-    notes = (*_compared(result), *_left_out(lost), *_unadjusted(posterior.attrs), *refits)
+    notes = (
+        *_compared(result),
+        *_left_out(lost),
+        *harmless,
+        *_unadjusted(posterior.attrs),
+        *refits,
+    )
     return Diagnosis(tuple(messages), designs.support, notes)
 
 

@@ -17,7 +17,7 @@ from arviz_stats import rhat
 from scipy import stats
 
 import prbayes as prb
-from prbayes._diagnose import _NOISE
+from prbayes._diagnose import _NOISE, _failed
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.chains import Particles
 from prbayes.posterior.smc import _refuse_lost
@@ -489,6 +489,23 @@ def test_failed_responses_are_part_of_results_diagnosis_and_report() -> None:
     (section,) = [s for s in report.sections if s.title == "Failed responses"]
     assert section.table["reason"].tolist()[0] == "it raised OSError: license server"
     assert len(section.table) <= 20
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_run_that_failed_far_from_the_answer_is_no_problem(value: float) -> None:
+    policy = prb.response.Replace(value)
+    for limit, ok in ((3.5, True), (1.2, False)):
+        model = failing(prb.Reweighted(64, on_failure=policy, max_lost=0.5), limit=limit)
+        optimum = prb.minimize(model, progressbar=False)
+        assert optimum.failures.sizes["failure"] > 0
+        for result in (optimum, optimum.to_datatree()):
+            found = prb.diagnose(result)
+            told = [line for line in found.notes if "next to no specimens there" in line]
+            problems = [line for line in found.messages if "is no result" in line]
+            assert (bool(told), bool(problems)) == (ok, not ok)
+    failures = optimum.failures.drop_vars("instead")
+    _, harmless = _failed(failures, {"y": 0.0}, {"y": 0.0})
+    assert not harmless  # of files that do not say what took the place
 
 
 def test_results_without_failures_have_no_table_of_them() -> None:

@@ -61,12 +61,17 @@ def labelled(evaluator: Evaluator, values: dict[str, Any], leading: dict[str, in
 def failures_dataset(evaluator: Evaluator) -> xr.Dataset:
     """Return the points whose response failed so far: simulator, inputs and reason of each.
 
+    And what took its place, ``instead``: NaN for none.
+
     Dims (failure) and (failure, column): the arguments of the response one after the other, NaN
     where another simulator has more of them.
     """
     each = []
+    instead = []
     for node in evaluator.nodes:
-        each += [(node.name, failure) for failure in node.bound.responses.failed]
+        own = node.bound.responses.failed
+        each += [(node.name, failure) for failure in own]
+        instead += [node.bound.responses.replacement] * len(own)
     columns = max((failure.inputs.size for _, failure in each), default=0)
     inputs = np.full((len(each), columns), np.nan)
     for row, (_, failure) in zip(inputs, each, strict=True):
@@ -78,6 +83,7 @@ def failures_dataset(evaluator: Evaluator) -> xr.Dataset:
             "simulator": ("failure", names.astype(str)),
             "inputs": (["failure", "column"], inputs),
             "reason": ("failure", reasons.astype(str)),
+            "instead": ("failure", np.array(instead, dtype=float)),
         }
     )
 

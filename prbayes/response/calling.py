@@ -76,8 +76,11 @@ class scalar:  # noqa: N801 (reads as a function in a model)
             raise TypeError(f"scalar: got {got}, expected a function of one specimen's inputs")
         self.function = function
 
-    def __call__(self, *inputs: Any) -> Floats:
-        """Call the function for each element of arrays that broadcast against each other."""
+    def __call__(self, *inputs: Any) -> Floats | dict[str, Floats]:
+        """Call the function for each element of arrays that broadcast against each other.
+
+        Outputs by name where the function returns a mapping.
+        """
         arrays = np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in inputs))
         columns = [array.ravel() for array in arrays]
         specimens = zip(*columns, strict=True)
@@ -92,7 +95,9 @@ class scalar:  # noqa: N801 (reads as a function in a model)
             outputs = _told_by(result, 0, outputs)
             values.append(_of_one(result, outputs if isinstance(result, Mapping) else None))
         event = np.shape(values[0]) if values else ()
-        return np.array(values).reshape(arrays[0].shape + event)
+        found = np.array(values).reshape(arrays[0].shape + event)
+        # What has names keeps them: in a function around this one places would be other outputs'.
+        return found if outputs is None else outputs.by_key(found)
 
 
 @dataclass(frozen=True)
@@ -194,6 +199,7 @@ class Tally:
     computed: int = 0
     failures: int = 0  # points whose response failed in the end and was replaced
     seconds: float = 0.0  # that one response takes, measured; 0 as long as nothing is known
+    good: bool = False  # whether any run gave a response
     named: Outputs | None = None  # what mappings call the columns, where nobody knew
     failed: dict[bytes, Failure] = field(default_factory=dict)  # by inputs, the first of them
 
@@ -261,6 +267,10 @@ def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
             for rows, chunk in done:
                 values = _filled_in(values, rows, tally.aligned(chunk))
                 raised.update({int(rows[i]): text for i, text in chunk.raised.items()})
+                tally.good = tally.good or len(chunk.raised) < len(rows)
+            if not tally.good and raised and all(map(_is_misfit, raised.values())):
+                # Not one run has given a response so far: no failure, but another function.
+                raise _failed(calling, raised)
             if calling.store is not None:
                 # NaN is a result, too, after the last try, but not where a chunk broke off.
                 _keep(calling.store, keys, done, last=last, tolerant=tolerant)
@@ -395,11 +405,23 @@ def _failed(calling: Calling, raised: dict[int, str]) -> ResponseError:
     kept = ""
     if calling.store is not None:
         kept = f"; {len(calling.store)} responses are kept in {calling.store.folder}"
+    policies = "on_failure=prb.response.Replace() or prb.response.Retry()"
+    advice = f"repair it, or pass {policies} to the propagation or surrogate"
+    if _is_misfit(first):
+        advice = f"repair it; if this is what a run that failed returns, pass {policies}"
     return ResponseError(
-        f"{calling.name}: the response failed at {len(raised)} point(s): {first}{kept}; "
-        "repair it, or pass on_failure=prb.response.Replace() or prb.response.Retry() "
-        "to the propagation or surrogate"
+        f"{calling.name}: the response failed at {len(raised)} point(s): {first}{kept}; {advice}"
     )
+
+
+# How the reason begins where a function of one specimen returned what is no response.
+_IT = "it "
+_RETURNED = f"{_IT}returned "
+
+
+def _is_misfit(reason: str) -> bool:
+    """Return whether a function of one specimen returned what is no response."""
+    return reason.startswith(_RETURNED)
 
 
 # -- sending out -----------------------------------------------------------------------------------
@@ -600,6 +622,10 @@ def _one_by_one(
     return values, raised, outputs
 
 
+class _NoResponseError(ResponseError):
+    """A function of one specimen returned something that is no response."""
+
+
 def _told_by(result: Any, batch_ndim: int, outputs: Outputs | None) -> Outputs | None:
     """Return the outputs, which a mapping tells where nobody knew them."""
     if outputs is None and isinstance(result, Mapping):
@@ -612,7 +638,11 @@ def _of_one(result: Any, outputs: Outputs | None) -> Floats:
     one = np.ndim(result) == 0 if outputs is None else not outputs.event
     if one and not isinstance(result, Mapping):
         return np.asarray(float(result))
-    return checked(result, (), (), outputs)
+    try:
+        return checked(result, (), (), outputs)
+    except ResponseError as error:
+        text = str(error).removeprefix("the response ")
+        raise _NoResponseError(f"{_IT}{text}") from None
 
 
 def _at_once(
@@ -650,6 +680,8 @@ def _said(error: BaseException) -> str:
 
     A few lines are enough: what a program printed may be long.
     """
+    if isinstance(error, _NoResponseError):
+        return str(error)
     try:
         text = str(error)
     except Exception as other:

@@ -45,6 +45,17 @@ class Outputs:
         """The labels as text."""
         return tuple(f"{x:g}" if isinstance(x, float) else str(x) for x in self.labels)
 
+    def by_key(self, values: Floats) -> dict[str, Floats]:
+        """Return outputs in the last axis, (..., m), as the mapping that they were assembled of."""
+        found = {}
+        first = 0
+        for key, size in self.keys:
+            last = first + (1 if size is None else size)
+            columns = values[..., first:last]
+            found[key] = columns[..., 0] if size is None else columns
+            first = last
+        return found
+
     def assembled(self, result: Mapping[str, Any]) -> Any:
         """Return a mapping's arrays as one, outputs in the last axis.
 

@@ -249,6 +249,12 @@ class Responses:
         return self._tally.failures
 
     @property
+    def replacement(self) -> float:
+        """What takes the place of a response that failed; NaN if nothing does."""
+        value = self._calling.on_failure.final.replacement
+        return np.nan if value is None else float(value)
+
+    @property
     def failed(self) -> tuple[Failure, ...]:
         """The points that failed, each once, with their reasons; the first ten thousand."""
         return tuple(self._tally.failed.values())

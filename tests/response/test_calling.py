@@ -389,6 +389,38 @@ def test_a_wrong_shape_is_a_mistake_and_no_failure() -> None:
 
 
 @pytest.mark.parametrize("version", [None, "1"])
+def test_a_function_that_never_gives_what_is_observed_ends_the_run_whatever_the_policy() -> None:
+    columns = {"a": np.arange(20.0), "b": np.arange(20.0) ** 2}
+    policy = prb.response.Retry(1, then=prb.response.Replace())
+    calls = 0
+
+    def outputs(x: float, y: float) -> dict[str, float]:
+        nonlocal calls
+        calls += 1
+        return {"a": x, "c": y} if calls > good else {"a": x, "b": y}
+
+    def run() -> prb.Optimum:
+        with pm.Model() as model:
+            inputs = [pm.Normal.dist(pm.Normal(name, 5, 5), 5.0) for name in ("mu", "nu")]
+            prb.Simulator(
+                "y", prb.scalar(outputs), *inputs, metric=prb.Joint(prb.AreaMetric()),
+                observed=columns, propagation=prb.Reweighted(64, on_failure=policy),
+            )  # fmt: skip
+            return prb.minimize(model, progressbar=False, max_runs=64)
+
+    good = 0
+    wrong = r"keys \['a', 'c'\], expected \['a', 'b'\].*; repair it; if this is what a run that"
+    with pytest.raises(prb.response.ResponseError, match=wrong):
+        run()
+    assert calls < 5
+    # Later on it is what some runs return that failed.
+    good, calls = 60, 0
+    with pytest.raises(prb.BudgetError) as caught:
+        run()
+    assert calls >= 64
+    assert "keys" not in str(caught.value)
+
+
 def test_nothing_is_computed_twice_but_one_response_without_a_version(
     version: str | None, tmp_path: Path
 ) -> None:

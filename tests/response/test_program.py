@@ -100,7 +100,14 @@ def test_a_run_has_several_outputs_as_an_array_or_by_name() -> None:
     settings: dict[str, Any] = {"inputs": ["x"]}
     as_array = prb.command([*PYTHON, code], read=both, **settings)
     np.testing.assert_array_equal(as_array(x), np.stack([x, 3 * x], axis=-1))
-    found = prb.command([*PYTHON, code], read=named, **settings).function(2.0)
+    by_name = prb.command([*PYTHON, code], read=named, **settings)
+    found: dict[str, Any] = by_name(x)  # type: ignore[assignment]
+    np.testing.assert_array_equal(found["twice"], np.stack([3 * x, x], axis=-1))
+    np.testing.assert_array_equal(found["one"], x)
+    # A function around it, as for a vector of inputs, keeps the names.
+    around = prb.scalar(lambda pair: by_name(pair[0]))
+    assert set(around.function(np.array([2.0, 1.0]))) == {"twice", "one"}
+    found = by_name.function(2.0)
     assert found.pop("twice").tolist() == [6.0, 2.0]
     assert found == {"one": 2.0}
     assert type(found["one"]) is float
