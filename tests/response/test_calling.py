@@ -388,7 +388,6 @@ def test_a_wrong_shape_is_a_mistake_and_no_failure() -> None:
 # -- what is stored --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("version", [None, "1"])
 def test_a_function_that_never_gives_what_is_observed_ends_the_run_whatever_the_policy() -> None:
     columns = {"a": np.arange(20.0), "b": np.arange(20.0) ** 2}
     policy = prb.response.Retry(1, then=prb.response.Replace())
@@ -406,7 +405,7 @@ def test_a_function_that_never_gives_what_is_observed_ends_the_run_whatever_the_
                 "y", prb.scalar(outputs), *inputs, metric=prb.Joint(prb.AreaMetric()),
                 observed=columns, propagation=prb.Reweighted(64, on_failure=policy),
             )  # fmt: skip
-            return prb.minimize(model, progressbar=False, max_runs=64)
+            return prb.minimize(model, progressbar=False)
 
     good = 0
     wrong = r"keys \['a', 'c'\], expected \['a', 'b'\].*; repair it; if this is what a run that"
@@ -415,12 +414,12 @@ def test_a_function_that_never_gives_what_is_observed_ends_the_run_whatever_the_
     assert calls < 5
     # Later on it is what some runs return that failed.
     good, calls = 60, 0
-    with pytest.raises(prb.BudgetError) as caught:
+    with pytest.raises(prb.propagation.DesignError, match="lost mass"):
         run()
     assert calls >= 64
-    assert "keys" not in str(caught.value)
 
 
+@pytest.mark.parametrize("version", [None, "1"])
 def test_nothing_is_computed_twice_but_one_response_without_a_version(
     version: str | None, tmp_path: Path
 ) -> None:
