@@ -135,7 +135,8 @@ class Reweighted(Propagation):
         and none is computed again. You then answer for a new name whenever the response changes;
         needed for one that is random, or minutes long.
     on_failure : Abort, Replace or Retry
-        What to do with a response that raises or is NaN.
+        What to do with a response that raises, and if asked for with one that is NaN: by default
+        that is a result, of a specimen without response.
     retry_failed : bool
         Whether points that the store has as failed are computed again. Under `Abort` they are in
         any case: a failure is no result.

@@ -719,10 +719,12 @@ def checked(
     event = array.shape[len(batch) :]
     wanted = event[:1] if outputs is None else outputs.event
     if array.shape != batch + wanted:
-        remedy = (
-            "reduce over the event axis only (the last one), or wrap a function of one specimen in "
-            "prb.scalar"
-        )
+        remedy = "return as many numbers as were observed of a specimen"
+        if batch:
+            remedy = (
+                "reduce over the event axis only (the last one), or wrap a function of one "
+                "specimen in prb.scalar"
+            )
         if event and event in {np.shape(a)[len(batch) :] for a in arguments}:
             remedy = (
                 "it is as long as an input, which has several elements; reduce over them, or where "
@@ -730,7 +732,7 @@ def checked(
                 "prb.response.group"
             )
         raise ResponseError(
-            f"the response returned shape {array.shape} for inputs of shapes {shapes(arguments)}, "
+            f"the response returned shape {array.shape}{_for_inputs(arguments)}, "
             f"expected {batch + wanted}: {_each(wanted)}; {remedy}"
         )
     values = array.astype(np.float64)
@@ -741,6 +743,11 @@ def checked(
 
 def _each(event: tuple[int, ...]) -> str:
     return f"{event[0]} outputs per specimen" if event else "one response per specimen"
+
+
+def _for_inputs(arguments: Sequence[Any]) -> str:
+    """Return for which inputs, as a clause; of one specimen there is nothing to say."""
+    return f" for inputs of shapes {shapes(arguments)}" if arguments else ""
 
 
 def shapes(arguments: Sequence[Any]) -> str:

@@ -287,6 +287,32 @@ def test_reweighted_calls_the_response_n_times_in_all() -> None:
     )
 
 
+def test_data_beyond_all_responses_are_told_of_at_once(caplog: pytest.LogCaptureFixture) -> None:
+    def both(x: Any) -> Any:
+        return np.stack([x, 2 * x], axis=-1)
+
+    measured = np.random.default_rng(0).normal(0.0, 1.0, (20, 2))
+    for factor in (1.0, 1000.0):  # on both sides of zero no unit is seen
+        _simulate(both, measured * factor)
+    assert "look at the units" not in caplog.text
+    _simulate(both, np.abs(measured) + [0.0, 1e4])
+    (record,) = [r for r in caplog.records if "look at the units" in r.message]
+    assert record.message.startswith("y[1]: got observed values from 1e+04 to 1e+04, all above the")
+    caplog.clear()
+    _simulate(np.exp, -1.0 - np.abs(measured[:, 0]))
+    assert "y: got observed values from -" in caplog.text
+    assert "all below the first 64 responses" in caplog.text
+
+
+def _simulate(response: Callable[..., Any], observed: Any) -> None:
+    several = np.ndim(observed) > 1
+    with pm.Model():
+        x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
+        metric = prb.Joint(prb.AreaMetric()) if several else prb.AreaMetric()
+        propagation = prb.Reweighted(64)
+        prb.Simulator("y", response, x, metric=metric, observed=observed, propagation=propagation)
+
+
 @pytest.mark.parametrize("response", [line, BlackBox()])
 def test_resimulated_counts_its_responses(response: Any) -> None:
     model, node = build(prb.Resimulated(64), response)
