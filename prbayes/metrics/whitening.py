@@ -79,10 +79,11 @@ def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> Whi
     weights = weights / weights.sum()
     n, m = sample.shape
     if n < m + 2:
+        turned = "" if n > m else "; rows are specimens: is it transposed?"
         raise ValueError(
             f"observed: got {n} specimens with finite outputs {_listed(outputs)} (counted from 0), "
             f"expected at least {m + 2} for {m} outputs; leave outputs out, or compare them by "
-            "prb.MarginalCorrelation(metric)"
+            f"prb.MarginalCorrelation(metric){turned}"
         )
     center, unit = units(sample, weights, outputs)
     z = (sample - center) / unit

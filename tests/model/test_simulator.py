@@ -295,7 +295,7 @@ def test_data_beyond_all_responses_are_told_of_at_once(caplog: pytest.LogCapture
     for factor in (1.0, 1000.0):  # on both sides of zero no unit is seen
         _simulate(both, measured * factor)
     assert "look at the units" not in caplog.text
-    _simulate(both, np.abs(measured) + [0.0, 1e4])
+    _simulate(both, np.add(np.abs(measured), [0.0, 1e4]))
     (record,) = [r for r in caplog.records if "look at the units" in r.message]
     assert record.message.startswith("y[1]: got observed values from 1e+04 to 1e+04, all above the")
     caplog.clear()
