@@ -79,7 +79,7 @@ def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> Whi
     weights = weights / weights.sum()
     n, m = sample.shape
     if n < m + 2:
-        turned = "" if n > m else "; rows are specimens: is it transposed?"
+        turned = "" if n > max(m, 3) else "; rows are specimens: is it transposed?"
         raise ValueError(
             f"observed: got {n} specimens with finite outputs {_listed(outputs)} (counted from 0), "
             f"expected at least {m + 2} for {m} outputs; leave outputs out, or compare them by "
