@@ -160,9 +160,16 @@ class Program:
             If there are more or fewer inputs than names.
         """
         if len(values) != len(self.inputs):
+            hint = ""
+            if len(values) == 1 and np.size(values[0]) == len(self.inputs):
+                elements = ", ".join(f"x[{i}]" for i in range(len(self.inputs)))
+                hint = (
+                    "; one input that has these as its elements, as correlated ones are, is taken "
+                    f"apart by prb.scalar(lambda x: program({elements}))"
+                )
             raise ValueError(
                 f"{self.__name__}: got {len(values)} inputs, expected {len(self.inputs)}: "
-                f"{', '.join(self.inputs)}"
+                f"{', '.join(self.inputs)}{hint}"
             )
         known = dict(zip(self.inputs, values, strict=True))
         if self.folder is not None:

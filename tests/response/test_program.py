@@ -104,6 +104,12 @@ def test_a_run_has_several_outputs_as_an_array_or_by_name() -> None:
     found: dict[str, Any] = by_name(x)  # type: ignore[assignment]
     np.testing.assert_array_equal(found["twice"], np.stack([3 * x, x], axis=-1))
     np.testing.assert_array_equal(found["one"], x)
+    with pytest.raises(
+        ValueError, match=r"got 1 inputs, expected 2: a, b; .*program\(x\[0\], x\[1\]"
+    ):
+        prb.command([*PYTHON, "print({a} + {b})"], inputs=["a", "b"], read=printed).function(
+            np.ones(2)
+        )
     # A function around it, as for a vector of inputs, keeps the names.
     around = prb.scalar(lambda pair: by_name(pair[0]))
     assert set(around.function(np.array([2.0, 1.0]))) == {"twice", "one"}
