@@ -178,7 +178,8 @@ def _answer(m: Material) -> str:
         return f"The answer is in the table of the {kind}."
     pairs = []
     for name, (value, sd) in estimates.items():
-        pairs.append(f"{named(name, m.labels)} = {plus_minus(value, sd)}")
+        found = f"= {plus_minus(value, sd)}" if sd < np.inf else "is not identified"
+        pairs.append(f"{named(name, m.labels)} {found}")
     which = f" of {label}" if len(of_kind) > 1 else ""
     return f"The answer{which} is {', '.join(pairs)} ({what})."
 
@@ -211,7 +212,9 @@ def _agreement(m: Material) -> str:
     """Return how far apart two results are; nothing of more."""
     if m.comparison is None or m.comparison.sizes["result"] != 2:
         return ""
-    shifts = np.abs(m.comparison["shift"].values)
+    # What one of them does not identify has no estimate there.
+    told = np.isfinite(m.comparison["sd"]).all("result")
+    shifts = np.abs(m.comparison["shift"].where(told).values)
     if not np.isfinite(shifts).any():
         return ""
     largest = float(np.nanmax(shifts))

@@ -5,6 +5,7 @@ import re
 from typing import Any
 
 import numpy as np
+import pymc as pm
 import pytest
 import xarray as xr
 
@@ -80,6 +81,24 @@ def test_without_spread_nothing_is_said_of_the_distance() -> None:
     other = draws(p=np.full((1, 5), 2.0))
     text = " ".join(summary(material(posterior={"a": fixed, "b": other})))
     assert "differ by" not in text
+
+
+def test_what_is_not_identified_has_no_estimate() -> None:
+    rng = np.random.default_rng(1)
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, 2)
+        pm.Normal("idle", mu, 3)
+        x = pm.Normal.dist(mu, 1.0)
+        prb.Simulator("y", np.positive, x, metric=prb.AreaMetric(), observed=rng.normal(size=30))
+    optimum = prb.minimize(model, progressbar=False)
+    own = {"mu": rng.normal(size=(2, 50)), "idle": rng.normal(5.0, 3.0, size=(2, 50))}
+    text = " ".join(summary(material(optimum=optimum, posterior=draws(**own), model=model)))
+    assert "differ by at most" in text
+    far = float(re.findall(r"differ by at most ([\d.]+)", text)[0])
+    assert far < 1.0  # that of mu
+    text = " ".join(summary(material(optimum=optimum, model=model)))
+    assert "idle is not identified" in text
+    assert "inf" not in text
 
 
 def test_a_verdict_names_the_sign(calibrated: Any) -> None:
