@@ -101,15 +101,14 @@ def identified_by_area(information: Information, weakest: float = 1.0) -> Floats
         changes = np.abs(vectors.T @ _in_prior_sd(area, information))
         change = change + (changes * area.lengths).sum(axis=-1)
     found = weakest * change > _CHANGE * information.noise_floor
-    points = information.node.bound.blocks
-    if points.size >= _HALVED:
+    if information.blocks.size >= _HALVED:
         found &= _halves_agree(information, vectors)
     return np.asarray(vectors[:, found])
 
 
 def _halves_agree(information: Information, vectors: Floats) -> NDArray[np.bool_]:
     """Return along which directions both halves of the points change alike, shape (d,)."""
-    blocks = information.node.bound.blocks
+    blocks = information.blocks
     of_even = information.areas(*information.data_set, blocks % 2 == 0)
     of_odd = information.areas(*information.data_set, blocks % 2 == 1)
     both = one = other = np.zeros(vectors.shape[1])

@@ -68,6 +68,7 @@ class Stencil:
     step: Floats  # (d,): the step, shorter where the prior is wide beside the population
     values: Floats  # (s, n), or (s, n, m) of several outputs
     weights: Floats  # (s, n)
+    blocks: NDArray[np.intp]  # (n,): of the design's points, which may change afterwards
     target: Discrepancy
 
     @cached_property
@@ -172,7 +173,12 @@ class Information:
         """Return the populations within given steps."""
         thetas = self.theta + stencil(step.size) * step
         values, weights = self.evaluator.populations(thetas, self.k)
-        return Stencil(share, step, values, weights, self._target)
+        return Stencil(share, step, values, weights, self.node.bound.blocks, self._target)
+
+    @property
+    def blocks(self) -> NDArray[np.intp]:
+        """The block of each point of the populations around theta, (n,)."""
+        return self._stencil.blocks
 
     @property
     def _step(self) -> Floats:

@@ -213,7 +213,7 @@ def _agreement(m: Material) -> str:
     if m.comparison is None or m.comparison.sizes["result"] != 2:
         return ""
     # What one of them does not identify has no estimate there.
-    told = np.isfinite(m.comparison["sd"]).all("result")
+    told = (m.comparison["sd"] < np.inf).all("result")
     shifts = np.abs(m.comparison["shift"].where(told).values)
     if not np.isfinite(shifts).any():
         return ""

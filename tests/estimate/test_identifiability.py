@@ -173,3 +173,22 @@ def test_directions_of_other_elements_are_left_out() -> None:
     left = without(hidden, others)
     assert unidentified_directions(left, ["m", "tau", "a", "b"]) == ["a + b"]
     assert without(hidden, np.zeros(4, dtype=bool)) is hidden
+
+
+def test_what_is_looked_at_stays_when_the_design_grows() -> None:
+    """Populations around an optimum are those of the design as it was."""
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        y = pm.Normal.dist(pm.Normal("nu", 0, 2), 0.5)
+        prb.Simulator(
+            "y", lambda x, y: x + y, x, y, metric=prb.AreaMetric(), observed=OBSERVED,
+            propagation=prb.Reweighted(1024, emulator=None),
+        )  # fmt: skip
+    evaluator = Evaluator(model)
+    theta = evaluator.initial
+    information = Information(evaluator, 0, theta, n_sets=20)
+    before = identified_by_area(information)
+    (design,) = evaluator.designs.values()
+    design.add([np.atleast_1d(values) for values in evaluator.roots(theta[None], 0)], 512)
+    assert design.n_points == 1536
+    np.testing.assert_array_equal(identified_by_area(information), before)
