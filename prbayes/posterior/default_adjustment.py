@@ -10,9 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from prbayes._checks import Floats
+from prbayes.estimate.data_sets import dependent
 from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.node import Node
 from prbayes.posterior.adjustment import Adjusted, Affine, Mapped
 from prbayes.posterior.given_estimate import GivenEstimate
 
@@ -55,8 +57,11 @@ def default_adjustment(evaluator: Evaluator) -> Affine:
 
 def _is_likelihood(evaluator: Evaluator) -> bool:
     """Return whether exp(-d / epsilon) is the likelihood of independent specimens, and smooth."""
-    if len(evaluator.nodes) > 1:  # others may share its specimens
-        return False
-    (node,) = evaluator.nodes
+    # Of several simulators, as groups are, where none shares specimens with another.
+    return not dependent(evaluator.nodes) and all(map(_tells_likelihood, evaluator.nodes))
+
+
+def _tells_likelihood(node: Node) -> bool:
+    """Return whether a simulator's term is the likelihood of its own specimens."""
     all_alike = np.isclose(node.n_specimens, len(node.target.observed))
     return node.target.exact and node.epsilon_is_default and node.bound.stored and bool(all_alike)

@@ -51,6 +51,35 @@ def test_what_is_not_quite_a_likelihood_is_adjusted(keywords: dict[str, Any]) ->
     assert chosen(**{"metric": METRICS["ll"]} | keywords) == GivenEstimate()
 
 
+def grouped(metric: prb.Metric) -> pm.Model:
+    places = np.repeat(["a", "b", "c"], 10)
+    observed = xr.DataArray(OBSERVED, coords={"g": ("specimen", places)}, dims="specimen")
+    with pm.Model(coords={"g": ["a", "b", "c"]}) as model:
+        mu = pm.Normal("mu", pm.Normal("m", 0, 2), pm.HalfNormal("tau", 1), dims="g")
+        x = pm.Normal.dist(mu[prb.response.group("g")], pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", same, x, metric=metric, observed=observed, propagation=R256)
+    return model
+
+
+def two(labels: Any) -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        for name in ("y", "z"):
+            prb.Simulator(
+                name, same, x, metric=METRICS["ll"], observed=OBSERVED, specimens=labels,
+                propagation=R256,
+            )  # fmt: skip
+    return model
+
+
+def test_likelihoods_of_different_specimens_are_one() -> None:
+    """Their draws are the posterior as they are, and refits would make them narrower."""
+    for model in (grouped(METRICS["ll"]), two(None)):
+        assert type(default_adjustment(Evaluator(model))).__name__ == "_LikelihoodDraws"
+    assert default_adjustment(Evaluator(two(np.arange(30)))) == GivenEstimate()
+    assert default_adjustment(Evaluator(grouped(METRICS["pr"]))) == Affine()
+
+
 def sample(model: pm.Model, **keywords: Any) -> xr.DataTree:
     return prb.sample_smc(200, chains=2, model=model, random_seed=1, progressbar=False, **keywords)
 
