@@ -48,11 +48,7 @@ class _LikelihoodDraws(Affine):
 
 def default_adjustment(evaluator: Evaluator) -> Affine:
     """Return what adjusts the draws of a model by default."""
-    if _is_likelihood(evaluator):
-        return _LikelihoodDraws()
-    # A prior that learns counts exactly in the straight map as well, which is quicker where there
-    # are many elements, and of which benchmarks/partial_pooling.py is.
-    return Affine() if evaluator.told_by_prior.any() else GivenEstimate()
+    return _LikelihoodDraws() if _is_likelihood(evaluator) else GivenEstimate()
 
 
 def _is_likelihood(evaluator: Evaluator) -> bool:

@@ -77,7 +77,7 @@ def test_likelihoods_of_different_specimens_are_one() -> None:
     for model in (grouped(METRICS["ll"]), two(None)):
         assert type(default_adjustment(Evaluator(model))).__name__ == "_LikelihoodDraws"
     assert default_adjustment(Evaluator(two(np.arange(30)))) == GivenEstimate()
-    assert default_adjustment(Evaluator(grouped(METRICS["pr"]))) == Affine()
+    assert default_adjustment(Evaluator(grouped(METRICS["pr"]))) == GivenEstimate()
 
 
 def sample(model: pm.Model, **keywords: Any) -> xr.DataTree:
