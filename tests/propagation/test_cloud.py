@@ -191,7 +191,7 @@ def test_parts_of_a_cloud_without_a_minimum_leave_its_error_to_the_others(
     optimum = prb.minimize(model, starts=0, refine=False, progressbar=False)
     sampling = SamplingDistribution.of(optimum.evaluator, optimum.theta, np.ones(1))
     found = iter([np.full(2, np.inf)] * lost + [np.array([k, -k]) for k in np.arange(8.0)])
-    monkeypatch.setattr(SamplingDistribution, "_roughly", lambda *_: next(found))
+    monkeypatch.setattr(SamplingDistribution, "_only", lambda *_: next(found))
     assert np.isfinite(sampling._error_of_points()).all() == known
 
 
