@@ -381,7 +381,10 @@ def _of_refits(attrs: Mapping[Any, Any], *, several: bool) -> tuple[str, ...]:
     if np.isfinite(probability):
         return ()
     said = str(attrs.get("adjustment", ""))
-    why = said.removeprefix("none").removeprefix(": ") or "there was no adjustment"
+    done, _, reason = said.partition(": ")
+    why = "they told nothing here"
+    if done.startswith("none") or not done:
+        why = reason or "there was no adjustment"
     return _not_looked_at(f"refits tell of it, and {why}; look at prb.diagnose of an optimum")
 
 

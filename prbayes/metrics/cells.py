@@ -25,7 +25,7 @@ def product(weights: Floats, matrix: Floats) -> Floats:
     """
     *batch, n = weights.shape
     m = matrix.shape[-1]
-    rows = weights.reshape(-1, n)
+    rows = weights.reshape(int(np.prod(batch, dtype=int)), n)
     found = rows @ matrix
     return found.reshape(*batch, m)
 

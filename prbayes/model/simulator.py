@@ -79,7 +79,7 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     *inputs
         Each is a ``.dist()`` (aleatory: varies between specimens), a model variable (epistemic:
         common to all specimens) or a constant. The same ``.dist()`` in two simulators means the
-        same specimens.
+        same population; that values were measured on the same specimens is said by ``specimens``.
     metric : Metric
         How simulated and observed responses are compared.
     observed : array_like, shape (N,) or (N, m), DataFrame, DataArray, mapping or pymc.Data

@@ -271,3 +271,10 @@ def test_a_product_of_rows_is_that_of_each_row() -> None:
     found = product(weights, matrix)
     np.testing.assert_allclose(found, np.einsum("ijn,nm->ijm", weights, matrix), rtol=1e-12)
     assert product(weights[0, 0], matrix).shape == (5,)
+
+
+def test_a_product_of_nothing_is_nothing() -> None:
+    """As where a part of the data has no value of a group."""
+    assert product(np.empty((0, 0)), np.empty((0, 5))).shape == (0, 5)
+    assert product(np.empty((2, 3, 0)), np.empty((0, 5))).shape == (2, 3, 5)
+    assert product(np.ones(4), np.ones((4, 5))).shape == (5,)
