@@ -259,6 +259,8 @@ def _tell_far_data(name: str, observed: Floats, responses: Floats, outputs: Outp
 
     As where one is in another unit: each run after that would be for nothing.
     """
+    if not responses.size:  # a propagation of one's own may keep none
+        return
     columns = observed.reshape(len(observed), -1).T
     simulated = responses.reshape(len(responses), -1).T
     if len(columns) != len(simulated):

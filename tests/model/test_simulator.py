@@ -20,8 +20,10 @@ import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node
+from prbayes.model.simulator import _tell_far_data
 from prbayes.propagation.base import Propagation
 from prbayes.response.compilation import PLAIN
+from prbayes.response.outputs import ONE
 
 
 @dataclass
@@ -302,6 +304,12 @@ def test_data_beyond_all_responses_are_told_of_at_once(caplog: pytest.LogCapture
     _simulate(np.exp, -1.0 - np.abs(measured[:, 0]))
     assert "y: got observed values from -" in caplog.text
     assert "all below the first 64 responses" in caplog.text
+
+
+def test_without_responses_nothing_is_told_of_the_data(caplog: pytest.LogCaptureFixture) -> None:
+    _tell_far_data("y", np.ones(5), np.empty(0), ONE)
+    _tell_far_data("y", np.ones((5, 2)), np.empty((0, 2)), ONE)
+    assert not caplog.records
 
 
 def _simulate(response: Callable[..., Any], observed: Any) -> None:
