@@ -77,14 +77,18 @@ def called(value: object) -> str:
     return f"{type(value).__name__} {on_one_line:.60}"
 
 
-def observed_sample(values: ArrayLike, name: str = "observed", *, minimum: int = 1) -> Floats:
-    """Check measured responses: one-dimensional, finite, at least ``minimum`` of them.
+def observed_sample(
+    values: ArrayLike, name: str = "observed", *, minimum: int = 1, failures: bool = False
+) -> Floats:
+    """Check measured responses: one-dimensional, at least ``minimum`` of them, and finite.
 
     Parameters
     ----------
     values : array_like, shape (N,)
     name : str
     minimum : int
+    failures : bool
+        Whether specimens may have failed, +inf, besides the minimum.
 
     Returns
     -------
@@ -105,14 +109,24 @@ def observed_sample(values: ArrayLike, name: str = "observed", *, minimum: int =
             f"{name}: got an array of shape {array.shape}, expected one dimension, (N,); "
             "several outputs of a specimen, (N, m), take prb.Joint(metric), or one Simulator each"
         )
-    if array.size < minimum:
-        few = "no values" if array.size == 0 else f"{array.size} value"
-        raise ValueError(f"{name}: got {few}, expected at least {minimum} measured responses")
-    bad = int((~np.isfinite(array)).sum())
+    failed = np.isposinf(array)
+    bad = int((~np.isfinite(array)).sum() - (failed.sum() if failures else 0))
     if bad:
+        what = ""
+        if failures:
+            what = ", and give those that had failed as +inf"
+        elif failed.any():
+            what = "; a specimen that failed, +inf, takes a metric that counts it"
         raise ValueError(
             f"{name}: got {bad} NaN or infinite among {array.size} values, expected finite ones; "
-            "leave missing specimens out"
+            f"leave missing specimens out{what}"
+        )
+    number = array.size - int(failed.sum())
+    if number < minimum:
+        few = "no values" if array.size == 0 else f"{number} value"
+        besides = f" besides {failed.sum()} of specimens that failed" if failed.any() else ""
+        raise ValueError(
+            f"{name}: got {few}{besides}, expected at least {minimum} measured responses"
         )
     return array
 

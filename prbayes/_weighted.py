@@ -26,6 +26,19 @@ Sorting = Literal["stable", "quicksort"]
 INTERVAL = 0.89
 
 
+def finite_sample(values: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """Return the finite values that have weight, (n,), with weights that sum to one.
+
+    Others are as if they had been left out: specimens that failed have no value.
+    """
+    counted = weights > 0
+    known = counted & np.isfinite(values)
+    own = weights[known]
+    if known.sum() < counted.sum():
+        own = own / own.sum()
+    return values[known], own
+
+
 def ranked(
     values: Floats, points: Floats, *, kind: Sorting = "stable"
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -121,10 +121,22 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         ValueError,
         r"y: observed: got 1 NaN .* leave missing",
     ),
-    "observed inf": (
-        simulator(observed=[1, np.inf, 2]),
+    "observed -inf": (
+        simulator(observed=[1, -np.inf, 2]),
         ValueError,
-        r"got 1 NaN or infinite among 3.*leave missing",
+        r"got 1 NaN or infinite among 3.*leave missing.*that had failed as \+inf",
+    ),
+    "observed inf": (
+        simulator(
+            observed=[1, np.inf, 2], metric=prb.FunctionMetric(lambda s, o, w: 0.0, weighted=True)
+        ),
+        ValueError,
+        r"got 1 NaN or infinite among 3.*\+inf, takes a metric that counts it",
+    ),
+    "observed failures": (
+        simulator(observed=[np.inf, np.inf, 2]),
+        ValueError,
+        r"got 1 value besides 2 of specimens that failed, expected at least 2",
     ),
     "observed masked": (
         simulator(observed=np.ma.masked_array([1, 2, 3], [0, 1, 0])),

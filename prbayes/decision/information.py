@@ -115,7 +115,7 @@ def fisher_information(told: Told) -> Floats:
     step = _LOG_WEIGHT_STEP * unit
     around = cross(center, step)
     _, weights = told.design.populations(evaluator.roots(around, told.k))
-    used = (weights[0] > 0) & observable(told.every)
+    used = (weights[0] > 0) & observable(told.every, evaluator.nodes[told.k].target)
     weights = weights[:, used]
     with np.errstate(divide="ignore", invalid="ignore"):
         scores = slopes(np.log(weights), step) * unit
@@ -155,7 +155,7 @@ def _ideal(told: Told, n: int) -> Floats:
     evaluator = told.populations.evaluator
     center = told.populations.center
     _, weights = told.design.populations(evaluator.roots(center[None], told.k))
-    seen = observable(told.every)
+    seen = observable(told.every, evaluator.nodes[told.k].target)
     values = told.every[seen]
     mass = weights[0][seen]
     first = values.reshape(len(values), -1)[:, 0]

@@ -234,8 +234,8 @@ def between_runs(evaluator: Evaluator, theta: Floats) -> list[str]:
             if not width > 0:
                 continue
             observed = part.target.observed
-            lonely = np.isfinite(observed)
-            lonely &= _nearest(part.of(values[0]), observed) > _APART_BY * width
+            observed = observed[np.isfinite(observed)]
+            lonely = _nearest(part.of(values[0]), observed) > _APART_BY * width
             if lonely.any():
                 told = ", ".join(f"{value:.4g}" for value in observed[lonely][:3])
                 lines.append(

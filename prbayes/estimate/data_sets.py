@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import AT_ONCE, Floats
+from prbayes.metrics.base import Discrepancy
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node
 from prbayes.response.distributions import PopulationSampler
@@ -133,9 +134,10 @@ def _same_specimens(node: Node, other: Node) -> bool:
 def simulated_sets(evaluator: Evaluator, theta: Floats, n_sets: int, seed: int = 0) -> DataSets:
     """Draw data sets of the observed sizes from the populations at theta (parametric bootstrap).
 
-    Only responses that are finite can be observed. Of populations of more than 2^15 points that
-    many, the first of a Sobol sequence, stand for all. Repeated observations of one specimen within
-    a simulator are equal, as the model has them.
+    Specimens without a response (NaN) cannot be observed, and those that failed (+inf) only where
+    the metric counts them. Of populations of more than 2^15 points that many, the first of a Sobol
+    sequence, stand for all. Repeated observations of one specimen within a simulator are equal, as
+    the model has them.
 
     Raises
     ------
@@ -173,7 +175,7 @@ def sets_along(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) -
         populations.append((responses, np.empty(0)))
     for group in groups(nodes):
         _refuse_unlike([nodes[k] for k in group])
-        finite = np.all([observable(populations[k][0][0]) for k in group], axis=0)
+        finite = _observable_together(nodes, populations, group)
         uniform = rng.random(size)
         drawn = _drawn_along(evaluator, group[0], thetas, finite, uniform)
         points |= dict.fromkeys(group, drawn)
@@ -228,7 +230,7 @@ def simulated_points(
         members = [nodes[k] for k in group]
         _refuse_unlike(members)
         # All that share specimens have the same points, with the same weights.
-        finite = np.all([observable(populations[k][0][0]) for k in group], axis=0)
+        finite = _observable_together(nodes, populations, group)
         _, weights = populations[group[0]]
         drawn = _draw(weights[0], finite, size, rng)
         draws |= dict.fromkeys(group, drawn)
@@ -244,7 +246,7 @@ def sets_at(
     weights = []
     for k, node in enumerate(evaluator.nodes):
         responses = populations[k][0][0]
-        finite = observable(responses)
+        finite = observable(responses, node.target)
         # The place of each point among those that can be observed.
         place = np.cumsum(finite) - 1
         measured = place[points[k][:, numbers[k]]]
@@ -278,14 +280,21 @@ def _seen(
     return places.reshape(measured.shape), shown
 
 
-def observable(responses: Floats) -> NDArray[np.bool_]:
+def observable(responses: Floats, target: Discrepancy) -> NDArray[np.bool_]:
     """Return which points can be observed, (n,) or (n, m) -> (n,).
 
-    Where specimens have several outputs, one that failed is observed as such.
+    A specimen that failed is observed as such, if the metric counts failures.
     """
-    if responses.ndim == 1:
-        return np.isfinite(responses)
-    return ~np.isnan(responses).any(axis=1)
+    known = ~np.isnan(responses) if target.metric.counts_failures else np.isfinite(responses)
+    return known if known.ndim == 1 else known.all(axis=1)
+
+
+def _observable_together(
+    nodes: list[Node], populations: list[tuple[Floats, Floats]], group: list[int]
+) -> NDArray[np.bool_]:
+    """Return which points can be observed by all of some simulators, (n,)."""
+    seen = [observable(populations[k][0][0], nodes[k].target) for k in group]
+    return np.asarray(np.all(seen, axis=0))
 
 
 def _patterns(observed: Floats) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
@@ -339,12 +348,12 @@ def _draw(
 def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) -> dict[str, Floats]:
     """Draw one data set from the populations at theta by calling the response.
 
-    Specimens whose response is not finite cannot be observed; others take their place.
+    Specimens that cannot be observed are replaced by others, as in `simulated_sets`.
 
     Raises
     ------
     ValueError
-        If hardly any response is finite.
+        If hardly any response can be observed.
     """
     nodes = evaluator.nodes
     numbers, total = specimens(nodes)
@@ -359,7 +368,8 @@ def fresh_data(evaluator: Evaluator, theta: Floats, rng: np.random.Generator) ->
             column = _responses(evaluator, theta, k, 4 * total, generator)
             columns.append(column)
         # What one simulator of a specimen cannot measure, none of them has.
-        finite = np.all([observable(column) for column in columns], axis=0)
+        targets = [nodes[k].target for k in group]
+        finite = np.all(list(map(observable, columns, targets)), axis=0)
         for k, column in zip(group, columns, strict=True):
             node = nodes[k]
             _refuse_few(node, finite, total)
@@ -385,8 +395,8 @@ def _refuse_few(node: Node, finite: NDArray[np.bool_], expected: int) -> None:
     count = finite.sum()
     if count < expected:
         raise ValueError(
-            f"{node.name}: got {count} finite responses of {finite.size}, expected at least "
-            f"{expected}"
+            f"{node.name}: got {count} responses that can be observed of {finite.size}, expected at "
+            f"least {expected}"
         )
 
 

@@ -34,6 +34,7 @@ from prbayes.estimate.caveats import (
     not_identified,
 )
 from prbayes.estimate.data_sets import SETS
+from prbayes.estimate.kernel_width import wide_kernels
 from prbayes.estimate.methods import Method
 from prbayes.estimate.objective import Hold
 from prbayes.estimate.obstacles import sampling_obstacle
@@ -749,6 +750,7 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State) -> Optimum:
         *breakdown(edge, jump),
         *heavy_tails(evaluator, state.theta),
         *between_runs(evaluator, state.theta),
+        *wide_kernels(evaluator, state.theta, state.scales, state.local),
         *caveats(evaluator, state.local, state.others, state.design_error),
     )
     for line in warnings:

@@ -193,7 +193,7 @@ class Information:
     def _center(self) -> tuple[Floats, Floats]:
         """The population at theta that could be observed: finite, with weights that sum to one."""
         values = self._stencil.values[0]
-        finite = observable(values)
+        finite = observable(values, self._target)
         weights = self._stencil.weights[0]
         mass = weights[finite]
         return values[finite], mass / mass.sum()
@@ -359,9 +359,8 @@ class Information:
 
     def _knots(self, values: Floats, observed: Floats) -> Floats:
         """Return values that occur, where distribution functions are exact, some hundred of all."""
-        finite = values[np.isfinite(values)]
-        occurring = np.concatenate([finite, observed])
-        knots = np.unique(occurring)
+        occurring = np.concatenate([values, observed])
+        knots = np.unique(occurring[np.isfinite(occurring)])
         places = np.linspace(0, knots.size - 1, _KNOTS)
         some = np.unique(places.astype(int))
         return np.asarray(knots[some])

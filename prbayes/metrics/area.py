@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats
-from prbayes._weighted import ranked, summed_below
+from prbayes._weighted import finite_sample, ranked, summed_below
 from prbayes.metrics.base import Discrepancy, Metric, Minimum
 
 
@@ -19,8 +19,8 @@ class AreaMetric(Metric):
     r"""Area between two distribution functions, in units of the response.
 
     :math:`\int |F(z) - S_N(z)|\,dz`, F of the simulated and :math:`S_N` of the observed values.
-    Exact for any sizes and weights; in one dimension it is the 1-Wasserstein distance. Simulated
-    specimens that failed (+inf) count in F below; the infinite last interval is left out.
+    Exact for any sizes and weights; in one dimension it is the 1-Wasserstein distance. Specimens
+    that failed (+inf) count below, in F and in S_N; the infinite last interval is left out.
 
     References
     ----------
@@ -33,6 +33,7 @@ class AreaMetric(Metric):
     """
 
     minimum: ClassVar[Minimum] = Minimum.ABSOLUTE
+    counts_failures: ClassVar[bool] = True
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         return AreaDiscrepancy(self, observed, weights)
@@ -44,10 +45,11 @@ class AreaDiscrepancy(Discrepancy):
     @property
     def scale(self) -> float:
         """Mean absolute deviation of observed values from their mean, or one if they are equal."""
-        from_least = self.observed - self.observed.min()  # equal values give exactly zero
-        mean = self.weights @ from_least
+        values, weights = finite_sample(self.observed, self.weights)
+        from_least = values - values.min()  # equal values give exactly zero
+        mean = weights @ from_least
         deviations = np.abs(from_least - mean)
-        mean_deviation = float(self.weights @ deviations)
+        mean_deviation = float(weights @ deviations)
         return mean_deviation if mean_deviation > 0 else 1.0
 
     def features(self, simulated: Any, weights: Any, xp: Any) -> tuple[Any, ...]:
@@ -77,9 +79,8 @@ class AreaDiscrepancy(Discrepancy):
 
         The knots are all finite values; last come the lengths of the intervals between them.
         """
-        finite = simulated[np.isfinite(simulated)]
-        both = np.concatenate([finite, self.observed])
-        knots = np.unique(both)
+        both = np.concatenate([simulated, self.observed])
+        knots = np.unique(both[np.isfinite(both)])
         starts = knots[:-1]
         order, below = ranked(simulated, starts, kind="quicksort")
         own, own_below = ranked(self.observed, starts, kind="quicksort")

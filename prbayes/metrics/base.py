@@ -197,6 +197,10 @@ class Discrepancy(ABC):
         """
         return 0.0
 
+    def narrowed(self, factor: float) -> Discrepancy:
+        """Return the same with that kernel narrowed by a factor; itself where it has none."""
+        return self
+
     @property
     def additive(self) -> bool:
         """Whether its gradient in the hyperparameters is a mean over observations."""
@@ -360,6 +364,9 @@ class Metric(ABC):
         sets. Metrics with a quadratic minimum are taken for additive unless they declare it.
     takes_weights : bool
         Whether simulated responses may have unequal weights, as under `Reweighted`.
+    counts_failures : bool
+        Whether observed values may be +inf, specimens that failed, as simulated ones may. Data sets
+        of its sampling distribution then have failures as well.
     tail_responses : int
         Simulated responses for each observation, all of equal weight, below which the metric sees
         too little of the population's tails; zero where that does not matter.
@@ -374,6 +381,7 @@ class Metric(ABC):
     minimum: ClassVar[Minimum] = Minimum.UNKNOWN
     likelihood: ClassVar[bool] = False
     distance: ClassVar[bool] = True
+    counts_failures: ClassVar[bool] = False
     tail_responses: ClassVar[int] = 0
 
     @property
@@ -419,7 +427,8 @@ class Metric(ABC):
         Parameters
         ----------
         observed : array_like, shape (N,)
-            Measured responses; (N, m) where the metric takes several outputs.
+            Measured responses; (N, m) where the metric takes several outputs. +inf is a specimen
+            that failed, where the metric counts failures.
         weights : array_like, shape (N,), optional
             Weights of the measured responses; equal by default.
 
@@ -434,8 +443,10 @@ class Metric(ABC):
             If the observed values are not one-dimensional, real and finite, or if the metric needs
             a bandwidth or bins and they are all equal.
         """
-        checked = observed_outputs if self.takes_outputs else observed_sample
-        sample = checked(observed)
+        if self.takes_outputs:
+            sample = observed_outputs(observed)
+        else:
+            sample = observed_sample(observed, failures=self.counts_failures)
         w = sample_weights(weights, len(sample), "observed weights")
         if w.ndim > 1:
             raise ValueError(f"observed weights: got shape {w.shape}, expected ({len(sample)},)")

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from prbayes._checks import Floats, positive_integer, positive_number
-from prbayes._weighted import quantile
+from prbayes._weighted import finite_sample, quantile
 from prbayes.metrics.cells import BinCells, Cells, KernelCells
 
 # Grid nodes per bandwidth. The density is then exact to 3e-5 of a kernel's peak, which a test
@@ -84,12 +84,6 @@ def likelihood_bandwidth(sample: Floats, weights: Floats) -> float:
     return float(0.35 * spread(sample, weights) * inverse_n**0.25)
 
 
-def _with_weight(observed: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Return the observed values that have weight; others are as if they had been left out."""
-    seen = weights > 0
-    return observed[seen], weights[seen]
-
-
 class DensityEstimator(ABC):
     """How densities are estimated; ``cells(observed, weights)`` lays out the cells once."""
 
@@ -142,7 +136,7 @@ class GaussianKDE(DensityEstimator):
 
     def cells(self, observed: Floats, weights: Floats) -> Cells:
         """Return a grid over the observed range and a margin: six bandwidths, or half the range."""
-        observed, weights = _with_weight(observed, weights)
+        observed, weights = finite_sample(observed, weights)
         h = self._bandwidth(observed, weights)
         step = h / _PER_BANDWIDTH
         low, n_nodes = _grid(observed, h, step)
@@ -230,7 +224,7 @@ class Histogram(DensityEstimator):
 
     def cells(self, observed: Floats, weights: Floats) -> Cells:
         """Return equal bins over the observed range, and one bin's width for either outside."""
-        observed, weights = _with_weight(observed, weights)
+        observed, weights = finite_sample(observed, weights)
         low = float(observed.min())
         high = float(observed.max())
         if high <= low:

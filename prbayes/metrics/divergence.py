@@ -44,6 +44,7 @@ class KullbackLeibler(Metric):
     density: DensityEstimator = field(default_factory=GaussianKDE)
     reverse: bool = False
     minimum: ClassVar[Minimum] = Minimum.QUADRATIC
+    counts_failures: ClassVar[bool] = True
     likelihood: ClassVar[bool] = True
 
     def __post_init__(self) -> None:

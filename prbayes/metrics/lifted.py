@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +20,7 @@ class LiftedMetric(Metric):
     """A metric of several outputs, made of a metric of one, whose properties it has."""
 
     metric: Metric
+    counts_failures: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if not isinstance(self.metric, Metric):

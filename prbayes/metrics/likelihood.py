@@ -28,7 +28,8 @@ class LogLikelihood(Metric):
     r"""Negative mean log-likelihood of observed values, :math:`-\frac{1}{N} \sum_i \log p(z_i)`.
 
     Only the simulated side is smoothed, which makes the fitted population narrower by about
-    :math:`h^2/(2\sigma^2)`; the default bandwidth keeps that below a tenth of the sampling error.
+    :math:`h^2/(2\sigma^2)`; the default bandwidth keeps that below a tenth of the sampling error of
+    a normal population. Where it is more, as of responses in groups, an optimum warns.
 
     Parameters
     ----------
@@ -50,6 +51,7 @@ class LogLikelihood(Metric):
 
     density: DensityEstimator = field(default_factory=lambda: GaussianKDE(likelihood_bandwidth))
     minimum: ClassVar[Minimum] = Minimum.QUADRATIC
+    counts_failures: ClassVar[bool] = True
     likelihood: ClassVar[bool] = True
     distance: ClassVar[bool] = False
     tail_responses: ClassVar[int] = 300  # from which standard errors are right to a tenth
@@ -93,6 +95,13 @@ class LikelihoodDiscrepancy(CellwiseDiscrepancy):
     def resolution(self) -> float:
         """That of a Gaussian kernel; a histogram has none."""
         return float(getattr(self.cells, "bandwidth", 0.0))
+
+    def narrowed(self, factor: float) -> Discrepancy:
+        """Return the same with a narrower kernel; a histogram stays as it is."""
+        if not self.resolution:
+            return self
+        kernel = GaussianKDE(factor * self.resolution)
+        return LogLikelihood(kernel).against(self.observed, self.weights)
 
     @property
     def constants(self) -> tuple[Any, ...]:

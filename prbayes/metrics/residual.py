@@ -60,6 +60,7 @@ class ProbabilityResidual(Metric):
     density: DensityEstimator = field(default_factory=GaussianKDE)
     scale_base: float = 100.0
     minimum: ClassVar[Minimum] = Minimum.QUADRATIC
+    counts_failures: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         density_estimator(self.density)

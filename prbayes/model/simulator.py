@@ -405,7 +405,7 @@ def _target(name: str, metric: Metric, observed: Floats, weights: ArrayLike | No
         )
     try:
         if np.ndim(observed) != 2:
-            observed = observed_sample(observed, minimum=2)
+            observed = observed_sample(observed, minimum=2, failures=metric.counts_failures)
         elif len(observed) < 2:
             raise ValueError(
                 f"observed: got {len(observed)} specimen(s), expected at least 2 of them"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from prbayes._checks import Floats
-from prbayes._weighted import quantile
+from prbayes._weighted import finite_sample, quantile
 from prbayes.metrics.base import Discrepancy, Metric, Part
 from prbayes.metrics.density import spread
 from prbayes.metrics.joint import Joint
@@ -88,7 +88,6 @@ def _logs(part: Part, points: Floats, simulated: Floats, weights: Floats) -> Flo
 
 def _wide(target: Discrepancy, points: Floats) -> Floats:
     """Return the density at points of what is spread widely over the observed values."""
-    observed = target.observed
-    weights = target.weights
-    middle = quantile(observed, weights, 0.5)
-    return np.asarray(student.pdf(points, _WIDE_DEGREES, middle, spread(observed, weights)))
+    values, weights = finite_sample(target.observed, target.weights)
+    middle = quantile(values, weights, 0.5)
+    return np.asarray(student.pdf(points, _WIDE_DEGREES, middle, spread(values, weights)))

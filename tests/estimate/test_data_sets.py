@@ -6,6 +6,7 @@ import numpy as np
 import pymc as pm
 import pytest
 from four_metrics import METRICS, R256, same, slow
+from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._checks import Floats
@@ -190,29 +191,49 @@ def test_shared_labels_of_different_inputs_or_designs_are_refused(keywords: dict
     assert len(simulated_sets(pair(None, None, **keywords), TRUTH, 5).values) == 3
 
 
+def weighted_mean(simulated: Any, observed: Any, weights: Any) -> Any:
+    known = np.isfinite(simulated)
+    return abs((np.where(known, simulated, 0) * weights).sum(axis=-1) - observed.mean())
+
+
 def failing(x: Any) -> Any:
     return np.where(x > 1.2, np.inf, np.where(x < 0, np.nan, x))
 
 
-def test_responses_that_are_not_finite_cannot_be_observed() -> None:
+def of_failing(metric: Any) -> Evaluator:
+    """A model of specimens of which half are lost, and a few fail."""
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 1), 0.5)
-        prb.Simulator(
-            "y",
-            failing,
-            x,
-            metric=AREA,
-            observed=OBSERVED[OBSERVED < 1],
-            propagation=prb.Reweighted(256, max_lost=0.9),
-        )
-    evaluator = Evaluator(model)
+        propagation = prb.Reweighted(256, max_lost=0.9)
+        observed = OBSERVED[OBSERVED < 1]
+        prb.Simulator("y", failing, x, metric=metric, observed=observed, propagation=propagation)
+    return Evaluator(model)
+
+
+def test_specimens_without_a_response_cannot_be_observed() -> None:
+    # Where a metric does not count failures, those neither.
+    evaluator = of_failing(prb.FunctionMetric(weighted_mean, weighted=True))
     sets = simulated_sets(evaluator, TRUTH, 50)
     assert np.isfinite(sets.values[0]).all()
     np.testing.assert_allclose(sets.weights[0].sum(axis=1), 1)
     fresh = fresh_data(evaluator, TRUTH, np.random.default_rng(0))["y"]
     assert ((fresh > 0) & (fresh < 1.2)).all()
-    with pytest.raises(ValueError, match="y: got 0 finite responses of"):
+    with pytest.raises(ValueError, match="y: got 0 responses that can be observed of"):
         fresh_data(evaluator, np.array([9.0]), np.random.default_rng(0))
+
+
+def test_specimens_that_failed_are_observed_as_such() -> None:
+    evaluator = of_failing(AREA)
+    among = norm.sf(1.2, *TRUTH, 0.5) / norm.sf(0, *TRUTH, 0.5)
+    sets = simulated_sets(evaluator, TRUTH, 2000)
+    assert not np.isnan(sets.values[0]).any()
+    share = sets.weights[0][:, np.isinf(sets.values[0])].sum(axis=1)
+    error = share.std() / np.sqrt(2000)
+    np.testing.assert_allclose(share.mean(), among, atol=4 * error + 1 / 256)
+    rng = np.random.default_rng(0)
+    fresh = np.array([fresh_data(evaluator, TRUTH, rng)["y"] for _ in range(200)])
+    error = np.sqrt(among / fresh.size)
+    np.testing.assert_allclose(np.isinf(fresh).mean(), among, atol=4 * error)
 
 
 @pytest.mark.parametrize("propagation", [R256, prb.Resimulated(64)])

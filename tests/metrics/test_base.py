@@ -256,6 +256,25 @@ def test_the_floor_keeps_an_outlier_in_the_forward_divergence(
 # --------------------------------------------------------------------------
 
 
+def test_observed_specimens_that_failed_count_as_simulated_ones(metric: Metric, draw: Draw) -> None:
+    x, w, z, u = draw(12)
+    failed = np.append(z, INF)
+    d = metric.against(failed, np.append(0.9 * u, 0.1))
+    # Units are those of specimens that did not fail.
+    assert d.scale == pytest.approx(metric.against(z, u).scale, rel=0.2)
+    rows = np.stack([np.append((1 - s) * u, s) for s in (0.1, 0.02, 0.3)])
+    right, few, many = d(failed, rows)
+    if metric.distance:
+        assert right == pytest.approx(0, abs=1e-12)
+    assert right < few
+    assert right < many
+    # Weights of stored values, and other observed ones.
+    stored = d.outer(*d.from_basis(rows, d.stored(failed), np), xp=np)
+    np.testing.assert_allclose(stored, d(failed, rows), rtol=1e-9, atol=1e-12)
+    other = d.with_observed(np.append(x, INF), np.append(0.8 * w, 0.2))
+    assert np.isfinite(other(failed, rows)).all()
+
+
 @dataclass(frozen=True)
 class Hellinger(Metric):
     density: DensityEstimator = field(default_factory=GaussianKDE)

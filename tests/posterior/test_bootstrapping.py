@@ -8,6 +8,7 @@ import pymc as pm
 import pytest
 import xarray as xr
 from four_metrics import METRICS, R256, same
+from scipy.stats import norm
 
 import prbayes as prb
 
@@ -57,6 +58,27 @@ def test_the_parametric_bootstrap_agrees_with_the_standard_error(name: str) -> N
     # One by refitting, one to first order: 2.2% and 5% of sampling error, and curvature.
     draws = prb.bootstrap(fit(name), 1000, parametric=True, random_seed=3).posterior["mu"]
     np.testing.assert_allclose(float(draws.std()), fit(name).stderr["mu"], rtol=0.2)
+
+
+def breaking(x: Any) -> Any:
+    """Return the load at which a specimen was measured; the strong ones break the machine."""
+    return np.where(x > 1.6, np.inf, x)
+
+
+@pytest.mark.parametrize("name", sorted(METRICS))
+def test_where_specimens_fail_the_refits_are_around_the_optimum(name: str) -> None:
+    specimens = breaking(1 + 0.5 * norm.ppf((np.arange(40) + 0.5) / 40))
+    assert np.isinf(specimens).sum() == 5
+    with pm.Model():
+        x = pm.Normal.dist(pm.Normal("mu", 0, 5), 0.5)
+        prb.Simulator("y", breaking, x, metric=METRICS[name], observed=specimens, propagation=R256)
+        optimum = prb.minimize(progressbar=False)
+    assert optimum.point["mu"] == pytest.approx(1, abs=0.06)
+    # Were failures left out of the data sets, these would be a standard error farther down.
+    draws = prb.bootstrap(optimum, parametric=True).posterior["mu"]
+    sd = float(draws.std())
+    assert abs(float(draws.mean()) - optimum.point["mu"]) < 0.2 * sd
+    assert sd == pytest.approx(optimum.stderr["mu"], rel=0.2)
 
 
 def test_no_response_is_computed_and_nothing_is_random() -> None:
