@@ -12,8 +12,10 @@ from prbayes._weighted import distribution_function, quantile
 from prbayes.estimate.confounding import confounded
 from prbayes.estimate.differences import cross
 from prbayes.estimate.identifiability import unidentified_directions, without
+from prbayes.estimate.prior_ends import at_prior_ends, of_prior_ends
 from prbayes.estimate.projections import number_parts, one_dimensional
 from prbayes.estimate.refinement import AGREE
+from prbayes.estimate.refit import SamplingDistribution
 from prbayes.estimate.rivals import Rival
 from prbayes.estimate.sampling import Local
 from prbayes.metrics.base import Minimum
@@ -256,7 +258,10 @@ def _nearest(values: Floats, places: Floats) -> Floats:
 
 
 def caveats(
-    evaluator: Evaluator, local: Local | None, others: Sequence[Rival], design_error: float
+    evaluator: Evaluator,
+    sampling: SamplingDistribution | None,
+    others: Sequence[Rival],
+    design_error: float,
 ) -> tuple[str, ...]:
     """Say what is not seen, is identified only by the prior, or could as well be elsewhere.
 
@@ -268,17 +273,19 @@ def caveats(
     for rival in others:
         if rival.comparable:
             lines.append(_of_rival(evaluator, rival))
-    if local is not None:
-        lines += not_identified(evaluator, local)
-        lines += confounded(evaluator, local)
+    if sampling is not None:
+        ends = at_prior_ends(sampling)
+        lines += of_prior_ends(ends)
+        lines += not_identified(evaluator, sampling.local, [end.name for end in ends])
+        lines += confounded(evaluator, sampling.local)
     return tuple(lines)
 
 
-def not_identified(evaluator: Evaluator, local: Local) -> list[str]:
-    """Say about which directions the data tell less than the prior."""
+def not_identified(evaluator: Evaluator, local: Local, told: Sequence[str] = ()) -> list[str]:
+    """Say about which directions the data tell less than the prior, without those told of."""
     hidden = without(local.unidentified, evaluator.told_by_prior)
     directions = unidentified_directions(hidden, evaluator.readable_names)
-    return [_of_direction(direction) for direction in directions]
+    return [_of_direction(direction) for direction in directions if direction not in told]
 
 
 def _of_design(evaluator: Evaluator, error: float) -> str:

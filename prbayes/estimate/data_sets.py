@@ -395,8 +395,8 @@ def _refuse_few(node: Node, finite: NDArray[np.bool_], expected: int) -> None:
     count = finite.sum()
     if count < expected:
         raise ValueError(
-            f"{node.name}: got {count} responses that can be observed of {finite.size}, expected at "
-            f"least {expected}"
+            f"{node.name}: got {count} responses that can be observed of {finite.size}, expected "
+            f"at least {expected}"
         )
 
 

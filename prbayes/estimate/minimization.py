@@ -751,7 +751,7 @@ def _reported(plan: _Plan, begun: _Beginning, state: _State) -> Optimum:
         *heavy_tails(evaluator, state.theta),
         *between_runs(evaluator, state.theta),
         *wide_kernels(evaluator, state.theta, state.scales, state.local),
-        *caveats(evaluator, state.local, state.others, state.design_error),
+        *caveats(evaluator, state.sampling, state.others, state.design_error),
     )
     for line in warnings:
         _log.warning("%s", line)

@@ -10,6 +10,7 @@ import numpy as np
 from prbayes._checks import Floats, positive_integer
 from prbayes._threads import one_thread
 from prbayes.estimate.data_sets import observed_set, sets_along
+from prbayes.estimate.prior_ends import at_prior_ends
 from prbayes.estimate.refit import ARRIVED, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.support import TOLERABLE, supports_each
@@ -99,13 +100,6 @@ class GivenEstimate(Affine):
             return self
         return Affine(self.n_sets, self.random_seed)
 
-    def _distrust(self, moves: Floats, mapped: list[Mapped], names: list[str]) -> list[str]:
-        """Say where draws rest on an extrapolation, or are not where they should be."""
-        found = [doubt for mode in mapped for doubt in mode.doubts]
-        if all(mode.given for mode in mapped):
-            return found
-        return [*found, *super()._distrust(moves, mapped, names)]
-
     def _said(self, mapped: list[Mapped], modes: int, draws: int, design_variance: float) -> str:
         """Return what was done, in words."""
         done = super()._said(mapped, modes, draws, design_variance)
@@ -118,10 +112,15 @@ class GivenEstimate(Affine):
         self, sampling: SamplingDistribution, draws: Floats, design_variance: float
     ) -> Mapped:
         """Return the draws of one mode where they should be."""
+        ends = at_prior_ends(sampling)
         sampling = among(sampling, draws)
         first = self._by_refits(sampling, draws, design_variance)
         rng = np.random.default_rng([self.random_seed, 7])
         try:
+            if ends:
+                raise UnsettledError(
+                    f"the data push {' and '.join(map(str, ends))}, where estimates pile up"
+                )
             look = _Look.at(sampling, draws, design_variance)
             found = self._followed(look, first.draws, rng)
         except (UnsettledError, np.linalg.LinAlgError) as error:
