@@ -123,7 +123,7 @@ def observed_sample(
         )
     number = array.size - int(failed.sum())
     if number < minimum:
-        few = "no values" if array.size == 0 else f"{number} value"
+        few = {0: "no values", 1: "one value"}.get(number, f"{number} values")
         besides = f" besides {failed.sum()} of specimens that failed" if failed.any() else ""
         raise ValueError(
             f"{name}: got {few}{besides}, expected at least {minimum} measured responses"

@@ -136,7 +136,7 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "observed failures": (
         simulator(observed=[np.inf, np.inf, 2]),
         ValueError,
-        r"got 1 value besides 2 of specimens that failed, expected at least 2",
+        r"got one value besides 2 of specimens that failed, expected at least 2",
     ),
     "observed masked": (
         simulator(observed=np.ma.masked_array([1, 2, 3], [0, 1, 0])),
@@ -151,7 +151,7 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "observed one": (
         simulator(observed=[1.0]),
         ValueError,
-        r"y: observed: got 1 value, expected at least 2",
+        r"y: observed: got one value, expected at least 2",
     ),
     "observed scalar": (
         simulator(observed=1.0),

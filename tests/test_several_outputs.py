@@ -129,7 +129,8 @@ def test_two_simulators_of_a_response_with_outputs_share_its_runs():
     calls = []
 
     def counted(a, b):
-        calls.append(np.size(a))
+        if np.size(a) > 1:  # a specimen by itself is no run
+            calls.append(np.size(a))
         return two(a, b)
 
     with pm.Model():

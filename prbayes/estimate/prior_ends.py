@@ -22,7 +22,7 @@ from prbayes.model.hyperparameters import THETAS
 _TAIL_OF_PRIOR = 0.05
 # Squared loading from which a direction that is not identified is an element alone; two that only
 # stand for each other have a half each.
-_ALONE = 0.9
+_BY_ITSELF = 0.9
 # Where a transform has come to the end of its range, in spreads of the prior: two places, far out
 # and much farther.
 _FAR_OUTSIDE = (1e3, 1e6)
@@ -51,7 +51,7 @@ def at_prior_ends(sampling: SamplingDistribution, seed: int = 0) -> list[PriorEn
     local = sampling.local
     if not local.unidentified.size or not all(node.bound.stored for node in evaluator.nodes):
         return []
-    alone = (local.unidentified**2).sum(axis=1) > _ALONE
+    alone = (local.unidentified**2).sum(axis=1) > _BY_ITSELF
     alone &= ~evaluator.told_by_prior
     theta = sampling.theta
     prior = evaluator.prior_thetas(THETAS, seed)

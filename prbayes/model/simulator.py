@@ -28,6 +28,7 @@ from prbayes._progress import shown
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.costing import Asked, listening
 from prbayes.model.description import without_addresses
+from prbayes.model.first_look import tell_copies, tell_far_data
 from prbayes.model.node import (
     Node,
     SimulatorDistribution,
@@ -227,7 +228,10 @@ def _observed_term(
         bound = propagation.bind(name, sorted_inputs, target, responses)
         bound.aim(target.beside(bound.first_responses, bound.dimensions))
         target = bound.target
-    _tell_far_data(name, target.observed, bound.first_responses, responses.outputs or ONE)
+    labels = (responses.outputs or ONE).names
+    tell_far_data(name, target.observed, bound.first_responses, labels)
+    if term.labels is None:
+        tell_copies(name, target.observed)
     if epsilon is None:
         epsilon = 1 / effective_specimens(target, term.labels) if target.likelihood else np.nan
     node = Node(
@@ -248,44 +252,6 @@ def _observed_term(
     rv = SimulatorDistribution(name, *params, **given)
     rv.owner.op.own_node(rv.owner)
     return rv
-
-
-# Responses that a range is told from: of fewer it says little of the prior.
-_FEWEST_OF_A_RANGE = 16
-
-
-def _tell_far_data(name: str, observed: Floats, responses: Floats, outputs: Outputs) -> None:
-    """Say so where all that was measured of an output is beyond all responses so far.
-
-    As where one is in another unit: each run after that would be for nothing.
-    """
-    if not responses.size:  # a propagation of one's own may keep none
-        return
-    columns = observed.reshape(len(observed), -1).T
-    simulated = responses.reshape(len(responses), -1).T
-    if len(columns) != len(simulated):
-        return
-    labels = [f"{name}[{own}]" for own in outputs.names] or [name]
-    for label, one, other in zip(labels, columns, simulated, strict=True):
-        measured, there = one[np.isfinite(one)], other[np.isfinite(other)]
-        if not measured.size or there.size < _FEWEST_OF_A_RANGE:
-            continue
-        low, high = measured.min(), measured.max()
-        lowest, highest = there.min(), there.max()
-        if high < lowest or low > highest:
-            _log.warning(
-                "%s: got observed values from %.4g to %.4g, all %s the first %d responses, from "
-                "%.4g to %.4g: look at the units, and at whether the priors reach that far, before "
-                "more runs are made",
-                label,
-                low,
-                high,
-                "below" if high < lowest else "above",
-                there.size,
-                lowest,
-                highest,
-            )
-            return
 
 
 def _grouped(name: str, inputs: Inputs, observed: Any) -> tuple[NDArray[np.intp] | None, Any]:

@@ -31,6 +31,7 @@ from prbayes.response.executors import capacity
 from prbayes.response.failures import Abort, Failure, OnFailure, ResponseError
 from prbayes.response.inadequacy import caveats_of
 from prbayes.response.inputs import Inputs
+from prbayes.response.mixing import refuse_mixing
 from prbayes.response.outputs import ONE, Outputs, outputs_of_result
 from prbayes.response.store import Store
 
@@ -217,6 +218,7 @@ class Responses:
         )
         self.count = 0
         self.scatters: bool | None = None
+        self._looked = False  # whether specimens are computed by themselves
         self._found = 0
         self.runs = Runs()
         self._calling = Calling(
@@ -304,13 +306,27 @@ class Responses:
         if self.plain:
             batch = batch_shape(given, self._event_ndims)
             values = broadcast_batch(given, self._event_ndims, batch)
-            return self._at_once(self._filled(values), batch)
+            found = self._at_once(self._filled(values), batch)
+            self._refuse_mixing(values, batch, found)
+            return found
         batch, points = self._rows(given)
         self.count += len(points)
         found = respond(self._calling, points, self._tally)
         if self.outputs is None:
             self.outputs = self._tally.named
         return found.reshape(batch + found.shape[1:])
+
+    def _refuse_mixing(self, values: list[Floats], batch: tuple[int, ...], found: Floats) -> None:
+        """Raise if what is computed for a batch is another thing by itself; looked at once."""
+        if self._looked or not batch or found.size < 2:
+            return
+        self._looked = True
+
+        def alone(place: tuple[int, ...]) -> Floats:
+            one = [np.array(v[place])[None] for v in values]
+            return self._at_once(self._filled(one), (1,), counted=False)
+
+        refuse_mixing(self.name, batch, found, alone)
 
     def _rows(self, given: list[Floats]) -> tuple[tuple[int, ...], Points]:
         """Return the batch shape of values of the inputs, and their points, each a row."""
@@ -336,9 +352,11 @@ class Responses:
         k = len(self.inputs.aleatory)
         return self.inputs.fill(values[:k], values[k:])
 
-    def _at_once(self, arguments: Sequence[Any], batch: tuple[int, ...]) -> Floats:
+    def _at_once(
+        self, arguments: Sequence[Any], batch: tuple[int, ...], *, counted: bool = True
+    ) -> Floats:
         """Call the function once for a batch of any shape."""
-        size = int(np.prod(batch, dtype=int))
+        size = int(np.prod(batch, dtype=int)) if counted else 0
         budget().grant(size, least=size)
         try:
             with np.errstate(all="ignore"):

@@ -16,14 +16,15 @@ from prbayes.response.response import Responses
 
 
 class Counted:
-    """A response that keeps what it was asked for."""
+    """A response that keeps what it was asked for; a specimen by itself is no run."""
 
     def __init__(self, function: Any) -> None:
         self.function = function
         self.asked: list[int] = []
 
     def __call__(self, *inputs: Any) -> Any:
-        self.asked.append(int(np.size(inputs[0])))
+        if np.size(inputs[0]) > 1:
+            self.asked.append(int(np.size(inputs[0])))
         return self.function(*inputs)
 
 

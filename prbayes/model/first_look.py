@@ -1,0 +1,83 @@
+"""What is told of measured responses at once: that none is in reach, or that all are there twice."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+
+from prbayes._checks import Floats
+
+_log = logging.getLogger("prbayes")
+
+# Responses that a range is told from: of fewer it says little of the prior.
+_FEWEST_OF_A_RANGE = 16
+
+
+def tell_far_data(name: str, observed: Floats, responses: Floats, outputs: Sequence[str]) -> None:
+    """Say so where all that was measured of an output is beyond all responses so far.
+
+    As where one is in another unit: each run after that would be for nothing.
+    """
+    if not responses.size:  # a propagation of one's own may keep none
+        return
+    columns = observed.reshape(len(observed), -1).T
+    simulated = responses.reshape(len(responses), -1).T
+    if len(columns) != len(simulated):
+        return
+    labels = [f"{name}[{own}]" for own in outputs] or [name]
+    for label, one, other in zip(labels, columns, simulated, strict=True):
+        measured, there = one[np.isfinite(one)], other[np.isfinite(other)]
+        if not measured.size or there.size < _FEWEST_OF_A_RANGE:
+            continue
+        low, high = measured.min(), measured.max()
+        lowest, highest = there.min(), there.max()
+        if high < lowest or low > highest:
+            _log.warning(
+                "%s: got observed values from %.4g to %.4g, all %s the first %d responses, from "
+                "%.4g to %.4g: look at the units, and at whether the priors reach that far, before "
+                "more runs are made",
+                label,
+                low,
+                high,
+                "below" if high < lowest else "above",
+                there.size,
+                lowest,
+                highest,
+            )
+            return
+
+
+# Specimens from which on it is no chance that each is there twice.
+_FEWEST_COPIED = 6
+
+
+def tell_copies(name: str, observed: Floats) -> None:
+    """Say so where each specimen, of none of which there is a label, is there at least twice.
+
+    Counts, and readings on a scale of few steps, are so by chance.
+    """
+    rows = observed.reshape(len(observed), -1)
+    different, counts = np.unique(rows, axis=0, return_counts=True)
+    if len(rows) < _FEWEST_COPIED or counts.min() < 2 or _on_few_steps(rows):
+        return
+    _log.warning(
+        "%s: got %d observed values of which only %d are different, each at least twice: if these "
+        "are repeated readings of a specimen, say so by specimens=, and leave out what is there "
+        "twice by mistake; else every specimen counts, and the uncertainty is too small",
+        name,
+        len(rows),
+        len(different),
+    )
+
+
+def _on_few_steps(rows: Floats) -> bool:
+    """Return whether values of each output, (n, m), are whole steps apart, fewer than values."""
+    for column in rows.T:
+        gaps = np.diff(np.unique(column[np.isfinite(column)]))
+        steps = gaps / gaps.min(initial=np.inf)
+        whole = np.allclose(steps, np.round(steps), rtol=0, atol=1e-6)
+        if not whole or steps.sum() >= len(rows):
+            return False
+    return True
