@@ -1,4 +1,4 @@
-"""What is told of measured responses at once: that none is in reach, or that all are there twice."""
+"""What is told of measured responses at once: that none is in reach, or all are there twice."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def test_on_both_sides_of_the_responses_no_unit_is_seen(
 
 
 def test_data_beyond_all_responses_are_told_of(logged: pytest.LogCaptureFixture) -> None:
-    tell_far_data("y", np.abs(MEASURED) + [0.0, 1e4], SIMULATED, ["a", "b"])
+    tell_far_data("y", np.add(np.abs(MEASURED), [0.0, 1e4]), SIMULATED, ["a", "b"])
     (record,) = logged.records
     assert "y[b]: got observed values from 1e+04 to 1e+04, all above the first 64" in record.message
     logged.clear()
