@@ -219,7 +219,11 @@ def test_a_standard_deviation_near_zero(name: str, sigma: float) -> None:
             "propagation": prb.Reweighted(1024),
         }
         prb.Simulator("y", lambda x, e: x + e, x, error, **keywords)
-    found = np.asarray(sample(model, 1000)["posterior"]["sigma"]).ravel()
+    # Refits of the area leave a tenth of a standard deviation of noise in its upper quantile: three
+    # times as many draws of their own.
+    found = np.concatenate(
+        [sample(model, 1000, random_seed=seed)["posterior"]["sigma"].values for seed in range(3)]
+    ).ravel()
     at = np.linspace(1e-3, 3, 3000)
     scale = np.hypot(at, gauge)
     p = np.exp(
@@ -591,7 +595,9 @@ def test_shared_specimens_do_not_count_twice(name: str) -> None:
         optimum = prb.minimize(two_responses(METRICS[name], labels=labels), method="Nelder-Mead")
         stderr.append(optimum.stderr["mu"])
         idata = sample(optimum.model, optimum=optimum)
-        assert adjustment(idata).startswith("GivenEstimate")
+        # Likelihoods of different specimens are the posterior.
+        exact = name == "ll" and not labels
+        assert adjustment(idata).startswith("none needed" if exact else "GivenEstimate")
         widths.append(float(idata.posterior["mu"].std()))
         bootstrapped.append(float(prb.bootstrap(optimum, 400).posterior["mu"].std()))
     # Standard deviations of 200 data sets, twice: 5% each, 7% the ratio; of 400: 5%.
