@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from prbayes._checks import AT_ONCE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.hyperparameters import Hyperparameters
-from prbayes.model.node import Node, log_kernel, required_nodes
+from prbayes.model.node import Node, log_kernel, priors_alone, required_nodes
 from prbayes.propagation.reweighted import Design
 from prbayes.response.budget import budget
 from prbayes.response.compilation import compiled, ninf_for_invalid, untraced
@@ -177,7 +177,8 @@ class Evaluator:
 
     def _log_other(self) -> Any:
         ordinary = [rv for rv in self.model.observed_RVs if rv not in self._variables]
-        likelihood = self.model.logp(vars=ordinary) if ordinary else pt.constant(0.0)
+        with priors_alone():
+            likelihood = self.model.logp(vars=ordinary) if ordinary else pt.constant(0.0)
         return likelihood + self.model.potentiallogp
 
     @property
@@ -255,7 +256,8 @@ class Evaluator:
         scales = pt.dvector("scales")
         scaled = sum(graph / scales[k] for k, graph in enumerate(self._graphs()))
         total = scaled - self._log_other()
-        log_prior = self.model.logp(vars=self.model.free_RVs, jacobian=False)
+        with priors_alone():
+            log_prior = self.model.logp(vars=self.model.free_RVs, jacobian=False)
         objective = total - log_prior if prior else total
         within = pt.switch(log_prior > -np.inf, objective, np.inf)
         (value,), theta = self.hyperparameters.joined([within])

@@ -19,6 +19,7 @@ from pytensor.graph.traversal import ancestors
 
 from prbayes._checks import Floats, called, real_array, refuse_single_precision
 from prbayes.model.elements import coordinates, element_names
+from prbayes.model.node import priors_alone
 from prbayes.propagation.points import sobol
 from prbayes.response.compilation import compiled, interpreted, ninf_for_invalid, untraced
 from prbayes.response.distributions import PriorPoints, PriorSampler
@@ -145,7 +146,9 @@ class Hyperparameters:
     @cached_property
     def _log_prior(self) -> Any:
         with untraced():
-            return self.compile([self.model.varlogp])
+            with priors_alone():
+                graph = self.model.varlogp
+            return self.compile([graph])
 
     def log_prior(self, thetas: Floats) -> Floats:
         """Return the log prior density with the Jacobian of the transforms, shape (P,)."""

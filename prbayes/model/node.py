@@ -10,8 +10,11 @@ module.
 from __future__ import annotations
 
 import logging
+import sys
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from inspect import signature
 from typing import Any
@@ -315,6 +318,20 @@ def _places(index: tuple[int, ...], batch: tuple[int, ...]) -> tuple[int | slice
     return tuple(slice(None) if n == 1 else i for i, n in pairs)
 
 
+# Whether densities are made of which only those of hyperparameters are taken: PyMC makes all.
+_PRIORS_ALONE: ContextVar[bool] = ContextVar("priors alone", default=False)
+
+
+@contextmanager
+def priors_alone() -> Iterator[None]:
+    """Say nothing of epsilon meanwhile, which priors do without."""
+    token = _PRIORS_ALONE.set(True)
+    try:
+        yield
+    finally:
+        _PRIORS_ALONE.reset(token)
+
+
 @_logprob.register(SimulatorRV)  # type: ignore[untyped-decorator]
 def _log_density(
     op: SimulatorRV, values: Any, rng: Any, size: Any, *params: Any, **kwargs: Any
@@ -332,7 +349,8 @@ def _log_density(
     if np.isnan(node.epsilon_value):
         # nutpie tells no more of an error than its number; nobody else has to be told who may yet
         # calibrate it
-        _log.debug("%s", unset)
+        blunt = "nutpie" in sys.modules and not _PRIORS_ALONE.get()
+        _log.log(logging.WARNING if blunt else logging.DEBUG, "%s", unset)
     check = CheckParameterValue(unset)
     epsilon = check(node.epsilon, pt.gt(node.epsilon, 0.0))
     inputs = node.bound.inputs

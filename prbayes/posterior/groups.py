@@ -15,6 +15,7 @@ from prbayes.model.labels import (
     labelled_responses,
     observed_dataset,
 )
+from prbayes.model.node import priors_alone
 from prbayes.response.compilation import untraced
 from prbayes.response.outputs import lacking
 
@@ -120,7 +121,8 @@ def _log_prior(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
     chains, draws, d = thetas.shape
     free = evaluator.model.free_RVs
     with untraced():
-        graphs = evaluator.model.logp(vars=free, jacobian=False, sum=False)
+        with priors_alone():
+            graphs = evaluator.model.logp(vars=free, jacobian=False, sum=False)
         density = evaluator.hyperparameters.compile(graphs)
     values = density(thetas.reshape(-1, d))
     found = {}

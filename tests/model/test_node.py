@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import cloudpickle
@@ -383,14 +384,24 @@ def test_data_that_do_not_fit_what_goes_with_them_are_refused() -> None:
         prb.minimize(model)
 
 
+@pytest.mark.parametrize("nutpie", [False, True])
 def test_an_epsilon_that_is_not_set_is_told_when_the_density_is_made(
-    caplog: pytest.LogCaptureFixture,
+    nutpie: bool, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.delitem(sys.modules, "nutpie", raising=False)
+    if nutpie:  # which tells no more of an error than its number
+        monkeypatch.setitem(sys.modules, "nutpie", ModuleType("nutpie"))
+    model = build(prb.Reweighted(64), epsilon=None)
     with caplog.at_level("DEBUG", "prbayes"):
-        build(prb.Reweighted(64), epsilon=None).logp()
-    assert "y: epsilon is not set; call prb.set_epsilon(model" in caplog.text
-    told = [record for record in caplog.records if "epsilon is not set" in record.getMessage()]
-    assert {record.levelname for record in told} == {"DEBUG"}, "nothing is wrong yet"
+        model.logp()
+        told = [record for record in caplog.records if "epsilon is not set" in record.message]
+        assert told[0].message.startswith("y: epsilon is not set; call prb.set_epsilon(model")
+        # Nothing is wrong yet for others.
+        assert {record.levelname for record in told} == {"WARNING" if nutpie else "DEBUG"}
+        caplog.clear()
+        prb.minimize(model, progressbar=False)
+    told = [record for record in caplog.records if "epsilon is not set" in record.message]
+    assert {record.levelname for record in told} <= {"DEBUG"}
 
 
 def test_the_value_that_a_log_density_is_asked_at_has_to_be_the_data() -> None:
