@@ -25,6 +25,7 @@ from prbayes.posterior.adjustment import Affine
 from prbayes.posterior.chains import Particles
 from prbayes.posterior.default_adjustment import default_adjustment
 from prbayes.posterior.epsilon import calibrate_epsilon
+from prbayes.posterior.groups import arviz_groups
 from prbayes.posterior.smc import Rounds, epsilons_restored, evaluator_of, optima_of
 from prbayes.posterior.trees import adjusted_tree
 
@@ -66,7 +67,8 @@ def adjust(
         Groups ``posterior``, the draws where they should be, with the attribute ``adjustment`` and
         those that `sample_smc` gives besides; ``unadjusted``, those that were given, if an
         adjustment was needed and could be made;
-        ``calibration`` and ``observed_data``, as of `sample_smc`; and those given that do not
+        ``calibration``, ``observed_data``, ``log_prior``, predictive draws of stored responses and,
+        given the estimate, ``log_likelihood``, as of `sample_smc`; and those given that do not
         depend on the draws, or tell how they were drawn (``sample_stats``, ``prior`` and the
         like). Predictions and log-likelihoods of the draws before are left out.
 
@@ -225,6 +227,16 @@ def _adjusted(
         )
         found = rounds.until_supported(progressbar=False)
         found.warn()
+        groups = arviz_groups(
+            evaluator,
+            draws.thetas,
+            found.particles.discrepancies,
+            found.thetas,
+            found.log_likelihood,
+            by.random_seed,
+        )
+        if found.log_likelihood is None:  # nobody knows what a sampler's draws were of
+            groups.pop("log_likelihood", None)
         return adjusted_tree(
             evaluator,
             idata,
@@ -234,4 +246,5 @@ def _adjusted(
             measured=found.measured,
             warnings=(*optimum.warnings, *found.warnings),
             seconds=time.perf_counter() - clock,
+            groups=groups,
         )

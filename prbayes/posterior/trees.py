@@ -125,6 +125,7 @@ def adjusted_tree(
     measured: dict[str, float],
     warnings: tuple[str, ...],
     seconds: float,
+    groups: Mapping[str, xr.Dataset],
 ) -> xr.DataTree:
     """Return the DataTree of another sampler's draws that were adjusted.
 
@@ -137,6 +138,9 @@ def adjusted_tree(
     unadjusted, adjustment, measured, warnings
         As in `posterior_tree`.
     seconds : float
+    groups : mapping
+        What ArviZ looks for besides, of the draws that are returned; of the prior in case there was
+        nothing.
     """
     told = {
         "adjustment": adjustment,
@@ -159,15 +163,19 @@ def adjusted_tree(
         own["unadjusted"] = _draws(evaluator, unadjusted)
     coords = given["posterior"].coords
     where = {name: coords[name].values for name in ("chain", "draw") if name in coords}
-    groups = {name: group.assign_coords(where) for name, group in own.items()}
-    groups["observed_data"] = observed_dataset(evaluator)
+    own |= {name: group for name, group in groups.items() if name in _OF_DRAWS}
+    found = {}
+    for name, group in own.items():
+        places = {dim: known[group[dim].values] for dim, known in where.items()}
+        found[name] = group.assign_coords(places)
+    found["observed_data"] = observed_dataset(evaluator)
     failures = failures_dataset(evaluator)
     if failures.sizes["failure"]:
-        groups["failures"] = failures
-    for name, group in given.children.items():
-        if name not in groups and name not in _OF_DRAWS:
-            groups[name] = group.to_dataset()
-    return xr.DataTree.from_dict(groups)
+        found["failures"] = failures
+    for name, other in given.children.items():
+        if name not in found and name not in _OF_DRAWS:
+            found[str(name)] = other.to_dataset()
+    return xr.DataTree.from_dict({**groups, **found})
 
 
 def _posterior(evaluator: Evaluator, thetas: Floats, attrs: dict[str, Any]) -> xr.Dataset:

@@ -3,11 +3,13 @@
 import logging
 from typing import Any
 
+import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
 from four_metrics import METRICS, same
+from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._checks import Floats
@@ -96,7 +98,15 @@ def test_draws_of_nuts_get_the_width_that_the_data_warrant(
     np.testing.assert_allclose(adjusted.unadjusted["mu"], idata.posterior["mu"])
     np.testing.assert_allclose(adjusted.posterior["variance"], adjusted.posterior["sigma"] ** 2)
     assert "diverging" in adjusted.sample_stats
-    assert "posterior_predictive" not in adjusted.children
+    # What ArviZ looks for is that of the adjusted draws.
+    predictive = adjusted.posterior_predictive["y"]
+    np.testing.assert_array_equal(predictive["draw"], adjusted.posterior["draw"])
+    assert float(predictive.std()) > 0.1
+    np.testing.assert_allclose(
+        adjusted.log_prior["mu"], norm.logpdf(adjusted.posterior["mu"], 0, 2), rtol=1e-8
+    )
+    assert "diagnosis" in az.psense_summary(adjusted, var_names=["mu", "sigma"])
+    assert set(adjusted.prior.data_vars) == {"mu", "sigma", "variance"}
     assert adjusted.posterior.attrs["inference_library"] == "pymc"
     # Diagnoses tell both apart, the second without the model.
     assert "prb.adjust" in "".join(prb.diagnose(idata, model=model).notes)
