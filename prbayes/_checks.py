@@ -121,6 +121,7 @@ def observed_sample(
             f"{name}: got {bad} NaN or infinite among {array.size} values, expected finite ones; "
             f"leave missing specimens out{what}"
         )
+    _refuse_huge(array, name)
     number = array.size - int(failed.sum())
     if number < minimum:
         few = {0: "no values", 1: "one value"}.get(number, f"{number} values")
@@ -165,12 +166,27 @@ def observed_outputs(values: ArrayLike, name: str = "observed") -> Floats:
             f"{name}: got -inf, expected numbers; NaN is an output that was not measured, +inf a "
             "specimen that failed"
         )
+    _refuse_huge(array, name)
     missing = np.isnan(array)
     _refuse_empty(missing.all(axis=1), name, "specimens", "row", "without any output")
     _refuse_empty(missing.all(axis=0), name, "outputs", "column", "that no specimen has")
     without = ~np.isfinite(array).any(axis=0)
     _refuse_empty(without, name, "outputs", "column", "in which every specimen failed")
     return array
+
+
+# Squares of measured values and their sums are numbers up to here, with room for a wide margin.
+_HUGE = 1e100
+
+
+def _refuse_huge(array: Floats, name: str) -> None:
+    """Raise if values are so large that their squares are none: rather a mistake than a unit."""
+    largest = float(np.abs(array[np.isfinite(array)]).max(initial=0.0))
+    if largest > _HUGE:
+        raise ValueError(
+            f"{name}: got values of up to {largest:.3g}, expected at most {_HUGE:g} in size; look "
+            "at what they are, or take another unit"
+        )
 
 
 def _refuse_empty(empty: NDArray[np.bool_], name: str, what: str, place: str, without: str) -> None:

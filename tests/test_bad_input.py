@@ -121,6 +121,11 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         ValueError,
         r"y: observed: got 1 NaN .* leave missing",
     ),
+    "observed huge": (
+        simulator(observed=[1, 2e150, 2]),
+        ValueError,
+        r"got values of up to 2e\+150, expected at most 1e\+100 in size",
+    ),
     "observed -inf": (
         simulator(observed=[1, -np.inf, 2]),
         ValueError,

@@ -11,18 +11,20 @@ from scipy.stats import t as student
 
 from prbayes._checks import Floats, Seed, called, flag, positive_integer, seed_number
 from prbayes.estimate.optimum import Optimum
-from prbayes.validation.cross_validation import cross_validate
+from prbayes.validation.cross_validation import cross_validate, most_folds
 
 # Share of comparisons of candidates that predict alike in which one is said to be better.
 _CLAIMED = 0.05
 _EXAMPLE = "expected a mapping such as {'normal': optimum, 'lognormal': other}"
 _CALLER = "compare_candidates"
+# Of which nine in ten calibrate: nearly as many as there are.
+_COMPARED_BY = 10
 
 
 def compare_candidates(
     candidates: Mapping[str, Optimum | xr.Dataset],
     *,
-    folds: int = 10,
+    folds: int | None = None,
     random_seed: Seed = 0,
     progressbar: bool = True,
 ) -> xr.Dataset:
@@ -38,8 +40,9 @@ def compare_candidates(
     candidates : mapping
         By label an `Optimum`, from `minimize` without the prior, or what `cross_validate` returned
         for it. All are of the same observed values, weights and labels, in the same order.
-    folds : int
-        Of each optimum; cross-validations keep theirs, which have to be the same.
+    folds : int, optional
+        Of each optimum: by default those of cross-validations among the candidates, which keep
+        theirs and have to have the same; else ten, or half as many as there are specimens.
     random_seed : int, sequence of int, numpy.random.Generator or None
         By which specimens are dealt out; likewise.
     progressbar : bool
@@ -95,14 +98,18 @@ def compare_candidates(
     (['LogNormal', 'Normal'], True)
     """
     _refuse(candidates)
-    folds = positive_integer(folds, "folds", minimum=2)
+    if folds is not None:
+        folds = positive_integer(folds, "folds", minimum=2)
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
+    known = [one.sizes["fold"] for one in candidates.values() if isinstance(one, xr.Dataset)]
+    asked = folds or (known[0] if known else None)
     found = {}
     for label, candidate in candidates.items():
         if isinstance(candidate, Optimum):
+            number = asked or most_folds(candidate, _COMPARED_BY)
             found[label] = cross_validate(
-                candidate, folds=folds, random_seed=seed, progressbar=progressbar
+                candidate, folds=number, random_seed=seed, progressbar=progressbar
             )
         else:
             found[label] = candidate

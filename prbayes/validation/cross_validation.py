@@ -20,10 +20,18 @@ from prbayes.model.node import Node
 from prbayes.model.turns import in_turn
 from prbayes.validation.scores import Scoring
 
+_ADVICE = ", so that the model cannot be calibrated anew"
+# Parts by default: four in five calibrate.
+_FOLDS = 5
+
 
 @in_turn
 def cross_validate(
-    optimum: Optimum, *, folds: int = 5, random_seed: Seed = 0, progressbar: bool = True
+    optimum: Optimum,
+    *,
+    folds: int | None = None,
+    random_seed: Seed = 0,
+    progressbar: bool = True,
 ) -> xr.Dataset:
     """Calibrate on parts of the specimens, and return the discrepancy of those left out.
 
@@ -40,8 +48,9 @@ def cross_validate(
     ----------
     optimum : Optimum
         From `minimize`, without the prior.
-    folds : int
-        Number of parts; specimens are dealt out at random, those with the same label together.
+    folds : int, optional
+        Number of parts, five by default, or half as many as there are specimens; these are dealt
+        out at random, those with the same label together.
     random_seed : int, sequence of int, numpy.random.Generator or None
         Models with as many specimens have the same folds with the same seed.
     progressbar : bool
@@ -82,8 +91,8 @@ def cross_validate(
     >>> found.discrepancy.dims, bool((found.discrepancy > found.calibrated).mean() > 0.5)
     (('fold', 'simulator'), True)
     """
-    advice = ", so that the model cannot be calibrated anew"
-    evaluator = require_refits(optimum, "cross_validate", advice).evaluator
+    evaluator = require_refits(optimum, "cross_validate", _ADVICE).evaluator
+    folds = most_folds(optimum, _FOLDS) if folds is None else folds
     folds = positive_integer(folds, "folds", minimum=2)
     seed = seed_number(random_seed)
     parts = _Folds.dealt(evaluator.nodes, folds, seed)
@@ -117,6 +126,13 @@ def cross_validate(
         },
         attrs={"random_seed": str(seed), **versions()},
     )
+
+
+def most_folds(optimum: Optimum, wanted: int) -> int:
+    """Return how many folds there are of a wanted number, each of two specimens at least."""
+    evaluator = require_refits(optimum, "cross_validate", _ADVICE).evaluator
+    _, total = specimens(evaluator.nodes)
+    return max(2, min(wanted, total // 2))
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,6 +67,21 @@ def test_specimens_are_dealt_out_whole() -> None:
     )
 
 
+def test_few_specimens_have_fewer_folds() -> None:
+    with pm.Model() as model:
+        x = pm.LogNormal.dist(pm.Normal("mu", 0.5, 1), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", np.positive, x, metric=METRIC, observed=DATA[:9])
+    few = prb.minimize(model)
+    assert prb.cross_validate(few).sizes["fold"] == 4
+    assert prb.cross_validate(optimum()).sizes["fold"] == 5
+    table = prb.validation.compare_candidates({"one": few, "other": few})
+    assert table.attrs["folds"] == 4
+    # Those that are there already say how many.
+    three = prb.cross_validate(few, folds=3)
+    table = prb.validation.compare_candidates({"one": three, "other": few})
+    assert table.attrs["folds"] == 3
+
+
 def test_refusals() -> None:
     with pytest.raises(TypeError, match="got dict, expected an Optimum"):
         prb.cross_validate({})  # type: ignore[arg-type]
