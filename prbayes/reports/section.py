@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from prbayes._checks import plain_text
-from prbayes.reports.images import image, kind_of
+from prbayes.reports.images import image, is_broad, kind_of
 from prbayes.reports.tables import cells
 
 
@@ -102,6 +102,11 @@ class Section(_Content):
     def media_type(self) -> str:
         """The type of the picture for a data URI."""
         return kind_of(self._drawn)[1]
+
+    @property
+    def broad(self) -> bool:
+        """Whether the picture scrolls on a narrow screen, where it would be too small to read."""
+        return is_broad(self._drawn)
 
     @property
     def _drawn(self) -> bytes:

@@ -3,6 +3,8 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
 import pytest
 import xarray as xr
 from scipy import stats
@@ -35,3 +37,48 @@ def test_wrong_arguments_are_refused(optimum: prb.Optimum) -> None:
         prb.plot_population(3, model=optimum.model)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"level: got 1\.0"):
         prb.plot_population(optimum, level=1.0)
+
+
+def correlated() -> pm.Model:
+    with pm.Model() as model:
+        mean = pm.Normal("mean", [1.0, 2.0, 0.0], 1.0, shape=3)
+        rho = pm.Uniform("rho", -1, 1)
+        covariance = [[1.0, 2 * rho, 0.0], [2 * rho, 4.0, 0.0], [0.0, 0.0, 1.0]]
+        x = pm.MvNormal.dist(mean, pt.stacklists(covariance))
+        z = pm.Normal.dist(0, 1)
+        prb.Simulator(
+            "y",
+            lambda loads, z: loads[..., 0] + loads[..., 1] + loads[..., 2] + z,
+            x,
+            z,
+            metric=prb.AreaMetric(),
+            observed=[1.0, 2.0, 3.0],
+            propagation=prb.Reweighted(64, emulator=None),
+        )
+    return model
+
+
+def test_a_multivariate_input_has_its_pairs(read: SimpleNamespace) -> None:
+    draws = xr.Dataset(
+        {
+            "mean": (["chain", "draw", "mean_dim_0"], np.tile([1.0, 2.0, 0.0], (1, 4, 1))),
+            "rho": (["chain", "draw"], np.full((1, 4), 0.6)),
+        }
+    )
+    posterior = xr.DataTree.from_dict({"posterior": draws})
+    pc = prb.plot_population(posterior, model=correlated(), level=0.89, backend="matplotlib")
+    pairs = ["loads[1], loads[0]", "loads[2], loads[0]", "loads[2], loads[1]"]
+    assert list(pc.viz["region"].data_vars) == list(pc.viz["half"].data_vars) == pairs
+    # The ellipse of 89%: as far out as the root of a chi-square quantile, and as inclined.
+    for name, share in (("region", 0.89), ("half", 0.5)):
+        x, y = pc.viz[name][pairs[0]].item().get_data()
+        reach = np.sqrt(stats.chi2.ppf(share, 2))
+        np.testing.assert_allclose([np.nanmax(x) - 1, 1 - np.nanmin(x)], reach, rtol=0.06)
+        np.testing.assert_allclose([np.nanmax(y) - 2, 2 - np.nanmin(y)], 2 * reach, rtol=0.06)
+        top = x[np.nanargmax(y)] - 1
+        assert top == pytest.approx(0.6 * reach, abs=0.3 * reach)
+    titles = [axis.get_title() for axis in pc.viz["region"][pairs[0]].item().figure.axes]
+    assert any("correlation 0.6" in title for title in titles)
+    # One margin alone has no pair.
+    alone = prb.plot_population(posterior, model=correlated(), inputs=["loads[0]"], backend="none")
+    assert "region" not in alone.viz

@@ -7,8 +7,9 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import pytest
+from matplotlib.figure import Figure
 
-from prbayes.reports.images import image, kind_of
+from prbayes.reports.images import image, is_broad, kind_of
 
 
 class Drawing:
@@ -57,3 +58,11 @@ def test_a_figure_gives_the_same_bytes_each_time_and_its_words_are_drawn() -> No
     plt.close(figure)
     assert first == second
     assert b"<text" not in first, "letters are paths, which need no font"
+
+
+@pytest.mark.parametrize(("inches", "broad"), [(5.0, False), (12.0, True)])
+def test_a_picture_of_several_panels_is_broad(inches: float, broad: bool) -> None:
+    figure = Figure(figsize=(inches, 3.0))
+    figure.add_subplot().plot([0, 1], [0, 1])
+    assert is_broad(image(figure)) == broad
+    assert not is_broad(b"\x89PNG\r\n and so on")
