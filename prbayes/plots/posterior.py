@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,7 +34,7 @@ from prbayes.plots._canvas import (
     refuse_look,
 )
 from prbayes.plots._curves import bounded_density, central_levels
-from prbayes.plots._names import named, refuse_labels
+from prbayes.plots._names import named, refuse_labels, variable_of
 from prbayes.plots._ticks import round_ticks
 
 
@@ -43,6 +43,7 @@ def plot_posterior(
     optimum: Optimum | None = None,
     *,
     model: pm.Model | None = None,
+    var_names: Sequence[str] | None = None,
     level: float = 0.89,
     labels: Mapping[str, str] | None = None,
     backend: str | None = None,
@@ -63,6 +64,8 @@ def plot_posterior(
     model : pymc.Model, optional
         Restricts the picture to the model's variables, its deterministics among them, and adds
         their prior; by default all variables that posterior and optimum share.
+    var_names : sequence of str, optional
+        Variables that are drawn, or elements of them, such as ``"mu[Adler]"``; all by default.
     level : float
         Probability of the intervals.
     labels : mapping, optional
@@ -103,7 +106,7 @@ def plot_posterior(
     refuse_look(labels, backend, pc_kwargs)
     _check_results(posterior, optimum, model)
     share(level, "level")
-    found = _read_hyperparameters(posterior, optimum, model)
+    found = _wanted(_read_hyperparameters(posterior, optimum, model), var_names)
     evaluator = None if model is None else Evaluator(model)
     refuse_labels(labels, map(str, posterior["posterior"].data_vars), evaluator=evaluator)
     canvas = Canvas(list(found), size=(4.6, 3.6), backend=backend, pc_kwargs=pc_kwargs)
@@ -113,6 +116,21 @@ def plot_posterior(
         x = named(name, labels)
         panel.axes(x=x, y="density", yticks=round_ticks(0.0, top))
     return canvas.finish()
+
+
+def _wanted(
+    found: dict[str, _Hyperparameter], var_names: Sequence[str] | None
+) -> dict[str, _Hyperparameter]:
+    """Return those hyperparameters that were asked for."""
+    if var_names is None:
+        return found
+    asked = [var_names] if isinstance(var_names, str) else list(var_names)
+    unknown = [one for one in asked if not any(one in (name, variable_of(name)) for name in found)]
+    if unknown or not asked:
+        raise KeyError(
+            f"plot_posterior: var_names: got {unknown or 'none'}, expected some of {list(found)}"
+        )
+    return {name: one for name, one in found.items() if name in asked or variable_of(name) in asked}
 
 
 def _check_results(posterior: Any, optimum: Any, model: pm.Model | None) -> None:

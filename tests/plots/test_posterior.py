@@ -62,6 +62,25 @@ def test_a_posterior_alone(optimum: prb.Optimum, posterior: xr.DataTree) -> None
     assert "normal" not in pc.viz
 
 
+def test_some_of_the_variables(posterior: xr.DataTree) -> None:
+    draws = np.random.default_rng(0).normal(size=(1, 50, 2))
+    many = posterior.posterior.to_dataset().isel(chain=[0], draw=slice(50))
+    many["rate"] = (["chain", "draw", "supplier"], draws)
+    many = many.assign_coords(supplier=["Adler", "Busch"])
+    tree = xr.DataTree.from_dict({"posterior": many})
+
+    def drawn(var_names: Any) -> list[str]:
+        return list(prb.plot_posterior(tree, var_names=var_names, backend="none").viz["posterior"])
+
+    assert drawn(["rate"]) == ["rate[Adler]", "rate[Busch]"]
+    assert drawn("mu") == ["mu"]
+    assert drawn(["rate[Busch]", "mu"]) == ["mu", "rate[Busch]"]
+    with pytest.raises(KeyError, match=r"var_names: got \['nu'\], expected some of \['mu'"):
+        drawn(["mu", "nu"])
+    with pytest.raises(KeyError, match="var_names: got none"):
+        drawn([])
+
+
 def test_wrong_arguments_are_refused(optimum: prb.Optimum, posterior: xr.DataTree) -> None:
     with pytest.raises(TypeError, match="got Optimum, expected a DataTree"):
         prb.plot_posterior(optimum)  # type: ignore[arg-type]
