@@ -24,17 +24,30 @@ class _Problem:
 
     value: Callable[[Floats, Any], Floats]
     step: float
-    stencil: Floats
-    one_sided: bool
+    stencil: Floats  # (s, r): here, and around
+    back: Floats  # (r, r): slopes along the stencil's axes -> gradients
+    bend: float | None  # what one-sided differences have too much; None of central ones
 
     @classmethod
     def of(
-        cls, value: Callable[[Floats, Any], Floats], r: int, step: float, *, one_sided: bool
+        cls,
+        value: Callable[[Floats, Any], Floats],
+        r: int,
+        step: float,
+        curvature: Floats | None = None,
     ) -> _Problem:
-        unit = np.eye(r)
         here = np.zeros((1, r))
-        around = np.concatenate([here, unit] if one_sided else [here, unit, -unit])
-        return cls(value, step, step * around, one_sided)
+        if curvature is None:
+            unit = step * np.eye(r)
+            return cls(value, step, np.concatenate([here, unit, -unit]), np.eye(r), None)
+        # Axes along which a typical function is bent alike, of a mean length of one: along others a
+        # function of coordinates that hang together is bent by much more than it is across them,
+        # and a difference to one side would move its minimum by as much.
+        axes = np.linalg.inv(np.linalg.cholesky(curvature))
+        axes *= np.sqrt(r) / np.linalg.norm(axes)
+        bent = float(np.trace(axes @ curvature @ axes.T)) / r
+        stencil = np.concatenate([here, step * axes])
+        return cls(value, step, stencil, np.linalg.inv(axes).T, step * bent / 2)
 
     def __call__(self, x: Floats, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
         """Return values (A,) and gradients (A, r) of some rows at one point each, (A, r)."""
@@ -42,11 +55,11 @@ class _Problem:
         points = x[:, None] + self.stencil
         found = self.value(points, rows)
         up = found[:, 1 : 1 + r]
-        down = found[:, :1] if self.one_sided else found[:, 1 + r :]
-        apart = self.step if self.one_sided else 2 * self.step
         with np.errstate(invalid="ignore"):
-            gradients = (up - down) / apart
-        return found[:, 0], gradients
+            if self.bend is None:
+                return found[:, 0], (up - found[:, 1 + r :]) / (2 * self.step)
+            slopes = (up - found[:, :1]) / self.step - self.bend
+            return found[:, 0], slopes @ self.back
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +104,7 @@ def descend(
     step: float,
     tolerance: float,
     max_iterations: int = 40,
-    one_sided: bool = False,
+    curvature: Floats | None = None,
 ) -> Minima:
     """Minimise B functions of r parameters of order one, each from its own start, all in step.
 
@@ -110,9 +123,11 @@ def descend(
     tolerance : float
         In units of the functions.
     max_iterations : int
-    one_sided : bool
-        Whether differences are one-sided instead of central: half of the calls, and minima are off
-        by half of ``step``.
+    curvature : ndarray, shape (r, r), optional
+        The Hessian of a typical function, positive definite. With it differences are one-sided
+        instead of central, which halves the calls, along axes that it makes alike, and freed of
+        what it bends them by: minima are off by half a step, times by how much the function's
+        own Hessian is another one.
 
     References
     ----------
@@ -129,7 +144,7 @@ def descend(
     np.True_
     """
     size, r = start.shape
-    problem = _Problem.of(value, r, step, one_sided=one_sided)
+    problem = _Problem.of(value, r, step, curvature)
     x = start.copy()
     inverse = np.broadcast_to(inverse_hessian, (size, r, r)).copy()
     active = np.arange(size)
@@ -171,7 +186,7 @@ class Descent:
     inverse: Floats  # (r, r) or (B, r, r): first guesses of inverse Hessians
     tolerance: float  # gain that is left on the table
     step: float  # of the differences
-    one_sided: bool = False  # whether the differences are
+    curvature: Floats | None = None  # (r, r): of which one-sided differences are freed
 
     def __call__(self, value: Callable[[Floats, Any], Floats], start: Floats) -> Minima:
         """Return minimisers from starts (B, r) on."""
@@ -181,7 +196,7 @@ class Descent:
             self.inverse,
             step=self.step,
             tolerance=self.tolerance,
-            one_sided=self.one_sided,
+            curvature=self.curvature,
         )
 
 

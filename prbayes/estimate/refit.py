@@ -335,9 +335,19 @@ class SamplingDistribution:
         r = self.stderr.size
         if r == 0 or measured_by_refits(self.evaluator):  # then nothing follows it
             return Descent(np.zeros((r, r)), 0.0, _REFIT_STEP)
-        curvature = _mean_hessian(typical, r)
-        gain = (_ROUGHLY if roughly else _TOLERANCE) * np.trace(curvature) / r
-        return Descent(np.linalg.inv(curvature), gain, _REFIT_STEP, one_sided)
+        # By steps of a standard error across each other: along axes whose estimates hang together
+        # the curvature across them would hide that along them.
+        local = self.local
+        along = self.axes.T @ local.identified / self.stderr[:, None]
+        root = np.linalg.cholesky(along @ local.covariance @ along.T)
+        across = np.linalg.inv(root)
+        curvature = across.T @ _mean_hessian(lambda z: typical(z @ root.T), r) @ across
+        inverse = np.linalg.inv(curvature)
+        # What an error of one standard error costs, in whichever direction: where estimates hang
+        # together the mean curvature is that of the direction across, in which next to none is.
+        cost = r / np.trace(inverse)
+        gain = (_ROUGHLY if roughly else _TOLERANCE) * cost
+        return Descent(inverse, gain, _REFIT_STEP, curvature if one_sided else None)
 
     def _only(self, objective: BatchObjective, descent: Descent) -> Floats:
         """Return the minimiser of one data set along the axes, (r,): inf where none was found."""

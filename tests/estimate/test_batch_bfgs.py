@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pytest
 
 from prbayes._checks import Floats
 from prbayes.estimate.batch_bfgs import _updated, descend
@@ -77,19 +78,32 @@ def test_a_kink_is_the_end_of_a_line_search() -> None:
     np.testing.assert_allclose(x, centers, atol=0.02)
 
 
-def test_one_sided_differences_arrive_within_half_a_step() -> None:
+@pytest.mark.parametrize("correlation", [0.0, 0.95])
+@pytest.mark.parametrize("stiffer", [1.0, 1.5])
+def test_one_sided_differences_arrive_within_a_fraction_of_a_step(
+    correlation: float, stiffer: float
+) -> None:
     centers = np.array([[0.0, 1.0], [2.0, -1.5]])
+    curvature = np.linalg.inv([[1.0, correlation], [correlation, 1.0]])
     points = []
 
     def value(x: Floats, rows: Any) -> Floats:
         points.append(x.shape[1])
-        return np.asarray(((x - centers[rows, None]) ** 2).sum(-1))
+        away = x - centers[rows, None]
+        return stiffer * np.einsum("...i,ij,...j->...", away, curvature, away) / 2
 
     step = 0.02
     x, _, converged, _ = descend(
-        value, np.zeros((2, 2)), np.eye(2) / 2, step=step, tolerance=1e-9, one_sided=True
+        value,
+        np.zeros((2, 2)),
+        np.linalg.inv(curvature),
+        step=step,
+        tolerance=1e-9,
+        curvature=curvature,
     )
     assert converged.all()
-    # A slope to one side is that of the middle: the minimum is half a step before its place.
-    np.testing.assert_allclose(x, centers - step / 2, atol=1e-3)
+    # Half a step, times by how much the typical curvature is another one: to one side along the
+    # coordinates it was twenty times that much where they hang together.
+    expected = step / 2 * abs(1 / stiffer - 1) * np.sqrt(2) + 1e-3
+    assert np.abs(x - centers).max() < expected
     assert set(points) == {3}  # here, and one step along each axis
