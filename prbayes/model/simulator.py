@@ -71,7 +71,8 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     response : callable
         ``response(*inputs)``, a NumPy-style function: one array per input, any leading batch shape,
         a multivariate input with its event axis last; returns an array of the batch shape, in units
-        of the observed values; for m outputs of each specimen an array with them in a last axis, or
+        of the observed values, in which each specimen's is its own: one of them is computed by itself
+        as well, and what differs then is refused; for m outputs of each specimen an array with them in a last axis, or
         a mapping of arrays with the keys of ``observed``. NaN is a point at which it could not be
         computed, all outputs of it, +inf a specimen that failed. It is a function of its inputs:
         where these repeat, as discrete ones do, a design computes it once, unless four that are
