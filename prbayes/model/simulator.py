@@ -71,13 +71,14 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     response : callable
         ``response(*inputs)``, a NumPy-style function: one array per input, any leading batch shape,
         a multivariate input with its event axis last; returns an array of the batch shape, in units
-        of the observed values, in which each specimen's is its own: one of them is computed by itself
-        as well, and what differs then is refused; for m outputs of each specimen an array with them in a last axis, or
-        a mapping of arrays with the keys of ``observed``. NaN is a point at which it could not be
-        computed, all outputs of it, +inf a specimen that failed. It is a function of its inputs:
-        where these repeat, as discrete ones do, a design computes it once, unless four that are
-        computed again differ. Scatter of its own is best an input, as ``pm.Normal.dist(0, 1)``.
-        Simulators with the same response object, inputs and propagation share its runs.
+        of the observed values, in which each specimen's is its own: one of them is computed by
+        itself as well, and what differs then is refused; for m outputs of each specimen an array
+        with them in a last axis, or a mapping of arrays with the keys of ``observed``. NaN is a
+        point at which it could not be computed, all outputs of it, +inf a specimen that failed. It
+        is a function of its inputs: where these repeat, as discrete ones do, a design computes it
+        once, unless four that are computed again differ. Scatter of its own is best an input, as
+        ``pm.Normal.dist(0, 1)``. Simulators with the same response object, inputs and propagation
+        share its runs.
     *inputs
         Each is a ``.dist()`` (aleatory: varies between specimens), a model variable (epistemic:
         common to all specimens) or a constant. The same ``.dist()`` in two simulators means the
