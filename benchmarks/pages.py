@@ -417,37 +417,56 @@ def surrogates() -> Iterator[Row]:
         ]
 
 
-def joint() -> Iterator[Row]:
-    """Return the rows of joint calibration."""
-    from benchmarks.joint import ENOUGH, grouped
+# Problems of joint calibration, by the name of their table.
+JOINT = {
+    "correlation 0": "normal 0",
+    "correlation .6": "normal .6",
+    "correlation .95": "normal .95",
+    "frame": "frame",
+    "four outputs": "four .9",
+}
 
+
+def _joint_label(method: str) -> str:
+    """Return what a way of joint calibration is called."""
     schools = {
-        "joint": "`Joint`",
-        "given": "`Joint`, default posterior",
+        "joint": "`Joint`, straight map",
+        "given": "`Joint`",
         "correlation": "`MarginalCorrelation`",
         "separate": "separate marginals",
     }
-    problems = {
-        "normal 0": "two normal outputs, correlation 0",
-        "normal .6": "the same, .6",
-        "normal .95": "the same, .95",
-        "frame": "frame",
-        "four .9": "four normal outputs, .9",
-    }
+    if method == "exact":
+        return "exact posterior"
+    school, metric = method.split()
+    return f"{schools[school]}, {metric}"
+
+
+def joint_pooled() -> Iterator[Row]:
+    """Return the rows of joint calibration over all problems."""
+    from benchmarks.joint import METHODS
+
+    table = found("joint")["pooled"]
+    for size, method in product((20, 50, 200), METHODS):
+        cell = table.get(f"{method}/{size}")
+        if cell is not None:
+            figures = ("worst rmse over likelihood", "coverage", "worst off", "mean sd over exact")
+            columns = [short(cell[figure]) for figure in figures]
+            yield [str(size), _joint_label(method), str(cell["data sets"]), *columns]
+
+
+def joint(problem: str) -> Iterator[Row]:
+    """Return the rows of joint calibration of one problem."""
+    from benchmarks.joint import ENOUGH, grouped
+
     for key, cell in found("joint")["cells"].items():
-        if cell["data sets"] < ENOUGH:
-            continue
         name, size, method = key.split("/")
-        if method == "exact":
-            label = "exact posterior"
-        else:
-            school, metric = method.split()
-            label = f"{schools[school]}, {metric}"
+        if name != problem or cell["data sets"] < ENOUGH:
+            continue
         columns = [
             " / ".join(short(round(value, 2) + 0.0) for value in grouped(name, cell[figure]))
             for figure in ("rmse over likelihood", "coverage", "off", "sd over exact")
         ]
-        yield [problems[name], size, label, str(cell["data sets"]), *columns]
+        yield [size, _joint_label(method), str(cell["data sets"]), *columns]
 
 
 def joint_time() -> Iterator[Row]:
@@ -747,7 +766,8 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "wrong families, few data": lambda: families((20, 50)),
     "ties": ties,
     "surrogates": surrogates,
-    "joint": joint,
+    "joint, pooled": joint_pooled,
+    **{f"joint, {name}": partial(joint, problem) for name, problem in JOINT.items()},
     "joint, time": joint_time,
     "joint, memory": joint_memory,
     "scale": scale,
