@@ -179,6 +179,15 @@ def _ends(axis: Floats) -> tuple[float, float]:
     return float(axis[0]), float(axis[-1])
 
 
+def told_apart(values: Floats) -> tuple[str, ...]:
+    """Return numbers with three digits, or as many more, up to eight, as tell them apart."""
+    for digits in range(3, 9):
+        texts = tuple(f"{value:.{digits}g}" for value in values)
+        if len(set(texts)) == len(texts):
+            break
+    return texts
+
+
 def _draw_plane(panel: Panel, found: Landscape, height: str) -> None:
     """Draw the objective over two hyperparameters, with a bar of its values by its name."""
     roots, low, high = rooted(found.heights)
@@ -186,7 +195,7 @@ def _draw_plane(panel: Panel, found: Landscape, height: str) -> None:
     levels = np.linspace(0, 1, 11)
     told = levels[::2]
     values = low + told**2 * (high - low)
-    texts = tuple(f"{value:.3g}" for value in values)
+    texts = told_apart(values)
     scale = ColourScale(tuple(told.tolist()), texts, height)
     panel.heights("landscape", (first, second), roots, levels, scale)
     x, y = found.path.T

@@ -11,6 +11,7 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
+from prbayes.plots.landscape import told_apart
 
 QUANTILES = stats.norm.ppf((np.arange(30) + 0.5) / 30)
 
@@ -128,3 +129,9 @@ def _one() -> pm.Model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.3)
         prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 4.0])
     return model
+
+
+def test_values_of_a_flat_landscape_are_told_apart() -> None:
+    assert told_apart(np.array([0.002, 0.5, 12.345])) == ("0.002", "0.5", "12.3")
+    assert told_apart(np.array([1.00001, 1.00002])) == ("1.00001", "1.00002")
+    assert told_apart(np.array([1.0, 1.0])) == ("1", "1")
