@@ -335,11 +335,7 @@ class SamplingDistribution:
         r = self.stderr.size
         if r == 0 or measured_by_refits(self.evaluator):  # then nothing follows it
             return Descent(np.zeros((r, r)), 0.0, _REFIT_STEP)
-        # By steps of a standard error across each other: along axes whose estimates hang together
-        # the curvature across them would hide that along them.
-        local = self.local
-        along = self.axes.T @ local.identified / self.stderr[:, None]
-        root = np.linalg.cholesky(along @ local.covariance @ along.T)
+        root = self._root
         across = np.linalg.inv(root)
         curvature = across.T @ _mean_hessian(lambda z: typical(z @ root.T), r) @ across
         inverse = np.linalg.inv(curvature)
@@ -348,6 +344,19 @@ class SamplingDistribution:
         cost = r / np.trace(inverse)
         gain = (_ROUGHLY if roughly else _TOLERANCE) * cost
         return Descent(inverse, gain, _REFIT_STEP, curvature if one_sided else None)
+
+    @property
+    def _root(self) -> Floats:
+        """Steps of one standard error that lead across each other, in coordinates, (r, r).
+
+        Along axes whose estimates hang together the curvature across them would hide that along.
+        """
+        local = self.local
+        along = self.axes.T @ local.identified / self.stderr[:, None]
+        try:
+            return np.asarray(np.linalg.cholesky(along @ local.covariance @ along.T))
+        except np.linalg.LinAlgError:  # a variance that rounding made nothing
+            return np.eye(self.stderr.size)
 
     def _only(self, objective: BatchObjective, descent: Descent) -> Floats:
         """Return the minimiser of one data set along the axes, (r,): inf where none was found."""

@@ -268,3 +268,12 @@ def test_rough_refits_are_around_the_exact_ones_where_hyperparameters_hang_toget
     off = (rough - exact) / exact.std(axis=0)
     assert np.abs(off.mean(axis=0)).max() < 0.01
     assert off.std(axis=0).max() < 0.03
+
+
+def test_a_variance_that_rounding_made_nothing_leaves_refits_their_axes() -> None:
+    sampling = neighbourhood("kl")
+    flat = replace(sampling, local=replace(sampling.local, covariance=0 * sampling.local.covariance))
+    np.testing.assert_array_equal(flat._root, np.eye(2))
+    x, converged = flat.refit(observed_set(flat.evaluator))
+    assert converged.all()
+    np.testing.assert_allclose(x, sampling.refit(observed_set(flat.evaluator))[0], atol=1e-6)
