@@ -175,8 +175,8 @@ def observed_outputs(values: ArrayLike, name: str = "observed") -> Floats:
     return array
 
 
-# Squares of measured values and their sums are numbers up to here, with room for a wide margin.
-_HUGE = 1e100
+# Squares of measured values, and sums of them, are numbers up to here.
+_HUGE = 1e152
 
 
 def _refuse_huge(array: Floats, name: str) -> None:

@@ -109,7 +109,7 @@ def test_observed_values_are_one_dimensional_and_finite(values: Any, match: str)
         observed_sample(values, "strain")
 
 
-@pytest.mark.parametrize(("n", "got"), [(0, "no values"), (1, "1 value,")])
+@pytest.mark.parametrize(("n", "got"), [(0, "no values"), (1, "one value,")])
 def test_observed_values_can_have_a_minimum_number(n: int, got: str) -> None:
     with pytest.raises(ValueError, match=f"observed: got {got}.*at least 2"):
         observed_sample(np.zeros(n), minimum=2)

@@ -48,12 +48,12 @@ def image(picture: Any) -> bytes:
 # Width, in points, from which a picture's letters are too small on a phone: pictures of one panel
 # are 400 wide, those of two 650.
 _BROAD = 560
-_WIDTH = re.compile(rb'<svg[^>]*\swidth="([0-9.]+)(?:pt)?"')
+_SVG_WIDTH = re.compile(rb'<svg[^>]*\swidth="([0-9.]+)(?:pt)?"')
 
 
 def is_broad(picture: bytes) -> bool:
     """Return whether a picture is so wide that a phone should not shrink it: of a drawing alone."""
-    found = _WIDTH.search(picture[:2000])
+    found = _SVG_WIDTH.search(picture[:2000])
     return found is not None and float(found[1]) > _BROAD
 
 

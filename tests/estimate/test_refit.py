@@ -272,7 +272,9 @@ def test_rough_refits_are_around_the_exact_ones_where_hyperparameters_hang_toget
 
 def test_a_variance_that_rounding_made_nothing_leaves_refits_their_axes() -> None:
     sampling = neighbourhood("kl")
-    flat = replace(sampling, local=replace(sampling.local, covariance=0 * sampling.local.covariance))
+    flat = replace(
+        sampling, local=replace(sampling.local, covariance=0 * sampling.local.covariance)
+    )
     np.testing.assert_array_equal(flat._root, np.eye(2))
     x, converged = flat.refit(observed_set(flat.evaluator))
     assert converged.all()
