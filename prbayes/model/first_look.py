@@ -73,11 +73,18 @@ def tell_copies(name: str, observed: Floats) -> None:
 
 
 def _on_few_steps(rows: Floats) -> bool:
-    """Return whether values of each output, (n, m), are whole steps apart, fewer than values."""
+    """Return whether values of each output, (n, m), are on a decimal scale of fewer steps than n."""
     for column in rows.T:
-        gaps = np.diff(np.unique(column[np.isfinite(column)]))
-        steps = gaps / gaps.min(initial=np.inf)
-        whole = np.allclose(steps, np.round(steps), rtol=0, atol=1e-6)
-        if not whole or steps.sum() >= len(rows):
+        values = column[np.isfinite(column)]
+        steps = [np.ptp(values) * unit for unit in _UNITS if _are_whole(values * unit)]
+        if not steps or min(steps) >= len(rows):
             return False
     return True
+
+
+# Readings in whole units, in tenths of them, and so on.
+_UNITS = 10.0 ** np.arange(-3, 7)
+
+
+def _are_whole(values: Floats) -> bool:
+    return bool(np.abs(values - np.round(values)).max(initial=0.0) < 1e-6)

@@ -53,7 +53,9 @@ def test_without_enough_to_tell_nothing_is_told(
     assert not logged.records
 
 
-@pytest.mark.parametrize("values", [MEASURED[:, 0], MEASURED, MEASURED[:, 0].round(3)])
+@pytest.mark.parametrize(
+    "values", [MEASURED[:, 0], MEASURED, MEASURED[:, 0].round(3), 0.001 * np.arange(20) ** 2]
+)
 def test_specimens_that_are_all_there_twice_are_told_of(
     values: Floats, logged: pytest.LogCaptureFixture
 ) -> None:
@@ -68,11 +70,13 @@ def test_specimens_that_are_all_there_twice_are_told_of(
         MEASURED[:, 0],
         np.append(MEASURED[:, 0], MEASURED[:3, 0]),  # some of them
         RNG.binomial(4, 0.5, 60),  # counts
+        np.repeat([3, 5, 8], 4),
+        np.repeat([300, 500, 800], 4),  # of hundreds
         RNG.normal(size=400).round(1).clip(-1, 1),  # rounded readings
         np.full(9, 2.5),  # all equal
         [1.0, 1.0, 2.0, 2.0],  # few
     ],
-    ids=["once", "some", "counts", "rounded", "equal", "few"],
+    ids=["once", "some", "counts", "other counts", "hundreds", "rounded", "equal", "few"],
 )
 def test_ties_by_chance_are_not(values: Floats, logged: pytest.LogCaptureFixture) -> None:
     tell_copies("y", np.asarray(values, dtype=float))
