@@ -73,7 +73,7 @@ def tell_copies(name: str, observed: Floats) -> None:
 
 
 def _on_few_steps(rows: Floats) -> bool:
-    """Return whether values of each output, (n, m), are on a decimal scale of fewer steps than n."""
+    """Return whether values of each output, (n, m), are on a decimal scale of less than n steps."""
     for column in rows.T:
         values = column[np.isfinite(column)]
         steps = [np.ptp(values) * unit for unit in _UNITS if _are_whole(values * unit)]
