@@ -272,7 +272,9 @@ def _tested(test: ValidityTest) -> dict[str, Any]:
     of = "|2u - 1|" if test.folded else "u"
     if directions and not test.folded:
         of = "u and |2u - 1|"
+    # The verdict first: what is at the end of a wide table is off a phone's screen.
     return {
+        "verdict": "rejected" if test.rejected else "not rejected",
         "values": test.u_values.size,
         "specimens": np.unique(test.specimens).size,
         "directions": str(directions) if directions else "",
@@ -281,7 +283,6 @@ def _tested(test: ValidityTest) -> dict[str, Any]:
         "critical value": f"{test.critical_value:.4f}",
         "p-value": probability(test.p_value).removeprefix("= "),
         "level": percentage(test.level),
-        "verdict": "rejected" if test.rejected else "not rejected",
     }
 
 
