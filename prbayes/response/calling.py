@@ -270,13 +270,13 @@ def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
                 tally.good = tally.good or len(chunk.raised) < len(rows)
             if not tally.good and raised and all(map(_is_misfit, raised.values())):
                 # Not one run has given a response so far: no failure, but another function.
-                raise _failed(calling, raised)
+                raise _failed(calling, points, raised)
             if calling.store is not None:
                 # NaN is a result, too, after the last try, but not where a chunk broke off.
                 _keep(calling.store, keys, done, last=last, tolerant=tolerant)
         if raised and not tolerant:
             tally.note(points, raised)
-            raise _failed(calling, raised)
+            raise _failed(calling, points, raised)
         missing = missing[lacking(values[missing])]
         if not missing.size:
             break
@@ -332,9 +332,9 @@ def _again(calling: Calling, point: Points, tally: Tally) -> tuple[Floats, str]:
     return np.array([np.nan]), f"nothing ({next(iter(chunk.raised.values()), 'it was lost')})"
 
 
-def _numbers_told(values: Floats) -> str:
-    """Return outputs of a run in words, shape (m,)."""
-    text = ", ".join(f"{value:.10g}" for value in values[:6])  # what fits a line
+def _numbers_told(values: Floats, digits: int = 10) -> str:
+    """Return outputs of a run, or its inputs, in words, shape (m,)."""
+    text = ", ".join(f"{value:.{digits}g}" for value in values[:6])  # what fits a line
     if values.size == 1:
         return text
     return f"({text}, ...)" if values.size > 6 else f"({text})"
@@ -390,7 +390,7 @@ def _settled(
         return values
     first = next(iter(raised.values()), "it is NaN")
     if policy.refuses_nan:
-        raise _failed(calling, raised or {0: first})
+        raise _failed(calling, points, raised or {int(np.flatnonzero(bad)[0]): first})
     if policy.replacement is not None:
         tally.failures += n_bad
         text = f"{n_bad} of {bad.size} responses failed, replaced by {policy.replacement}"
@@ -400,17 +400,25 @@ def _settled(
     return values
 
 
-def _failed(calling: Calling, raised: dict[int, str]) -> ResponseError:
-    first = next(iter(raised.values()))
+def _failed(calling: Calling, points: Points, raised: dict[int, str]) -> ResponseError:
+    row, first = next(iter(raised.items()))
+    place = ""
+    if isinstance(calling.function, scalar):  # of a batch nobody knows which it was
+        (inputs,) = points.at(np.array([row])).keys()
+        place = f", the first with inputs {_numbers_told(inputs, 6)}"
     kept = ""
     if calling.store is not None:
         kept = f"; {len(calling.store)} responses are kept in {calling.store.folder}"
     policies = "on_failure=prb.response.Replace() or prb.response.Retry()"
-    advice = f"repair it, or pass {policies} to the propagation or surrogate"
+    advice = (
+        "repair it, keep priors and inputs where it has a response, or pass "
+        f"{policies} to the propagation or surrogate"
+    )
     if _is_misfit(first):
         advice = f"repair it; if this is what a run that failed returns, pass {policies}"
     return ResponseError(
-        f"{calling.name}: the response failed at {len(raised)} point(s): {first}{kept}; {advice}"
+        f"{calling.name}: the response failed at {len(raised)} point(s){place}: {first}{kept}; "
+        f"{advice}"
     )
 
 

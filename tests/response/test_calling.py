@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import math
+import re
 import sqlite3
 import threading
 import time
@@ -386,6 +388,24 @@ def test_a_wrong_shape_is_a_mistake_and_no_failure() -> None:
 
 
 # -- what is stored --------------------------------------------------------------------------------
+
+
+def test_a_failure_says_where() -> None:
+    def root(x: float, y: float) -> float:
+        return math.sqrt(x) + y  # which there is none of
+
+    with pm.Model():
+        inputs = [pm.Normal.dist(pm.Normal(name, 0, 1), 1.0) for name in ("mu", "nu")]
+        given = {"metric": prb.AreaMetric(), "observed": [1.0, 2.0, 3.0]}
+        with pytest.raises(
+            prb.response.ResponseError,
+            match=r"failed at 1 point\(s\), the first with inputs \(-[\d.]+, -?[\d.]+\): it raised "
+            r"ValueError.*; repair it, keep priors and inputs where it has a response, or pass",
+        ) as raised:
+            prb.Simulator("y", prb.scalar(root), *inputs, **given)
+    x, y = map(float, re.findall(r"inputs \((.*?), (.*?)\)", str(raised.value))[0])
+    with pytest.raises(ValueError, match="math domain"):
+        root(x, y)
 
 
 def test_a_function_that_never_gives_what_is_observed_ends_the_run_whatever_the_policy() -> None:
