@@ -230,8 +230,9 @@ def of_another_family(probability: float) -> list[str]:
     if not probability < UNLIKELY:
         return []
     return [
-        f"the data are farther from the best population than {1 - probability:.1%} of data sets "
-        "that the model draws there are from theirs: the inputs probably have another family, or "
-        "the response an error; look at prb.plot_responses, and at outliers"
+        f"the data are farther from the best population than {1 - probability:.1%} or more of data "
+        "sets that the model draws there are from theirs: the inputs probably have another family, "
+        "or the response an error; look at prb.plot_responses, at outliers, and at other families, "
+        "by prb.validation.compare_candidates"
         f"{more_in('choosing_metric.md#a-wrong-family')}"
     ]
