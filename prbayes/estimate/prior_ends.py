@@ -91,15 +91,19 @@ def _pushed(sampling: SamplingDistribution, i: int, middle: float) -> bool:
     evaluator = sampling.evaluator
     noise = np.array([one.noise_floor for one in sampling.information])
 
-    def worse(theta: Floats) -> Floats:
+    def is_worse(theta: Floats) -> bool:
         here, there = evaluator(np.stack([sampling.theta, theta])).discrepancies
-        return np.asarray(np.nan_to_num((there - here) / noise, nan=np.inf, posinf=np.inf))
+        with np.errstate(invalid="ignore"):
+            # What is no number, as where no design reaches, is worse.
+            return not bool((there - here <= noise).all())
 
     others = np.delete(np.arange(sampling.theta.size), i)
     back = sampling.theta.copy()
     back[i] = middle
-    if worse(back).max() <= 1 or not others.size:
-        return bool(worse(back).max() > 1)
+    if not is_worse(back):
+        return False
+    if not others.size:
+        return True
 
     def along(x: Floats) -> float:
         moved = back.copy()
@@ -117,7 +121,7 @@ def _pushed(sampling: SamplingDistribution, i: int, middle: float) -> bool:
     }
     found = minimize(along, begin, method="Nelder-Mead", options=options)
     back[others] += found.x * evaluator.prior_sd[others]
-    return bool(worse(back).max() > 1)
+    return is_worse(back)
 
 
 def of_prior_ends(ends: list[PriorEnd]) -> list[str]:

@@ -113,6 +113,7 @@ def posterior_tree(
 
 # Groups of a result that depend on its draws, which are others after an adjustment.
 _OF_DRAWS = ("posterior_predictive", "predictions", "log_likelihood", "log_prior")
+_PRIOR_GROUPS = {"prior", "prior_predictive"}
 
 
 def adjusted_tree(
@@ -175,7 +176,9 @@ def adjusted_tree(
     for name, other in given.children.items():
         if name not in found and name not in _OF_DRAWS:
             found[str(name)] = other.to_dataset()
-    return xr.DataTree.from_dict({**groups, **found})
+    if _PRIOR_GROUPS.isdisjoint(found):  # draws of a prior and what they predict belong together
+        found |= {name: group for name, group in groups.items() if name in _PRIOR_GROUPS}
+    return xr.DataTree.from_dict(found)
 
 
 def _posterior(evaluator: Evaluator, thetas: Floats, attrs: dict[str, Any]) -> xr.Dataset:

@@ -318,7 +318,7 @@ class Responses:
 
     def _refuse_mixing(self, values: list[Floats], batch: tuple[int, ...], found: Floats) -> None:
         """Raise if what is computed for a batch is another thing by itself; looked at once."""
-        if self._looked or not batch or found.size < 2:
+        if self._looked or int(np.prod(batch, dtype=int)) < 2 or not batch:
             return
         self._looked = True
 

@@ -107,6 +107,12 @@ def test_draws_of_nuts_get_the_width_that_the_data_warrant(
     )
     assert "diagnosis" in az.psense_summary(adjusted, var_names=["mu", "sigma"])
     assert set(adjusted.prior.data_vars) == {"mu", "sigma", "variance"}
+    assert "y" in adjusted.prior_predictive
+    # A prior that is there is not joined by predictions of other draws.
+    idata["prior"] = xr.Dataset({"mu": ("draw", np.zeros(3))})
+    kept = prb.adjust(idata, model=model)
+    assert kept.prior.sizes["draw"] == 3
+    assert "prior_predictive" not in kept.children
     assert adjusted.posterior.attrs["inference_library"] == "pymc"
     # Diagnoses tell both apart, the second without the model.
     assert "prb.adjust" in "".join(prb.diagnose(idata, model=model).notes)

@@ -7,6 +7,8 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
+from prbayes.response.inputs import read_inputs
+from prbayes.response.response import Responses
 
 OBSERVED = np.linspace(-1, 1, 20)
 
@@ -52,6 +54,18 @@ def test_of_several_outputs_one_is_enough() -> None:
             observed=np.random.default_rng(0).normal(size=(20, 2)),
             metric=prb.Joint(prb.AreaMetric()),
         )
+
+
+def test_a_first_batch_of_one_specimen_is_no_look() -> None:
+    def two(x: Any) -> Any:
+        return np.stack([x, x[..., ::-1]], axis=-1)
+
+    with pm.Model() as model:
+        inputs = read_inputs("y", [pm.Normal.dist(pm.Normal("mu", 0, 1), 1)], model)
+    responses = Responses("y", two, inputs, outputs=None)
+    responses([np.array([0.5])], [])
+    with pytest.raises(prb.response.ResponseError, match="depends on those that it is computed"):
+        responses([np.arange(4.0)], [])
 
 
 def test_others_are_not_refused() -> None:
