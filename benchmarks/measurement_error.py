@@ -58,13 +58,7 @@ def posterior(way: str, readings: Any, differences: Any, seed: int) -> Any:
             )
     optimum = prb.minimize(model, progressbar=False)
     return prb.sample_smc(
-        250,
-        chains=2,
-        model=model,
-        optimum=optimum,
-        random_seed=seed,
-        progressbar=False,
-        adjust=prb.posterior.Affine(),
+        250, chains=2, model=model, optimum=optimum, random_seed=seed, progressbar=False
     ).posterior
 
 
