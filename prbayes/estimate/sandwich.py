@@ -43,8 +43,12 @@ _FAR_ENOUGH = 0.24
 _SHORTENED = 8
 # Knots on which distribution functions are linearised.
 _KNOTS = 400
-# Single observations over which the covariance of an additive gradient is taken.
+# Single observations over which the covariance of an additive gradient is taken: of one output, and
+# of several, whose gradients have tails in all directions. So many are computed at a time, as the
+# work grows with their square.
 _SINGLE = 1000
+_SINGLE_TOGETHER = 2000
+_SINGLES_AT_ONCE = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,24 +282,33 @@ class Information:
             gradients = self.gradients(*self.data_set)
             covariance = np.cov(gradients, rowvar=False)
             return np.atleast_2d(covariance)
-        # A mean over observations: the covariance of single ones, at equal steps of probability,
-        # by N.
-        single = self._quantiles(_SINGLE)
-        gradients = self.gradients(single, np.eye(_SINGLE))
-        covariance = np.cov(gradients, rowvar=False)
+        # A mean over observations: the covariance of single ones, by N.
+        single, mass = self._single
+        each = range(0, len(single), _SINGLES_AT_ONCE)
+        batches = [single[i : i + _SINGLES_AT_ONCE] for i in each]
+        gradients = [self.gradients(batch, np.eye(len(batch))) for batch in batches]
+        covariance = np.cov(np.concatenate(gradients), rowvar=False, aweights=mass)
         return np.atleast_2d(covariance) / self._target.n_effective
 
-    def _quantiles(self, n: int) -> Floats:
-        """Return values of the population at theta at n equal steps of probability.
+    @property
+    def _single(self) -> tuple[Floats, Floats]:
+        """Specimens of the population at theta, and what each stands for, shapes (n, ...), (n,).
 
-        Specimens of several outputs in the order of the first.
+        Of one output at equal steps of probability. Of several, half are taken in proportion to the
+        fourth power of their distance from the middle, since most of the mean square of gradients
+        is theirs.
         """
         values, weights = self._center
         order = np.argsort(values.reshape(len(values), -1)[:, 0])
+        n, mass = _SINGLE, weights
+        if values.ndim > 1:
+            n = _SINGLE_TOGETHER
+            far = _squared_distances(self._target, values, weights) ** 2
+            mass = weights * (1 + far / max(weights @ far, np.finfo(float).tiny))
+            mass = mass / mass.sum()
         levels = (np.arange(n) + 0.5) / n
-        places = reached(weights[order], levels)
-        ordered = values[order]
-        return np.asarray(ordered[places])
+        chosen = order[reached(mass[order], levels)]
+        return values[chosen], weights[chosen] / mass[chosen]
 
     @cached_property
     def hessian(self) -> Floats:
@@ -364,3 +377,17 @@ class Information:
         places = np.linspace(0, knots.size - 1, _KNOTS)
         some = np.unique(places.astype(int))
         return np.asarray(knots[some])
+
+
+def _squared_distances(target: Discrepancy, values: Floats, weights: Floats) -> Floats:
+    """Return how far out each specimen is: mean squares of standardised projections, (n,)."""
+    squares = [np.zeros(len(values))]
+    for projected in one_dimensional(target, values):
+        finite = np.isfinite(projected)
+        known = np.where(finite, projected, 0.0)
+        mass = np.where(finite, weights, 0.0)
+        mass = mass / max(mass.sum(), np.finfo(float).tiny)
+        centered = np.where(finite, known - mass @ known, 0.0)
+        variance = mass @ centered**2
+        squares.append(centered**2 / max(variance, np.finfo(float).tiny))
+    return np.asarray(np.mean(squares, axis=0))

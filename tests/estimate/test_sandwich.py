@@ -214,3 +214,28 @@ def test_responses_beyond_the_grid_leave_the_curvature_as_it_is(metric: prb.Metr
         # Of a normal population, which the kernel widens by a few per cent.
         of_a_normal = np.diag([1 / spread**2, 2.0])
         np.testing.assert_allclose(moved.hessian, of_a_normal, atol=0.3)
+
+
+def test_noise_of_gradients_with_tails_is_that_of_the_whole_population() -> None:
+    # Of two outputs one of which is a square, where a few specimens have most of the mean square:
+    # a thousand of them taken evenly scatter by a tenth and more.
+    with pm.Model() as model:
+        mu, sigma = pm.Normal("mu", 0.0, 1.0), pm.HalfNormal("sigma", 1.0)
+        x, z = pm.Normal.dist(mu, sigma), pm.Normal.dist(0.0, 1.0)
+        observed = np.random.default_rng(0).normal(size=(N, 2))
+        prb.Simulator(
+            *("y", lambda x, z: np.stack([x + x**2, z * x], axis=-1), x, z),
+            metric=prb.Joint(KL),
+            observed=observed,
+            propagation=prb.Reweighted(4096, emulator=None),
+            progressbar=False,
+        )
+    evaluator = Evaluator(model)
+    information = Information(evaluator, 0, np.array([0.3, -0.5]))
+    values, weights = information._center
+    batches = [slice(i, i + 64) for i in range(0, len(values), 64)]
+    each = [information.gradients(values[b], np.eye(len(values[b]))) for b in batches]
+    noise = np.cov(np.concatenate(each), rowvar=False, aweights=weights)
+    size = np.sqrt(np.diag(noise))
+    found = information.sampling_covariance * information._target.n_effective
+    np.testing.assert_allclose(found / np.outer(size, size), noise / np.outer(size, size), atol=0.02)
