@@ -4,7 +4,8 @@ Every input has a mean and a standard deviation of its own. Responses are those 
 `benchmarks.responses`, with as many outputs again that each follow one input, so that the data
 identify all hyperparameters; N = 50 specimens, compared by `Joint(KullbackLeibler())`. Priors of
 means are two population standard deviations wide, of standard deviations a factor of 1.6; the frame
-has uniform priors a hundred posterior standard deviations wide.
+has uniform priors a hundred posterior standard deviations wide, and is there again with inputs that
+correlate, by .6, of which the prior knows nothing.
 
 The design begins with 32 runs an input and grows by itself. The reference is the optimum of
 Resimulated(65 536) on the same data. Beside it: runs alone, without an emulator, which may grow to
@@ -28,25 +29,37 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
+import pytensor.tensor as pt
 
 import prbayes as prb
 from benchmarks import record
-from benchmarks.responses import RESPONSES
+from benchmarks.responses import RESPONSES, Response
 
-NAMES = ("product", "frame", "NaN region", "three inputs", "two kinks", "jump")
+NAMES = ("product", "frame", "correlated frame", "NaN region", "three inputs", "two kinks", "jump")
 N = 50
 FIRST = 32  # runs for each input
 
 
+RHO = 0.6  # correlation of the inputs of the correlated frame
+
+
+def response_of(name: str) -> Response:
+    """Return the response of a problem."""
+    return RESPONSES[name.removeprefix("correlated ")]
+
+
 def outputs_of(name: str) -> Callable[..., Any]:
-    """Return the response with an output for each input beside its own: inputs -> (..., m)."""
-    response = RESPONSES[name]
+    """Return the response with an output for each input beside its own: inputs -> (..., m).
+
+    Correlated inputs are one argument.
+    """
+    response = response_of(name)
 
     def together(*inputs: Any) -> Any:
-        x = np.stack(np.broadcast_arrays(*inputs), axis=-1)
+        x = inputs[0] if len(inputs) == 1 else np.stack(np.broadcast_arrays(*inputs), axis=-1)
         flat = x.reshape(-1, response.d)
         own = response(flat)
-        if name != "frame":
+        if response.name != "frame":
             z = (flat - response.mean) / response.sd
             own = np.concatenate([own, z + 0.2 * z * z[:, ::-1]], axis=1)
         return own.reshape(*x.shape[:-1], own.shape[1])
@@ -56,27 +69,37 @@ def outputs_of(name: str) -> Callable[..., Any]:
 
 def observed_of(name: str, seed: int) -> Any:
     """Return outputs of specimens of the true population, without those that have none."""
-    response = RESPONSES[name]
+    response = response_of(name)
     rng = np.random.default_rng([seed, N])
-    x = response.mean + response.sd * rng.standard_normal((2 * N, response.d))
-    found = outputs_of(name)(*x.T)
+    z = rng.standard_normal((2 * N, response.d))
+    if name.startswith("correlated"):
+        z[:, 1] = RHO * z[:, 0] + np.sqrt(1 - RHO**2) * z[:, 1]
+    x = response.mean + response.sd * z
+    found = outputs_of(name)(x)
     return found[np.isfinite(found).all(axis=1)][:N]
 
 
 def build(name: str, observed: Any, propagation: Any) -> pm.Model:
     """Return the model."""
-    response = RESPONSES[name]
+    response = response_of(name)
     with pm.Model() as model:
-        inputs = []
+        inputs, means, sds = [], [], []
         for i, (mean, sd) in enumerate(zip(response.mean, response.sd, strict=True)):
-            if name == "frame":
+            if response.name == "frame":
                 half = 50 * sd / np.sqrt(N)
                 mu = pm.Uniform(f"mu{i}", mean - half, mean + half)
                 sigma = pm.Uniform(f"sigma{i}", 0, 100 * sd / np.sqrt(2 * N))
             else:
                 mu = pm.Normal(f"mu{i}", mean, 2 * sd)
                 sigma = pm.LogNormal(f"sigma{i}", np.log(sd), 0.5)
+            means.append(mu)
+            sds.append(sigma)
             inputs.append(pm.Normal.dist(mu, sigma))
+        if name.startswith("correlated"):
+            rho = pm.Uniform("rho", -1, 1)
+            both = rho * sds[0] * sds[1]
+            covariance = pt.stacklists([[sds[0] ** 2, both], [both, sds[1] ** 2]])
+            inputs = [pm.MvNormal.dist(pt.stack(means), covariance)]
         metric = prb.Joint(prb.KullbackLeibler())
         prb.Simulator(
             "y",
@@ -128,7 +151,7 @@ def along_axes(reference: Any) -> Any:
 def problem(name: str, seeds: int, of_runs_alone: int) -> dict[str, Any]:
     """Calibrate a problem with several designs, with an emulator and without."""
     observed = observed_of(name, 1)
-    n = FIRST * RESPONSES[name].d
+    n = FIRST * response_of(name).d
     begin = prb.minimize(
         build(name, observed, prb.Reweighted(n, emulator="auto", random_seed=1000)),
         progressbar=False,
@@ -147,7 +170,7 @@ def problem(name: str, seeds: int, of_runs_alone: int) -> dict[str, Any]:
     for seed in range(of_runs_alone):
         stored = prb.Reweighted(1024, emulator=None, max_points=32_768, random_seed=seed)
         alone.append(fitted(name, observed, stored, reference))
-    return {"inputs": RESPONSES[name].d, "emulated": rows, "alone": alone}
+    return {"inputs": response_of(name).d, "emulated": rows, "alone": alone}
 
 
 def figures(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, positive_number
 from prbayes._threads import one_thread
 from prbayes.emulators.surfaces import Predict, Surface
 
@@ -68,8 +68,8 @@ class GaussianProcess(Surface):
 
     Raises
     ------
-    ValueError
-        If the kernel is none of these.
+    TypeError, ValueError
+        If an argument is not as described, or only one of lengths and nugget is given.
 
     References
     ----------
@@ -91,6 +91,17 @@ class GaussianProcess(Surface):
             raise ValueError(
                 f"GaussianProcess: kernel: got {self.kernel!r}, expected one of {list(KERNELS)}"
             )
+        if (self.lengths is None) != (self.nugget is None):
+            raise ValueError(
+                f"GaussianProcess: got lengths {self.lengths} and nugget {self.nugget}, expected "
+                "both, or neither, which are then the likeliest"
+            )
+        if self.lengths is None:
+            return
+        for length in self.lengths:
+            positive_number(length, "GaussianProcess: lengths")
+        if self.nugget != 0:
+            positive_number(self.nugget, "GaussianProcess: nugget")
 
     def terms(self, dimensions: int) -> int:
         """Return how many points it needs at least."""
@@ -127,6 +138,11 @@ class GaussianProcess(Surface):
         """Return the mean of the process given the points."""
         if self.lengths is None or self.nugget is None:
             return self.tuned(x, y).through(x, y)
+        if len(self.lengths) != x.shape[1]:
+            raise ValueError(
+                f"GaussianProcess: lengths: got {len(self.lengths)}, expected one for each of "
+                f"{x.shape[1]} inputs"
+            )
         return mean_through(KERNELS[self.kernel], np.array(self.lengths), self.nugget, x, y)
 
     def without_each(self, x: Floats, y: Floats, lacking: NDArray[np.bool_]) -> Predict:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import product
 from math import comb
 from typing import Any
@@ -215,27 +215,6 @@ def least_squares(x: Floats, y: Floats, along: Floats) -> float:
     """Return how steeply responses follow another one beside a plane, which any surface tells."""
     columns = np.column_stack([np.ones(len(x)), x, along])
     return float(np.linalg.lstsq(columns, y, rcond=None)[0][-1])
-
-
-# Those that a file can name, so that it is read without being handed the surface.
-_SHIPPED: dict[str, type[RadialBasis] | type[Polynomial]] = {
-    "RadialBasis": RadialBasis,
-    "Polynomial": Polynomial,
-}
-
-
-def settings_of(model: Any) -> dict[str, Any]:
-    """Return what a file keeps of a surface that ships with prbayes; of any other one nothing."""
-    if isinstance(model, RadialBasis | Polynomial):
-        return asdict(model)
-    return {}
-
-
-def shipped(kind: str, settings: dict[str, Any]) -> Surface | None:
-    """Return the surface with such settings, or None if no such kind ships with prbayes."""
-    if kind not in _SHIPPED:
-        return None
-    return _SHIPPED[kind](**settings)
 
 
 def fitted(model: Any, x: Floats, y: Floats) -> Predict:

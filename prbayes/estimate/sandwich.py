@@ -49,6 +49,8 @@ _KNOTS = 400
 _SINGLE = 1000
 _SINGLE_TOGETHER = 2000
 _SINGLES_AT_ONCE = 64
+# Instead of a zero that something is divided by.
+_TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,10 +286,10 @@ class Information:
             return np.atleast_2d(covariance)
         # A mean over observations: the covariance of single ones, by N.
         single, mass = self._single
-        each = range(0, len(single), _SINGLES_AT_ONCE)
-        batches = [single[i : i + _SINGLES_AT_ONCE] for i in each]
-        gradients = [self.gradients(batch, np.eye(len(batch))) for batch in batches]
-        covariance = np.cov(np.concatenate(gradients), rowvar=False, aweights=mass)
+        starts = range(0, len(single), _SINGLES_AT_ONCE)
+        batches = [single[i : i + _SINGLES_AT_ONCE] for i in starts]
+        each = [self.gradients(batch, np.eye(len(batch))) for batch in batches]
+        covariance = np.cov(np.concatenate(each), rowvar=False, aweights=mass)
         return np.atleast_2d(covariance) / self._target.n_effective
 
     @property
@@ -304,7 +306,7 @@ class Information:
         if values.ndim > 1:
             n = _SINGLE_TOGETHER
             far = _squared_distances(self._target, values, weights) ** 2
-            mass = weights * (1 + far / max(weights @ far, np.finfo(float).tiny))
+            mass = weights * (1 + far / max(float(weights @ far), _TINY))
             mass = mass / mass.sum()
         levels = (np.arange(n) + 0.5) / n
         chosen = order[reached(mass[order], levels)]
@@ -386,8 +388,8 @@ def _squared_distances(target: Discrepancy, values: Floats, weights: Floats) -> 
         finite = np.isfinite(projected)
         known = np.where(finite, projected, 0.0)
         mass = np.where(finite, weights, 0.0)
-        mass = mass / max(mass.sum(), np.finfo(float).tiny)
+        mass = mass / max(float(mass.sum()), _TINY)
         centered = np.where(finite, known - mass @ known, 0.0)
-        variance = mass @ centered**2
-        squares.append(centered**2 / max(variance, np.finfo(float).tiny))
+        variance = float(mass @ centered**2)
+        squares.append(centered**2 / max(variance, _TINY))
     return np.asarray(np.mean(squares, axis=0))

@@ -91,7 +91,12 @@ def outputs_of_result(result: Mapping[str, Any], batch_ndim: int) -> Outputs:
     for key, column in result.items():
         array = np.asarray(column)
         sizes.append((str(key), array.shape[-1] if array.ndim > batch_ndim else None))
-    return Outputs(_labels(sizes), keys=tuple(sizes))
+    return outputs_of_keys(sizes)
+
+
+def outputs_of_keys(keys: Sequence[tuple[str, int | None]]) -> Outputs:
+    """Return the outputs of a mapping with these keys, and as many outputs of each."""
+    return Outputs(_labels(list(keys)), keys=tuple(keys))
 
 
 def read_observed(name: str, observed: Any) -> tuple[Floats, Outputs]:

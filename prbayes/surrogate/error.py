@@ -23,39 +23,50 @@ class CrossValidation:
 
     Attributes
     ----------
-    residuals : ndarray, shape (n,)
+    residuals : ndarray, shape (n,) or (n, m)
         Response less surrogate at each design point, fitted without a tenth of the points that this
         one belongs to; in units of the response, NaN where the response failed.
-    population_sd : float
-        Standard deviation of the response: over the prior predictive distribution where an input is
-        a ``.dist()``, and else over the ranges.
+    population_sd : float or ndarray, shape (m,)
+        Standard deviation of the response, of each output where there are several: over the prior
+        predictive distribution where an input is a ``.dist()``, and else over the ranges.
     """
 
     residuals: Floats = field(repr=False)
-    population_sd: float
+    population_sd: Any
 
     @property
-    def rms(self) -> float:
-        """Root mean square, in units of the response."""
-        return float(np.sqrt(np.nanmean(self.residuals**2)))
+    def rms(self) -> Any:
+        """Root mean square, in units of the response; (m,) of several outputs."""
+        return _number(np.sqrt(np.nanmean(self.residuals**2, axis=0)))
 
     @property
-    def largest(self) -> float:
-        """Largest magnitude, in units of the response."""
-        return float(np.nanmax(np.abs(self.residuals)))
+    def largest(self) -> Any:
+        """Largest magnitude, in units of the response; (m,) of several outputs."""
+        return _number(np.nanmax(np.abs(self.residuals), axis=0))
 
     @property
-    def relative(self) -> float:
-        """Root mean square in units of the population's standard deviation; of a constant too."""
-        if self.population_sd == 0:
-            return np.inf if self.rms else 0.0
-        return self.rms / self.population_sd
+    def relative(self) -> Any:
+        """Root mean square in units of the population's standard deviation; of a constant too.
+
+        Shape (m,) of several outputs.
+        """
+        sd = np.asarray(self.population_sd)
+        constant = sd == 0
+        of_constant = np.where(np.asarray(self.rms) > 0, np.inf, 0.0)
+        return _number(np.where(constant, of_constant, self.rms / np.where(constant, 1.0, sd)))
 
     def __str__(self) -> str:
-        return (
-            f"rms {self.rms:.3g} ({self.relative:.2%} of the population's sd), "
-            f"largest {self.largest:.3g}"
-        )
+        each = zip(*map(np.atleast_1d, (self.rms, self.relative, self.largest)), strict=True)
+        told = [
+            f"rms {rms:.3g} ({relative:.2%} of the population's sd), largest {largest:.3g}"
+            for rms, relative, largest in each
+        ]
+        return "; ".join(told)
+
+
+def _number(values: Any) -> Any:
+    """Return an array of several outputs, or the number of one."""
+    return float(values) if np.ndim(values) == 0 else values
 
 
 def cross_validated(
@@ -68,7 +79,8 @@ def cross_validated(
     model : Following, Surface or regressor
     x : ndarray, shape (n, d)
         In the unit cube.
-    y : ndarray, shape (n,)
+    y : ndarray, shape (n,) or (n, m)
+        Each output has a surface of its own.
     random_seed : int
         Of the order in which points are dealt out to folds.
     coarse : ndarray, shape (n,), optional
@@ -76,8 +88,12 @@ def cross_validated(
 
     Returns
     -------
-    ndarray, shape (n,)
+    ndarray
+        Of the shape of y.
     """
+    if y.ndim > 1:
+        each = [cross_validated(model, x, own, random_seed) for own in y.T]
+        return np.stack(each, axis=1)
     order = np.random.default_rng(random_seed).permutation(len(y))
     residuals = np.empty(len(y))
     for fold in np.array_split(order, min(FOLDS, len(y))):

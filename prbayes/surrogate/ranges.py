@@ -90,6 +90,12 @@ class Ranges:
         columns[:, self.free] += unit * (self.high - self.low)[self.free]
         return columns
 
+    def like(self, rows: Floats, unit: Floats) -> Floats:
+        """Return points of the unit cube whose coordinates are distributed as those of rows are."""
+        known = self.scaled(rows)
+        each = [np.quantile(own, u) for own, u in zip(known.T, unit.T, strict=True)]
+        return np.stack(each, axis=1)
+
     def outside(self, columns: Floats) -> NDArray[np.bool_]:
         """Return which numbers are outside of their range, NaN included, shape (n, columns)."""
         # For a bound that was computed in another way: far above rounding, and far below any

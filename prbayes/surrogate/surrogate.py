@@ -24,15 +24,15 @@ from prbayes._checks import (
 )
 from prbayes._progress import shown
 from prbayes.emulators.following import Followed, Following, followed
-from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted, settings_of, shipped
+from prbayes.emulators.surfaces import Predict, RadialBasis, Surface, fitted
 from prbayes.propagation.points import sobol
 from prbayes.response.calling import Calling, Points, Tally, compute, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
-from prbayes.response.outputs import ONE
+from prbayes.response.outputs import Outputs, lacking
 from prbayes.response.response import refuse_calling, refuse_coarse, refuse_misfit
 from prbayes.response.store import Store
 from prbayes.surrogate.error import CrossValidation, cross_validated, points_needed
-from prbayes.surrogate.files import Kept, read, write
+from prbayes.surrogate.files import Kept, read, settings_of, shipped, write
 from prbayes.surrogate.noise import hashed_rows
 from prbayes.surrogate.ranges import Ranges, read_ranges
 
@@ -41,6 +41,7 @@ _log = logging.getLogger("prbayes")
 # Times d + 1 is how many residuals are nearby: 8 or more of them tell an rms to a quarter or
 # better, 1 / sqrt(2 k), and more of them are less near.
 _NEIGHBOURS = 4
+_POINTS = ("even", "predictive")
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +51,10 @@ class Surrogate:
     It is made by ``fit`` or ``load``.
 
     Called with arrays of any leading shape, like the response; can be given to `Simulator` and
-    `predict`. Inside its ranges only: outside, and where the nearest design point failed, it gives
-    what ``outside`` says, and says so.
+    `predict`. Of several outputs each has a surface of its own, all through the same runs; they
+    come back in the last axis, or as a mapping where the response returns one. Inside its ranges
+    only: outside, and where the nearest design point failed, it gives what ``outside`` says, and
+    says so.
 
     Attributes
     ----------
@@ -59,7 +62,7 @@ class Surrogate:
         Of the inputs.
     points : ndarray, shape (n, columns)
         The design.
-    responses : ndarray, shape (n,)
+    responses : ndarray, shape (n,) or (n, m)
         In its own units; NaN or +inf where it failed.
     model : object
         The kind of surface.
@@ -105,6 +108,8 @@ class Surrogate:
     _joined: bool = field(repr=False, default=False)
     _predict: Predict = field(repr=False, default=cast(Predict, None))
     _followed: Followed = field(repr=False, default=cast(Followed, None))
+    # What the response's mapping calls its outputs; None where they have no names.
+    _named: Outputs | None = field(repr=False, default=None)
     # Search trees of all points, and of those that did not fail.
     _trees: tuple[Any, Any] = field(repr=False, default=(None, None))
 
@@ -118,6 +123,7 @@ class Surrogate:
         model: Any = None,
         coarse: Callable[..., Any] | None = None,
         outside: OnFailure | None = None,
+        points: str = "even",
         coverage: float = 0.999,
         name: str = "surrogate",
         executor: Executor | None = None,
@@ -130,10 +136,14 @@ class Surrogate:
     ) -> Surrogate:
         """Compute the response on a scrambled Sobol design, and fit a surface.
 
+        The populations of many inputs are far from nearly all corners of their ranges: the design
+        is then better where they are, ``points="predictive"``, and the surface a process.
+
         Parameters
         ----------
         response : callable
-            As for `Simulator`: one array per input, any leading shape; or in `scalar`.
+            As for `Simulator`: one array per input, any leading shape; or in `scalar`. Several
+            outputs of a run are in the last axis, or in a mapping.
         inputs : mapping or sequence
             One entry per argument of the response, in its order, by name if you like: ``(low,
             high)``, in the input's own units; a ``.dist()`` or a variable of the model on the
@@ -142,18 +152,23 @@ class Surrogate:
         n : int
             Number of design points. With the same seed those of a smaller n are among them.
         model : object, optional
-            `RadialBasis` (default), `Polynomial`, or any regressor with ``fit(X, y)`` and
-            ``predict(X)``, as those of scikit-learn; it gets inputs scaled to [0, 1] and responses
+            `RadialBasis` (default), `Polynomial`, `GaussianProcess`, which is better with many
+            inputs, or any regressor with ``fit(X, y)`` and ``predict(X)``, as those of
+            scikit-learn; it gets inputs scaled to [0, 1] and responses
             of mean 0 and spread 1, and is left as it is.
         coarse : callable, optional
             A cheap response of the same inputs that is about the expensive one, such as that of a
             coarser mesh. The surrogate follows it if its cross-validated error is smaller then; it
             calls it wherever it is called. Where it raises, or is not finite, the surface goes on
-            without it, and the log says so.
+            without it, and the log says so. For a response of one output; several follow one under
+            ``prb.Reweighted(coarse=)``.
         outside : OnFailure, optional
             `Replace` (default): points outside the ranges give its value, NaN, with a warning in
             the log. A simulator with `Reweighted` reports them as lost mass, and refuses an answer
             that rests on them. `Abort`: they raise; take that with `Resimulated`.
+        points : {"even", "predictive"}
+            Where the design is: evenly in all ranges, or each input by its own prior predictive
+            distribution, inside its range; those that are given as a range evenly.
         coverage : float
         name : str
             For messages, and of the store.
@@ -185,45 +200,54 @@ class Surrogate:
         model = RadialBasis() if model is None else model
         outside = Replace() if outside is None else outside
         policy = Abort() if on_failure is None else on_failure
-        _refuse_wrong(name, response, model, outside)
+        _refuse_wrong(name, response, model, outside, points)
         refuse_calling(executor, store, version, policy)
         flag(retry_failed, f"{name}: retry_failed")
         share(coverage, f"{name}: coverage")
         seed = seed_number(random_seed, f"{name}: random_seed")
         domain, predictive = read_ranges(name, inputs, coverage, seed)
-        refuse_misfit(name, response, lambda: [one.size for one in domain.inputs], ONE)
+        refuse_misfit(name, response, lambda: [one.size for one in domain.inputs], None)
         needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=needed)
 
+        design = _designed(name, points, domain, predictive, sobol(n, domain.dimensions, seed))
+
         # Compute the responses.
-        points = domain.at(sobol(n, domain.dimensions, seed))
         # First, as what is wrong with it then costs no run.
-        beside = None if coarse is None else _first_coarse(name, coarse, domain, points)
-        kept = None if store is None else Store(store, name, points.shape[1], version=version)
-        calling = Calling(name, response, executor, kept, policy, retry_failed)
+        beside = None if coarse is None else _first_coarse(name, coarse, domain, design)
+        kept = None if store is None else Store(store, name, design.shape[1], version=version)
+        calling = Calling(name, response, executor, kept, policy, retry_failed, outputs=None)
         tally = Tally()
         with shown(progressbar):
-            responses = respond(calling, Points(domain.arguments(points), domain.varying), tally)
-        good = np.isfinite(responses)
+            responses = respond(calling, Points(domain.arguments(design), domain.varying), tally)
+        good = _usable(responses)
         if good.sum() < needed:
             raise ResponseError(
                 f"{name}: got {good.sum()} numbers from {n} responses, too few for a surface"
             )
+        if beside is not None and responses.ndim > 1:
+            raise ResponseError(
+                f"{name}: coarse: got one number a point beside a response of {responses.shape[1]} "
+                "outputs, expected a response of one; leave coarse= out, or use "
+                "prb.Reweighted(n, coarse=)"
+            )
+
+        named = _names(calling, domain, design[good], tally) if responses.ndim > 1 else None
 
         # Tell the error.
-        unit = domain.scaled(points)
-        residuals = np.full(n, np.nan)
+        unit = domain.scaled(design)
+        residuals = np.full(responses.shape, np.nan)
         beside = None if beside is None else beside[good]
         residuals[good], joined = _best(model, unit[good], responses[good], beside, seed)
         if coarse is not None and joined is None:
             coarse = None
             _log.info("%s: the coarse response tells nothing more, and is not followed", name)
-        error = CrossValidation(residuals, float(responses[good].std()))
+        error = CrossValidation(residuals, _spread(responses[good]))
 
         # Fit the surface; only then is the spread over the prior predictive distribution known.
         unfitted = cls(
             domain,
-            points,
+            design,
             responses,
             model,
             outside,
@@ -231,12 +255,13 @@ class Surrogate:
             error,
             coarse=coarse,
             _joined=bool(joined),
+            _named=named,
         )
         found = unfitted._completed()
         if predictive is not None:
             values = found._at(predictive)
-            spread = values[np.isfinite(values)].std()
-            found = replace(found, error=CrossValidation(residuals, float(spread)))
+            spread = _spread(values[_usable(values)])
+            found = replace(found, error=CrossValidation(residuals, spread))
         _log.info(
             "%s: %d responses computed; cross-validated error %s", name, tally.computed, found.error
         )
@@ -252,8 +277,8 @@ class Surrogate:
         """Lowest and highest value of each input."""
         return {one.name: (one.low.tolist(), one.high.tolist()) for one in self.domain.inputs}
 
-    def __call__(self, *inputs: ArrayLike) -> Floats:
-        """Return what the response would be about, shape (...).
+    def __call__(self, *inputs: ArrayLike) -> Any:
+        """Return what the response would be about, (...) or (..., m), or a mapping of such.
 
         Parameters
         ----------
@@ -263,11 +288,17 @@ class Surrogate:
         columns, batch = self.domain.columns(inputs)
         out = self.domain.outside(columns)
         bad = out.any(axis=1)
-        values = np.full(len(columns), np.nan)
+        values = np.full((len(columns), *self._event), np.nan)
         values[~bad] = self._at(columns[~bad])
         if bad.any():
             values[bad] = self._outside_value(columns, out)
-        return values.reshape(batch)
+        found = values.reshape((*batch, *self._event))
+        return found if self._named is None else self._named.by_key(found)
+
+    @property
+    def _event(self) -> tuple[int, ...]:
+        """Shape of one response: () or (m,)."""
+        return self.responses.shape[1:]
 
     def _outside_value(self, columns: Floats, out: NDArray[np.bool_]) -> float:
         """Return what stands for the response outside the ranges, and say so, or raise."""
@@ -291,13 +322,13 @@ class Surrogate:
 
         Returns
         -------
-        ndarray, shape (...)
+        ndarray, shape (...) or (..., m)
             In units of the response.
         """
         columns, batch = self.domain.columns(inputs)
         near = self._nearby(self.domain.scaled(columns))
         rms = np.sqrt((near**2).mean(axis=1))
-        return np.asarray(rms.reshape(batch))
+        return np.asarray(rms.reshape((*batch, *self._event)))
 
     def with_error(self, random_seed: Seed = 0) -> Surrogate:
         """Return the surrogate with its own error added.
@@ -347,6 +378,7 @@ class Surrogate:
             n_runs=self.n_runs,
             probes=self._probes(),
             joined=None if self.coarse is None else self._joined,
+            outputs=self._named,
         )
         write(path, kept)
 
@@ -403,14 +435,15 @@ class Surrogate:
             noise=kept.noise,
             coarse=None if kept.joined is None else coarse,
             _joined=bool(kept.joined),
+            _named=kept.outputs,
         )
         found = unfitted._completed()
-        good = kept.responses[np.isfinite(kept.responses)]
-        spread = float(np.nanstd(good)) or 1.0
+        spread = np.asarray(_spread(kept.responses[_usable(kept.responses)]))
         # Above what the linear algebra of another processor leaves, below what another setting
         # changes.
-        tolerance = 1e-6 * spread
-        if not np.allclose(found._probes(), kept.probes, rtol=0, atol=tolerance, equal_nan=True):
+        size = np.where(spread > 0, spread, 1.0)
+        now, then = found._probes() / size, kept.probes / size
+        if not np.allclose(now, then, rtol=0, atol=1e-6, equal_nan=True):
             beside = "" if kept.joined is None else ", and the same coarse response"
             raise ValueError(
                 f"Surrogate.load: got a {type(model).__name__} that gives other values than the "
@@ -424,8 +457,8 @@ class Surrogate:
         from scipy.spatial import cKDTree
 
         unit = self.domain.scaled(self.points)
-        good = np.isfinite(self.responses)
-        surface = fitted(self.model, unit[good], self.responses[good])
+        good = _usable(self.responses)
+        surface = _surfaces(self.model, unit[good], self.responses[good])
         trees = cKDTree(unit), cKDTree(unit[good])
         found = replace(self, _predict=surface, _trees=trees)
         if self.coarse is None:
@@ -439,18 +472,19 @@ class Surrogate:
     def _at(self, columns: Floats) -> Floats:
         """Return values inside the ranges, shape (n,)."""
         if not len(columns):
-            return np.empty(0)
+            return np.empty((0, *self._event))
         # What lies outside by its rounding only is on the edge.
         unit = np.clip(self.domain.scaled(columns), 0.0, 1.0)
         values = self._surface(columns, unit)
         if self.noise is not None:
             values = values + self._noise_at(columns, unit, self.noise)
-        if not np.isfinite(self.responses).all():
+        failed = ~_usable(self.responses)
+        if failed.any():
             # Nothing is known near a run that failed.
             all_points, _ = self._trees
             _, which = all_points.query(unit)
-            nearest = self.responses[which]
-            values = np.where(np.isfinite(nearest), values, nearest)
+            near = failed[which]
+            values[near] = self.responses[which[near]]
         return values
 
     def _surface(self, columns: Floats, unit: Floats) -> Floats:
@@ -473,19 +507,20 @@ class Surrogate:
         return values
 
     def _noise_at(self, columns: Floats, unit: Floats, random_seed: int) -> Floats:
-        """Return for each row one of the residuals nearby, with either sign, shape (n,)."""
+        """Return for each row residuals of one run nearby, with either sign, (n,) or (n, m)."""
         near = self._nearby(unit)
-        n, k = near.shape
+        n, k = near.shape[:2]
         number, sign = np.divmod(hashed_rows(columns, random_seed), np.uint64(2))
         which = (number % np.uint64(k)).astype(np.intp)
         chosen = near[np.arange(n), which]
-        return np.where(sign == 0, chosen, -chosen)
+        turned = np.where(sign == 0, 1.0, -1.0)
+        return chosen * turned.reshape((n, *(1 for _ in self._event)))
 
     def _nearby(self, unit: Floats) -> Floats:
-        """Return the residuals at the nearest design points that did not fail, shape (n, k)."""
-        residuals = self.error.residuals[np.isfinite(self.responses)]
+        """Return the residuals at the nearest design points that did not fail, (n, k, ...)."""
+        residuals = self.error.residuals[_usable(self.responses)]
         dimensions = unit.shape[1]
-        k = min(residuals.size, _NEIGHBOURS * (dimensions + 1))
+        k = min(len(residuals), _NEIGHBOURS * (dimensions + 1))
         _, good_points = self._trees
         # What is not finite is outside, and has no neighbours: any will do.
         known = np.where(np.isfinite(unit), unit, 0.5)
@@ -498,6 +533,59 @@ class Surrogate:
         # cannot agree at all of them.
         unit = sobol(64, self.domain.dimensions, 0)
         return self._surface(self.domain.at(unit), unit)
+
+
+def _designed(
+    name: str, points: str, domain: Ranges, predictive: Floats | None, unit: Floats
+) -> Floats:
+    """Return the design's rows for points of the unit cube: evenly, or as the prior has them."""
+    if points == "even":
+        return domain.at(unit)
+    if predictive is None:
+        raise ValueError(
+            f"{name}: points: got 'predictive' for inputs that are ranges, expected a `.dist()` "
+            "among them; leave points= out"
+        )
+    return domain.at(domain.like(predictive, unit))
+
+
+def _usable(responses: Floats) -> NDArray[np.bool_]:
+    """Return which runs have finite outputs, all of them, (n,)."""
+    return ~lacking(np.where(np.isfinite(responses), responses, np.nan))
+
+
+def _spread(values: Floats) -> Any:
+    """Return the standard deviation of responses, a number or one for each output."""
+    found = values.std(axis=0)
+    return float(found) if found.ndim == 0 else found
+
+
+@dataclass(frozen=True, eq=False)
+class _Together:
+    """Surfaces of several outputs; a class, so that it can be pickled."""
+
+    each: tuple[Predict, ...]
+
+    def __call__(self, at: Floats) -> Floats:
+        return np.stack([predict(at) for predict in self.each], axis=-1)
+
+
+def _surfaces(model: Any, x: Floats, y: Floats) -> Predict:
+    """Return a surface through responses, or one through each of several outputs."""
+    if y.ndim == 1:
+        return fitted(model, x, y)
+    return _Together(tuple(fitted(model, x, own) for own in y.T))
+
+
+def _names(calling: Calling, domain: Ranges, good: Floats, tally: Tally) -> Outputs | None:
+    """Return what a mapping calls several outputs; None where they have no names.
+
+    A store keeps numbers only: where it had all runs, one of them is computed again.
+    """
+    if tally.named is None and calling.store is not None and not tally.computed:
+        first = Points(domain.arguments(good[:1]), domain.varying)
+        respond(replace(calling, store=None), first, tally)
+    return tally.named
 
 
 def _coarse_at(name: str, coarse: Callable[..., Any], domain: Ranges, columns: Floats) -> Floats:
@@ -542,7 +630,7 @@ def _best(
     return least, choice
 
 
-def _refuse_wrong(name: str, response: object, model: Any, outside: object) -> None:
+def _refuse_wrong(name: str, response: object, model: Any, outside: object, points: object) -> None:
     """Raise if an argument of `Surrogate.fit` is not of its kind."""
     if not callable(response):
         raise TypeError(
@@ -561,3 +649,5 @@ def _refuse_wrong(name: str, response: object, model: Any, outside: object) -> N
             f"{name}: outside: got {outside!r:.60}, expected prb.response.Replace() or "
             "prb.response.Abort()"
         )
+    if points not in _POINTS:
+        raise ValueError(f"{name}: points: got {points!r:.60}, expected one of {_POINTS}")

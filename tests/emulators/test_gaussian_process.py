@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
@@ -77,3 +78,24 @@ def test_a_constant_response_is_that_constant() -> None:
 def test_a_kernel_that_there_is_not_is_refused() -> None:
     with pytest.raises(ValueError, match="kernel: got 'cubic', expected one of"):
         GaussianProcess("cubic")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ({"kernel": "cubic"}, "kernel: got 'cubic'"),
+        ({"lengths": (1.0, 2.0)}, "expected both, or neither"),
+        ({"nugget": 0.1}, "expected both, or neither"),
+        ({"lengths": (1.0, -2.0), "nugget": 0.1}, "lengths: got -2.0"),
+        ({"lengths": (1.0, 2.0), "nugget": -0.1}, "nugget: got -0.1"),
+    ],
+)
+def test_settings_that_are_none_are_refused(arguments: Any, told: str) -> None:
+    with pytest.raises(ValueError, match=told):
+        GaussianProcess(**arguments)
+
+
+def test_lengths_are_as_many_as_inputs() -> None:
+    x = np.random.default_rng(0).random((20, 3))
+    with pytest.raises(ValueError, match="got 2, expected one for each of 3 inputs"):
+        GaussianProcess("matern", (1.0, 2.0), 0.0).through(x, x[:, 0])

@@ -8,7 +8,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF
 
 import prbayes as prb
-from prbayes.emulators.surfaces import Surface, fitted, settings_of, shipped
+from prbayes.emulators.surfaces import Surface, fitted
 
 BOX = {"x": (0.0, 3.0), "y": (1.0, 2.0)}
 
@@ -119,13 +119,6 @@ def test_surfaces_are_fitted_to_responses_of_mean_0_and_spread_1() -> None:
 )
 def test_terms_of_two_inputs(kernel: str, degree: int | None, terms: int) -> None:
     assert prb.surrogate.RadialBasis(kernel, degree).terms(2) == terms
-
-
-def test_settings_make_the_same_surface_again() -> None:
-    for model in (prb.surrogate.RadialBasis("quintic", 2, 0.1), prb.surrogate.Polynomial(4)):
-        assert shipped(type(model).__name__, settings_of(model)) == model
-    assert settings_of(Plane()) == {}
-    assert shipped("Plane", {}) is None
 
 
 def test_refusals() -> None:

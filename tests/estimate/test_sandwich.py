@@ -238,4 +238,6 @@ def test_noise_of_gradients_with_tails_is_that_of_the_whole_population() -> None
     noise = np.cov(np.concatenate(each), rowvar=False, aweights=weights)
     size = np.sqrt(np.diag(noise))
     found = information.sampling_covariance * information._target.n_effective
-    np.testing.assert_allclose(found / np.outer(size, size), noise / np.outer(size, size), atol=0.02)
+    np.testing.assert_allclose(
+        found / np.outer(size, size), noise / np.outer(size, size), atol=0.02
+    )

@@ -1,5 +1,6 @@
 """Files of surrogates: the same comes back, and nothing else is taken for it."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from sklearn.linear_model import Ridge
 import prbayes as prb
 from prbayes.response.failures import Abort, Replace
 from prbayes.response.store import StoreError
+from prbayes.surrogate.files import settings_of, shipped
 
 BOX = {"x": (0.0, 3.0), "y": (1.0, 2.0)}
 
@@ -97,3 +99,35 @@ def test_what_is_no_surrogate_is_refused(tmp_path: Path) -> None:
     (tmp_path / "s.nc").write_bytes(b"not a file of this kind")
     with pytest.raises(StoreError, match=r"path: got .*expected a file of Surrogate.save"):
         prb.Surrogate.load(tmp_path / "s.nc")
+
+
+def test_settings_make_the_same_surface_again() -> None:
+    surfaces = (
+        prb.surrogate.RadialBasis("quintic", 2, 0.1),
+        prb.surrogate.Polynomial(4),
+        prb.surrogate.GaussianProcess("matern", (0.5, 1.5), 1e-6),
+    )
+    for model in surfaces:
+        # As JSON has them.
+        settings = json.loads(json.dumps(settings_of(model)))
+        assert shipped(type(model).__name__, settings) == model
+    assert settings_of(Ridge()) == {}
+    assert shipped("Ridge", {}) is None
+
+
+def test_several_outputs_survive_a_file(tmp_path: Path) -> None:
+    def both(x: Any, y: Any) -> Any:
+        return {"bent": bent(x, y), "pair": np.stack([100 * x, y * x], axis=-1)}
+
+    process = prb.surrogate.GaussianProcess()
+    found = prb.Surrogate.fit(both, BOX, 48, model=process).with_error(3)
+    found.save(tmp_path / "s.nc")
+    back = prb.Surrogate.load(tmp_path / "s.nc")
+    x, y = fresh_points()
+    assert list(back(x, y)) == ["bent", "pair"]
+    for name, values in found(x, y).items():
+        np.testing.assert_array_equal(back(x, y)[name], values)
+    np.testing.assert_array_equal(back.error.rms, found.error.rms)
+    np.testing.assert_array_equal(back.error.population_sd, found.error.population_sd)
+    prb.Surrogate.fit(lambda x, y: np.stack([x, y], axis=-1), BOX, 48).save(tmp_path / "p.nc")
+    assert prb.Surrogate.load(tmp_path / "p.nc")(1.0, 1.5).shape == (2,)

@@ -12,6 +12,7 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
+from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.base import DesignError
 from prbayes.response.failures import Abort, Replace, ResponseError, Retry
 
@@ -121,6 +122,8 @@ def test_a_response_that_raises_stops_or_is_left_out(tmp_path: Path) -> None:
         ({"outside": Retry()}, TypeError, r"expected prb.response.Replace\(\) or"),
         ({"store": 3}, TypeError, "expected the path of a folder"),
         ({"coverage": 99.0}, ValueError, "a number between 0 and 1"),
+        ({"points": "sobol"}, ValueError, r"points: got 'sobol', expected one of \('even'"),
+        ({"points": "predictive"}, ValueError, "got 'predictive' for inputs that are ranges"),
         ({"response": 3}, TypeError, "expected a function"),
     ],
 )
@@ -261,3 +264,110 @@ def test_what_is_no_coarse_response_is_refused_before_any_run(
     with pytest.raises(error, match=told):
         prb.Surrogate.fit(lambda x, y: calls.append(1) or bent(x, y), BOX, 48, coarse=coarse)
     assert not calls
+
+
+def two(x: Any, y: Any) -> Any:
+    return np.stack([bent(x, y), 40 * np.cos(x) - y], axis=-1)
+
+
+def named(x: Any, y: Any) -> Any:
+    return {"bent": bent(x, y), "other": 40 * np.cos(x) - y}
+
+
+def test_each_of_several_outputs_has_a_surface_of_its_own_through_the_same_runs(
+    surrogate: prb.Surrogate,
+) -> None:
+    found = prb.Surrogate.fit(two, BOX, 64).with_error(1)
+    other = prb.Surrogate.fit(lambda x, y: two(x, y)[..., 1], BOX, 64)
+    assert (found.n_runs, found.responses.shape) == (64, (64, 2))
+    x, y = np.random.default_rng(1).uniform((0, 1), (3, 2), (3, 5, 2)).T
+    plain = prb.Surrogate.fit(two, BOX, 64)(x, y)
+    assert plain.shape == (5, 3, 2)
+    for k, alone in enumerate((surrogate, other)):
+        np.testing.assert_array_equal(plain[..., k], alone(x, y))
+        near = alone.local_error(x, y)
+        np.testing.assert_allclose(found.local_error(x, y)[..., k], near, rtol=1e-12)
+        for name in ("rms", "relative", "largest"):
+            of_alone = getattr(alone.error, name)
+            np.testing.assert_allclose(getattr(found.error, name)[k], of_alone, rtol=1e-12)
+    assert str(found.error) == f"{surrogate.error}; {other.error}"
+    # The error that is added is that of one run, in all its outputs.
+    added = (found(x, y) - plain).reshape(-1, 2)
+    runs = np.concatenate([found.error.residuals, -found.error.residuals])
+    nearest = np.abs((added[:, None] - runs) / found.error.rms).max(axis=-1).min(axis=1)
+    assert (nearest < 1e-9).all()
+    assert np.isnan(found(5.0, 1.5)).tolist() == [True, True]
+
+
+def test_outputs_keep_their_names_also_from_a_store(tmp_path: Path) -> None:
+    found = prb.Surrogate.fit(named, BOX, 32, store=tmp_path, version="1")
+    assert list(found(1.0, 1.5)) == ["bent", "other"]
+    plain = prb.Surrogate.fit(two, BOX, 32)(1.0, 1.5)
+    assert list(found(1.0, 1.5).values()) == plain.tolist()
+    # A store keeps numbers: one run tells the names.
+    again = prb.Surrogate.fit(named, BOX, 32, store=tmp_path, version="1")
+    assert (again.n_runs, list(again(1.0, 1.5))) == (1, ["bent", "other"])
+    # So that what was observed may have another order.
+    observed = {"other": [20.0, 25.0, 30.0, 22.0], "bent": [1.0, 1.1, 1.2, 1.0]}
+    with pm.Model() as model:
+        x, y = pm.Normal.dist(pm.Normal("m", 1.0, 0.1), 0.1), pm.Uniform.dist(1.4, 1.6)
+        prb.Simulator(
+            *("z", found, x, y),
+            metric=prb.Joint(prb.AreaMetric()),
+            observed=observed,
+            propagation=prb.Reweighted(64, emulator=None),
+            progressbar=False,
+        )
+    values = Evaluator(model).nodes[0].bound.known_responses
+    assert 15 < values[:, 0].mean() < 25
+    assert 1 < values[:, 1].mean() < 2
+
+
+def test_where_one_of_several_outputs_failed_the_run_is_what_it_is() -> None:
+    def partly(x: Any, y: Any) -> Any:
+        found = two(x, y)
+        found[..., 1] = np.where(x > 2, np.inf, found[..., 1])
+        return found
+
+    found = prb.Surrogate.fit(partly, BOX, 128)
+    values = found([1.2, 2.6], 1.5)
+    np.testing.assert_allclose(values[0], two(1.2, 1.5), atol=0.05)
+    assert np.isfinite(values).tolist() == [[True, True], [True, False]]
+    assert np.isnan(found.error.residuals).all(axis=1).sum() == (found.points[:, 0] > 2).sum()
+
+
+def test_a_coarse_response_is_for_one_output() -> None:
+    with pytest.raises(ResponseError, match=r"beside a response of 2 outputs.*Reweighted"):
+        prb.Surrogate.fit(two, BOX, 48, coarse=bent)
+
+
+def test_a_process_says_many_inputs_better_than_splines_and_as_well_as_it_claims() -> None:
+    def many(*x: Any) -> Any:
+        return np.exp(0.3 * sum(x)) + np.sin(x[0] * x[1])
+
+    ranges = [(-1.0, 1.0)] * 6
+    process = prb.Surrogate.fit(many, ranges, 128, model=prb.surrogate.GaussianProcess())
+    splines = prb.Surrogate.fit(many, ranges, 128)
+    x = np.random.default_rng(0).uniform(-1, 1, (6, 1000))
+    off, of_splines = (np.std(s(*x) - many(*x)) for s in (process, splines))
+    assert off < 0.5 * of_splines
+    assert 0.5 < process.error.rms / off < 3
+
+
+def test_a_design_where_populations_are_says_many_inputs_better() -> None:
+    def many(*x: Any) -> Any:
+        return np.exp(0.3 * sum(x)) + np.sin(x[0] * x[1])
+
+    with pm.Model():
+        m = pm.Normal("m", 0.0, 1.0, shape=5)
+        inputs = [*(pm.Normal.dist(m[i], 0.5) for i in range(5)), (0.0, 1.0)]
+        process = {"model": prb.surrogate.GaussianProcess()}
+        there = prb.Surrogate.fit(many, inputs, 128, points="predictive", **process)
+        evenly = prb.Surrogate.fit(many, inputs, 128, **process)
+    assert there.ranges == evenly.ranges
+    # Each by its own distribution, the last one evenly; inside the ranges, which is no warning.
+    np.testing.assert_allclose(there.points.std(axis=0)[:5], np.sqrt(1.25), rtol=0.1)
+    np.testing.assert_allclose(np.quantile(there.points[:, 5], [0.1, 0.9]), [0.1, 0.9], atol=0.02)
+    x = [*(1.0 + 0.5 * np.random.default_rng(0).standard_normal((5, 1000))), 0.5]
+    off, before = (np.std(s(*x) - many(*x)) for s in (there, evenly))
+    assert off < 0.3 * before
