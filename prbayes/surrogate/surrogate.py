@@ -41,7 +41,7 @@ _log = logging.getLogger("prbayes")
 # Times d + 1 is how many residuals are nearby: 8 or more of them tell an rms to a quarter or
 # better, 1 / sqrt(2 k), and more of them are less near.
 _NEIGHBOURS = 4
-_POINTS = ("even", "predictive")
+_DESIGNS = ("even", "predictive")
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +108,8 @@ class Surrogate:
     _joined: bool = field(repr=False, default=False)
     _predict: Predict = field(repr=False, default=cast(Predict, None))
     _followed: Followed = field(repr=False, default=cast(Followed, None))
+    # Whether points outside were told of.
+    _warned: list[bool] = field(repr=False, default_factory=list)
     # What the response's mapping calls its outputs; None where they have no names.
     _named: Outputs | None = field(repr=False, default=None)
     # Search trees of all points, and of those that did not fail.
@@ -210,9 +212,8 @@ class Surrogate:
         needed = points_needed(model, domain.dimensions)
         positive_integer(n, f"{name}: n", minimum=needed)
 
-        design = _designed(name, points, domain, predictive, sobol(n, domain.dimensions, seed))
-
         # Compute the responses.
+        design = _designed(name, points, domain, predictive, sobol(n, domain.dimensions, seed))
         # First, as what is wrong with it then costs no run.
         beside = None if coarse is None else _first_coarse(name, coarse, domain, design)
         kept = None if store is None else Store(store, name, design.shape[1], version=version)
@@ -221,17 +222,7 @@ class Surrogate:
         with shown(progressbar):
             responses = respond(calling, Points(domain.arguments(design), domain.varying), tally)
         good = _usable(responses)
-        if good.sum() < needed:
-            raise ResponseError(
-                f"{name}: got {good.sum()} numbers from {n} responses, too few for a surface"
-            )
-        if beside is not None and responses.ndim > 1:
-            raise ResponseError(
-                f"{name}: coarse: got one number a point beside a response of {responses.shape[1]} "
-                "outputs, expected a response of one; leave coarse= out, or use "
-                "prb.Reweighted(n, coarse=)"
-            )
-
+        _refuse_unfit(name, responses, needed, followed=coarse is not None)
         named = _names(calling, domain, design[good], tally) if responses.ndim > 1 else None
 
         # Tell the error.
@@ -257,11 +248,7 @@ class Surrogate:
             _joined=bool(joined),
             _named=named,
         )
-        found = unfitted._completed()
-        if predictive is not None:
-            values = found._at(predictive)
-            spread = _spread(values[_usable(values)])
-            found = replace(found, error=CrossValidation(residuals, spread))
+        found = unfitted._completed()._over(predictive)
         _log.info(
             "%s: %d responses computed; cross-validated error %s", name, tally.computed, found.error
         )
@@ -309,7 +296,11 @@ class Surrogate:
                 "gives NaN there"
             )
         value = cast(Replace, self.outside).value
-        _log.warning("%s; they give %s", text, value)
+        # Once: a sampler asks thousands of times, and a simulator tells of the mass it loses.
+        level = logging.DEBUG if self._warned else logging.WARNING
+        _log.log(level, "%s; they give %s; this is told once", text, value)
+        self._warned.append(True)
+        del self._warned[1:]
         return value
 
     def local_error(self, *inputs: ArrayLike) -> Floats:
@@ -469,6 +460,14 @@ class Surrogate:
         beside = followed(self.model, unit[good], y, coarse[good], joined=self._joined)
         return replace(found, _followed=beside)
 
+    def _over(self, predictive: Floats | None) -> Surrogate:
+        """Return this one with the spread over the prior predictive distribution, if there is."""
+        if predictive is None:
+            return self
+        values = self._at(predictive)
+        spread = _spread(values[_usable(values)])
+        return replace(self, error=CrossValidation(self.error.residuals, spread))
+
     def _at(self, columns: Floats) -> Floats:
         """Return values inside the ranges, shape (n,)."""
         if not len(columns):
@@ -552,6 +551,21 @@ def _designed(
 def _usable(responses: Floats) -> NDArray[np.bool_]:
     """Return which runs have finite outputs, all of them, (n,)."""
     return ~lacking(np.where(np.isfinite(responses), responses, np.nan))
+
+
+def _refuse_unfit(name: str, responses: Floats, needed: int, *, followed: bool) -> None:
+    """Raise if too few runs have a response, or several outputs were to follow a coarse one."""
+    good = _usable(responses).sum()
+    if good < needed:
+        raise ResponseError(
+            f"{name}: got {good} numbers from {len(responses)} responses, too few for a surface"
+        )
+    if followed and responses.ndim > 1:
+        raise ResponseError(
+            f"{name}: coarse: got one number a point beside a response of {responses.shape[1]} "
+            "outputs, expected a response of one; leave coarse= out, or use "
+            "prb.Reweighted(n, coarse=)"
+        )
 
 
 def _spread(values: Floats) -> Any:
@@ -649,5 +663,5 @@ def _refuse_wrong(name: str, response: object, model: Any, outside: object, poin
             f"{name}: outside: got {outside!r:.60}, expected prb.response.Replace() or "
             "prb.response.Abort()"
         )
-    if points not in _POINTS:
-        raise ValueError(f"{name}: points: got {points!r:.60}, expected one of {_POINTS}")
+    if points not in _DESIGNS:
+        raise ValueError(f"{name}: points: got {points!r:.60}, expected one of {_DESIGNS}")

