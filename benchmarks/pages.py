@@ -252,6 +252,16 @@ def partial_pooling() -> Iterator[Row]:
         ]
 
 
+def small_groups() -> Iterator[Row]:
+    """Return the rows of small groups beside the exact posterior."""
+    for cell in found("small_groups")["table"]:
+        columns = [cell["metric"], str(cell["size"])]
+        for name in ("mu", "sigma"):
+            columns += [f"{cell[f'{name} off']:.2f}", f"{cell[f'{name} ratio']:.2f}"]
+            columns.append(f"{cell[f'{name} held']:.0%} ({cell[f'{name} exact held']:.0%})")
+        yield [*columns, str(cell["data sets"]), f"{cell['seconds']:.1f}"]
+
+
 def measurement_error() -> Iterator[Row]:
     """Return the rows of readings with an error."""
     table = found("measurement_error")
@@ -573,6 +583,17 @@ def few_runs() -> Iterator[Row]:
         yield [name, str(cell["inputs"]), runs, *columns, *beside]
 
 
+def many_inputs() -> Iterator[Row]:
+    """Return the rows of eight inputs by a surrogate."""
+    from benchmarks.many_inputs import figures
+
+    for runs, rows in found("many_inputs").items():
+        if runs.isdigit():
+            cell = figures(rows)
+            errors = [short(cell[key], 3) for key in ("off", "worst")]
+            yield [runs, str(len(rows)), *errors, f"{cell['widths']:.1%}", f"{cell['seconds']:.0f}"]
+
+
 def three_masses() -> Iterator[Row]:
     """Return the rows of the benchmark of three masses."""
     for case, rows in found("three_masses").items():
@@ -595,8 +616,12 @@ def two_fidelities() -> Iterator[Row]:
 
 def plans() -> Iterator[Row]:
     """Return the rows of expected and found standard deviations."""
-    labels = {"crack": ("crack growth", "21 + 20"), "virkler": ("Virkler", "20 + 24")}
-    names = {"quantity": "quantile later on"}
+    labels = {
+        "crack": ("crack growth", "21 + 20"),
+        "virkler": ("Virkler", "20 + 24"),
+        "exact": ("normal population, exact posterior", "21 + 20"),
+    }
+    names = {"quantity": "quantile later on", "any": "anything"}
     for problem, (label, specimens) in labels.items():
         table = found("planning")[problem]
         for key, cell in table["table"].items():
@@ -612,6 +637,7 @@ def plans() -> Iterator[Row]:
                 str(table["data sets"]),
                 ratio,
                 f"{low} to {high}",
+                f"{cell['within 15%']:.0%}",
             ]
 
 
@@ -760,6 +786,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "case study, evaluations": evaluations,
     "scale factor": scale_factor,
     "partial pooling": partial_pooling,
+    "small groups": small_groups,
     "measurement error": measurement_error,
     "landscapes": landscapes,
     "wrong families, many data": lambda: families((100_000,)),
@@ -776,6 +803,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "placement": placement,
     "emulators, time": emulator_speed,
     "few runs": few_runs,
+    "many inputs": many_inputs,
     "three masses": three_masses,
     "two fidelities": two_fidelities,
     "libraries": libraries,

@@ -7,7 +7,10 @@ or after 200 000 cycles. Each time the model is calibrated anew with all data, b
 decision quantity is a quantile of the crack length at another time: the 99% one, but the 90% one where
 cracks fail, of which the other may be infinite.
 
-    uv run python -m benchmarks.planning [--data-sets 200] [--problems crack virkler]
+Exact: of a normal population under the right Haar prior all standard deviations go with the sample's
+own, so that what is expected, and how single ones scatter about it, needs no calibration.
+
+    uv run python -m benchmarks.planning [--data-sets 200] [--problems crack virkler exact]
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ import argparse
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -161,6 +165,18 @@ def repetition(problem: Problem, seed: int) -> dict[str, Any]:
     return found
 
 
+def exact(seed: int, first: int = 21, more: int = 20) -> dict[str, Any]:
+    """Return the same of a normal population with the exact posterior."""
+    rng = np.random.default_rng(seed)
+    x = rng.standard_normal(first + more)
+    before = x[:first]
+    sigma = before.std(ddof=1) * np.sqrt((first - 1) / rng.chisquare(first - 1, (1000, 1)))
+    mu = before.mean() + sigma / np.sqrt(first) * rng.standard_normal((1000, 1))
+    others = mu + sigma * rng.standard_normal((1000, more))
+    planned = np.column_stack([np.tile(before, (1000, 1)), others]).std(axis=1, ddof=1)
+    return {"same": {"any": [float(planned.mean()), float(x.std(ddof=1))]}}
+
+
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return by condition and name: means of both, their ratio, and how single ratios scatter."""
     table = {}
@@ -185,12 +201,13 @@ def main() -> None:
     """Compute, print and save."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data-sets", type=int, default=200)
-    parser.add_argument("--problems", nargs="*", default=list(PROBLEMS))
+    parser.add_argument("--problems", nargs="*", default=[*PROBLEMS, "exact"])
     parser.add_argument("--out", type=Path, default=OUT)
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
     for name in arguments.problems:
-        rows = [repetition(PROBLEMS[name], seed) for seed in range(arguments.data_sets)]
+        one = exact if name == "exact" else partial(repetition, PROBLEMS[name])
+        rows = [one(seed) for seed in range(arguments.data_sets)]
         whole = record.load(arguments.out, {})  # of another problem, which may have run meanwhile
         whole[name] = {"data sets": len(rows), "table": summary(rows)}
         for key, cell in whole[name]["table"].items():

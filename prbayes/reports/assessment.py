@@ -226,6 +226,12 @@ def validity(m: Material) -> list[Section]:
             "which a wrong correlation is a wrong spread; the statistic is the mean over these of "
             "the areas of u and of |2u - 1|."
         )
+    if len(m.tests) > 1:
+        levels = sum(test.level for test in m.tests.values())
+        about += (
+            f" A right model is rejected by one or more of these {len(m.tests)} tests in up to "
+            f"{percentage(min(levels, 1.0))} of cases."
+        )
     verdicts = [verdict(label, test, m) for label, test in m.tests.items()]
     assumed = dict.fromkeys(f"Held to be true: {test.null}." for test in m.tests.values())
     sections = [Section("Validity", (*verdicts, about, *assumed), rows_table(rows))]

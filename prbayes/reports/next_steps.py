@@ -61,6 +61,11 @@ def _of_decision(m: Material) -> list[str]:
         return []
     asked = {kind_of_decision(table) for table in m.decisions.values()}
     steps = []
+    if any(table.attrs.get("verdict") == "not decided" for table in m.decisions.values()):
+        steps.append(
+            "A requirement is not decided, as too little is known of the probability: make as many "
+            "more specimens as prb.plan says, with prb.decision.Exceedance as its quantity."
+        )
     if "risk" not in asked:
         steps.append("Ask for the probability that a response is beyond its limit: prb.exceedance.")
     if "plan" not in asked:

@@ -227,7 +227,7 @@ def _stderr(differences: Floats, weights: Floats) -> float:
 
 def _sentence(best: str, other: str, difference: float, error: float, *, apart: bool) -> str:
     """Return what the data say of two candidates."""
-    by = f"{difference:.1f} ± {error:.1f} nats"
+    by = f"{difference:.1f} nats (standard error {error:.1f})"
     if apart:
         return f"{best} predicts better than {other} by {by}"
     return f"the data cannot tell {best} and {other} apart: {best} is ahead by {by}"

@@ -75,6 +75,10 @@ def test_validity(calibrated: Any, page: Any, row: Any) -> None:
     assert len(cells(specimens.table).rows) == test.u_values.size
     found_by = [("is rejected" in p, p.split(":")[0]) for p in summary.text]
     assert found_by == [(False, "early"), (True, "late")]
+    more_often = "rejected by one or more of these 2 tests in up to 10% of cases"
+    assert any(more_often in p for p in tested.text)
+    one = prb.Report("x", validity=test, pictures=False).sections[1]
+    assert not any("up to" in p for p in one.text)
     rows = cells(tested.table).rows
     assert [r[0] for r in rows] == ["early", "late"]
     assert [r[1] for r in rows] == ["not rejected", "rejected"]

@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 import prbayes as prb
 from prbayes.reports.material import gather
@@ -45,6 +46,16 @@ def test_problems_come_first(calibrated: Any) -> None:
     posterior = calibrated.posterior.copy(deep=True)
     posterior["posterior"]["mu"][0] += 5.0
     assert steps(calibrated, posterior=posterior).startswith("1. Remove the problems")
+
+
+def test_what_is_not_decided_wants_more_specimens(calibrated: Any) -> None:
+    draws = xr.DataArray([[0.01, 0.2]], dims=("chain", "draw"))
+    table = xr.Dataset({"probability": 0.1, "by_draw": draws, "error": 0.01})
+    given = {"posterior": calibrated.posterior, "validity": calibrated.test}
+    for verdict, said in (("not decided", True), ("met", False)):
+        asked = table.assign_attrs(verdict=verdict)
+        found = steps(calibrated, **given, decision={"P": asked})
+        assert ("with prb.decision.Exceedance as its quantity" in found) == said
 
 
 def test_without_a_result_there_is_nothing_to_do(calibrated: Any) -> None:

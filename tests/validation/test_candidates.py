@@ -76,7 +76,7 @@ def test_the_right_family_is_told_and_families_alike_are_not() -> None:
     table = compare(skewed(), **QUIET)
     assert table.candidate.values.tolist() == ["lognormal", "normal"]
     assert table.told_apart.values.tolist() == [False, True]
-    by = f"{float(table.difference[1]):.1f} ± {float(table.stderr[1]):.1f} nats"
+    by = f"{float(table.difference[1]):.1f} nats (standard error {float(table.stderr[1]):.1f})"
     assert table.attrs["verdict"] == f"lognormal predicts better than normal by {by}"
     assert table.to_dataframe().shape == (2, 6)
     alike = compare(narrow(), **QUIET)
