@@ -327,7 +327,7 @@ def _again(calling: Calling, point: Points, tally: Tally) -> tuple[Floats, str]:
     for _ in range(calling.on_failure.tries):
         for ((_, chunk),) in chunks(calling, point, np.arange(1), True, tally):
             if not chunk.raised:
-                found = chunk.values.ravel()
+                found = tally.aligned(chunk).ravel()
                 return found, _numbers_told(found)
     return np.array([np.nan]), f"nothing ({next(iter(chunk.raised.values()), 'it was lost')})"
 

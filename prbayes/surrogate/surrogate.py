@@ -594,7 +594,8 @@ def _surfaces(model: Any, x: Floats, y: Floats) -> Predict:
 def _names(calling: Calling, domain: Ranges, good: Floats, tally: Tally) -> Outputs | None:
     """Return what a mapping calls several outputs; None where they have no names.
 
-    A store keeps numbers only: where it had all runs, one of them is computed again.
+    A store keeps numbers only: where it had all runs, and its version was believed, one of them is
+    computed again.
     """
     if tally.named is None and calling.store is not None and not tally.computed:
         first = Points(domain.arguments(good[:1]), domain.varying)

@@ -312,6 +312,9 @@ def test_outputs_keep_their_names_also_from_a_store(tmp_path: Path) -> None:
     # A store keeps numbers: one run tells the names.
     again = prb.Surrogate.fit(named, BOX, 32, store=tmp_path, version="1")
     assert (again.n_runs, list(again(1.0, 1.5))) == (1, ["bent", "other"])
+    prb.Surrogate.fit(named, BOX, 32, store=tmp_path / "unversioned")
+    again = prb.Surrogate.fit(named, BOX, 32, store=tmp_path / "unversioned")
+    assert (again.n_runs, list(again(1.0, 1.5))) == (1, ["bent", "other"])
     # So that what was observed may have another order.
     observed = {"other": [20.0, 25.0, 30.0, 22.0], "bent": [1.0, 1.1, 1.2, 1.0]}
     with pm.Model() as model:
