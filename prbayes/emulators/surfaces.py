@@ -189,15 +189,25 @@ class Polynomial(Surface):
     def basis(self, x: Floats) -> Floats:
         """Return products of Legendre polynomials at points of the unit cube, shape (n, terms)."""
         dimensions = x.shape[1]
-        # One input at a time, shape (n, d, degree + 1).
+        # One input at a time, and points last, so that what is multiplied lies in a row:
+        # (d, degree + 1, n).
         single = np.polynomial.legendre.legvander(2 * x - 1, self.degree)
-        columns = []
-        for degrees in product(range(self.degree + 1), repeat=dimensions):
-            if sum(degrees) > self.degree:
-                continue
-            factors = [single[:, i, k] for i, k in enumerate(degrees)]
-            columns.append(np.prod(factors, axis=0))
-        return np.stack(columns, axis=1)
+        rows = np.ascontiguousarray(np.moveaxis(single, 0, -1))
+        degrees = [
+            each
+            for each in product(range(self.degree + 1), repeat=dimensions)
+            if sum(each) <= self.degree
+        ]
+        terms = np.ones((len(degrees), len(x)))
+        for term, each in zip(terms, degrees, strict=True):
+            for own, k in zip(rows, each, strict=True):
+                if k:  # the first one is one
+                    term *= own[k]
+        return terms.T
+
+
+# Points whose terms are made at a time: they stay in the cache.
+_POINTS_OF_A_BASIS = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +218,11 @@ class _LeastSquares:
     coefficients: Floats
 
     def __call__(self, at: Floats) -> Floats:
-        return np.asarray(self.polynomial.basis(at) @ self.coefficients)
+        values = np.empty(len(at))
+        for first in range(0, len(at), _POINTS_OF_A_BASIS):
+            some = slice(first, first + _POINTS_OF_A_BASIS)
+            values[some] = self.polynomial.basis(at[some]) @ self.coefficients
+        return values
 
 
 def least_squares(x: Floats, y: Floats, along: Floats) -> float:
