@@ -130,3 +130,10 @@ def test_refusals() -> None:
         prb.surrogate.RadialBasis(smoothing=-1)
     with pytest.raises(ValueError, match="degree: got 0"):
         prb.surrogate.Polynomial(0)
+
+
+def test_a_polynomial_says_the_same_of_many_points_at_once() -> None:
+    x = np.random.default_rng(0).random((6000, 2))
+    predict = prb.surrogate.Polynomial(3).through(x[:50], np.exp(x[:50, 0]) * x[:50, 1])
+    pieces = [predict(x[i : i + 1000]) for i in range(0, 6000, 1000)]
+    np.testing.assert_allclose(predict(x), np.concatenate(pieces), rtol=1e-12)
