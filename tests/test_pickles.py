@@ -95,6 +95,7 @@ MAKE: dict[str, Callable[[], Any]] = {
     "response.StoreError": lambda: prb.response.StoreError("y: store"),
     "scalar": lambda: prb.scalar(abs),
     "surrogate.CrossValidation": lambda: surrogate().error,
+    "surrogate.GaussianProcess": prb.surrogate.GaussianProcess,
     "surrogate.Polynomial": lambda: prb.surrogate.Polynomial(3),
     "surrogate.RadialBasis": prb.surrogate.RadialBasis,
     "surrogate.Surface": prb.surrogate.RadialBasis,
