@@ -30,7 +30,7 @@ from prbayes.response.calling import Calling, Points, Tally, compute, respond
 from prbayes.response.failures import Abort, OnFailure, Replace, ResponseError
 from prbayes.response.outputs import Outputs, lacking
 from prbayes.response.response import refuse_calling, refuse_coarse, refuse_misfit
-from prbayes.response.store import Store
+from prbayes.response.store import Store, StoreError
 from prbayes.surrogate.error import CrossValidation, cross_validated, points_needed
 from prbayes.surrogate.files import Kept, read, settings_of, shipped, write
 from prbayes.surrogate.noise import hashed_rows
@@ -219,11 +219,12 @@ class Surrogate:
         kept = None if store is None else Store(store, name, design.shape[1], version=version)
         calling = Calling(name, response, executor, kept, policy, retry_failed, outputs=None)
         tally = Tally()
+        at = Points(domain.arguments(design), domain.varying)
         with shown(progressbar):
-            responses = respond(calling, Points(domain.arguments(design), domain.varying), tally)
+            _learn_names(calling, at, tally)
+            responses = respond(calling, at, tally)
         good = _usable(responses)
         _refuse_unfit(name, responses, needed, followed=coarse is not None)
-        named = _names(calling, domain, design[good], tally) if responses.ndim > 1 else None
 
         # Tell the error.
         unit = domain.scaled(design)
@@ -246,7 +247,7 @@ class Surrogate:
             error,
             coarse=coarse,
             _joined=bool(joined),
-            _named=named,
+            _named=tally.named,
         )
         found = unfitted._completed()._over(predictive)
         _log.info(
@@ -591,16 +592,29 @@ def _surfaces(model: Any, x: Floats, y: Floats) -> Predict:
     return _Together(tuple(fitted(model, x, own) for own in y.T))
 
 
-def _names(calling: Calling, domain: Ranges, good: Floats, tally: Tally) -> Outputs | None:
-    """Return what a mapping calls several outputs; None where they have no names.
+def _learn_names(calling: Calling, points: Points, tally: Tally) -> None:
+    """Learn what a mapping calls several outputs that are stored, before any other run.
 
-    A store keeps numbers only: where it had all runs, and its version was believed, one of them is
-    computed again.
+    A store keeps numbers only: where a version is believed, one of its runs is computed again, and
+    refused if its outputs have changed places.
     """
-    if tally.named is None and calling.store is not None and not tally.computed:
-        first = Points(domain.arguments(good[:1]), domain.varying)
-        respond(replace(calling, store=None), first, tally)
-    return tally.named
+    store = calling.store
+    if store is None or store.version is None:
+        return
+    keys, values = store.known()
+    if values.ndim == 1:
+        return
+    usable = np.flatnonzero(_usable(values) & points.with_same_constants(keys))[:1]
+    if not usable.size:
+        return
+    (again,) = respond(replace(calling, store=None), points.read(keys[usable]), tally)
+    (stored,) = values[usable]
+    moved = np.allclose(np.sort(again), np.sort(stored)) and not np.allclose(again, stored)
+    if tally.named is not None and moved:
+        raise StoreError(
+            f"{calling.name}: store: got a mapping with the keys {list(tally.named.names)}, whose "
+            "numbers are stored in another order, expected the same one; pass another version="
+        )
 
 
 def _coarse_at(name: str, coarse: Callable[..., Any], domain: Ranges, columns: Floats) -> Floats:

@@ -312,6 +312,14 @@ def test_outputs_keep_their_names_also_from_a_store(tmp_path: Path) -> None:
     # A store keeps numbers: one run tells the names.
     again = prb.Surrogate.fit(named, BOX, 32, store=tmp_path, version="1")
     assert (again.n_runs, list(again(1.0, 1.5))) == (1, ["bent", "other"])
+    turned = lambda x, y: dict(reversed(named(x, y).items()))  # noqa: E731
+    for n in (32, 48):
+        with pytest.raises(prb.response.StoreError, match="stored in another order"):
+            prb.Surrogate.fit(turned, BOX, n, store=tmp_path, version="1")
+    # Refused before it was stored: with more runs all are in their places.
+    more = prb.Surrogate.fit(named, BOX, 48, store=tmp_path, version="1")
+    assert more.n_runs == 16 + 1
+    np.testing.assert_array_equal(more.responses, prb.Surrogate.fit(two, BOX, 48).responses)
     prb.Surrogate.fit(named, BOX, 32, store=tmp_path / "unversioned")
     again = prb.Surrogate.fit(named, BOX, 32, store=tmp_path / "unversioned")
     assert (again.n_runs, list(again(1.0, 1.5))) == (1, ["bent", "other"])
