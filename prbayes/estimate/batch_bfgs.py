@@ -154,7 +154,7 @@ def descend(
     sound = np.isfinite(f)
     sound &= np.isfinite(g).all(axis=-1)
     active = active[sound]
-    for _ in range(max_iterations):
+    for iteration in range(max_iterations):
         # Rows whose step is no number stop; those that promise next to nothing have converged.
         plan = _planned(active, inverse, g)
         done = plan.promise < 2 * tolerance
@@ -167,7 +167,10 @@ def descend(
         accepted = _line_search(problem, plan, x, f, g)
         motion = accepted.x - x[active]
         change = accepted.g - g[active]
-        inverse[active] = _updated(inverse[active], motion, change)
+        known = inverse[active]
+        if iteration == 0:  # a first guess may be of the wrong size, if of the right form
+            known = _scaled(known, motion, change)
+        inverse[active] = _updated(known, motion, change)
         # Book-keeping.
         x[active] = accepted.x
         f[active] = accepted.f
@@ -249,16 +252,23 @@ def _line_search(problem: _Problem, plan: _Steps, x: Floats, f: Floats, g: Float
     return _Accepted(new_x, new_f, new_g, waiting)
 
 
+def _scaled(inverse: Floats, s: Floats, y: Floats) -> Floats:
+    """Return first guesses of inverse Hessians, (B, r, r), in the size that a first step found.
+
+    Nocedal and Wright, eq. 6.20, with the guess in place of the identity.
+    """
+    sy, good = _curved(s, y)
+    expected = np.einsum("bi,bij,bj->b", y, inverse, y)
+    factors = np.where(good, sy, 1.0) / np.where(good, expected, 1.0)
+    return np.asarray(factors[:, None, None] * inverse)
+
+
 def _updated(inverse: Floats, s: Floats, y: Floats) -> Floats:
     """Return the BFGS update of inverse Hessians, (B, r, r), where it keeps them positive definite.
 
     Nocedal and Wright, eq. 6.17.
     """
-    sy = (s * y).sum(axis=-1)
-    lengths = np.linalg.norm(s, axis=-1)
-    changes = np.linalg.norm(y, axis=-1)
-    # Steps and changes that are nearly orthogonal would spoil the inverse Hessian.
-    good = sy > 1e-4 * lengths * changes
+    sy, good = _curved(s, y)
     # The others have rho = 0, which leaves them as they are.
     safe = np.where(good, sy, 1.0)
     inverted = np.where(good, 1 / safe, 0.0)
@@ -271,3 +281,12 @@ def _updated(inverse: Floats, s: Floats, y: Floats) -> Floats:
     right = np.swapaxes(left, -1, -2)
     turned = left @ inverse @ right
     return np.asarray(turned + along)
+
+
+def _curved(s: Floats, y: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the products of steps and changes of slopes, and which tell of a curvature, (B,)."""
+    sy = (s * y).sum(axis=-1)
+    lengths = np.linalg.norm(s, axis=-1)
+    changes = np.linalg.norm(y, axis=-1)
+    # Steps and changes that are nearly orthogonal would spoil the inverse Hessian.
+    return sy, sy > 1e-4 * lengths * changes

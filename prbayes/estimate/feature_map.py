@@ -33,6 +33,8 @@ _AROUND = 4.0
 _AT_HAND = 0.3
 # Intervals of a distribution function on which it is interpolated.
 _INTERVALS = 1024
+# Features of populations and data sets that are held at a time.
+_NUMBERS = 1 << 17
 # Share of the features' variance that the principal components they are interpolated by leave out.
 _SMALL_SHARE = 1e-10
 
@@ -111,6 +113,16 @@ class FeatureMap:
 
         @one_thread()
         def value(x: Floats, rows: Any) -> Floats:
+            values = np.empty(x.shape[:-1])
+            numbers = np.arange(objective.n_sets)[rows]
+            at_once = max(1, _NUMBERS // (x.shape[1] * self.center.size))
+            # Some data sets at a time, whose features stay near at hand.
+            for first in range(0, len(x), at_once):
+                some = slice(first, first + at_once)
+                values[some] = of_some(x[some], numbers[some])
+            return values
+
+        def of_some(x: Floats, rows: Any) -> Floats:
             scores = self.interpolator(x.reshape(-1, x.shape[-1]))
             features = np.clip(scores @ self.axes + self.center, self.lowest, self.highest)
             total: Any = 0.0
@@ -119,8 +131,7 @@ class FeatureMap:
                 if piece.basis:
                     own = own + of_data[rows]
                 total = total + factor * target.rows(rows).outer(own, *piece.constants, xp=np)
-            values = np.nan_to_num(total, nan=np.inf, posinf=np.inf)
-            return np.asarray(values)
+            return np.nan_to_num(total, nan=np.inf, posinf=np.inf)
 
         return value
 

@@ -115,6 +115,25 @@ def test_values_are_nearly_those_of_the_objective(name: str) -> None:
     assert np.abs(values - exact).max() < 0.05 * np.abs(rise).mean()
 
 
+@SOME
+def test_some_data_sets_at_a_time_have_the_values_of_all(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sampling = fitted(name)
+    sets, points = along(name)
+    objective = BatchObjective.of(sampling.evaluator, sampling.scales, sets)
+    found = FeatureMap.around(objective, points, sampling.thetas)
+    assert found is not None
+    about = found.against(objective)
+    x = 0.5 * np.stack([points, points + 0.1], axis=1)
+    rows = np.arange(len(points))[::-1]
+    monkeypatch.setattr(feature_map, "_NUMBERS", 10**9)
+    expected = about(x, rows)
+    monkeypatch.setattr(feature_map, "_NUMBERS", 14 * found.center.size)
+    np.testing.assert_allclose(about(x, rows), expected, rtol=1e-9)
+    np.testing.assert_allclose(about(x, slice(None)), about(x, np.arange(len(x))), rtol=1e-12)
+
+
 def test_a_map_that_misleads_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     exact, _ = refitted("residual", monkeypatch, worth=10**9)
     used = 0
