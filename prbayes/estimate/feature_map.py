@@ -131,7 +131,7 @@ class FeatureMap:
                 if piece.basis:
                     own = own + of_data[rows]
                 total = total + factor * target.rows(rows).outer(own, *piece.constants, xp=np)
-            return np.nan_to_num(total, nan=np.inf, posinf=np.inf)
+            return np.asarray(np.nan_to_num(total, nan=np.inf, posinf=np.inf))
 
         return value
 
