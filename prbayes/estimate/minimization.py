@@ -54,7 +54,7 @@ from prbayes.estimate.refinement import (
     spread_around,
 )
 from prbayes.estimate.refit import SamplingDistribution
-from prbayes.estimate.rivals import Rival, excluded, rivals
+from prbayes.estimate.rivals import Rival, confirmed, excluded, rivals
 from prbayes.estimate.sampling import Local
 from prbayes.estimate.search import (
     OVERLAP,
@@ -682,30 +682,23 @@ def _against_rivals(plan: _Plan, state: _State) -> _State:
 def _rivals(plan: _Plan, state: _State) -> list[Rival]:
     """Return other optima.
 
-    Where a design is too thin for one that matters, refine and look again.
+    Where a design is too thin for one that matters, and stands up where clouds reach it, refine for
+    both and look again.
     """
     evaluator = plan.evaluator
     assert state.local is not None
     floors = noise_floors(evaluator, state.theta, FEW_SETS)
     noise = _NOISE_SHARE * float((floors / state.scales).sum())
+    against = (evaluator, state.theta, state.scales, state.local, noise)
     # Most need one look.
     for _ in range(3):
-        found = rivals(
-            evaluator,
-            state.theta,
-            state.scales,
-            state.local,
-            noise,
-            starts=plan.starts,
-            seed=plan.seed,
-            hold=state.hold,
-        )
-        matter = [r for r in found if r.better or r.comparable]
-        thin = [r for r in matter if shortcomings(evaluator, r.theta[None])]
-        if not thin or not plan.refine:
+        found = rivals(*against, starts=plan.starts, seed=plan.seed, hold=state.hold)
+        supported = [r for r in found if not shortcomings(evaluator, r.theta[None])]
+        thin = [r for r in found if (r.better or r.comparable) and r not in supported]
+        real = [r for r in thin if plan.refine and confirmed(*against, r, hold=state.hold)]
+        if not real:
             break
-        refine_at(evaluator, thin[0].theta[None])
-    supported = [r for r in found if not shortcomings(evaluator, r.theta[None])]
+        refine_at(evaluator, real[0].theta[None], beside=state.theta[None])
     return excluded(evaluator, state.theta, supported, _NOISE_SHARE * floors)
 
 

@@ -46,11 +46,12 @@ FEW_SETS = 50
 
 
 def refine_at(
-    evaluator: Evaluator, thetas: Floats, *, again: bool = False
+    evaluator: Evaluator, thetas: Floats, *, beside: Floats | None = None, again: bool = False
 ) -> dict[str, Shortcoming]:
     """Add one batch to each design that falls short at thetas, (P, d); return what was short.
 
-    A cloud is drawn anew for them, and is larger where that was done before (``again``).
+    A cloud is drawn anew for them, and for those that it is to support ``beside`` them; it is
+    larger where that was done before (``again``).
 
     Raises
     ------
@@ -65,12 +66,13 @@ def refine_at(
                 "narrow the priors, or raise max_lost"
             )
     thin = set(short)
-    drawn = _widened(evaluator, thetas, thin) if again else _reach(evaluator, thetas, thin)
+    every = thetas if beside is None else np.concatenate([thetas, beside])
+    drawn = _widened(evaluator, every, thin) if again else _reach(evaluator, every, thin)
     while drawn and thin:
         thin &= set(shortcomings(evaluator, thetas))
-        drawn = _widened(evaluator, thetas, thin, on_the_way=True)
+        drawn = _widened(evaluator, every, thin, on_the_way=True)
     # What no cloud reaches needs runs, and so does what no emulator tells.
-    _add(evaluator, thetas, thin | _untold(evaluator, set(short)))
+    _add(evaluator, every, thin | _untold(evaluator, set(short)))
     return short
 
 
@@ -245,13 +247,28 @@ def reached(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
 
     They know the prior alone, and are thin around what was found by another process.
     """
+    designs = evaluator.designs.items()
+    names = {name for name, design in designs if len(design.contents.groups) == 1}
+    with _reaching(evaluator, thetas, names, on_the_way=False):
+        yield
+
+
+@contextmanager
+def visited(evaluator: Evaluator, thetas: Floats) -> Iterator[None]:
+    """Let clouds reach the populations at thetas, inside, with the emulators that they have."""
+    with _reaching(evaluator, thetas, set(evaluator.designs), on_the_way=True):
+        yield
+
+
+@contextmanager
+def _reaching(
+    evaluator: Evaluator, thetas: Floats, names: set[str], *, on_the_way: bool
+) -> Iterator[None]:
+    """Let clouds of the designs named reach populations, and bring them back afterwards."""
     with ExitStack() as stack:
-        names = set()
-        for name, design in evaluator.designs.items():
-            if design.contents.cloud and len(design.contents.groups) == 1:
-                stack.enter_context(design.undone())
-                names.add(name)
-        _reach(evaluator, thetas, names)
+        for _, design in _clouds(evaluator, names):
+            stack.enter_context(design.undone())
+        _reach(evaluator, thetas, names, on_the_way=on_the_way)
         yield
 
 

@@ -10,8 +10,10 @@ import numpy as np
 from prbayes._checks import Floats
 from prbayes.estimate.batch_bfgs import descend
 from prbayes.estimate.objective import Hold
+from prbayes.estimate.refinement import visited
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.support import shortcomings
 
 # Difference, in multiples of the noise, up to which data could come from either optimum; three of
 # them are about the noise floor, since the noise is a third of it.
@@ -23,6 +25,8 @@ _BETTER = 0.1
 _LOOKED_AT = 8
 # Steps of the way between two optima at which a barrier is looked for: one narrower is missed.
 _SECTIONS = 10
+# Times that points are drawn where a descent on too few of them has ended.
+_VISITS = 4
 # Multiples of the noise that are nothing: what descents stop at, and what may be given up.
 _NEGLIGIBLE = 0.01
 
@@ -143,6 +147,47 @@ def rivals(
             kept.append((end, value))
     found = kept[1:]
     return [_rival(theta, value, lowest, noise) for theta, value in found]
+
+
+def confirmed(
+    evaluator: Evaluator,
+    best: Floats,
+    scales: Floats,
+    local: Local,
+    noise: float,
+    rival: Rival,
+    *,
+    hold: Hold | None = None,
+) -> bool:
+    """Return whether an optimum that designs do not support stands up where clouds reach it.
+
+    Few points of a cloud far away have minima of their own. Without a cloud it costs runs to tell:
+    then it stands. Other parameters are those of `rivals`.
+    """
+    objective = _Objective(evaluator, scales, best, local.prior_sd, hold)
+    if not any(design.contents.cloud for design in evaluator.designs.values()):
+        return True
+    theta = rival.theta
+    for _ in range(_VISITS):
+        with visited(evaluator, np.stack([best, theta])):
+            if shortcomings(evaluator, theta[None]):
+                return False
+            lowest = float(objective(best[None])[0])
+            start = (theta - best) / local.prior_sd
+            inverse = np.eye(best.size) / max(float(objective(theta[None])[0]) - lowest, noise)
+            end, value, *_ = descend(
+                objective.along,
+                start[None],
+                inverse,
+                step=1e-3,
+                tolerance=_NEGLIGIBLE * noise,
+            )
+            theta = objective.theta(end[0])
+            if not value[0] - lowest < _COMPARABLE * noise:
+                return False
+            if not shortcomings(evaluator, theta[None]):
+                return _separate(objective, theta, float(value[0]), best, lowest, noise)
+    return False
 
 
 def excluded(evaluator: Evaluator, best: Floats, found: list[Rival], noises: Floats) -> list[Rival]:

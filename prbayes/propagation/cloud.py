@@ -216,8 +216,11 @@ def columns(points: Sequence[Floats]) -> Floats:
 
 
 def some_of(group: Sequence[Floats], most: int = _POPULATIONS) -> list[Floats]:
-    """Return populations of a group, spread over it; a few come again and again."""
-    places = np.linspace(0, len(group[0]) - 1, most).astype(int)
+    """Return populations of a group, spread over it; a few come again and again, equally often."""
+    size = len(group[0])
+    places = np.linspace(0, size - 1, most).astype(int)
+    if size < most:
+        places = np.arange(most) * size // most
     return [values[places] for values in group]
 
 

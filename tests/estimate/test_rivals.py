@@ -12,9 +12,10 @@ from four_metrics import METRICS, R256, same, slow
 
 import prbayes as prb
 from prbayes.estimate.objective import Hold
-from prbayes.estimate.rivals import rivals
+from prbayes.estimate.rivals import Rival, confirmed, rivals
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.support import shortcomings
 
 DATA = (np.random.default_rng(3).normal(2.0, 0.3, 40) - 1) ** 2
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
@@ -251,3 +252,65 @@ def test_one_output_of_many_excludes_a_mirror(slope: float, comparable: bool) ->
     assert optimum.rivals
     assert any(rival["comparable"] for rival in optimum.rivals) == comparable
     assert ("mirror solution" in "".join(optimum.warnings)) == comparable
+
+
+# -- optima of designs whose points follow the search
+# ------------------------------------------------------------------------------------
+
+
+def two_outputs(x: Any, y: Any) -> Any:
+    """Symmetric about x = 1."""
+    return np.stack([(x - 1) ** 2 + 0.2 * y, y], axis=-1)
+
+
+@cache
+def followed(starts: int) -> prb.Optimum:
+    rng = np.random.default_rng(3)
+    data = two_outputs(rng.normal(2.0, 0.2, 25), rng.normal(0.0, 0.2, 25))
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1.5), pm.HalfNormal("sigma", 1))
+        y = pm.Normal.dist(pm.Normal("nu", 0, 1), 0.2)
+        prb.Simulator(
+            "y",
+            two_outputs,
+            x,
+            y,
+            metric=prb.Joint(prb.ProbabilityResidual()),
+            observed=data,
+            propagation=prb.Reweighted(256),
+        )
+    return prb.minimize(model, starts=starts)
+
+
+def test_a_mirror_far_from_the_points_is_found_and_both_are_supported() -> None:
+    optimum = followed(16)
+    (rival,) = [r for r in optimum.rivals if r["comparable"]]
+    assert optimum.point["mu"] + rival["point"]["mu"] == pytest.approx(2, abs=0.1)
+    thetas = np.stack([optimum.theta, rival["theta"]])
+    for theta in thetas:
+        assert not shortcomings(optimum.evaluator, theta[None])
+
+
+@pytest.mark.parametrize(("mu", "sigma", "real"), [(None, 0.2, True), (-6.0, 0.3, False)])
+def test_what_few_points_tell_is_looked_at_with_more(
+    mu: float | None, sigma: float, real: bool
+) -> None:
+    optimum = followed(0)
+    evaluator = optimum.evaluator
+    mirror = 2 - optimum.point["mu"] if mu is None else mu
+    there = optimum.theta.copy()
+    there[0], there[1] = mirror + 0.05, np.log(sigma)
+    # Whatever a design says of it: few points may have any value.
+    told = Rival(there, 0.0, comparable=True, better=True)
+    before = evaluator.designs["y"].contents
+    local = Local(evaluator.prior_sd, np.eye(3), np.zeros((3, 0)), np.eye(3))
+    assert confirmed(evaluator, optimum.theta, np.ones(1), local, 0.05, told) is real
+    assert evaluator.designs["y"].contents is before  # and not a run more
+
+
+def test_an_optimum_that_is_the_best_one_is_no_other() -> None:
+    optimum = followed(0)
+    near = Rival(optimum.theta + 0.02, 0.0, comparable=True, better=True)
+    evaluator = optimum.evaluator
+    local = Local(evaluator.prior_sd, np.eye(3), np.zeros((3, 0)), np.eye(3))
+    assert not confirmed(evaluator, optimum.theta, np.ones(1), local, 0.05, near)

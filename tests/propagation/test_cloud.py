@@ -16,7 +16,7 @@ from prbayes.estimate.refit import DesignErrors, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import identity_of
 from prbayes.propagation.base import DesignError
-from prbayes.propagation.cloud import CLOUD, columns, mixture_of
+from prbayes.propagation.cloud import CLOUD, columns, mixture_of, some_of
 from prbayes.propagation.reweighted import Design, UntoldError
 from prbayes.response.budget import BudgetError
 from prbayes.response.compilation import PLAIN
@@ -428,3 +428,16 @@ def test_points_are_as_many_as_the_shares_of_their_populations() -> None:
     thetas = evaluator.prior_thetas(2, 0)
     _, counts = design._place(evaluator.roots(thetas, 0), 1024, 3, np.array([0.125, 0.875]))
     np.testing.assert_array_equal(counts, [128, 896])
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 40, 200])
+def test_populations_of_a_group_count_alike(size: int) -> None:
+    (found,) = some_of([np.arange(size)], 40)
+    assert len(found) == 40
+    assert found[0] == 0
+    counts = np.bincount(found, minlength=size)
+    if size <= 40:
+        assert np.ptp(counts) <= 1
+    else:
+        assert counts.max() == 1
+        assert found[-1] == size - 1
