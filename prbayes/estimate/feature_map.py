@@ -34,7 +34,7 @@ _AT_HAND = 0.3
 # Intervals of a distribution function on which it is interpolated.
 _INTERVALS = 1024
 # Features of populations and data sets that are held at a time.
-_AT_A_TIME = 1 << 17
+_FEATURES_AT_ONCE = 1 << 17
 # Share of the features' variance that the principal components they are interpolated by leave out.
 _SMALL_SHARE = 1e-10
 
@@ -115,7 +115,7 @@ class FeatureMap:
         def value(x: Floats, rows: Any) -> Floats:
             values = np.empty(x.shape[:-1])
             numbers = np.arange(objective.n_sets)[rows]
-            at_once = max(1, _AT_A_TIME // (x.shape[1] * self.center.size))
+            at_once = max(1, _FEATURES_AT_ONCE // (x.shape[1] * self.center.size))
             # Some data sets at a time, whose features stay near at hand.
             for first in range(0, len(x), at_once):
                 some = slice(first, first + at_once)

@@ -127,9 +127,9 @@ def test_some_data_sets_at_a_time_have_the_values_of_all(
     about = found.against(objective)
     x = 0.5 * np.stack([points, points + 0.1], axis=1)
     rows = np.arange(len(points))[::-1]
-    monkeypatch.setattr(feature_map, "_AT_A_TIME", 10**9)
+    monkeypatch.setattr(feature_map, "_FEATURES_AT_ONCE", 10**9)
     expected = about(x, rows)
-    monkeypatch.setattr(feature_map, "_AT_A_TIME", 14 * found.center.size)
+    monkeypatch.setattr(feature_map, "_FEATURES_AT_ONCE", 14 * found.center.size)
     np.testing.assert_allclose(about(x, rows), expected, rtol=1e-9)
     np.testing.assert_allclose(about(x, slice(None)), about(x, np.arange(len(x))), rtol=1e-12)
 
