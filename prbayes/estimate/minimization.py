@@ -179,6 +179,8 @@ _TERMS = 64
 # truth's. It decides which optima are told of: of five problems half or twice changes what is said
 # of one each, no optimum and no standard error (docs/constants.md).
 _NOISE_SHARE = 0.3
+# Looks at other optima, between which designs are refined for one of them.
+_LOOKS = 3
 
 
 @in_turn
@@ -670,7 +672,10 @@ def _against_rivals(plan: _Plan, state: _State) -> _State:
     if not others or not others[0].better:
         return replace(state, others=tuple(others))
     better = others[0].theta
-    run = minimise(plan.held(state.hold), better, state.scales, state.run.trace)
+    search = plan.held(state.hold)
+    run = minimise(search, better, state.scales, state.run.trace)
+    if plan.refine and refine_at(plan.evaluator, run.best[None]):
+        run = minimise(search, run.best, state.scales, run.trace)
     sampling = _sampling(plan.evaluator, run.best, state.scales)
     state = replace(state, theta=run.best, run=run, sampling=sampling)
     if sampling is None:
@@ -691,12 +696,12 @@ def _rivals(plan: _Plan, state: _State) -> list[Rival]:
     noise = _NOISE_SHARE * float((floors / state.scales).sum())
     against = (evaluator, state.theta, state.scales, state.local, noise)
     # Most need one look.
-    for _ in range(3):
+    for look in range(_LOOKS):
         found = rivals(*against, starts=plan.starts, seed=plan.seed, hold=state.hold)
         supported = [r for r in found if not shortcomings(evaluator, r.theta[None])]
         thin = [r for r in found if (r.better or r.comparable) and r not in supported]
         real = [r for r in thin if plan.refine and confirmed(*against, r, hold=state.hold)]
-        if not real:
+        if not real or look == _LOOKS - 1:
             break
         refine_at(evaluator, real[0].theta[None], beside=state.theta[None])
     return excluded(evaluator, state.theta, supported, _NOISE_SHARE * floors)
@@ -706,6 +711,11 @@ def _settled(plan: _Plan, state: _State) -> _State:
     """Settle a line search that gave up; what is known of the optimum is then that of its place."""
     before = state.theta
     run = settle(plan.held(state.hold), state.run)
+    if plan.refine and refine_at(plan.evaluator, run.best[None], beside=before[None]):
+        # A simplex goes where few points have a lower value.
+        run = settle(plan.held(state.hold), state.run)
+        if shortcomings(plan.evaluator, run.best[None]):
+            run = state.run
     state = replace(state, theta=run.best, run=run)
     if state.sampling is None:
         return state

@@ -1,6 +1,7 @@
 """`minimize` against closed forms, brute force, and its own promises."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.estimate import minimization
 from prbayes.estimate.refit import SamplingDistribution
-from prbayes.estimate.search import Approach, Trace
+from prbayes.estimate.search import Approach, Run, Search, Trace
 from prbayes.metrics.density import GaussianKDE
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import nodes
@@ -884,3 +885,23 @@ def test_a_search_is_held_where_the_data_do_not_tell_and_names_what_it_is() -> N
     # The standard error of a mean, and a few per cent that the residual costs.
     assert error == pytest.approx(observed.std() / np.sqrt(observed.size), rel=0.3)
     assert abs(optimum.point["ratio"] - np.median(observed)) < error
+
+
+def test_a_simplex_that_leaves_the_design_is_not_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few points have a lower value by accident."""
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
+        few = prb.Reweighted(256, max_points=256)
+        prb.Simulator("y", same, x, metric=METRICS["area"], observed=OBSERVED, propagation=few)
+    expected = prb.minimize(model, starts=0)
+    begun = []
+
+    def astray(search: Search, run: Run) -> Run:
+        begun.append(run.best)
+        return replace(run, best=run.best + np.array([0.0, -8.0]), lowest=0.0)
+
+    monkeypatch.setattr(minimization, "settle", astray)
+    found = prb.minimize(model, starts=0)
+    np.testing.assert_allclose(found.theta, expected.theta, atol=0.01)
+    # It was tried twice from where the search had been.
+    np.testing.assert_array_equal(*begun)
