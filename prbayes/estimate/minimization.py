@@ -9,6 +9,7 @@ import logging
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -54,7 +55,7 @@ from prbayes.estimate.refinement import (
     spread_around,
 )
 from prbayes.estimate.refit import SamplingDistribution
-from prbayes.estimate.rivals import Rival, confirmed, excluded, rivals
+from prbayes.estimate.rivals import Rival, excluded, rivals, standing, visit
 from prbayes.estimate.sampling import Local
 from prbayes.estimate.search import (
     OVERLAP,
@@ -181,6 +182,8 @@ _TERMS = 64
 _NOISE_SHARE = 0.3
 # Looks at other optima, between which designs are refined for one of them.
 _LOOKS = 3
+# Optima, of those on too few points, that clouds are led to.
+_VISITED = 4
 
 
 @in_turn
@@ -642,9 +645,15 @@ def _holding(plan: _Plan, state: _State) -> Hold | None:
     if state.hold is None or shortcomings(evaluator, place[None]):
         place = _likeliest(plan, state.cloud, state.scales)
     sampling = _sampling(evaluator, place, state.scales)
-    if sampling is None or not sampling.local.unidentified.size:
+    if sampling is None:
         return None
-    return Hold(place, sampling.local.unidentified, _noise(evaluator, place, state.scales))
+    unidentified = sampling.local.unidentified
+    if not unidentified.size and state.local is not None:
+        # Where the search has gone: a standard deviation that makes no difference has no end.
+        unidentified = state.local.unidentified
+    if not unidentified.size:
+        return None
+    return Hold(place, unidentified, _noise(evaluator, place, state.scales))
 
 
 def _likeliest(plan: _Plan, thetas: Floats, scales: Floats) -> Floats:
@@ -685,26 +694,50 @@ def _against_rivals(plan: _Plan, state: _State) -> _State:
 
 
 def _rivals(plan: _Plan, state: _State) -> list[Rival]:
-    """Return other optima.
-
-    Where a design is too thin for one that matters, and stands up where clouds reach it, refine for
-    both and look again.
-    """
+    """Return other optima, refining where designs are too thin for one that matters."""
     evaluator = plan.evaluator
     assert state.local is not None
     floors = noise_floors(evaluator, state.theta, FEW_SETS)
     noise = _NOISE_SHARE * float((floors / state.scales).sum())
     against = (evaluator, state.theta, state.scales, state.local, noise)
+    search = partial(rivals, *against, starts=plan.starts, seed=plan.seed, hold=state.hold)
+    clouds = any(design.contents.cloud for design in evaluator.designs.values())
+    if clouds and plan.refine:
+        found = _visited(against, search(), state)
+    else:
+        found = _supported(plan, search)
+    return excluded(evaluator, state.theta, found, _NOISE_SHARE * floors)
+
+
+def _visited(
+    against: tuple[Evaluator, Floats, Floats, Local, float], found: list[Rival], state: _State
+) -> list[Rival]:
+    """Return optima that stand up where clouds reach them, which they do afterwards."""
+    evaluator = against[0]
+    thin = [bool(shortcomings(evaluator, r.theta[None])) for r in found]
+    few = [r.theta for r, short in zip(found, thin, strict=True) if short][:_VISITED]
+    ends = [visit(*against, theta, hold=state.hold) for theta in few]
+    real = [end for end in ends if end is not None]
+    kept = [r for r, short in zip(found, thin, strict=True) if not short]
+    if not real:
+        return kept
+    refine_at(evaluator, np.stack(real), beside=state.theta[None])
+    thetas = np.stack([r.theta for r in kept] + real)
+    return standing(*against, thetas, hold=state.hold)
+
+
+def _supported(plan: _Plan, search: Callable[[], list[Rival]]) -> list[Rival]:
+    """Return optima that designs support, with runs more where one that matters has too few."""
+    evaluator = plan.evaluator
     # Most need one look.
     for look in range(_LOOKS):
-        found = rivals(*against, starts=plan.starts, seed=plan.seed, hold=state.hold)
+        found = search()
         supported = [r for r in found if not shortcomings(evaluator, r.theta[None])]
         thin = [r for r in found if (r.better or r.comparable) and r not in supported]
-        real = [r for r in thin if plan.refine and confirmed(*against, r, hold=state.hold)]
-        if not real or look == _LOOKS - 1:
+        if not thin or not plan.refine or look == _LOOKS - 1:
             break
-        refine_at(evaluator, real[0].theta[None], beside=state.theta[None])
-    return excluded(evaluator, state.theta, supported, _NOISE_SHARE * floors)
+        refine_at(evaluator, thin[0].theta[None])
+    return supported
 
 
 def _settled(plan: _Plan, state: _State) -> _State:

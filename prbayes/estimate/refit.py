@@ -225,20 +225,23 @@ class SamplingDistribution:
     def _error_of_emulators(self) -> Floats:
         """Return how far the optimum is off by the emulators' error, (r,); NaN without emulators.
 
-        The minimum of each emulator that lacks a block of the runs is found.
+        The minimum of each emulator that lacks a block of the runs is found, and how far it is from
+        that of the whole: where a descent ends differs from the optimum for other reasons, too.
         """
         each = [node.design.left_out() if node.design else [] for node in self.evaluator.nodes]
         number = max(map(len, each))
         if not number:
             return np.full(self.stderr.size, np.nan)
         observed = observed_set(self.evaluator)
+        whole = BatchObjective.of(self.evaluator, self.scales, observed)
+        descent = self._descent(whole, roughly=True)
+        end = self._only(whole, descent)
+        end = np.where(np.isfinite(end), end, 0.0)
         found = []
-        descent = None
         for b in range(number):
             stored = [values[b] if values else None for values in each]
             objective = BatchObjective.of(self.evaluator, self.scales, observed, stored=stored)
-            descent = descent or self._descent(objective, roughly=True)
-            found.append(self._only(objective, descent))
+            found.append(self._only(objective, descent) - end)
         return np.asarray(np.sqrt(np.square(found).sum(axis=0)))
 
     def _error_of_points(self) -> Floats:

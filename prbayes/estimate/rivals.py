@@ -67,6 +67,15 @@ class _Objective:
         """Return values of shifts; the same function for all rows."""
         return self(self.theta(x))
 
+    def polished(self, thetas: Floats, local: Local, noise: float) -> tuple[Floats, Floats]:
+        """Return minima near thetas, (n, d), and their values: they are bent about as at best."""
+        known = local.identified @ local.covariance @ local.identified.T
+        inverse = (known + local.unidentified @ local.unidentified.T) / noise
+        shifts = (thetas - self.best) / self.prior_sd
+        tolerance = _NEGLIGIBLE * noise
+        ends, values, *_ = descend(self.along, shifts, inverse, step=1e-3, tolerance=tolerance)
+        return self.theta(ends), values
+
 
 def _starts(objective: _Objective, n: int, noise: float, seed: int) -> tuple[Floats, float]:
     """Return shifts to begin at, (n, d), and the typical size of the objective among the priors'.
@@ -135,59 +144,72 @@ def rivals(
     lowest = float(objective(best[None])[0])
     ends, values = _in_line(objective, local.unidentified, ends, values, noise)
 
-    # Keep those that a barrier separates from all that are kept already.
-    kept = [(best, lowest)]
-    for i in np.argsort(values):
-        value = float(values[i])
-        if not np.isfinite(value):
-            continue
-        end = objective.theta(ends[i])
-        separate = (_separate(objective, end, value, *other, noise) for other in kept)
-        if all(separate):
-            kept.append((end, value))
-    found = kept[1:]
-    return [_rival(theta, value, lowest, noise) for theta, value in found]
+    return _kept(objective, objective.theta(ends), values, lowest, noise)
 
 
-def confirmed(
+def standing(
     evaluator: Evaluator,
     best: Floats,
     scales: Floats,
     local: Local,
     noise: float,
-    rival: Rival,
+    thetas: Floats,
     *,
     hold: Hold | None = None,
-) -> bool:
-    """Return whether an optimum that designs do not support stands up where clouds reach it.
+) -> list[Rival]:
+    """Return optima near thetas, (n, d), on designs as they are now.
 
-    Few points of a cloud far away have minima of their own. Without a cloud it costs runs to tell:
-    then it stands. Other parameters are those of `rivals`.
+    Other parameters, and what is returned, are those of `rivals`.
     """
     objective = _Objective(evaluator, scales, best, local.prior_sd, hold)
-    if not any(design.contents.cloud for design in evaluator.designs.values()):
-        return True
-    theta = rival.theta
+    lowest = float(objective(best[None])[0])
+    ends, values = objective.polished(thetas, local, noise)
+    return _kept(objective, ends, values, lowest, noise)
+
+
+def _kept(
+    objective: _Objective, ends: Floats, values: Floats, lowest: float, noise: float
+) -> list[Rival]:
+    """Return those that a barrier separates from the best one and from all that are kept."""
+    kept = [(objective.best, lowest)]
+    for i in np.argsort(values):
+        value = float(values[i])
+        if not np.isfinite(value):
+            continue
+        separate = (_separate(objective, ends[i], value, *other, noise) for other in kept)
+        if all(separate):
+            kept.append((ends[i], value))
+    return [_rival(theta, value, lowest, noise) for theta, value in kept[1:]]
+
+
+def visit(
+    evaluator: Evaluator,
+    best: Floats,
+    scales: Floats,
+    local: Local,
+    noise: float,
+    theta: Floats,
+    *,
+    hold: Hold | None = None,
+) -> Floats | None:
+    """Return where an optimum that clouds do not support is once they reach it; None if nowhere.
+
+    Few points of a cloud far away have minima of their own, and values of their own at those of
+    all. Other parameters are those of `rivals`.
+    """
+    objective = _Objective(evaluator, scales, best, local.prior_sd, hold)
     for _ in range(_VISITS):
         with visited(evaluator, np.stack([best, theta])):
             if shortcomings(evaluator, theta[None]):
-                return False
+                return None
             lowest = float(objective(best[None])[0])
-            start = (theta - best) / local.prior_sd
-            inverse = np.eye(best.size) / max(float(objective(theta[None])[0]) - lowest, noise)
-            end, value, *_ = descend(
-                objective.along,
-                start[None],
-                inverse,
-                step=1e-3,
-                tolerance=_NEGLIGIBLE * noise,
-            )
-            theta = objective.theta(end[0])
-            if not value[0] - lowest < _COMPARABLE * noise:
-                return False
+            (theta,), (value,) = objective.polished(theta[None], local, noise)
+            if not value - lowest < _COMPARABLE * noise:
+                return None
             if not shortcomings(evaluator, theta[None]):
-                return _separate(objective, theta, float(value[0]), best, lowest, noise)
-    return False
+                apart = _separate(objective, theta, value, best, lowest, noise)
+                return theta if apart else None
+    return None
 
 
 def excluded(evaluator: Evaluator, best: Floats, found: list[Rival], noises: Floats) -> list[Rival]:

@@ -12,7 +12,7 @@ from four_metrics import METRICS, R256, same, slow
 
 import prbayes as prb
 from prbayes.estimate.objective import Hold
-from prbayes.estimate.rivals import Rival, confirmed, rivals
+from prbayes.estimate.rivals import rivals, standing, visit
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.support import shortcomings
@@ -291,26 +291,34 @@ def test_a_mirror_far_from_the_points_is_found_and_both_are_supported() -> None:
         assert not shortcomings(optimum.evaluator, theta[None])
 
 
+@cache
+def around(starts: int) -> tuple[Any, ...]:
+    """Return what is known of the optimum, to look for others."""
+    optimum = followed(starts)
+    evaluator = optimum.evaluator
+    local = Local(evaluator.prior_sd, np.eye(3), np.zeros((3, 0)), 1e-3 * np.eye(3))
+    return evaluator, optimum.theta, np.ones(1), local, 0.05
+
+
 @pytest.mark.parametrize(("mu", "sigma", "real"), [(None, 0.2, True), (-6.0, 0.3, False)])
 def test_what_few_points_tell_is_looked_at_with_more(
     mu: float | None, sigma: float, real: bool
 ) -> None:
     optimum = followed(0)
-    evaluator = optimum.evaluator
-    mirror = 2 - optimum.point["mu"] if mu is None else mu
+    design = optimum.evaluator.designs["y"]
+    mirror = 2 - optimum.point["mu"]
     there = optimum.theta.copy()
-    there[0], there[1] = mirror + 0.05, np.log(sigma)
-    # Whatever a design says of it: few points may have any value.
-    told = Rival(there, 0.0, comparable=True, better=True)
-    before = evaluator.designs["y"].contents
-    local = Local(evaluator.prior_sd, np.eye(3), np.zeros((3, 0)), np.eye(3))
-    assert confirmed(evaluator, optimum.theta, np.ones(1), local, 0.05, told) is real
-    assert evaluator.designs["y"].contents is before  # and not a run more
+    there[:2] = mirror + 0.05 if mu is None else mu, np.log(sigma)
+    before = design.contents
+    found = visit(*around(0), there)
+    assert design.contents is before  # and not a run more
+    if not real:
+        assert found is None
+        return
+    assert found is not None
+    assert found[0] == pytest.approx(mirror, abs=0.05)
 
 
 def test_an_optimum_that_is_the_best_one_is_no_other() -> None:
-    optimum = followed(0)
-    near = Rival(optimum.theta + 0.02, 0.0, comparable=True, better=True)
-    evaluator = optimum.evaluator
-    local = Local(evaluator.prior_sd, np.eye(3), np.zeros((3, 0)), np.eye(3))
-    assert not confirmed(evaluator, optimum.theta, np.ones(1), local, 0.05, near)
+    assert visit(*around(0), followed(0).theta + 0.02) is None
+    assert standing(*around(0), followed(0).theta[None] + 0.02) == []
