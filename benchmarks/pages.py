@@ -594,6 +594,17 @@ def many_inputs() -> Iterator[Row]:
             yield [runs, str(len(rows)), *errors, f"{cell['widths']:.1%}", f"{cell['seconds']:.0f}"]
 
 
+def random_problems() -> Iterator[Row]:
+    """Return the row of problems that nobody chose."""
+    from benchmarks.random_problems import summary
+
+    of = summary(found("random_problems")["rows"])
+    errors = [short(of[key], 3) for key in ("median off", "farthest off")]
+    counts = [str(of[key]) for key in ("problems", "refused")]
+    runs = [f"{of[key]:,.0f}" for key in ("median runs", "most runs")]
+    yield [*counts, *errors, str(of["claimed more than 0.1"]), *runs, f"{of['median seconds']:.0f}"]
+
+
 def three_masses() -> Iterator[Row]:
     """Return the rows of the benchmark of three masses."""
     for case, rows in found("three_masses").items():
@@ -804,6 +815,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "emulators, time": emulator_speed,
     "few runs": few_runs,
     "many inputs": many_inputs,
+    "random problems": random_problems,
     "three masses": three_masses,
     "two fidelities": two_fidelities,
     "libraries": libraries,
