@@ -714,16 +714,20 @@ def _visited(
 ) -> list[Rival]:
     """Return optima that stand up where clouds reach them, which they do afterwards."""
     evaluator = against[0]
-    thin = [bool(shortcomings(evaluator, r.theta[None])) for r in found]
-    few = [r.theta for r, short in zip(found, thin, strict=True) if short][:_VISITED]
+    supported = _of_support(evaluator, found)
+    few = [r.theta for r in found if r not in supported][:_VISITED]
     ends = [visit(*against, theta, hold=state.hold) for theta in few]
     real = [end for end in ends if end is not None]
-    kept = [r for r, short in zip(found, thin, strict=True) if not short]
     if not real:
-        return kept
+        return supported
     refine_at(evaluator, np.stack(real), beside=state.theta[None])
-    thetas = np.stack([r.theta for r in kept] + real)
-    return standing(*against, thetas, hold=state.hold)
+    thetas = np.stack([r.theta for r in supported] + real)
+    return _of_support(evaluator, standing(*against, thetas, hold=state.hold))
+
+
+def _of_support(evaluator: Evaluator, found: list[Rival]) -> list[Rival]:
+    """Return the optima that designs support, each by itself."""
+    return [r for r in found if not shortcomings(evaluator, r.theta[None])]
 
 
 def _supported(plan: _Plan, search: Callable[[], list[Rival]]) -> list[Rival]:
@@ -732,7 +736,7 @@ def _supported(plan: _Plan, search: Callable[[], list[Rival]]) -> list[Rival]:
     # Most need one look.
     for look in range(_LOOKS):
         found = search()
-        supported = [r for r in found if not shortcomings(evaluator, r.theta[None])]
+        supported = _of_support(evaluator, found)
         thin = [r for r in found if (r.better or r.comparable) and r not in supported]
         if not thin or not plan.refine or look == _LOOKS - 1:
             break

@@ -25,6 +25,8 @@ _BETTER = 0.1
 _LOOKED_AT = 8
 # Steps of the way between two optima at which a barrier is looked for: one narrower is missed.
 _SECTIONS = 10
+# Times that the way between two optima is halved, to find one that is not straight.
+_HALVED = 5
 # Times that points are drawn where a descent on too few of them has ended.
 _VISITS = 4
 # Multiples of the noise that are nothing: what descents stop at, and what may be given up.
@@ -206,10 +208,31 @@ def visit(
             (theta,), (value,) = objective.polished(theta[None], local, noise)
             if not value - lowest < _COMPARABLE * noise:
                 return None
-            if not shortcomings(evaluator, theta[None]):
-                apart = _separate(objective, theta, value, best, lowest, noise)
-                return theta if apart else None
-    return None
+            found = not shortcomings(evaluator, theta[None])
+        if found:
+            break
+    else:
+        return None
+    return None if _joined(objective, best, theta, local, noise, _HALVED) else theta
+
+
+def _joined(
+    objective: _Objective, a: Floats, b: Floats, local: Local, noise: float, times: int
+) -> bool:
+    """Return whether a way leads from one point to another that is nowhere above both.
+
+    Straight, or along a valley: from where the middle of the way goes down to. Clouds reach it.
+    """
+    way = np.linspace(a, b, 3)
+    with visited(objective.evaluator, way):
+        value_a, value_b = map(float, objective(way[[0, -1]]))
+        if not _separate(objective, a, value_a, b, value_b, noise):
+            return True
+        (middle,), (value,) = objective.polished(way[1:2], local, noise)
+    if not times or not value < max(value_a, value_b) + noise:
+        return False
+    first = _joined(objective, a, middle, local, noise, times - 1)
+    return first and _joined(objective, middle, b, local, noise, times - 1)
 
 
 def excluded(evaluator: Evaluator, best: Floats, found: list[Rival], noises: Floats) -> list[Rival]:

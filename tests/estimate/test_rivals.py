@@ -1,6 +1,7 @@
 """Mirror solutions, and what is said about them."""
 
 import logging
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -11,8 +12,9 @@ import xarray as xr
 from four_metrics import METRICS, R256, same, slow
 
 import prbayes as prb
+from prbayes._checks import Floats
 from prbayes.estimate.objective import Hold
-from prbayes.estimate.rivals import rivals, standing, visit
+from prbayes.estimate.rivals import _joined, _Objective, _separate, rivals, standing, visit
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.support import shortcomings
@@ -322,3 +324,32 @@ def test_what_few_points_tell_is_looked_at_with_more(
 def test_an_optimum_that_is_the_best_one_is_no_other() -> None:
     assert visit(*around(0), followed(0).theta + 0.02) is None
     assert standing(*around(0), followed(0).theta[None] + 0.02) == []
+
+
+@dataclass(frozen=True)
+class Landscape:
+    """A discrepancy that is a formula, in place of a model."""
+
+    formula: Any
+    designs: dict[str, Any] = field(default_factory=dict)
+    nodes: tuple[Any, ...] = ()
+
+    def total(self, thetas: Floats, scales: Floats) -> Floats:
+        return np.asarray(self.formula(*thetas.T))
+
+
+@pytest.mark.parametrize(
+    ("formula", "joined"),
+    [
+        (lambda x, y: 5 * (y - x**2) ** 2, True),  # a valley that bends
+        (lambda x, y: 5 * (x**2 - 1) ** 2 + (y - 1) ** 2, False),  # two hollows
+        (lambda x, y: 5 * (x**2 - y) ** 2 + 3 * np.exp(-20 * x**2), False),  # a ridge across it
+    ],
+)
+def test_a_bent_valley_has_no_two_optima(formula: Any, joined: bool) -> None:
+    a, b = np.array([-1.0, 1.0]), np.array([1.0, 1.0])
+    evaluator: Any = Landscape(formula)
+    objective = _Objective(evaluator, np.ones(1), a, np.ones(2), None)
+    local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), 0.01 * np.eye(2))
+    assert _separate(objective, a, 0.0, b, 0.0, 0.1)  # straight on
+    assert _joined(objective, a, b, local, 0.1, 5) is joined
