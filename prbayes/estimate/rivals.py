@@ -26,7 +26,7 @@ _LOOKED_AT = 8
 # Steps of the way between two optima at which a barrier is looked for: one narrower is missed.
 _SECTIONS = 10
 # Times that the way between two optima is halved, to find one that is not straight.
-_HALVED = 5
+_WAY_HALVED = 5
 # Times that points are drawn where a descent on too few of them has ended.
 _VISITS = 4
 # Multiples of the noise that are nothing: what descents stop at, and what may be given up.
@@ -197,7 +197,8 @@ def visit(
     """Return where an optimum that clouds do not support is once they reach it; None if nowhere.
 
     Few points of a cloud far away have minima of their own, and values of their own at those of
-    all. Other parameters are those of `rivals`.
+    all. What they hide is a mirror image, which is as good as the best one: worse by less than the
+    noise. Other parameters are those of `rivals`.
     """
     objective = _Objective(evaluator, scales, best, local.prior_sd, hold)
     for _ in range(_VISITS):
@@ -206,14 +207,14 @@ def visit(
                 return None
             lowest = float(objective(best[None])[0])
             (theta,), (value,) = objective.polished(theta[None], local, noise)
-            if not value - lowest < _COMPARABLE * noise:
+            if not value - lowest < noise:
                 return None
             found = not shortcomings(evaluator, theta[None])
         if found:
             break
     else:
         return None
-    return None if _joined(objective, best, theta, local, noise, _HALVED) else theta
+    return None if _joined(objective, best, theta, local, noise, _WAY_HALVED) else theta
 
 
 def _joined(
