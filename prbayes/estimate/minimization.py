@@ -645,15 +645,9 @@ def _holding(plan: _Plan, state: _State) -> Hold | None:
     if state.hold is None or shortcomings(evaluator, place[None]):
         place = _likeliest(plan, state.cloud, state.scales)
     sampling = _sampling(evaluator, place, state.scales)
-    if sampling is None:
+    if sampling is None or not sampling.local.unidentified.size:
         return None
-    unidentified = sampling.local.unidentified
-    if not unidentified.size and state.local is not None:
-        # Where the search has gone: a standard deviation that makes no difference has no end.
-        unidentified = state.local.unidentified
-    if not unidentified.size:
-        return None
-    return Hold(place, unidentified, _noise(evaluator, place, state.scales))
+    return Hold(place, sampling.local.unidentified, _noise(evaluator, place, state.scales))
 
 
 def _likeliest(plan: _Plan, thetas: Floats, scales: Floats) -> Floats:
