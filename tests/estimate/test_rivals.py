@@ -268,7 +268,7 @@ def two_outputs(x: Any, y: Any) -> Any:
 @cache
 def followed(starts: int) -> prb.Optimum:
     rng = np.random.default_rng(3)
-    data = two_outputs(rng.normal(2.0, 0.2, 25), rng.normal(0.0, 0.2, 25))
+    data = two_outputs(rng.normal(2.0, 0.05, 25), rng.normal(0.0, 0.2, 25))
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1.5), pm.HalfNormal("sigma", 1))
         y = pm.Normal.dist(pm.Normal("nu", 0, 1), 0.2)
@@ -302,7 +302,7 @@ def around(starts: int) -> tuple[Any, ...]:
     return evaluator, optimum.theta, np.ones(1), local, 0.05
 
 
-@pytest.mark.parametrize(("mu", "sigma", "real"), [(None, 0.2, True), (-6.0, 0.3, False)])
+@pytest.mark.parametrize(("mu", "sigma", "real"), [(None, 0.05, True), (-6.0, 0.3, False)])
 def test_what_few_points_tell_is_looked_at_with_more(
     mu: float | None, sigma: float, real: bool
 ) -> None:
@@ -319,6 +319,16 @@ def test_what_few_points_tell_is_looked_at_with_more(
         return
     assert found is not None
     assert found[0] == pytest.approx(mirror, abs=0.05)
+
+
+def test_what_is_worse_by_more_than_the_noise_is_no_mirror_image() -> None:
+    *known, _ = around(0)
+    optimum = followed(0)
+    mirror = optimum.theta.copy()
+    mirror[0] = 2 - mirror[0]
+    assert visit(*known, 0.05, mirror) is not None
+    # A hold adds about a sixth there.
+    assert visit(*known, 0.05, mirror, hold=Hold(optimum.theta, np.eye(3), 0.2)) is None
 
 
 def test_an_optimum_that_is_the_best_one_is_no_other() -> None:
