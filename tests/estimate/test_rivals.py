@@ -270,8 +270,8 @@ def followed(starts: int) -> prb.Optimum:
     rng = np.random.default_rng(3)
     data = two_outputs(rng.normal(2.0, 0.05, 25), rng.normal(0.0, 0.2, 25))
     with pm.Model() as model:
-        x = pm.Normal.dist(pm.Normal("mu", 1, 1.5), pm.HalfNormal("sigma", 1))
-        y = pm.Normal.dist(pm.Normal("nu", 0, 1), 0.2)
+        x = pm.Normal.dist(pm.Normal("mu", 1, 4), pm.HalfNormal("sigma", 2))
+        y = pm.Normal.dist(pm.Normal("nu", 0, 3), 0.2)
         prb.Simulator(
             "y",
             two_outputs,
@@ -328,7 +328,7 @@ def test_what_is_worse_by_more_than_the_noise_is_no_mirror_image() -> None:
     mirror[0] = 2 - mirror[0]
     assert visit(*known, 0.05, mirror) is not None
     # A hold adds about a sixth there.
-    assert visit(*known, 0.05, mirror, hold=Hold(optimum.theta, np.eye(3), 0.2)) is None
+    assert visit(*known, 0.05, mirror, hold=Hold(optimum.theta, np.eye(3), 1.5)) is None
 
 
 def test_an_optimum_that_is_the_best_one_is_no_other() -> None:
