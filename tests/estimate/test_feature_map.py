@@ -98,13 +98,20 @@ def test_minima_are_the_same_for_half_of_the_populations(
     assert count < 0.6 * needed
 
 
-@KEYS
-def test_values_are_nearly_those_of_the_objective(name: str) -> None:
+def mapped(name: str) -> tuple[FeatureMap, BatchObjective, Floats]:
+    """Return the map of these data sets, what it stands for, and the coordinates."""
     sampling = fitted(name)
     sets, points = along(name)
     objective = BatchObjective.of(sampling.evaluator, sampling.scales, sets)
     found = FeatureMap.around(objective, points, sampling.thetas)
     assert found is not None
+    return found, objective, points
+
+
+@KEYS
+def test_values_are_nearly_those_of_the_objective(name: str) -> None:
+    found, objective, points = mapped(name)
+    sampling = fitted(name)
     about = found.against(objective)
     x = 0.5 * points[:50, None]
     values = about(x, slice(50))
@@ -119,11 +126,7 @@ def test_values_are_nearly_those_of_the_objective(name: str) -> None:
 def test_some_data_sets_at_a_time_have_the_values_of_all(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sampling = fitted(name)
-    sets, points = along(name)
-    objective = BatchObjective.of(sampling.evaluator, sampling.scales, sets)
-    found = FeatureMap.around(objective, points, sampling.thetas)
-    assert found is not None
+    found, objective, points = mapped(name)
     about = found.against(objective)
     x = 0.5 * np.stack([points, points + 0.1], axis=1)
     rows = np.arange(len(points))[::-1]
