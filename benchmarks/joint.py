@@ -23,7 +23,7 @@ import json
 import logging
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +65,7 @@ class Problem:
     values: Callable[[Any, Any], dict[str, Any]]  # mean, covariance -> values near them
     correlated: bool  # whether there is a correlation among the hyperparameters
     points: int  # of the design, for N = 50
+    wider: int = 1  # times as many for N = 20, whose data sets' populations are further apart
 
     def draw(self, rng: Any, size: int) -> Any:
         """Return inputs of specimens, (size, p)."""
@@ -170,7 +171,7 @@ PROBLEMS = {
     "normal .6": _normal(2, 0.6, 2048),
     "normal .95": _normal(2, 0.95, 2048),
     "frame": _frame(),
-    "four .9": _normal(4, 0.9, 4096),
+    "four .9": replace(_normal(4, 0.9, 4096), wider=4),
 }
 
 
@@ -215,7 +216,7 @@ class Cell:
 
         p = self.problem
         some = p.response(p.draw(np.random.default_rng(0), self.size))
-        n = p.points * (2 if self.size > 50 else 1)
+        n = p.points * (2 if self.size > 50 else p.wider if self.size < 50 else 1)
         stored = prb.Reweighted(16, max_points=n + 16, emulator=None)
         with pm.Model() as model:
             inputs = p.model(self.size, separate)

@@ -17,9 +17,12 @@ from numpy.typing import NDArray
 
 from prbayes._checks import Floats
 
+# Values (A,) and gradients (A, r) of some rows at one point each, of x (A, r) and rows (A,).
+type Slopes = Callable[[Floats, NDArray[np.intp]], tuple[Floats, Floats]]
+
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class _Differences:
     """B functions and the differences that give their gradients."""
 
     value: Callable[[Floats, Any], Floats]
@@ -35,7 +38,7 @@ class _Problem:
         r: int,
         step: float,
         curvature: Floats | None = None,
-    ) -> _Problem:
+    ) -> _Differences:
         here = np.zeros((1, r))
         if curvature is None:
             unit = step * np.eye(r)
@@ -105,11 +108,12 @@ def descend(
     tolerance: float,
     max_iterations: int = 40,
     curvature: Floats | None = None,
+    slopes: Slopes | None = None,
 ) -> Minima:
     """Minimise B functions of r parameters of order one, each from its own start, all in step.
 
-    Gradients are differences. A row has converged when its next step promises to gain less
-    than ``tolerance``, or when no shorter step gains anything.
+    Gradients are differences, unless they are given. A row has converged when its next step
+    promises to gain less than ``tolerance``, or when no shorter step gains anything.
 
     Parameters
     ----------
@@ -128,6 +132,9 @@ def descend(
         instead of central, which halves the calls, along axes that it makes alike, and freed of
         what it bends them by: minima are off by half a step, times by how much the function's
         own Hessian is another one.
+    slopes : callable, optional
+        ``slopes(x, rows)``, shapes (A, r), (A,) -> (A,), (A, r): values and exact gradients of the
+        same functions, instead of differences.
 
     References
     ----------
@@ -144,7 +151,7 @@ def descend(
     np.True_
     """
     size, r = start.shape
-    problem = _Problem.of(value, r, step, curvature)
+    problem = slopes or _Differences.of(value, r, step, curvature)
     x = start.copy()
     inverse = np.broadcast_to(inverse_hessian, (size, r, r)).copy()
     active = np.arange(size)
@@ -191,8 +198,10 @@ class Descent:
     step: float  # of the differences
     curvature: Floats | None = None  # (r, r): of which one-sided differences are freed
 
-    def __call__(self, value: Callable[[Floats, Any], Floats], start: Floats) -> Minima:
-        """Return minimisers from starts (B, r) on."""
+    def __call__(
+        self, value: Callable[[Floats, Any], Floats], start: Floats, slopes: Slopes | None = None
+    ) -> Minima:
+        """Return minimisers from starts (B, r) on; with exact gradients where they are given."""
         return descend(
             value,
             start,
@@ -200,6 +209,7 @@ class Descent:
             step=self.step,
             tolerance=self.tolerance,
             curvature=self.curvature,
+            slopes=slopes,
         )
 
 
@@ -220,7 +230,7 @@ def _planned(active: NDArray[np.intp], inverse: Floats, g: Floats) -> _Steps:
     return plan.only(sound)
 
 
-def _line_search(problem: _Problem, plan: _Steps, x: Floats, f: Floats, g: Floats) -> _Accepted:
+def _line_search(problem: Slopes, plan: _Steps, x: Floats, f: Floats, g: Floats) -> _Accepted:
     """Halve the steps until they keep enough of what they promise."""
     rows = plan.rows
     new_x = x[rows].copy()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats
 from prbayes._threads import one_thread
 from prbayes.estimate.data_sets import DataSets
-from prbayes.metrics.base import Discrepancy
+from prbayes.metrics.base import Cellwise, Discrepancy
 from prbayes.model.evaluator import Evaluator
 
 # Weights that are held at a time.
@@ -80,29 +81,40 @@ class BatchObjective:
         With thetas of shape (1, s, d) all data sets are compared with the same populations. What is
         not a number, as where a design has no point, is infinite.
         """
-        most = max(len(values) for values in self.values)
-        at_once = max(1, _NUMBERS // (most * thetas.shape[1]))
-        if len(thetas) <= at_once:
+        portions = self.portions(len(thetas), thetas.shape[1])
+        if len(portions) < 2:
             return self._values(thetas, rows)
-        # Some data sets at a time, whose weights stay near at hand.
         numbers = np.arange(self.n_sets)[rows]
-        parts = []
-        for first in range(0, len(thetas), at_once):
-            some = slice(first, first + at_once)
-            parts.append(self._values(thetas[some], numbers[some]))
+        parts = [self._values(thetas[some], numbers[some]) for some in portions]
         return np.concatenate(parts)
+
+    def portions(self, number: int, each: int = 1) -> list[slice]:
+        """Divide data sets, with so many populations each, lest their weights be far from hand."""
+        most = max(len(values) for values in self.values)
+        at_once = max(1, _NUMBERS // (most * each))
+        return [slice(first, first + at_once) for first in range(0, number, at_once)]
 
     def _values(self, thetas: Floats, rows: Any) -> Floats:
         """Return the values for some data sets."""
         total: Any = 0.0
         for i, k in enumerate(self.simulators):
-            target = self.targets[i].rows(rows)
             weights = self.weights(thetas, rows, i)
-            features = target.from_basis(weights, self.bases[i], np)
-            discrepancies = target.outer(*features, xp=np)
+            over = self.sums[i]
+            if over is None:
+                target = self.targets[i].rows(rows)
+                features = target.from_basis(weights, self.bases[i], np)
+                discrepancies = target.outer(*features, xp=np)
+            else:
+                (density,) = self.targets[i].from_basis(weights, self.bases[i], np)
+                discrepancies = over.rows(rows).outer(density, xp=np)
             total = total + discrepancies / self.scales[k]
         values = np.nan_to_num(total, nan=np.inf, posinf=np.inf)
         return np.asarray(values)
+
+    @cached_property
+    def sums(self) -> list[Cellwise | None]:
+        """Those targets that are sums over cells, as such: each row is then much smaller."""
+        return [target.cellwise for target in self.targets]
 
     def weights(self, thetas: Floats, rows: Any, i: int) -> Floats:
         """Return weights of the stored responses, (A, s, n), on the whole design or on blocks."""

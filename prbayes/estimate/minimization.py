@@ -55,7 +55,7 @@ from prbayes.estimate.refinement import (
     spread_around,
 )
 from prbayes.estimate.refit import SamplingDistribution
-from prbayes.estimate.rivals import Rival, excluded, rivals, standing, visit
+from prbayes.estimate.rivals import Best, Rival, excluded, rivals, standing, visit
 from prbayes.estimate.sampling import Local
 from prbayes.estimate.search import (
     OVERLAP,
@@ -693,30 +693,28 @@ def _rivals(plan: _Plan, state: _State) -> list[Rival]:
     assert state.local is not None
     floors = noise_floors(evaluator, state.theta, FEW_SETS)
     noise = _NOISE_SHARE * float((floors / state.scales).sum())
-    against = (evaluator, state.theta, state.scales, state.local, noise)
-    search = partial(rivals, *against, starts=plan.starts, seed=plan.seed, hold=state.hold)
+    best = Best(evaluator, state.theta, state.scales, state.local, noise, state.hold)
+    search = partial(rivals, best, starts=plan.starts, seed=plan.seed)
     clouds = any(design.contents.cloud for design in evaluator.designs.values())
     if clouds and plan.refine:
-        found = _visited(against, search(), state)
+        found = _visited(best, search())
     else:
         found = _supported(plan, search)
     return excluded(evaluator, state.theta, found, _NOISE_SHARE * floors)
 
 
-def _visited(
-    against: tuple[Evaluator, Floats, Floats, Local, float], found: list[Rival], state: _State
-) -> list[Rival]:
+def _visited(best: Best, found: list[Rival]) -> list[Rival]:
     """Return optima that stand up where clouds reach them, which they do afterwards."""
-    evaluator = against[0]
+    evaluator = best.evaluator
     supported = _of_support(evaluator, found)
     few = [r.theta for r in found if r not in supported][:_VISITED]
-    ends = [visit(*against, theta, hold=state.hold) for theta in few]
+    ends = [visit(best, theta) for theta in few]
     real = [end for end in ends if end is not None]
     if not real:
         return supported
-    refine_at(evaluator, np.stack(real), beside=state.theta[None])
+    refine_at(evaluator, np.stack(real), beside=best.theta[None])
     thetas = np.stack([r.theta for r in supported] + real)
-    return _of_support(evaluator, standing(*against, thetas, hold=state.hold))
+    return _of_support(evaluator, standing(best, thetas))
 
 
 def _of_support(evaluator: Evaluator, found: list[Rival]) -> list[Rival]:

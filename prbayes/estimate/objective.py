@@ -32,10 +32,10 @@ class Hold:
         along = (thetas - self.place) / prior_sd @ self.directions
         return np.asarray(0.5 * self.weight * (along**2).sum(axis=-1))
 
-    def slope(self, theta: Floats, prior_sd: Floats) -> Floats:
-        """Return the gradient of that at a theta, (d,)."""
-        along = (theta - self.place) / prior_sd @ self.directions
-        return np.asarray(self.weight * (self.directions @ along) / prior_sd)
+    def slope(self, thetas: Floats, prior_sd: Floats) -> Floats:
+        """Return the gradient of that at thetas, (..., d)."""
+        along = (thetas - self.place) / prior_sd @ self.directions
+        return np.asarray(self.weight * (along @ self.directions.T) / prior_sd)
 
 
 class Objective:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from prbayes._checks import AT_ONCE, Floats
 from prbayes._progress import progress
-from prbayes.estimate.batch_bfgs import Descent
+from prbayes.estimate.batch_bfgs import Descent, Slopes
+from prbayes.estimate.batch_gradient import WORTH_A_GRADIENT, BatchGradient
 from prbayes.estimate.batch_objective import BatchObjective
 from prbayes.estimate.batch_simplex import descend_by_simplex
 from prbayes.estimate.curvature import second_differences
@@ -383,8 +384,23 @@ class SamplingDistribution:
             # In standard errors; the second one starts where the first has ended.
             x, _, converged = descend_by_simplex(value, start, sizes=(1.0, -0.5))
             return x, converged
-        found = descent(value, start)
+        found = descent(value, start, self._slopes(objective))
         return found.x, found.converged
+
+    def _slopes(self, objective: BatchObjective) -> Slopes | None:
+        """Return values and exact gradients along the axes, where these are worth their graphs."""
+        if self.stderr.size < WORTH_A_GRADIENT:
+            return None
+        gradient = BatchGradient.of(objective)
+        if gradient is None:
+            return None
+        along = self.local.prior_sd[:, None] * self.axes * self.stderr
+
+        def slopes(x: Floats, rows: Any) -> tuple[Floats, Floats]:
+            values, by_theta = gradient(self.thetas(x), rows)
+            return values, by_theta @ along
+
+        return slopes
 
 
 def _mean_hessian(value: Callable[[Floats], Floats], r: int) -> Floats:

@@ -8,12 +8,16 @@ from typing import Any
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes.estimate.batch_bfgs import descend
+from prbayes.estimate.batch_bfgs import Minima, Slopes, descend
+from prbayes.estimate.batch_gradient import WORTH_A_GRADIENT, BatchGradient
+from prbayes.estimate.batch_objective import BatchObjective
+from prbayes.estimate.data_sets import observed_set
 from prbayes.estimate.objective import Hold
 from prbayes.estimate.refinement import visited
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.support import shortcomings
+from prbayes.response.budget import budget
 
 # Difference, in multiples of the noise, up to which data could come from either optimum; three of
 # them are about the noise floor, since the noise is a third of it.
@@ -44,196 +48,180 @@ class Rival:
 
 
 @dataclass(frozen=True, eq=False)
-class _Objective:
-    """The objective in theta, and in units of the prior's spread around the best one."""
+class Best:
+    """What is known of the best optimum, and the objective in units of the prior's spread around.
+
+    Rivals are those of the same objective, with what held the search for it.
+    """
 
     evaluator: Evaluator
-    scales: Floats
-    best: Floats
-    prior_sd: Floats
-    hold: Hold | None  # what is added to it
+    theta: Floats  # (d,)
+    scales: Floats  # (k,)
+    # What the data identify there; along the other directions, rivals are reported at its place.
+    local: Local
+    noise: float  # a difference of the objective that sampling explains
+    hold: Hold | None = None  # what is added to the objective
 
     def __call__(self, thetas: Floats) -> Floats:
         """Return values of thetas, (..., d) -> (...)."""
         stacked = thetas.reshape(-1, thetas.shape[-1])
-        values = self.evaluator.total(stacked, self.scales)
-        if self.hold is not None:
-            values = values + self.hold(stacked, self.prior_sd)
+        values = self._held(stacked, self.evaluator.total(stacked, self.scales))
         return values.reshape(thetas.shape[:-1])
 
-    def theta(self, x: Floats) -> Floats:
-        """Return thetas, (..., d), of shifts in units of the prior's spread."""
-        return np.asarray(self.best + x * self.prior_sd)
+    def _held(self, thetas: Floats, values: Floats) -> Floats:
+        if self.hold is None:
+            return values
+        return values + self.hold(thetas, self.local.prior_sd)
 
-    def along(self, x: Floats, rows: Any) -> Floats:
+    def shifts(self, thetas: Floats) -> Floats:
+        """Return how far thetas, (..., d), are from the best one."""
+        return np.asarray((thetas - self.theta) / self.local.prior_sd)
+
+    def thetas(self, shifts: Floats) -> Floats:
+        """Return the thetas of shifts, (..., d)."""
+        return np.asarray(self.theta + shifts * self.local.prior_sd)
+
+    def along(self, shifts: Floats, rows: Any) -> Floats:
         """Return values of shifts; the same function for all rows."""
-        return self(self.theta(x))
+        return self(self.thetas(shifts))
 
-    def polished(self, thetas: Floats, local: Local, noise: float) -> tuple[Floats, Floats]:
+    def descended(self, shifts: Floats, inverse_hessian: Floats) -> Minima:
+        """Return the minima that shifts, (n, d), lead to."""
+        return descend(
+            self.along,
+            shifts,
+            inverse_hessian,
+            step=1e-3,
+            tolerance=_NEGLIGIBLE * self.noise,
+            slopes=self._slopes(),
+        )
+
+    def _slopes(self) -> Slopes | None:
+        """Return values and exact gradients of shifts, where these pay and there are any."""
+        evaluator = self.evaluator
+        if len(self.theta) < WORTH_A_GRADIENT or evaluator.has_other_terms:
+            return None
+        if not all(node.bound.stored for node in evaluator.nodes):
+            return None
+        observed = BatchObjective.of(evaluator, self.scales, observed_set(evaluator))
+        gradient = BatchGradient.of(observed)
+        if gradient is None:
+            return None
+
+        def slopes(shifts: Floats, rows: Any) -> tuple[Floats, Floats]:
+            budget().go_on()
+            thetas = self.thetas(shifts)
+            values, by_theta = gradient(thetas, np.zeros(len(thetas), dtype=np.intp))
+            if self.hold is not None:
+                by_theta = by_theta + self.hold.slope(thetas, self.local.prior_sd)
+            values = np.where(evaluator.in_support(thetas), values, np.inf)
+            return self._held(thetas, values), by_theta * self.local.prior_sd
+
+        return slopes
+
+    def polished(self, thetas: Floats) -> tuple[Floats, Floats]:
         """Return minima near thetas, (n, d), and their values: they are bent about as at best."""
+        local = self.local
         known = local.identified @ local.covariance @ local.identified.T
-        inverse = (known + local.unidentified @ local.unidentified.T) / noise
-        shifts = (thetas - self.best) / self.prior_sd
-        tolerance = _NEGLIGIBLE * noise
-        ends, values, *_ = descend(self.along, shifts, inverse, step=1e-3, tolerance=tolerance)
-        return self.theta(ends), values
+        inverse = (known + local.unidentified @ local.unidentified.T) / self.noise
+        ends, values, *_ = self.descended(self.shifts(thetas), inverse)
+        return self.thetas(ends), values
 
 
-def _starts(objective: _Objective, n: int, noise: float, seed: int) -> tuple[Floats, float]:
+def _starts(best: Best, n: int, seed: int) -> tuple[Floats, float]:
     """Return shifts to begin at, (n, d), and the typical size of the objective among the priors'.
 
     They are the better half of points of the prior, without crowding.
     """
-    points = objective.evaluator.prior_points(_LOOKED_AT * n, seed)
-    values = objective(points)
+    points = best.evaluator.prior_points(_LOOKED_AT * n, seed)
+    values = best(points)
     ranked = np.argsort(values, kind="stable")
     thinned = ranked[: len(ranked) // 2 : max(_LOOKED_AT // 2, 1)]
     chosen = points[thinned[:n]]
     finite = values[np.isfinite(values)]
     quantiles = np.quantile(finite, [0.0, 0.5])
     half = float(np.ptp(quantiles))
-    size = max(half, noise)
-    shifts = (chosen - objective.best) / objective.prior_sd
-    return shifts, size
+    return best.shifts(chosen), max(half, best.noise)
 
 
-def rivals(
-    evaluator: Evaluator,
-    best: Floats,
-    scales: Floats,
-    local: Local,
-    noise: float,
-    *,
-    starts: int,
-    seed: int,
-    hold: Hold | None = None,
-) -> list[Rival]:
+def rivals(best: Best, *, starts: int, seed: int) -> list[Rival]:
     """Descend from points of the prior, and return the optima that barriers separate.
-
-    Parameters
-    ----------
-    evaluator : Evaluator
-    best : ndarray, shape (d,)
-    scales : ndarray, shape (k,)
-    local : Local
-        What the data identify at ``best``; along the other directions, rivals are reported at the
-        same place as ``best``.
-    noise : float
-        A difference of the objective that sampling explains.
-    starts : int
-    seed : int
-    hold : Hold, optional
-        What held the search for ``best``: rivals are those of the same objective.
 
     Returns
     -------
     list of Rival
-        Sorted by value; without ``best``.
+        Sorted by value; without the best.
     """
-    objective = _Objective(evaluator, scales, best, local.prior_sd, hold)
-    starts_at, size = _starts(objective, starts, noise, seed)
+    starts_at, size = _starts(best, starts, seed)
     if not size > 0:
         return []
 
     # Descend, all at once.
-    ends, values, *_ = descend(
-        objective.along,
-        starts_at,
-        np.eye(best.size) / size,
-        step=1e-3,
-        tolerance=_NEGLIGIBLE * noise,
-    )
-    lowest = float(objective(best[None])[0])
-    ends, values = _in_line(objective, local.unidentified, ends, values, noise)
+    ends, values, *_ = best.descended(starts_at, np.eye(best.theta.size) / size)
+    lowest = float(best(best.theta[None])[0])
+    ends, values = _in_line(best, ends, values)
 
-    return _kept(objective, objective.theta(ends), values, lowest, noise)
+    return _kept(best, best.thetas(ends), values, lowest)
 
 
-def standing(
-    evaluator: Evaluator,
-    best: Floats,
-    scales: Floats,
-    local: Local,
-    noise: float,
-    thetas: Floats,
-    *,
-    hold: Hold | None = None,
-) -> list[Rival]:
-    """Return optima near thetas, (n, d), on designs as they are now.
-
-    Other parameters, and what is returned, are those of `rivals`.
-    """
-    objective = _Objective(evaluator, scales, best, local.prior_sd, hold)
-    lowest = float(objective(best[None])[0])
-    ends, values = objective.polished(thetas, local, noise)
-    return _kept(objective, ends, values, lowest, noise)
+def standing(best: Best, thetas: Floats) -> list[Rival]:
+    """Return optima near thetas, (n, d), on designs as they are now, as `rivals` does."""
+    lowest = float(best(best.theta[None])[0])
+    ends, values = best.polished(thetas)
+    return _kept(best, ends, values, lowest)
 
 
-def _kept(
-    objective: _Objective, ends: Floats, values: Floats, lowest: float, noise: float
-) -> list[Rival]:
+def _kept(best: Best, ends: Floats, values: Floats, lowest: float) -> list[Rival]:
     """Return those that a barrier separates from the best one and from all that are kept."""
-    kept = [(objective.best, lowest)]
+    kept = [(best.theta, lowest)]
     for i in np.argsort(values):
         value = float(values[i])
         if not np.isfinite(value):
             continue
-        separate = (_separate(objective, ends[i], value, *other, noise) for other in kept)
+        separate = (_separate(best, ends[i], value, *other) for other in kept)
         if all(separate):
             kept.append((ends[i], value))
-    return [_rival(theta, value, lowest, noise) for theta, value in kept[1:]]
+    return [_rival(theta, value, lowest, best.noise) for theta, value in kept[1:]]
 
 
-def visit(
-    evaluator: Evaluator,
-    best: Floats,
-    scales: Floats,
-    local: Local,
-    noise: float,
-    theta: Floats,
-    *,
-    hold: Hold | None = None,
-) -> Floats | None:
+def visit(best: Best, theta: Floats) -> Floats | None:
     """Return where an optimum that clouds do not support is once they reach it; None if nowhere.
 
     Few points of a cloud far away have minima of their own, and values of their own at those of
     all. What they hide is a mirror image, which is as good as the best one: worse by less than the
-    noise. Other parameters are those of `rivals`.
+    noise.
     """
-    objective = _Objective(evaluator, scales, best, local.prior_sd, hold)
+    evaluator = best.evaluator
     for _ in range(_VISITS):
-        with visited(evaluator, np.stack([best, theta])):
+        with visited(evaluator, np.stack([best.theta, theta])):
             if shortcomings(evaluator, theta[None]):
                 return None
-            lowest = float(objective(best[None])[0])
-            (theta,), (value,) = objective.polished(theta[None], local, noise)
-            if not value - lowest < noise:
+            lowest = float(best(best.theta[None])[0])
+            (theta,), (value,) = best.polished(theta[None])
+            if not value - lowest < best.noise:
                 return None
             found = not shortcomings(evaluator, theta[None])
         if found:
             break
     else:
         return None
-    return None if _joined(objective, best, theta, local, noise, _WAY_HALVED) else theta
+    return None if _joined(best, best.theta, theta, _WAY_HALVED) else theta
 
 
-def _joined(
-    objective: _Objective, a: Floats, b: Floats, local: Local, noise: float, times: int
-) -> bool:
+def _joined(best: Best, a: Floats, b: Floats, times: int) -> bool:
     """Return whether a way leads from one point to another that is nowhere above both.
 
     Straight, or along a valley: from where the middle of the way goes down to. Clouds reach it.
     """
     way = np.linspace(a, b, 3)
-    with visited(objective.evaluator, way):
-        value_a, value_b = map(float, objective(way[[0, -1]]))
-        if not _separate(objective, a, value_a, b, value_b, noise):
+    with visited(best.evaluator, way):
+        value_a, value_b = map(float, best(way[[0, -1]]))
+        if not _separate(best, a, value_a, b, value_b):
             return True
-        (middle,), (value,) = objective.polished(way[1:2], local, noise)
-    if not times or not value < max(value_a, value_b) + noise:
+        (middle,), (value,) = best.polished(way[1:2])
+    if not times or not value < max(value_a, value_b) + best.noise:
         return False
-    first = _joined(objective, a, middle, local, noise, times - 1)
-    return first and _joined(objective, middle, b, local, noise, times - 1)
+    return _joined(best, a, middle, times - 1) and _joined(best, middle, b, times - 1)
 
 
 def excluded(evaluator: Evaluator, best: Floats, found: list[Rival], noises: Floats) -> list[Rival]:
@@ -261,18 +249,13 @@ def excluded(evaluator: Evaluator, best: Floats, found: list[Rival], noises: Flo
     ]
 
 
-def _in_line(
-    objective: _Objective,
-    unidentified: Floats,
-    ends: Floats,
-    values: Floats,
-    noise: float,
-) -> tuple[Floats, Floats]:
+def _in_line(best: Best, ends: Floats, values: Floats) -> tuple[Floats, Floats]:
     """Move ends to where the best is along what is not identified, if that is as good."""
+    unidentified = best.local.unidentified
     hidden = ends @ unidentified @ unidentified.T
     in_line = ends - hidden
-    also = objective.along(in_line, None)
-    as_good = also < values + _NEGLIGIBLE * noise
+    also = best.along(in_line, None)
+    as_good = also < values + _NEGLIGIBLE * best.noise
     aligned = np.where(as_good[:, None], in_line, ends)
     return aligned, np.minimum(also, values)
 
@@ -283,17 +266,10 @@ def _rival(theta: Floats, value: float, lowest: float, noise: float) -> Rival:
     return Rival(theta, value, comparable, better)
 
 
-def _separate(
-    objective: _Objective,
-    a: Floats,
-    value_a: float,
-    b: Floats,
-    value_b: float,
-    noise: float,
-) -> bool:
+def _separate(best: Best, a: Floats, value_a: float, b: Floats, value_b: float) -> bool:
     """Return whether the objective between two optima is above both by more than the noise."""
     share = np.linspace(0, 1, _SECTIONS + 1)
     inside = share[1:-1, None]
-    between = objective(a + inside * (b - a))
+    between = best(a + inside * (b - a))
     barrier = np.max(between) - max(value_a, value_b)
-    return bool(barrier > noise)
+    return bool(barrier > best.noise)

@@ -50,17 +50,18 @@ def count(
 ) -> None:
     """Add weights at the nodes of a grid, spread by cubic B-splines, and those outside it.
 
-    Node k is at ``(low + k - before) / inverse``. The sample has shape (rows, n), the counts (rows,
-    g), ``outside`` (rows, 2); the weights are flat, and only the first counts if they are equal.
-    NaN counts nowhere.
+    Node k is at ``(low + k - before) / inverse``. The sample has shape (1 or rows, n), the counts
+    (rows, g), ``outside`` (rows, 2); the weights are flat, and only the first counts if they are
+    equal. NaN counts nowhere.
     """
-    rows, n = sample.shape
-    g = counts.shape[1]
+    n = sample.shape[1]
+    rows, g = counts.shape
     moments = np.zeros((g, 4))  # sums of 1, t, t^2, t^3 beyond each node
     for r in range(rows):
+        values = sample[r % len(sample)]
         # Sum the powers of the fractions of all values beyond a node.
         for i in range(n):
-            t = sample[r, i] * inverse - low
+            t = values[i] * inverse - low
             w = weights[0] if equal else weights[r * n + i]
             if 1 - before <= t < g - 2 - before:
                 left = math.floor(t)

@@ -262,10 +262,11 @@ class Discrepancy(ABC):
         """
         return basis
 
-    def pulled_back(self, compact: Floats, cotangent: Floats) -> Floats:
-        """Return the derivatives for the weights, (..., n), of a sum over features, (..., columns).
+    def pulled_back(self, basis: Floats, cotangent: Floats) -> Floats:
+        """Return the derivatives for the weights, (..., n), of a sum over the only feature.
 
-        Of the sum of the features times the cotangent; where there are columns.
+        Of the sum of the feature times the cotangent, (..., m), by the basis or its compact form;
+        where densities are compared.
         """
         raise NotImplementedError
 
@@ -283,6 +284,11 @@ class Discrepancy(ABC):
 
         Written with ``xp`` (``numpy`` or ``pytensor.tensor``), by functions that both have.
         """
+
+    @property
+    def cellwise(self) -> Cellwise | None:
+        """How it is a sum over the cells of a density, its only feature; None if it is not."""
+        return None
 
     @staticmethod
     def stacked(bases: Sequence[tuple[NDArray[Any], ...]]) -> tuple[NDArray[Any], ...] | None:
@@ -518,6 +524,10 @@ class DensityDiscrepancy(Discrepancy):
         """Return the density on the cells."""
         return (product(weights, *basis) if xp is np else weights @ basis[0],)
 
+    def pulled_back(self, basis: Floats, cotangent: Floats) -> Floats:
+        """Return the derivatives for the weights of a sum over the density."""
+        return product(cotangent, basis.T)
+
     @property
     def density_cells(self) -> Cells:
         """The cells."""
@@ -571,6 +581,26 @@ def raised(density: Any, least: Any) -> Any:
     return (1 - _FLOOR) * density + least
 
 
+@dataclass(frozen=True, eq=False)
+class Cellwise:
+    """A discrepancy as a sum over cells: of what its terms say, each times a share."""
+
+    of: CellwiseDiscrepancy  # whose terms these are
+    constants: tuple[Any, ...]
+    shares: Any  # (..., m), or one number
+
+    def rows(self, index: Any) -> Cellwise:
+        """Return it for some of the data sets of which there are several."""
+        # What is the same for all of them is a number, or one by cell.
+        constants = tuple(c[index] if np.ndim(c) > 1 else c for c in self.constants)
+        shares = self.shares[index] if np.ndim(self.shares) > 1 else self.shares
+        return Cellwise(self.of, constants, shares)
+
+    def outer(self, density: Any, xp: Any) -> Any:
+        """Return the sum over the cells, (..., m) -> (...)."""
+        return (self.of.terms(density, self.constants, xp) * self.shares).sum(axis=-1)
+
+
 class CellwiseDiscrepancy(DensityDiscrepancy):
     """A discrepancy of two densities that is a sum over the cells.
 
@@ -588,6 +618,13 @@ class CellwiseDiscrepancy(DensityDiscrepancy):
 
         The constants are given, since they may be those of several records side by side.
         """
+
+    @property
+    def cellwise(self) -> Cellwise | None:
+        """Itself, unless its outer function is another one."""
+        if type(self).outer is not CellwiseDiscrepancy.outer:
+            return None
+        return Cellwise(self, self.constants, np.float64(1.0))
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the sum over the cells."""

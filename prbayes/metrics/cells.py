@@ -131,9 +131,10 @@ class KernelCells(Cells):
         equal = _are_equal(weights)
         each = weights if equal else np.broadcast_to(weights, sample.shape)
         each = each.ravel()
-        # Bin the sample on the grid.
-        values = np.ascontiguousarray(sample, dtype=np.float64)
-        values = values.reshape(rows, n)
+        # Bin the sample on the grid; values that all rows share are passed once.
+        shared = not any(sample.strides[:-1])
+        values = sample.reshape(rows, n)[:1] if shared else sample.reshape(rows, n)
+        values = np.ascontiguousarray(values, dtype=np.float64)
         counts = np.zeros((rows, nodes + 2 * before))
         outside = np.zeros((rows, 2))
         count(values, each, equal, self._low, 1 / self.step, before, counts, outside)

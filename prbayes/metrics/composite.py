@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import Floats, sample_weights
-from prbayes.metrics.base import CellwiseDiscrepancy, Discrepancy, Minimum, Part, View
+from prbayes.metrics.base import Cellwise, CellwiseDiscrepancy, Discrepancy, Minimum, Part, View
 from prbayes.metrics.cells import Cells, product
 from prbayes.metrics.components import Components
 
@@ -263,9 +263,9 @@ class CompositeDiscrepancy(Discrepancy):
         """Return what each part sees, (n, K), instead of densities of it, (n, cells)."""
         return self._groups[0].compact(simulated) if self.columns else self.basis(simulated)
 
-    def pulled_back(self, compact: Floats, cotangent: Floats) -> Floats:
+    def pulled_back(self, basis: Floats, cotangent: Floats) -> Floats:
         """Return the derivatives for the weights, (..., n), of a sum over densities."""
-        return self._groups[0].pulled_back(compact, cotangent)
+        return self._groups[0].pulled_back(basis, cotangent)
 
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return the features of the values that the basis was made for."""
@@ -279,6 +279,14 @@ class CompositeDiscrepancy(Discrepancy):
             features = group.from_basis(weights, own, xp)
             found.append(features)
         return sum(found, ())
+
+    @property
+    def cellwise(self) -> Cellwise | None:
+        """How all parts are one sum over the cells of all of them."""
+        first, *others = self._groups
+        if others or not self.symbolic:
+            return None
+        return first.cellwise(self.shares[..., list(first.places)])
 
     def outer(self, *features: Any, xp: Any) -> Any:
         """Return the sum of the parts, each times its share."""
@@ -322,13 +330,17 @@ class _Group(ABC):
         """As of a discrepancy."""
         return self.basis(simulated)
 
-    def pulled_back(self, compact: Floats, cotangent: Floats) -> Floats:
+    def pulled_back(self, basis: Floats, cotangent: Floats) -> Floats:
         """As of a discrepancy."""
         raise NotImplementedError
 
     @abstractmethod
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return the features."""
+
+    def cellwise(self, shares: Floats) -> Cellwise | None:
+        """As of a discrepancy."""
+        return None
 
     @abstractmethod
     def outer(self, features: tuple[Any, ...], shares: Floats, xp: Any) -> Any:
@@ -475,15 +487,20 @@ class _Densities(_Group):
         (matrix,) = basis
         if xp is not np:
             return (weights @ matrix,)
-        # Each part has several cells.
-        if self.columns and matrix.shape[-1] == len(self.parts):
+        if self._is_compact(matrix):
             return (self._binned(matrix, weights),)
         return (product(weights, matrix),)
 
-    def pulled_back(self, compact: Floats, cotangent: Floats) -> Floats:
+    def _is_compact(self, matrix: Floats) -> bool:
+        """Whether this is what each part sees; densities have several cells a part."""
+        return self.columns > 0 and matrix.shape[-1] == len(self.parts)
+
+    def pulled_back(self, basis: Floats, cotangent: Floats) -> Floats:
         """Return the derivatives for the weights of a sum over the densities."""
+        if not self._is_compact(basis):
+            return product(cotangent, basis.T)
         total: Any = 0.0
-        for part, values, cells in zip(self.parts, compact.T, self._slices, strict=True):
+        for part, values, cells in zip(self.parts, basis.T, self._slices, strict=True):
             own = cast(Cells, part.target.density_cells)
             total = total + own.value(values, cotangent[..., cells])
         return np.asarray(total)
@@ -499,11 +516,17 @@ class _Densities(_Group):
     def outer(self, features: tuple[Any, ...], shares: Floats, xp: Any) -> Any:
         """Return the sum of the parts, in one pass over all cells where that can be."""
         (densities,) = features
-        if not self._cellwise:
+        over = self.cellwise(shares)
+        if over is None:
             return self._one_by_one(densities, shares, xp)
+        return over.outer(densities, xp)
+
+    def cellwise(self, shares: Floats) -> Cellwise | None:
+        """Return the parts as one sum over all cells, if each is one over its own."""
+        if not self._cellwise:
+            return None
         first = cast(CellwiseDiscrepancy, self.parts[0].target)
-        terms = first.terms(densities, self._constants, xp)
-        return (terms * np.repeat(shares, self._sizes, axis=-1)).sum(axis=-1)
+        return Cellwise(first, self._constants, np.repeat(shares, self._sizes, axis=-1))
 
     def _one_by_one(self, densities: Any, shares: Floats, xp: Any) -> Any:
         """Return the sum of parts with an outer function of their own."""

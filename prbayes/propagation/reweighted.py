@@ -54,7 +54,7 @@ from prbayes.propagation.edges import (
 )
 from prbayes.propagation.ops import CompactOp, OpaqueOp
 from prbayes.propagation.points import base_points
-from prbayes.response.compilation import compile_batched
+from prbayes.response.compilation import compile_batched, untraced
 from prbayes.response.costs import Demand
 from prbayes.response.distributions import (
     PopulationSampler,
@@ -1002,7 +1002,7 @@ class Design(Bound):
         other._others = deque(self._others, maxlen=self._others.maxlen)
         other._shared = []
         other._share(self._held())
-        other.__dict__.pop("_log_weights", None)  # compiled on the shared variables of this one
+        other._forget_compiled()
         return other
 
     def telling(self, values: Floats, target: Discrepancy) -> Self:
@@ -1018,7 +1018,7 @@ class Design(Bound):
         other._basis = (None, None, None)
         other._shared = []
         other._share(other._arrays())
-        other.__dict__.pop("_log_weights", None)  # compiled on the shared variables of this one
+        other._forget_compiled()
         return other
 
     @contextmanager
@@ -1099,6 +1099,38 @@ class Design(Bound):
     def _log_weights(self) -> Any:
         symbols = self.inputs.placeholders()
         return compile_batched(symbols, [self.log_weights(symbols)])
+
+    def _forget_compiled(self) -> None:
+        """Compile anew what reads the shared variables: those of a copy are others."""
+        for name in ("_log_weights", "_log_weight_slopes"):
+            self.__dict__.pop(name, None)
+
+    @cached_property
+    def _log_weight_slopes(self) -> Any:
+        symbols = self.inputs.placeholders()
+        cotangent = pt.dvector("cotangent")
+        with untraced():
+            known: Any = {self.log_weights(symbols): cotangent}
+            slopes = pt.grad(None, symbols, known_grads=known, disconnected_inputs="ignore")
+        return compile_batched([*symbols, cotangent], slopes)
+
+    def pulled_back(
+        self, params: Sequence[Any], weights: Floats, by_weights: Floats
+    ) -> list[Floats]:
+        """Return the derivatives for the roots of a sum over weights, shapes (k, *shape).
+
+        Of the sum of the weights times ``by_weights``, both (k, n), at given roots.
+        """
+        with np.errstate(invalid="ignore"):
+            mean = (weights * by_weights).sum(axis=-1, keepdims=True)
+            by_logs = weights * (by_weights - mean)
+        slopes = self._log_weight_slopes(*params, by_logs)
+        found = []
+        for root, by_root in zip(self.inputs.roots, slopes, strict=True):
+            # What does not depend on the roots comes without the leading axis.
+            shape = np.shape(by_root)[np.ndim(by_root) - root.ndim :]
+            found.append(np.broadcast_to(by_root, (len(weights), *shape)))
+        return found
 
     def _discrepancy(self, params: Sequence[Any]) -> TensorVariable:
         """Return the discrepancy of the reweighted responses, +inf where no point has weight."""

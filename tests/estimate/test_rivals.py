@@ -1,7 +1,7 @@
 """Mirror solutions, and what is said about them."""
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -14,7 +14,7 @@ from four_metrics import METRICS, R256, same, slow
 import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.estimate.objective import Hold
-from prbayes.estimate.rivals import _joined, _Objective, _separate, rivals, standing, visit
+from prbayes.estimate.rivals import Best, _joined, _separate, rivals, standing, visit
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.support import shortcomings
@@ -154,12 +154,12 @@ def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
     optimum = fit("pr")
     evaluator = Evaluator(optimum.model)
     local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), np.eye(2))
-    arguments = (evaluator, optimum.theta, np.ones(1), local)
-    assert rivals(*arguments, 1e-3, starts=16, seed=0)
-    assert rivals(*arguments, 1e3, starts=16, seed=0) == []
+    best = Best(evaluator, optimum.theta, np.ones(1), local, noise=1e-3)
+    assert rivals(best, starts=16, seed=0)
+    assert rivals(replace(best, noise=1e3), starts=16, seed=0) == []
     # Nor is there one where a search that is held cannot go.
     hold = Hold(optimum.theta, np.eye(2), 1e3)
-    assert rivals(*arguments, 1e-3, starts=16, seed=0, hold=hold) == []
+    assert rivals(replace(best, hold=hold), starts=16, seed=0) == []
 
 
 # -- the posterior of two modes
@@ -294,12 +294,12 @@ def test_a_mirror_far_from_the_points_is_found_and_both_are_supported() -> None:
 
 
 @cache
-def around(starts: int) -> tuple[Any, ...]:
+def around(starts: int) -> Best:
     """Return what is known of the optimum, to look for others."""
     optimum = followed(starts)
     evaluator = optimum.evaluator
     local = Local(evaluator.prior_sd, np.eye(3), np.zeros((3, 0)), 1e-3 * np.eye(3))
-    return evaluator, optimum.theta, np.ones(1), local, 0.05
+    return Best(evaluator, optimum.theta, np.ones(1), local, 0.05)
 
 
 @pytest.mark.parametrize(("mu", "sigma", "real"), [(None, 0.05, True), (-6.0, 0.3, False)])
@@ -312,7 +312,7 @@ def test_what_few_points_tell_is_looked_at_with_more(
     there = optimum.theta.copy()
     there[:2] = mirror + 0.05 if mu is None else mu, np.log(sigma)
     before = design.contents
-    found = visit(*around(0), there)
+    found = visit(around(0), there)
     assert design.contents is before  # and not a run more
     if not real:
         assert found is None
@@ -322,18 +322,19 @@ def test_what_few_points_tell_is_looked_at_with_more(
 
 
 def test_what_is_worse_by_more_than_the_noise_is_no_mirror_image() -> None:
-    *known, _ = around(0)
+    best = around(0)
     optimum = followed(0)
     mirror = optimum.theta.copy()
     mirror[0] = 2 - mirror[0]
-    assert visit(*known, 0.05, mirror) is not None
+    assert visit(best, mirror) is not None
     # A hold adds about a sixth there.
-    assert visit(*known, 0.05, mirror, hold=Hold(optimum.theta, np.eye(3), 1.5)) is None
+    hold = Hold(optimum.theta, np.eye(3), 1.5)
+    assert visit(replace(best, hold=hold), mirror) is None
 
 
 def test_an_optimum_that_is_the_best_one_is_no_other() -> None:
-    assert visit(*around(0), followed(0).theta + 0.02) is None
-    assert standing(*around(0), followed(0).theta[None] + 0.02) == []
+    assert visit(around(0), followed(0).theta + 0.02) is None
+    assert standing(around(0), followed(0).theta[None] + 0.02) == []
 
 
 @dataclass(frozen=True)
@@ -359,7 +360,7 @@ class Landscape:
 def test_a_bent_valley_has_no_two_optima(formula: Any, joined: bool) -> None:
     a, b = np.array([-1.0, 1.0]), np.array([1.0, 1.0])
     evaluator: Any = Landscape(formula)
-    objective = _Objective(evaluator, np.ones(1), a, np.ones(2), None)
     local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), 0.01 * np.eye(2))
-    assert _separate(objective, a, 0.0, b, 0.0, 0.1)  # straight on
-    assert _joined(objective, a, b, local, 0.1, 5) is joined
+    best = Best(evaluator, a, np.ones(1), local, noise=0.1)
+    assert _separate(best, a, 0.0, b, 0.0)  # straight on
+    assert _joined(best, a, b, 5) is joined
