@@ -530,6 +530,8 @@ def _states(plan: _Plan, begun: _Beginning) -> Iterator[_State]:
         if left is not None and _is_better(plan, left, state):
             state = yield from _minimised(plan, left, state.scales, state.run.trace, before)
     yield state
+    state = yield from _released(plan, state)
+    yield state
     # Terminate: other optima, stalled line searches, the error of the design where it ended
     state = _against_rivals(plan, state)
     yield state
@@ -648,6 +650,20 @@ def _holding(plan: _Plan, state: _State) -> Hold | None:
     if sampling is None or not sampling.local.unidentified.size:
         return None
     return Hold(place, sampling.local.unidentified, _noise(evaluator, place, state.scales))
+
+
+def _released(plan: _Plan, state: _State) -> Generator[_State, None, _State]:
+    """Minimise without a hold along what designs have come to tell since, if they support it.
+
+    A thin design does not tell everything that one tells which has grown.
+    """
+    hold, local = state.hold, state.local
+    if hold is None or local is None or local.unidentified.shape[1] >= hold.directions.shape[1]:
+        return state
+    left = replace(hold, directions=local.unidentified) if local.unidentified.size else None
+    before = replace(state, hold=left)
+    free = yield from _minimised(plan, state.theta, state.scales, state.run.trace, before)
+    return state if shortcomings(plan.evaluator, free.theta[None]) else free
 
 
 def _likeliest(plan: _Plan, thetas: Floats, scales: Floats) -> Floats:

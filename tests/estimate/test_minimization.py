@@ -17,6 +17,7 @@ from scipy.stats import norm
 import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.estimate import minimization
+from prbayes.estimate.objective import Hold
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.estimate.search import Approach, Run, Search, Trace
 from prbayes.metrics.density import GaussianKDE
@@ -885,6 +886,35 @@ def test_a_search_is_held_where_the_data_do_not_tell_and_names_what_it_is() -> N
     # The standard error of a mean, and a few per cent that the residual costs.
     assert error == pytest.approx(observed.std() / np.sqrt(observed.size), rel=0.3)
     assert abs(optimum.point["ratio"] - np.median(observed)) < error
+
+
+@pytest.mark.parametrize("supported", [True, False])
+def test_a_search_is_held_no_longer_than_designs_tell_nothing(
+    supported: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = normal_model(METRICS["kl"])
+    expected = prb.minimize(model, starts=0)
+    judged = minimization._judged
+    away = np.array([0.1, 0.1])
+
+    def held(plan: Any, state: Any, rounds: int) -> Any:
+        # As by a design that was too thin at first to tell anything.
+        if rounds == 0:
+            hold = Hold(expected.theta + away, np.eye(2), 10.0)
+            return replace(state, hold=hold, restart=hold.place)
+        if not supported:
+            monkeypatch.setattr(minimization, "shortcomings", lambda *_: {"y": "too few points"})
+        return judged(plan, state, rounds)
+
+    monkeypatch.setattr(minimization, "_judged", held)
+    found = prb.minimize(model, starts=0, refine=False)
+    if supported:
+        np.testing.assert_allclose(found.theta, expected.theta, atol=1e-4)
+        assert "was held" not in found.message
+        return
+    # It stays where it was held, and says so.
+    assert np.abs(found.theta - expected.theta).max() > 0.05
+    assert "was held" in found.message
 
 
 def test_a_simplex_that_leaves_the_design_is_not_followed(monkeypatch: pytest.MonkeyPatch) -> None:
