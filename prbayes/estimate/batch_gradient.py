@@ -16,8 +16,8 @@ from prbayes.metrics.base import Cellwise
 from prbayes.response.compilation import compiled, untraced
 
 # Hyperparameters from which on it pays for the second or so that its graphs take to compile:
-# differences take a value for each. With two, of one output, nothing is gained; with five refits
-# take a fifth less, with nine a third of the time.
+# differences take a value for each (benchmarks/gradients.py: half of the time with four, a quarter
+# with nine).
 WORTH_A_GRADIENT = 4
 
 
