@@ -21,6 +21,7 @@ from prbayes.estimate.sampling import Local
 from prbayes.metrics.base import Minimum
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
+from prbayes.propagation.cloud import LARGEST_CLOUD
 
 # Design error of which is warned, in standard errors: half as much again as is asked for, since an
 # estimate from eight blocks is itself uncertain by a quarter.
@@ -289,11 +290,17 @@ def not_identified(evaluator: Evaluator, local: Local, told: Sequence[str] = ())
 
 
 def _of_design(evaluator: Evaluator, error: float) -> str:
-    points = max(d.n_runs for d in evaluator.designs.values())
+    designs = evaluator.designs.values()
+    runs = max(design.n_runs for design in designs)
+    apart = f"the optimum of another design would differ by about {error:.2f} standard errors, "
+    apart += f"expected at most {AGREE}; "
+    more = more_in("choose.md#how-many-responses")
+    if min(len(design.contents.cloud or ()) for design in designs) < LARGEST_CLOUD:
+        return f"{apart}pass a larger n or max_points to prb.Reweighted (now {runs} runs){more}"
     return (
-        f"the optimum of another design would differ by about {error:.2f} standard errors, "
-        f"expected at most {AGREE}; pass a larger n or max_points to prb.Reweighted (now {points} "
-        f"runs){more_in('choose.md#how-many-responses')}"
+        f"{apart}between its {runs} runs are {LARGEST_CLOUD} emulated points, the most there are: "
+        "more runs help as far as the emulator is off, which the message says, and the rest counts "
+        f"as another error of the optimum{more}"
     )
 
 

@@ -663,7 +663,8 @@ def _released(plan: _Plan, state: _State) -> Generator[_State, None, _State]:
     left = replace(hold, directions=local.unidentified) if local.unidentified.size else None
     before = replace(state, hold=left)
     free = yield from _minimised(plan, state.theta, state.scales, state.run.trace, before)
-    return state if shortcomings(plan.evaluator, free.theta[None]) else free
+    lost = free.local is None or shortcomings(plan.evaluator, free.theta[None])
+    return state if lost else free
 
 
 def _likeliest(plan: _Plan, thetas: Floats, scales: Floats) -> Floats:

@@ -1,5 +1,6 @@
 """What is said of an optimum, and when two populations differ."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -8,8 +9,9 @@ import pytest
 from scipy.stats import norm
 
 import prbayes as prb
-from prbayes.estimate.caveats import between_runs, breakdown, elements_at_edge
+from prbayes.estimate.caveats import between_runs, breakdown, caveats, elements_at_edge
 from prbayes.model.evaluator import Evaluator
+from prbayes.propagation.cloud import LARGEST_CLOUD
 
 
 def test_what_breaks_down_is_said_by_name_and_only_then() -> None:
@@ -19,6 +21,27 @@ def test_what_breaks_down_is_said_by_name_and_only_then() -> None:
     (line,) = breakdown((), ("y",))
     assert line.startswith("y: points lose their response at the optimum")
     assert len(breakdown(("sigma",), ("y",))) == 2
+
+
+@pytest.mark.parametrize(("clouds", "told"), [
+    ([None], "pass a larger n or max_points to prb.Reweighted (now 300 runs)"),
+    ([16384], "pass a larger n"),
+    ([LARGEST_CLOUD, None], "pass a larger n"),
+    ([LARGEST_CLOUD, LARGEST_CLOUD], "between its 300 runs are 65536 emulated points, the most"),
+])  # fmt: skip
+def test_no_larger_design_is_asked_for_where_points_cost_nothing(
+    clouds: list[int | None], told: str
+) -> None:
+    of = [None if size is None else range(size) for size in clouds]
+    designs = {
+        f"y{k}": SimpleNamespace(n_runs=300, contents=SimpleNamespace(cloud=cloud))
+        for k, cloud in enumerate(of)
+    }
+    evaluator: Any = SimpleNamespace(nodes=(), designs=designs)
+    (line,) = caveats(evaluator, None, (), 0.4)
+    assert "by about 0.40 standard errors, expected at most 0.1" in line
+    assert told in line
+    assert caveats(evaluator, None, (), 0.14) == ()
 
 
 def edges(model: pm.Model, *theta: float) -> tuple[str, ...]:
