@@ -19,6 +19,8 @@ from prbayes.response.compilation import compiled, untraced
 # differences take a value for each (benchmarks/gradients.py: half of the time with four, a quarter
 # with nine).
 WORTH_A_GRADIENT = 4
+# Step of differences, in spreads of the prior, where a gradient is no number.
+_STEP = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +40,8 @@ class BatchGradient:
         sums = [over for over in objective.sums if over is not None]
         if any(map(np.any, objective.blocks)) or len(sums) < len(objective.sums):
             return None
-        found = cls(objective, sums, [_compiled(over) for over in sums])
         try:
+            found = cls(objective, sums, [_compiled(over) for over in sums])
             found(objective.evaluator.initial[None], slice(0, 1))
         except (NotImplementedError, NullTypeGradError):
             return None  # a distribution has none
@@ -54,7 +56,19 @@ class BatchGradient:
         numbers = np.arange(objective.n_sets)[rows]
         for some in objective.portions(len(thetas)):
             values[some], gradients[some] = self._of_some(thetas[some], numbers[some])
+        # Some distributions' gradients are no numbers, as of a normal cut off on one side.
+        untold = np.isfinite(values) & ~np.isfinite(gradients).all(axis=1)
+        if untold.any():
+            gradients[untold] = self._by_differences(thetas[untold], numbers[untold])
         return values, gradients
+
+    def _by_differences(self, thetas: Floats, rows: Any) -> Floats:
+        step = _STEP * self.objective.evaluator.prior_sd
+        up, down = (
+            self.objective(thetas[:, None] + sign * np.diag(step), rows) for sign in (1, -1)
+        )
+        with np.errstate(invalid="ignore"):
+            return np.asarray((up - down) / (2 * step))
 
     def _of_some(self, thetas: Floats, rows: Any) -> tuple[Floats, Floats]:
         objective = self.objective

@@ -43,11 +43,11 @@ def of_sets(model: pm.Model, number: int = 4) -> tuple[BatchObjective, DataSets]
     return BatchObjective.of(evaluator, np.array([0.7, 2.0]), sets), sets
 
 
-def differences(objective: BatchObjective, thetas: Floats, rows: Any) -> Floats:
+def differences(objective: BatchObjective, thetas: Floats, rows: Any, step: Any = STEP) -> Floats:
     """Return central differences of the objective."""
-    unit = STEP * np.eye(thetas.shape[1])
+    unit = step * np.eye(thetas.shape[1])
     up = objective(thetas[:, None] + unit, rows)
-    return (up - objective(thetas[:, None] - unit, rows)) / (2 * STEP)
+    return (up - objective(thetas[:, None] - unit, rows)) / (2 * step)
 
 
 def near(objective: BatchObjective, number: int) -> Floats:
@@ -115,11 +115,36 @@ def test_where_no_population_is_supported_it_is_infinite() -> None:
     assert gradient is not None
     thetas = near(objective, 2)
     thetas[1, 2] = -800.0  # a standard deviation that is zero: no density
-    with np.errstate(all="ignore"):
-        values, slopes = gradient(thetas, np.arange(2))
+    values, slopes = gradient(thetas, np.arange(2))
     assert np.isfinite(values[0])
     assert np.isfinite(slopes[0]).all()
     assert np.isposinf(values[1])
+
+
+def test_where_a_gradient_is_no_number_differences_tell() -> None:
+    with pm.Model() as model:
+        mu, sd, _ = priors()  # no response depends on the last
+        x = pm.TruncatedNormal.dist(mu[0], sd[0], lower=mu[0] - 1)
+        y = pm.Normal.dist(mu[1], sd[1])
+        prb.Simulator(
+            "y",
+            lambda x, y: np.stack([x, y], axis=-1),
+            x,
+            y,
+            metric=METRICS["kl"],
+            observed=PAIRS,
+            propagation=prb.Reweighted(256),
+        )
+    objective, _ = of_sets(model)
+    gradient = BatchGradient.of(objective)
+    assert gradient is not None
+    thetas = near(objective, 4)
+    rows = np.arange(4)
+    assert np.isnan(gradient._of_some(thetas, rows)[1]).any()
+    _, slopes = gradient(thetas, rows)
+    # Points are cut off one by one: the step matters.
+    expected = differences(objective, thetas, rows, 1e-4 * objective.evaluator.prior_sd)
+    np.testing.assert_allclose(slopes, expected, rtol=1e-6, atol=1e-9)
 
 
 def test_one_data_set_serves_any_number_of_rows() -> None:
