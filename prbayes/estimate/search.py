@@ -128,12 +128,21 @@ class Search:
 
         Exact where it can be, or by differences.
         """
+        by_differences = differences(self._values(scales), _STEP * self.prior_sd)
         try:
             exact = self.evaluator.objective(prior=self.prior, gradient=True)
         except (NotImplementedError, NullTypeGradError):
             # Of the response, or of an inverse distribution function, there is none.
-            return differences(self._values(scales), _STEP * self.prior_sd)
-        return lambda theta: (*exact(theta, scales), 1)
+            return by_differences
+
+        def function(theta: Floats) -> tuple[float, Floats | None, int]:
+            value, gradient = exact(theta, scales)
+            if np.isfinite(value) and not np.isfinite(gradient).all():
+                # That of a normal cut off on one side is no number at points that are cut off.
+                return by_differences(theta)
+            return value, gradient, 1
+
+        return function
 
     def _without_gradient(self, scales: Floats) -> Function:
         values = self._values(scales)

@@ -888,6 +888,27 @@ def test_a_search_is_held_where_the_data_do_not_tell_and_names_what_it_is() -> N
     assert abs(optimum.point["ratio"] - np.median(observed)) < error
 
 
+def test_where_a_gradient_is_no_number_the_search_goes_on() -> None:
+    # PyMC's gradient of a normal cut off on one side is NaN at what is cut off.
+    rng = np.random.default_rng(0)
+    values = rng.normal(1.0, 0.7, 400)
+    with pm.Model() as model:
+        mu, w = pm.Normal("mu", 1, 1), pm.HalfNormal("w", 2)
+        x = pm.TruncatedNormal.dist(mu, pm.HalfNormal("sd", 1), lower=mu - w)
+        data = values[values > 0][:40]
+        prb.Simulator("y", same, x, metric=METRICS["kl"], observed=data, propagation=R256)
+    start = {"mu": 0.9, "w": 1.4, "sd": 0.5}
+    evaluator = Evaluator(model)
+    exact = evaluator.objective(prior=False, gradient=True)
+    value, gradient = exact(evaluator.unconstrained(start), np.ones(1))
+    assert np.isfinite(value)
+    assert np.isnan(gradient).any()
+    found = prb.minimize(model, start=start, starts=0, refine=False)
+    simplex = prb.minimize(model, start=start, starts=0, refine=False, method="Nelder-Mead")
+    assert found.discrepancy < 1.1 * simplex.discrepancy
+    assert found.discrepancy < 0.5 * value
+
+
 @pytest.mark.parametrize("supported", [True, False])
 def test_a_search_is_held_no_longer_than_designs_tell_nothing(
     supported: bool, monkeypatch: pytest.MonkeyPatch
