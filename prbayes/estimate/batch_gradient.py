@@ -20,7 +20,7 @@ from prbayes.response.compilation import compiled, untraced
 # with nine).
 WORTH_A_GRADIENT = 4
 # Step of differences, in spreads of the prior, where a gradient is no number.
-_STEP = 1e-4
+_UNTOLD_STEP = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class BatchGradient:
         return values, gradients
 
     def _by_differences(self, thetas: Floats, rows: Any) -> Floats:
-        step = _STEP * self.objective.evaluator.prior_sd
+        step = _UNTOLD_STEP * self.objective.evaluator.prior_sd
         up, down = (
             self.objective(thetas[:, None] + sign * np.diag(step), rows) for sign in (1, -1)
         )
