@@ -19,7 +19,8 @@ from prbayes.response.compilation import compiled, untraced
 # differences take a value for each (benchmarks/gradients.py: half of the time with four, a quarter
 # with nine).
 WORTH_A_GRADIENT = 4
-# Step of differences, in spreads of the prior, where a gradient is no number.
+# Step of differences, in spreads of the prior, where a gradient is no number: central ones are off
+# by about its square, and rounding by 1e-16 over it.
 _UNTOLD_STEP = 1e-4
 
 
