@@ -410,6 +410,28 @@ def observed_set(evaluator: Evaluator) -> DataSets:
     return DataSets(values, weights)
 
 
+def one_set(
+    evaluator: Evaluator, sets: DataSets, i: int
+) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    """Return the i-th data set as it would be measured: values and their weights, by simulator.
+
+    Specimens that count alike are repeated where a value occurs several times.
+    """
+    observed: dict[str, Floats] = {}
+    counted: dict[str, Floats] = {}
+    for node, values, weights in zip(evaluator.nodes, sets.values, sets.weights, strict=True):
+        own = node.target.weights
+        seen = np.flatnonzero(weights[i])
+        if np.ptp(own) == 0:
+            times = np.rint(weights[i, seen] / own[0]).astype(np.intp)
+            seen = np.repeat(seen, times)
+            counted[node.name] = np.full(seen.size, own[0])
+        else:
+            counted[node.name] = weights[i, seen]
+        observed[node.name] = values[seen]
+    return observed, counted
+
+
 def reweighted_sets(evaluator: Evaluator, n_sets: int, seed: int = 0) -> DataSets:
     """Give the observed specimens Dirichlet weights (Bayesian bootstrap), times their own."""
     rng = np.random.default_rng([seed, 2])

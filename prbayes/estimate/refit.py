@@ -17,10 +17,11 @@ from prbayes.estimate.batch_gradient import WORTH_A_GRADIENT, BatchGradient
 from prbayes.estimate.batch_objective import BatchObjective
 from prbayes.estimate.batch_simplex import descend_by_simplex
 from prbayes.estimate.curvature import second_differences
-from prbayes.estimate.data_sets import SETS, DataSets, observed_set
+from prbayes.estimate.data_sets import SETS, DataSets, observed_set, one_set
 from prbayes.estimate.feature_map import WORTH, Shortcut
 from prbayes.estimate.measured import Refits
 from prbayes.estimate.obstacles import measured_by_refits
+from prbayes.estimate.prepared_anew import PREPARED, told_enough
 from prbayes.estimate.sampling import Local, first_order_shifts, local_sampling
 from prbayes.estimate.sandwich import Information
 from prbayes.model.evaluator import Evaluator
@@ -195,6 +196,44 @@ class SamplingDistribution:
                 arrived.append(converged)
                 report(len(converged), "")
         return np.concatenate(minimisers), np.concatenate(arrived)
+
+    def refit_anew(self, sets: DataSets, start: Floats, minimisers: Floats) -> Floats:
+        """Return minimisers of the metric prepared for each of some data sets, (n_sets, r).
+
+        From ``start`` or those of what was prepared for the data, ``minimisers``, of which some run
+        away, (n_sets, r) both. NaN for the other data sets; for all of them where a metric sees one
+        output, responses are not stored, or minimisers are simplices'.
+        """
+        found = np.full(start.shape, np.nan)
+        several = any(node.target.event for node in self.evaluator.nodes)
+        if not several or not self._stored or measured_by_refits(self.evaluator):
+            return found
+        shared = BatchObjective.of(self.evaluator, self.scales, observed_set(self.evaluator))
+        descent = self._descent(shared, roughly=True)
+        most = min(PREPARED, len(start))
+        with progress("metric prepared anew", most) as report:
+            for i in range(most):
+                report(1, "")
+                own = self._objective_anew(sets, i)
+                if own is None:
+                    continue
+                begin = np.stack([start[i], minimisers[i]])
+                (values,) = own(self.thetas(begin)[None], slice(1))
+                minimiser, converged = self._minimise(own, descent, begin[[values.argmin()]])
+                if converged[0]:
+                    found[i] = minimiser[0]
+                if told_enough(found[: i + 1] - minimisers[: i + 1]):
+                    break
+        return found
+
+    def _objective_anew(self, sets: DataSets, i: int) -> BatchObjective | None:
+        """Return the objective of the metric prepared for a data set; None where it cannot be."""
+        data, weights = one_set(self.evaluator, sets, i)
+        try:
+            other = self.evaluator.observing(data, weights=weights)
+        except ValueError:  # as where all its specimens are alike
+            return None
+        return BatchObjective.of(other, self.scales, observed_set(other))
 
     def _at_once(self, sets: DataSets) -> int:
         """Return how many data sets fit into memory."""

@@ -274,10 +274,16 @@ class Evaluator:
 
         return counted
 
-    def observing(self, data: dict[str, Floats], metric: Metric | None = None) -> Evaluator:
+    def observing(
+        self,
+        data: dict[str, Floats],
+        metric: Metric | None = None,
+        weights: dict[str, Floats] | None = None,
+    ) -> Evaluator:
         """Return an evaluator of the same model with other observed responses.
 
-        They come by the names of simulators.
+        They come by the names of simulators, and so do their weights; those of as many responses
+        are by default what they were.
         Metrics choose bandwidths and cells anew; designs and epsilons are the same objects. With
         ``metric`` all simulators have that one.
         """
@@ -287,9 +293,11 @@ class Evaluator:
             observed = data[node.name]
             before = node.target
             same_size = np.shape(observed) == before.observed.shape
-            weights = before.weights if same_size else None
+            counted = before.weights if same_size else None
+            if weights is not None:
+                counted = weights[node.name]
             chosen = metric or node.metric
-            target = chosen.against(observed, weights)
+            target = chosen.against(observed, counted)
             bound = node.bound
             targets.append(target.beside(bound.first_responses, bound.dimensions))
         return self._with_targets(targets)

@@ -13,6 +13,7 @@ from prbayes.estimate.data_sets import observed_set, simulated_sets
 from prbayes.estimate.goodness import of_another_family, probability_of_fit
 from prbayes.estimate.measured import drawn_in
 from prbayes.estimate.obstacles import refit_obstacle
+from prbayes.estimate.prepared_anew import as_prepared_anew
 from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.refit import ARRIVED, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
@@ -213,7 +214,9 @@ class Affine:
                 f"{int(converged.sum())} of {self.n_sets} refits converged, expected at least "
                 f"{ARRIVED:.0%}, so that they do not tell how wide the draws should be"
             )
-        away = x[converged] - center
+        anew = sampling.refit_anew(sets, np.broadcast_to(center, x.shape), x)
+        luck = np.random.default_rng([self.random_seed, 8]).random(len(x))
+        away = as_prepared_anew(x - center, anew - center, luck)[converged]
         shifts = np.clip(away, -_REACH, _REACH)
         # What the prior tells.
         draws = evaluator.prior_thetas(4 * THETAS, self.random_seed)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from prbayes._checks import Floats, positive_integer
 from prbayes._threads import one_thread
 from prbayes.estimate.data_sets import observed_set, sets_along
+from prbayes.estimate.prepared_anew import as_prepared_anew
 from prbayes.estimate.prior_ends import at_prior_ends
 from prbayes.estimate.refit import ARRIVED, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
@@ -186,12 +189,26 @@ class _Refits:
     """Estimates of data sets, and the hyperparameters that these were drawn at."""
 
     thetas: Floats  # (n, d)
-    estimates: Floats  # (n, r)
+    points: Floats  # (n, r): their coordinates
+    minimisers: Floats  # (n, r): of the metric as it is prepared for the data
+    # (n, r): of the metric prepared for the data set; NaN of most, and where that is the same.
+    anew: Floats
+    luck: Floats  # (n,): as `as_prepared_anew` has it
+
+    @cached_property
+    def estimates(self) -> Floats:
+        """Those of the metric prepared for each data set, told from some of them, (n, r)."""
+        away = self.minimisers - self.points
+        return self.points + as_prepared_anew(away, self.anew - self.points, self.luck)
 
     def and_more(self, other: _Refits) -> _Refits:
         """Return these and others."""
-        thetas = np.concatenate([self.thetas, other.thetas])
-        return _Refits(thetas, np.concatenate([self.estimates, other.estimates]))
+        pairs = [(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)]
+        return _Refits(*map(np.concatenate, pairs))
+
+    def rows(self, chosen: NDArray[np.intp]) -> _Refits:
+        """Return some of them, which may be the same more than once."""
+        return _Refits(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,7 +321,9 @@ class _Look:
                 f"{int(converged.sum())} of {converged.size} refits converged, expected at least "
                 f"{ARRIVED:.0%}, so that they do not tell how the estimate is distributed"
             )
-        return _Refits(thetas[converged], estimates[converged])
+        anew = self.sampling.refit_anew(sets, start, estimates)
+        luck = rng.random(len(start))
+        return _Refits(thetas, start, estimates, anew, luck).rows(np.flatnonzero(converged))
 
     def _supported(self, thetas: Floats) -> Any:
         """Return at which thetas designs support the populations, shape (n,)."""
@@ -373,7 +392,7 @@ class _Look:
             chosen = rng.integers(n, size=n)
             other = SamplingModel.fit(
                 [kind[chosen] for kind in fitted],
-                refits.estimates[chosen],
+                refits.rows(chosen).estimates,
                 weights[chosen],
                 model.sight,
                 like=model,

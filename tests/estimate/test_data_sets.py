@@ -16,6 +16,7 @@ from prbayes.estimate.data_sets import (
     dependent,
     fresh_data,
     groups,
+    one_set,
     reweighted_sets,
     sets_along,
     siblings,
@@ -424,3 +425,28 @@ def test_specimens_are_shared_at_each_theta() -> None:
     means = [w @ v for w, v in zip(sets.weights, sets.values, strict=True)]
     np.testing.assert_allclose(means[1], 2 * means[0])
     assert not np.allclose(means[2], means[0])
+
+
+# -- one of them, as it would be measured
+# ---------------------------------------------------------------------------------------------
+
+
+def test_one_data_set_has_a_row_for_each_specimen() -> None:
+    evaluator = Evaluator(build())
+    sets = simulated_sets(evaluator, TRUTH, 5, seed=3)
+    data, weights = one_set(evaluator, sets, 2)
+    assert data["y"].shape == (N,)
+    np.testing.assert_allclose(weights["y"], 1 / N)
+    np.testing.assert_allclose(data["y"].mean(), sets.weights[0][2] @ sets.values[0])
+    assert len(np.unique(data["y"])) < N  # some points stand for two specimens
+
+
+def test_one_data_set_of_specimens_that_count_differently() -> None:
+    own = np.random.default_rng(8).dirichlet(np.full(N, 3.0))
+    evaluator = Evaluator(build(weights=own))
+    sets = simulated_sets(evaluator, TRUTH, 5, seed=3)
+    data, weights = one_set(evaluator, sets, 2)
+    np.testing.assert_allclose(weights["y"].sum(), 1)
+    np.testing.assert_allclose(data["y"] @ weights["y"], sets.weights[0][2] @ sets.values[0])
+    other = evaluator.observing(data, weights=weights)
+    np.testing.assert_array_equal(other.nodes[0].target.weights, weights["y"])

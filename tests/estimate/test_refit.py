@@ -17,6 +17,7 @@ from prbayes.estimate import refit
 from prbayes.estimate.data_sets import (
     DataSets,
     observed_set,
+    one_set,
     reweighted_sets,
     sets_along,
     simulated_sets,
@@ -326,3 +327,88 @@ def test_where_all_descents_end_is_no_error_of_emulators(monkeypatch: pytest.Mon
     ends = iter([0.3, *[0.4] * 3, *[0.3] * 5])  # of the whole, and of eight that lack a block
     monkeypatch.setattr(SamplingDistribution, "_only", lambda *_: np.array([next(ends)]))
     assert sampling._error_of_emulators() == pytest.approx(np.sqrt(3) * 0.1)
+
+
+# -- a metric prepared for each data set
+# ---------------------------------------------------------------------------------------------
+
+
+@cache
+def of_two_outputs(name: str = "kl") -> SamplingDistribution:
+    rng = np.random.default_rng(2)
+    a, b = rng.normal(1, 0.5, 15), rng.normal(0, 0.3, 15)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        z = pm.Normal.dist(0, pm.HalfNormal("tau", 1))
+        prb.Simulator(
+            "y",
+            lambda x, z: np.stack([x, x + z], axis=-1),
+            x,
+            z,
+            metric=prb.Joint(METRICS[name]),
+            observed=np.column_stack([a, a + b]),
+            propagation=prb.Reweighted(1024, emulator=None),
+        )
+    evaluator = Evaluator(model)
+    theta = evaluator.unconstrained({"mu": 1.0, "sigma": 0.5, "tau": 0.3})
+    return SamplingDistribution.of(evaluator, theta, np.ones(1))
+
+
+@pytest.mark.parametrize("name", ["kl", "area"])
+def test_a_metric_prepared_anew_is_that_of_the_other_data(name: str) -> None:
+    sampling = of_two_outputs(name)
+    sets = simulated_sets(sampling.evaluator, sampling.theta, 20, seed=4)
+    shared, _ = sampling.refit(sets)
+    found = sampling.refit_anew(sets, np.zeros_like(shared), shared)
+    for i in (0, 7):
+        data, weights = one_set(sampling.evaluator, sets, i)
+        other = sampling.evaluator.observing(data, weights=weights)
+        (expected,), _ = replace(sampling, evaluator=other).refit(observed_set(other))
+        # To a few hundredths of a standard error, and a kink of areas that is flat.
+        np.testing.assert_allclose(found[i], expected, atol=0.1 if name == "kl" else 0.25)
+    # It is another one than that of what was prepared for the data.
+    assert np.nanstd(found - shared) > 0.02
+
+
+def test_a_minimiser_that_ran_away_is_not_where_another_one_begins() -> None:
+    sampling = of_two_outputs()
+    sets = simulated_sets(sampling.evaluator, sampling.theta, 4, seed=4)
+    shared, _ = sampling.refit(sets)
+    near = sampling.refit_anew(sets, shared, shared)
+    away = shared + np.array([0.0, 0.0, 25.0])
+    np.testing.assert_allclose(sampling.refit_anew(sets, shared, away), near, atol=0.05)
+    np.testing.assert_allclose(sampling.refit_anew(sets, away, shared), near, atol=0.05)
+
+
+def test_a_data_set_that_a_metric_cannot_be_prepared_for_is_left_out() -> None:
+    sampling = of_two_outputs()
+    sets = simulated_sets(sampling.evaluator, sampling.theta, 3, seed=4)
+    weights = sets.weights[0].copy()
+    weights[1] = 0.0
+    weights[1, 5] = 1.0  # all specimens are alike
+    alike = DataSets(sets.values, [weights])
+    x = np.zeros((3, 3))
+    assert np.isfinite(sampling.refit_anew(alike, x, x)).all(axis=1).tolist() == [True, False, True]
+
+
+def test_of_many_data_sets_some_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    sampling = of_two_outputs()
+    sets = simulated_sets(sampling.evaluator, sampling.theta, 100, seed=4)
+    shared, _ = sampling.refit(sets)
+    for enough, expected in ((20, 20), (101, 64)):
+
+        def told(differences: Floats, enough: int = enough) -> bool:
+            assert differences.shape[1] == 3
+            return len(differences) >= enough
+
+        monkeypatch.setattr(refit, "told_enough", told)
+        known = np.isfinite(sampling.refit_anew(sets, shared, shared)).all(axis=1)
+        assert known.tolist() == [i < expected for i in range(100)]
+
+
+@pytest.mark.parametrize("design", [True, False])
+def test_a_metric_of_one_output_is_prepared_for_the_data_alone(design: bool) -> None:
+    sampling = neighbourhood("kl", design=design)
+    sets = simulated_sets(sampling.evaluator, sampling.theta, 3)
+    x = np.zeros((3, 2))
+    assert np.isnan(sampling.refit_anew(sets, x, x)).all()

@@ -762,3 +762,20 @@ def test_a_prior_that_agrees_with_the_data_is_not(name: str) -> None:
     assert idata.posterior.attrs["adjustment_moved"] < 0.6
     assert idata.posterior.attrs["prior_probability"] > 0.05
     assert prb.diagnose(idata).ok
+
+
+def test_a_metric_prepared_anew_moves_center_and_width(monkeypatch: pytest.MonkeyPatch) -> None:
+    sampling = fit("kl").sampling()
+    adjust = prb.posterior.Affine(n_sets=1000)
+    center, covariance = adjust.target(sampling)
+
+    def anew(self: Any, sets: Any, start: Floats, minimisers: Floats) -> Floats:
+        # Half as wide, and two standard errors up.
+        found = np.full_like(minimisers, np.nan)
+        found[:64] = 2 + start[:64] + (minimisers - start)[:64] / 2
+        return found
+
+    monkeypatch.setattr(SamplingDistribution, "refit_anew", anew)
+    moved, narrower = adjust.target(sampling)
+    np.testing.assert_allclose(moved, center - 2, atol=0.25)
+    np.testing.assert_allclose(np.diag(narrower), np.diag(covariance) / 4, rtol=0.25)

@@ -13,6 +13,7 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes._checks import Floats
+from prbayes.estimate.refit import SamplingDistribution
 from prbayes.posterior import GivenEstimate, given_estimate
 from prbayes.posterior.adjustment import UnsettledError
 
@@ -185,3 +186,25 @@ def test_where_the_optimum_is_at_an_edge_it_is_the_straight_map_and_says_so(
     straight = sample(model, prb.posterior.Affine(), draws=200, optimum=optimum)
     assert "the optimum is at an edge" in caplog.text
     np.testing.assert_array_equal(given.posterior["mu"], straight.posterior["mu"])
+
+
+@pytest.mark.long
+def test_a_metric_prepared_anew_moves_center_and_width(monkeypatch: pytest.MonkeyPatch) -> None:
+    observed = np.random.default_rng(5).normal(0, 1, 50)
+    model = build(METRICS["kl"], observed, 2.0)
+    before = moments(sample(model, GivenEstimate()))
+
+    def anew(self: Any, sets: Any, start: Floats, minimisers: Floats) -> Floats:
+        # A standard error up, and half as wide.
+        found = np.full_like(minimisers, np.nan)
+        found[:64] = start[:64] + 1 + (minimisers - start)[:64] / 2
+        return found
+
+    monkeypatch.setattr(SamplingDistribution, "refit_anew", anew)
+    after = moments(sample(model, GivenEstimate()))
+    widths = before[[1, 1, 3, 3]]
+    change = (after - before) / widths
+    # Of the mean a standard error, up or down as its axis goes; of the width a half.
+    np.testing.assert_allclose(np.abs(change[0]), 1, atol=0.25)
+    np.testing.assert_allclose(change[1], -0.5, atol=0.15)
+    np.testing.assert_allclose(change[3], -0.5, atol=0.2)
