@@ -17,13 +17,13 @@ from prbayes._checks import Floats
 # half a standard error has an error of .06.
 PREPARED = 64
 # Of them, below which nothing is told.
-_FEWEST = 16
+FEWEST_PAIRS = 16
 # Error of the mean difference, in standard errors, at which there are enough of them.
-_TOLD = 0.04
+_DIFFERENCE_KNOWN = 0.06
 # Standard errors up to which a minimiser follows the other one on a line, and from which on a
 # minimiser that ran away is no farther.
-_NEAR = 3.0
-_FAR = 6.0
+_ON_A_LINE = 3.0
+_RAN_AWAY = 6.0
 # Slope beyond near from which on those that ran away farther are farther still.
 _FOLLOWS = 0.5
 # Of slopes, as of a pair that is one standard error off: without any pair that ran away those that
@@ -48,21 +48,21 @@ def as_prepared_anew(away: Floats, anew: Floats, luck: Floats) -> Floats:
     """
     known = np.isfinite(anew).all(axis=1)
     pairs = int(known.sum())
-    if pairs < _FEWEST:
+    if pairs < FEWEST_PAIRS:
         return away
     told = np.empty_like(away)
     left = np.empty((pairs, away.shape[1]))
     for i, (one, other) in enumerate(zip(away.T, anew.T, strict=True)):
         terms = _terms(one)
         seen = terms[known]
-        wanted = np.clip(other[known], -_FAR, _FAR)
+        wanted = np.clip(other[known], -_RAN_AWAY, _RAN_AWAY)
         normal = seen.T @ seen + _RIDGE * np.eye(3)
         straight = np.array([0.0, 1.0, 1.0])
         coefficients = straight + np.linalg.solve(normal, seen.T @ (wanted - seen @ straight))
         told[:, i] = terms @ coefficients
         left[:, i] = wanted - seen @ coefficients
         if coefficients[2] > _FOLLOWS:
-            told[:, i] += one - np.clip(one, -_FAR, _FAR)
+            told[:, i] += one - np.clip(one, -_RAN_AWAY, _RAN_AWAY)
     told += left[(luck * pairs).astype(np.intp)]
     told[known] = anew[known]
     return told
@@ -71,14 +71,14 @@ def as_prepared_anew(away: Floats, anew: Floats, luck: Floats) -> Floats:
 def told_enough(differences: Floats) -> bool:
     """Return whether pairs, (n, r), of which some are NaN, tell their mean difference."""
     known = differences[np.isfinite(differences).all(axis=1)]
-    if len(known) < _FEWEST:
+    if len(known) < FEWEST_PAIRS:
         return False
-    scatter = np.clip(known, -_FAR, _FAR).std(axis=0).max(initial=0.0)
-    return bool(scatter < _TOLD * np.sqrt(len(known)))
+    scatter = np.clip(known, -_RAN_AWAY, _RAN_AWAY).std(axis=0).max(initial=0.0)
+    return bool(scatter < _DIFFERENCE_KNOWN * np.sqrt(len(known)))
 
 
 def _terms(away: Floats) -> Floats:
     """Return one, how far minimisers are away, and how much farther than near, (n, 3)."""
-    within = np.clip(away, -_FAR, _FAR)
-    near = np.clip(away, -_NEAR, _NEAR)
+    within = np.clip(away, -_RAN_AWAY, _RAN_AWAY)
+    near = np.clip(away, -_ON_A_LINE, _ON_A_LINE)
     return np.column_stack([np.ones(len(away)), near, within - near])

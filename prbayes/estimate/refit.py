@@ -197,6 +197,15 @@ class SamplingDistribution:
                 report(len(converged), "")
         return np.concatenate(minimisers), np.concatenate(arrived)
 
+    @property
+    def prepares(self) -> bool:
+        """Whether the metric takes from the data how it looks at them, as at several outputs.
+
+        It is known of stored responses, and of metrics whose minimum declares something.
+        """
+        several = any(node.target.event for node in self.evaluator.nodes)
+        return several and self._stored and not measured_by_refits(self.evaluator)
+
     def refit_anew(self, sets: DataSets, start: Floats, minimisers: Floats) -> Floats:
         """Return minimisers of the metric prepared for each of some data sets, (n_sets, r).
 
@@ -205,8 +214,7 @@ class SamplingDistribution:
         output, responses are not stored, or minimisers are simplices'.
         """
         found = np.full(start.shape, np.nan)
-        several = any(node.target.event for node in self.evaluator.nodes)
-        if not several or not self._stored or measured_by_refits(self.evaluator):
+        if not self.prepares:
             return found
         shared = BatchObjective.of(self.evaluator, self.scales, observed_set(self.evaluator))
         descent = self._descent(shared, roughly=True)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats, positive_integer
 from prbayes._threads import one_thread
 from prbayes.estimate.data_sets import observed_set, sets_along
-from prbayes.estimate.prepared_anew import as_prepared_anew
+from prbayes.estimate.prepared_anew import FEWEST_PAIRS, as_prepared_anew
 from prbayes.estimate.prior_ends import at_prior_ends
 from prbayes.estimate.refit import ARRIVED, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
@@ -59,6 +59,10 @@ class GivenEstimate(Affine):
     these estimates tell is how the estimate is distributed as a function of the hyperparameters:
     its bias, spread and skewness, each changing with them. The density of the estimate that was
     found is a likelihood, to which the prior is added exactly, and draws are made from both.
+
+    A metric of several outputs takes from the data in which coordinates it looks at them. Some of
+    the data sets are fitted by the metric as it is prepared for each of them, and tell where the
+    estimates of all are; of metrics whose minimum declares nothing it is not known.
 
     By ``random_seed`` the width of the draws varies by 2 to 6% where a response is folded
     (``benchmarks/folded.py``), and more where prior and data contradict each other.
@@ -159,6 +163,14 @@ class GivenEstimate(Affine):
     def _doubts(self, look: _Look, found: _Found) -> tuple[str, ...]:
         """Say what speaks against the draws."""
         doubts = []
+        pairs = found.refits.pairs
+        if look.sampling.prepares and pairs < FEWEST_PAIRS:
+            doubts.append(
+                f"the metric could be prepared for {pairs} of the data sets drawn from the "
+                f"calibrated population, expected at least {FEWEST_PAIRS}, as where few specimens "
+                "have several outputs: estimates are those of a metric that looks at all data sets "
+                "as at the measured one, and draws too wide"
+            )
         strain = look.strain(found.model, found.draws)
         if strain > _STRAINED:
             doubts.append(
@@ -200,6 +212,11 @@ class _Refits:
         """Those of the metric prepared for each data set, told from some of them, (n, r)."""
         away = self.minimisers - self.points
         return self.points + as_prepared_anew(away, self.anew - self.points, self.luck)
+
+    @property
+    def pairs(self) -> int:
+        """How many data sets the metric was prepared for."""
+        return int(np.isfinite(self.anew).all(axis=1).sum())
 
     def and_more(self, other: _Refits) -> _Refits:
         """Return these and others."""

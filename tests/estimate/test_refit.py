@@ -334,7 +334,7 @@ def test_where_all_descents_end_is_no_error_of_emulators(monkeypatch: pytest.Mon
 
 
 @cache
-def of_two_outputs(name: str = "kl") -> SamplingDistribution:
+def of_two_outputs(metric: prb.Metric = METRICS["kl"]) -> SamplingDistribution:
     rng = np.random.default_rng(2)
     a, b = rng.normal(1, 0.5, 15), rng.normal(0, 0.3, 15)
     with pm.Model() as model:
@@ -345,7 +345,7 @@ def of_two_outputs(name: str = "kl") -> SamplingDistribution:
             lambda x, z: np.stack([x, x + z], axis=-1),
             x,
             z,
-            metric=prb.Joint(METRICS[name]),
+            metric=prb.Joint(metric),
             observed=np.column_stack([a, a + b]),
             propagation=prb.Reweighted(1024, emulator=None),
         )
@@ -356,7 +356,7 @@ def of_two_outputs(name: str = "kl") -> SamplingDistribution:
 
 @pytest.mark.parametrize("name", ["kl", "area"])
 def test_a_metric_prepared_anew_is_that_of_the_other_data(name: str) -> None:
-    sampling = of_two_outputs(name)
+    sampling = of_two_outputs(METRICS[name])
     sets = simulated_sets(sampling.evaluator, sampling.theta, 20, seed=4)
     shared, _ = sampling.refit(sets)
     found = sampling.refit_anew(sets, np.zeros_like(shared), shared)
@@ -406,9 +406,18 @@ def test_of_many_data_sets_some_are_enough(monkeypatch: pytest.MonkeyPatch) -> N
         assert known.tolist() == [i < expected for i in range(100)]
 
 
-@pytest.mark.parametrize("design", [True, False])
-def test_a_metric_of_one_output_is_prepared_for_the_data_alone(design: bool) -> None:
-    sampling = neighbourhood("kl", design=design)
+@pytest.mark.parametrize("case", ["one output", "computed anew", "declares nothing"])
+def test_where_a_metric_is_prepared_for_the_data_alone(case: str) -> None:
+    if case == "declares nothing":
+
+        def between(x: Floats, y: Floats, weights: Floats) -> Any:
+            return np.abs(np.average(x, axis=-1, weights=weights) - y.mean())
+
+        sampling = of_two_outputs(prb.FunctionMetric(between, weighted=True))
+    else:
+        sampling = neighbourhood("kl", design=case == "one output")
+    assert not sampling.prepares
+    assert of_two_outputs().prepares
     sets = simulated_sets(sampling.evaluator, sampling.theta, 3)
-    x = np.zeros((3, 2))
+    x = np.zeros((3, sampling.stderr.size))
     assert np.isnan(sampling.refit_anew(sets, x, x)).all()

@@ -126,24 +126,30 @@ def test_where_too_few_refits_arrive_it_is_the_straight_map_and_says_so(
 
 
 @pytest.mark.parametrize(
-    ("strain", "moved", "memory", "words"),
+    ("strain", "moved", "memory", "pairs", "words"),
     [
-        (1.0, 0.5, 0.01, []),
-        (4.0, 0.5, 0.01, ["4.0 standard deviations from where it is expected"]),
-        (1.0, 1.5, 0.01, ["still moved by 1.5 of their standard deviations"]),
-        (1.0, 0.5, 0.4, ["still have a correlation of 0.40 with where they began"]),
-        (4.0, 1.5, 0.4, ["4.0", "1.5", "0.40"]),
+        (1.0, 0.5, 0.01, 16, []),
+        (4.0, 0.5, 0.01, 64, ["4.0 standard deviations from where it is expected"]),
+        (1.0, 1.5, 0.01, 64, ["still moved by 1.5 of their standard deviations"]),
+        (1.0, 0.5, 0.4, 64, ["still have a correlation of 0.40 with where they began"]),
+        (1.0, 0.5, 0.01, 15, ["could be prepared for 15 of the data sets"]),
+        (4.0, 1.5, 0.4, 0, ["prepared for 0", "4.0", "1.5", "0.40"]),
     ],
 )
 def test_what_speaks_against_draws_is_told(
-    strain: float, moved: float, memory: float, words: list[str]
+    strain: float, moved: float, memory: float, pairs: int, words: list[str]
 ) -> None:
-    look: Any = SimpleNamespace(strain=lambda model, draws: strain)
-    found: Any = SimpleNamespace(model=None, draws=None, moved=moved, memory=memory)
+    sampling = SimpleNamespace(prepares=True)
+    look: Any = SimpleNamespace(strain=lambda model, draws: strain, sampling=sampling)
+    refits = SimpleNamespace(pairs=pairs)
+    found: Any = SimpleNamespace(model=None, draws=None, moved=moved, memory=memory, refits=refits)
     doubts = GivenEstimate()._doubts(look, found)
     assert len(doubts) == len(words)
     for doubt, word in zip(doubts, words, strict=True):
         assert word in doubt
+    # Of one output, or of responses that are not stored, there is nothing to prepare.
+    sampling.prepares = False
+    assert len(GivenEstimate()._doubts(look, found)) == len(words) - (pairs < 16)
 
 
 @pytest.mark.slow
