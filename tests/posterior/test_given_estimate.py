@@ -214,3 +214,18 @@ def test_a_metric_prepared_anew_moves_center_and_width(monkeypatch: pytest.Monke
     np.testing.assert_allclose(np.abs(change[0]), 1, atol=0.25)
     np.testing.assert_allclose(change[1], -0.5, atol=0.15)
     np.testing.assert_allclose(change[3], -0.5, atol=0.2)
+
+
+def test_estimates_are_those_of_the_metric_prepared_anew() -> None:
+    rng = np.random.default_rng(1)
+    points = rng.normal(scale=2, size=(400, 2))
+    away = rng.normal(size=(400, 2))
+    anew = np.where(np.arange(400)[:, None] < 64, points + 1 + away / 2, np.nan)
+    refits = given_estimate._Refits(points, points, points + away, anew, rng.random(400))
+    np.testing.assert_allclose(refits.estimates, points + 1 + away / 2, atol=0.1)
+    assert refits.pairs == 64
+    # Some of them, or more, hold together.
+    chosen = np.arange(10, 300)
+    again = refits.rows(chosen).and_more(refits.rows(np.arange(100)))
+    assert again.pairs == 54 + 64
+    np.testing.assert_array_equal(again.points[:290], points[chosen])
