@@ -398,7 +398,7 @@ def test_of_many_data_sets_some_are_enough(monkeypatch: pytest.MonkeyPatch) -> N
     for enough, expected in ((20, 20), (101, 64)):
 
         def told(differences: Floats, enough: int = enough) -> bool:
-            assert np.abs(differences[-1]).max() > 0.003  # those of some are small
+            assert len(differences) < 10 or np.abs(differences).max() > 0.1
             return len(differences) >= enough
 
         monkeypatch.setattr(refit, "told_enough", told)

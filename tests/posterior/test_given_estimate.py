@@ -222,7 +222,7 @@ def test_estimates_are_those_of_the_metric_prepared_anew() -> None:
     away = rng.normal(size=(400, 2))
     anew = np.where(np.arange(400)[:, None] < 64, points + 1 + away / 2, np.nan)
     refits = given_estimate._Refits(points, points, points + away, anew, rng.random(400))
-    np.testing.assert_allclose(refits.estimates, points + 1 + away / 2, atol=0.1)
+    np.testing.assert_allclose(refits.estimates, points + 1 + away / 2, atol=0.4)
     assert refits.pairs == 64
     # Some of them, or more, hold together.
     chosen = np.arange(10, 300)
