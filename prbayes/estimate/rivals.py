@@ -33,6 +33,8 @@ _SECTIONS = 10
 _WAY_HALVED = 5
 # Times that points are drawn where a descent on too few of them has ended.
 _VISITS = 4
+# Times that descents go on from where they ended.
+_GOING_ON = 8
 # Multiples of the noise that are nothing: what descents stop at, and what may be given up.
 _NEGLIGIBLE = 0.01
 
@@ -161,7 +163,22 @@ def rivals(best: Best, *, starts: int, seed: int) -> list[Rival]:
     lowest = float(best(best.theta[None])[0])
     ends, values = _in_line(best, ends, values)
 
-    return _kept(best, best.thetas(ends), values, lowest)
+    found = _kept(best, best.thetas(ends), values, lowest)
+    # In a bent valley a descent ends where it has not learned how flat that is.
+    for _ in range(_GOING_ON):
+        before = found
+        if not before:
+            break
+        found = standing(best, np.stack([rival.theta for rival in before]))
+        if not _lower(before, found, _NEGLIGIBLE * best.noise):
+            break
+    return found
+
+
+def _lower(before: list[Rival], after: list[Rival], least: float) -> bool:
+    """Return whether optima are fewer, or one of them is lower by more than a least gain."""
+    gains = [a.value - b.value for a, b in zip(before, after, strict=False)]
+    return len(after) < len(before) or max(gains) > least
 
 
 def standing(best: Best, thetas: Floats) -> list[Rival]:

@@ -2,7 +2,7 @@
 
 import logging
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from four_metrics import METRICS, R256, same, slow
 
 import prbayes as prb
 from prbayes._checks import Floats
+from prbayes.estimate.batch_bfgs import descend
 from prbayes.estimate.minimization import _visited
 from prbayes.estimate.objective import Hold
 from prbayes.estimate.refinement import refine_at
@@ -424,3 +425,32 @@ def test_a_bent_valley_has_no_two_optima(formula: Any, joined: bool) -> None:
     best = Best(evaluator, a, np.ones(1), local, noise=0.1)
     assert _separate(best, a, 0.0, b, 0.0)  # straight on
     assert _joined(best, a, b, 5) is joined
+
+
+class Valley:
+    """A bent valley with one minimum, at (1, 1), and what rivals ask of an evaluator."""
+
+    nodes: tuple[()] = ()
+    has_other_terms = False
+
+    def total(self, thetas: Floats, scales: Floats) -> Floats:
+        x, y = thetas.T
+        return np.asarray((1 - x) ** 2 + 100 * (y - x**2) ** 2)
+
+    def prior_points(self, n: int, seed: int) -> Floats:
+        return np.random.default_rng(seed).normal(size=(n, 2))
+
+
+@pytest.mark.parametrize("iterations", [10, 40])
+def test_where_a_descent_was_stopped_in_a_valley_is_no_optimum(
+    iterations: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evaluator: Any = Valley()
+    covariance = 0.01 * np.linalg.inv([[802.0, -400.0], [-400.0, 200.0]])
+    local = Local(np.ones(2), np.eye(2), np.zeros((2, 0)), covariance)
+    best = Best(evaluator, np.ones(2), np.ones(1), local, noise=0.01)
+    short = partial(descend, max_iterations=iterations)
+    monkeypatch.setattr("prbayes.estimate.rivals.descend", short)
+    found = best.descended(best.shifts(evaluator.prior_points(16, 1)), np.eye(2))
+    assert found.converged.all() == (iterations == 40)
+    assert rivals(best, starts=16, seed=0) == []
