@@ -465,7 +465,7 @@ def table(store: Path, before: dict[str, Any]) -> dict[str, Any]:
         for size in sorted(SIZES):
             for method in METHODS:
                 key = f"{name}/{size}/{method}"
-                known = [before.get(key), summarise(store, name, size, method)]
+                known = [summarise(store, name, size, method), before.get(key)]
                 both = [cell for cell in known if cell is not None]
                 if both:
                     cells[key] = max(both, key=lambda cell: cell["data sets"])
