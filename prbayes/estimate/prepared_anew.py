@@ -13,8 +13,8 @@ import numpy as np
 
 from prbayes._checks import Floats
 
-# Data sets that a metric is prepared for, at most. From so many pairs a difference that scatters by
-# half a standard error has an error of .06.
+# By judgement, as all that follows: data sets that a metric is prepared for, at most. From so many
+# pairs a difference that scatters by half a standard error has an error of .06.
 PREPARED = 64
 # Of them, below which nothing is told.
 FEWEST_PAIRS = 16

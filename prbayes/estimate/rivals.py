@@ -33,7 +33,7 @@ _SECTIONS = 10
 _WAY_HALVED = 5
 # Times that points are drawn where a descent on too few of them has ended.
 _VISITS = 4
-# Times that descents go on from where they ended.
+# Times that descents go on from where they ended, at most; once or twice does, by judgement.
 _GOING_ON = 8
 # Multiples of the noise that are nothing: what descents stop at, and what may be given up.
 _NEGLIGIBLE = 0.01
