@@ -339,7 +339,7 @@ class _Look:
                 f"{ARRIVED:.0%}, so that they do not tell how the estimate is distributed"
             )
         anew = self.sampling.refit_anew(sets, start, estimates)
-        luck = rng.random(len(start))
+        luck = rng.spawn(1)[0].random(len(start))  # what else is drawn stays as it was
         return _Refits(thetas, start, estimates, anew, luck).rows(np.flatnonzero(converged))
 
     def _supported(self, thetas: Floats) -> Any:
