@@ -406,7 +406,10 @@ def test_of_many_data_sets_some_are_enough(monkeypatch: pytest.MonkeyPatch) -> N
         assert known.tolist() == [i < expected for i in range(100)]
 
 
-@pytest.mark.parametrize("case", ["one output", "computed anew", "declares nothing"])
+@pytest.mark.parametrize(
+    "case",
+    ["one output", "computed anew", pytest.param("declares nothing", marks=pytest.mark.long)],
+)
 def test_where_a_metric_is_prepared_for_the_data_alone(case: str) -> None:
     if case == "declares nothing":
 
