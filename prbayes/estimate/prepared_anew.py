@@ -1,10 +1,9 @@
 """Minimisers of a metric that is prepared for each data set anew, told from some of them.
 
 Where several outputs are measured, a metric takes from the data in which coordinates it looks at
-them. It would look at another data set in others, and its minimiser would be another one: with four
-correlated outputs of twenty specimens by most of a standard error. Refits by thousands share what
-was prepared for the data; some are made by what is prepared for each of them, and tell how both
-hang together.
+them. It would look at another data set in others, and its minimiser would be another one, with a
+bias that refits by what was prepared for the data do not have. These are made by thousands; some
+are made by what is prepared for each of them, and tell how both hang together.
 """
 
 from __future__ import annotations
