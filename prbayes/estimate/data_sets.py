@@ -422,9 +422,10 @@ def one_set(
     for node, values, weights in zip(evaluator.nodes, sets.values, sets.weights, strict=True):
         own = node.target.weights
         seen = np.flatnonzero(weights[i])
-        if np.ptp(own) == 0:
-            times = np.rint(weights[i, seen] / own[0]).astype(np.intp)
-            seen = np.repeat(seen, times)
+        times = weights[i, seen] / own[0]
+        whole = np.rint(times).astype(np.intp)
+        if np.ptp(own) == 0 and np.allclose(times, whole):
+            seen = np.repeat(seen, whole)
             counted[node.name] = np.full(seen.size, own[0])
         else:
             counted[node.name] = weights[i, seen]

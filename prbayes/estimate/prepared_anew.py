@@ -76,6 +76,19 @@ def told_enough(differences: Floats) -> bool:
     return bool(scatter < _DIFFERENCE_KNOWN * np.sqrt(len(known)))
 
 
+def of_few_pairs(anew: Floats) -> list[str]:
+    """Say so where too few are known of minimisers, (n, r), as `as_prepared_anew` has them."""
+    pairs = int(np.isfinite(anew).all(axis=1).sum())
+    if pairs >= FEWEST_PAIRS:
+        return []
+    return [
+        f"the metric could be prepared for {pairs} of the data sets drawn from the calibrated "
+        f"population, expected at least {FEWEST_PAIRS}, as where few specimens have several "
+        "outputs: estimates are those of a metric that looks at all data sets as at the measured "
+        "one, and draws too wide"
+    ]
+
+
 def _terms(away: Floats) -> Floats:
     """Return one, how far minimisers are away, and how much farther than near, (n, 3)."""
     within = np.clip(away, -_RAN_AWAY, _RAN_AWAY)

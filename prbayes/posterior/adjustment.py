@@ -13,7 +13,7 @@ from prbayes.estimate.data_sets import observed_set, simulated_sets
 from prbayes.estimate.goodness import of_another_family, probability_of_fit
 from prbayes.estimate.measured import drawn_in
 from prbayes.estimate.obstacles import refit_obstacle
-from prbayes.estimate.prepared_anew import as_prepared_anew
+from prbayes.estimate.prepared_anew import as_prepared_anew, of_few_pairs
 from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.refit import ARRIVED, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
@@ -105,6 +105,7 @@ class _Told:
     prior_precision: Floats  # (r, r)
     fit_probability: float  # as in `Adjusted`
     allowed: dict[str, float]  # by the prior, as `prior_probabilities` says
+    doubts: tuple[str, ...]  # what speaks against it
     design_variance: float = 0.0  # of the minimiser, by the design's error
 
     def of_data(self, shifts: Floats) -> tuple[Floats, Floats]:
@@ -224,7 +225,8 @@ class Affine:
         precision = _precision(prior, sampling.stderr.size)
         fit = probability_of_fit(sampling, center, sets, x, converged)
         allowed = prior_probabilities(sampling, center, shifts, self.random_seed)
-        return _Told(center, shifts, prior.mean(axis=0), precision, fit, allowed)
+        doubts = of_few_pairs(anew) if sampling.prepares else []
+        return _Told(center, shifts, prior.mean(axis=0), precision, fit, allowed, tuple(doubts))
 
     def __call__(
         self,
@@ -379,12 +381,13 @@ class Affine:
             center, information = told.of_data(told.shifts)
             found, doubts = pooled(sampling, center, information, draws, self.random_seed)
             mapped = Mapped(found, 0, *errors, told.fit_probability, told.allowed)
-            return replace(mapped, given=True, doubts=doubts)
+            return replace(mapped, given=True, doubts=(*told.doubts, *doubts))
         center, covariance = told.combined(told.shifts)
         out = transported(sampling, x, remainder, center, covariance)
         outside = drawn_in(x, _FAR) != x
         far = int(outside.any(axis=1).sum())
-        return Mapped(out, far, *errors, told.fit_probability, told.allowed)
+        mapped = Mapped(out, far, *errors, told.fit_probability, told.allowed)
+        return replace(mapped, doubts=told.doubts)
 
 
 @dataclass(frozen=True, eq=False)

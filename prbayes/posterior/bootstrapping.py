@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import time
 
+import numpy as np
 import xarray as xr
 
 from prbayes._checks import Seed, flag, positive_integer, seed_number
@@ -11,8 +13,11 @@ from prbayes._progress import shown
 from prbayes.estimate.data_sets import reweighted_sets, simulated_sets
 from prbayes.estimate.identifiability import unidentified_directions
 from prbayes.estimate.optimum import Optimum, require_refits
+from prbayes.estimate.prepared_anew import as_prepared_anew, of_few_pairs
 from prbayes.model.turns import in_turn
 from prbayes.posterior.trees import bootstrap_tree
+
+_log = logging.getLogger("prbayes")
 
 
 @in_turn
@@ -33,7 +38,9 @@ def bootstrap(
     together.
 
     With `Reweighted` each minimisation is exact and computes no response; with `Resimulated` it is
-    of first order.
+    of first order. A metric of several outputs takes from the data in which coordinates it looks at
+    them: some minimisations are of the metric as it is prepared for their data set, and tell where
+    all are.
 
     Parameters
     ----------
@@ -50,7 +57,7 @@ def bootstrap(
     xarray.DataTree
         Group ``posterior`` with dimensions (chain, draw), chain of length one, for ArviZ and
         `compare`; and ``observed_data``. The attribute ``converged`` is the share of minimisations
-        that did.
+        that did, ``warnings`` what speaks against them, which is in the log as well.
 
     Raises
     ------
@@ -95,11 +102,17 @@ def bootstrap(
         data = reweighted_sets(evaluator, draws, seed)
     with shown(progressbar):
         x, converged = sampling.refit(data)
+        anew = sampling.refit_anew(data, np.zeros_like(x), x)
+    x = as_prepared_anew(x, anew, np.random.default_rng([seed, 9]).random(draws))
+    doubts = of_few_pairs(anew) if sampling.prepares else []
+    for line in doubts:
+        _log.warning("%s", line)
     return bootstrap_tree(
         evaluator,
         sampling.thetas(x)[None],
         sampler="parametric bootstrap" if parametric else "loss-likelihood bootstrap",
         converged=float(converged.mean()),
+        warnings=tuple(doubts),
         seed=seed,
         n_responses=optimum.n_responses,
         seconds=time.perf_counter() - clock,

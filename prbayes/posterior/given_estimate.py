@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from prbayes._checks import Floats, positive_integer
 from prbayes._threads import one_thread
 from prbayes.estimate.data_sets import observed_set, sets_along
-from prbayes.estimate.prepared_anew import FEWEST_PAIRS, as_prepared_anew
+from prbayes.estimate.prepared_anew import as_prepared_anew, of_few_pairs
 from prbayes.estimate.prior_ends import at_prior_ends
 from prbayes.estimate.refit import ARRIVED, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
@@ -132,7 +132,7 @@ class GivenEstimate(Affine):
             found = self._followed(look, first.draws, rng)
         except (UnsettledError, np.linalg.LinAlgError) as error:
             doubt = f"{error}; the draws are those of prb.posterior.Affine()"
-            return replace(first, doubts=(doubt,))
+            return replace(first, doubts=(*first.doubts, doubt))
         center_error, width_error = look.errors(found, rng)
         return replace(
             first,
@@ -163,14 +163,8 @@ class GivenEstimate(Affine):
     def _doubts(self, look: _Look, found: _Found) -> tuple[str, ...]:
         """Say what speaks against the draws."""
         doubts = []
-        pairs = found.refits.pairs
-        if look.sampling.prepares and pairs < FEWEST_PAIRS:
-            doubts.append(
-                f"the metric could be prepared for {pairs} of the data sets drawn from the "
-                f"calibrated population, expected at least {FEWEST_PAIRS}, as where few specimens "
-                "have several outputs: estimates are those of a metric that looks at all data sets "
-                "as at the measured one, and draws too wide"
-            )
+        if look.sampling.prepares:
+            doubts += of_few_pairs(found.refits.anew)
         strain = look.strain(found.model, found.draws)
         if strain > _STRAINED:
             doubts.append(
@@ -212,11 +206,6 @@ class _Refits:
         """Those of the metric prepared for each data set, told from some of them, (n, r)."""
         away = self.minimisers - self.points
         return self.points + as_prepared_anew(away, self.anew - self.points, self.luck)
-
-    @property
-    def pairs(self) -> int:
-        """How many data sets the metric was prepared for."""
-        return int(np.isfinite(self.anew).all(axis=1).sum())
 
     def and_more(self, other: _Refits) -> _Refits:
         """Return these and others."""

@@ -323,6 +323,7 @@ def bootstrap_tree(
     *,
     sampler: str,
     converged: float,
+    warnings: tuple[str, ...] = (),
     seed: int,
     n_responses: int,
     seconds: float,
@@ -331,6 +332,7 @@ def bootstrap_tree(
     attrs = {
         "sampler": sampler,
         "converged": converged,
+        "warnings": "\n".join(warnings),
         "n_responses": n_responses,
         "seconds": seconds,
         "random_seed": str(seed),

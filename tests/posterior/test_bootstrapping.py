@@ -1,5 +1,6 @@
 """`bootstrap` against theory."""
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -11,6 +12,7 @@ from four_metrics import METRICS, R256, same
 from scipy.stats import norm
 
 import prbayes as prb
+from prbayes.estimate.data_sets import observed_set, one_set, reweighted_sets, simulated_sets
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 N, SD = OBSERVED.size, float(OBSERVED.std())
@@ -79,6 +81,60 @@ def test_where_specimens_fail_the_refits_are_around_the_optimum(name: str) -> No
     sd = float(draws.std())
     assert abs(float(draws.mean()) - optimum.point["mu"]) < 0.2 * sd
     assert sd == pytest.approx(optimum.stderr["mu"], rel=0.2)
+
+
+@pytest.mark.parametrize("parametric", [False, True])
+def test_several_outputs_are_looked_at_as_the_metric_is_prepared_for_them(parametric: bool) -> None:
+    optimum = of_two_outputs()
+    found = prb.bootstrap(optimum, 20, parametric=parametric, random_seed=3)
+    evaluator, sampling = optimum.evaluator, optimum.sampling()
+    if parametric:
+        sets = simulated_sets(evaluator, optimum.theta, 20, 3)
+    else:
+        sets = reweighted_sets(evaluator, 20, 3)
+    shared, _ = sampling.refit(sets)
+    draws = np.column_stack([found.posterior[name][0] for name in ("mu", "tau")])
+    for i in (0, 9):
+        data, weights = one_set(evaluator, sets, i)
+        other = evaluator.observing(data, weights=weights)
+        own, _ = replace(sampling, evaluator=other).refit(observed_set(other))
+        (expected,) = own_values(evaluator, sampling.thetas(own))
+        np.testing.assert_allclose(draws[i], expected, rtol=0.02)
+    as_measured = own_values(evaluator, sampling.thetas(shared))
+    assert np.abs(draws / as_measured - 1).max() > 0.04
+    assert found.posterior.attrs["warnings"] == ""
+
+
+def test_too_few_data_sets_that_a_metric_is_prepared_for_are_told(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    found = prb.bootstrap(of_two_outputs(), 10)
+    assert "could be prepared for 10 of the data sets" in found.posterior.attrs["warnings"]
+    assert caplog.messages[-1] == found.posterior.attrs["warnings"]
+
+
+def own_values(evaluator: Any, thetas: Any) -> Any:
+    values = evaluator.constrained(thetas)
+    return np.column_stack([values[name] for name in ("mu", "tau")])
+
+
+@cache
+def of_two_outputs() -> prb.Optimum:
+    rng = np.random.default_rng(2)
+    a, b = rng.normal(1, 0.5, 12), rng.normal(0, 0.3, 12)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 0.5)
+        z = pm.Normal.dist(0, pm.HalfNormal("tau", 1))
+        prb.Simulator(
+            "y",
+            lambda x, z: np.stack([x, x + z], axis=-1),
+            x,
+            z,
+            metric=prb.Joint(METRICS["kl"]),
+            observed=np.column_stack([a, a + b]),
+            propagation=prb.Reweighted(1024, emulator=None),
+        )
+    return prb.minimize(model, starts=0, progressbar=False)
 
 
 def test_no_response_is_computed_and_nothing_is_random() -> None:
