@@ -594,6 +594,19 @@ def many_inputs() -> Iterator[Row]:
             yield [runs, str(len(rows)), *errors, f"{cell['widths']:.1%}", f"{cell['seconds']:.0f}"]
 
 
+def at_a_fold() -> Iterator[Row]:
+    """Return the rows of metrics near a fold."""
+    rows = found("at_a_fold")
+    for metric in dict.fromkeys(row["metric"] for row in rows):
+        cells = []
+        for response, size in product(("y", "root of y"), (50, 200)):
+            (row,) = (
+                r for r in rows if (r["metric"], r["response"], r["N"]) == (metric, response, size)
+            )
+            cells.append(f"{short(row['mu'])} / {short(row['sigma'])}")
+        yield [metric, *cells]
+
+
 def random_problems() -> Iterator[Row]:
     """Return the row of problems that nobody chose."""
     from benchmarks.random_problems import summary
@@ -815,6 +828,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "emulators, time": emulator_speed,
     "few runs": few_runs,
     "many inputs": many_inputs,
+    "at a fold": at_a_fold,
     "random problems": random_problems,
     "three masses": three_masses,
     "two fidelities": two_fidelities,
