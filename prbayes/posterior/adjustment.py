@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from prbayes._checks import Floats, called, positive_integer
 from prbayes.estimate.conflict import least_probability, of_conflict, prior_probabilities
@@ -18,6 +19,7 @@ from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.refit import ARRIVED, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
+from prbayes.posterior.mode_weights import Mode, dealt_out, mode_weights
 from prbayes.posterior.pooling import pooled
 
 # Standard errors from which on a minimiser is elsewhere than where its sampling distribution was
@@ -34,6 +36,8 @@ _FEWEST = 50
 # Standard deviations to which draws farther out are drawn in. Half or twice moves a mean by .012
 # standard deviations at most (docs/constants.md).
 _FAR = 6.0
+# Modes that are looked for where draws are so far from all that are known, at most.
+_OVERLOOKED = 4
 # Standard errors beyond which a refit counts as so far away, and no farther. Twice changes means by
 # .016 standard deviations and spreads by 2% at most; with half, where refits within are cut as
 # well, spreads shrink by up to 7% (docs/constants.md).
@@ -281,6 +285,7 @@ class Affine:
         if not modes:
             reason = "the data tell less than the prior about every hyperparameter"
             return Adjusted(thetas, reason=reason)
+        modes = _with_overlooked(modes, draws)
         distances = np.array([_distance(mode, draws) for mode in modes])
         if _run_together(distances):
             return Adjusted(thetas, reason="the posterior has modes that run into each other")
@@ -298,8 +303,8 @@ class Affine:
         design_variance: float,
     ) -> Adjusted:
         """Map the draws of each mode, (..., d), given their distances (modes, n) from each."""
-        draws = thetas.reshape(-1, thetas.shape[-1])
-        nearest = distances.argmin(axis=0)
+        rows, nearest, counted = self._dealt_out(modes, thetas, distances.argmin(axis=0))
+        draws = thetas.reshape(-1, thetas.shape[-1])[rows]
         out = draws.copy()
         mapped = []
         for m, mode in enumerate(modes):
@@ -326,7 +331,7 @@ class Affine:
             likelihood = likelihood.reshape(thetas.shape[:-1])
         return Adjusted(
             out.reshape(thetas.shape),
-            self._said(mapped, len(modes), len(draws), design_variance),
+            self._said(mapped, len(modes), len(draws), design_variance) + counted,
             center_error=center_error,
             width_error=width_error,
             moved=float(moves.max()),
@@ -340,6 +345,46 @@ class Affine:
             ),
             log_likelihood=likelihood,
         )
+
+    def _dealt_out(
+        self, modes: list[SamplingDistribution], thetas: Floats, nearest: NDArray[np.intp]
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], str]:
+        """Return which draws stand for the posterior, (n,), their modes, and what to say of it.
+
+        Modes count as fits in all of them tell, where responses are stored, and else as epsilon
+        says.
+        """
+        every = np.arange(nearest.size)
+        numbers = np.bincount(nearest, minlength=len(modes))
+        if len(modes) < 2 or numbers.min() < _FEWEST:
+            return every, nearest, ""
+        as_drawn = every, nearest, ", which count as epsilon says"
+        evaluator = modes[0].evaluator
+        stored = all(node.bound.stored for node in evaluator.nodes)
+        if not stored or evaluator.told_by_prior.any():
+            return as_drawn
+        draws = thetas.reshape(-1, thetas.shape[-1])
+        rng = np.random.default_rng([self.random_seed, 10])
+        try:
+            found = [
+                self._mode(mode, draws[nearest == m], numbers[m] / nearest.size)
+                for m, mode in enumerate(modes)
+            ]
+            weights = mode_weights(found, 2 * self.n_sets, rng)
+        except (ValueError, np.linalg.LinAlgError):
+            return as_drawn
+        if weights is None:
+            return as_drawn
+        rows, dealt = dealt_out(nearest, weights, rng)
+        shares = " and ".join(f"{weight:.2f}" for weight in weights)
+        return rows, dealt, f", of shares {shares}"
+
+    def _mode(self, sampling: SamplingDistribution, draws: Floats, share: float) -> Mode:
+        sampling = among(sampling, draws)
+        told = self._told(sampling)
+        x, _ = sampling.coordinates(draws)
+        before = np.atleast_2d(np.cov(drawn_in(x, _REACH), rowvar=False))
+        return Mode(sampling, share, before, *told.combined(told.shifts))
 
     @property
     def _refits(self) -> str:
@@ -356,7 +401,8 @@ class Affine:
         """Return what was done, in words."""
         done = f"{self!r}"
         if modes > 1:
-            done += f", {len(mapped)} modes each by itself"
+            few = "" if len(mapped) == modes else f", but {modes - len(mapped)} of few draws"
+            done += f", {modes} modes each by itself{few}"
         far = sum(found.outside for found in mapped)
         if far:
             share = far / draws
@@ -451,6 +497,34 @@ def _identified_modes(evaluator: Evaluator, optima: Sequence[Floats]) -> list[Sa
         sampling = _at_minimiser(SamplingDistribution.of(evaluator, theta, scales, WEAKEST))
         if sampling.stderr.size:
             found.append(sampling)
+    return found
+
+
+def _with_overlooked(
+    modes: list[SamplingDistribution], draws: Floats
+) -> list[SamplingDistribution]:
+    """Return modes and those that draws, (n, d), have besides, with stored responses.
+
+    Not every mode is as good as the best one: it has draws where the data cannot quite exclude it.
+    """
+    evaluator = modes[0].evaluator
+    if not all(node.bound.stored for node in evaluator.nodes):
+        return modes
+    found = list(modes)
+    for _ in range(_OVERLOOKED):
+        far = draws[np.min([_distance(mode, draws) for mode in found], axis=0) > _FAR]
+        if len(far) < _FEWEST:
+            break
+        likely = evaluator(far).log_likelihood(evaluator.epsilon)
+        best = far[int(np.nan_to_num(likely, nan=-np.inf).argmax())]
+        mode = _at_minimiser(SamplingDistribution.of(evaluator, best, evaluator.epsilon, WEAKEST))
+        # Where it leads back these draws are the tail of a mode that is known.
+        back = [_distance(known, mode.theta[None])[0] for known in found]
+        if not mode.stderr.size or min(back) < _FAR:
+            break
+        if (_distance(mode, far) < _FAR).sum() < _FEWEST:
+            break
+        found.append(mode)
     return found
 
 

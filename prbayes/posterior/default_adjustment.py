@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from prbayes._checks import Floats
 from prbayes.estimate.data_sets import dependent
@@ -37,6 +38,12 @@ class _LikelihoodDraws(Affine):
         if found.reason is not None:
             return Adjusted(given, NONE_NEEDED)
         return replace(found, thetas=given, done=NONE_NEEDED)
+
+    def _dealt_out(
+        self, modes: list[SamplingDistribution], thetas: Floats, nearest: NDArray[np.intp]
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], str]:
+        """Return all draws as they are: a likelihood says how much modes count."""
+        return np.arange(nearest.size), nearest, ""
 
     def _mapped(
         self, sampling: SamplingDistribution, draws: Floats, design_variance: float
