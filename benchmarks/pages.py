@@ -607,6 +607,13 @@ def at_a_fold() -> Iterator[Row]:
         yield [metric, *cells]
 
 
+def mode_weights() -> Iterator[Row]:
+    """Return the rows of what shares of modes are worth."""
+    for row in found("mode_weights"):
+        cells = [row[way][what] for way in ("epsilon", "dealt out", "exact") for what in row[way]]
+        yield [str(row["N"]), row["metric"], str(row["data sets"]), *map(short, cells)]
+
+
 def random_problems() -> Iterator[Row]:
     """Return the row of problems that nobody chose."""
     from benchmarks.random_problems import summary
@@ -829,6 +836,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "few runs": few_runs,
     "many inputs": many_inputs,
     "at a fold": at_a_fold,
+    "mode weights": mode_weights,
     "random problems": random_problems,
     "three masses": three_masses,
     "two fidelities": two_fidelities,

@@ -180,9 +180,10 @@ def test_each_mode_is_adjusted_by_itself(name: str) -> None:
         assert idata.posterior.attrs["adjustment"].startswith(
             "GivenEstimate(n_sets=200, random_seed=0, n_fits=2000), 2 modes each by itself"
         )
-        # No draw changes sides; 1000 of them keep the shares to 1.6%, and resampling adds drift.
+        # Fits tell the shares to about .05, and a draw changes sides only for that.
         before = idata.unadjusted["mu"].values.ravel()
-        np.testing.assert_array_equal(mu > 1, before > 1)
+        moved = abs((mu > 1).mean() - (before > 1).mean())
+        assert ((mu > 1) != (before > 1)).mean() == pytest.approx(moved)
     assert 0.3 < (mu > 1).mean() < 0.7
     for side in (mu > 1, mu < 1):
         # The sd of each mode is that of the estimator, not of the distance between modes; linear
