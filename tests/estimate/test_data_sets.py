@@ -450,3 +450,11 @@ def test_one_data_set_of_specimens_that_count_differently() -> None:
     np.testing.assert_allclose(data["y"] @ weights["y"], sets.weights[0][2] @ sets.values[0])
     other = evaluator.observing(data, weights=weights)
     np.testing.assert_array_equal(other.nodes[0].target.weights, weights["y"])
+
+
+def test_one_data_set_of_specimens_that_were_weighted_anew() -> None:
+    evaluator = Evaluator(build())
+    sets = reweighted_sets(evaluator, 3, 1)
+    data, weights = one_set(evaluator, sets, 1)
+    np.testing.assert_array_equal(data["y"], OBSERVED)
+    np.testing.assert_array_equal(weights["y"], sets.weights[0][1])
