@@ -518,11 +518,8 @@ def _with_overlooked(
         likely = evaluator(far).log_likelihood(evaluator.epsilon)
         best = far[int(np.nan_to_num(likely, nan=-np.inf).argmax())]
         mode = _at_minimiser(SamplingDistribution.of(evaluator, best, evaluator.epsilon, WEAKEST))
-        # Where it leads back these draws are the tail of a mode that is known.
-        back = [_distance(known, mode.theta[None])[0] for known in found]
-        if not mode.stderr.size or min(back) < _FAR:
-            break
-        if (_distance(mode, far) < _FAR).sum() < _FEWEST:
+        # Where it leads back these draws are the tail of a mode that is known, and as far from it.
+        if not mode.stderr.size or (_distance(mode, far) < _FAR).sum() < _FEWEST:
             break
         found.append(mode)
     return found

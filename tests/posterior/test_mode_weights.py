@@ -183,6 +183,9 @@ def test_draws_of_the_posterior_are_of_such_shares(
     found = posterior(model, adjust=adjust)
     share = float((found["mu"] > 0).mean())
     assert low < share < high
+    # Each draw is of its mode before that, and has its width.
+    for side in (found["mu"].values > 0, found["mu"].values < 0):
+        assert 0.1 < found["mu"].values[side].std() < 0.35
     done = found.attrs["adjustment"]
     assert "2 modes each by itself, of shares" in done
     said = sorted(float(word) for word in done.split("of shares ")[1].split(" and "))
@@ -219,3 +222,5 @@ def test_only_what_is_a_mode_is_looked_for() -> None:
     # A tail leads back, and is none.
     tail = one.thetas(np.linspace(7, 9, 60)[:, None])
     assert _with_overlooked([one], np.concatenate([there, tail])) == [one]
+    # The likeliest of all that are far off leads to the other mode.
+    assert len(_with_overlooked([one], np.concatenate([tail, there, elsewhere]))) == 2
