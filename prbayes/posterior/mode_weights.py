@@ -79,7 +79,7 @@ def mode_weights(modes: Sequence[Mode], n_sets: int, rng: np.random.Generator) -
         center, scatter = _given_estimate(differences[known], away[known])
         centers.append(center)
         scatters.append(scatter)
-    # One for all: which tells whether measured differences are far from all modes then.
+    # One for all modes: with one each, the widest would win where measured differences are far off.
     scatter = np.mean(scatters, axis=0) + _TELLS_NOTHING**2 * np.eye(len(modes) - 1)
     off = measured - np.array(centers)
     log_density = -0.5 * np.einsum("mi,mi->m", off, np.linalg.solve(scatter, off.T).T)
