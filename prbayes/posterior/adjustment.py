@@ -36,7 +36,7 @@ _FEWEST = 50
 # Standard deviations to which draws farther out are drawn in. Half or twice moves a mean by .012
 # standard deviations at most (docs/constants.md).
 _FAR = 6.0
-# Modes that are looked for where draws are so far from all that are known, at most; by judgement.
+# Modes that are looked for where draws are far from all that are known, at most; by judgement.
 _OVERLOOKED = 4
 # Standard errors beyond which a refit counts as so far away, and no farther. Twice changes means by
 # .016 standard deviations and spreads by 2% at most; with half, where refits within are cut as
