@@ -20,7 +20,8 @@ from prbayes.estimate.batch_objective import BatchObjective
 from prbayes.estimate.data_sets import DataSets, observed_set, sets_along
 from prbayes.estimate.refit import SamplingDistribution
 
-# By judgement, as all that follows: standard errors beyond which a fit ran away, and tells nothing of the others.
+# By judgement, as all that follows. Standard errors beyond which a fit ran away, and tells nothing
+# of the others.
 _ELSEWHERE_BY_FAR = 6.0
 # Share of the data sets of a mode that have to be fitted in all of them.
 _FITTED = 0.5
