@@ -19,7 +19,13 @@ from prbayes.estimate.refinement import AGREE
 from prbayes.estimate.refit import ARRIVED, SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
-from prbayes.posterior.mode_weights import Mode, dealt_out, mode_weights
+from prbayes.posterior.mode_weights import (
+    BY_EPSILON,
+    Mode,
+    dealt_out,
+    mode_weights,
+    of_several_modes,
+)
 from prbayes.posterior.pooling import pooled
 
 # Standard errors from which on a minimiser is elsewhere than where its sampling distribution was
@@ -323,6 +329,8 @@ class Affine:
         center_error = max(found.center_error for found in mapped)
         width_error = max(found.width_error for found in mapped)
         moves = _moves(draws, out)
+        unweighed = counted if counted == BY_EPSILON else ""
+        several = of_several_modes(evaluator.constrained(out), nearest, unweighed)
         # Of several modes the one that the prior allows most.
         allowed = max((found.allowed for found in mapped), key=least_probability)
         # Of several modes the constants between them are not known.
@@ -338,6 +346,7 @@ class Affine:
             fit_probability=mapped[0].fit_probability,
             prior_probability=least_probability(allowed),
             warnings=(
+                *several,
                 *of_conflict(allowed),
                 *self._distrust(moves, mapped, evaluator.readable_names),
                 *_of_noise(center_error, width_error, self._refits),
@@ -358,7 +367,7 @@ class Affine:
         numbers = np.bincount(nearest, minlength=len(modes))
         if len(modes) < 2 or numbers.min() < _FEWEST:
             return every, nearest, ""
-        as_drawn = every, nearest, ", which count as epsilon says"
+        as_drawn = every, nearest, BY_EPSILON
         evaluator = modes[0].evaluator
         stored = all(node.bound.stored for node in evaluator.nodes)
         if not stored or evaluator.told_by_prior.any():

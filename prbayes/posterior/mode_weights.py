@@ -8,7 +8,7 @@ that of the measured data lies among them tells the modes apart.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,7 @@ from prbayes._checks import Floats
 from prbayes.estimate.batch_objective import BatchObjective
 from prbayes.estimate.data_sets import DataSets, observed_set, sets_along
 from prbayes.estimate.refit import SamplingDistribution
+from prbayes.model.elements import split_elements, told_elements
 
 # By judgement, as all that follows. Standard errors beyond which a fit ran away, and tells nothing
 # of the others.
@@ -28,6 +29,10 @@ _FITTED = 0.5
 # Difference of d / epsilon that tells nothing: a tenth of a unit of a log-likelihood, of which
 # refits are known to a hundredth.
 _TELLS_NOTHING = 0.1
+# Hyperparameters that a sentence about modes has at most, those in which they are farthest apart.
+_SAID = 4
+# What is said of modes where fits do not tell how much they count.
+BY_EPSILON = ", which count as epsilon says"
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,3 +147,36 @@ def dealt_out(
         rows[some] = rng.choice(own, size=some.size)
         modes[some] = m
     return rows, modes
+
+
+def of_several_modes(
+    draws: Mapping[str, Floats], modes: NDArray[np.intp], counted: str
+) -> list[str]:
+    """Say so where draws, (n, *shape) by variable, are of several modes, which has shape (n,).
+
+    Their mean lies between the modes, where the posterior has next to nothing. ``counted`` says by
+    what modes count.
+    """
+    labels, numbers = np.unique(modes, return_counts=True)
+    if len(labels) < 2:
+        return []
+    values = split_elements(draws)
+    medians = {}
+    gaps = {}
+    for name in told_elements(draws):
+        own = [values[name][modes == label] for label in labels]
+        medians[name] = [np.median(some) for some in own]
+        widest = max(some.std() for some in own)
+        gaps[name] = np.ptp(medians[name]) / max(widest, 1e-300)
+    by_gap = sorted(gaps, key=gaps.__getitem__, reverse=True)
+    # No farther apart than they are wide, they do not tell modes apart; one does most.
+    apart = [name for name in by_gap[:_SAID] if gaps[name] > 1] or by_gap[:1]
+    each = []
+    for m in np.argsort(-numbers, stable=True):
+        place = ", ".join(f"{name} = {medians[name][m]:.3g}" for name in apart)
+        each.append(f"{numbers[m] / modes.size:.0%} of the draws around {place}")
+    return [
+        f"the posterior has {len(labels)} modes{counted}: {'; '.join(each)}. Means and standard "
+        "deviations over all draws describe none of them: look at each by itself, or state a prior "
+        "that excludes what cannot be"
+    ]

@@ -76,7 +76,7 @@ def _other_optimum(rival: Mapping[str, Any], point: Mapping[Any, Any]) -> str:
     if rival["comparable"]:
         judged = "the data could as well come from there"
     else:
-        judged = "the data speak against it"
+        judged = "the data fit it less well; a posterior tells how much it counts"
     return f"Another optimum is at {at}, with discrepancy {discrepancy}: {judged}."
 
 

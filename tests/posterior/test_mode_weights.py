@@ -16,7 +16,13 @@ from prbayes.estimate.data_sets import observed_set
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.adjustment import _with_overlooked
-from prbayes.posterior.mode_weights import Mode, _given_estimate, dealt_out, mode_weights
+from prbayes.posterior.mode_weights import (
+    Mode,
+    _given_estimate,
+    dealt_out,
+    mode_weights,
+    of_several_modes,
+)
 
 SCATTER = 0.5
 
@@ -155,6 +161,29 @@ def test_draws_are_dealt_out() -> None:
     np.testing.assert_array_equal(modes, nearest)
 
 
+def test_several_modes_are_said() -> None:
+    rng = np.random.default_rng(1)
+    modes = np.repeat([0, 2], [30, 70])
+    centers = np.repeat([[1.0, 5.0, 0.1], [3.0, -5.0, 0.2]], [30, 70], axis=0)
+    values = centers + rng.normal(0, [0.1, 0.1, 1.0], (100, 3))
+    draws = {"mu": values[:, :2], "sigma": values[:, 2], "fixed": np.ones(100)}
+    (said,) = of_several_modes(draws, modes, ", which count as epsilon says")
+    medians = np.median(values[modes == 2], axis=0)
+    # The one with more draws first, and what tells them apart best.
+    assert said.startswith(
+        "the posterior has 2 modes, which count as epsilon says: 70% of the draws around "
+        f"mu[1] = {medians[1]:.3g}, mu[0] = {medians[0]:.3g}; "
+        "30% of the draws around mu[1] = "
+    )
+    many = {f"x{i}": modes * (i + 2) + values[:, 2] for i in range(6)}
+    (said,) = of_several_modes(many, modes, "")
+    assert said.startswith("the posterior has 2 modes: 70% of the draws around x5 = ")
+    assert said.count("=") == 8
+    (said,) = of_several_modes({"mu": values[:, 2] + 0.5 * modes}, modes, "")
+    assert "70% of the draws around mu = " in said
+    assert of_several_modes(draws, np.zeros(100, dtype=int), "") == []
+
+
 def posterior(model: pm.Model, **chosen: Any) -> Any:
     return prb.sample_smc(
         200, chains=2, model=model, random_seed=1, progressbar=False, **chosen
@@ -192,6 +221,11 @@ def test_draws_of_the_posterior_are_of_such_shares(
     assert "2 modes each by itself, of shares" in done
     said = sorted(float(word) for word in done.split("of shares ")[1].split(" and "))
     np.testing.assert_allclose(said, sorted([share, 1 - share]), atol=0.01)
+    *_, warning = found.attrs["warnings"].splitlines()
+    assert warning.startswith("the posterior has 2 modes: ")
+    middle = np.median(found["mu"].values[found["mu"].values > 0])
+    assert f"{share:.0%} of the draws around mu = {middle:.3g}" in warning
+    assert f"{1 - share:.0%} of the draws around mu = -" in warning
 
 
 def test_epsilon_tells_where_responses_are_not_stored() -> None:

@@ -101,7 +101,10 @@ def test_other_optima_are_told(calibrated: Any, section: Any) -> None:
         "Another optimum is at mu = -1.500, with discrepancy 0.2500: "
         "the data could as well come from there."
     )
-    assert text[2].endswith("at mu = 3.000, with discrepancy 0.2500: the data speak against it.")
+    assert text[2].endswith(
+        "at mu = 3.000, with discrepancy 0.2500: the data fit it less well; a posterior tells how "
+        "much it counts."
+    )
     vector = ({"point": {"w": np.array([1.0, 2.0])}, "discrepancy": 0.25, "comparable": True},)
     optimum = dataclasses.replace(optimum, rivals=vector)
     text = section(prb.Report("x", optimum=optimum, pictures=False), "Optimum").text
