@@ -20,9 +20,15 @@ from prbayes._checks import AT_ONCE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.hyperparameters import Hyperparameters
 from prbayes.model.node import Node, log_kernel, priors_alone, required_nodes
+from prbayes.propagation.base import Bound
+from prbayes.propagation.cloud import CLOUD
 from prbayes.propagation.reweighted import Design
 from prbayes.response.budget import budget
 from prbayes.response.compilation import compile_batched, compiled, ninf_for_invalid, untraced
+
+# Points of a design from which on an eighth of them serve on the way to an answer: those of the
+# smallest cloud.
+_LARGE = CLOUD
 
 
 @dataclass(frozen=True)
@@ -309,6 +315,21 @@ class Evaluator:
         other._variables = [self._variables[k]]
         for name in ("_roots", "_roots_slopes"):
             vars(other).pop(name, None)
+        other.__dict__["objective"] = other._uncompiled
+        return other
+
+    def coarser(self) -> Evaluator | None:
+        """Return an evaluator with an eighth of the points of large designs; None if none is."""
+        bounds: list[Bound] = []
+        for node in self.nodes:
+            design = node.design
+            large = design is not None and design.n_points >= _LARGE
+            bounds.append(design.coarser() if design is not None and large else node.bound)
+        pairs = list(zip(self.nodes, bounds, strict=True))
+        if all(node.bound is bound for node, bound in pairs):
+            return None
+        other = copy.copy(self)
+        other.nodes = [replace(node, bound=bound) for node, bound in pairs]
         other.__dict__["objective"] = other._uncompiled
         return other
 

@@ -81,6 +81,7 @@ class Chains:
             TextColumn("acceptance {task.fields[rate]:.2f}"),
             TimeElapsedColumn(),
         )
+        coarser = self.evaluator.coarser()
         done: list[Chain] = []
         stats: list[Stages] = []
         stopped = ""
@@ -97,7 +98,7 @@ class Chains:
                     stats.append(self._saved["stats"][chain])
                     continue
                 try:
-                    kernel, stages = self._begun(chain, seed)
+                    kernel, stages = self._begun(chain, seed, coarser)
                     for _ in self._stages(kernel, stages):
                         self._save(done, [*stats, stages], kernel)
                         progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
@@ -120,12 +121,19 @@ class Chains:
         BudgetError
             If a budget is spent before the last one.
         """
-        while kernel.beta < 1:
+        while kernel.beta < 1 or kernel.roughly:
             if len(stages["beta"]) == self.max_stages:
                 raise BudgetError(
                     f"max_stages = {self.max_stages} was reached (beta {kernel.beta:.3g}, of 1)"
                 )
-            kernel.update_beta_and_weights()
+            if kernel.beta < 1:
+                kernel.update_beta_and_weights()
+            elif not kernel.go_over(self.evaluator):
+                # An eighth of the points saw another posterior: once more, on all of them.
+                kernel.initialize(kernel.start, kernel.rng)
+                for values in stages.values():
+                    values.clear()
+                continue
             for name, value in kernel.step().items():
                 stages[name].append(value)
             yield
@@ -158,20 +166,31 @@ class Chains:
             return None
         return Chain(**self._arrays(f"chain{chain}_"))
 
-    def _begun(self, chain: int, seed: np.random.SeedSequence) -> tuple[BatchedKernel, Stages]:
-        """Return a kernel at the stage its chain had reached, and the statistics until then."""
+    def _begun(
+        self, chain: int, seed: np.random.SeedSequence, coarser: Evaluator | None
+    ) -> tuple[BatchedKernel, Stages]:
+        """Return a kernel at the stage its chain had reached, and the statistics until then.
+
+        On the way it has a coarser evaluator, if there is one.
+        """
         evaluator = self.evaluator
+        saved = self._saved
+        goes_on = chain == saved.get("chain")
+        roughly = saved["state"]["roughly"] if goes_on else coarser is not None
         (stream,) = seed.generate_state(1)
         for node in evaluator.nodes:
             node.bound.restart(int(stream))
         kernel = BatchedKernel(
-            self.draws, model=evaluator.model, threshold=self.threshold, evaluator=evaluator
+            self.draws,
+            model=evaluator.model,
+            threshold=self.threshold,
+            evaluator=coarser if roughly and coarser is not None else evaluator,
         )
-        if chain != self._saved.get("chain"):
+        kernel.roughly = roughly
+        if not goes_on:
             start = None if self.starts is None else self.starts[chain]
             kernel.initialize(start, np.random.default_rng(seed))
             return kernel, {name: [] for name in kernel.stats_dtypes_shapes}
-        saved = self._saved
         kernel.restore(self._arrays("now_"), saved["state"])
         for node in evaluator.nodes:
             if node.bound.random:

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pymc as pm
 from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
+from scipy.special import logsumexp
 
 from prbayes._checks import Floats, positive_integer, share
 from prbayes._checks import random_seed as refuse_seed
@@ -21,6 +22,9 @@ from prbayes.model.start import starting_thetas
 # standard deviation, of 400 draws, as another seed does (docs/constants.md).
 _UNCORRELATED = 0.05
 _ON_THE_WAY = 6
+# Share of the particles that have to carry the weight where another evaluator weighs them, by
+# judgement: they move afterwards until they forget where they were.
+_SERVE = 0.2
 
 
 class BatchedKernel(SMC_KERNEL):
@@ -83,6 +87,8 @@ class BatchedKernel(SMC_KERNEL):
             size = int(np.prod(shape, dtype=int))
             self.var_info[name] = (shape, size)
         self.rng = np.random.default_rng(random_seed)
+        # Whether the evaluator is a coarser one, that `go_over` is to follow.
+        self.roughly = False
         self._reset_state()
 
     def set_rng(self, rng: np.random.Generator) -> None:
@@ -125,11 +131,31 @@ class BatchedKernel(SMC_KERNEL):
         self.discrepancies = self.discrepancies[index]
         self.lost = self.lost[index]
 
+    def go_over(self, evaluator: Evaluator) -> bool:
+        """Weigh the particles by another evaluator, for the next step; return whether they serve.
+
+        They do not where few of them would carry the weight.
+        """
+        self.evaluator = evaluator
+        self.roughly = False
+        before = self.likelihood_logp
+        found = self._evaluate(self.tempered_posterior)
+        self.prior_logp, self.likelihood_logp, self.discrepancies, self.lost = found
+        with np.errstate(invalid="ignore"):
+            log_weights = np.nan_to_num(self.likelihood_logp - before, nan=-np.inf)
+        total = logsumexp(log_weights)
+        if not np.isfinite(total):
+            return False
+        self.weights = np.exp(log_weights - total)
+        self.log_marginal_likelihood += total - np.log(self.draws)
+        return bool(1 / np.square(self.weights).sum() > _SERVE * self.draws)
+
     def mutate(self) -> None:
         """Move all particles by Metropolis-Hastings steps that keep the tempered posterior."""
         before = self.tempered_posterior.copy()
         fitted = Normal.of(before)
-        enough = _UNCORRELATED if self.beta == 1 else _UNCORRELATED * _ON_THE_WAY
+        at_the_end = self.beta == 1 and not self.roughly
+        enough = _UNCORRELATED if at_the_end else _UNCORRELATED * _ON_THE_WAY
         # The scale that is best for normal targets, steered to an acceptance rate between those for
         # many dimensions and for one: Roberts, Gelman and Gilks (1997),
         # doi:10.1214/aoap/1034625254.
@@ -201,6 +227,7 @@ class BatchedKernel(SMC_KERNEL):
             "lost": self.lost,
         }
         note = {
+            "roughly": self.roughly,
             "beta": self.beta,
             "evidence": self.log_marginal_likelihood,
             "iteration": self.iteration,
@@ -215,6 +242,7 @@ class BatchedKernel(SMC_KERNEL):
         self.likelihood_logp = arrays["likelihood"].copy()
         self.discrepancies = arrays["discrepancies"].copy()
         self.lost = arrays["lost"].copy()
+        self.roughly = note["roughly"]
         self.beta = note["beta"]
         self.log_marginal_likelihood = note["evidence"]
         self.iteration = note["iteration"]

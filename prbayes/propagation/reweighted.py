@@ -771,6 +771,10 @@ class Design(Bound):
     @contextmanager
     def part(self, rows: NDArray[np.bool_]) -> Iterator[None]:
         """Take weights of some of the points only, inside."""
+        with self._instead(self._part(rows)):
+            yield
+
+    def _part(self, rows: NDArray[np.bool_]) -> Contents:
         table = self.contents.table
         some = Table(
             points=tuple(x[rows] for x in table.points),
@@ -778,8 +782,7 @@ class Design(Bound):
             log_g=table.log_g[rows],
             blocks=table.blocks[rows],
         )
-        with self._instead(replace(self.contents, table=some)):
-            yield
+        return replace(self.contents, table=some)
 
     @contextmanager
     def alone(self) -> Iterator[None]:
@@ -1002,6 +1005,16 @@ class Design(Bound):
         other._others = deque(self._others, maxlen=self._others.maxlen)
         other._shared = []
         other._share(self._held())
+        other._forget_compiled()
+        return other
+
+    def coarser(self) -> Self:
+        """Return a design with an eighth of the points; it is not to grow."""
+        other = super().copied()
+        other._contents = self._part(self.blocks == 0)
+        other._basis = (None, None, None)
+        other._shared = []
+        other._share(other._arrays())
         other._forget_compiled()
         return other
 

@@ -405,6 +405,36 @@ def test_data_above_the_inputs_is_followed(propagation: Propagation) -> None:
 # Travelling.
 
 
+def test_large_designs_have_coarser_ones() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
+        y = pm.Normal.dist(0.0, 1.0)
+        for name, n in {"small": 128, "large": 8192}.items():
+            prb.Simulator(
+                name,
+                lambda x, y: x + y**2,
+                x,
+                y,
+                metric=prb.KullbackLeibler(),
+                observed=np.linspace(-1, 3, 9),
+                propagation=prb.Reweighted(n, emulator=None),
+            )
+    evaluator = Evaluator(model)
+    coarser = evaluator.coarser()
+    assert coarser is not None
+    assert [node.bound.n_points for node in coarser.nodes] == [128, 1024]
+    assert [node.bound.n_points for node in evaluator.nodes] == [128, 8192]
+    assert coarser.nodes[0].bound is evaluator.nodes[0].bound
+    design = evaluator.designs["large"]
+    np.testing.assert_array_equal(coarser.designs["large"].values, design.values[:1024])
+    thetas = np.linspace(-1, 1, 5)[:, None]
+    found, expected = coarser(thetas), evaluator(thetas)
+    np.testing.assert_array_equal(found.discrepancies[:, 0], expected.discrepancies[:, 0])
+    assert np.all(found.discrepancies[:, 1] != expected.discrepancies[:, 1])
+    np.testing.assert_allclose(found.discrepancies[:, 1], expected.discrepancies[:, 1], rtol=0.1)
+    assert coarser.coarser() is None
+
+
 def test_an_evaluator_of_other_data_travels_with_them() -> None:
     evaluator = Evaluator(build(prb.Reweighted(POINTS))[0])
     other = evaluator.observing({"y": OBSERVED + 1})

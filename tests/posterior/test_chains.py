@@ -19,7 +19,16 @@ from prbayes.posterior.smc_kernel import BatchedKernel
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 20)
 DRAWS, CHAINS = 20, 3
-PROPAGATIONS: dict[str, Any] = {"stored": prb.Reweighted(64), "random": prb.Fresh(32)}
+PROPAGATIONS: dict[str, Any] = {
+    "stored": prb.Reweighted(64),
+    "large": prb.Reweighted(512),
+    "random": prb.Fresh(32),
+}
+
+
+@pytest.fixture(autouse=True)
+def _large(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("prbayes.model.evaluator._LARGE", 512)
 
 
 class Killed(Exception):  # noqa: N818
@@ -72,13 +81,18 @@ def stages_of(particles: Particles) -> list[int]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", PROPAGATIONS)
-@pytest.mark.parametrize("where", ["in the first", "between", "in the last"])
+@pytest.mark.parametrize("where", ["in the first", "before its end", "between", "in the last"])
 def test_a_chain_that_was_killed_gives_the_same_particles(
     name: str, where: str, tmp_path: Path
 ) -> None:
     expected = undisturbed(name)
     first, second, _ = stages_of(expected)
-    n_stages = {"in the first": 1, "between": first, "in the last": first + second + 1}[where]
+    n_stages = {
+        "in the first": 1,
+        "before its end": first - 1,
+        "between": first,
+        "in the last": first + second + 1,
+    }[where]
     with pytest.MonkeyPatch.context() as patch:
         kill_after(n_stages, patch)
         with pytest.raises(Killed):
@@ -105,10 +119,61 @@ def test_chains_are_independent_of_one_another() -> None:
             assert not np.isin(thetas[one], thetas[other]).any()
 
 
-def test_the_discrepancies_are_those_of_the_particles() -> None:
-    found = undisturbed("stored")
-    again = evaluator("stored")(found.thetas.reshape(-1, 1)).discrepancies
+@pytest.mark.parametrize("name", ["stored", "large"])
+def test_the_discrepancies_are_those_of_the_particles(name: str) -> None:
+    found = undisturbed(name)
+    again = evaluator(name)(found.thetas.reshape(-1, 1)).discrepancies
     np.testing.assert_allclose(found.discrepancies.reshape(-1, 1), again)
+
+
+def test_large_designs_are_whole_in_the_last_stage_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[list[int]] = []
+    original = BatchedKernel.mutate
+
+    def mutate(self: BatchedKernel) -> None:
+        seen[-1].append(self.evaluator.nodes[0].bound.n_points)
+        original(self)
+
+    def begun(self: Any, *rest: Any) -> Any:
+        seen.append([])
+        return beginning(self, *rest)
+
+    beginning = Chains._begun
+    monkeypatch.setattr(BatchedKernel, "mutate", mutate)
+    monkeypatch.setattr(Chains, "_begun", begun)
+    found = run("large")
+    assert len(seen) == CHAINS
+    for points, stages in zip(seen, found.stats, strict=True):
+        assert points == [64] * (len(points) - 1) + [512]
+        # Twice at one: on an eighth of the points, and on all of them.
+        betas = stages["beta"]
+        assert betas[-2:] == [1, 1]
+        assert max(betas[:-2]) < 1
+        assert np.isnan(stages["log_marginal_likelihood"][:-2]).all()
+
+
+def test_where_few_particles_serve_the_chain_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("prbayes.posterior.smc_kernel._SERVE", 1.1)
+    found = run("large")
+    for stages in found.stats:
+        assert stages["beta"].count(1) == 1
+        assert np.all(np.diff(stages["beta"]) > 0)
+        assert {len(values) for values in stages.values()} == {len(stages["beta"])}
+    again = evaluator("large")(found.thetas.reshape(-1, 1)).discrepancies
+    np.testing.assert_allclose(found.discrepancies.reshape(-1, 1), again)
+
+
+def test_coarser_designs_change_no_posterior(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = evaluator("large")
+    some = [Chains(own, 500, 0.5, None)(np.random.SeedSequence(s).spawn(2), False) for s in (1, 2)]
+    monkeypatch.setattr("prbayes.model.evaluator._LARGE", 513)
+    whole = Chains(own, 500, 0.5, None)(np.random.SeedSequence(3).spawn(4), False)
+    thetas = np.concatenate([found.thetas for found in some])
+    assert abs(thetas.mean() - whole.thetas.mean()) < 0.2 * whole.thetas.std()
+    assert thetas.std() == pytest.approx(whole.thetas.std(), rel=0.15)
+    evidence = [found.stats[i]["log_marginal_likelihood"][-1] for found in some for i in (0, 1)]
+    others = [stages["log_marginal_likelihood"][-1] for stages in whole.stats]
+    np.testing.assert_allclose(np.mean(evidence), np.mean(others), atol=0.2)
 
 
 def test_a_saved_refinement_is_of_rounds_that_are_over(tmp_path: Path) -> None:

@@ -171,6 +171,37 @@ def test_resampling_takes_particles_by_their_weights() -> None:
     np.testing.assert_array_equal(kernel.discrepancies, before[1][taken])
 
 
+def test_another_evaluator_weighs_the_particles() -> None:
+    # A standard normal at beta 1, of prior and likelihood exp(-x^2 / 4) each.
+    kernel = at_standard_normal(4000, Quadratic())
+    kernel.beta, kernel.draws, kernel.roughly = 1.0, 4000, True
+    kernel.likelihood_logp /= 2
+    kernel._evaluate = Quadratic()
+    assert kernel.go_over(evaluator())
+    assert not kernel.roughly
+    assert kernel.evaluator is evaluator()
+    # The mean of exp(-x^2 / 4) in two dimensions is 2/3; variances become 2/3.
+    assert kernel.log_marginal_likelihood == pytest.approx(np.log(2 / 3), abs=0.03)
+    kernel.resample()
+    np.testing.assert_allclose(kernel.tempered_posterior.var(axis=0), 2 / 3, rtol=0.1)
+    np.testing.assert_array_equal(kernel.likelihood_logp, Quadratic()(kernel.tempered_posterior)[1])
+
+
+def test_particles_that_carry_no_weight_do_not_serve() -> None:
+    kernel = at_standard_normal(1000, Quadratic())
+    kernel.beta, kernel.draws = 1.0, 1000
+    kernel._evaluate = Quadratic(within=0.0)
+    assert not kernel.go_over(evaluator())
+    kernel = at_standard_normal(1000, Quadratic())
+    kernel.draws = 1000
+    kernel._evaluate = Quadratic(within=0.2)  # 16% of them
+    assert not kernel.go_over(evaluator())
+    kernel = at_standard_normal(1000, Quadratic())
+    kernel.draws = 1000
+    kernel._evaluate = Quadratic(within=0.4)  # 31%
+    assert kernel.go_over(evaluator())
+
+
 def test_a_state_that_is_restored_goes_on_bit_for_bit() -> None:
     kernel = begun()
     stage(kernel)
