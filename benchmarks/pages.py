@@ -180,7 +180,9 @@ def ranks() -> Iterator[Row]:
             mean = f"{short(told['mean rank'], 3)} ± {short(told['error of mean rank'], 3)}"
             within = short(told["share within 89%"], 3)
             p = short(told["p of Kolmogorov and Smirnov"])
-            yield [model, labels[model], name, str(told["data sets"]), mean, within, p]
+            error = short(told["error of it"], 3)
+            off = f"{short(told["off the exact posterior's"], 3)} ± {error}"
+            yield [model, labels[model], name, str(told["data sets"]), mean, off, within, p]
 
 
 def _mean_ratio(ratios: Any) -> str:
