@@ -176,7 +176,7 @@ class Chains:
         evaluator = self.evaluator
         saved = self._saved
         goes_on = chain == saved.get("chain")
-        roughly = saved["state"]["roughly"] if goes_on else coarser is not None
+        roughly = saved["state"].get("roughly", False) if goes_on else coarser is not None
         (stream,) = seed.generate_state(1)
         for node in evaluator.nodes:
             node.bound.restart(int(stream))

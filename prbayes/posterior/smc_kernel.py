@@ -242,7 +242,7 @@ class BatchedKernel(SMC_KERNEL):
         self.likelihood_logp = arrays["likelihood"].copy()
         self.discrepancies = arrays["discrepancies"].copy()
         self.lost = arrays["lost"].copy()
-        self.roughly = note["roughly"]
+        self.roughly = note.get("roughly", False)  # of an earlier version
         self.beta = note["beta"]
         self.log_marginal_likelihood = note["evidence"]
         self.iteration = note["iteration"]

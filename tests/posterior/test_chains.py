@@ -159,6 +159,10 @@ def test_where_few_particles_serve_the_chain_begins_anew(monkeypatch: pytest.Mon
         assert stages["beta"].count(1) == 1
         assert np.all(np.diff(stages["beta"]) > 0)
         assert {len(values) for values in stages.values()} == {len(stages["beta"])}
+    # From the prior: all of the evidence is gathered once more.
+    evidence = [stages["log_marginal_likelihood"][-1] for stages in found.stats]
+    others = [stages["log_marginal_likelihood"][-1] for stages in undisturbed("large").stats]
+    assert np.mean(evidence) == pytest.approx(np.mean(others), abs=0.5)
     again = evaluator("large")(found.thetas.reshape(-1, 1)).discrepancies
     np.testing.assert_allclose(found.discrepancies.reshape(-1, 1), again)
 
