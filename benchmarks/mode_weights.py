@@ -30,7 +30,6 @@ from scipy.stats import norm
 
 from benchmarks import record
 
-RESULT = record.RESULTS / "mode_weights.json"
 METRICS = {"PR": "ProbabilityResidual", "KLD": "KullbackLeibler", "area": "AreaMetric"}
 SIZES = (8, 20)
 SCATTER = 0.5
@@ -169,7 +168,6 @@ def cell(kind: str, size: int, name: str, replicates: int) -> dict[str, Any]:
     found = [calibrated(evaluator, problem, metric, y, i) for i, (_, y) in enumerate(sets)]
     by_epsilon, dealt = np.transpose(found)
     return {
-        "problem": kind,
         "N": size,
         "metric": name,
         "data sets": replicates,
@@ -188,15 +186,16 @@ def main() -> None:
     parser.add_argument("--problems", nargs="+", default=list(PROBLEMS), choices=list(PROBLEMS))
     arguments = parser.parse_args()
     logging.getLogger("prbayes").setLevel(logging.ERROR)
-    rows = []
     print("problem   N  metric     log score, slope: epsilon    dealt out        exact")
-    for kind, size, name in product(arguments.problems, arguments.sizes, arguments.metrics):
-        row = cell(kind, size, name, arguments.replicates)
-        rows.append(row)
-        told = [row[by] for by in ("epsilon", "dealt out", "exact")]
-        columns = [f"{each['log score']:.3f} {each['slope']:5.2f}" for each in told]
-        print(f"{kind:7s} {size:3d}  {name:6s} {'':18s} " + "     ".join(columns), flush=True)
-        record.save(RESULT, rows)
+    for kind in arguments.problems:
+        rows = []
+        for size, name in product(arguments.sizes, arguments.metrics):
+            row = cell(kind, size, name, arguments.replicates)
+            rows.append(row)
+            told = [row[by] for by in ("epsilon", "dealt out", "exact")]
+            columns = [f"{each['log score']:.3f} {each['slope']:5.2f}" for each in told]
+            print(f"{kind:7s} {size:3d}  {name:6s} {'':18s} " + "     ".join(columns), flush=True)
+        record.save(record.RESULTS / f"mode_weights_{kind}.json", rows)
 
 
 if __name__ == "__main__":

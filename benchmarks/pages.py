@@ -611,9 +611,11 @@ def at_a_fold() -> Iterator[Row]:
 
 def mode_weights() -> Iterator[Row]:
     """Return the rows of what shares of modes are worth."""
-    for row in found("mode_weights"):
-        cells = [row[way][what] for way in ("epsilon", "dealt out", "exact") for what in row[way]]
-        yield [str(row["N"]), row["metric"], str(row["data sets"]), *map(short, cells)]
+    ways = ("epsilon", "dealt out", "exact")
+    for kind in ("cubic", "bent"):
+        for row in found(f"mode_weights_{kind}"):
+            cells = [row[way][what] for way in ways for what in row[way]]
+            yield [kind, str(row["N"]), row["metric"], str(row["data sets"]), *map(short, cells)]
 
 
 def random_problems() -> Iterator[Row]:
