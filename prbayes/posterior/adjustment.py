@@ -330,7 +330,8 @@ class Affine:
         width_error = max(found.width_error for found in mapped)
         moves = _moves(draws, out)
         unweighed = counted if counted == BY_EPSILON else ""
-        several = of_several_modes(evaluator.constrained(out), nearest, unweighed)
+        enough = np.bincount(nearest)[nearest] >= _FEWEST
+        several = of_several_modes(evaluator.constrained(out[enough]), nearest[enough], unweighed)
         # Of several modes the one that the prior allows most.
         allowed = max((found.allowed for found in mapped), key=least_probability)
         # Of several modes the constants between them are not known.

@@ -260,3 +260,16 @@ def test_only_what_is_a_mode_is_looked_for() -> None:
     assert _with_overlooked([one], np.concatenate([there, tail])) == [one]
     # The likeliest of all that are far off leads to the other mode.
     assert len(_with_overlooked([one], np.concatenate([tail, there, elsewhere]))) == 2
+
+
+@pytest.mark.parametrize(("number", "said"), [(30, False), (80, True)])
+def test_modes_of_hardly_any_draws_are_not_said(number: int, said: bool) -> None:
+    one, other = (mode.sampling for mode in two(METRICS[0], 2.0))
+    rng = np.random.default_rng(1)
+    draws = [
+        one.thetas(rng.standard_normal((300, 1))),
+        other.thetas(rng.standard_normal((number, 1))),
+    ]
+    optima = [one.theta, other.theta]
+    found = prb.posterior.Affine(40)(one.evaluator, np.concatenate(draws), optima)
+    assert any(line.startswith("the posterior has 2 modes") for line in found.warnings) == said
