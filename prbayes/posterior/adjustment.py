@@ -531,6 +531,9 @@ def _with_overlooked(
         # Where it leads back these draws are the tail of a mode that is known, and as far from it.
         if not mode.stderr.size or (_distance(mode, far) < _FAR).sum() < _FEWEST:
             break
+        # They are a tail, too, where there are draws all the way to it.
+        if _run_together(np.array([_distance(one, draws) for one in (*found, mode)])):
+            break
         found.append(mode)
     return found
 

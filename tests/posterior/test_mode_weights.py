@@ -255,6 +255,9 @@ def test_only_what_is_a_mode_is_looked_for() -> None:
     _, found = _with_overlooked([one], np.concatenate([there, elsewhere]))
     np.testing.assert_allclose(found.theta, other.theta, atol=0.1)
     assert _with_overlooked([one], np.concatenate([there, elsewhere[:49]])) == [one]
+    # With draws all the way to it, it is none.
+    between = np.linspace(one.theta, other.theta, 150)
+    assert _with_overlooked([one], np.concatenate([there, elsewhere, between])) == [one]
     # A tail leads back, and is none.
     tail = one.thetas(np.linspace(7, 9, 60)[:, None])
     assert _with_overlooked([one], np.concatenate([there, tail])) == [one]
