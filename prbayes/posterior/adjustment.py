@@ -285,16 +285,16 @@ class Affine:
         """Map the draws of each mode, or say why not."""
         obstacle = refit_obstacle(evaluator)
         if obstacle is not None:
-            return Adjusted(thetas, reason=obstacle)
+            return _not_adjusted(thetas, obstacle)
         draws = thetas.reshape(-1, thetas.shape[-1])
         modes = _identified_modes(evaluator, optima)
         if not modes:
             reason = "the data tell less than the prior about every hyperparameter"
-            return Adjusted(thetas, reason=reason)
+            return _not_adjusted(thetas, reason)
         modes = _with_overlooked(modes, draws)
         distances = np.array([_distance(mode, draws) for mode in modes])
         if _run_together(distances):
-            return Adjusted(thetas, reason="the posterior has modes that run into each other")
+            return _not_adjusted(thetas, "the posterior has modes that run into each other")
         matters = AGREE < design_error < np.inf
         # Two designs differ by the root of two of one's error.
         variance = design_error**2 / 2 if matters else 0.0
@@ -320,12 +320,11 @@ class Affine:
             try:
                 found = self._mapped(mode, draws[own], design_variance)
             except UnsettledError as error:
-                reason = str(error)
-                return Adjusted(thetas, reason=reason, warnings=(_UNADJUSTED.format(reason),))
+                return _not_adjusted(thetas, str(error))
             out[own] = found.draws
             mapped.append(found)
         if not mapped:
-            return Adjusted(thetas, reason=f"there are fewer than {_FEWEST} draws of a mode")
+            return _not_adjusted(thetas, f"there are fewer than {_FEWEST} draws of a mode")
         center_error = max(found.center_error for found in mapped)
         width_error = max(found.width_error for found in mapped)
         moves = _moves(draws, out)
@@ -461,7 +460,10 @@ class Mapped:
     log_likelihood: Floats | None = None  # (n,): of the draws, where it is known
 
 
-_UNADJUSTED = "the draws are not adjusted: {}; their width is epsilon's"
+def _not_adjusted(thetas: Floats, reason: str) -> Adjusted:
+    """Return the draws that were given, and say why they stay as they are."""
+    said = f"the draws are not adjusted: {reason}; their width is epsilon's"
+    return Adjusted(thetas, reason=reason, warnings=(said,))
 
 
 def _moves(before: Floats, after: Floats) -> Floats:

@@ -451,15 +451,10 @@ class _Draws:
 
     def warn(self) -> None:
         """Say it in the log."""
-        if self.reason is not None:
-            _log.warning(
-                "the draws are not adjusted: %s; their width is epsilon's%s",
-                self.reason,
-                more_in("choose.md#epsilon-and-the-width-of-the-posterior"),
-            )
-            return
+        unadjusted = self.reason is not None
+        where = more_in("choose.md#epsilon-and-the-width-of-the-posterior") if unadjusted else ""
         for line in self.warnings:
-            _log.warning("%s", line)
+            _log.warning("%s%s", line, where)
 
     @property
     def measured(self) -> dict[str, float]:

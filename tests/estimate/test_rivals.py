@@ -205,6 +205,8 @@ def test_modes_that_run_into_each_other_are_left_alone(caplog: pytest.LogCapture
     )
     assert "unadjusted" not in idata.children
     assert "modes that run into each other; their width is epsilon's" in caplog.text
+    # Whoever reads the report alone is told as well.
+    assert "run into each other" in idata.posterior.attrs["warnings"]
 
 
 # -- unidentified directions
