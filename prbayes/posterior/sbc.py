@@ -9,7 +9,7 @@ import logging
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, as_completed
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any
 
@@ -61,7 +61,7 @@ def simulation_based_calibration(
     draws : int
         Draws of each posterior, in one chain.
     adjust : Affine or bool
-        As in `sample_smc`.
+        As in `sample_smc`, but with another ``random_seed`` for each data set.
     executor : concurrent.futures.Executor, optional
         Where data sets are analysed, ten at a time; the model is sent with cloudpickle.
     random_seed : int, sequence of int, numpy.random.Generator or None
@@ -203,7 +203,10 @@ def _one(evaluator: Evaluator, job: _Job, rng: np.random.Generator) -> dict[str,
     theta = evaluator.prior_thetas(1, theta_seed)[0]
     data = fresh_data(evaluator, theta, rng)
     draws_seed = int(rng.integers(2**31))
-    asked = Sampling(draws=job.draws, adjust=job.adjust, random_seed=draws_seed)
+    adjust = job.adjust
+    if isinstance(adjust, Affine):  # the same refits for all data sets would err alike
+        adjust = replace(adjust, random_seed=draws_seed)
+    asked = Sampling(draws=job.draws, adjust=adjust, random_seed=draws_seed)
     posterior = sample(evaluator.observing(data), asked)["posterior"]
     row = {}
     for name, (truth,) in evaluator.constrained(theta[None]).items():

@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any, Protocol
 
@@ -93,10 +93,10 @@ def sample_smc(
         Where to calibrate epsilon, and the centre of the adjustment; `minimize` finds it if needed.
     adjust : Affine or bool
         Whether, and how, the draws are brought to the width that the data warrant. By default by
-        ``prb.posterior.GivenEstimate()``, and not where they are the posterior as they are, as
-        those of `LogLikelihood` with one simulator, stored responses and epsilon = 1/N; nor where
-        an epsilon was given, which is then taken at its word. An `Affine` or `GivenEstimate` that
-        is given adjusts in any case.
+        ``prb.posterior.GivenEstimate()`` with the same ``random_seed``, and not where they are the
+        posterior as they are, as those of `LogLikelihood` with one simulator, stored responses and
+        epsilon = 1/N; nor where an epsilon was given, which is then taken at its word. An `Affine`
+        or `GivenEstimate` that is given adjusts in any case.
     threshold : float
         Share of the effective sample size that a stage keeps; higher means more stages.
     refine : bool
@@ -390,10 +390,16 @@ def _rounds(
         **told,
     )
     entropy = asked.random_seed if saved is None else int(saved.settings["entropy"])
+    seeds = np.random.SeedSequence(entropy)
+    if adjustment is not None and not isinstance(asked.adjust, Affine):
+        # Other seeds tell the Monte Carlo error of refits as well.
+        own = asked.random_seed
+        own = int(seeds.generate_state(1)[0]) if own is None else own
+        adjustment = replace(adjustment, random_seed=own)
     return Rounds(
         run=Chains(evaluator, asked.draws, asked.threshold, saved, asked.max_stages, starts),
         chains=asked.chains,
-        seeds=np.random.SeedSequence(entropy),
+        seeds=seeds,
         adjustment=adjustment,
         optima=() if optimum is None else optima_of(optimum, evaluator),
         design_error=0.0 if optimum is None else optimum.design_error,

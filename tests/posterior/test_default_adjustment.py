@@ -1,5 +1,7 @@
 """What adjusts draws where nobody chose."""
 
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,6 +51,24 @@ def test_draws_are_those_given_the_estimate_but_for_a_likelihood() -> None:
 )
 def test_what_is_not_quite_a_likelihood_is_adjusted(keywords: dict[str, Any]) -> None:
     assert chosen(**{"metric": METRICS["ll"]} | keywords) == GivenEstimate()
+
+
+def test_another_seed_has_other_refits(tmp_path: Path) -> None:
+    optimum = prb.minimize(build(METRICS["kl"]))
+    run = partial(prb.sample_smc, 40, model=optimum.model, optimum=optimum, progressbar=False)
+
+    def done(**keywords: Any) -> str:
+        return str(run(**keywords).posterior.attrs["adjustment"])
+
+    assert "random_seed=3," in done(random_seed=3)
+    # Nobody's own seed is changed, and without a seed there is none twice.
+    given = GivenEstimate(random_seed=5, n_fits=200)
+    assert "random_seed=5," in done(random_seed=3, adjust=given)
+    unseeded = run(random_seed=None, checkpoint=tmp_path / "state.npz")
+    assert done(random_seed=None) != unseeded.posterior.attrs["adjustment"]
+    again = run(random_seed=None, checkpoint=tmp_path / "state.npz")
+    assert again.posterior.attrs["adjustment"] == unseeded.posterior.attrs["adjustment"]
+    xr.testing.assert_equal(again.posterior, unseeded.posterior)
 
 
 def grouped(metric: prb.Metric) -> pm.Model:

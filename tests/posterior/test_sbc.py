@@ -4,6 +4,7 @@ import logging
 import multiprocessing
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import nodes
 from prbayes.posterior import sbc
+from prbayes.posterior.smc import Sampling, sample
 from prbayes.response.compilation import PLAIN
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
@@ -152,6 +154,21 @@ def test_data_sets_do_not_depend_on_their_number() -> None:
     )
     other = prb.simulation_based_calibration(model=model, random_seed=1, **(RUN | {"n": 2}))
     assert not np.isin(other.truth["mu"].values, result.truth["mu"].values).any()
+
+
+def test_each_data_set_has_refits_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, _ = serial()
+    seen: list[Any] = []
+
+    def asked_for(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
+        seen.append(asked.adjust)
+        return sample(evaluator, replace(asked, adjust=False))
+
+    monkeypatch.setattr(sbc, "sample", asked_for)
+    adjust = prb.posterior.Affine(n_sets=50)
+    prb.simulation_based_calibration(model=model, adjust=adjust, **(RUN | {"n": 2}))
+    assert {one.n_sets for one in seen} == {50}
+    assert len({one.random_seed for one in seen}) == 2
 
 
 def test_ranks_count_the_draws_below_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
