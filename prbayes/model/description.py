@@ -14,6 +14,7 @@ from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
 
 from prbayes.model.node import Node, nodes, response_name
+from prbayes.response.inputs import is_random
 
 # What is told of a variable and of a simulator.
 _VARIABLE = ("name", "role", "distribution")
@@ -150,6 +151,9 @@ def _constants(rv: Any) -> list[str]:
     for parameter in parameters:
         while parameter.owner is not None and len(parameter.owner.inputs) == 1:
             (parameter,) = parameter.owner.inputs  # with other axes
+        if is_random(parameter):  # as standard deviations are that a covariance has
+            found += _constants(parameter)
+            continue
         value = getattr(parameter, "data", None)
         if value is None or np.size(value) == 1:
             continue

@@ -141,6 +141,7 @@ def test_arrays_of_constants_are_told() -> None:
         pm.HalfNormal("scale", np.full(2, 0.2))
         pm.Normal("many", np.arange(9.0), [[1.0], [2.0]])
         pm.LKJCholeskyCov("chol", n=2, eta=2, sd_dist=pm.HalfNormal.dist(0.4, shape=2))
+        pm.LKJCholeskyCov("other", n=2, eta=2, sd_dist=pm.HalfNormal.dist([0.4, 2.0]))
         x = pm.MvNormal.dist(location, np.diag([1.0, 2.0]))
         prb.Simulator("y", lambda x: x[..., 0], x, metric=prb.AreaMetric(), observed=[1.0, 2.0])
     told = {v["name"]: v["distribution"] for v in describe(model)["variables"]}
@@ -148,6 +149,7 @@ def test_arrays_of_constants_are_told() -> None:
     assert told["scale"] == "HalfNormal(0, [0.2, 0.2])"
     assert told["many"] == "Normal(9 numbers, [1, 2])"
     assert told["chol"] == "LKJCholeskyCov(2, 2, HalfNormal(0, 0.4))"
+    assert told["other"] == "LKJCholeskyCov(2, 2, HalfNormal(0, [0.4, 2]))"
     (simulator,) = describe(model)["simulators"]
     assert simulator["response"] == "lambda(x)"
     assert simulator["inputs"] == "MultivariateNormal(f(location), [1, 0, 0, 2])"
