@@ -10,6 +10,9 @@ import numpy as np
 
 from prbayes._checks import Floats
 
+# A smaller gain, in typical sizes of the objective, is rounding of a sum over thousands of points.
+_ROUNDING = 1e-10
+
 
 class SpentError(Exception):
     """The budget of evaluations is spent."""
@@ -74,6 +77,8 @@ class Objective:
         self.most = most
         self.count = 0
         self.patience: float = np.inf
+        self.least_gain = 0.0  # relative, that counts as progress
+        self._progress_at = np.inf
         self._lowest = np.inf
         self._since = 0
         self.thetas: list[Floats] = []
@@ -105,9 +110,11 @@ class Objective:
         self.counts.append(self.count)
 
     def _look_for_progress(self, value: float, cost: int) -> None:
-        # A smaller gain is rounding of a sum over thousands of points.
-        gained = value < self._lowest - 1e-10
+        least = max(_ROUNDING, self.least_gain * abs(self._progress_at))
+        gained = value < self._progress_at - least or not np.isfinite(self._progress_at)
         self._since = 0 if gained else self._since + 1
+        if gained:
+            self._progress_at = value
         self._lowest = min(self._lowest, value)
         self.report(cost, f"discrepancy {self._lowest * self.size:.4g}")
         if self._since > self.patience:

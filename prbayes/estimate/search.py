@@ -30,6 +30,18 @@ _SETTLED = 1e-4
 # Evaluations in a line search without progress; those of scipy that arrive take fewer. By
 # judgement.
 _STALLED = 15
+# The same, and what counts as progress, where gradients jump, so that line searches end in ever
+# smaller steps. What they leave is found by gradients a step apart.
+_STALLED_AT_KINKS = 8
+_PROGRESS_AT_KINKS = 0.1 * _SETTLED
+_SPENT = "max_evaluations = {} was reached before convergence."
+# Most evaluations of a simplex that settles it, for each parameter. By judgement.
+_SIMPLEX = 60
+# Spreads of the prior that gradients are apart, at first: wider than kinks of a thousand points.
+_APART = 0.01
+# Rounds of such gradients, and how far their step may go beyond what they saw. By judgement.
+_ROUNDS = 5
+_BEYOND_SEEN = 10.0
 # Step of differences in spreads of the prior: errors of rounding, 1e-16 / step, and of curvature,
 # step^2, are then both below the tolerance.
 _STEP = 1e-4
@@ -191,6 +203,9 @@ def minimise(search: Search, theta: Floats, scales: Floats, trace: Trace) -> Run
     objective = search.objective(theta, scales, size, gradient=search.gradient, spent=trace.count)
     if search.method.name.lower() in _LINE_SEARCHES:
         objective.patience = _STALLED
+        if any(n.metric.minimum is Minimum.ABSOLUTE for n in search.evaluator.nodes):
+            objective.patience = _STALLED_AT_KINKS
+            objective.least_gain = _PROGRESS_AT_KINKS
     success, message = _scipy(
         search,
         objective,
@@ -212,23 +227,29 @@ def minimise(search: Search, theta: Floats, scales: Floats, trace: Trace) -> Run
 
 
 def settle(search: Search, run: Run) -> Run:
-    """Decide on a line search that gave up: at a kink or rounding, it has if a simplex agrees.
+    """Decide on a line search that gave up, at a kink or rounding.
 
-    Where the discrepancy jumps, since points lose their response there, the simplex is wide enough
-    to step over it.
+    It has converged if gradients around its end promise next to nothing, or else if a simplex
+    agrees. Where the discrepancy jumps, since points lose their response there, the simplex is wide
+    enough to step over it.
     """
     if run.success or not search.gradient or run.trace.count >= search.most:
         return run
+    jumping = jumps(search, run.best)
+    if not jumping:
+        run = _by_gradients(search, run)
+        if run.success or run.trace.count >= search.most:
+            return run
     spent = run.trace.count
     again = search.objective(run.center, run.scales, run.size, gradient=False, spent=spent)
     begin = (run.best - run.center) / search.prior_sd
     # In spreads of the prior: wide enough to step over the jump of a point that loses its response,
     # or small, to see whether a stalled line search is at its minimum.
-    edge = 0.5 if jumps(search, run.best) else 0.01
+    edge = 0.5 if jumping else _APART
     simplex = np.vstack([begin, begin + edge * np.eye(begin.size)])
     options = {
         "initial_simplex": simplex,
-        "maxfev": 60 * begin.size,
+        "maxfev": _SIMPLEX * begin.size,
         # Coarse, since it only has to gain less than _SETTLED.
         "xatol": 1e-4,
         "fatol": 1e-7,
@@ -242,6 +263,67 @@ def settle(search: Search, run: Run) -> Run:
         message=f"{run.message} A simplex from there gained {max(gain, 0):.1e}: {message}",
         trace=run.trace.then(again),
     )
+
+
+def _by_gradients(search: Search, run: Run) -> Run:
+    """Go on by Newton's steps of gradients that lie apart, so that kinks count as curvature.
+
+    The run has converged where such a step neither promises nor gains anything that counts.
+    """
+    spent = run.trace.count
+    objective = search.objective(run.center, run.scales, run.size, gradient=True, spent=spent)
+    # Differences for gradients may take as many evaluations as a simplex.
+    objective.most = min(objective.most, _SIMPLEX * run.best.size)
+    best, lowest, apart = run.best, run.lowest, _APART
+    settled, said = False, ""
+    try:
+        for _ in range(_ROUNDS):
+            at = (best - run.center) / search.prior_sd
+            step, promised = _newton(objective, at, apart)
+            objective(at + step)
+            gain = (lowest - objective.lowest) / max(abs(lowest), 1e-300)
+            promise = promised * run.size / max(abs(lowest), 1e-300)
+            if objective.lowest < lowest:
+                best, lowest = objective.best, objective.lowest
+            settled = max(promise, gain) < _SETTLED
+            if settled:
+                break
+            if gain < _SETTLED:
+                apart /= 4
+        said = f" Gradients around it promise a gain of {promise:.1e}."
+    except SpentError:
+        if spent + objective.count >= search.most:
+            said = f" {_SPENT.format(search.most)}"
+    except BudgetError:
+        said = " Stopped."
+    return replace(
+        run,
+        best=best,
+        lowest=lowest,
+        success=settled,
+        message=run.message + said,
+        trace=run.trace.then(objective),
+    )
+
+
+def _newton(objective: Objective, at: Floats, apart: float) -> tuple[Floats, float]:
+    """Return Newton's step by gradients around a place, and what it promises to gain.
+
+    Infinity where the objective is no number at one of them.
+    """
+    pairs = [(objective(at + step)[1], objective(at - step)[1]) for step in apart * np.eye(at.size)]
+    if not np.isfinite(objective.values[-2 * at.size :]).all():
+        return np.zeros(at.size), np.inf
+    slope = np.mean(pairs, axis=(0, 1))
+    rows = np.array([after - before for after, before in pairs]) / (2 * apart)
+    bends, axes = np.linalg.eigh((rows + rows.T) / 2)
+    along = axes.T @ slope
+    reach = _BEYOND_SEEN * apart
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shift = np.where(bends > 0, -along / bends, -np.inf * np.sign(along))
+    shift = np.clip(np.nan_to_num(shift), -reach, reach)
+    promised = -(along @ shift) - 0.5 * bends @ shift**2
+    return axes @ shift, float(promised)
 
 
 def jumps(search: Search, theta: Floats) -> bool:
@@ -267,7 +349,7 @@ def _scipy(
         with progress("evaluations") as objective.report:
             result = optimize.minimize(objective, begin, **settings)
     except SpentError:
-        return False, f"max_evaluations = {search.most} was reached before convergence."
+        return False, _SPENT.format(search.most)
     except BudgetError:
         if not np.isfinite(objective.lowest):
             raise

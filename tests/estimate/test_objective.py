@@ -68,6 +68,30 @@ def test_a_line_search_without_progress_is_stopped() -> None:
         found(np.zeros(1))
 
 
+def test_small_gains_count_as_progress_once_they_add_up() -> None:
+    values = iter([1.0, *(1 - 1e-3 * k for k in range(1, 40))])
+    found = Objective(
+        lambda t: (next(values), np.zeros(1), 1),
+        np.zeros(1),
+        np.ones(1),
+        1.0,
+        gradient=True,
+        most=99,
+    )
+    found.patience = 4
+    found.least_gain = 3.5e-3  # four steps together, within the patience
+    for _ in range(20):
+        found(np.zeros(1))
+    found.least_gain = 9e-3  # nine steps, beyond it
+    stalled = False
+    for _ in range(12):
+        try:
+            found(np.zeros(1))
+        except StalledError:
+            stalled = True
+    assert stalled
+
+
 def test_a_search_is_held_along_its_directions_alone() -> None:
     units = np.array([0.5, 4.0])
     direction = np.array([[0.6], [0.8]])

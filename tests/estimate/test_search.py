@@ -14,7 +14,8 @@ from scipy import stats
 import prbayes as prb
 from prbayes.estimate.differences import differences
 from prbayes.estimate.methods import Method
-from prbayes.estimate.search import Search, approach, overlap
+from prbayes.estimate.objective import Objective
+from prbayes.estimate.search import Search, _newton, approach, overlap
 from prbayes.model.evaluator import Evaluator
 
 # -- budgets, tolerances, trace
@@ -82,6 +83,48 @@ def test_exact_and_differenced_gradients_agree() -> None:
 
 # -- starting points
 # -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("response", [lambda x: x, lambda x: x**2 - 2 * x + 1], ids=["x", "x^2"])
+def test_the_area_metric_takes_few_evaluations(response: Any) -> None:
+    observed = response(np.random.default_rng(1).normal(2, 0.5, 50))
+    with pm.Model() as other:
+        x = pm.Normal.dist(pm.TruncatedNormal("mu", 2, 1, lower=1), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", response, x, metric=prb.AreaMetric(), observed=observed)
+    found = prb.minimize(other, starts=0)
+    assert found.converged
+    assert "Gradients around it promise a gain of" in found.message
+    # Its line search ends at the kinks of a thousand points: 23 and 26 here, 87 by a simplex.
+    assert found.n_evaluations <= 40
+    simplex = prb.minimize(other, starts=0, method="Nelder-Mead")
+    assert found.discrepancy < simplex.discrepancy * (1 + 1e-4)
+
+
+def valley(t: Any) -> Any:
+    """Return a valley with a kink along its bottom, lowest at (1, -1), and its gradient."""
+    across, along = t[0] + t[1], t[0] - t[1] - 2
+    value = 1 + abs(across) + 0.02 * along**2
+    slope = np.sign(across) * np.ones(2) + 0.04 * along * np.array([1.0, -1.0])
+    return value, slope, 1
+
+
+def test_gradients_a_step_apart_see_along_a_kink() -> None:
+    found = Objective(valley, np.zeros(2), np.ones(2), 1.0, gradient=True, most=100)
+    # At a kink, where each step across goes up, and a line search ends.
+    at = np.array([0.3, -0.3])
+    step, promised = _newton(found, at, 0.01)
+    np.testing.assert_allclose(step[0], -step[1], atol=1e-9)
+    assert 0.05 < step[0] <= 0.1  # as far as it may go beyond what it saw
+    before, after = valley(at)[0], valley(at + step)[0]
+    assert promised == pytest.approx(before - after, rel=0.1)
+    # Beside the lowest place it promises nothing.
+    step, promised = _newton(found, np.array([1.0, -1.0]), 0.01)
+    assert abs(promised) < 1e-12
+    # Where the objective is no number nothing is promised that could count as settled.
+    holes = Objective(
+        lambda t: (np.nan, np.zeros(2), 1), np.zeros(2), np.ones(2), 1.0, gradient=True, most=100
+    )
+    assert _newton(holes, at, 0.01)[1] == np.inf
 
 
 def test_points_of_the_prior_are_spread_evenly_and_follow_hierarchies() -> None:
