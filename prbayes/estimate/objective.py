@@ -11,7 +11,7 @@ import numpy as np
 from prbayes._checks import Floats
 
 # A smaller gain, in typical sizes of the objective, is rounding of a sum over thousands of points.
-_ROUNDING = 1e-10
+_NO_GAIN = 1e-10
 
 
 class SpentError(Exception):
@@ -110,7 +110,7 @@ class Objective:
         self.counts.append(self.count)
 
     def _look_for_progress(self, value: float, cost: int) -> None:
-        least = max(_ROUNDING, self.least_gain * abs(self._progress_at))
+        least = max(_NO_GAIN, self.least_gain * abs(self._progress_at))
         gained = value < self._progress_at - least or not np.isfinite(self._progress_at)
         self._since = 0 if gained else self._since + 1
         if gained:

@@ -38,7 +38,7 @@ _SPENT = "max_evaluations = {} was reached before convergence."
 # Most evaluations of a simplex that settles it, for each parameter. By judgement.
 _SIMPLEX = 60
 # Spreads of the prior that gradients are apart, at first: wider than kinks of a thousand points.
-_APART = 0.01
+_ASTRIDE = 0.01
 # Rounds of such gradients, and how far their step may go beyond what they saw. By judgement.
 _ROUNDS = 5
 _BEYOND_SEEN = 10.0
@@ -245,7 +245,7 @@ def settle(search: Search, run: Run) -> Run:
     begin = (run.best - run.center) / search.prior_sd
     # In spreads of the prior: wide enough to step over the jump of a point that loses its response,
     # or small, to see whether a stalled line search is at its minimum.
-    edge = 0.5 if jumping else _APART
+    edge = 0.5 if jumping else _ASTRIDE
     simplex = np.vstack([begin, begin + edge * np.eye(begin.size)])
     options = {
         "initial_simplex": simplex,
@@ -274,7 +274,7 @@ def _by_gradients(search: Search, run: Run) -> Run:
     objective = search.objective(run.center, run.scales, run.size, gradient=True, spent=spent)
     # Differences for gradients may take as many evaluations as a simplex.
     objective.most = min(objective.most, _SIMPLEX * run.best.size)
-    best, lowest, apart = run.best, run.lowest, _APART
+    best, lowest, apart = run.best, run.lowest, _ASTRIDE
     settled, said = False, ""
     try:
         for _ in range(_ROUNDS):
