@@ -15,7 +15,7 @@ import prbayes as prb
 from prbayes.estimate.differences import differences
 from prbayes.estimate.methods import Method
 from prbayes.estimate.objective import Objective
-from prbayes.estimate.search import Search, _newton, approach, overlap
+from prbayes.estimate.search import Run, Search, Trace, _newton, approach, overlap, settle
 from prbayes.model.evaluator import Evaluator
 
 # -- budgets, tolerances, trace
@@ -93,7 +93,7 @@ def test_the_area_metric_takes_few_evaluations(response: Any) -> None:
         prb.Simulator("y", response, x, metric=prb.AreaMetric(), observed=observed)
     found = prb.minimize(other, starts=0)
     assert found.converged
-    assert "Gradients around it promise a gain of" in found.message
+    assert "gained nothing in 8 evaluations. Gradients around it promise a gain" in found.message
     # Its line search ends at the kinks of a thousand points: 23 and 26 here, 87 by a simplex.
     assert found.n_evaluations <= 40
     simplex = prb.minimize(other, starts=0, method="Nelder-Mead")
@@ -108,23 +108,84 @@ def valley(t: Any) -> Any:
     return value, slope, 1
 
 
+def objective(function: Any) -> Objective:
+    return Objective(function, np.zeros(2), np.ones(2), 1.0, gradient=True, most=100)
+
+
 def test_gradients_a_step_apart_see_along_a_kink() -> None:
-    found = Objective(valley, np.zeros(2), np.ones(2), 1.0, gradient=True, most=100)
     # At a kink, where each step across goes up, and a line search ends.
-    at = np.array([0.3, -0.3])
-    step, promised = _newton(found, at, 0.01)
+    at = np.array([0.2, -0.2])
+    step, promised = _newton(objective(valley), at, 0.01)
     np.testing.assert_allclose(step[0], -step[1], atol=1e-9)
-    assert 0.05 < step[0] <= 0.1  # as far as it may go beyond what it saw
-    before, after = valley(at)[0], valley(at + step)[0]
-    assert promised == pytest.approx(before - after, rel=0.1)
-    # Beside the lowest place it promises nothing.
-    step, promised = _newton(found, np.array([1.0, -1.0]), 0.01)
+    assert np.hypot(*step) == pytest.approx(0.1)  # as far as it may go beyond what it saw
+    assert promised == pytest.approx(valley(at)[0] - valley(at + step)[0], rel=0.1)
+    _, promised = _newton(objective(valley), np.array([1.0, -1.0]), 0.01)
     assert abs(promised) < 1e-12
-    # Where the objective is no number nothing is promised that could count as settled.
-    holes = Objective(
-        lambda t: (np.nan, np.zeros(2), 1), np.zeros(2), np.ones(2), 1.0, gradient=True, most=100
-    )
-    assert _newton(holes, at, 0.01)[1] == np.inf
+    # Where it is smooth the step is Newton's, and where it bends down it goes down.
+    bends = np.array([[3.0, 1.0], [1.0, 2.0]])
+    smooth = objective(lambda t: (t @ bends @ t / 2, bends @ t, 1))
+    step, promised = _newton(smooth, np.array([0.03, -0.05]), 0.01)
+    np.testing.assert_allclose(step, [-0.03, 0.05])
+    step, _ = _newton(objective(lambda t: (-t @ t / 2, -t, 1)), np.array([0.5, -0.5]), 0.01)
+    np.testing.assert_allclose(step, [0.1, -0.1])
+    nowhere = objective(lambda t: (np.nan, np.zeros(2), 1))
+    assert _newton(nowhere, at, 0.01)[1] == np.inf
+
+
+def settled(function: Any, at: list[float], most: int = 1000, count: int = 10) -> Run:
+    """Settle a line search that gave up at a place of some function."""
+
+    class Known(Search):
+        def _with_gradient(self, scales: Any) -> Any:
+            return function
+
+        def _without_gradient(self, scales: Any) -> Any:
+            return lambda theta: (function(theta)[0], None, 1)
+
+    search = Known(Evaluator(model()), np.ones(2), Method(), False, 1e-5, most)
+    end = np.array(at)
+    value = float(function(end)[0])
+    trace = Trace((end,), (value,), (count,), count)
+    return settle(search, Run(end, False, "Gave up.", trace, np.zeros(2), np.ones(1), value, 1.0))
+
+
+def test_a_line_search_at_a_kink_goes_on_along_it() -> None:
+    run = settled(valley, [0.95, -0.95])
+    assert run.success
+    np.testing.assert_allclose(run.best, [1.0, -1.0], atol=1e-6)
+    assert run.lowest == pytest.approx(1)
+    assert run.trace.count == 10 + 2 * 5
+    assert run.message.startswith("Gave up. Gradients around it promise a gain of ")
+
+
+def test_what_is_lower_than_gradients_promise_is_followed() -> None:
+    def stairs(t: Any) -> Any:
+        return 1.0 - 0.1 * np.sum(t > 0.005), np.zeros(2), 1
+
+    run = settled(stairs, [0.0, 0.0])
+    assert run.success
+    assert run.lowest == pytest.approx(0.8)
+    assert run.trace.count == 10 + 3 * 5
+
+
+def test_gradients_whose_promise_is_not_kept_leave_the_word_to_a_simplex() -> None:
+    def promising(t: Any) -> Any:
+        return 1 + t @ t, np.array([1.0, 1.0]) + 0 * t, 1
+
+    run = settled(promising, [0.0, 0.0])
+    assert run.success
+    assert "A simplex from there gained 0.0e+00" in run.message
+    # Differences that take many evaluations are not asked for all rounds.
+    run = settled(lambda t: (*promising(t)[:2], 60), [0.0, 0.0])
+    assert "A simplex from there" in run.message
+    assert run.trace.count < 10 + 5 * 60 + 120
+
+
+def test_a_budget_that_is_spent_is_not_convergence() -> None:
+    run = settled(valley, [0.2, -0.2], most=13)
+    assert not run.success
+    assert run.message == "Gave up. max_evaluations = 13 was reached before convergence."
+    assert run.trace.count == 13
 
 
 def test_points_of_the_prior_are_spread_evenly_and_follow_hierarchies() -> None:
