@@ -108,8 +108,8 @@ def valley(t: Any) -> Any:
     return value, slope, 1
 
 
-def objective(function: Any) -> Objective:
-    return Objective(function, np.zeros(2), np.ones(2), 1.0, gradient=True, most=100)
+def objective(function: Any, size: int = 2) -> Objective:
+    return Objective(function, np.zeros(size), np.ones(size), 1.0, gradient=True, most=100)
 
 
 def test_gradients_a_step_apart_see_along_a_kink() -> None:
@@ -118,14 +118,14 @@ def test_gradients_a_step_apart_see_along_a_kink() -> None:
     step, promised = _newton(objective(valley), at, 0.01)
     np.testing.assert_allclose(step[0], -step[1], atol=1e-9)
     assert np.hypot(*step) == pytest.approx(0.1)  # as far as it may go beyond what it saw
-    assert promised == pytest.approx(valley(at)[0] - valley(at + step)[0], rel=0.1)
+    assert promised == pytest.approx(valley(at)[0] - valley(at + step)[0], rel=1e-6)
     _, promised = _newton(objective(valley), np.array([1.0, -1.0]), 0.01)
     assert abs(promised) < 1e-12
     # Where it is smooth the step is Newton's, and where it bends down it goes down.
-    bends = np.array([[3.0, 1.0], [1.0, 2.0]])
-    smooth = objective(lambda t: (t @ bends @ t / 2, bends @ t, 1))
-    step, promised = _newton(smooth, np.array([0.03, -0.05]), 0.01)
-    np.testing.assert_allclose(step, [-0.03, 0.05])
+    bends = np.array([[3.0, 1.0, 0.5], [1.0, 2.0, 0.0], [0.5, 0.0, 1.0]])
+    smooth = objective(lambda t: (t @ bends @ t / 2, bends @ t, 1), size=3)
+    step, promised = _newton(smooth, np.array([0.03, -0.05, 0.01]), 0.01)
+    np.testing.assert_allclose(step, [-0.03, 0.05, -0.01])
     step, _ = _newton(objective(lambda t: (-t @ t / 2, -t, 1)), np.array([0.5, -0.5]), 0.01)
     np.testing.assert_allclose(step, [0.1, -0.1])
     nowhere = objective(lambda t: (np.nan, np.zeros(2), 1))
