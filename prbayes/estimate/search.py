@@ -30,15 +30,14 @@ _SETTLED = 1e-4
 # Evaluations in a line search without progress; those of scipy that arrive take fewer. By
 # judgement.
 _STALLED = 15
-# The same, and what counts as progress, where gradients jump, so that line searches end in ever
-# smaller steps. What they leave is found by gradients a step apart.
-_STALLED_AT_KINKS = 8
-_PROGRESS_AT_KINKS = 0.1 * _SETTLED
+# The same where gradients jump, so that line searches end in ever smaller steps, and where only
+# a gain that counts is progress. What they leave is found by gradients a step apart.
+_STALLED_AT_KINKS = 5
 _SPENT = "max_evaluations = {} was reached before convergence."
 # Most evaluations of a simplex that settles it, for each parameter. By judgement.
 _SIMPLEX = 60
 # Spreads of the prior that gradients are apart, at first: wider than kinks of a thousand points.
-_ASTRIDE = 0.01
+_ASTRIDE = 0.0025
 # Rounds of such gradients, and how far their step may go beyond what they saw. By judgement.
 _ROUNDS = 5
 _BEYOND_SEEN = 10.0
@@ -205,7 +204,7 @@ def minimise(search: Search, theta: Floats, scales: Floats, trace: Trace) -> Run
         objective.patience = _STALLED
         if any(n.metric.minimum is Minimum.ABSOLUTE for n in search.evaluator.nodes):
             objective.patience = _STALLED_AT_KINKS
-            objective.least_gain = _PROGRESS_AT_KINKS
+            objective.least_gain = _SETTLED
     success, message = _scipy(
         search,
         objective,

@@ -93,8 +93,8 @@ def test_the_area_metric_takes_few_evaluations(response: Any) -> None:
         prb.Simulator("y", response, x, metric=prb.AreaMetric(), observed=observed)
     found = prb.minimize(other, starts=0)
     assert found.converged
-    assert "gained nothing in 8 evaluations. Gradients around it promise a gain" in found.message
-    # Its line search ends at the kinks of a thousand points: 23 and 26 here, 87 by a simplex.
+    assert "gained nothing in 5 evaluations. Gradients around it promise a gain" in found.message
+    # Its line search ends at the kinks of a thousand points: 18 and 23 here, 87 by a simplex.
     assert found.n_evaluations <= 40
     simplex = prb.minimize(other, starts=0, method="Nelder-Mead")
     assert found.discrepancy < simplex.discrepancy * (1 + 1e-4)
@@ -103,8 +103,8 @@ def test_the_area_metric_takes_few_evaluations(response: Any) -> None:
 def valley(t: Any) -> Any:
     """Return a valley with a kink along its bottom, lowest at (1, -1), and its gradient."""
     across, along = t[0] + t[1], t[0] - t[1] - 2
-    value = 1 + abs(across) + 0.02 * along**2
-    slope = np.sign(across) * np.ones(2) + 0.04 * along * np.array([1.0, -1.0])
+    value = 1 + abs(across) + 2 * along**2
+    slope = np.sign(across) * np.ones(2) + 4 * along * np.array([1.0, -1.0])
     return value, slope, 1
 
 
@@ -150,7 +150,7 @@ def settled(function: Any, at: list[float], most: int = 1000, count: int = 10) -
 
 
 def test_a_line_search_at_a_kink_goes_on_along_it() -> None:
-    run = settled(valley, [0.95, -0.95])
+    run = settled(valley, [0.99, -0.99])
     assert run.success
     np.testing.assert_allclose(run.best, [1.0, -1.0], atol=1e-6)
     assert run.lowest == pytest.approx(1)
@@ -160,7 +160,7 @@ def test_a_line_search_at_a_kink_goes_on_along_it() -> None:
 
 def test_what_is_lower_than_gradients_promise_is_followed() -> None:
     def stairs(t: Any) -> Any:
-        return 1.0 - 0.1 * np.sum(t > 0.005), np.zeros(2), 1
+        return 1.0 - 0.1 * np.sum(t > 0.002), np.zeros(2), 1
 
     run = settled(stairs, [0.0, 0.0])
     assert run.success
