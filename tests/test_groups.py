@@ -10,8 +10,8 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
-from scipy import stats
 from pymc.model.fgraph import clone_model
+from scipy import stats
 from suppliers import labelled
 
 import prbayes as prb
