@@ -193,8 +193,10 @@ def test_a_design_that_grows_tells_its_error_and_the_runs_that_are_left(
 
 @pytest.mark.parametrize("visible", [True, False])
 def test_everything_inside_the_sampler_follows_its_keyword(
-    screen: io.StringIO, visible: bool
+    screen: io.StringIO, monkeypatch: pytest.MonkeyPatch, visible: bool
 ) -> None:
+    # At once, however quick the search is.
+    monkeypatch.setattr(prbayes._progress, "_SHOWN_FROM", 0.0)
     prb.sample_smc(
         60, chains=1, model=build(prb.Resimulated(16)), random_seed=1, progressbar=visible
     )
