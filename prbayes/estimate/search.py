@@ -32,7 +32,7 @@ _SETTLED = 1e-4
 _STALLED = 15
 # The same where gradients jump, so that line searches end in ever smaller steps, and where only
 # a gain that counts is progress. What they leave is found by gradients a step apart.
-_STALLED_AT_KINKS = 5
+_STALLED_AT_KINKS = 4
 _SPENT = "max_evaluations = {} was reached before convergence."
 # Most evaluations of a simplex that settles it, for each parameter. By judgement.
 _SIMPLEX = 60
@@ -41,6 +41,9 @@ _ASTRIDE = 0.0025
 # Rounds of such gradients, and how far their step may go beyond what they saw. By judgement.
 _ROUNDS = 5
 _BEYOND_SEEN = 10.0
+# Spreads of the prior at which the objective has to be higher, each way that gradients lead down:
+# kinks make small minima on a slope. By judgement.
+_FARTHER = 0.25
 # Step of differences in spreads of the prior: errors of rounding, 1e-16 / step, and of curvature,
 # step^2, are then both below the tolerance.
 _STEP = 1e-4
@@ -196,13 +199,18 @@ def start(
     return search.best_of(candidates, scales), len(candidates)
 
 
-def minimise(search: Search, theta: Floats, scales: Floats, trace: Trace) -> Run:
-    """Minimise from theta, within what is left of the budget."""
+def minimise(
+    search: Search, theta: Floats, scales: Floats, trace: Trace, *, patient: bool = False
+) -> Run:
+    """Minimise from theta, within what is left of the budget.
+
+    Where gradients jump a line search is stopped soon, unless it is to be ``patient``.
+    """
     size = search.size(theta, scales)
     objective = search.objective(theta, scales, size, gradient=search.gradient, spent=trace.count)
     if search.method.name.lower() in _LINE_SEARCHES:
         objective.patience = _STALLED
-        if any(n.metric.minimum is Minimum.ABSOLUTE for n in search.evaluator.nodes):
+        if _hasty(search) and not patient:
             objective.patience = _STALLED_AT_KINKS
             objective.least_gain = _SETTLED
     success, message = _scipy(
@@ -225,12 +233,17 @@ def minimise(search: Search, theta: Floats, scales: Floats, trace: Trace) -> Run
     )
 
 
+def _hasty(search: Search) -> bool:
+    """Return whether line searches are stopped soon, since gradients jump."""
+    return any(n.metric.minimum is Minimum.ABSOLUTE for n in search.evaluator.nodes)
+
+
 def settle(search: Search, run: Run) -> Run:
     """Decide on a line search that gave up, at a kink or rounding.
 
     It has converged if gradients around its end promise next to nothing, or else if a simplex
-    agrees. Where the discrepancy jumps, since points lose their response there, the simplex is wide
-    enough to step over it.
+    agrees, after a more patient line search where the first was stopped soon. Where the discrepancy
+    jumps, since points lose their response there, the simplex is wide enough to step over it.
     """
     if run.success or not search.gradient or run.trace.count >= search.most:
         return run
@@ -239,12 +252,16 @@ def settle(search: Search, run: Run) -> Run:
         run = _by_gradients(search, run)
         if run.success or run.trace.count >= search.most:
             return run
+        if _hasty(search):
+            run = minimise(search, run.best, run.scales, run.trace, patient=True)
+            if run.success or run.trace.count >= search.most:
+                return run
     spent = run.trace.count
     again = search.objective(run.center, run.scales, run.size, gradient=False, spent=spent)
     begin = (run.best - run.center) / search.prior_sd
     # In spreads of the prior: wide enough to step over the jump of a point that loses its response,
     # or small, to see whether a stalled line search is at its minimum.
-    edge = 0.5 if jumping else _ASTRIDE
+    edge = 0.5 if jumping else 0.01
     simplex = np.vstack([begin, begin + edge * np.eye(begin.size)])
     options = {
         "initial_simplex": simplex,
@@ -278,18 +295,23 @@ def _by_gradients(search: Search, run: Run) -> Run:
     try:
         for _ in range(_ROUNDS):
             at = (best - run.center) / search.prior_sd
-            step, promised = _newton(objective, at, apart)
+            step, promised, downhill = _newton(objective, at, apart)
             objective(at + step)
-            gain = (lowest - objective.lowest) / max(abs(lowest), 1e-300)
             promise = promised * run.size / max(abs(lowest), 1e-300)
+            settled = max(promise, _gain(lowest, objective)) < _SETTLED
+            for way in downhill if settled else ():
+                objective(at + step + _FARTHER * way)
+            gain = _gain(lowest, objective)
+            settled = settled and gain < _SETTLED
             if objective.lowest < lowest:
                 best, lowest = objective.best, objective.lowest
-            settled = max(promise, gain) < _SETTLED
             if settled:
                 break
             if gain < _SETTLED:
                 apart /= 4
-        said = f" Gradients around it promise a gain of {promise:.1e}."
+        said = " Gradients around it tell of no minimum there."
+        if np.isfinite(promise):
+            said = f" Gradients around it promise a gain of {promise:.1e}."
     except SpentError:
         if spent + objective.count >= search.most:
             said = f" {_SPENT.format(search.most)}"
@@ -305,24 +327,34 @@ def _by_gradients(search: Search, run: Run) -> Run:
     )
 
 
-def _newton(objective: Objective, at: Floats, apart: float) -> tuple[Floats, float]:
-    """Return Newton's step by gradients around a place, and what it promises to gain.
+def _gain(before: float, objective: Objective) -> float:
+    """Return what the lowest value is below another, as a share of it."""
+    return (before - objective.lowest) / max(abs(before), 1e-300)
 
-    Infinity where the objective is no number at one of them.
+
+def _newton(objective: Objective, at: Floats, apart: float) -> tuple[Floats, float, Floats]:
+    """Return Newton's step by gradients around a place, what it promises to gain, and ways down.
+
+    Infinity where the minimum is farther away than it may go, or there is none, and where the
+    objective is no number at one of them.
     """
     pairs = [(objective(at + step)[1], objective(at - step)[1]) for step in apart * np.eye(at.size)]
     if not np.isfinite(objective.values[-2 * at.size :]).all():
-        return np.zeros(at.size), np.inf
+        return np.zeros(at.size), np.inf, np.zeros((0, at.size))
     slope = np.mean(pairs, axis=(0, 1))
     rows = np.array([after - before for after, before in pairs]) / (2 * apart)
     bends, axes = np.linalg.eigh((rows + rows.T) / 2)
     along = axes.T @ slope
+    ways = np.where(along > 0, -1.0, 1.0)[:, None] * axes.T
     reach = _BEYOND_SEEN * apart
     with np.errstate(divide="ignore", invalid="ignore"):
-        shift = np.where(bends > 0, -along / bends, -np.inf * np.sign(along))
-    shift = np.clip(np.nan_to_num(shift), -reach, reach)
+        full = np.where(bends > 0, -along / bends, np.where(along > 0, -np.inf, np.inf))
+    full[(bends == 0) & (along == 0)] = 0.0  # nothing changes at all
+    shift = np.clip(full, -reach, reach)
+    if not (np.abs(full) <= reach).all():  # as on a saddle
+        return axes @ shift, np.inf, ways
     promised = -(along @ shift) - 0.5 * bends @ shift**2
-    return axes @ shift, float(promised)
+    return axes @ shift, float(promised), ways
 
 
 def jumps(search: Search, theta: Floats) -> bool:

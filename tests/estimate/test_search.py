@@ -93,7 +93,7 @@ def test_the_area_metric_takes_few_evaluations(response: Any) -> None:
         prb.Simulator("y", response, x, metric=prb.AreaMetric(), observed=observed)
     found = prb.minimize(other, starts=0)
     assert found.converged
-    assert "gained nothing in 5 evaluations. Gradients around it promise a gain" in found.message
+    assert "gained nothing in 4 evaluations. Gradients around it promise a gain" in found.message
     # Its line search ends at the kinks of a thousand points: 18 and 23 here, 87 by a simplex.
     assert found.n_evaluations <= 40
     simplex = prb.minimize(other, starts=0, method="Nelder-Mead")
@@ -115,19 +115,28 @@ def objective(function: Any, size: int = 2) -> Objective:
 def test_gradients_a_step_apart_see_along_a_kink() -> None:
     # At a kink, where each step across goes up, and a line search ends.
     at = np.array([0.2, -0.2])
-    step, promised = _newton(objective(valley), at, 0.01)
+    step, promised, _ = _newton(objective(valley), at, 0.01)
     np.testing.assert_allclose(step[0], -step[1], atol=1e-9)
     assert np.hypot(*step) == pytest.approx(0.1)  # as far as it may go beyond what it saw
+    assert promised == np.inf
+    at = np.array([0.99, -0.99])
+    step, promised, _ = _newton(objective(valley), at, 0.01)
+    np.testing.assert_allclose(step, [0.01, -0.01], atol=1e-9)
     assert promised == pytest.approx(valley(at)[0] - valley(at + step)[0], rel=1e-6)
-    _, promised = _newton(objective(valley), np.array([1.0, -1.0]), 0.01)
+    _, promised, _ = _newton(objective(valley), np.array([1.0, -1.0]), 0.01)
     assert abs(promised) < 1e-12
     # Where it is smooth the step is Newton's, and where it bends down it goes down.
     bends = np.array([[3.0, 1.0, 0.5], [1.0, 2.0, 0.0], [0.5, 0.0, 1.0]])
     smooth = objective(lambda t: (t @ bends @ t / 2, bends @ t, 1), size=3)
-    step, promised = _newton(smooth, np.array([0.03, -0.05, 0.01]), 0.01)
+    step, promised, _ = _newton(smooth, np.array([0.03, -0.05, 0.01]), 0.01)
     np.testing.assert_allclose(step, [-0.03, 0.05, -0.01])
-    step, _ = _newton(objective(lambda t: (-t @ t / 2, -t, 1)), np.array([0.5, -0.5]), 0.01)
+    step, _, ways = _newton(objective(lambda t: (-t @ t / 2, -t, 1)), np.array([0.5, -0.5]), 0.01)
     np.testing.assert_allclose(step, [0.1, -0.1])
+    assert (ways @ np.array([-0.5, 0.5]) <= 0).all()  # against the slope
+    saddle = objective(lambda t: (t[0] ** 2 - t[1] ** 2, np.array([2.0, -2.0]) * t, 1))
+    step, promised, _ = _newton(saddle, np.zeros(2), 0.01)
+    np.testing.assert_allclose(np.abs(step), [0.0, 0.1], atol=1e-12)
+    assert promised == np.inf
     nowhere = objective(lambda t: (np.nan, np.zeros(2), 1))
     assert _newton(nowhere, at, 0.01)[1] == np.inf
 
@@ -154,7 +163,7 @@ def test_a_line_search_at_a_kink_goes_on_along_it() -> None:
     assert run.success
     np.testing.assert_allclose(run.best, [1.0, -1.0], atol=1e-6)
     assert run.lowest == pytest.approx(1)
-    assert run.trace.count == 10 + 2 * 5
+    assert run.trace.count == 10 + 2 * 5 + 2
     assert run.message.startswith("Gave up. Gradients around it promise a gain of ")
 
 
@@ -165,7 +174,16 @@ def test_what_is_lower_than_gradients_promise_is_followed() -> None:
     run = settled(stairs, [0.0, 0.0])
     assert run.success
     assert run.lowest == pytest.approx(0.8)
-    assert run.trace.count == 10 + 3 * 5
+    assert run.trace.count == 10 + 3 * 5 + 2
+
+
+def test_a_small_minimum_on_a_slope_is_left() -> None:
+    def slope(t: Any) -> Any:
+        near = np.array([min(max(x, -0.01), 0.01) for x in t])  # a dent around zero
+        return 2 + 0.5 * np.sum(t) + 60 * near @ near, 0.5 + 120 * near, 1
+
+    run = settled(lambda t: (*slope(t)[:2], 1), [0.0, 0.0], most=60)
+    assert run.lowest < 1.95  # 1.998 in the dent
 
 
 def test_gradients_whose_promise_is_not_kept_leave_the_word_to_a_simplex() -> None:
