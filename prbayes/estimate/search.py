@@ -298,11 +298,11 @@ def _by_gradients(search: Search, run: Run) -> Run:
             step, promised, downhill = _newton(objective, at, apart)
             objective(at + step)
             promise = promised * run.size / max(abs(lowest), 1e-300)
-            settled = max(promise, _gain(lowest, objective)) < _SETTLED
-            for way in downhill if settled else ():
+            calm = max(promise, _gain(lowest, objective)) < _SETTLED
+            for way in downhill if calm else ():
                 objective(at + step + _FARTHER * way)
             gain = _gain(lowest, objective)
-            settled = settled and gain < _SETTLED
+            settled = calm and gain < _SETTLED
             if objective.lowest < lowest:
                 best, lowest = objective.best, objective.lowest
             if settled:
@@ -317,10 +317,11 @@ def _by_gradients(search: Search, run: Run) -> Run:
             said = f" {_SPENT.format(search.most)}"
     except BudgetError:
         said = " Stopped."
+    lower = objective.lowest < lowest
     return replace(
         run,
-        best=best,
-        lowest=lowest,
+        best=objective.best if lower else best,
+        lowest=min(objective.lowest, lowest),
         success=settled,
         message=run.message + said,
         trace=run.trace.then(objective),

@@ -204,6 +204,9 @@ def test_a_budget_that_is_spent_is_not_convergence() -> None:
     assert not run.success
     assert run.message == "Gave up. max_evaluations = 13 was reached before convergence."
     assert run.trace.count == 13
+    # Nor where it is spent on the last look around.
+    run = settled(valley, [1.0, -1.0], most=16)
+    assert not run.success
 
 
 def test_points_of_the_prior_are_spread_evenly_and_follow_hierarchies() -> None:
