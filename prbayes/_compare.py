@@ -26,11 +26,13 @@ from prbayes.metrics.residual import ProbabilityResidual
 from prbayes.model.elements import (
     coordinates,
     element_names,
+    read_elements,
     single_elements,
     split_elements,
     stacked_draws,
     told_elements,
     told_of,
+    variable_of,
     with_coordinates,
 )
 from prbayes.model.evaluator import Evaluator
@@ -62,7 +64,8 @@ def compare(
         they get.
     model : pymc.Model, optional
         Restricts the table to the model's variables, its deterministics among them; by default all
-        that the results share. Its data, and its populations, score the results.
+        that the results share. Of a `pymc.LKJCholeskyCov` standard deviations and correlations are
+        shown. Its data, and its populations, score the results.
     metrics : sequence of Metric, optional
         Under which each estimate is scored, whatever it was made with. By default all four where
         that costs no response (`Reweighted`); under the other propagations each result costs n
@@ -117,7 +120,7 @@ def compare(
     columns = {label: _column(label, result, naming) for label, result in results.items()}
     every = _shared(list(columns.values()), model)
     told = set.intersection(*(column.told for column in columns.values()))
-    names = [name for name in every if name in told]
+    names = read_elements(name for name in every if name in told)
     if not names:
         raise ValueError(
             f"compare: got results {list(results)} that share no hyperparameter, "
@@ -288,7 +291,7 @@ def _shared(columns: list[_Column], model: pm.Model | None) -> list[str]:
     if model is None:
         return names
     own = {variable.name for variable in model.unobserved_RVs}
-    return [name for name in names if name.partition("[")[0] in own]
+    return [name for name in names if variable_of(name) in own]
 
 
 def _scores(

@@ -47,6 +47,25 @@ def idata(model: pm.Model, optimum: prb.Optimum) -> xr.DataTree:
     )
 
 
+def test_what_nobody_reads_of_a_covariance_is_compared_only_where_nothing_else_is() -> None:
+    rng = np.random.default_rng(0)
+    sizes = {"mu": (), "cov": (3,), "cov_stds": (2,), "cov_corr": (2, 2)}
+    draws = {
+        name: (
+            ["chain", "draw", *(f"{name}_{i}" for i in range(len(shape)))],
+            rng.normal(size=(2, 50, *shape)),
+        )
+        for name, shape in sizes.items()
+    }
+    whole = xr.DataTree.from_dict({"posterior": xr.Dataset(draws)})
+    part = xr.DataTree.from_dict({"posterior": xr.Dataset({n: draws[n] for n in ("mu", "cov")})})
+    names = prb.compare({"a": whole, "b": whole})["hyperparameter"].values.tolist()
+    assert names[:3] == ["mu", "cov_stds[0]", "cov_stds[1]"]
+    assert len(names) == 7
+    names = prb.compare({"a": whole, "b": part})["hyperparameter"].values.tolist()
+    assert names == ["mu", "cov[0]", "cov[1]", "cov[2]"]
+
+
 def test_compare_sets_optimum_and_posterior_side_by_side(
     model: pm.Model, optimum: prb.Optimum, idata: xr.DataTree
 ) -> None:

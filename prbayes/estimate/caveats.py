@@ -19,8 +19,10 @@ from prbayes.estimate.refit import SamplingDistribution
 from prbayes.estimate.rivals import Rival
 from prbayes.estimate.sampling import Local
 from prbayes.metrics.base import Minimum
+from prbayes.model.elements import read_variables, split_elements, told_elements
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
+from prbayes.model.labels import labelled
 from prbayes.propagation.cloud import LARGEST_CLOUD
 
 # Design error of which is warned, in standard errors: half as much again as is asked for, since an
@@ -305,13 +307,12 @@ def _of_design(evaluator: Evaluator, error: float) -> str:
 
 
 def _of_rival(evaluator: Evaluator, rival: Rival) -> str:
-    point = evaluator.constrained(rival.theta[None])
-    values = []
-    for rv in evaluator.model.free_RVs:
-        own = point[rv.name][0]
-        value = np.array2string(own, precision=4)
-        values.append(f"{rv.name} = {value}")
-    place = ", ".join(values)
+    # Beside another point, by which what is the same everywhere is seen.
+    points = evaluator.constrained(np.stack([rival.theta, evaluator.initial]))
+    read = read_variables([str(rv.name) for rv in evaluator.model.free_RVs], points)
+    values = labelled(evaluator, {name: points[name] for name in read}, {"point": 2}).data_vars
+    elements = split_elements(values)
+    place = ", ".join(f"{name} = {elements[name][0]:.4g}" for name in told_elements(values))
     return (
         f"the data could as well come from {place}: another optimum, or mirror "
         "solution, whose discrepancy differs by no more than sampling noise; state a prior that "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -170,6 +170,31 @@ def _told(array: Floats) -> Any:
         return told
     symmetric = np.abs(array - array.swapaxes(1, 2)) <= rounding
     return np.triu(~fixed) if symmetric.all() else ~fixed
+
+
+def variable_of(element: str) -> str:
+    """Return the name of the variable that an element belongs to."""
+    return element.partition("[")[0]
+
+
+def read_variables(names: Iterable[str], among: Collection[str]) -> list[str]:
+    """Return the variables that are read for some.
+
+    For a `pymc.LKJCholeskyCov`, a packed factor, its standard deviations and correlations.
+    """
+    read = []
+    for name in names:
+        instead = [f"{name}_stds", f"{name}_corr"]
+        read += instead if set(instead) <= set(among) else [name]
+    return read
+
+
+def read_elements(elements: Iterable[str]) -> list[str]:
+    """Return elements without those of packed factors beside what is read for them."""
+    variables = {element: variable_of(element) for element in elements}
+    every = set(variables.values())
+    read = set(read_variables(every, every))
+    return [element for element, variable in variables.items() if variable in read]
 
 
 def finite_draws(posterior: Any, names: Sequence[str]) -> dict[str, Floats]:

@@ -8,11 +8,10 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum
-from prbayes.model.elements import single_elements
+from prbayes.model.elements import single_elements, variable_of
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import labelled
 from prbayes.plots._ensemble import supported
-from prbayes.plots._names import variable_of
 from prbayes.plots._objective import free_elements, objective
 
 # How far an axis goes from the optimum, in standard errors: the discrepancy is far above its lowest

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from prbayes.model.elements import variable_of
 from prbayes.model.evaluator import Evaluator
 from prbayes.plots._objective import METRIC_LABELS
 from prbayes.response.inputs import aleatory_names
@@ -17,11 +18,6 @@ STATISTIC_LABELS = {
 }
 # Names that a message lists: two lines, by judgement.
 _MOST_LISTED = 12
-
-
-def variable_of(element: str) -> str:
-    """Return the name of the variable that an element belongs to."""
-    return element.partition("[")[0]
 
 
 def named(name: str, labels: Mapping[str, str] | None) -> str:

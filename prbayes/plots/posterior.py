@@ -14,10 +14,12 @@ from scipy.stats import norm
 from prbayes._checks import Floats, share
 from prbayes.estimate.optimum import Optimum, identity_in, require_of_model
 from prbayes.model.elements import (
+    read_elements,
     single_elements,
     split_elements,
     stacked_draws,
     told_elements,
+    variable_of,
 )
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level, require_together
@@ -34,7 +36,7 @@ from prbayes.plots._canvas import (
     refuse_look,
 )
 from prbayes.plots._curves import bounded_density, central_levels
-from prbayes.plots._names import named, refuse_labels, variable_of
+from prbayes.plots._names import named, refuse_labels
 from prbayes.plots._ticks import round_ticks
 
 
@@ -121,9 +123,9 @@ def plot_posterior(
 def _wanted(
     found: dict[str, _Hyperparameter], var_names: Sequence[str] | None
 ) -> dict[str, _Hyperparameter]:
-    """Return those hyperparameters that were asked for."""
+    """Return those hyperparameters that were asked for; by default those that are read."""
     if var_names is None:
-        return found
+        return {name: found[name] for name in read_elements(found)}
     asked = [var_names] if isinstance(var_names, str) else list(var_names)
     unknown = [one for one in asked if not any(one in (name, variable_of(name)) for name in found)]
     if unknown or not asked:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
@@ -12,6 +12,7 @@ import xarray as xr
 
 from prbayes._weighted import INTERVAL
 from prbayes.model.elements import (
+    read_elements,
     single_elements,
     split_elements,
     stacked_draws,
@@ -24,6 +25,10 @@ from prbayes.reports.numbers import NOTHING, alike, counted, number, places
 from prbayes.reports.section import Section
 from prbayes.reports.tables import rows_table
 
+# More elements than this make a sentence too long to read, so that it has scalars alone: by
+# judgement.
+_LONGEST_PLACE = 8
+
 
 def optima(m: Material) -> list[Section]:
     """Return a section for each optimum."""
@@ -34,7 +39,7 @@ def optima(m: Material) -> list[Section]:
             evaluator = m.found[label].evaluator
             for rival in m.found[label].rivals:
                 point = labelled(evaluator, rival["point"], {}).data_vars
-                text.append(_other_optimum(rival, point))
+                text.append(_other_optimum(rival, point, _read_of(tree)))
         text.append(
             "Standard errors are those of the estimator over repeated sets of as many specimens."
         )
@@ -47,10 +52,15 @@ def _optimum_rows(tree: xr.DataTree) -> list[dict[str, Any]]:
     point = single_elements(tree["optimum"].data_vars)
     stderr = single_elements(tree["stderr"].data_vars)
     rows = []
-    for name in told_of(tree["optimum"].data_vars, tree["stderr"].data_vars):
+    for name in _read_of(tree):
         estimate, error = alike((point[name], stderr[name]), stderr[name])
         rows.append({"hyperparameter": name, "estimate": estimate, "standard error": error})
     return rows
+
+
+def _read_of(tree: xr.DataTree) -> list[str]:
+    """Return the elements of an optimum that are read."""
+    return read_elements(told_of(tree["optimum"].data_vars, tree["stderr"].data_vars))
 
 
 def _how_it_ended(attrs: Mapping[Any, Any]) -> str:
@@ -66,12 +76,13 @@ def _how_it_ended(attrs: Mapping[Any, Any]) -> str:
     )
 
 
-def _other_optimum(rival: Mapping[str, Any], point: Mapping[Any, Any]) -> str:
-    """Say where another optimum is."""
+def _other_optimum(rival: Mapping[str, Any], point: Mapping[Any, Any], names: Sequence[str]) -> str:
+    """Say where another optimum is, by elements that are read."""
     elements = single_elements(point)
-    scalars = {name: value for name, value in elements.items() if name in point}
-    shown = scalars or elements
-    at = ", ".join(f"{name} = {number(value)}" for name, value in shown.items())
+    shown = [name for name in names if name in elements]
+    if len(shown) > _LONGEST_PLACE:
+        shown = [name for name in shown if name in point] or shown
+    at = ", ".join(f"{name} = {number(elements[name])}" for name in shown)
     discrepancy = number(float(rival["discrepancy"]))
     if rival["comparable"]:
         judged = "the data could as well come from there"
@@ -103,7 +114,7 @@ def _correlation_rows(tree: xr.DataTree) -> list[dict[str, str]]:
     """Return the correlations of the draws; none of one variable, or of more than fit."""
     draws = stacked_draws(tree["posterior"])
     values = split_elements(draws)
-    told = [name for name in told_elements(draws) if np.ptp(values[name]) > 0]
+    told = [name for name in read_elements(told_elements(draws)) if np.ptp(values[name]) > 0]
     if not 2 <= len(told) <= _MOST_CORRELATED:
         return []
     r = np.corrcoef([values[name] for name in told])
@@ -127,7 +138,7 @@ def _posterior_rows(tree: xr.DataTree) -> list[dict[str, Any]]:
     # Elements are called as in all else of a report, where ArviZ has ways of its own.
     draws = stacked_draws(tree["posterior"])
     names = list(split_elements(draws))
-    told = told_elements(draws)
+    told = read_elements(told_elements(draws))
     percent = f"{100 * INTERVAL:.0f}"
     rows = []
     for name, (_, found) in zip(names, table.iterrows(), strict=True):

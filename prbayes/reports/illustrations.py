@@ -11,8 +11,8 @@ from typing import Any
 
 import pymc as pm
 
+from prbayes.model.elements import variable_of
 from prbayes.model.node import nodes
-from prbayes.plots._names import variable_of
 from prbayes.plots.comparison import plot_comparison
 from prbayes.plots.influences import plot_sensitivity
 from prbayes.plots.landscape import plot_landscape

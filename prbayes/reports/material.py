@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -150,7 +150,7 @@ def gather(
     # Find out what was not given
     description = _stored_description(results) if model is None else describe(model)
     if comparison is None and len(results) > 1:
-        comparison = _readable(compare(results | found, model=model))
+        comparison = compare(results | found, model=model)
     observed, outputs = _observed(model, results)
     _require_known_labels(labels, model, description, outputs, validation)
     diagnoses = {}
@@ -330,27 +330,6 @@ def _stored_description(results: dict[str, xr.DataTree]) -> dict[str, Any] | Non
         if description is not None:
             return description
     return None
-
-
-def read_variables(hyperparameters: Sequence[str], among: Collection[str]) -> list[str]:
-    """Return the variables that are read for hyperparameters.
-
-    For a `pymc.LKJCholeskyCov`, a packed factor, its standard deviations and correlations.
-    """
-    read = []
-    for name in hyperparameters:
-        instead = [f"{name}_stds", f"{name}_corr"]
-        read += instead if set(instead) <= set(among) else [name]
-    return read
-
-
-def _readable(comparison: xr.Dataset) -> xr.Dataset:
-    """Leave out packed factors beside their standard deviations and correlations."""
-    names = comparison["hyperparameter"].values.tolist()
-    variables = list(dict.fromkeys(name.partition("[")[0] for name in names))
-    read = set(read_variables(variables, variables))
-    kept = [name for name in names if name.partition("[")[0] in read]
-    return comparison.sel(hyperparameter=kept)
 
 
 def _observed(

@@ -6,17 +6,19 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.model.elements import (
+    read_variables,
     single_elements,
     split_elements,
     stacked_draws,
     told_elements,
     told_of,
+    variable_of,
 )
 from prbayes.plots._names import named
 from prbayes.plots._objective import metric_label
 from prbayes.plots.validity import in_directions
 from prbayes.reports.decision import interval_of, kind_of_decision
-from prbayes.reports.material import Material, read_variables
+from prbayes.reports.material import Material
 from prbayes.reports.numbers import alike, counted, number, percentage, plus_minus, probability
 from prbayes.validation.validity import ValidityTest
 
@@ -203,7 +205,7 @@ def _estimates(m: Material, label: str) -> dict[str, tuple[float, float]]:
         errors = single_elements(stderr)
         for name in told_of(optimum, stderr):
             found[name] = (points[name], errors[name])
-    variables = {name: name.partition("[")[0] for name in found}
+    variables = {name: variable_of(name) for name in found}
     known = read_variables(m.hyperparameters, set(variables.values()))
     return {name: pair for name, pair in found.items() if variables[name] in known}
 

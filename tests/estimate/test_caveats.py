@@ -10,6 +10,7 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes.estimate.caveats import between_runs, breakdown, caveats, elements_at_edge
+from prbayes.estimate.rivals import Rival
 from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.cloud import LARGEST_CLOUD
 
@@ -42,6 +43,25 @@ def test_no_larger_design_is_asked_for_where_points_cost_nothing(
     assert "by about 0.40 standard errors, expected at most 0.1" in line
     assert told in line
     assert caveats(evaluator, None, (), 0.14) == ()
+
+
+def test_a_mirror_is_told_by_standard_deviations_and_correlations() -> None:
+    """Not by the elements of a packed factor, of which nobody knows what they mean."""
+    response = np.random.default_rng(0).normal(size=(20, 2))
+    with pm.Model(coords={"part": ["rod", "pin"]}) as model:
+        mean = pm.Normal("mean", 0, 1, dims="part")
+        sds = pm.HalfNormal.dist(1, shape=2)
+        chol, _, _ = pm.LKJCholeskyCov("cov", n=2, eta=2, sd_dist=sds)
+        x = pm.MvNormal.dist(mean, chol=chol, shape=2)
+        prb.Simulator("y", np.positive, x, metric=prb.Joint(prb.AreaMetric()), observed=response)
+    evaluator = Evaluator(model)
+    point = {"mean": [1.0, 2.0], "cov": [0.5, -0.3, 0.4]}
+    rival = Rival(evaluator.unconstrained(point), 0.1, comparable=True, better=False)
+    (line,) = caveats(evaluator, None, (rival,), 0.0)
+    assert (
+        "come from mean[rod] = 1, mean[pin] = 2, cov_stds[0] = 0.5, cov_stds[1] = 0.5, "
+        "cov_corr[0,1] = -0.6: another optimum"
+    ) in line
 
 
 def edges(model: pm.Model, *theta: float) -> tuple[str, ...]:

@@ -8,6 +8,8 @@ from prbayes.model.elements import (
     element_name,
     element_names,
     finite_draws,
+    read_elements,
+    read_variables,
     single_elements,
     split_elements,
     stacked_draws,
@@ -120,3 +122,18 @@ def test_draws_and_points_carry_their_coordinates() -> None:
     assert single_elements(point) == {"mu[Adler]": 1.0, "mu[Busch]": 2.0}
     assert told_of(point, {"mu": [0.1, 0.2]}) == ["mu[Adler]", "mu[Busch]"]
     assert type(finite_draws(xr.Dataset({"mu": mu}), ["mu"])["mu"]) is np.ndarray
+
+
+def test_for_a_packed_factor_its_standard_deviations_and_correlations_are_read() -> None:
+    assert read_variables(["mu", "chol"], {"mu", "chol", "chol_stds", "chol_corr"}) == [
+        "mu",
+        "chol_stds",
+        "chol_corr",
+    ]
+    assert read_variables(["mu", "chol"], {"mu", "chol", "chol_corr"}) == ["mu", "chol"]
+
+
+def test_of_elements_those_of_a_packed_factor_are_not_read() -> None:
+    names = ["mu[0]", "chol[0]", "chol[1]", "chol_corr[0,1]", "chol_stds[0]", "rho"]
+    assert read_elements(names) == ["mu[0]", "chol_corr[0,1]", "chol_stds[0]", "rho"]
+    assert read_elements(["chol[0]", "chol_stds[0]"]) == ["chol[0]", "chol_stds[0]"]

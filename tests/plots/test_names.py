@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from prbayes.model.elements import element_name, split_elements
-from prbayes.plots._names import named, variable_of
+from prbayes.model.elements import element_name, split_elements, variable_of
+from prbayes.plots._names import named
 
 
 @pytest.mark.parametrize(("index", "expected"), [((), "mu"), ((1,), "mu[1]"), ((0, 2), "mu[0,2]")])

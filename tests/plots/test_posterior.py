@@ -81,6 +81,20 @@ def test_some_of_the_variables(posterior: xr.DataTree) -> None:
         drawn([])
 
 
+def test_a_packed_factor_is_drawn_where_it_is_asked_for() -> None:
+    rng = np.random.default_rng(0)
+    sizes = {"chol": 3, "chol_stds": 2, "chol_corr": 1}
+    draws = {
+        name: (["chain", "draw", f"{name}_dim"], rng.normal(size=(1, 50, size)))
+        for name, size in sizes.items()
+    }
+    tree = xr.DataTree.from_dict({"posterior": xr.Dataset(draws)})
+    drawn = list(prb.plot_posterior(tree, backend="none").viz["posterior"])
+    assert drawn == ["chol_stds[0]", "chol_stds[1]", "chol_corr[0]"]
+    drawn = list(prb.plot_posterior(tree, var_names="chol", backend="none").viz["posterior"])
+    assert drawn == ["chol[0]", "chol[1]", "chol[2]"]
+
+
 def test_wrong_arguments_are_refused(optimum: prb.Optimum, posterior: xr.DataTree) -> None:
     with pytest.raises(TypeError, match="got Optimum, expected a DataTree"):
         prb.plot_posterior(optimum)  # type: ignore[arg-type]

@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 
 import prbayes as prb
+from prbayes.reports.estimates import _other_optimum
 from prbayes.reports.tables import cells
 
 
@@ -106,9 +107,52 @@ def test_other_optima_are_told(calibrated: Any, section: Any) -> None:
         "much it counts."
     )
     vector = ({"point": {"w": np.array([1.0, 2.0])}, "discrepancy": 0.25, "comparable": True},)
-    optimum = dataclasses.replace(optimum, rivals=vector)
+    of_it = {"w": np.array([3.0, 4.0])}
+    optimum = dataclasses.replace(optimum, rivals=vector, point=of_it, stderr=of_it)
     text = section(prb.Report("x", optimum=optimum, pictures=False), "Optimum").text
     assert "is at w[0] = 1.000, w[1] = 2.000, with" in text[1]
+
+
+def test_a_place_of_many_elements_is_told_by_scalars_alone() -> None:
+    for size, told in ((7, "mu = 2.000, w[0]"), (8, "mu = 2.000, with")):
+        point = {"mu": 2.0, "w": np.ones(size)}
+        names = ["mu", *(f"w[{i}]" for i in range(size))]
+        rival = {"discrepancy": 0.1, "comparable": False}
+        assert f"is at {told}" in _other_optimum(rival, point, names)
+
+
+def test_of_a_covariance_standard_deviations_and_correlations_are_read(
+    calibrated: Any, section: Any
+) -> None:
+    read = ["mu", "chol_corr[0,1]", "chol_stds[0]", "chol_stds[1]"]
+    point = {
+        "mu": 1.0,
+        "chol": np.array([0.5, 0.1, 0.3]),
+        "chol_corr": np.array([[1.0, 0.3], [0.3, 1.0]]),
+        "chol_stds": np.array([0.5, 0.32]),
+    }
+    stderr = {name: 0.1 * np.ones(np.shape(value)) for name, value in point.items()}
+    stderr["chol_corr"] = np.array([[0.0, 0.1], [0.1, 0.0]])
+    rival = {"point": {**point, "mu": 7.0}, "discrepancy": 0.25, "comparable": True}
+    optimum = dataclasses.replace(calibrated.optimum, point=point, stderr=stderr, rivals=(rival,))
+    found = section(prb.Report("x", optimum=optimum, pictures=False), "Optimum")
+    assert [row[0] for row in cells(found.table).rows] == read
+    assert "is at mu = 7.000, chol_corr[0,1] = 0.3000, chol_stds[0] = 0.5000, chol" in found.text[1]
+
+    rng = np.random.default_rng(0)
+    r = np.tanh(rng.normal(size=(2, 100)))
+    matrices = np.array([[np.ones_like(r), r], [r, np.ones_like(r)]]).transpose(2, 3, 0, 1)
+    draws = {
+        "mu": (["chain", "draw"], rng.normal(size=(2, 100))),
+        "chol": (["chain", "draw", "k"], rng.normal(size=(2, 100, 3))),
+        "chol_corr": (["chain", "draw", "i", "j"], matrices),
+        "chol_stds": (["chain", "draw", "i"], rng.gamma(4.0, size=(2, 100, 2))),
+    }
+    tree = xr.DataTree.from_dict({"posterior": xr.Dataset(draws)})
+    made = prb.Report("x", posterior=tree, pictures=False)
+    for title in ("Posterior", "Correlations of the hyperparameters"):
+        (found,) = [each for each in made.sections if each.title == title]
+        assert [row[0] for row in cells(found.table).rows] == read
 
 
 def test_a_variable_that_never_moves_is_shown() -> None:

@@ -11,7 +11,7 @@ import xarray as xr
 
 import prbayes as prb
 from prbayes.model.node import nodes
-from prbayes.reports.material import _readable, gather, read_variables
+from prbayes.reports.material import gather
 from prbayes.reports.tables import cells
 
 
@@ -153,19 +153,3 @@ def test_deterministics_are_compared(calibrated: Any) -> None:
     comparison = gather(**given, **trees).comparison
     assert comparison is not None
     assert comparison["hyperparameter"].values.tolist() == ["mu", "sigma", "cv"]
-
-
-def test_for_a_packed_factor_its_standard_deviations_and_correlations_areread_variables() -> None:
-    assert read_variables(["mu", "chol"], {"mu", "chol", "chol_stds", "chol_corr"}) == [
-        "mu",
-        "chol_stds",
-        "chol_corr",
-    ]
-    assert read_variables(["mu", "chol"], {"mu", "chol", "chol_corr"}) == ["mu", "chol"]
-
-
-def test_a_packed_factor_is_not_compared_beside_what_is_read_for_it() -> None:
-    names = ["mu[0]", "chol[0]", "chol[1]", "chol_corr[0,1]", "chol_stds[0]", "rho"]
-    comparison = xr.Dataset(coords={"hyperparameter": names})
-    left = _readable(comparison)["hyperparameter"].values.tolist()
-    assert left == ["mu[0]", "chol_corr[0,1]", "chol_stds[0]", "rho"]
