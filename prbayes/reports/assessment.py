@@ -250,7 +250,7 @@ def _validation_data(m: Material) -> list[Section]:
         if any(row[key] for row in rows):
             rows = [row | {key: row[key] or "0"} for row in rows]
     about = (
-        "Specimens that the calibration has not seen, and what was predicted of them: the median, "
+        "Specimens that the calibration has not seen, and what was predicted of them: the median "
         f"and the range that holds {INTERVAL:.0%} of the predicted responses. ∞ is a failure."
     )
     return [Section("Data of the test", about, rows_table(rows), level=3)]
@@ -267,7 +267,7 @@ def _measured_and_predicted(pair: Comparable, m: Material) -> dict[str, Any]:
     return {
         "condition": named(pair.name, m.labels),
         **described(pair.measured),
-        "predicted": middle,
+        "predicted median": middle,
         f"{INTERVAL:.0%} from": lower,
         "to": upper,
     }

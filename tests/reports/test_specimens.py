@@ -13,11 +13,11 @@ from prbayes.reports.tables import cells
 NULL: dict[str, Any] = {"null": prb.validation.PosteriorNull(99)}
 
 
-def table(**given: Any) -> list[dict[str, str]]:
-    """Return the rows of the table of a report; none where it has none."""
+def table(title: str = "Specimens of the test", **given: Any) -> list[dict[str, str]]:
+    """Return the rows of a table of a report; none where it has none."""
     report = prb.Report("x", **given, pictures=False)
     for section in report.sections:
-        if section.title == "Specimens of the test":
+        if section.title == title:
             found = cells(section.table)
             return [dict(zip(found.header, row, strict=True)) for row in found.rows]
     return []
@@ -93,3 +93,16 @@ def test_a_page_of_them_is_told(later: xr.DataArray) -> None:
     (section,) = (s for s in report.sections if s.title == "Specimens of the test")
     assert "The first 40 of 60 values are told." in " ".join(section.text)
     assert len(cells(section.table).rows) == 40
+
+
+def test_measured_and_predicted_responses_are_summed_up(later: xr.DataArray) -> None:
+    fresh = np.random.default_rng(4).normal(2.0, 0.6, 30)
+    fresh[7] = np.inf
+    (row,) = table("Data of the test", validation={"hot": (fresh, later)})
+    finite = fresh[np.isfinite(fresh)]
+    assert (row["condition"], row["N"], row["failed"]) == ("hot", "30", "1")
+    told = [float(row[key]) for key in ("smallest", "largest", "mean", "sd")]
+    own = [finite.min(), finite.max(), finite.mean(), finite.std(ddof=1)]
+    np.testing.assert_allclose(told, own, atol=6e-3)
+    told = [float(row[key]) for key in ("predicted median", "89% from", "to")]
+    np.testing.assert_allclose(told, np.quantile(later, [0.5, 0.055, 0.945]), atol=6e-3)
