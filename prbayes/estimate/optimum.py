@@ -15,7 +15,7 @@ from prbayes.estimate.caveats import breakdown
 from prbayes.estimate.obstacles import refit_obstacle, sampling_obstacle
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.description import as_attribute, without_addresses
-from prbayes.model.elements import coordinates, element_names
+from prbayes.model.elements import read_variables, single_elements, told_of
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import (
     Identity,
@@ -31,7 +31,7 @@ from prbayes.model.turns import in_turn
 
 # What is less is written as 0.0%.
 TOLD_SHARE = 5e-4
-# Elements of a variable with labels that make as many lines.
+# Elements of a variable that make as many lines.
 _ONE_BY_ONE = 20
 # How specimens whose response is NaN are told of.
 NO_RESPONSE = "have no response (NaN) and are left out"
@@ -145,17 +145,23 @@ class Optimum:
         return view(self._heading(), header=header, rows=rows, sentences=sentences)
 
     def _told(self) -> list[tuple[str, str, str]]:
-        """Return name, estimate and standard error in words; those with labels one by one."""
+        """Return name, estimate and standard error in words.
+
+        Elements with labels, and those of matrices, one by one.
+        """
+        point = labelled(self.evaluator, self.point, {}).data_vars
+        stderr = labelled(self.evaluator, self.stderr, {}).data_vars
         rows = []
-        for name, value in self.point.items():
-            axes = coordinates(self.model, name)
-            labelled_ones = len(axes) == 1 and axes[0] is not None
-            names, values, errors = [name], [value], [self.stderr[name]]
-            if labelled_ones and np.size(value) <= _ONE_BY_ONE:
-                names = element_names(name, np.shape(value), axes)
-                values, errors = list(value), list(self.stderr[name])
-            for element, estimate, error in zip(names, values, errors, strict=True):
-                rows.append((element, _short(estimate), _short(error)))
+        names = [str(name) for name in point]
+        for name in read_variables(names, names):
+            value, error = point[name], stderr[name]
+            alone = value.ndim == 2 or (value.ndim == 1 and bool(value.coords))
+            if not alone or value.size > _ONE_BY_ONE:
+                rows.append((name, _short(value), _short(error)))
+                continue
+            values, errors = single_elements({name: value}), single_elements({name: error})
+            for element in told_of({name: value}, {name: error}):
+                rows.append((element, _short(values[element]), _short(errors[element])))
         return rows
 
     def _heading(self) -> str:

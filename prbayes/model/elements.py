@@ -178,7 +178,7 @@ def variable_of(element: str) -> str:
 
 
 def read_variables(names: Iterable[str], among: Collection[str]) -> list[str]:
-    """Return the variables that are read for some.
+    """Return the variables that are read for some, each once.
 
     For a `pymc.LKJCholeskyCov`, a packed factor, its standard deviations and correlations.
     """
@@ -186,7 +186,7 @@ def read_variables(names: Iterable[str], among: Collection[str]) -> list[str]:
     for name in names:
         instead = [f"{name}_stds", f"{name}_corr"]
         read += instead if set(instead) <= set(among) else [name]
-    return read
+    return list(dict.fromkeys(read))
 
 
 def read_elements(elements: Iterable[str]) -> list[str]:

@@ -69,6 +69,22 @@ def test_an_optimum_survives_plain_pickle_into_a_fresh_process(tmp_path: Path) -
     assert pickle.loads(pickle.dumps(tree)).identical(tree)
 
 
+def test_of_a_covariance_standard_deviations_and_correlations_are_shown() -> None:
+    response = np.random.default_rng(0).normal(size=(20, 2))
+    with pm.Model() as model:
+        sds = pm.HalfNormal.dist(1, shape=2)
+        chol, _, _ = pm.LKJCholeskyCov("cov", n=2, eta=2, sd_dist=sds)
+        x = pm.MvNormal.dist(np.zeros(2), chol=chol, shape=2)
+        given = {"metric": prb.Joint(prb.AreaMetric()), "observed": response}
+        prb.Simulator("y", np.positive, x, propagation=prb.Reweighted(64), **given)
+    optimum = prb.minimize(model, starts=0, progressbar=False)
+    _, *lines = repr(optimum).splitlines()
+    r, r_error = optimum.point["cov_corr"][0, 1], optimum.stderr["cov_corr"][0, 1]
+    names = [line.strip().partition(" = ")[0] for line in lines]
+    assert [name for name in names if name.startswith("cov")] == ["cov_stds", "cov_corr[0,1]"]
+    assert f"cov_corr[0,1] = {r:.4g} ± {r_error:.4g}" in lines[1]
+
+
 def test_elements_with_labels_are_shown_one_by_one() -> None:
     with pm.Model(coords={"supplier": ["A", "B"]}) as model:
         mu = pm.Normal("mu", 0, 2, dims="supplier")

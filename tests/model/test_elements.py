@@ -131,6 +131,8 @@ def test_for_a_packed_factor_its_standard_deviations_and_correlations_are_read()
         "chol_corr",
     ]
     assert read_variables(["mu", "chol"], {"mu", "chol", "chol_corr"}) == ["mu", "chol"]
+    every = ["chol", "mu", "chol_corr", "chol_stds"]
+    assert read_variables(every, every) == ["chol_stds", "chol_corr", "mu"]
 
 
 def test_of_elements_those_of_a_packed_factor_are_not_read() -> None:
