@@ -317,14 +317,15 @@ def go_on(problem: str, size: int, metric: str, until: int) -> None:
     """Analyse the data sets of a cell that are missing, up to a number."""
     from prbayes._progress import shown
 
-    done = len(rows_of(problem, size, metric))
-    if done >= until:
+    done = {row["replicate"] for row in rows_of(problem, size, metric)}
+    missing = [i for i in range(until) if i not in done]
+    if not missing:
         return
     p = PROBLEMS[problem]
     evaluator = build(p, metric, size)
     point = {name: np.array([value]) for name, value in p.truth.items()}
     truth = evaluator.thetas_of([point[rv.name] for rv in evaluator.model.free_RVs])[0]
-    for i in range(done, until):
+    for i in missing:
         data = p.response(p.draw(np.random.default_rng([2027, i, size]), size))
         row: dict[str, Any]
         try:
@@ -332,8 +333,7 @@ def go_on(problem: str, size: int, metric: str, until: int) -> None:
                 row = analyse(evaluator, p, data, truth, i)
         except Exception as error:  # a failure is a result
             row = {"error": f"{type(error).__name__}: {error}"[:300]}
-        row["truth"] = truth.tolist()
-        row = rounded(row)
+        row = rounded({"replicate": i, **row, "truth": truth.tolist()})
         with path(problem, size, metric).open("a") as file:
             file.write(json.dumps(row) + "\n")
 
