@@ -64,8 +64,8 @@ def compare(
         they get.
     model : pymc.Model, optional
         Restricts the table to the model's variables, its deterministics among them; by default all
-        that the results share. Of a `pymc.LKJCholeskyCov` standard deviations and correlations are
-        shown. Its data, and its populations, score the results.
+        that the results share. Of a ``pymc.LKJCholeskyCov`` standard deviations and correlations
+        are shown. Its data, and its populations, score the results.
     metrics : sequence of Metric, optional
         Under which each estimate is scored, whatever it was made with. By default all four where
         that costs no response (`Reweighted`); under the other propagations each result costs n
