@@ -467,6 +467,7 @@ INNER = {
     "response.compilation": {
         "pymc.logprob.utils.CheckParameterValue",
         "pytensor.compile.mode.Mode",
+        "pytensor.graph.basic.Apply",
         "pytensor.graph.basic.Constant",
         "pytensor.graph.basic.Variable",
         "pytensor.graph.op.Op",

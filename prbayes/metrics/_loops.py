@@ -11,6 +11,7 @@ from collections.abc import Callable
 from functools import cache, update_wrapper
 
 import numpy as np
+from numpy.typing import NDArray
 
 from prbayes._checks import Floats
 
@@ -81,6 +82,24 @@ def count(
                     for power in range(4):
                         counts[r, node - 1 + k] += SPLINE[k, power] * m[power]
                 m[:] = 0
+
+
+@_compiled
+def sum_below(
+    weights: Floats, order: NDArray[np.intp], below: NDArray[np.intp], out: Floats
+) -> None:
+    """Put the sums of the first ``below`` weights in an order, shape (rows, m), into ``out``.
+
+    The weights have shape (rows, n), the order (n,), ``below`` (m,).
+    """
+    sums = np.zeros(len(order) + 1)
+    for r in range(len(weights)):
+        total = 0.0
+        for i in range(len(order)):
+            total += weights[r, order[i]]
+            sums[i + 1] = total
+        for k in range(len(below)):
+            out[r, k] = sums[below[k]]
 
 
 @_compiled

@@ -12,7 +12,7 @@ import numpy as np
 import pytensor
 import pytensor.tensor as pt
 from pytensor.compile.mode import Mode
-from pytensor.graph.basic import Constant, Variable
+from pytensor.graph.basic import Apply, Constant, Variable
 from pytensor.graph.op import Op
 from pytensor.graph.replace import graph_replace, vectorize_graph
 from pytensor.graph.rewriting.basic import node_rewriter, out2in
@@ -68,6 +68,40 @@ def _elements_of_rows(fgraph: Any, node: Any) -> Any:
     return [x[pt.arange(x.shape[0]), index]]
 
 
+class _Where(Op):
+    """Choose between arrays, at no cost where the first is chosen throughout.
+
+    Every density asks whether its values and parameters are in its support, and most often all are.
+    """
+
+    __props__ = ()
+    view_map = {0: [1]}  # noqa: RUF012 - what PyTensor declares
+
+    def make_node(self, condition: Any, first: Any, second: Any) -> Apply:
+        """Take the three as they are."""
+        return Apply(self, [condition, first, second], [pt.switch(condition, first, second).type()])
+
+    def perform(self, node: Apply, inputs: Sequence[Any], output_storage: Any) -> None:
+        """Return the first itself if it is the result."""
+        condition, first, second = inputs
+        dtype = node.outputs[0].dtype
+        shape = np.broadcast_shapes(condition.shape, first.shape, second.shape)
+        if first.shape == shape and first.dtype == dtype and condition.all():
+            output_storage[0][0] = first
+        else:
+            output_storage[0][0] = np.asarray(np.where(condition, first, second), dtype=dtype)
+
+
+_where = _Where()
+
+
+def _choices_if_any(fgraph: Any, node: Any) -> Any:
+    """Choose between arrays only where there is a choice."""
+    if node.op.scalar_op != pt.switch.scalar_op:
+        return False
+    return [_where(*node.inputs)]
+
+
 # Batched NumPy calls: nothing here runs often enough to repay a heavy compilation. Without fusion
 # every elementwise operation is one NumPy ufunc; with it, the Python linker would loop over
 # scalars. Sums and the like are divided last, lest they be put together again.
@@ -77,6 +111,7 @@ PLAIN = (
     .register((out2in(node_rewriter([Elemwise])(_softplus_of_arrays)), 1000))
     .register((out2in(node_rewriter([Blockwise])(_elements_of_rows)), 1000))
     .register((out2in(node_rewriter([Elemwise])(_sums_of_sums)), 1001))
+    .register((out2in(node_rewriter([Elemwise])(_choices_if_any)), 1001))
 )
 
 # Functions that are kept, the oldest of which goes: a model has about ten. What they hold beside

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytensor
@@ -9,6 +10,7 @@ import pytest
 from scipy.stats import wasserstein_distance
 
 from prbayes._checks import Floats
+from prbayes.metrics._loops import sum_below
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Minimum
 
@@ -97,6 +99,35 @@ def test_its_features_are_the_simulated_less_the_observed_distribution_function(
     ):
         np.testing.assert_allclose(gap, [0.75, 0.25, 0.5])
         np.testing.assert_allclose(lengths, [1, 1, 1])
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
+def test_many_weights_are_summed_to_the_same_digits(
+    draw: Draw, shape: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x, _, z, u = draw(0)
+    d = AreaMetric().against(z, u)
+    rng = np.random.default_rng(1)
+    weights = rng.dirichlet(np.ones(x.size), shape)
+    weights[..., 3] = 0
+    if shape:
+        weights[0] = NAN  # a population without support
+    basis = d.basis(np.round(x))
+    few, _ = d.from_basis(weights, basis, np)
+    called: list[Any] = []
+
+    def counting(*given: Any) -> None:
+        called.append(given)
+        sum_below(*given)
+
+    monkeypatch.setattr("prbayes.metrics.area._MANY", 0)
+    monkeypatch.setattr("prbayes.metrics.area.sum_below", counting)
+    read_only = np.asfortranarray(weights)
+    read_only.flags.writeable = False
+    for given in (weights, read_only):
+        many, _ = d.from_basis(given, basis, np)
+        np.testing.assert_array_equal(many, few)
+    assert len(called) == 2
 
 
 def test_scale_is_the_mean_absolute_deviation() -> None:
