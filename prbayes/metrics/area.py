@@ -94,8 +94,10 @@ class AreaDiscrepancy(Discrepancy):
     def from_basis(self, weights: Any, basis: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
         """Return F - S_N on each interval between knots, and the interval's length."""
         order, below, own, own_below, lengths = basis
-        many = xp is np and weights.size > _MANY
-        simulated = (_sums_below if many else summed_below)(weights, order, below, xp)
+        if xp is np and weights.size > _MANY:
+            simulated = _many_summed_below(weights, order, below)
+        else:
+            simulated = summed_below(weights, order, below, xp)
         observed = summed_below(self.weights, own, own_below, xp)
         return simulated - observed, lengths
 
@@ -143,7 +145,7 @@ class AreaDiscrepancy(Discrepancy):
         return (gaps * lengths).sum(axis=-1)
 
 
-def _sums_below(weights: Floats, order: Any, below: Any, xp: Any) -> Floats:
+def _many_summed_below(weights: Floats, order: NDArray[np.intp], below: NDArray[np.intp]) -> Floats:
     """Return what `summed_below` does, reading and writing each number once."""
     rows = np.ascontiguousarray(weights).reshape(-1, weights.shape[-1])
     out = np.empty((len(rows), len(below)))
