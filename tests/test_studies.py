@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -34,6 +36,27 @@ def test_coverage(problem: str, count: int, size: int) -> None:
         # At N = 20 the full study has up to 1.44, its first 60 data sets alone 2.30: some estimates
         # lie near an edge.
         assert np.max(found["sd_over_own_sampling_sd"]) < (2.2 if size == 20 else 1.2) + 0.3 * error
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.13, 0.4999, 0.5, 2.0])
+def test_the_exact_density_of_correlated_inputs_is_its_integral(sigma: float) -> None:
+    mu, given = 3.0, 0.2 * np.sqrt(0.75)
+    for y in (2.0, 3.0, 4.5):
+        expected, _ = quad(
+            lambda z, y=y: norm.pdf(z) * norm.pdf(np.log(y / (mu + sigma * z)), 0.1 * z, given) / y,
+            max(-8.0, -mu / sigma),
+            8.0,
+            epsabs=1e-12,
+            limit=500,
+        )
+        found = coverage.PROBLEMS["correlated"].density(y, mu, sigma)
+        np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+def test_estimates_at_an_edge_are_no_spread() -> None:
+    estimates = norm.ppf((np.arange(13) + 0.5) / 13)
+    found = coverage.spread(np.r_[estimates, -8.0, -12.0][:, None])
+    np.testing.assert_allclose(found, estimates.std(ddof=1), rtol=1e-12)
 
 
 def test_a_study_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
