@@ -873,7 +873,7 @@ TABLE: dict[str, Row] = {
         of_optimum(prb.cross_validate),
         {
             "optimum": NO_OPTIMUM,
-            "folds": (*COUNT, 1, 29),
+            "folds": (*but_none(COUNT), 1, 29),
             "random_seed": SEED,
             "progressbar": FLAG,
         },
@@ -892,7 +892,7 @@ TABLE: dict[str, Row] = {
                 [],
                 None,
             ),
-            "folds": (*COUNT, 1, 29),
+            "folds": (*but_none(COUNT), 1, 29),
             "random_seed": SEED,
             "progressbar": FLAG,
         },
