@@ -36,10 +36,9 @@ class Share:
 
     def __call__(self, observed: Any, weights: Any) -> float:
         """Return the bandwidth of measured responses."""
-        import prbayes as prb
+        from prbayes.metrics.density import twice_silverman
 
-        default: Any = prb.GaussianKDE().bandwidth
-        return float(self.share * default(observed, weights))
+        return self.share * twice_silverman(observed, weights)
 
 
 def metrics() -> dict[str, Any]:
@@ -53,7 +52,7 @@ def metrics() -> dict[str, Any]:
     others = {
         "PR": prb.ProbabilityResidual(),
         "area": prb.AreaMetric(),
-        "log-likelihood": prb.LogLikelihood(),
+        "log-likelihood": prb.LogLikelihood(density=prb.GaussianKDE()),
     }
     return found | others
 

@@ -369,7 +369,7 @@ def problems() -> dict[str, Problem]:
             np.square, np.square(larger), prb.AreaMetric(), everywhere=True
         ),
         "log-likelihood, N = 60": of_one(
-            np.exp, np.exp(larger), prb.LogLikelihood(), everywhere=True
+            np.exp, np.exp(larger), prb.LogLikelihood(density=prb.GaussianKDE()), everywhere=True
         ),
         LEFT_OUT: Problem(partial(minimised, lambda: two_inputs(again())), sampled, True),
         "two inputs, three outputs, PR, N = 40": Problem(

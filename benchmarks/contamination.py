@@ -20,6 +20,7 @@ import pymc as pm
 
 import prbayes as prb
 from benchmarks import record
+from benchmarks.metrics import BY_NAME
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.smc import Sampling, sample
 
@@ -37,7 +38,7 @@ def evaluator_of(metric: str) -> Evaluator:
             "y",
             lambda x: x,
             pm.Normal.dist(mu, sigma),
-            metric=getattr(prb, metric)(),
+            metric=BY_NAME[metric],
             observed=np.random.default_rng(0).normal(10, 1, SIZE),
         )
     return Evaluator(model)

@@ -182,6 +182,7 @@ def build(problem: str, metric: str, size: int) -> Any:
     import pymc as pm
 
     import prbayes as prb
+    from benchmarks.metrics import BY_NAME
     from prbayes.model.evaluator import Evaluator
 
     p = PROBLEMS[problem]
@@ -192,7 +193,7 @@ def build(problem: str, metric: str, size: int) -> Any:
             "y",
             p.response,
             *inputs,
-            metric=getattr(prb, metric)(),
+            metric=BY_NAME[metric],
             observed=some,
             propagation=prb.Reweighted(p.n, max_points=p.max_points),
         )

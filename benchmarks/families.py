@@ -30,6 +30,7 @@ import pymc as pm
 
 import prbayes as prb
 from benchmarks import record
+from benchmarks.metrics import BY_NAME
 
 FAMILIES = ("normal", "lognormal")
 VARIATIONS = (0.1, 0.3, 0.6)
@@ -62,7 +63,7 @@ def calibrated(family: str, response: str, metric: str, data: Any) -> prb.Optimu
             variance = pm.math.log1p((sd / mean) ** 2)
             x = pm.LogNormal.dist(pm.math.log(mean) - variance / 2, pm.math.sqrt(variance))
         prb.Simulator(
-            "y", RESPONSES[response], x, metric=getattr(prb, metric)(), observed=data,
+            "y", RESPONSES[response], x, metric=BY_NAME[metric], observed=data,
             propagation=prb.Reweighted(512), progressbar=False,
         )  # fmt: skip
         return prb.minimize(progressbar=False)

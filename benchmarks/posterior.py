@@ -218,6 +218,7 @@ def build(problem: Problem, metric: str, size: int) -> Any:
     import pymc as pm
 
     import prbayes as prb
+    from benchmarks.metrics import BY_NAME
     from prbayes.model.evaluator import Evaluator
 
     some = problem.response(problem.draw(np.random.default_rng(0), size))
@@ -232,7 +233,7 @@ def build(problem: Problem, metric: str, size: int) -> Any:
             "y",
             response,
             *every,
-            metric=getattr(prb, METRICS[metric])(),
+            metric=BY_NAME[METRICS[metric]],
             observed=some,
             propagation=prb.Reweighted(problem.points, max_points=2048),
         )

@@ -30,7 +30,7 @@ METRICS = {
     "PR": prb.ProbabilityResidual(),
     "KLD": prb.KullbackLeibler(),
     "area": prb.AreaMetric(),
-    "log-likelihood": prb.LogLikelihood(),
+    "log-likelihood": prb.LogLikelihood(density=prb.GaussianKDE()),
 }
 SIZES = (10, 5)
 MEANS = np.array([1.0, 1.3, 0.8])

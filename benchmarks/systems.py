@@ -21,7 +21,7 @@ METRICS: dict[str, prb.Metric] = {
     "PR": prb.ProbabilityResidual(),
     "KLD": prb.KullbackLeibler(),
     "area": prb.AreaMetric(),
-    "log-likelihood": prb.LogLikelihood(),
+    "log-likelihood": prb.LogLikelihood(density=prb.GaussianKDE()),
 }
 
 

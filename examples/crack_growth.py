@@ -23,7 +23,7 @@ METRICS = {
     "PR": prb.ProbabilityResidual(),
     "KLD": prb.KullbackLeibler(),
     "area": prb.AreaMetric(),
-    "log-likelihood": prb.LogLikelihood(),
+    "log-likelihood": prb.LogLikelihood(density=prb.GaussianKDE()),
 }
 
 

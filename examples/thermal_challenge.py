@@ -263,7 +263,7 @@ def study():
     found = {"capacity": {}}
     for metric in (
         prb.KullbackLeibler(),
-        prb.LogLikelihood(),
+        prb.LogLikelihood(density=prb.GaussianKDE()),
         prb.ProbabilityResidual(),
         prb.AreaMetric(),
     ):

@@ -19,6 +19,7 @@ from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.estimate.refinement import reached
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
+from prbayes.metrics.density import GaussianKDE
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.joint import Joint
 from prbayes.metrics.likelihood import LogLikelihood
@@ -45,7 +46,12 @@ from prbayes.response.inputs import event_shape
 
 # What a comparison has by result besides scores.
 COSTS = ("n_responses", "seconds")
-_METRICS = (ProbabilityResidual(), KullbackLeibler(), AreaMetric(), LogLikelihood())
+_METRICS = (
+    ProbabilityResidual(),
+    KullbackLeibler(),
+    AreaMetric(),
+    LogLikelihood(density=GaussianKDE()),
+)
 
 
 @in_turn

@@ -471,7 +471,7 @@ TABLE: dict[str, Row] = {
     "KullbackLeibler": Row(
         prb.KullbackLeibler, {"density": (None, 0.3, prb.Histogram, "kde"), "reverse": FLAG}
     ),
-    "LogLikelihood": Row(prb.LogLikelihood, {"density": (None, 0.3, prb.GaussianKDE, "kde")}),
+    "LogLikelihood": Row(prb.LogLikelihood, {"density": (0.3, prb.GaussianKDE, "kde")}),
     "FunctionMetric": Row(
         prb.FunctionMetric, {"function": (3, "f", None), "weighted": FLAG}, {"function": np.mean}
     ),
@@ -518,7 +518,7 @@ TABLE: dict[str, Row] = {
             "weights": (np.ones(3), -np.ones(30), np.zeros(30), "abc", OBSERVED > 2),
         },
     ),
-    "GaussianKDE": Row(prb.GaussianKDE, {"bandwidth": POSITIVE}),
+    "GaussianKDE": Row(prb.GaussianKDE, {"bandwidth": but_none(POSITIVE)}),
     "Histogram": Row(prb.Histogram, {"bins": (0, -3, 1.5, "a", True, [3.0, 2.0, 1.0], np.nan)}),
     "a metric": Row(
         metric_called,

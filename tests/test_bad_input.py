@@ -439,7 +439,7 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         r"density: got float 0.3, expected prb.GaussianKDE",
     ),
     "density None": (
-        lambda: prb.LogLikelihood(None),
+        lambda: prb.KullbackLeibler(None),
         TypeError,
         r"density: got NoneType None, expected prb.Gauss",
     ),

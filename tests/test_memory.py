@@ -16,6 +16,7 @@ import pytest
 from line_problem import OBSERVED, line
 
 import prbayes as prb
+from prbayes.metrics.density import twice_silverman
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import nodes
 
@@ -136,11 +137,11 @@ def test_the_support_of_many_populations_is_looked_at_in_parts(
     assert max(sizes) == 1024 // design.n_points
 
 
-@pytest.mark.parametrize("density", [prb.GaussianKDE(), prb.Histogram()])
+@pytest.mark.parametrize("density", [prb.GaussianKDE(twice_silverman), prb.Histogram()])
 def test_the_log_likelihood_of_many_observations_takes_little_memory(density: Any) -> None:
     observed = np.random.default_rng(1).normal(size=20_000)
     tracemalloc.start()
-    prb.LogLikelihood(density).against(observed)
+    prb.LogLikelihood(density=density).against(observed)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 200 * MIB
@@ -148,7 +149,7 @@ def test_the_log_likelihood_of_many_observations_takes_little_memory(density: An
 
 def test_readings_in_parts_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     observed = np.random.default_rng(1).normal(size=200)
-    whole = prb.LogLikelihood().against(observed)
+    whole = prb.LogLikelihood(density=prb.GaussianKDE()).against(observed)
     monkeypatch.setattr("prbayes.metrics.cells.AT_ONCE", 20 * whole.reading.size)  # type: ignore[attr-defined]
-    parts = prb.LogLikelihood().against(observed)
+    parts = prb.LogLikelihood(density=prb.GaussianKDE()).against(observed)
     assert np.allclose(parts.reading, whole.reading, rtol=1e-12, atol=1e-15)  # type: ignore[attr-defined]

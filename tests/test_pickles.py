@@ -64,7 +64,7 @@ MAKE: dict[str, Callable[[], Any]] = {
     "Histogram": lambda: prb.Histogram(9),
     "Joint": lambda: prb.Joint(prb.KullbackLeibler(), 5),
     "KullbackLeibler": prb.KullbackLeibler,
-    "LogLikelihood": prb.LogLikelihood,
+    "LogLikelihood": lambda: prb.LogLikelihood(density=prb.GaussianKDE()),
     "MarginalCorrelation": lambda: prb.MarginalCorrelation(prb.AreaMetric(), (1.0, 2.0)),
     "Metric": lambda: prb.ProbabilityResidual(density=prb.Histogram(4)),
     "Optimum": optimum,

@@ -28,7 +28,7 @@ METRICS = {
     "PR": prb.ProbabilityResidual(),
     "KLD": prb.KullbackLeibler(),
     "area": prb.AreaMetric(),
-    "log-likelihood": prb.LogLikelihood(),
+    "log-likelihood": prb.LogLikelihood(density=prb.GaussianKDE()),
     "one's own": prb.FunctionMetric(kolmogorov, weighted=True),
 }
 # How the discrepancy itself depends on the unit: these two have one.

@@ -34,7 +34,7 @@ METRICS = {
     "PR": prb.ProbabilityResidual(),
     "KLD": prb.KullbackLeibler(),
     "area": prb.AreaMetric(),
-    "log-likelihood": prb.LogLikelihood(),
+    "log-likelihood": prb.LogLikelihood(density=prb.GaussianKDE()),
 }
 COLORS = dict(zip(METRICS, ["#0072B2", "#009E73", "#D55E00", "#CC79A7"], strict=True))
 RANGES = {

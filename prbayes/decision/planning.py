@@ -103,7 +103,8 @@ def plan(
     >>> with pm.Model() as model:
     ...     x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1), name="x")
     ...     data = np.random.default_rng(1).normal(0, 1, 50)
-    ...     y = prb.Simulator("y", np.sinh, x, metric=prb.LogLikelihood(), observed=data)
+    ...     metric = prb.LogLikelihood(density=prb.GaussianKDE())
+    ...     y = prb.Simulator("y", np.sinh, x, metric=metric, observed=data)
     >>> same = prb.decision.Condition(np.sinh, x)
     >>> table = prb.plan(prb.minimize(model), {"same": same}, k=150)
     >>> ratio = table.sd.sel(candidate="same", k=150, name="mu") / table.now.sel(name="mu")

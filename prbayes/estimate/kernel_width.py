@@ -103,7 +103,7 @@ def _told(evaluator: Evaluator, k: int, bias: Floats) -> str:
     parts = number_parts(node.target)
     if len(parts) == 1:
         width = parts[0].target.resolution * np.sqrt(_AIMED / bias[worst])
-        kernel = f"prb.LogLikelihood(prb.GaussianKDE({width:.2g})), or "
+        kernel = f"prb.LogLikelihood(density=prb.GaussianKDE({width:.2g})), or "
     size = f"about {bias[worst]:.1f} standard errors"
     if bias[worst] > _ONE_STEP:
         size = "more than a standard error"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -74,7 +74,7 @@ def twice_silverman(sample: Floats, weights: Floats) -> float:
 
 
 def likelihood_bandwidth(sample: Floats, weights: Floats) -> float:
-    """Return 0.35 min(sd, IQR/1.34) n^(-1/4), the default of the log-likelihood.
+    """Return 0.35 min(sd, IQR/1.34) n^(-1/4), the default of the kernel log-likelihood.
 
     Only the simulated side is smoothed there, which makes the fitted population too narrow by about
     h^2 / (2 sd^2); with this rule that is at most a tenth of the sampling error sd / sqrt(2 n) for
@@ -104,8 +104,8 @@ class GaussianKDE(DensityEstimator):
     Parameters
     ----------
     bandwidth : float or callable, optional
-        In units of the response, or a rule ``(observed, weights) -> float``. Two Silverman
-        bandwidths by default.
+        In units of the response, or a rule ``(observed, weights) -> float``. By default the rule of
+        the metric: `likelihood_bandwidth` in `LogLikelihood`, two Silverman bandwidths elsewhere.
 
     Raises
     ------
@@ -128,10 +128,10 @@ class GaussianKDE(DensityEstimator):
     True
     """
 
-    bandwidth: float | BandwidthRule = twice_silverman
+    bandwidth: float | BandwidthRule | None = None
 
     def __post_init__(self) -> None:
-        if not callable(self.bandwidth):
+        if self.bandwidth is not None and not callable(self.bandwidth):
             positive_number(self.bandwidth, "bandwidth")
 
     def cells(self, observed: Floats, weights: Floats) -> Cells:
@@ -152,7 +152,7 @@ class GaussianKDE(DensityEstimator):
 
     def _bandwidth(self, observed: Floats, weights: Floats) -> float:
         """Return the bandwidth for observed values, or raise if it is not positive."""
-        rule = self.bandwidth
+        rule = twice_silverman if self.bandwidth is None else self.bandwidth
         h = rule(observed, weights) if callable(rule) else float(rule)
         if not np.isfinite(h) or h <= 0:
             raise ValueError(
@@ -252,10 +252,20 @@ class Histogram(DensityEstimator):
         return int(np.clip(np.ceil(length / width), 5, _MAX_CELLS))
 
 
-def density_estimator(density: object) -> None:
-    """Refuse what is no estimator of densities."""
+def density_estimator(
+    density: object, bandwidth: BandwidthRule = twice_silverman
+) -> DensityEstimator:
+    """Return a metric's density estimator, where a kernel without bandwidth has the metric's rule.
+
+    Raises
+    ------
+    TypeError
+        If it is not a density estimator.
+    """
+    if isinstance(density, GaussianKDE) and density.bandwidth is None:
+        return replace(density, bandwidth=bandwidth)
     if isinstance(density, DensityEstimator):
-        return
+        return density
     got = f"{type(density).__name__} {density!r}"
     if isinstance(density, type):
         got = f"the class {density.__name__}"

@@ -48,7 +48,7 @@ class KullbackLeibler(Metric):
     likelihood: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        density_estimator(self.density)
+        object.__setattr__(self, "density", density_estimator(self.density))
         flag(self.reverse, "reverse")
 
     @property

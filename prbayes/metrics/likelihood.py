@@ -1,4 +1,4 @@
-"""The negative mean log-likelihood."""
+"""The negative mean log-likelihood, estimated from a kernel density or a histogram."""
 
 from __future__ import annotations
 
@@ -27,13 +27,20 @@ from prbayes.metrics.density import (
 class LogLikelihood(Metric):
     r"""Negative mean log-likelihood of observed values, :math:`-\frac{1}{N} \sum_i \log p(z_i)`.
 
-    Only the simulated side is smoothed, which makes the fitted population narrower by about
-    :math:`h^2/(2\sigma^2)`; the default bandwidth keeps that below a tenth of the sampling error of
-    a normal population. Where it is more, as of responses in groups, an optimum warns.
+    The density p is that of the simulated responses. Only this side is smoothed, which makes the
+    fitted population narrower by about :math:`h^2/(2\sigma^2)`; the default bandwidth keeps that
+    below a tenth of the sampling error of a normal population. Where it is more, as of responses in
+    groups, an optimum warns.
 
     Parameters
     ----------
     density : GaussianKDE or Histogram
+        Estimates the simulated density. A `GaussianKDE` without bandwidth has the default one.
+
+    Raises
+    ------
+    TypeError
+        When prepared against observed values without a density.
 
     References
     ----------
@@ -44,12 +51,13 @@ class LogLikelihood(Metric):
     >>> import numpy as np
     >>> from scipy.stats import norm
     >>> simulated = norm.ppf((np.arange(4000) + 0.5) / 4000)
-    >>> found = LogLikelihood()(simulated, [-1.0, 0.0, 1.0])
-    >>> bool(np.isclose(found, -norm.logpdf([-1, 0, 1]).mean(), rtol=0.05))
+    >>> metric = LogLikelihood(density=GaussianKDE())
+    >>> value = metric(simulated, [-1.0, 0.0, 1.0])
+    >>> bool(np.isclose(value, -norm.logpdf([-1, 0, 1]).mean(), rtol=0.05))
     True
     """
 
-    density: DensityEstimator = field(default_factory=lambda: GaussianKDE(likelihood_bandwidth))
+    density: DensityEstimator | None = field(default=None, kw_only=True)
     minimum: ClassVar[Minimum] = Minimum.QUADRATIC
     counts_failures: ClassVar[bool] = True
     likelihood: ClassVar[bool] = True
@@ -57,9 +65,16 @@ class LogLikelihood(Metric):
     tail_responses: ClassVar[int] = 300  # from which standard errors are right to a tenth
 
     def __post_init__(self) -> None:
-        density_estimator(self.density)
+        if self.density is not None:
+            density = density_estimator(self.density, likelihood_bandwidth)
+            object.__setattr__(self, "density", density)
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
+        if self.density is None:
+            raise TypeError(
+                "LogLikelihood: got density=None, expected prb.GaussianKDE() or prb.Histogram(); "
+                "pass prb.LogLikelihood(density=prb.GaussianKDE())"
+            )
         cells = self.density.cells(observed, weights)
         return LikelihoodDiscrepancy.on_cells(self, observed, weights, cells)
 
@@ -89,7 +104,7 @@ class LikelihoodDiscrepancy(CellwiseDiscrepancy):
     @property
     def exact(self) -> bool:
         """Whether the kernel is as narrow as the default."""
-        return bool(self.metric == LogLikelihood())
+        return bool(self.metric == LogLikelihood(density=GaussianKDE()))
 
     @property
     def resolution(self) -> float:
@@ -101,7 +116,7 @@ class LikelihoodDiscrepancy(CellwiseDiscrepancy):
         if not self.resolution:
             return self
         kernel = GaussianKDE(factor * self.resolution)
-        return LogLikelihood(kernel).against(self.observed, self.weights)
+        return LogLikelihood(density=kernel).against(self.observed, self.weights)
 
     @property
     def constants(self) -> tuple[Any, ...]:

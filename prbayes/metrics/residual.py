@@ -63,7 +63,7 @@ class ProbabilityResidual(Metric):
     counts_failures: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        density_estimator(self.density)
+        object.__setattr__(self, "density", density_estimator(self.density))
         positive_number(self.scale_base, "scale_base")
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:

@@ -94,9 +94,9 @@ def sample_smc(
     adjust : Affine or bool
         Whether, and how, the draws are brought to the width that the data warrant. By default by
         ``prb.posterior.GivenEstimate()`` with the same ``random_seed``, and not where they are the
-        posterior as they are, as those of `LogLikelihood` with one simulator, stored responses and
-        epsilon = 1/N; nor where an epsilon was given, which is then taken at its word. An `Affine`
-        or `GivenEstimate` that is given adjusts in any case.
+        posterior as they are, as those of the kernel log-likelihood with one simulator, stored
+        responses and epsilon = 1/N; nor where an epsilon was given, which is then taken at its
+        word. An `Affine` or `GivenEstimate` that is given adjusts in any case.
     threshold : float
         Share of the effective sample size that a stage keeps; higher means more stages.
     refine : bool

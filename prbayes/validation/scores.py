@@ -12,7 +12,7 @@ from scipy.stats import t as student
 from prbayes._checks import Floats
 from prbayes._weighted import finite_sample, quantile
 from prbayes.metrics.base import Discrepancy, Metric, Part
-from prbayes.metrics.density import spread
+from prbayes.metrics.density import GaussianKDE, spread
 from prbayes.metrics.joint import Joint
 from prbayes.metrics.likelihood import LogLikelihood
 
@@ -43,7 +43,7 @@ class Scoring:
         ValueError
             If they have no density, as where all are equal.
         """
-        metric: Metric = LogLikelihood()
+        metric: Metric = LogLikelihood(density=GaussianKDE())
         if observed.ndim > 1:
             metric = Joint(metric)
         return cls(metric.against(observed, weights))

@@ -8,7 +8,11 @@ import prbayes as prb
 from prbayes.decision.information import Belief, fisher_information, of_a_specimen
 from prbayes.decision.populations import Populations
 
-METRICS = [prb.LogLikelihood(), prb.AreaMetric(), prb.ProbabilityResidual()]
+METRICS = [
+    prb.LogLikelihood(density=prb.GaussianKDE()),
+    prb.AreaMetric(),
+    prb.ProbabilityResidual(),
+]
 # Efficiency of each metric for the mean and the standard deviation of a normal population: that of
 # Cramer and von Mises' kind of distances is known to be within these.
 LEAST = [0.95, 0.85, 0.8]
@@ -56,7 +60,7 @@ def test_fishers_information_of_a_response() -> None:
 def test_what_tells_of_one_direction_only() -> None:
     populations = Populations.of(optimum(), None, 10, "prb.plan")
     told = populations.all_outputs(lambda x: np.abs(x - 1.0), (normal()[1],))
-    found = of_a_specimen(told, prb.LogLikelihood())
+    found = of_a_specimen(told, prb.LogLikelihood(density=prb.GaussianKDE()))
     # How far specimens are from about the middle says little of where that is.
     sigma = np.exp(populations.center[1])
     unit = populations.evaluator.prior_sd

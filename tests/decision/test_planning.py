@@ -14,7 +14,9 @@ def table() -> xr.Dataset:
     quantity = prb.decision.Quantile(same, x, probability=0.95)
     candidates = {
         "same": prb.decision.Condition(same, x),
-        "size": prb.decision.Condition(lambda x: np.abs(x - 1.0), x, metric=prb.LogLikelihood()),
+        "size": prb.decision.Condition(
+            lambda x: np.abs(x - 1.0), x, metric=prb.LogLikelihood(density=prb.GaussianKDE())
+        ),
     }
     return prb.plan(optimum(), candidates, [N, 3 * N], quantity=quantity)
 

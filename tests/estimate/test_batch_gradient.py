@@ -60,7 +60,7 @@ METRICS = {
     "kl": prb.Joint(prb.KullbackLeibler()),
     "reverse": prb.Joint(prb.KullbackLeibler(reverse=True)),
     "pr": prb.Joint(prb.ProbabilityResidual()),
-    "ll": prb.Joint(prb.LogLikelihood()),
+    "ll": prb.Joint(prb.LogLikelihood(density=prb.GaussianKDE())),
 }
 
 

@@ -78,7 +78,7 @@ def test_a_population_that_collapsed_is_known_however_far_out(out: float) -> Non
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1.5, 0.5), pm.HalfNormal("sigma", 0.3))
         density = prb.GaussianKDE(0.5)
-        metric = prb.LogLikelihood(density)
+        metric = prb.LogLikelihood(density=density)
         prb.Simulator(
             "y", np.positive, x, metric=metric, observed=observed, propagation=prb.Resimulated(64)
         )
@@ -131,7 +131,13 @@ def test_a_value_between_responses_far_apart_is_told_of(largest: float, said: bo
     observed = np.append(np.exp(norm.ppf((np.arange(59) + 0.5) / 59, 0, 0.2)), largest)
     with pm.Model() as model:
         x = pm.LogNormal.dist(pm.Normal("mu", 0, 0.5), pm.HalfNormal("sigma", 0.5))
-        prb.Simulator("y", np.positive, x, metric=prb.LogLikelihood(), observed=observed)
+        prb.Simulator(
+            "y",
+            np.positive,
+            x,
+            metric=prb.LogLikelihood(density=prb.GaussianKDE()),
+            observed=observed,
+        )
     evaluator = Evaluator(model)
     found = between_runs(evaluator, np.array([0.0, np.log(0.3)]))
     assert len(found) == said

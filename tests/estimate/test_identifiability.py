@@ -18,7 +18,7 @@ from prbayes.model.evaluator import Evaluator
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
 METRICS: dict[str, prb.Metric] = {
-    "ll": prb.LogLikelihood(),
+    "ll": prb.LogLikelihood(density=prb.GaussianKDE()),
     "kl": prb.KullbackLeibler(),
     "pr": prb.ProbabilityResidual(),
 }

@@ -33,21 +33,21 @@ def told(result: prb.Optimum) -> list[str]:
 
 
 def test_a_kernel_that_is_wide_beside_a_branch_is_told_of() -> None:
-    found = optimum(branches, prb.LogLikelihood())
+    found = optimum(branches, prb.LogLikelihood(density=prb.GaussianKDE()))
     assert found.point["sigma"] < INPUTS.std() - found.stderr["sigma"]
     (line,) = told(found)
     assert "y: the kernel of the log-likelihood is wide" in line
     assert "sigma is off by more than a standard error" in line
     # What is proposed mends it.
     width = float(line.split("GaussianKDE(")[1].split(")")[0])
-    mended = optimum(branches, prb.LogLikelihood(prb.GaussianKDE(width)))
+    mended = optimum(branches, prb.LogLikelihood(density=prb.GaussianKDE(width)))
     assert not told(mended)
     assert mended.point["sigma"] == pytest.approx(INPUTS.std(), rel=0.02)
 
 
 @pytest.mark.parametrize("width", [0.2, 0.4])
 def test_the_bias_is_that_of_the_kernel_s_variance(width: float) -> None:
-    found = optimum(same, prb.LogLikelihood(prb.GaussianKDE(width)))
+    found = optimum(same, prb.LogLikelihood(density=prb.GaussianKDE(width)))
     # The smoothed population has the data's variance.
     sigma = np.sqrt(INPUTS.var() - width**2)
     assert found.point["sigma"] == pytest.approx(sigma, rel=2e-3)
@@ -62,9 +62,9 @@ def test_the_bias_is_that_of_the_kernel_s_variance(width: float) -> None:
 @pytest.mark.parametrize(
     "metric",
     [
-        prb.LogLikelihood(prb.Histogram(9)),
+        prb.LogLikelihood(density=prb.Histogram(9)),
         prb.KullbackLeibler(prb.GaussianKDE(0.9)),
-        prb.LogLikelihood(),
+        prb.LogLikelihood(density=prb.GaussianKDE()),
     ],
 )
 def test_others_are_not(metric: prb.Metric) -> None:

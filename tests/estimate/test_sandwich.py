@@ -188,7 +188,11 @@ NARROW = prb.GaussianKDE(0.15)
 
 @pytest.mark.parametrize(
     "metric",
-    [prb.LogLikelihood(NARROW), prb.KullbackLeibler(NARROW), prb.ProbabilityResidual(NARROW)],
+    [
+        prb.LogLikelihood(density=NARROW),
+        prb.KullbackLeibler(NARROW),
+        prb.ProbabilityResidual(NARROW),
+    ],
     ids=["ll", "kl", "pr"],
 )
 def test_responses_beyond_the_grid_leave_the_curvature_as_it_is(metric: prb.Metric) -> None:

@@ -9,7 +9,7 @@ import pytest
 import prbayes as prb
 
 METRICS: dict[str, prb.Metric] = {
-    "ll": prb.LogLikelihood(),
+    "ll": prb.LogLikelihood(density=prb.GaussianKDE()),
     "kl": prb.KullbackLeibler(),
     "pr": prb.ProbabilityResidual(),
     "area": prb.AreaMetric(),

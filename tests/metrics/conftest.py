@@ -27,8 +27,8 @@ def _metrics(h: float = BANDWIDTH) -> dict[str, Metric]:
         "kl": KullbackLeibler(GaussianKDE(h)),
         "kl-reverse": KullbackLeibler(GaussianKDE(h), reverse=True),
         "kl-bins": KullbackLeibler(Histogram(7)),
-        "ll": LogLikelihood(GaussianKDE(h)),
-        "ll-bins": LogLikelihood(Histogram(7)),
+        "ll": LogLikelihood(density=GaussianKDE(h)),
+        "ll-bins": LogLikelihood(density=Histogram(7)),
     }
 
 

@@ -70,7 +70,7 @@ INNER: dict[str, Metric] = {
     "pr": ProbabilityResidual(),
     "pr-bins": ProbabilityResidual(Histogram(7)),
     "kl": KullbackLeibler(),
-    "ll": LogLikelihood(),
+    "ll": LogLikelihood(density=GaussianKDE()),
     "area": AreaMetric(),
     "absolute": Absolute(),
     "means": MeanMetric(),

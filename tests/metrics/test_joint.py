@@ -26,7 +26,7 @@ LIFTED: dict[str, Metric] = {
     "pr": ProbabilityResidual(),
     "kl": KullbackLeibler(),
     "kl-reverse": KullbackLeibler(reverse=True),
-    "ll": LogLikelihood(),
+    "ll": LogLikelihood(density=GaussianKDE()),
     "area": AreaMetric(),
 }
 by_metric = pytest.mark.parametrize("metric", LIFTED.values(), ids=LIFTED)

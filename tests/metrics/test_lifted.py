@@ -12,6 +12,7 @@ from prbayes._checks import Floats
 from prbayes.metrics.area import AreaMetric
 from prbayes.metrics.base import Metric
 from prbayes.metrics.correlation import MarginalCorrelation
+from prbayes.metrics.density import GaussianKDE
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.joint import Joint
 from prbayes.metrics.lifted import failure_caps
@@ -24,7 +25,7 @@ LIFTED: dict[str, Metric] = {
     "pr": ProbabilityResidual(),
     "kl": KullbackLeibler(),
     "kl-reverse": KullbackLeibler(reverse=True),
-    "ll": LogLikelihood(),
+    "ll": LogLikelihood(density=GaussianKDE()),
     "area": AreaMetric(),
 }
 by_metric = pytest.mark.parametrize("metric", LIFTED.values(), ids=LIFTED)

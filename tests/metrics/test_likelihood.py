@@ -8,8 +8,17 @@ from scipy.stats import norm
 
 from prbayes._checks import Floats
 from prbayes.metrics.base import Minimum
-from prbayes.metrics.density import GaussianKDE, Histogram, likelihood_bandwidth
+from prbayes.metrics.density import (
+    DensityEstimator,
+    GaussianKDE,
+    Histogram,
+    likelihood_bandwidth,
+    twice_silverman,
+)
+from prbayes.metrics.divergence import KullbackLeibler
+from prbayes.metrics.joint import Joint
 from prbayes.metrics.likelihood import LikelihoodDiscrepancy, LogLikelihood
+from prbayes.metrics.residual import ProbabilityResidual
 
 Draw = Callable[..., tuple[Floats, Floats, Floats, Floats]]
 
@@ -26,29 +35,29 @@ def test_the_likelihood_of_a_normal_density(
     x, z = a * normal(m, s, 100_000), a * normal(mu, sd, 99_000)
     vp, d = a**2 * (s**2 + h**2), a * (m - mu)
     expected = np.log(2 * np.pi * vp) / 2 + (a**2 * sd**2 + d**2) / (2 * vp)
-    np.testing.assert_allclose(LogLikelihood(GaussianKDE(a * h))(x, z), expected, rtol=3e-3)
+    np.testing.assert_allclose(LogLikelihood(density=GaussianKDE(a * h))(x, z), expected, rtol=3e-3)
 
 
 @pytest.mark.parametrize("observed", [[0.1], [0.1, 0.1], np.full(6, 0.1)])
 def test_equal_observed_values_need_a_bandwidth(draw: Draw, observed: Floats) -> None:
     x, w, _, _ = draw(11)
     expected = -np.log(w @ norm.pdf(x, 0.1, 0.4))
-    found = LogLikelihood(GaussianKDE(0.4))(x, observed, weights=w)
+    found = LogLikelihood(density=GaussianKDE(0.4))(x, observed, weights=w)
     np.testing.assert_allclose(found, expected, rtol=1e-3)
     with pytest.raises(ValueError, match=r"bandwidth: got 0 .*GaussianKDE\(bandwidth=.*AreaMetric"):
-        LogLikelihood()(x, observed)
+        LogLikelihood(density=GaussianKDE())(x, observed)
 
 
 def test_with_a_histogram_it_is_the_frequency_of_each_bin() -> None:
     # Two bins of width 2; 3 of 4 simulated values in the first.
     expected = -(2 * np.log(3 / 8) + np.log(1 / 8)) / 3
-    found = LogLikelihood(Histogram(2))([0.1, 0.2, 1.9, 3.0], [0.0, 1.0, 4.0])
+    found = LogLikelihood(density=Histogram(2))([0.1, 0.2, 1.9, 3.0], [0.0, 1.0, 4.0])
     assert found == pytest.approx(expected, abs=1e-7)
 
 
 def test_other_observed_values_are_read_where_they_are(draw: Draw) -> None:
     x, w, z, u = draw(12)
-    d = LogLikelihood(GaussianKDE(0.4)).against(z, u)
+    d = LogLikelihood(density=GaussianKDE(0.4)).against(z, u)
     other = d.with_observed(np.array([0.25]))
     assert isinstance(other, LikelihoodDiscrepancy)
     assert other(x, w) == pytest.approx(-np.log(w @ norm.pdf(x, 0.25, 0.4)), rel=1e-3)
@@ -60,9 +69,53 @@ def test_other_observed_values_are_read_where_they_are(draw: Draw) -> None:
 def test_what_it_declares() -> None:
     assert LogLikelihood.minimum is Minimum.QUADRATIC
     assert LogLikelihood.likelihood
-    assert LogLikelihood().additive
-    assert LogLikelihood().density == GaussianKDE(likelihood_bandwidth)
-    assert LogLikelihood().against([0.0, 1.0, 5.0]).scale == 1
+    assert LogLikelihood(density=GaussianKDE()).additive
+    assert LogLikelihood(density=GaussianKDE()).against([0.0, 1.0, 5.0]).scale == 1
+
+
+def test_a_kernel_without_bandwidth_has_the_rule_of_its_metric() -> None:
+    kernel = GaussianKDE()
+    z, w = np.array([0.0, 0.4, 1.0, 5.0]), np.full(4, 0.25)
+    likelihood = LogLikelihood(density=kernel)
+    assert likelihood == LogLikelihood(density=GaussianKDE(likelihood_bandwidth))
+    assert hash(likelihood) == hash(LogLikelihood(density=kernel))
+    assert likelihood != LogLikelihood(density=GaussianKDE(twice_silverman))
+    assert repr(likelihood) == repr(LogLikelihood(density=GaussianKDE(likelihood_bandwidth)))
+    assert likelihood.against(z).resolution == likelihood_bandwidth(z, w)
+    for metric in (KullbackLeibler, ProbabilityResidual):
+        assert metric(kernel) == metric() == metric(GaussianKDE(twice_silverman))
+        assert repr(metric(kernel)) == repr(metric(GaussianKDE(twice_silverman)))
+        cells = metric(kernel).against(z).density_cells
+        assert getattr(cells, "bandwidth", None) == twice_silverman(z, w)
+    assert getattr(kernel.cells(z, w), "bandwidth", None) == twice_silverman(z, w)
+    assert kernel.bandwidth is None
+
+
+@pytest.mark.parametrize("density", [GaussianKDE(0.4), GaussianKDE(twice_silverman), Histogram()])
+def test_a_density_with_its_own_rule_stays(density: DensityEstimator) -> None:
+    metric = LogLikelihood(density=density)
+    assert metric.density is density
+    assert not metric.against([0.0, 1.0, 5.0]).exact
+
+
+def test_the_default_kernel_counts_as_exact() -> None:
+    for kernel in (GaussianKDE(), GaussianKDE(likelihood_bandwidth)):
+        assert LogLikelihood(density=kernel).against([0.0, 1.0, 5.0]).exact
+
+
+def test_the_kernel_form_needs_a_density() -> None:
+    bare = LogLikelihood()
+    assert bare.density is None
+    assert bare == LogLikelihood(density=None) != LogLikelihood(density=GaussianKDE())
+    message = r"density=None, expected prb.GaussianKDE.*pass .*density=prb.GaussianKDE\(\)"
+    with pytest.raises(TypeError, match=message):
+        bare.against([0.0, 1.0])
+    with pytest.raises(TypeError, match=message):
+        bare([0.0, 1.0], [0.0, 1.0])
+    with pytest.raises(TypeError, match=message):
+        Joint(bare).against(np.random.default_rng(0).normal(size=(9, 2)))
+    with pytest.raises(TypeError, match="positional"):
+        LogLikelihood(GaussianKDE())  # type: ignore[misc]
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
@@ -74,7 +127,7 @@ def test_an_outlier_counts_alike_whether_it_was_there_at_first_or_in_a_refit(
     observed = rng.normal(size=30)
     simulated = rng.normal(size=2000)
     with_outlier = np.append(observed, side * far)
-    metric = LogLikelihood(GaussianKDE(0.3))
+    metric = LogLikelihood(density=GaussianKDE(0.3))
     inner = metric.against(observed)
     refitted = inner.with_observed(with_outlier)
     direct = metric.against(with_outlier)
@@ -94,7 +147,7 @@ def test_an_outlier_counts_alike_whether_it_was_there_at_first_or_in_a_refit(
 def test_no_value_beyond_the_grid_improves_the_likelihood(spread: float) -> None:
     simulated = spread * norm.ppf((np.arange(2000) + 0.5) / 2000)
     observed = norm.ppf((np.arange(20) + 0.5) / 20)
-    inner = LogLikelihood().against(observed)
+    inner = LogLikelihood(density=GaussianKDE()).against(observed)
     assert isinstance(inner, LikelihoodDiscrepancy)
     for far in inner.cells.centers[-1] + np.array([0.01, 1.0, 100.0]):
         for value in (far, -far):

@@ -240,8 +240,8 @@ METRICS: dict[str, Metric] = {
     "KLD": prb.KullbackLeibler(),
     "KLD, reverse": prb.KullbackLeibler(reverse=True),
     "KLD, bins": prb.KullbackLeibler(prb.Histogram(6)),
-    "LL": prb.LogLikelihood(),
-    "LL, bins": prb.LogLikelihood(prb.Histogram(6)),
+    "LL": prb.LogLikelihood(density=prb.GaussianKDE()),
+    "LL, bins": prb.LogLikelihood(density=prb.Histogram(6)),
     "area": prb.AreaMetric(),
     "own": prb.FunctionMetric(
         lambda simulated, observed, w: ((simulated * w).sum(-1) - observed.mean()) ** 2,

@@ -338,7 +338,7 @@ def _theta(model: pm.Model) -> Floats:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("metric", [prb.AreaMetric(), prb.LogLikelihood()])
+@pytest.mark.parametrize("metric", [prb.AreaMetric(), prb.LogLikelihood(density=prb.GaussianKDE())])
 def test_data_that_are_set_anew_are_those_of_a_model_made_with_them(metric: prb.Metric) -> None:
     model, new = with_data(metric, OBSERVED), with_data(metric, NEW)
     first = prb.minimize(model, starts=0, **QUIET)

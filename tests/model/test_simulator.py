@@ -334,7 +334,7 @@ OF_OTHERS = [
     prb.AreaMetric(),
     prb.ProbabilityResidual(),
     prb.KullbackLeibler(),
-    prb.LogLikelihood(),
+    prb.LogLikelihood(density=prb.GaussianKDE()),
 ]
 
 
@@ -409,7 +409,8 @@ def test_single_precision_is_refused_before_the_response_is_computed() -> None:
 
 
 @pytest.mark.parametrize(
-    "metric", [prb.AreaMetric(), prb.ProbabilityResidual(), prb.LogLikelihood()]
+    "metric",
+    [prb.AreaMetric(), prb.ProbabilityResidual(), prb.LogLikelihood(density=prb.GaussianKDE())],
 )
 def test_a_reweighted_log_density_is_the_same_compiled_by_jax(metric: prb.Metric) -> None:
     pytest.importorskip("jax")

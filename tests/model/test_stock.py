@@ -27,7 +27,7 @@ def simulate(rng: np.random.Generator, mu: Any, sigma: Any, size: Any = None) ->
 STOCK = {
     "PR": (prb.ProbabilityResidual(), 0.01),
     "KLD": (prb.KullbackLeibler(), 1 / N),
-    "LL": (prb.LogLikelihood(), 1 / N),
+    "LL": (prb.LogLikelihood(density=prb.GaussianKDE()), 1 / N),
     "area": (prb.AreaMetric(), 0.02),
 }
 

@@ -42,7 +42,7 @@ def test_draws_are_those_given_the_estimate_but_for_a_likelihood() -> None:
 @pytest.mark.parametrize(
     "keywords",
     [
-        {"metric": prb.LogLikelihood(prb.GaussianKDE(0.3))},
+        {"metric": prb.LogLikelihood(density=prb.GaussianKDE(0.3))},
         {"epsilon": 0.1},
         {"specimens": [i // 2 for i in range(30)]},
         {"propagation": prb.Resimulated(256)},

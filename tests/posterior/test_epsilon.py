@@ -21,7 +21,7 @@ PR, AREA, KL, LL = (
     prb.ProbabilityResidual(),
     prb.AreaMetric(),
     prb.KullbackLeibler(),
-    prb.LogLikelihood(),
+    prb.LogLikelihood(density=prb.GaussianKDE()),
 )
 
 
@@ -325,7 +325,9 @@ def _shared(metric: prb.Metric, labels: Any, others: Any = None, observed: Any =
     return model
 
 
-@pytest.mark.parametrize("metric", [prb.KullbackLeibler(), prb.LogLikelihood()])
+@pytest.mark.parametrize(
+    "metric", [prb.KullbackLeibler(), prb.LogLikelihood(density=prb.GaussianKDE())]
+)
 def test_a_likelihood_counts_specimens_and_not_observations(metric: prb.Metric) -> None:
     thrice = np.repeat(np.random.default_rng(0).normal(1.0, 0.5, 10), 3)
     model = _shared(metric, np.arange(30) // 3, observed=thrice)

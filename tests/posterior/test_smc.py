@@ -101,7 +101,11 @@ def assert_moments(draws: xr.DataArray, mean: float, sd: float, rtol_sd: float) 
 def test_conjugate_posterior_of_a_normal_mean(name: str) -> None:
     # N times these metrics is the negative log-likelihood of a normal with variance sd^2 + h^2, up
     # to a constant.
-    metric = prb.KullbackLeibler() if name == "KullbackLeibler" else prb.LogLikelihood()
+    metric = (
+        prb.KullbackLeibler()
+        if name == "KullbackLeibler"
+        else prb.LogLikelihood(density=prb.GaussianKDE())
+    )
     model = known_sd(metric)
     h = next(iter(nodes(model).values())).target.cells.bandwidth
     idata = sample(model)

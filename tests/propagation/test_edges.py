@@ -17,7 +17,12 @@ from prbayes.propagation import edges
 from prbayes.propagation.edges import averaged_log_density, cells_around, refuse_moving_atoms
 from prbayes.response.inputs import read_inputs
 
-METRICS = [prb.ProbabilityResidual(), prb.KullbackLeibler(), prb.AreaMetric(), prb.LogLikelihood()]
+METRICS = [
+    prb.ProbabilityResidual(),
+    prb.KullbackLeibler(),
+    prb.AreaMetric(),
+    prb.LogLikelihood(density=prb.GaussianKDE()),
+]
 
 
 def of_kind(metric: prb.Metric) -> str:

@@ -76,11 +76,11 @@ def test_both_ways_give_the_same_discrepancy_and_count_alike() -> None:
 
 def test_too_few_responses_for_a_log_likelihood_are_said(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING, logger="prbayes"):
-        bound(np.positive, 1199, prb.LogLikelihood())
+        bound(np.positive, 1199, prb.LogLikelihood(density=prb.GaussianKDE()))
     assert "expected at least 1200 responses, 300 for each observation" in caplog.text
     caplog.clear()
     with caplog.at_level(logging.WARNING, logger="prbayes"):
-        bound(np.positive, 1200, prb.LogLikelihood())
+        bound(np.positive, 1200, prb.LogLikelihood(density=prb.GaussianKDE()))
         bound(np.positive, 64, prb.KullbackLeibler())
     assert not caplog.text
 

@@ -683,7 +683,7 @@ def test_a_log_likelihood_of_few_resimulated_responses_is_warned_of(
             )
         return float(prb.minimize(model).stderr["sigma"])
 
-    likelihood = prb.LogLikelihood()
+    likelihood = prb.LogLikelihood(density=prb.GaussianKDE())
     right = error(likelihood, prb.Reweighted(1024))
     assert not caplog.records
     few = error(likelihood, prb.Resimulated(1024))

@@ -39,7 +39,7 @@ def test_their_sum_is_what_the_log_likelihood_has_of_all(
     mixing = RNG.normal(size=(3, 3)) + 2 * np.eye(3)
     weights = RNG.uniform(0.5, 1.5, 40)
     weights = weights / weights.sum()
-    metric: prb.Metric = prb.LogLikelihood()
+    metric: prb.Metric = prb.LogLikelihood(density=prb.GaussianKDE())
     observed, simulated = DATA, POPULATION
     if outputs > 1:
         metric = prb.Joint(metric)

@@ -10,6 +10,7 @@ from typing import Any
 import pymc as pm
 
 import prbayes as prb
+from benchmarks.metrics import BY_NAME
 from benchmarks.scoreboard import in_pymc
 from benchmarks.scoreboard.problem import Draws
 from benchmarks.scoreboard.study import Rival, Task, main
@@ -21,7 +22,7 @@ def _of_vector(task: Task) -> Any:
 
 def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
     """Return draws of the hyperparameters."""
-    metric = getattr(prb, settings["metric"])()
+    metric = BY_NAME[settings["metric"]]
     with pm.Model() as model:
         values = in_pymc.hyperparameters(task.problem)
         inputs = in_pymc.inputs(task.problem, values)
