@@ -1,0 +1,1 @@
+"""Inference checks of the hyperparameters, on arrays without PyMC."""

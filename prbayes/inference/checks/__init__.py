@@ -1,0 +1,1 @@
+"""Checks of data, population and prior, with the size and power of every test."""
