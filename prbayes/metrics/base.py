@@ -401,6 +401,11 @@ class Metric(ABC):
         return True
 
     @property
+    def by_specimen(self) -> bool:
+        """Whether it is a likelihood of each specimen's record, and compares no distributions."""
+        return False
+
+    @property
     def takes_outputs(self) -> bool:
         """Whether it compares several outputs at a time, (N, m), as `Joint` does."""
         return False

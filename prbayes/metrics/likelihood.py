@@ -21,6 +21,7 @@ from prbayes.metrics.density import (
     density_estimator,
     likelihood_bandwidth,
 )
+from prbayes.metrics.readings import Readings
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,15 @@ class LogLikelihood(Metric):
         if self.density is not None:
             density = density_estimator(self.density, likelihood_bandwidth)
             object.__setattr__(self, "density", density)
+
+    @property
+    def by_specimen(self) -> bool:
+        """Whether it is the log-likelihood by specimen, which is no distance of two samples."""
+        return self.density is None
+
+    def readings(self, values: Floats) -> Readings:
+        """Return measured outputs, (N, m), with what is known of their measurement."""
+        return Readings.exact(values)
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         if self.density is None:

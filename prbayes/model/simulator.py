@@ -23,12 +23,14 @@ from prbayes._checks import (
     positive_number,
     refuse_single_precision,
     sample_labels,
+    sample_weights,
 )
 from prbayes._progress import shown
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.costing import Asked, listening
 from prbayes.model.description import without_addresses
 from prbayes.model.first_look import tell_copies, tell_far_data
+from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.model.node import (
     Node,
     SimulatorDistribution,
@@ -38,9 +40,11 @@ from prbayes.model.node import (
     nodes,
     shared_epsilon,
 )
-from prbayes.propagation.base import Bound, Propagation
+from prbayes.model.specimen_likelihood import SpecimenDistribution, SpecimenLikelihood
+from prbayes.propagation.base import Bound, Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.response.compilation import PLAIN
+from prbayes.response.distributions import refuse_without_density
 from prbayes.response.grouping import Groups, is_group, places_of
 from prbayes.response.inputs import Inputs, is_labelled, read_inputs
 from prbayes.response.outputs import ONE, Outputs, read_observed
@@ -53,7 +57,7 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     name: str,
     response: Callable[..., Any],
     *inputs: Any,
-    metric: Metric,
+    metric: Metric | None = None,
     observed: Any,
     epsilon: float | None = None,
     weights: ArrayLike | None = None,
@@ -155,6 +159,13 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         refuse_single_precision(f"{name}: {root.name}", root.dtype)
     places, measured = _grouped(name, sorted_inputs, observed)
     values, outputs = read_observed(name, _data(name, measured))
+    metric = LogLikelihood() if metric is None else metric
+    if isinstance(metric, Metric) and metric.by_specimen:
+        return _by_specimen(
+            name, model, response, sorted_inputs, metric, values, outputs, observed, places,
+            epsilon=epsilon, weights=weights, specimens=specimens, dims=dims,
+            propagation=propagation,
+        )  # fmt: skip
     target = _target(name, metric, values, weights)
     propagation = _propagation(name, propagation)
     size = len(target.observed)
@@ -182,6 +193,115 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         responses = _responses(term.name, response, sorted_inputs, propagation, outputs)
         made.append(_observed_term(term, model, responses, propagation, epsilon, progressbar))
     return made[0] if groups is None else tuple(made)
+
+
+def _by_specimen(
+    name: str,
+    model: pm.Model,
+    response: Callable[..., Any],
+    inputs: Inputs,
+    metric: Any,
+    values: Floats,
+    outputs: Outputs,
+    observed: Any,
+    groups: NDArray[np.intp] | None,
+    *,
+    epsilon: float | None,
+    weights: ArrayLike | None,
+    specimens: ArrayLike | None,
+    dims: str | Sequence[str] | None,
+    propagation: Propagation | None,
+) -> TensorVariable:
+    """Add an observed variable whose log-density is the log-likelihood by specimen."""
+    _refuse_by_specimen(name, inputs, epsilon, propagation)
+    values = checked_specimens(name, values)
+    settings = _propagation(name, propagation)
+    labels = None if specimens is None else sample_labels(specimens, len(values), f"{name}: specimens")
+    factors = None
+    if weights is not None:
+        factors = sample_weights(weights, len(values), f"{name}: weights") * len(values)
+    likelihood = SpecimenLikelihood(
+        name,
+        metric,
+        values,
+        metric.readings(values.reshape(len(values), -1)),
+        factors,
+        labels,
+        inputs,
+        _responses(name, response, inputs, settings, outputs),
+        settings,
+        outputs,
+        groups,
+    )
+    data: Any = values
+    if isinstance(observed, Variable):
+        data = observed
+    elif np.isnan(values).any():
+        # As a constant, in which PyMC does not look for missing values to impute.
+        data = pt.constant(values)
+    params = [pt.constant(groups) if is_group(root) else root for root in inputs.roots]
+    return SpecimenDistribution(
+        name,
+        *params,
+        likelihood=likelihood,
+        observed=data,
+        dims=_checked_dims(name, dims, values.shape, model),
+    )
+
+
+def _refuse_by_specimen(
+    name: str, inputs: Inputs, epsilon: float | None, propagation: Propagation | None
+) -> None:
+    """Raise where the log-likelihood by specimen does not apply, and name the metric that does."""
+    other = "use metric=prb.ProbabilityResidual()"
+    if epsilon is not None:
+        raise ValueError(
+            f"{name}: epsilon: got {epsilon!r}, expected none: prb.LogLikelihood() is a likelihood "
+            "and has no scale to choose; leave epsilon= out"
+        )
+    if isinstance(propagation, Propagation) and propagation.is_random:
+        raise TypeError(
+            f"{name}: propagation: got {called(propagation)}, expected stored responses of a "
+            f"deterministic response for prb.LogLikelihood(); {other}, or leave propagation= out"
+        )
+    if inputs.epistemic:
+        names = ", ".join(str(e.name or e) for e in inputs.epistemic)
+        raise TypeError(
+            f"{name}: got {names}, which goes into the response as a model variable, expected "
+            "aleatory inputs and constants for prb.LogLikelihood(); use "
+            "metric=prb.ProbabilityResidual() with propagation=prb.Resimulated()"
+        )
+    discrete = [x for x in inputs.aleatory if not x.dtype.startswith("float")]
+    if discrete:
+        raise TypeError(
+            f"{name}: got {discrete[0].owner.op}, which is discrete, expected continuous inputs "
+            f"for prb.LogLikelihood(); {other}"
+        )
+    refuse_nested(name, inputs)
+    refuse_without_density(name, inputs)
+
+
+def checked_specimens(name: str, observed: Floats) -> Floats:
+    """Return measured outputs, (N,) or (N, m), of at least two specimens."""
+    values = np.ma.filled(np.ma.asarray(observed, dtype=np.float64), np.nan)
+    if values.ndim not in (1, 2) or len(values) < 2:
+        raise ValueError(
+            f"{name}: observed: got shape {values.shape}, expected (N,) or (N, m) with at least "
+            "2 specimens"
+        )
+    rows = values.reshape(len(values), -1)
+    if np.isnan(rows).all(axis=1).any():
+        row = int(np.flatnonzero(np.isnan(rows).all(axis=1))[0])
+        raise ValueError(
+            f"{name}: observed: got no measured output of specimen {row}, expected at least one; "
+            "leave the specimen out"
+        )
+    if np.isinf(rows).any():
+        raise ValueError(
+            f"{name}: observed: got infinite values, expected finite ones for prb.LogLikelihood(); "
+            "use metric=prb.ProbabilityResidual(), which counts specimens that failed"
+        )
+    return values
 
 
 @dataclass(frozen=True, eq=False)

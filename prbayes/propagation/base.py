@@ -319,6 +319,15 @@ class Propagation(ABC):
     on_failure: OnFailure = field(default_factory=Abort, repr=False)
     retry_failed: bool = field(default=False, repr=False)
     timeout: float | None = field(default=None, repr=False)
+    # Whether every evaluation draws specimens, so that the discrepancy is random.
+    is_random: ClassVar[bool] = False
+    # Whether the response itself is called where an emulator could answer.
+    calls_response: ClassVar[bool] = False
+
+    @property
+    def emulator_runs(self) -> int | None:
+        """Number of first runs that the user asks for where a likelihood has its own emulator."""
+        return None
 
     def check(self) -> None:
         """Refuse what is no executor, folder or policy."""

@@ -53,6 +53,7 @@ class Fresh(Propagation):
     Fresh(n=50, random_seed=0)
     """
 
+    is_random: ClassVar[bool] = True
     n: int = 1024
     random_seed: int = 0
     max_lost: float = field(default=MAX_LOST, repr=False)

@@ -62,6 +62,7 @@ class Resimulated(Propagation):
     Resimulated(n=512, random_seed=0)
     """
 
+    calls_response: ClassVar[bool] = True
     n: int = 1024
     random_seed: int = 0
     points: str | Callable[[int, int, int], Floats] = field(default="sobol", repr=False)

@@ -188,6 +188,11 @@ class Reweighted(Propagation):
         return Demand(0, self.most, decides)
 
     @property
+    def emulator_runs(self) -> int | None:
+        """The number of runs, unless it is the default."""
+        return None if self.n == type(self).n else self.n
+
+    @property
     def most(self) -> int:
         """The largest number of responses, refinement included."""
         return self.max_points or 32 * self.n

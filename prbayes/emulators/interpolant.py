@@ -1,0 +1,203 @@
+"""Quintic radial basis interpolation with a polynomial, its Jacobian and left-out errors.
+
+The interpolant of values y_i at points z_i (Wendland 2005, ch. 8) is
+
+    f(z) = -sum_i w_i |z - z_i|^5 + sum_j c_j p_j(z),    sum_i w_i p_j(z_i) = 0,
+
+with all polynomials p_j up to a degree. A nugget on the diagonal of the interpolation matrix keeps
+it well conditioned where runs are close to each other. The error at a point that is left out needs
+no other fit: it is w_i divided by the i-th diagonal element of the inverse of the matrix (Rippa
+1999). It selects degree and nugget.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from math import comb
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prbayes._checks import AT_ONCE, Floats
+from prbayes._threads import one_thread
+
+
+@dataclass(frozen=True, eq=False)
+class Interpolant:
+    """A smooth surface through the outputs of runs.
+
+    Attributes
+    ----------
+    z : ndarray, shape (n, d)
+        Points of the runs.
+    weights : ndarray, shape (n, m)
+        Of the radial functions.
+    coefficients : ndarray, shape (terms, m)
+        Of the polynomial.
+    center, half_width : ndarray, shape (d,)
+        Of the box in which the polynomial's variables are scaled to [-1, 1].
+    powers : ndarray, shape (terms, d)
+        Degrees of the Legendre polynomials of each term.
+    left_out : ndarray, shape (n, m)
+        Error at each run of the interpolant of all others.
+    """
+
+    z: Floats
+    weights: Floats
+    coefficients: Floats
+    center: Floats
+    half_width: Floats
+    powers: NDArray[np.intp]
+    left_out: Floats
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d)."""
+        m, d = self.weights.shape[1], self.z.shape[1]
+        values, jacobian = np.empty((len(z), m)), np.empty((len(z), m, d))
+        step = max(1, AT_ONCE // (4 * len(self.z)))
+        for first in range(0, len(z), step):
+            rows = slice(first, first + step)
+            values[rows], jacobian[rows] = self._evaluate(z[rows])
+        return values, jacobian
+
+    def _evaluate(self, z: Floats) -> tuple[Floats, Floats]:
+        square = _squared_distances(z, self.z)
+        cube = square * np.sqrt(square)
+        terms, slopes = _polynomials((z - self.center) / self.half_width, self.powers)
+        values = terms @ self.coefficients - (cube * square) @ self.weights
+        jacobian = np.empty((*values.shape, z.shape[1]))
+        # d|r|^5 / dz_a = 5 |r|^3 r_a
+        steepness = cube @ self.weights
+        for a in range(z.shape[1]):
+            moment = cube @ (self.z[:, a, None] * self.weights)
+            radial = 5 * (moment - z[:, a, None] * steepness)
+            jacobian[:, :, a] = radial + slopes[a] @ self.coefficients / self.half_width[a]
+        return values, jacobian
+
+
+@one_thread()
+def fit_interpolant(z: Floats, y: Floats, near: NDArray[np.bool_] | None = None) -> Interpolant:
+    """Fit the interpolant whose polynomial degree has the smallest left-out errors.
+
+    Parameters
+    ----------
+    z : ndarray, shape (n, d)
+        Different points; in units in which the response varies about equally with each coordinate.
+    y : ndarray, shape (n, m)
+        Outputs, finite.
+    near : ndarray of bool, shape (n,), optional
+        Runs whose left-out errors select the degree; all by default.
+
+    Returns
+    -------
+    Interpolant
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the points do not determine a polynomial of degree two.
+
+    References
+    ----------
+    .. [1] Wendland, H. (2005), Scattered Data Approximation, Cambridge University Press.
+    .. [2] Rippa, S. (1999), An algorithm for selecting a good value for the parameter c in radial
+       basis function interpolation, Adv. Comput. Math. 11, 193-210, doi:10.1023/A:1018975909870.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> z = np.linspace(-1, 1, 16)[:, None]
+    >>> values, jacobian = fit_interpolant(z, np.exp(z))(np.array([[0.5]]))
+    >>> bool(np.isclose(values[0, 0], np.exp(0.5))), bool(np.isclose(jacobian[0, 0, 0], np.exp(0.5)))
+    (True, True)
+    """
+    n, d = z.shape
+    low, high = z.min(axis=0), z.max(axis=0)
+    center, half_width = (low + high) / 2, np.maximum((high - low) / 2, 1e-300)
+    scaled = (z - center) / half_width
+    square = _squared_distances(z, z)
+    radial = -(square**2) * np.sqrt(square)
+    largest = -radial.min()
+    spread = np.where(y.std(axis=0) > 0, y.std(axis=0), 1.0)
+    rows = slice(None) if near is None else near
+    best, least = None, np.inf
+    for degree in _degrees(n, d):
+        powers = _powers(d, degree)
+        terms, _ = _polynomials(scaled, powers)
+        target = np.concatenate([y, np.zeros((len(powers), y.shape[1]))])
+        for nugget in (1e-16, 1e-14, 1e-12, 1e-10, 1e-8):
+            kernel = radial + nugget * largest * np.eye(n)
+            matrix = np.block([[kernel, terms], [terms.T, np.zeros((len(powers),) * 2)]])
+            try:
+                inverse = np.linalg.inv(matrix)
+            except np.linalg.LinAlgError:
+                continue
+            # One step of iterative refinement: close runs make the matrix badly conditioned.
+            solution = inverse @ target
+            solution += inverse @ (target - matrix @ solution)
+            left_out = solution[:n] / np.diag(inverse)[:n, None]
+            error = float(np.sqrt(((left_out[rows] / spread) ** 2).mean()))
+            if error < least:
+                least = error
+                best = Interpolant(
+                    z, solution[:n], solution[n:], center, half_width, powers, left_out
+                )
+    if best is None:
+        raise np.linalg.LinAlgError(
+            f"interpolation: got {n} points that determine no surface of {d} inputs"
+        )
+    return best
+
+
+def _degrees(n: int, d: int) -> list[int]:
+    """Return degrees of polynomials with at most a third as many terms as there are points."""
+    return [2, *(p for p in range(3, 17) if 3 * comb(d + p, d) <= n)]
+
+
+def _powers(d: int, degree: int) -> NDArray[np.intp]:
+    """Return the degrees by coordinate of all terms up to a total degree, (terms, d)."""
+    rows = product(range(degree + 1), repeat=d) if d <= 4 else _sparse_powers(d, degree)
+    return np.array([row for row in rows if sum(row) <= degree], dtype=np.intp)
+
+
+def _sparse_powers(d: int, degree: int) -> list[tuple[int, ...]]:
+    """Return the same without the many combinations whose total is too high."""
+    if d == 1:
+        return [(p,) for p in range(degree + 1)]
+    return [
+        (p, *rest) for p in range(degree + 1) for rest in _sparse_powers(d - 1, degree - p)
+    ]
+
+
+def _polynomials(u: Floats, powers: NDArray[np.intp]) -> tuple[Floats, list[Floats]]:
+    """Return products of Legendre polynomials, (k, terms), and their d partial derivatives."""
+    k, d = u.shape
+    degree = int(powers.max())
+    single = np.polynomial.legendre.legvander(u, degree)  # (k, d, degree + 1)
+    slope = np.zeros_like(single)
+    # P'_{p+1} = P'_{p-1} + (2 p + 1) P_p
+    for p in range(degree):
+        slope[..., p + 1] = (2 * p + 1) * single[..., p]
+        if p > 0:
+            slope[..., p + 1] += slope[..., p - 1]
+    factors = [single[:, a, powers[:, a]] for a in range(d)]
+    terms = np.ones((k, len(powers)))
+    for factor in factors:
+        terms *= factor
+    slopes = []
+    for a in range(d):
+        derivative = slope[:, a, powers[:, a]].copy()
+        for b, factor in enumerate(factors):
+            if b != a:
+                derivative *= factor
+        slopes.append(derivative)
+    return terms, slopes
+
+
+def _squared_distances(a: Floats, b: Floats) -> Floats:
+    """Return squared distances by differences, since products lose digits of small ones."""
+    square = np.zeros((len(a), len(b)))
+    for column, other in zip(a.T, b.T, strict=True):
+        square += (column[:, None] - other) ** 2
+    return square

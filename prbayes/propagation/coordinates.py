@@ -1,0 +1,86 @@
+"""Coordinates in which a response is emulated: aleatory inputs as one vector, scaled to a box."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prbayes._checks import Floats
+from prbayes.response.distributions import PopulationSampler, prior_draws
+from prbayes.response.inputs import Inputs
+
+# Specimens of the prior predictive population that determine the box.
+_SPECIMENS = 4096
+# Ratio of the ends of a positive input's prior range from which on it is emulated as a logarithm.
+_DECADE = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """A smooth map between the aleatory inputs and a vector z with the prior range [-1, 1].
+
+    Attributes
+    ----------
+    shapes : tuple
+        Event shape of each aleatory input.
+    is_log : ndarray of bool, shape (d,)
+        Which elements are logarithms: positive inputs whose prior spans more than a factor of ten.
+    center, half_width : ndarray, shape (d,)
+        Of the prior range: all but 1 % of the specimens of the prior predictive population.
+    bounds : ndarray, shape (2, d)
+        Smallest and largest z of these specimens.
+    """
+
+    shapes: tuple[tuple[int, ...], ...]
+    is_log: NDArray[np.bool_]
+    center: Floats
+    half_width: Floats
+    bounds: Floats
+
+    @classmethod
+    def of_prior(cls, inputs: Inputs, seed: int = 0) -> Coordinates:
+        """Return the coordinates for the prior predictive population of the inputs."""
+        roots = prior_draws(inputs.roots, _SPECIMENS, seed)
+        drawn, _ = PopulationSampler(inputs)(roots, 1, np.random.default_rng([seed, 11]))
+        flat = np.concatenate([x.reshape(_SPECIMENS, -1) for x in drawn], axis=1)
+        flat = flat[np.isfinite(flat).all(axis=1)]
+        low, high = np.quantile(flat, [0.005, 0.995], axis=0)
+        is_log = (flat > 0).all(axis=0) & (high > _DECADE * low)
+        flat = np.where(is_log, np.log(np.where(is_log, flat, 1.0)), flat)
+        low, high = np.quantile(flat, [0.005, 0.995], axis=0)
+        half_width = np.where(high > low, (high - low) / 2, 1.0)
+        z = (flat - (low + high) / 2) / half_width
+        bounds = np.stack([z.min(axis=0), z.max(axis=0)])
+        return cls(inputs.event_shapes, is_log, (low + high) / 2, half_width, bounds)
+
+    @property
+    def size(self) -> int:
+        """Number of aleatory numbers of a specimen, d."""
+        return len(self.center)
+
+    def inputs(self, z: Floats) -> list[Floats]:
+        """Return the aleatory inputs, shapes (..., *event), of coordinates (..., d)."""
+        flat = self.center + self.half_width * z
+        flat = np.where(self.is_log, np.exp(np.where(self.is_log, flat, 0.0)), flat)
+        arrays, first = [], 0
+        for shape in self.shapes:
+            last = first + int(np.prod(shape, dtype=int))
+            arrays.append(flat[..., first:last].reshape(*z.shape[:-1], *shape))
+            first = last
+        return arrays
+
+    def of(self, inputs: Sequence[Floats], batch_ndim: int) -> Floats:
+        """Return the coordinates (..., d) of aleatory inputs with so many batch axes."""
+        batch = inputs[0].shape[:batch_ndim]
+        flat = np.concatenate([x.reshape(*batch, -1) for x in inputs], axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            flat = np.where(self.is_log, np.log(np.where(self.is_log, flat, 1.0)), flat)
+        return np.asarray((flat - self.center) / self.half_width)
+
+    def log_jacobian(self, z: Floats) -> Floats:
+        """Return log|dx/dz|, (..., d) -> (...)."""
+        logs = np.where(self.is_log, self.center + self.half_width * z, 0.0).sum(axis=-1)
+        return np.asarray(logs + np.log(self.half_width).sum())

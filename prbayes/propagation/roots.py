@@ -1,0 +1,175 @@
+"""All roots of f(x) = y: the inputs with which a response reproduces each measured specimen.
+
+Levenberg-Marquardt runs for all specimens and starts at once. A root is kept if its misfit is at
+most `gap` nats above the specimen's best, so that a mirror root is kept as long as the error of the
+comparison cannot tell it from the true one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prbayes._checks import Floats
+
+# Coordinates (k, d) -> values (k, m), Jacobian (k, m, d). NaN where there is no response.
+Response = Callable[[Floats], tuple[Floats, Floats]]
+
+
+@dataclass(frozen=True, eq=False)
+class Roots:
+    """Roots of all specimens, one row each.
+
+    Attributes
+    ----------
+    specimen : ndarray of int, shape (R,)
+        Row of the specimen; sorted.
+    z : ndarray, shape (R, d)
+    misfit : ndarray, shape (R,)
+        Half the squared standardised residual, in nats.
+    residual : ndarray, shape (R, m)
+        Measured minus simulated outputs, in units of the comparison's standard deviation.
+    jacobian : ndarray, shape (R, m, d)
+        Of the outputs in the same units.
+    """
+
+    specimen: NDArray[np.intp]
+    z: Floats
+    misfit: Floats
+    residual: Floats
+    jacobian: Floats
+
+
+def find_roots(
+    response: Response,
+    y: Floats,
+    sd: Floats,
+    starts: Floats,
+    box: Floats,
+    *,
+    gap: float = 20.0,
+) -> Roots:
+    """Find the roots of each specimen from several starts.
+
+    Parameters
+    ----------
+    response : callable
+    y : ndarray, shape (N, m)
+        Measured outputs.
+    sd : ndarray, shape (m,) or (N, m)
+        Standard deviation of the comparison.
+    starts : ndarray, shape (N, S, d)
+    box : ndarray, shape (2, d)
+        Bounds of the search.
+    gap : float
+        Largest misfit above the specimen's best, in nats.
+
+    Returns
+    -------
+    Roots
+        Specimens whose starts all have no response have none.
+
+    References
+    ----------
+    .. [1] Moré, J. J. (1978), The Levenberg-Marquardt algorithm, Lecture Notes in Mathematics 630,
+       105-116, doi:10.1007/BFb0067700.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> def square(z):
+    ...     return z**2, 2 * z[:, :, None]
+    >>> starts = np.array([[[-2.0], [2.0], [3.0]]])
+    >>> box = np.array([[-5.0], [5.0]])
+    >>> find_roots(square, np.array([[1.0]]), np.array([0.01]), starts, box).z.ravel().round(6)
+    array([-1.,  1.])
+    """
+    n, count, d = starts.shape
+    specimen = np.repeat(np.arange(n), count)
+    target = y[specimen]
+    scale = np.broadcast_to(sd, y.shape)[specimen]
+
+    def evaluate(z: Floats, rows: Any) -> tuple[Floats, Floats, Floats]:
+        values, jacobian = response(z)
+        residual = (target[rows] - values) / scale[rows]
+        misfit = (residual**2).sum(axis=1) / 2
+        return residual, jacobian / scale[rows][:, :, None], np.where(np.isnan(misfit), np.inf, misfit)
+
+    z = starts.reshape(-1, d).copy()
+    residual, jacobian, misfit = evaluate(z, slice(None))
+    damping = np.full(len(z), 1e-3)
+    active = np.flatnonzero(np.isfinite(misfit))
+    width = box[1] - box[0]
+    for _ in range(60):
+        if not active.size:
+            break
+        step = _damped_step(jacobian[active], residual[active], damping[active], width)
+        trial = np.clip(z[active] + step, box[0], box[1])
+        length = (np.abs(trial - z[active]) / width).max(axis=1)
+        new_residual, new_jacobian, new_misfit = evaluate(trial, active)
+        better = new_misfit < misfit[active]
+        rows = active[better]
+        z[rows], residual[rows] = trial[better], new_residual[better]
+        jacobian[rows], misfit[rows] = new_jacobian[better], new_misfit[better]
+        damping[active] = np.clip(damping[active] * np.where(better, 0.1, 8.0), 1e-12, 1e12)
+        # A misfit of 1e-8 nats is zero; a rejected step that is this short is rounding.
+        unfinished = (misfit[active] > 1e-8) & (length > 1e-11) & (damping[active] < 1e11)
+        active = active[unfinished]
+    kept = _distinct(specimen, z, misfit, jacobian, gap, width)
+    return Roots(specimen[kept], z[kept], misfit[kept], residual[kept], jacobian[kept])
+
+
+def _damped_step(jacobian: Floats, residual: Floats, damping: Floats, width: Floats) -> Floats:
+    """Return the step of Levenberg-Marquardt, at most a quarter of the box."""
+    normal = np.einsum("kmd,kme->kde", jacobian, jacobian)
+    diagonal = np.einsum("kdd->kd", normal)
+    # A coordinate without influence keeps its place.
+    floor = 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-300
+    added = damping[:, None] * np.maximum(diagonal, floor) + floor
+    normal = normal + added[:, :, None] * np.eye(jacobian.shape[2])
+    slope = np.einsum("kmd,km->kd", jacobian, residual)
+    step = np.linalg.solve(normal, slope[..., None])[..., 0]
+    return np.clip(step, -width / 4, width / 4)
+
+
+def _distinct(
+    specimen: NDArray[np.intp],
+    z: Floats,
+    misfit: Floats,
+    jacobian: Floats,
+    gap: float,
+    width: Floats,
+) -> NDArray[np.intp]:
+    """Return the rows of different roots within the gap of the specimen's best."""
+    least = np.full(specimen.max() + 1, np.inf)
+    np.minimum.at(least, specimen, misfit)
+    candidates = np.flatnonzero(np.isfinite(misfit) & (misfit <= least[specimen] + gap))
+    candidates = candidates[np.lexsort((misfit[candidates], specimen[candidates]))]
+    kept: list[int] = []
+    for row in candidates.tolist():
+        same = False
+        for other in reversed(kept):
+            if specimen[other] != specimen[row]:
+                break
+            away = z[row] - z[other]
+            # In units of the box, and in standard deviations of the Gauss-Newton approximation.
+            close = np.abs(away / width).max() < 1e-6
+            same = same or close or ((jacobian[other] @ away) ** 2).sum() < 1.0 and bool(
+                np.abs(away / width).max() < 1e-2
+            )
+        if not same:
+            kept.append(row)
+    return np.array(kept, dtype=np.intp)
+
+
+def nearest_starts(run_z: Floats, run_y: Floats, y: Floats, spread: Floats, count: int) -> Floats:
+    """Return the runs whose outputs are nearest to each specimen's, (N, count, d)."""
+    distance = np.zeros((len(y), len(run_y)))
+    for column, other, unit in zip(y.T, run_y.T, spread, strict=True):
+        distance += ((column[:, None] - other) / unit) ** 2
+    order = np.argsort(distance, axis=1, kind="stable")[:, :count]
+    return run_z[order]

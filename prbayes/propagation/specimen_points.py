@@ -1,0 +1,634 @@
+"""Importance points around the roots of each measured specimen.
+
+The likelihood of specimen i under a population p(x | theta) is
+
+    p(y_i | theta) = integral p(y_i | f(x)) p(x | theta) dx  ~=  sum_k exp(A_ik) p(x_ik | theta).
+
+Points x_ik and numbers A_ik do not contain theta. An emulator of the response is fitted to runs
+over the prior's range and at the roots of the specimens. Points are drawn around every root from a
+multivariate t distribution, whose mixture over the roots of a specimen is the proposal density.
+
+References
+----------
+Papadimas, N. and T. Dodwell (2021), A hierarchical Bayesian approach for calibration of stochastic
+material models, Data-Centric Engineering 2, e20, doi:10.1017/dce.2021.20.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln, logsumexp, ndtri
+
+from prbayes._checks import AT_ONCE, Floats
+from prbayes.emulators.interpolant import Interpolant, fit_interpolant
+from prbayes.propagation.base import DesignError
+from prbayes.propagation.points import sobol
+from prbayes.metrics.readings import Readings
+from prbayes.propagation.roots import Response, Roots, find_roots, nearest_starts
+
+
+@dataclass(frozen=True)
+class PointOptions:
+    """Settings of the points, from the study of guards (docs/likelihood.md).
+
+    Attributes
+    ----------
+    starts : int
+        Starts of the search for roots, by specimen; doubled while roots are missing.
+    gap : float
+        Largest misfit of a root above the specimen's best, in nats.
+    points : int
+        Points around each root; doubled until two independent halves agree.
+    most_points : int
+        Largest number of points of a specimen.
+    half_difference : float
+        Largest standard deviation, over plausible populations, of half the difference between the
+        log-likelihoods of the two halves.
+    fresh : int
+        Runs at roots that measure the emulator's bias; they stay in the emulator.
+    bias : float
+        Largest bias of a mean or standard deviation of an input, in posterior standard deviations.
+    missing : float
+        Largest share of simulated specimens that do not get their own inputs back.
+    floor : float
+        Smallest standard deviation of a comparison, as a share of the data's.
+    """
+
+    starts: int = 12
+    gap: float = 20.0
+    points: int = 4
+    most_points: int = 4096
+    half_difference: float = 0.15
+    fresh: int = 16
+    bias: float = 0.15
+    missing: float = 0.03
+    floor: float = 1e-6
+    degrees: float = 5.0
+
+
+def first_runs(dimensions: int) -> int:
+    """Return the number of runs that an emulator of so many inputs starts from."""
+    return 64 if dimensions <= 2 else 128 if dimensions <= 4 else 512
+
+
+@dataclass(frozen=True, eq=False)
+class Emulation:
+    """Runs of the response, and the emulator through them.
+
+    Attributes
+    ----------
+    z : ndarray, shape (n, d)
+        Coordinates of the runs.
+    y : ndarray, shape (n, m)
+        Their outputs; NaN where there is no response.
+    box : ndarray, shape (2, d)
+        Bounds of the search for roots.
+    surface : Interpolant
+    error : ndarray, shape (m,)
+        Standard deviation of the emulator's error at the roots: twice the error at runs there
+        before they were part of it.
+    bias : float
+        Predicted bias of a mean or standard deviation of an input, in posterior standard
+        deviations.
+    """
+
+    z: Floats
+    y: Floats
+    box: Floats
+    surface: Interpolant
+    error: Floats
+    bias: float
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian, NaN where the nearest run has no response."""
+        values, jacobian = self.surface(z)
+        failed = self.fails(z)
+        if failed.any():
+            values[failed], jacobian[failed] = np.nan, np.nan
+        return values, jacobian
+
+    def fails(self, z: Floats) -> NDArray[np.bool_]:
+        """Return where the nearest run has no response."""
+        good = np.isfinite(self.y).all(axis=1)
+        if good.all():
+            return np.zeros(len(z), dtype=bool)
+        from scipy.spatial import cKDTree
+
+        width = self.box[1] - self.box[0]
+        _, nearest = cKDTree(self.z / width).query(z / width)
+        return np.asarray(~good[nearest])
+
+
+def emulate(
+    run: Callable[[Floats], Floats],
+    readings: Readings,
+    box: Floats,
+    search_box: Floats,
+    options: PointOptions,
+    *,
+    n: int | None = None,
+    seed: int = 0,
+    name: str = "response",
+) -> tuple[Emulation, Roots]:
+    """Fit the emulator: runs over a box, then batches at the roots until the bias is small.
+
+    Parameters
+    ----------
+    run : callable
+        Coordinates (n, d) -> outputs (n, m); NaN where there is no response.
+    readings : Readings
+    box, search_box : ndarray, shape (2, d)
+        Of the first runs, and of the search for roots.
+    options : PointOptions
+    n : int, optional
+        First runs.
+    seed : int
+    name : str
+        For messages.
+
+    Raises
+    ------
+    DesignError
+        If the response cannot be emulated well enough.
+    """
+    d = box.shape[1]
+    n = first_runs(d) if n is None else n
+    z = box[0] + (box[1] - box[0]) * sobol(n, d, seed)
+    y = run(z)
+    spread = readings.spread()
+    rng = np.random.default_rng([seed, 1])
+    emulation, error, bias = None, None, np.inf
+    most = 6
+    for batch in range(most):
+        surface, left_out = _surface(z, y, readings, spread, name)
+        if error is None:
+            error = np.maximum(2 * left_out, options.floor * spread)
+        emulation = Emulation(z, y, search_box, surface, error, bias)
+        roots = specimen_roots(emulation, readings, options)
+        if (batch >= 2 and bias <= options.bias) or batch == most - 1:
+            break
+        fresh = _fresh_points(roots, search_box, max(n // 2, options.fresh), options.fresh, rng)
+        values, jacobian = surface(fresh)
+        outputs = run(fresh)
+        misfit = outputs - values
+        good = np.isfinite(misfit).all(axis=1)
+        if good.any():
+            error = 2 * np.sqrt((misfit[good] ** 2).mean(axis=0))
+            error = np.maximum(error, options.floor * spread)
+        some = np.flatnonzero(good[: options.fresh])
+        bias = _predicted_bias(
+            misfit[some], jacobian[some], fresh[some], len(readings), readings.comparison_sd(error)
+        )
+        z, y = np.concatenate([z, fresh]), np.concatenate([y, outputs])
+    assert emulation is not None
+    if emulation.bias > options.bias:
+        raise DesignError(
+            f"{name}: got an emulator whose error would shift a mean or standard deviation of an "
+            f"input by {emulation.bias:.2g} posterior standard deviations after {len(z)} runs, "
+            f"expected at most {options.bias}; the response is not smooth enough for "
+            "prb.LogLikelihood(): use metric=prb.ProbabilityResidual(), or more first runs with "
+            "propagation=prb.Reweighted(n)"
+        )
+    return emulation, roots
+
+
+def _surface(
+    z: Floats, y: Floats, readings: Readings, spread: Floats, name: str
+) -> tuple[Interpolant, Floats]:
+    """Return the interpolant, and its root mean square left-out error near the data, (m,)."""
+    good = np.isfinite(y).all(axis=1)
+    if good.sum() < 8:
+        raise DesignError(
+            f"{name}: got {int(good.sum())} runs with a response of {len(y)}, expected at least 8; "
+            "check the response, or give the hyperparameters priors where it exists"
+        )
+    zg, yg = z[good], y[good]
+    zg, first = np.unique(zg, axis=0, return_index=True)
+    yg = yg[first]
+    values = readings.values
+    low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
+    margin = np.maximum((high - low) / 2, spread)
+    inside = ((yg >= low - margin) & (yg <= high + margin)).all(axis=1)
+    if inside.sum() < len(yg) // 4:
+        distance = (((yg - np.nanmean(values, axis=0)) / spread) ** 2).sum(axis=1)
+        inside = np.zeros(len(yg), dtype=bool)
+        inside[np.argsort(distance, kind="stable")[: max(8, len(yg) // 4)]] = True
+    surface = fit_interpolant(zg, yg, inside)
+    return surface, np.sqrt((surface.left_out[inside] ** 2).mean(axis=0))
+
+
+def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptions) -> Roots:
+    """Return the roots of all specimens on an emulator."""
+    good = np.isfinite(emulation.y).all(axis=1)
+    run_z, run_y = emulation.z[good], emulation.y[good]
+    measured = readings.is_measured
+    target = np.where(measured, readings.values, 0.0)
+    sd = readings.comparison_sd(emulation.error)
+    parts = []
+    # Specimens in blocks, so that memory stays constant.
+    block = max(1, AT_ONCE // (options.starts * len(run_z) * 4))
+    for first in range(0, len(readings), block):
+        rows = slice(first, first + block)
+        starts = _starts(run_z, run_y, target[rows], measured[rows], readings.spread(), options.starts)
+        roots = find_roots(
+            emulation, target[rows], np.where(measured[rows], sd[rows], 1e150), starts,
+            emulation.box, gap=options.gap,
+        )  # fmt: skip
+        parts.append((roots, first))
+    names = ("z", "misfit", "residual", "jacobian")
+    joined = [np.concatenate([getattr(r, name) for r, _ in parts]) for name in names]
+    specimen = np.concatenate([r.specimen + first for r, first in parts])
+    return Roots(specimen, *joined)
+
+
+def _starts(
+    run_z: Floats,
+    run_y: Floats,
+    y: Floats,
+    measured: NDArray[np.bool_],
+    spread: Floats,
+    count: int,
+) -> Floats:
+    """Return starts by specimen, compared in the outputs that were measured, (N, count, d)."""
+    count = min(count, len(run_z))
+    starts = np.empty((len(y), count, run_z.shape[1]))
+    patterns, which = np.unique(measured, axis=0, return_inverse=True)
+    for k, pattern in enumerate(patterns):
+        rows = np.flatnonzero(which.ravel() == k)
+        columns = np.flatnonzero(pattern)
+        starts[rows] = nearest_starts(
+            run_z, run_y[:, columns], y[np.ix_(rows, columns)], spread[columns], count
+        )
+    return starts
+
+
+def _fresh_points(
+    roots: Roots, box: Floats, count: int, sampled: int, rng: np.random.Generator
+) -> Floats:
+    """Return points for new runs, (count, d): a sample of the roots, then the rest spread out.
+
+    The spread ones are chosen one by one, each farthest from all others, among the roots and
+    points around them.
+    """
+    z = roots.z
+    scale = np.maximum(z.std(axis=0), 1e-9 * (box[1] - box[0]))
+    chosen = z[rng.permutation(len(z))[: min(sampled, len(z))]]
+    around = z[rng.integers(0, len(z), 8 * count)]
+    jittered = around + 0.4 * scale * rng.standard_normal(around.shape)
+    candidates = np.clip(np.concatenate([z, jittered]), box[0], box[1]) / scale
+    picked = list(chosen / scale)
+    distance = np.min([((candidates - p) ** 2).sum(axis=1) for p in picked], axis=0)
+    while len(picked) < count:
+        best = int(np.argmax(distance))
+        picked.append(candidates[best])
+        distance = np.minimum(distance, ((candidates - candidates[best]) ** 2).sum(axis=1))
+    return np.array(picked) * scale
+
+
+def _predicted_bias(
+    misfit: Floats, jacobian: Floats, z: Floats, size: int, sd: Floats
+) -> float:
+    """Return the predicted bias of a mean or sd of the inputs, in posterior standard deviations."""
+    if len(z) < 4:
+        return np.inf
+    unit = np.where(np.isfinite(sd), sd, np.nan)
+    unit = np.where(np.isnan(unit).all(axis=0), np.inf, np.nanmedian(unit, axis=0))
+    weighted = jacobian / unit[:, None]
+    normal = np.einsum("nmd,nme->nde", weighted, weighted)
+    slope = np.einsum("nmd,nm->nd", weighted, misfit / unit)
+    shift = -np.einsum("nde,ne->nd", np.linalg.pinv(normal, hermitian=True), slope)
+    spread = np.maximum(z.std(axis=0), 1e-300)
+    of_mean = np.abs(shift.mean(axis=0)) / spread * np.sqrt(size)
+    covariance = ((z - z.mean(axis=0)) * shift).mean(axis=0)
+    of_sd = np.abs(covariance + shift.var(axis=0) / 2) / spread**2 * np.sqrt(2 * size)
+    return float(max(of_mean.max(), of_sd.max()))
+
+
+# -- points ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class SpecimenPoints:
+    """Points of N specimens.
+
+    Attributes
+    ----------
+    z : ndarray, shape (N, K, d)
+    outputs : ndarray, shape (N, K, m)
+        The emulator's outputs at the points.
+    log_a : ndarray, shape (N, K)
+        The log-likelihood of a specimen under a density p of z is
+        ``logsumexp(log p(z) + log_a, axis=1)``; -inf for points that fill up the array.
+    log_proposal : ndarray, shape (N, K)
+        Log of the number of points times the proposal density: ``log_a`` without the density of
+        the readings, for an error that is not known in advance.
+    n_roots : ndarray of int, shape (N,)
+    difference : float
+        The half difference of the log-likelihoods.
+    """
+
+    z: Floats
+    outputs: Floats
+    log_a: Floats
+    log_proposal: Floats
+    n_roots: NDArray[np.intp]
+    difference: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Components:
+    """Multivariate t components, one for each root."""
+
+    specimen: NDArray[np.intp]  # (R,)
+    center: Floats  # (R, d)
+    root: Floats  # (R, d, d): lower Cholesky factors of the scale matrices
+    log_mass: Floats  # (R,): log of the integral of the readings' density around the root
+
+    def table(self) -> NDArray[np.intp]:
+        """Return the components of each specimen, (N, most), filled up with -1."""
+        count = np.bincount(self.specimen)
+        slot = np.arange(len(self.specimen)) - np.repeat(np.cumsum(count) - count, count)
+        table = np.full((len(count), count.max()), -1)
+        table[self.specimen, slot] = np.arange(len(self.specimen))
+        return table
+
+
+def draw_points(
+    emulation: Response,
+    error: Floats,
+    readings: Readings,
+    roots: Roots,
+    box: Floats,
+    options: PointOptions,
+    *,
+    normalised: bool = True,
+    seed: int = 0,
+) -> SpecimenPoints:
+    """Draw points around all roots until two independent halves of them agree.
+
+    Parameters
+    ----------
+    emulation : callable
+    error : ndarray, shape (m,)
+        Standard deviation of its error.
+    readings : Readings
+        Every specimen has a root.
+    roots : Roots
+    box : ndarray, shape (2, d)
+    options : PointOptions
+    normalised : bool
+        Whether the weights around a root are scaled to its mass, which 256 points measure.
+    seed : int
+
+    Raises
+    ------
+    DesignError
+        If `most_points` are not enough.
+    """
+    components = _fit_components(emulation, error, readings, roots, box, options, seed)
+    count = options.points
+    while True:
+        halves = [
+            _draw(emulation, error, readings, components, max(1, count // 2), options, (seed, h))
+            for h in (1, 2)
+        ]
+        if normalised:
+            halves = [_normalised(half, components) for half in halves]
+        points = _joined(halves)
+        difference = _half_difference(halves, seed)
+        largest = int(points.n_roots.max()) * count
+        if difference <= options.half_difference or 2 * largest > options.most_points:
+            break
+        count *= 2
+    if difference > options.half_difference:
+        raise DesignError(
+            f"log-likelihood: got two halves of {largest} points a specimen that differ by "
+            f"{difference:.2g} nats, expected at most {options.half_difference}; use another "
+            "metric, such as prb.ProbabilityResidual()"
+        )
+    return SpecimenPoints(
+        points.z, points.outputs, points.log_a, points.log_proposal, points.n_roots, difference
+    )
+
+
+def _fit_components(
+    emulation: Response,
+    error: Floats,
+    readings: Readings,
+    roots: Roots,
+    box: Floats,
+    options: PointOptions,
+    seed: int,
+    fine: int = 256,
+) -> _Components:
+    """Return a t component for each root, fitted to the readings' density around it.
+
+    The first scale matrix is that of the Gauss-Newton approximation, within the box. Where the
+    weights of 256 points are uneven, as at a turning point of the response, location and scale
+    become their weighted moments, twice.
+    """
+    d = roots.z.shape[1]
+    precision = np.einsum("rmd,rme->rde", roots.jacobian, roots.jacobian)
+    precision = precision + np.diag(4.0 / (box[1] - box[0]) ** 2)
+    scale = np.linalg.cholesky(1.5 * np.linalg.inv(precision))
+    components = _Components(roots.specimen, roots.z, scale, np.zeros(len(scale)))
+    for attempt in range(3):
+        sample = _draw(emulation, error, readings, components, fine, options, (seed, 3 + attempt))
+        weights, log_mass = _component_weights(sample, components)
+        components = _Components(components.specimen, components.center, components.root, log_mass)
+        size = 1 / np.maximum((weights**2).sum(axis=1), 1e-300)
+        uneven = np.flatnonzero((size < fine / 2) & np.isfinite(log_mass))
+        if attempt == 2 or not uneven.size:
+            break
+        z = _by_component(sample.z, components)[uneven]
+        w = weights[uneven]
+        center = np.einsum("rk,rkd->rd", w, z)
+        away = z - center[:, None]
+        covariance = np.einsum("rk,rkd,rke->rde", w, away, away)
+        before = components.root[uneven] @ components.root[uneven].swapaxes(1, 2)
+        # A few effective points leave most of the scale as it was.
+        trust = (size[uneven] / (size[uneven] + 4 * d))[:, None, None]
+        covariance = trust * 1.5 * covariance + (1 - trust) * before
+        new_center, new_root = components.center.copy(), components.root.copy()
+        new_center[uneven] = center
+        new_root[uneven] = np.linalg.cholesky(covariance + 1e-14 * before)
+        components = _Components(components.specimen, new_center, new_root, log_mass)
+    return components
+
+
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """Points by specimen, filled up to the largest number of roots."""
+
+    z: Floats  # (N, S * k, d)
+    outputs: Floats  # (N, S * k, m)
+    log_a: Floats  # (N, S * k)
+    log_proposal: Floats  # (N, S * k)
+    n_roots: NDArray[np.intp]  # (N,)
+
+
+def _draw(
+    emulation: Response,
+    error: Floats,
+    readings: Readings,
+    components: _Components,
+    count: int,
+    options: PointOptions,
+    seed: tuple[int, int],
+) -> _Sample:
+    """Draw points from each component, weighted by the mixture over a specimen's components."""
+    table = components.table()
+    n, slots = table.shape
+    d = components.center.shape[1]
+    u = _scrambled(len(components.specimen), count, d + 1, seed)
+    nu = options.degrees
+    normal = ndtri(u[..., :d])
+    z = components.center[:, None] + np.einsum(
+        "rde,rke->rkd", components.root, normal * _t_radius(u[..., d], nu)[..., None]
+    )
+    values = _in_blocks(emulation, z.reshape(-1, d))
+    # By specimen.
+    filled = np.maximum(table, 0)
+    z_all = z[filled].reshape(n, slots * count, d)
+    outputs = values.reshape(len(z), count, -1)[filled].reshape(n, slots * count, -1)
+    log_q = np.full((n, slots, slots * count), -np.inf)
+    for s in range(slots):
+        c = filled[:, s]
+        away = z_all - components.center[c][:, None]
+        inverse = np.linalg.inv(components.root[c])
+        square = (np.einsum("nde,nke->nkd", inverse, away) ** 2).sum(axis=-1)
+        log_det = np.log(np.einsum("ndd->nd", components.root[c])).sum(axis=1)
+        constant = gammaln((nu + d) / 2) - gammaln(nu / 2) - d / 2 * np.log(nu * np.pi)
+        density = constant - log_det[:, None] - (nu + d) / 2 * np.log1p(square / nu)
+        log_q[:, s] = np.where(table[:, s, None] >= 0, density, -np.inf)
+    log_proposal = logsumexp(log_q, axis=1) + np.log(count)
+    exists = np.repeat(table >= 0, count, axis=1)
+    log_proposal = np.where(exists, log_proposal, np.inf)
+    log_a = readings.log_density(outputs, error) - log_proposal
+    return _Sample(z_all, outputs, log_a, log_proposal, (table >= 0).sum(axis=1))
+
+
+def _in_blocks(emulation: Response, z: Floats) -> Floats:
+    step = AT_ONCE // 16
+    parts = [emulation(z[first : first + step])[0] for first in range(0, len(z), step)]
+    return np.concatenate(parts)
+
+
+def _scrambled(components: int, count: int, dimensions: int, seed: tuple[int, int]) -> Floats:
+    """Return Sobol points with a random shift for each component, (components, count, dimensions)."""
+    base = sobol(count, dimensions, seed[0] * 1009 + seed[1])
+    shift = np.random.default_rng(seed).random((components, 1, dimensions))
+    return np.clip((base + shift) % 1.0, 1e-9, 1 - 1e-9)
+
+
+def _t_radius(u: Floats, degrees: float) -> Floats:
+    """Return the factors that turn normal vectors into vectors of a t distribution."""
+    from scipy.special import chdtri
+
+    return np.sqrt(degrees / chdtri(degrees, u))
+
+
+def _by_component(values: Floats, components: _Components) -> Floats:
+    """Return values by component, (R, k, ...), of values by specimen, (N, S * k, ...)."""
+    table = components.table()
+    n, slots = table.shape
+    count = values.shape[1] // slots
+    shaped = values.reshape(n, slots, count, *values.shape[2:])
+    rows, columns = np.nonzero(table >= 0)
+    result = np.empty((len(components.specimen), count, *values.shape[2:]))
+    result[table[rows, columns]] = shaped[rows, columns]
+    return result
+
+
+def _component_weights(sample: _Sample, components: _Components) -> tuple[Floats, Floats]:
+    """Return normalised weights, (R, k), and log masses, (R,), by component."""
+    log_a = _by_component(sample.log_a, components)
+    log_mass = logsumexp(log_a, axis=1)
+    safe = np.where(np.isfinite(log_mass), log_mass, 0.0)
+    return np.exp(log_a - safe[:, None]), log_mass
+
+
+def _normalised(sample: _Sample, components: _Components) -> _Sample:
+    """Scale the weights of the points around each root to the root's mass."""
+    table = components.table()
+    n, slots = table.shape
+    log_a = sample.log_a.reshape(n, slots, -1)
+    total = logsumexp(log_a, axis=2)
+    mass = np.where(table >= 0, components.log_mass[np.maximum(table, 0)], -np.inf)
+    shift = np.where(np.isfinite(total), mass - np.where(np.isfinite(total), total, 0.0), 0.0)
+    log_a = (log_a + shift[..., None]).reshape(n, -1)
+    return _Sample(sample.z, sample.outputs, log_a, sample.log_proposal, sample.n_roots)
+
+
+def _joined(halves: list[_Sample]) -> _Sample:
+    """Return two independent samples as one; each counts half."""
+    first, second = halves
+    return _Sample(
+        np.concatenate([first.z, second.z], axis=1),
+        np.concatenate([first.outputs, second.outputs], axis=1),
+        np.concatenate([first.log_a, second.log_a], axis=1) - np.log(2),
+        np.concatenate([first.log_proposal, second.log_proposal], axis=1) + np.log(2),
+        first.n_roots,
+    )
+
+
+def _half_difference(halves: list[_Sample], seed: int, draws: int = 32) -> float:
+    """Return the standard deviation of half the difference of log L between the halves.
+
+    Over normal populations that are fitted to Bayesian bootstrap samples of the specimens.
+    """
+    joint = _joined(halves)
+    populations = normal_populations(joint.z, joint.log_a, draws, seed)
+    differences = []
+    for mean, root in populations:
+        a, b = (
+            logsumexp(normal_log_density(half.z, mean, root) + half.log_a, axis=1).sum()
+            for half in halves
+        )
+        differences.append((a - b) / 2)
+    return float(np.std(differences))
+
+
+def normal_populations(
+    z: Floats, log_a: Floats, draws: int, seed: int, steps: int = 30
+) -> list[tuple[Floats, Floats]]:
+    """Fit normal populations to Bayesian bootstrap samples of the specimens, by EM.
+
+    Returns
+    -------
+    list of (mean (d,), root (d, d))
+        Means and lower Cholesky factors of the covariances.
+    """
+    rng = np.random.default_rng([seed, 7])
+    n, _, d = z.shape
+    flat = z.reshape(-1, d)
+    prior = 1e-12 * np.diag(np.maximum(flat.var(axis=0), 1e-300))
+    weights = np.exp(log_a - logsumexp(log_a, axis=1, keepdims=True))
+    result = []
+    start_mean = np.einsum("nk,nkd->d", weights, z) / n
+    away = z - start_mean
+    start_covariance = np.einsum("nk,nkd,nke->de", weights, away, away) / n + prior
+    for _ in range(draws):
+        share = rng.dirichlet(np.ones(n))
+        mean, covariance = start_mean, start_covariance
+        for _ in range(steps):
+            log_w = normal_log_density(z, mean, np.linalg.cholesky(covariance)) + log_a
+            w = np.exp(log_w - logsumexp(log_w, axis=1, keepdims=True)) * share[:, None]
+            mean = np.einsum("nk,nkd->d", w, z)
+            away = z - mean
+            covariance = np.einsum("nk,nkd,nke->de", w, away, away) + prior
+        result.append((mean, np.linalg.cholesky(covariance)))
+    return result
+
+
+def normal_log_density(z: Floats, mean: Floats, root: Floats) -> Floats:
+    """Return the log-density of a normal population, (..., d) -> (...)."""
+    inverse = np.linalg.inv(root)
+    standard = (z - mean) @ inverse.T
+    constant = np.log(np.diag(root)).sum() + len(mean) / 2 * np.log(2 * np.pi)
+    return np.asarray(-0.5 * (standard**2).sum(axis=-1) - constant)
