@@ -1,0 +1,323 @@
+"""Maximum likelihood for models whose observed variables have exact log-densities.
+
+BFGS with exact gradients from the most likely points of the prior. Every local optimum is kept with
+its weight, the share of the posterior mass by Laplace's approximation.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from prbayes._checks import Floats
+from prbayes._finding import Finding, report
+from prbayes.estimate.differences import cross, slopes
+from prbayes.estimate.optimum import Optimum, plain
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.identity import identity_of
+
+# Sobol points of the prior that are screened as starts, and descents from the best of them. Half
+# or twice as many find the same optima on the problems of the scoreboard.
+_SCREENED, _DESCENTS = 1024, 8
+
+
+@dataclass(frozen=True, eq=False)
+class LocalOptimum:
+    """A local minimum of minus the log-likelihood, or of minus the log-posterior.
+
+    Attributes
+    ----------
+    theta : ndarray, shape (d,)
+        In unconstrained space.
+    value : float
+    covariance : ndarray, shape (d, d)
+        Inverse Hessian; infinite along directions without curvature, NaN at the edge of a support.
+    converged : bool
+    """
+
+    theta: Floats
+    value: float
+    covariance: Floats
+    converged: bool
+
+
+def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
+    """Return the maximum of the likelihood, times the prior where that is asked for.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+        Of a model without a metric of distributions.
+    options : Minimisation
+        ``start``, ``prior``, ``tolerance``, ``max_evaluations``, ``starts`` and ``random_seed``.
+    """
+    clock = time.perf_counter()
+    before = evaluator.n_responses
+    objective = _Objective(evaluator, options.prior)
+    starts, screened = _starts(evaluator, options)
+    optima = []
+    for start in starts:
+        optima.append(_descend(objective, start, options))
+        if objective.count > options.max_evaluations:
+            break
+    modes = _distinct(optima, evaluator.prior_sd)
+    best = modes[0]
+    point, stderr = _in_units(evaluator, best.theta, best.covariance)
+    findings = report(_findings(evaluator, modes))
+    weights = mode_weights(modes)
+    rivals = tuple(
+        {
+            "point": _in_units(evaluator, mode.theta, mode.covariance)[0],
+            "discrepancy": mode.value,
+            "theta": mode.theta,
+            "comparable": mode.value - best.value < 6.0,
+            "weight": float(weight),
+        }
+        for mode, weight in zip(modes[1:], weights[1:], strict=True)
+    )
+    values = evaluator.specimen_log_likelihoods(best.theta[None])
+    identified = np.isfinite(best.covariance).all()
+    message = "Converged: " if best.converged else "Not converged: "
+    message += f"{len(modes)} local optimum(s) from {len(starts)} starts."
+    return Optimum(
+        point=point,
+        discrepancy=best.value,
+        discrepancies={name: -float(v.sum()) for name, v in values.items()},
+        scales={name: 1.0 for name in values},
+        n_evaluations=objective.count,
+        n_screened=screened,
+        n_responses=evaluator.n_responses - before,
+        converged=best.converged and bool(identified or np.isinf(best.covariance).any()),
+        message=message,
+        stderr=stderr,
+        covariance=best.covariance,
+        theta=best.theta,
+        names=evaluator.names,
+        evaluator=evaluator,
+        trace=objective.trace(),
+        seconds=time.perf_counter() - clock,
+        rivals=rivals,
+        warnings=tuple(str(finding) for finding in findings),
+        prior=options.prior,
+        identity=identity_of(evaluator, prior_minimised=options.prior),
+    )
+
+
+def mode_weights(modes: list[LocalOptimum]) -> Floats:
+    """Return the share of each mode in the mass, by Laplace's approximation."""
+    logs = []
+    for mode in modes:
+        finite = np.isfinite(mode.covariance).all()
+        sign, log_det = np.linalg.slogdet(mode.covariance) if finite else (0.0, 0.0)
+        logs.append(-mode.value + (log_det / 2 if sign > 0 else 0.0))
+    shares = np.exp(np.array(logs) - max(logs))
+    return np.asarray(shares / shares.sum())
+
+
+class _Objective:
+    """Minus the log-likelihood in standardised parameters, with a trace of its evaluations."""
+
+    def __init__(self, evaluator: Evaluator, prior: bool) -> None:
+        self.function = evaluator.objective(prior=prior, gradient=True)
+        self.unit = evaluator.prior_sd
+        self.count = 0
+        self.thetas: list[Floats] = []
+        self.values: list[float] = []
+
+    def __call__(self, theta: Floats) -> tuple[float, Floats]:
+        """Return value and gradient in unconstrained space; +inf outside the support."""
+        value, gradient = self.function(theta, np.empty(0))
+        self.count += 1
+        value = float(value) if np.isfinite(value) else np.inf
+        self.thetas.append(theta.copy())
+        self.values.append(value)
+        return value, np.where(np.isfinite(gradient), gradient, 0.0)
+
+    def trace(self) -> dict[str, Floats]:
+        """Return the points that were evaluated."""
+        return {
+            "theta": np.array(self.thetas),
+            "discrepancy": np.array(self.values),
+            "evaluations": np.arange(1, self.count + 1),
+        }
+
+
+def _starts(evaluator: Evaluator, options: Any) -> tuple[list[Floats], int]:
+    """Return the given start, or the most likely points of the prior, and the number screened."""
+    if options.start is not None:
+        return [evaluator.unconstrained(options.start)], 0
+    thetas = evaluator.prior_points(_SCREENED, options.random_seed)
+    values = evaluator.total(thetas, np.empty(0))
+    order = np.argsort(values, kind="stable")
+    count = _DESCENTS if options.starts is None else max(1, options.starts)
+    order = order[np.isfinite(values[order])]
+    if not order.size:
+        return [evaluator.initial], _SCREENED
+    # The best one, and of the better quarter those farthest from all chosen before.
+    candidates = thetas[order[: max(count, order.size // 4)]] / evaluator.prior_sd
+    chosen = [0]
+    distance = ((candidates - candidates[0]) ** 2).sum(axis=1)
+    while len(chosen) < min(count, len(candidates)):
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, ((candidates - candidates[chosen[-1]]) ** 2).sum(axis=1))
+    return list(candidates[chosen] * evaluator.prior_sd), _SCREENED
+
+
+def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum:
+    """Return the local minimum that BFGS finds, with its inverse Hessian."""
+    from scipy.optimize import minimize
+
+    unit = objective.unit
+
+    def standardised(u: Floats) -> tuple[float, Floats]:
+        value, gradient = objective(u * unit)
+        return value, gradient * unit
+
+    left = max(10, options.max_evaluations - objective.count)
+    result = minimize(
+        standardised, start / unit, jac=True, method="BFGS",
+        options={"gtol": options.tolerance * 100, "maxiter": left},
+    )  # fmt: skip
+    theta = np.asarray(result.x) * unit
+    value, gradient = objective(theta)
+    if not result.success and np.isfinite(value):
+        # A support whose end moves has its optimum at a jump: without gradients from there.
+        simplex = minimize(
+            lambda u: objective(u * unit)[0], theta / unit, method="Nelder-Mead",
+            options={"maxfev": min(left, 200 * theta.size), "xatol": 1e-8, "fatol": 1e-8},
+        )  # fmt: skip
+        if simplex.fun < value - 1e-6:
+            theta = np.asarray(simplex.x) * unit
+            value, gradient = objective(theta)
+    covariance, slope = _inverse_hessian(objective, theta)
+    return LocalOptimum(theta, value, covariance, bool(slope < 0.05))
+
+
+def _inverse_hessian(objective: _Objective, theta: Floats) -> tuple[Floats, float]:
+    """Return the inverse Hessian, and the gradient in standard errors.
+
+    By central differences of the gradient, with steps of a hundredth of a standard error. Infinite
+    along directions without curvature; NaN where the log-likelihood jumps.
+    """
+    d = theta.size
+    unknown = np.full((d, d), np.nan)
+    step = 1e-3 * objective.unit
+    hessian = unknown
+    for _ in range(3):
+        rows = []
+        for j in range(d):
+            shift = np.eye(d)[j] * step
+            (ahead, up), (behind, down) = objective(theta + shift), objective(theta - shift)
+            if not (np.isfinite(ahead) and np.isfinite(behind)):
+                return unknown, np.inf
+            rows.append((up - down) / (2 * step[j]))
+        hessian = (np.array(rows) + np.array(rows).T) / 2
+        curvature = np.maximum(np.diag(hessian), 1e-4 / objective.unit**2)
+        new = 0.01 / np.sqrt(curvature)
+        if np.all((new / step < 10) & (step / new < 10)):
+            break
+        step = new
+    # In units of the prior.
+    unit = objective.unit
+    values, vectors = np.linalg.eigh(hessian * np.outer(unit, unit))
+    if values.min() < -1e-3 * max(values.max(), 1.0):
+        return unknown, np.inf
+    # Less curvature than the prior's would have is none that data identify.
+    is_flat = values < 1.0 / 25
+    inverse = np.where(is_flat, 0.0, 1 / np.where(is_flat, 1.0, values))
+    covariance = (vectors * inverse) @ vectors.T
+    _, gradient = objective(theta)
+    slope = float(np.sqrt(max(0.0, (gradient * unit) @ covariance @ (gradient * unit))))
+    covariance = covariance * np.outer(unit, unit)
+    touched = (np.abs(vectors[:, is_flat]) > 1e-3).any(axis=1)
+    covariance[touched, :] = np.where(touched, np.inf, covariance[touched, :])
+    covariance[:, touched] = np.where(touched[:, None], np.inf, covariance[:, touched])
+    covariance[touched, touched] = np.inf
+    return covariance, slope
+
+
+def _distinct(optima: list[LocalOptimum], unit: Floats) -> list[LocalOptimum]:
+    """Return different optima within 30 nats of the best, best first."""
+    ordered = sorted((o for o in optima if np.isfinite(o.value)), key=lambda o: o.value)
+    if not ordered:
+        return optima[:1]
+    kept: list[LocalOptimum] = []
+    for optimum in ordered:
+        if optimum.value > ordered[0].value + 30 or (kept and not optimum.converged):
+            continue
+        new = True
+        for other in kept:
+            sd = np.sqrt(np.abs(np.diag(other.covariance)))
+            scale = np.where(np.isfinite(sd) & (sd > 0), sd, 0.1 * unit)
+            new = new and bool((np.abs(optimum.theta - other.theta) > 0.5 * scale).any())
+        if new:
+            kept.append(optimum)
+    return kept
+
+
+def _in_units(
+    evaluator: Evaluator, theta: Floats, covariance: Floats
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return variables in the user's units, and their standard errors by the delta method."""
+    step = 1e-4 * evaluator.prior_sd
+    values = evaluator.constrained(cross(theta, step))
+    point = {name: plain(v[0]) for name, v in values.items()}
+    stderr = {}
+    for name, v in values.items():
+        gradient = slopes(v, step)
+        infinite = np.isinf(covariance)
+        finite = np.where(infinite, 0.0, covariance)
+        variance = np.einsum("...i,ij,...j->...", gradient, finite, gradient)
+        touched = (np.abs(gradient) * np.isinf(np.diag(covariance))).sum(axis=-1) > 0
+        stderr[name] = plain(np.where(touched, np.inf, np.sqrt(np.maximum(variance, 0.0))))
+    return point, stderr
+
+
+def _findings(evaluator: Evaluator, modes: list[LocalOptimum]) -> list[Finding]:
+    """Report several modes, unidentified hyperparameters, and an optimum at the edge of a support."""
+    findings = []
+    best = modes[0]
+    if np.isnan(best.covariance).any():
+        findings.append(
+            Finding(
+                "support-edge",
+                "The likelihood jumps at the optimum, as it does where the end of an input's "
+                "support meets a specimen; no standard errors follow from its curvature. Sample "
+                "with prb.sample_smc",
+                "likelihood.md#moving-supports",
+            )
+        )
+    flat = [
+        name
+        for name, v in zip(evaluator.readable_names, np.diag(best.covariance), strict=True)
+        if np.isinf(v)
+    ]
+    if flat:
+        findings.append(
+            Finding(
+                "not-identified",
+                f"The data do not identify {', '.join(flat)}; values at the optimum are arbitrary, "
+                "and the posterior keeps the prior there",
+                "likelihood.md#identification",
+            )
+        )
+    weights = mode_weights(modes)
+    for mode, weight in zip(modes[1:], weights[1:], strict=True):
+        if weight < 0.01:
+            continue
+        point = _in_units(evaluator, mode.theta, mode.covariance)[0]
+        free = [str(rv.name) for rv in evaluator.model.free_RVs]
+        where = ", ".join(f"{name} = {np.array2string(np.asarray(point[name]), precision=4)}" for name in free)
+        findings.append(
+            Finding(
+                "second-mode",
+                f"A second optimum at {where} has {weight:.0%} of the likelihood's mass; NUTS "
+                "chains stay in the mode where they start, prb.sample_smc samples both",
+                "likelihood.md#several-modes",
+            )
+        )
+    return findings
