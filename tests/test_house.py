@@ -27,7 +27,17 @@ README_SCRIPT = re.findall(r"^```python\n(.*?)^```", README, re.MULTILINE | re.D
 
 # Each floor may import from those before it; rooms of one floor do not import each other.
 LAYERS = (
-    ("_checks", "_envelope", "_html", "_pages", "_progress", "_threads", "_weighted", "datasets"),
+    (
+        "_checks",
+        "_envelope",
+        "_finding",
+        "_html",
+        "_pages",
+        "_progress",
+        "_threads",
+        "_weighted",
+        "datasets",
+    ),
     ("metrics", "response", "emulators"),
     ("propagation",),
     ("model",),
@@ -41,7 +51,17 @@ LAYERS = (
 FLOOR = {room: floor for floor, rooms in enumerate(LAYERS) for room in rooms}
 # Rooms of one floor that may see each other: what is below everything, verbs, and the command line's two files.
 TOGETHER = (
-    {"_checks", "_envelope", "_html", "_pages", "_progress", "_threads", "_weighted", "datasets"},
+    {
+        "_checks",
+        "_envelope",
+        "_finding",
+        "_html",
+        "_pages",
+        "_progress",
+        "_threads",
+        "_weighted",
+        "datasets",
+    },
     {"_demo", "__main__"},
 )
 
