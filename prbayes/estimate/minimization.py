@@ -36,6 +36,7 @@ from prbayes.estimate.caveats import (
 )
 from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.kernel_width import wide_kernels
+from prbayes.estimate.maximum_likelihood import maximize_likelihood
 from prbayes.estimate.methods import Method
 from prbayes.estimate.objective import Hold
 from prbayes.estimate.obstacles import sampling_obstacle
@@ -331,6 +332,8 @@ def find_optimum(evaluator: Evaluator, asked: Minimisation) -> Optimum:
     BudgetError
         If a budget is spent before the discrepancy is known anywhere.
     """
+    if not evaluator.nodes:
+        return maximize_likelihood(evaluator, asked)
     for node in evaluator.nodes:
         node.bound.restart(asked.random_seed)
     last = None

@@ -168,7 +168,10 @@ class Optimum:
         """Say how good it is, and what it cost."""
         state = "converged" if self.converged else "NOT converged"
         what = "Optimum with the prior" if self.prior else "Optimum"
-        head = f"{what}: discrepancy {self.discrepancy:.4g} after"
+        value = f"discrepancy {self.discrepancy:.4g}"
+        if not self.evaluator.nodes:
+            value = f"log-likelihood {-self.discrepancy:.4g}"
+        head = f"{what}: {value} after"
         return f"{head} {self.n_evaluations} evaluations, {self.n_responses} responses, {state}"
 
     def _shares(self) -> list[str]:
@@ -187,12 +190,23 @@ class Optimum:
         return self.evaluator.model
 
     @property
+    def initvals(self) -> dict[str, Any]:
+        """The free variables at the optimum.
+
+        For ``pm.sample(initvals=optimum.initvals, init="adapt_diag")``, which starts every chain
+        there: PyMC's default jitter can move a chain into another mode.
+        """
+        return {str(rv.name): self.point[str(rv.name)] for rv in self.model.free_RVs}
+
+    @property
     def n_computed(self) -> int:
         """Responses computed for the model so far.
 
         Without those found in a store, with those computed again.
         """
-        return sum(node.bound.responses.computed for node in self.evaluator.nodes)
+        evaluator = self.evaluator
+        by_metric = sum(node.bound.responses.computed for node in evaluator.nodes)
+        return by_metric + sum(each.responses.computed for each in evaluator.likelihoods)
 
     @property
     def failures(self) -> xr.Dataset:

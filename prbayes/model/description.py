@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
+from numpy.typing import NDArray
 from pymc.printing import str_for_dist
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
 
 from prbayes.model.node import Node, nodes, response_name
-from prbayes.response.inputs import is_random
+from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
+from prbayes.response.inputs import Inputs, is_random
 
 # What is told of a variable and of a simulator.
 _VARIABLE = ("name", "role", "distribution")
@@ -36,6 +38,7 @@ def describe(model: pm.Model) -> dict[str, Any]:
     """
     known = known_variables(model)
     simulators = nodes(model)
+    likelihoods = specimen_likelihoods(model)
     variables = []
     for rv in model.free_RVs:
         variables.append(_variable(rv, "hyperparameter", _distribution(rv, known)))
@@ -43,9 +46,10 @@ def describe(model: pm.Model) -> dict[str, Any]:
         text = f"computed from {_above(computed, known)}"
         variables.append(_variable(computed, "deterministic", text))
     for rv in model.observed_RVs:
-        if rv not in simulators:
+        if rv not in simulators and rv not in likelihoods:
             variables.append(_variable(rv, "observed", _distribution(rv, known)))
     described = [_simulator(node, known) for node in simulators.values()]
+    described += [_specimen_simulator(each, known) for each in likelihoods.values()]
     return {"variables": variables, "simulators": described}
 
 
@@ -93,17 +97,32 @@ def _variable(variable: Any, role: str, distribution: str) -> dict[str, str]:
 
 
 def _simulator(node: Node, known: Set[Any]) -> dict[str, str]:
-    inputs = node.bound.inputs
-    arguments = [_input(argument, inputs.aleatory, known) for argument in inputs.arguments]
     return {
         "name": node.name,
         "response": response_name(node.bound.responses.function),
-        "inputs": ", ".join(arguments),
+        "inputs": _arguments(node.bound.inputs, known),
         "metric": without_addresses(node.metric),
         "propagation": without_addresses(node.propagation),
         "n_points": str(node.bound.n_points),
-        "specimens": _specimens(node),
+        "specimens": _specimens(node.specimens),
     }
+
+
+def _specimen_simulator(likelihood: SpecimenLikelihood, known: Set[Any]) -> dict[str, str]:
+    return {
+        "name": likelihood.name,
+        "response": response_name(likelihood.responses.function),
+        "inputs": _arguments(likelihood.inputs, known),
+        "metric": without_addresses(likelihood.metric),
+        "propagation": f"emulator of {len(likelihood.emulation.z)} runs",
+        "n_points": str(len(likelihood.emulation.z)),
+        "specimens": _specimens(likelihood.specimens),
+    }
+
+
+def _arguments(inputs: Inputs, known: Set[Any]) -> str:
+    """Return the arguments of a response in words."""
+    return ", ".join(_input(x, inputs.aleatory, known) for x in inputs.arguments)
 
 
 def _input(argument: Any, aleatory: tuple[Any, ...], known: Set[Any]) -> str:
@@ -180,10 +199,10 @@ def _above(variable: Any, known: Set[Any]) -> str:
     return ", ".join(names) or "constants"
 
 
-def _specimens(node: Node) -> str:
-    if node.specimens is None:
+def _specimens(specimens: NDArray[Any] | None) -> str:
+    if specimens is None:
         return ""
-    labels = list(dict.fromkeys(map(str, node.specimens.tolist())))
+    labels = list(dict.fromkeys(map(str, specimens.tolist())))
     shown = labels[:40]  # three lines of a report
     text = f"{len(labels)} specimens: {', '.join(shown)}"
     more = len(labels) - len(shown)

@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 from prbayes._checks import AT_ONCE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.hyperparameters import Hyperparameters
-from prbayes.model.node import Node, log_kernel, priors_alone, required_nodes
+from prbayes.model.node import Node, log_kernel, priors_alone
+from prbayes.model.specimen_likelihood import required_nodes, specimen_likelihoods
 from prbayes.propagation.base import Bound
 from prbayes.propagation.cloud import CLOUD
 from prbayes.propagation.reweighted import Design
 from prbayes.response.budget import budget
 from prbayes.response.compilation import compile_batched, compiled, ninf_for_invalid, untraced
+from prbayes.response.grouping import is_group
 
 # Points of a design from which on an eighth of them serve on the way to an answer: those of the
 # smallest cloud.
@@ -64,15 +66,19 @@ class Evaluator:
     Attributes
     ----------
     nodes : list of Node
-        The simulators.
+        The simulators with a metric of distributions.
+    likelihoods : list of SpecimenLikelihood
+        The simulators with a log-likelihood by specimen.
     hyperparameters : Hyperparameters
     """
 
     def __init__(self, model: pm.Model) -> None:
         self.model = model
-        found = required_nodes(model)
-        self.nodes: list[Node] = list(found.values())
-        self._variables = list(found)
+        simulators = required_nodes(model)
+        self.nodes: list[Node] = list(simulators.values())
+        self._variables = list(simulators)
+        # Simulators with a likelihood by specimen: ordinary observed variables.
+        self.likelihoods = list(specimen_likelihoods(model).values())
         self.hyperparameters = Hyperparameters(model)
         # Compiled, by what they were asked for; they live as long as this evaluator.
         self._objectives: dict[tuple[bool, bool], Any] = {}
@@ -134,7 +140,8 @@ class Evaluator:
     @property
     def n_responses(self) -> int:
         """Scalar responses computed so far; those that several simulators share count once."""
-        return self._once([node.bound.responses.count for node in self.nodes])
+        by_metric = self._once([node.bound.responses.count for node in self.nodes])
+        return by_metric + sum(each.responses.count for each in self.likelihoods)
 
     @property
     def n_runs(self) -> int:
@@ -205,6 +212,31 @@ class Evaluator:
         (found,) = self._evaluate_other(np.ascontiguousarray(thetas))
         return np.array(np.broadcast_to(found, len(thetas)))
 
+    def specimen_log_likelihoods(self, thetas: Floats) -> dict[str, Floats]:
+        """Return log p(y_i | theta) by simulator, shapes (P, N), of those with a likelihood."""
+        if not self.likelihoods:
+            return {}
+        rows = max(1, AT_ONCE // max(each.points.log_a.size for each in self.likelihoods))
+        parts = [
+            self._evaluate_specimens(np.ascontiguousarray(thetas[first : first + rows]))
+            for first in range(0, len(thetas), rows)
+        ]
+        names = [each.name for each in self.likelihoods]
+        joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
+        return dict(zip(names, joined, strict=True))
+
+    def specimen_roots(self, thetas: Floats, k: int) -> list[Floats]:
+        """Return the roots of the k-th likelihood by specimen at thetas, shapes (P, *shape)."""
+        likelihood = self.likelihoods[k]
+        values = self.constrained(thetas)
+        return [values[str(r.name)] for r in likelihood.inputs.roots if not is_group(r)]
+
+    @cached_property
+    def _evaluate_specimens(self) -> Any:
+        variables = list(specimen_likelihoods(self.model))
+        graphs = self.model.logp(vars=variables, sum=False)
+        return self.hyperparameters.compile(graphs)
+
     def discrepancies(self, thetas: Floats, k: int, target: Discrepancy | None = None) -> Floats:
         """Return the k-th simulator's discrepancies, shape (P,), or those from another target."""
         budget().go_on()
@@ -215,6 +247,7 @@ class Evaluator:
         """Evaluate a batch, shape (P, d); invalid thetas leave the others alone."""
         size = len(thetas)
         points = max((node.bound.n_points for node in self.nodes), default=1)
+        points = max(points, *(each.points.log_a.size for each in self.likelihoods), 1)
         step = max(1, AT_ONCE // max(1, points))
         log_prior = np.empty(size)
         log_other = np.empty(size)

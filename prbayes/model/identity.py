@@ -30,7 +30,9 @@ from prbayes.model.description import (
 )
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node, nodes
+from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
 from prbayes.response.compilation import interpreted
+from prbayes.response.inputs import Inputs
 
 
 class Level(IntEnum):
@@ -158,6 +160,7 @@ def identity_of(evaluator: Evaluator, *, prior_minimised: bool | None = None) ->
         free = node.bound.stored
         discrepancies = evaluator.discrepancies(thetas, k) if free else np.empty(0)
         simulators.append(_simulator(node, discrepancies))
+    simulators += map(_specimen_simulator, evaluator.likelihoods)
     return _identity(
         evaluator.model,
         simulators,
@@ -176,6 +179,7 @@ def identity_of_model(model: pm.Model) -> Identity:
     """
     found = nodes(model).values()
     simulators = [_simulator(node, np.empty(0)) for node in found]
+    simulators += map(_specimen_simulator, specimen_likelihoods(model).values())
     shapes = {}
     for rv in model.free_RVs:
         value = model.rvs_to_values[rv]
@@ -190,7 +194,8 @@ def identity_of_model(model: pm.Model) -> Identity:
 def _identity(model: pm.Model, simulators: Sequence[SimulatorIdentity], **others: Any) -> Identity:
     known = known_variables(model)
     priors = {str(rv.name): as_pymc_writes(rv, known) for rv in model.free_RVs}
-    observed = [rv for rv in model.observed_RVs if rv not in nodes(model)]
+    simulated = {*nodes(model), *specimen_likelihoods(model)}
+    observed = [rv for rv in model.observed_RVs if rv not in simulated]
     terms = [f"{rv.name} ~ {as_pymc_writes(rv, known)}" for rv in observed]
     terms += [str(potential.name) for potential in model.potentials]
     # Clones may order variables in other ways.
@@ -211,7 +216,7 @@ def _simulator(node: Node, discrepancies: Floats) -> SimulatorIdentity:
         data=_digest(observed[order].tobytes()),
         weights=_digest(weights[order].tobytes()),
         specimens=_digest(repr(labels).encode()),
-        inputs=_inputs(node),
+        inputs=_inputs(node.bound.inputs),
         metric=without_addresses(node.metric),
         propagation=without_addresses(node.propagation),
         n_points=node.bound.n_runs,
@@ -220,6 +225,27 @@ def _simulator(node: Node, discrepancies: Floats) -> SimulatorIdentity:
         responses=_numbers(node.bound.known_responses[:8].ravel()),
         discrepancies=_numbers(discrepancies),
         points=_points(node),
+    )
+
+
+def _specimen_simulator(likelihood: SpecimenLikelihood) -> SimulatorIdentity:
+    """Return the identity of a simulator with a likelihood by specimen."""
+    observed = likelihood.observed
+    labels = [] if likelihood.specimens is None else likelihood.specimens.tolist()
+    weights = b"" if likelihood.weights is None else likelihood.weights.tobytes()
+    groups = b"" if likelihood.groups is None else likelihood.groups.tobytes()
+    return SimulatorIdentity(
+        name=likelihood.name,
+        data=_digest(observed.tobytes() + groups),
+        weights=_digest(weights),
+        specimens=_digest(repr(labels).encode()),
+        inputs=_inputs(likelihood.inputs),
+        metric=without_addresses(likelihood.metric),
+        propagation=without_addresses(likelihood.propagation),
+        n_points=0,
+        batches=1,
+        epsilon=1.0,
+        responses=(),
     )
 
 
@@ -236,9 +262,8 @@ def _points(node: Node) -> tuple[tuple[float, ...], ...]:
     return tuple(map(_numbers, np.concatenate(columns, axis=1)))
 
 
-def _inputs(node: Node) -> str:
+def _inputs(inputs: Inputs) -> str:
     """Return the arguments of a response, the same for all clones of a model."""
-    inputs = node.bound.inputs
     roots = set(inputs.roots)
     texts = []
     for argument in inputs.arguments:
@@ -403,7 +428,7 @@ def require_together(
     """
     known = [identity for identity in identities.values() if identity is not None]
     expected = known[0] if known else None
-    if model is not None and nodes(model):
+    if model is not None and (nodes(model) or specimen_likelihoods(model)):
         expected = identity_of_model(model)
     for label, identity in identities.items():
         require_same(identity, expected, f"{caller}: {label}", level)

@@ -68,10 +68,11 @@ def failures_dataset(evaluator: Evaluator) -> xr.Dataset:
     """
     each = []
     instead = []
-    for node in evaluator.nodes:
-        own = node.bound.responses.failed
-        each += [(node.name, failure) for failure in own]
-        instead += [node.bound.responses.replacement] * len(own)
+    responses = [(node.name, node.bound.responses) for node in evaluator.nodes]
+    responses += [(simulator.name, simulator.responses) for simulator in evaluator.likelihoods]
+    for name, response in responses:
+        each += [(name, failure) for failure in response.failed]
+        instead += [response.replacement] * len(response.failed)
     columns = max((failure.inputs.size for _, failure in each), default=0)
     inputs = np.full((len(each), columns), np.nan)
     for row, (_, failure) in zip(inputs, each, strict=True):
@@ -91,6 +92,7 @@ def failures_dataset(evaluator: Evaluator) -> xr.Dataset:
 def observed_dataset(evaluator: Evaluator) -> xr.Dataset:
     """Return the observed responses of all simulators, labelled; several outputs by their names."""
     observed = {node.name: node.target.observed for node in evaluator.nodes}
+    observed |= {each.name: each.observed for each in evaluator.likelihoods}
     return labelled_responses(evaluator, observed)
 
 
@@ -103,13 +105,13 @@ def labelled_responses(
     """
     sizes = dict(zip(("chain", "draw"), leading, strict=False))
     data = labelled(evaluator, values, sizes)
-    for node in evaluator.nodes:
-        if node.name not in values:
+    for simulator in (*evaluator.nodes, *evaluator.likelihoods):
+        if simulator.name not in values:
             continue
-        if node.outputs.event:
-            data = _with_outputs(data, node.name, node.outputs)
+        if simulator.outputs.event:
+            data = _with_outputs(data, simulator.name, simulator.outputs)
         else:
-            _tell_units(data, node.name, node.outputs)
+            _tell_units(data, simulator.name, simulator.outputs)
     return data
 
 

@@ -33,7 +33,8 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._checks import Floats
 from prbayes._finding import Finding
 from prbayes.metrics.likelihood import LogLikelihood
-from prbayes.model.node import known_value, response_name
+from prbayes.model.node import Node, known_value, nodes, response_name
+from prbayes.model.node import required_nodes as required_metric_nodes
 from prbayes.propagation.base import Propagation
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.metrics.readings import Readings
@@ -164,10 +165,47 @@ class SpecimenLikelihood:
         likelihood = logsumexp_finite(terms)
         return likelihood if self.weights is None else likelihood * self.weights
 
-    def draw(self, rng: np.random.Generator, roots: Sequence[Floats], n: int) -> Floats:
-        """Draw the responses of n specimens of one population, (n,) or (n, m)."""
-        specimens, _ = self._sampler([np.asarray(r)[None] for r in roots], n, rng)
-        return self.emulated([x[0] for x in specimens])
+    def draws(self, rng: np.random.Generator, roots: Sequence[Floats], n: int) -> Floats:
+        """Draw the emulated responses of n specimens of each population.
+
+        Parameters
+        ----------
+        rng : Generator
+        roots : sequence of ndarray, shapes (P, *shape)
+            Without the group of a specimen: specimens are of the groups of the observed ones.
+        n : int
+
+        Returns
+        -------
+        ndarray, shape (P, n) or (P, n, m)
+        """
+        size = len(roots[0])
+        if self.groups is None:
+            specimens, _ = self._sampler(roots, n, rng)
+        else:
+            specimens = self._of_groups(rng, roots, n)
+        flat = [x.reshape(size * n, *x.shape[2:]) for x in specimens]
+        return self.emulated(flat).reshape(size, n, *self.event)
+
+    def _of_groups(
+        self, rng: np.random.Generator, roots: Sequence[Floats], n: int
+    ) -> list[Floats]:
+        """Return specimens of each population, each of the group of an observed one."""
+        assert self.groups is not None
+        groups = np.resize(self.groups, n)
+        drawn: list[Floats] = []
+        for group in np.unique(groups):
+            values = iter(roots)
+            completed = [
+                np.full(len(roots[0]), group) if is_group(root) else next(values)
+                for root in self.inputs.roots
+            ]
+            columns = np.flatnonzero(groups == group)
+            specimens, _ = self._sampler(completed, len(columns), rng)
+            drawn = drawn or [np.empty((x.shape[0], n, *x.shape[2:])) for x in specimens]
+            for whole, part in zip(drawn, specimens, strict=True):
+                whole[:, columns] = part
+        return drawn
 
     def emulated(self, inputs: Sequence[Floats]) -> Floats:
         """Return the emulator's responses of specimens, (n, *event) by input; no run is made.
@@ -240,6 +278,10 @@ class SpecimenRV(RandomVariable):
             raise RuntimeError("got an operation of a model that is gone")
         return likelihood
 
+    def __str__(self) -> str:
+        """Show the name and the signature, without the likelihood."""
+        return f'prbayes_Simulator_rv{{"{self.signature}"}}'
+
     @property
     def _print_name(self) -> tuple[str, str]:
         """What PyMC prints for the distribution, as text and as LaTeX."""
@@ -266,22 +308,27 @@ class SpecimenRV(RandomVariable):
         """Draw responses of specimens; their shape is the last of the arguments."""
         *params, size = arguments
         likelihood = self.likelihood
-        roots = likelihood.inputs.roots
-        batches = [p.shape[: p.ndim - r.type.ndim] for p, r in zip(params, roots, strict=True)]
-        batch = np.broadcast_shapes(*batches)
+        roots = []
+        batch: tuple[int, ...] = ()
+        for param, root in zip(params, likelihood.inputs.roots, strict=True):
+            if is_group(root):
+                continue
+            leading = param.shape[: param.ndim - root.type.ndim]
+            batch = np.broadcast_shapes(batch, leading)
+            roots.append(param)
         shape = batch if size is None else tuple(int(s) for s in size)
-        values = np.empty((*shape, *likelihood.event))
-        for index in np.ndindex(batch):
-            chosen = []
-            for p, leading in zip(params, batches, strict=True):
-                place = index[len(index) - len(leading) :]
-                chosen.append(p[tuple(0 if k == 1 else i for i, k in zip(place, leading))])
-            place = tuple(slice(None) if k == 1 else i for i, k in zip(index, batch, strict=True))
-            where = (..., *place) if not likelihood.event else (..., *place, slice(None))
-            part = values[where]
-            n = part.size // int(np.prod(likelihood.event, dtype=int))
-            values[where] = likelihood.draw(rng, chosen, n).reshape(part.shape)
-        return values
+        n = len(likelihood.observed) if not shape else shape[-1]
+        # The last batch axis is that of the specimens, along which parameters have length one.
+        populations = batch[:-1] if batch else ()
+        event_shapes = [r.type.shape for r in likelihood.inputs.roots if not is_group(r)]
+        flat = []
+        for param, event in zip(roots, event_shapes, strict=True):
+            ndim = len(event)
+            first = param if param.ndim == ndim else param[..., 0, *(slice(None),) * ndim]
+            tail = first.shape[first.ndim - ndim :]
+            flat.append(np.broadcast_to(first, (*populations, *tail)).reshape(-1, *tail))
+        values = likelihood.draws(rng, flat, n)
+        return values.reshape(*shape, *likelihood.event)
 
     def _supp_shape_from_params(self, dist_params: Any, param_shapes: Any = None) -> Any:
         """Return the number of outputs of a specimen."""
@@ -368,3 +415,9 @@ def specimen_likelihoods(model: pm.Model) -> dict[Any, SpecimenLikelihood]:
                 rv.owner.tag.likelihood = likelihood
             result[rv] = likelihood
     return result
+
+
+def required_nodes(model: pm.Model) -> dict[Any, Node]:
+    """Return the simulators with a metric of distributions, or raise if there is no simulator."""
+    simulators = nodes(model)
+    return simulators if simulators or specimen_likelihoods(model) else required_metric_nodes(model)

@@ -83,6 +83,54 @@ def arviz_groups(
     return {name: group.assign_attrs(arviz_attributes()) for name, group in groups.items()}
 
 
+def specimen_groups(
+    evaluator: Evaluator, thetas: Floats, seed: int | None
+) -> dict[str, xr.Dataset]:
+    """Return the groups of a model with likelihoods by specimen; no run is made.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    thetas : ndarray, shape (chains, draws, d)
+    seed : int or None
+
+    Returns
+    -------
+    dict
+        ``prior``, ``log_prior``, ``log_likelihood`` with a value for each specimen, and
+        ``posterior_predictive`` and ``prior_predictive`` draws by the emulator.
+    """
+    chains, draws, d = thetas.shape
+    rng = np.random.default_rng(seed)
+    prior = evaluator.prior_thetas(draws, int(rng.integers(2**31)))
+    values = evaluator.specimen_log_likelihoods(thetas.reshape(-1, d))
+    observed = observed_dataset(evaluator)
+    log_likelihood = {
+        name: (["chain", "draw", observed[name].dims[0]], value.reshape(chains, draws, -1))
+        for name, value in values.items()
+    }
+    coords = {"chain": np.arange(chains), "draw": np.arange(draws)}
+    groups = {
+        "prior": _variables(evaluator, prior[None]),
+        "log_prior": _log_prior(evaluator, thetas),
+        "log_likelihood": xr.Dataset(log_likelihood, coords=coords),
+        "posterior_predictive": _emulated(evaluator, thetas, rng),
+        "prior_predictive": _emulated(evaluator, prior[None], rng),
+    }
+    return {name: group.assign_attrs(arviz_attributes()) for name, group in groups.items()}
+
+
+def _emulated(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) -> xr.Dataset:
+    """Return emulated responses of new specimens at thetas, (chains, draws, d)."""
+    chains, draws, d = thetas.shape
+    drawn = {}
+    for k, likelihood in enumerate(evaluator.likelihoods):
+        roots = evaluator.specimen_roots(thetas.reshape(-1, d), k)
+        values = likelihood.draws(rng, roots, len(likelihood.observed))
+        drawn[likelihood.name] = values.reshape(chains, draws, *values.shape[1:])
+    return labelled_responses(evaluator, drawn, (chains, draws))
+
+
 def _variables(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
     """Return variables and deterministics at thetas, shape (chains, draws, d)."""
     chains, draws, d = thetas.shape

@@ -36,7 +36,7 @@ from prbayes.posterior.chains import Chains, Particles
 from prbayes.posterior.checkpoint import Checkpoint, stored_settings
 from prbayes.posterior.default_adjustment import default_adjustment
 from prbayes.posterior.epsilon import calibrate_epsilon
-from prbayes.posterior.groups import arviz_groups
+from prbayes.posterior.groups import arviz_groups, specimen_groups
 from prbayes.posterior.returned import (
     as_asked,
     as_multitrace,
@@ -252,6 +252,8 @@ class Sampling:
 
 def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     """Do what `sample_smc` does, for an evaluator."""
+    if not evaluator.nodes:
+        return sample_likelihood(evaluator, asked)
     clock = time.perf_counter()
     before = evaluator.n_responses - evaluator.n_runs
     drawn = [design.n_drawn for design in evaluator.designs.values()]
@@ -551,6 +553,40 @@ class Rounds:
         both = np.concatenate([found.particles.thetas, found.thetas])
         rows = both.reshape(-1, self.run.evaluator.size)
         return np.random.default_rng(self.seeds).permutation(rows)[:THETAS]
+
+
+def sample_likelihood(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
+    """Sample the posterior of a model whose simulators have a log-likelihood by specimen.
+
+    Nothing is calibrated or adjusted: the draws are those of the posterior.
+    """
+    clock = time.perf_counter()
+    before = evaluator.n_responses
+    if asked.epsilon is not None:
+        raise ValueError(
+            f"epsilon: got {asked.epsilon!r}, expected none: prb.LogLikelihood() is a likelihood "
+            "and has no scale to choose; leave epsilon= out"
+        )
+    rounds = _rounds(evaluator, asked, None, None)
+    particles = rounds.until_supported(asked.progressbar).particles
+    groups = None
+    with unlimited():
+        if asked.with_groups:
+            groups = specimen_groups(evaluator, particles.thetas, asked.random_seed)
+        optimum_warnings = () if asked.optimum is None else asked.optimum.warnings
+        return posterior_tree(
+            evaluator,
+            particles.thetas,
+            particles.discrepancies,
+            particles.lost,
+            particles.stats,
+            warnings=(*_of_budget(particles.stopped, particles, asked), *optimum_warnings),
+            stopped=particles.stopped,
+            seed=asked.random_seed,
+            n_responses=evaluator.n_responses - before,
+            seconds=time.perf_counter() - clock,
+            groups=groups,
+        )
 
 
 @contextmanager
