@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 
 import pytest
@@ -29,6 +30,8 @@ def test_the_page_comes_before_the_final_period() -> None:
 def test_findings_are_values() -> None:
     assert Finding("a", "text") == Finding("a", "text")
     assert len({Finding("a", "text"), Finding("a", "text"), Finding("b", "text")}) == 2
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Finding("a", "text").code = "b"  # type: ignore[misc]
 
 
 def test_report_logs_each_finding_as_a_warning(caplog: pytest.LogCaptureFixture) -> None:
