@@ -19,7 +19,13 @@ from numpy.typing import NDArray
 from prbayes._checks import AT_ONCE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.hyperparameters import Hyperparameters
-from prbayes.model.node import Node, log_kernel, priors_alone, required_nodes
+from prbayes.model.node import (
+    Node,
+    log_kernel,
+    priors_alone,
+    required_nodes,
+    required_simulators,
+)
 from prbayes.propagation.base import Bound
 from prbayes.propagation.cloud import CLOUD
 from prbayes.propagation.reweighted import Design
@@ -70,10 +76,11 @@ class Evaluator:
 
     def __init__(self, model: pm.Model) -> None:
         self.model = model
-        found = required_nodes(model)
-        self.nodes: list[Node] = list(found.values())
-        self._variables = list(found)
-        self.hyperparameters = Hyperparameters(model)
+        required_simulators(model)
+        self.hyperparameters = Hyperparameters(model)  # refuses what would waste the first runs
+        by_variable = required_nodes(model)
+        self.nodes: list[Node] = list(by_variable.values())
+        self._variables = list(by_variable)
         # Compiled, by what they were asked for; they live as long as this evaluator.
         self._objectives: dict[tuple[bool, bool], Any] = {}
         names = self.hyperparameters
