@@ -457,6 +457,16 @@ INNER = {
         "pytensor.tensor.variable.TensorVariable",
     },
     "model.simulator": {"pytensor.graph.basic.Variable", "pytensor.tensor.variable.TensorVariable"},
+    "model.specimen_likelihood": {
+        "pymc.logprob.abstract._logprob",
+        "pymc.logprob.utils.CheckParameterValue",
+        "pytensor.graph.basic.Apply",
+        "pytensor.graph.basic.Constant",
+        "pytensor.graph.replace.graph_replace",
+        "pytensor.graph.replace.vectorize_graph",
+        "pytensor.tensor.random.op.RandomVariable",
+        "pytensor.tensor.variable.TensorVariable",
+    },
     "model.stock": {"pytensor.graph.basic.Apply", "pytensor.graph.op.Op"},
     "plots._margins": {"pytensor.tensor.variable.TensorVariable"},
     "posterior.smc_kernel": {

@@ -74,7 +74,7 @@ from prbayes.estimate.search import (
 from prbayes.estimate.search import start as begin
 from prbayes.estimate.solution import assemble, rival_record
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.hyperparameters import THETAS
+from prbayes.model.hyperparameters import THETAS, Hyperparameters
 from prbayes.model.interruption import explained, kept
 from prbayes.model.node import model_on_context
 from prbayes.model.support import shortcomings
@@ -138,13 +138,13 @@ def refine(
     {'y': 1024}
     """
     model = model_on_context(model, "prb.refine")
-    evaluator = Evaluator(model)
-    wanted = None if thetas is None else _thetas(evaluator, thetas)
+    wanted = None if thetas is None else _thetas(Hyperparameters(model), thetas)
     with (
         shown(progressbar),
-        explained(evaluator, "prb.refine"),
+        explained(model, "prb.refine"),
         limited(max_seconds, max_runs),
     ):
+        evaluator = Evaluator(model)
         if wanted is None:
             require_finished(find_optimum(evaluator, Minimisation()))
         else:
@@ -155,14 +155,14 @@ def refine(
     return {name: design.n_runs for name, design in evaluator.designs.items()}
 
 
-def _thetas(evaluator: Evaluator, thetas: Any) -> Floats:
+def _thetas(hyperparameters: Hyperparameters, thetas: Any) -> Floats:
     """Return thetas, shape (P, d), or raise if they are none of the model's."""
     found = real_array(thetas, "thetas")
-    size = evaluator.size
+    size = hyperparameters.size
     if found.ndim != 2 or found.shape[1] != size or not len(found):
         raise ValueError(
             f"thetas: got shape {found.shape}, expected (P, {size}) with P >= 1: a row for each "
-            f"population, a column for each of {evaluator.names}"
+            f"population, a column for each of {hyperparameters.names}"
         )
     if not np.isfinite(found).all():
         raise ValueError("thetas: got NaN or infinite values, expected finite ones")
@@ -289,7 +289,7 @@ def minimize(
     >>> bool(abs(optimum.point["mu"] - 1) < 0.1)
     True
     """
-    evaluator = Evaluator(model_on_context(model, "prb.minimize"))
+    model = model_on_context(model, "prb.minimize")
     if starts is not None:
         positive_integer(starts, "starts", minimum=0)
     asked = Minimisation(
@@ -304,10 +304,10 @@ def minimize(
     )
     with (
         shown(progressbar),
-        explained(evaluator, "prb.minimize"),
+        explained(model, "prb.minimize"),
         limited(max_seconds, max_runs),
     ):
-        return find_optimum(evaluator, asked)
+        return find_optimum(Evaluator(model), asked)
 
 
 @dataclass(frozen=True)
@@ -866,8 +866,8 @@ def _stopped(plan: _Plan, begun: _Beginning, state: _State, reason: str) -> Opti
     )
     line = (
         f"{reason} before the minimisation was finished, so that this is no answer yet; "
-        f"{kept(plan.evaluator)}; call prb.minimize with a larger budget, on a model that is built "
-        f"again, to go on{more_in('expensive.md#a-night-is-not-enough')}"
+        f"{kept(plan.evaluator.model)}; call prb.minimize with a larger budget, on a model that is "
+        f"built again, to go on{more_in('expensive.md#a-night-is-not-enough')}"
     )
     _log.warning("%s", line)
     return replace(found, seconds=time.perf_counter() - plan.clock, warnings=(line,))

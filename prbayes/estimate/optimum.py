@@ -168,9 +168,8 @@ class Optimum:
         """Say how good it is, and what it cost."""
         state = "converged" if self.converged else "NOT converged"
         what = "Optimum with the prior" if self.prior else "Optimum"
-        value = f"discrepancy {self.discrepancy:.4g}"
-        if not self.evaluator.nodes:
-            value = f"log-likelihood {-self.discrepancy:.4g}"
+        label = "discrepancy" if self.evaluator.nodes else "minus log-likelihood"
+        value = f"{label} {self.discrepancy:.4g}"
         head = f"{what}: {value} after"
         return f"{head} {self.n_evaluations} evaluations, {self.n_responses} responses, {state}"
 

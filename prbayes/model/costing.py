@@ -13,7 +13,7 @@ import pymc as pm
 from prbayes._checks import called, flag
 from prbayes.metrics.base import Discrepancy
 from prbayes.model.description import without_addresses
-from prbayes.model.node import model_on_context, required_nodes
+from prbayes.model.node import model_on_context, required_simulators
 from prbayes.propagation.base import Propagation
 from prbayes.response.costs import Cost, SimulatorCost
 from prbayes.response.rehearsal import Rehearsal
@@ -29,8 +29,8 @@ def cost(model: pm.Model | Callable[[], Any] | None = None, *, dry_run: bool = F
     ----------
     model : callable or pymc.Model, optional
         A function without arguments that makes the model, and does nothing more: it is called, and
-        its simulators tell their runs in place of making them. Or a model that is there already,
-        whose first runs are made; the one on the context by default.
+        its simulators report their runs. Or a model, whose first runs are known from its first use
+        on; the one on the context by default.
     dry_run : bool
         Whether one specimen of each simulator is run, to see that the response works, and how long
         it takes: one in the middle of those that are needed first. With ``store=`` it is kept, so
@@ -152,9 +152,12 @@ def _of_function(build: Callable[[], Any]) -> list[Asked]:
 
 
 def _of_model(model: pm.Model) -> list[Asked]:
-    """Return what the simulators of a model ask for, which have begun."""
-    found = []
-    for node in required_nodes(model).values():
-        bound = node.bound
-        found.append(Asked(bound.responses, node.propagation, bound.target, computed=True))
-    return found
+    """Return what the simulators of a model ask for, or asked for at the first use."""
+    asked: list[Asked] = []
+    for simulator in required_simulators(model).values():
+        responses = simulator.responses
+        names = [one.responses.name for one in asked if one.responses.runs is responses.runs]
+        shared = "" if simulator.is_computed or not names else names[0]
+        computed = simulator.is_computed
+        asked.append(Asked(responses, simulator.propagation, simulator.target, shared, computed))
+    return asked

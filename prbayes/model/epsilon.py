@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pymc as pm
@@ -11,7 +11,7 @@ import pymc as pm
 from prbayes._checks import called, positive_number
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Identity, identity_of, require_same
-from prbayes.model.node import Node, required_nodes
+from prbayes.model.node import AnySimulator, required_simulators
 from prbayes.model.turns import in_turn
 
 _log = logging.getLogger("prbayes")
@@ -31,7 +31,7 @@ class Epsilon(dict[str, float]):
 
 
 def checked_epsilon(
-    epsilon: Mapping[str, float], simulators: list[Node], model: pm.Model, caller: str
+    epsilon: Mapping[str, float], simulators: Sequence[AnySimulator], model: pm.Model, caller: str
 ) -> dict[str, float]:
     """Return positive numbers by the names of simulators, or raise.
 
@@ -46,7 +46,7 @@ def checked_epsilon(
             f"epsilon: got {called(epsilon)}, expected a mapping of names of simulators to "
             'positive numbers, such as {"y": 0.1}'
         )
-    names = [node.name for node in simulators]
+    names = [simulator.name for simulator in simulators]
     unknown = sorted(map(str, set(epsilon) - set(names)))
     if unknown:
         raise KeyError(f"epsilon: got {unknown}, expected names of simulators: {sorted(names)}")
@@ -87,11 +87,11 @@ def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
     ...     y = prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=[0.5, 1.0, 4.0])
     >>> prb.set_epsilon(model, {"y": 0.1})
     """
-    simulators = list(required_nodes(model).values())
+    simulators = list(required_simulators(model).values())
     values = checked_epsilon(epsilon, simulators, model, "set_epsilon")
-    for node in simulators:
-        if node.name in values:
-            node.epsilon.set_value(np.asarray(values[node.name]))
+    for simulator in simulators:
+        if simulator.name in values:
+            simulator.epsilon.set_value(np.asarray(values[simulator.name]))
     _log.info(
         "draws of exp(-discrepancy / epsilon), as those of pymc.sample, are as wide as epsilon "
         "makes them; prb.adjust brings them to the width that the data warrant"

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from prbayes._checks import AT_ONCE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.hyperparameters import Hyperparameters
-from prbayes.model.node import Node, log_kernel, priors_alone
-from prbayes.model.specimen_likelihood import required_nodes, specimen_likelihoods
+from prbayes.model.node import Node, log_kernel, nodes, priors_alone
+from prbayes.model.specimen_likelihood import require_simulator, specimen_likelihoods
 from prbayes.propagation.base import Bound
 from prbayes.propagation.cloud import CLOUD
 from prbayes.propagation.reweighted import Design
@@ -74,12 +74,13 @@ class Evaluator:
 
     def __init__(self, model: pm.Model) -> None:
         self.model = model
-        simulators = required_nodes(model)
-        self.nodes: list[Node] = list(simulators.values())
-        self._variables = list(simulators)
+        require_simulator(model)
+        self.hyperparameters = Hyperparameters(model)  # refuses what would waste the first runs
+        by_variable = nodes(model)
+        self.nodes: list[Node] = list(by_variable.values())
+        self._variables = list(by_variable)
         # Simulators with a likelihood by specimen: ordinary observed variables.
         self.likelihoods = list(specimen_likelihoods(model).values())
-        self.hyperparameters = Hyperparameters(model)
         # Compiled, by what they were asked for; they live as long as this evaluator.
         self._objectives: dict[tuple[bool, bool], Any] = {}
         names = self.hyperparameters
@@ -110,7 +111,7 @@ class Evaluator:
     @property
     def is_current(self) -> bool:
         """Whether the model has the data that this was made with: `pymc.set_data` changes them."""
-        now = list(required_nodes(self.model).values())
+        now = list(nodes(self.model).values())
         same = zip(now, self.nodes, strict=False)
         return len(now) == len(self.nodes) and all(a is b for a, b in same)
 

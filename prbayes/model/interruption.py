@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import pymc as pm
+
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.node import simulators
 from prbayes.response.budget import BudgetError
 
 
@@ -25,7 +28,7 @@ def designs_as_before(evaluator: Evaluator) -> Iterator[None]:
 
 
 @contextmanager
-def explained(evaluator: Evaluator, caller: str, *also: str) -> Iterator[None]:
+def explained(model: pm.Model, caller: str, *also: str) -> Iterator[None]:
     """Say, where a budget was spent before there was a result, what is kept and what to do.
 
     ``also`` is what is kept besides responses.
@@ -34,19 +37,20 @@ def explained(evaluator: Evaluator, caller: str, *also: str) -> Iterator[None]:
         yield
     except BudgetError as spent:
         raise BudgetError(
-            f"{caller}: {spent} before there was a result; {kept(evaluator, *also)}; call it again "
+            f"{caller}: {spent} before there was a result; {kept(model, *also)}; call it again "
             "with a larger budget"
         ) from None
 
 
-def kept(evaluator: Evaluator, *also: str) -> str:
+def kept(model: pm.Model, *also: str) -> str:
     """Say what is kept, for the next time."""
-    stores = [node.bound.responses.folder for node in evaluator.nodes]
+    used = list(simulators(model).values())
+    stores = [simulator.responses.folder for simulator in used]
     folders = {str(folder) for folder in stores if folder is not None}
     parts = list(also)
     if folders:
         parts.append(f"all responses ({', '.join(sorted(folders))})")
-    elif evaluator.designs:
+    elif any(s.is_computed and s.node.design is not None for s in used):
         parts.append("the responses of the model's designs")
     if not parts:
         return "nothing is kept: give the propagation a store="

@@ -1,6 +1,7 @@
 """What a simulator is inside a PyMC model.
 
-A `Node`, carried by the operation of an observed variable.
+A `Specification`, carried by the operation of an observed variable, and from the first use on a
+`Node`, whose first responses are computed.
 
 The operation is an instance of one class, `SimulatorRV`, whose log-density is registered once: a
 model that is pickled, cloned, conditioned or sent to another process needs nothing else than this
@@ -16,7 +17,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from inspect import signature
+from math import ceil
 from typing import Any
 
 import numpy as np
@@ -26,19 +29,27 @@ import pytensor.tensor as pt
 from numpy.typing import NDArray
 from pymc.logprob.abstract import _logprob
 from pymc.logprob.utils import CheckParameterValue
+from pytensor.compile.mode import optdb
 from pytensor.compile.sharedvalue import SharedVariable
 from pytensor.graph.basic import Apply, Constant
+from pytensor.graph.rewriting.basic import node_rewriter, out2in
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.random.op import RandomVariable
+from pytensor.tensor.shape import Shape
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats, called
 from prbayes._pages import more_in
+from prbayes._progress import shown
 from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.model.first_look import tell_far_data
+from prbayes.model.turns import lock
 from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Design, design_of
 from prbayes.response.compilation import PLAIN
+from prbayes.response.costs import in_words
 from prbayes.response.outputs import ONE, Outputs
+from prbayes.response.response import Responses
 
 _log = logging.getLogger("prbayes")
 
@@ -65,6 +76,21 @@ class Node:
         return self.target.metric
 
     @property
+    def node(self) -> Node:
+        """The simulator itself, as `Specification.node` is."""
+        return self
+
+    @property
+    def is_computed(self) -> bool:
+        """Whether the first responses are computed."""
+        return True
+
+    @property
+    def responses(self) -> Responses:
+        """The response, and how it is called."""
+        return self.bound.responses
+
+    @property
     def design(self) -> Design | None:
         """The stored responses, None where the propagation stores none."""
         return design_of(self.bound)
@@ -77,9 +103,7 @@ class Node:
     @property
     def epsilon_is_default(self) -> bool:
         """Whether nobody gave epsilon: it is the 1/N of a metric on a likelihood's scale."""
-        # Weights that were normalised again differ by rounding.
-        is_default = abs(self.epsilon_value * self.n_specimens - 1) < 1e-12
-        return self.target.likelihood and is_default
+        return has_default_epsilon(self)
 
     @property
     def n_specimens(self) -> float:
@@ -129,6 +153,115 @@ class Node:
         return replace(self, bound=self.bound.copied(), epsilon=epsilon)
 
 
+@dataclass(frozen=True, eq=False)
+class Specification:
+    """One simulator of a model, before its first use; no response is computed for it."""
+
+    name: str
+    target: Discrepancy  # the metric, prepared against the observed responses
+    responses: Responses  # which stay as they are
+    propagation: Propagation
+    epsilon: Any  # scalar; NaN while it is not set
+    specimens: NDArray[Any] | None  # (N,): labels
+    same_inputs: tuple[str, ...] = ()
+    outputs: Outputs = ONE
+    group: str = ""
+    progressbar: bool = True
+    original: Specification | None = None  # of a clone, which takes the runs of the original
+
+    @property
+    def node(self) -> Node:
+        """The simulator, with its first responses: the first access computes them.
+
+        After an error, or an interruption, the next access tries again.
+
+        Raises
+        ------
+        BudgetError, ResponseError, StoreError
+            If the first responses cannot be computed.
+        TypeError, ValueError
+            If the propagation does not take the inputs or their priors.
+        """
+        with lock(self):
+            return self._node
+
+    @property
+    def is_computed(self) -> bool:
+        """Whether the first responses are computed."""
+        return "_node" in vars(self.original or self)
+
+    @cached_property
+    def _node(self) -> Node:
+        if self.original is not None:
+            return replace(self.original.node.copied(), epsilon=self.epsilon)
+        # What an attempt that fails counts and notes is dropped with it.
+        responses = self.responses.copied()
+        responses.runs = self.responses.runs
+        responses.on_start = partial(_log_first_runs, self.propagation, responses)
+        with shown(self.progressbar):
+            bound = self.propagation.bind(self.name, responses.inputs, self.target, responses)
+            bound.aim(self.target.beside(bound.first_responses, bound.dimensions))
+        responses.on_start = None
+        tell_far_data(self.name, self.target.observed, bound.first_responses, self.outputs.names)
+        return Node(
+            self.name,
+            bound.target,
+            bound,
+            self.propagation,
+            self.epsilon,
+            self.specimens,
+            self.same_inputs,
+            self.outputs,
+            self.group,
+        )
+
+    def copied(self) -> Specification:
+        """Return the same simulator with its own epsilon, for a clone of the model."""
+        epsilon = shared_epsilon(self.name, float(self.epsilon.get_value()))
+        return replace(self, epsilon=epsilon, original=self.original or self)
+
+
+type AnySimulator = Specification | Node
+
+
+def _log_first_runs(
+    propagation: Propagation, responses: Responses, runs: int, seconds: float
+) -> None:
+    """Log how many runs there are, and how long they take, from the time of one run, or NaN."""
+    demand = propagation.demand
+    if demand.each and np.isnan(seconds):
+        return  # known after the first call
+    responses.on_start = None
+
+    def number(runs: int) -> str:
+        total = ceil(runs / responses.workers) * seconds
+        if not runs or np.isnan(total):
+            return str(runs)
+        return f"{runs}, {f'about {in_words(total)}' if total >= 1 else 'less than 1 s'}"
+
+    setting = type(propagation).__name__
+    if hasattr(propagation, "n"):
+        setting += f"(n={propagation.n})"
+    _log.info(
+        "%s: runs at first: %s; for each value of the hyperparameters: %s; to change this, pass "
+        "another number in propagation=%s; more: %s",
+        responses.name,
+        number(runs),
+        number(demand.each),
+        setting,
+        demand.decides,
+    )
+
+
+def has_default_epsilon(simulator: AnySimulator) -> bool:
+    """Return whether nobody gave epsilon: it is the 1/N of a metric on a likelihood's scale."""
+    target = simulator.target
+    epsilon = float(simulator.epsilon.get_value())
+    # Weights that were normalised again differ by rounding.
+    is_default = abs(epsilon * effective_specimens(target, simulator.specimens) - 1) < 1e-12
+    return target.likelihood and is_default
+
+
 def effective_specimens(target: Discrepancy, labels: NDArray[Any] | None) -> float:
     """Return 1 / sum of squared weights of the specimens; without labels, of the observations."""
     if labels is None:
@@ -155,21 +288,24 @@ def log_kernel(discrepancy: Any, epsilon: Any) -> Any:
 
 
 class SimulatorRV(RandomVariable):
-    """The operation of an observed variable: draws data sets, and carries its `Node`.
+    """The operation of an observed variable: draws data sets, and carries its simulator.
 
-    Two of them are equal if they carry the same node, so that no rewrite of a graph takes one
-    simulator for another.
+    Two of them are equal if they carry the same simulator, so that no rewrite of a graph takes one
+    for another.
 
     PyTensor's rewriters remember every operation that they have met, as long as the process lasts.
-    So the node, with all stored responses, is held by the applications of the operation, which live
-    as long as a model or a compiled function, and not by the operation itself.
+    So the simulator, with all stored responses, is held by the applications of the operation, which
+    live as long as a model or a compiled function, and not by the operation itself.
 
     Attributes
     ----------
+    simulator : Specification or Node
+        No response is computed for it; a specification before `nodes` was asked for it.
     node : Node
+        The first access computes its first responses.
     """
 
-    __props__ = ("name", "signature", "dtype", "inplace", "node")
+    __props__ = ("name", "signature", "dtype", "inplace", "simulator")
 
     def __init__(
         self,
@@ -178,64 +314,69 @@ class SimulatorRV(RandomVariable):
         dtype: str = "floatX",
         inplace: bool = False,
         *,
-        node: Node,
+        simulator: AnySimulator,
     ) -> None:
         # What pictures of the model show.
-        response = response_name(node.bound.responses.function)
-        told = f"Simulator of {response} by {type(node.metric).__name__}"
+        response = response_name(simulator.responses.function)
+        told = f"Simulator of {response} by {type(simulator.target.metric).__name__}"
         super().__init__(name=name or told, signature=signature, dtype=dtype, inplace=inplace)
-        self._node = weakref.ref(node)
+        self._simulator = weakref.ref(simulator)
         self._owner: weakref.ref[Any] | None = None
         self._warned = False
 
     @property
-    def node(self) -> Node:
-        """The simulator."""
-        found = self._node()
-        if found is None:
+    def simulator(self) -> AnySimulator:
+        """The simulator, as far as it is computed."""
+        simulator = self._simulator()
+        if simulator is None:
             raise RuntimeError(f"{self}: got an operation of a model that is gone")
-        return found
+        return simulator
+
+    @property
+    def node(self) -> Node:
+        """The simulator with its first responses."""
+        return self.simulator.node
 
     def __eq__(self, other: object) -> bool:
-        """Return whether it is of the same node, and applied alike."""
+        """Return whether it is of the same simulator, and applied alike."""
         return type(self) is type(other) and self._told() == other._told()
 
     def __hash__(self) -> int:
-        """Return a number that stays when the node is gone."""
+        """Return a number that stays when the simulator is gone."""
         return hash((type(self), self.name, self.signature, self.dtype, self.inplace))
 
     def _told(self) -> tuple[Any, ...]:
-        return self.name, self.signature, self.dtype, self.inplace, self._node
+        return self.name, self.signature, self.dtype, self.inplace, self._simulator
 
     def make_node(self, *inputs: Any, **keywords: Any) -> Apply[Any, Any]:
-        """Apply the operation; copies of the application hold the node as well."""
+        """Apply the operation; copies of the application hold the simulator as well."""
         apply = super().make_node(*inputs, **keywords)
-        apply.tag.simulator = self.node
+        apply.tag.simulator = self.simulator
         return apply
 
     def __str__(self) -> str:
-        """Show the name and the signature, without what the node holds."""
+        """Show the name and the signature, without what the simulator holds."""
         return f'prbayes_Simulator_rv{{"{self.signature}"}}'
 
     @property
     def _print_name(self) -> tuple[str, str]:
         """What PyMC prints for the distribution, as text and as LaTeX."""
-        response = response_name(self.node.bound.responses.function)
-        told = f"{response}, {type(self.node.metric).__name__}"
+        response = response_name(self.simulator.responses.function)
+        told = f"{response}, {type(self.simulator.target.metric).__name__}"
         latex = told.replace("_", "\\_")
         return f"Simulator[{told}]", f"\\operatorname{{Simulator}}[\\text{{{latex}}}]"
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the owner: a copy that is unpickled belongs to a model of its own."""
-        return {**self.__dict__, "_owner": None, "_node": self.node}
+        return {**self.__dict__, "_owner": None, "_simulator": self.simulator}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take what was left in."""
         self.__dict__.update(state)
-        self._node = weakref.ref(state["_node"])
+        self._simulator = weakref.ref(state["_simulator"])
 
-    def own_node(self, apply: Apply[Any, Any]) -> Node:
-        """Return the node that belongs to an application of this operation in a model.
+    def own_simulator(self, apply: Apply[Any, Any]) -> AnySimulator:
+        """Return the simulator that belongs to an application of this operation in a model.
 
         Clones of a model share the operation with the original. Each is then given one of its own,
         whose design, count and epsilon are copies: what is refined or set there leaves the original
@@ -244,15 +385,17 @@ class SimulatorRV(RandomVariable):
         if self._owner is None:
             self._owner = weakref.ref(apply)
         if self._owner() is apply:
-            return self.node
-        return self.replaced(apply, self.node.copied())
+            return self.simulator
+        simulator = self.simulator.copied()
+        self.assign(apply, simulator)
+        return simulator
 
-    def replaced(self, apply: Apply[Any, Any], node: Node) -> Node:
-        """Let an application in a model have an operation of its own, which carries a node."""
-        own = SimulatorRV(**{**self._props_dict(), "node": node})
+    def assign(self, apply: Apply[Any, Any], simulator: AnySimulator) -> None:
+        """Give an application in a model an operation of its own, which carries a simulator."""
+        own = SimulatorRV(**{**self._props_dict(), "simulator": simulator})
+        own._owner = weakref.ref(apply)
         apply.op = own
-        apply.tag.simulator = node
-        return own.own_node(apply)
+        apply.tag.simulator = simulator
 
     def rng_fn(self, rng: np.random.Generator, *arguments: Any) -> Floats:
         """Draw responses of specimens; their shape is the last of the arguments."""
@@ -279,11 +422,11 @@ class SimulatorRV(RandomVariable):
 
     def _supp_shape_from_params(self, dist_params: Any, param_shapes: Any = None) -> Any:
         """Return how many outputs a specimen has."""
-        return [pt.constant(n, dtype="int64") for n in self.node.target.event]
+        return [pt.constant(n, dtype="int64") for n in self.simulator.target.event]
 
     def _warn_of_independence(self) -> None:
         """Say once that PyMC draws each variable by itself."""
-        others = self.node.same_inputs
+        others = self.simulator.same_inputs
         if not others or self._warned:
             return
         self._warned = True
@@ -291,7 +434,7 @@ class SimulatorRV(RandomVariable):
             "%s has inputs that %s has too, the same specimens; PyMC's predictive sampling draws "
             "each variable by itself, and so as independent of the others: use prb.predict for "
             "responses of the same specimens",
-            self.node.name,
+            self.simulator.name,
             ", ".join(others),
         )
 
@@ -389,16 +532,33 @@ def _observing(node: Node, values: Any) -> Node:
     return node if np.array_equal(given, own, equal_nan=True) else node.observing(given)
 
 
+@node_rewriter([Shape])
+def shape_without_draw(fgraph: Any, apply: Apply[Any, Any]) -> list[Any] | None:
+    """Return the shape of a simulator's variable without a draw, which would compute responses."""
+    rv = apply.inputs[0].owner
+    if rv is None or not isinstance(rv.op, SimulatorRV):
+        return None
+    parameters = [variable.shape for variable in rv.inputs[2:]]
+    _, shape = rv.op.infer_shape(rv, [None, None, *parameters])
+    return [pt.stack([pt.cast(size, "int64") for size in shape])]
+
+
+# In all modes: pictures of a model compile shapes without any other rewrite.
+optdb.register("prbayes_shape", out2in(shape_without_draw), "minimum_compile", position=0)
+
+
 class SimulatorDistribution(pm.Distribution):
     """The distribution of an observed variable, as PyMC makes variables from."""
 
     rv_type = SimulatorRV
 
     @classmethod
-    def rv_op(cls, *params: Any, node: Node, size: Any = None, rng: Any = None) -> TensorVariable:
-        """Return a random variable that carries a node."""
-        signature = _signature([p.type.ndim for p in params], len(node.target.event))
-        op = SimulatorRV(signature=signature, node=node)
+    def rv_op(
+        cls, *params: Any, simulator: Specification, size: Any = None, rng: Any = None
+    ) -> TensorVariable:
+        """Return a random variable that carries a simulator."""
+        signature = _signature([p.type.ndim for p in params], len(simulator.target.event))
+        op = SimulatorRV(signature=signature, simulator=simulator)
         generator = pt.random.shared_rng(seed=None) if rng is None else rng
         _, rv = op(*params, size=size, rng=generator, return_next_rng=True)
         return rv
@@ -423,39 +583,61 @@ def _signature(ndims: Sequence[int], ndim_supp: int) -> str:
     return ",".join(groups) + ("->(o)" if ndim_supp else "->()")
 
 
-def nodes(model: pm.Model) -> dict[Any, Node]:
-    """Return the simulators of a model, keyed by their observed variables, in the model's order.
+def simulators(model: pm.Model) -> dict[Any, AnySimulator]:
+    """Return the simulators of a model as far as they are computed, by their observed variables.
 
-    In a clone they are copies, made when they are first asked for, which its compiled functions
-    follow from then on. Where `pymc.set_data` or `pymc.observe` gave one other data, its metric is
-    prepared anew, and the responses are the same.
+    In a clone they are copies, made when they are first asked for.
 
     Raises
     ------
-    TypeError, ValueError
-        If it is no model, or a metric does not take the data that it has now.
+    TypeError
+        If it is no model.
     """
     if not isinstance(model, pm.Model):
         raise TypeError(f"model: got {called(model)}, expected a pm.Model")
-    found = {}
-    for rv in model.observed_RVs:
-        if isinstance(rv.owner.op, SimulatorRV):
-            own = rv.owner.op.own_node(rv.owner)
-            node = _observing(own, known_value(model.rvs_to_values[rv]))
-            found[rv] = node if node is own else rv.owner.op.replaced(rv.owner, node)
-    return found
+    applied = {rv: rv.owner for rv in model.observed_RVs if isinstance(rv.owner.op, SimulatorRV)}
+    return {rv: apply.op.own_simulator(apply) for rv, apply in applied.items()}
+
+
+def nodes(model: pm.Model) -> dict[Any, Node]:
+    """Return the simulators of a model, keyed by their observed variables, in the model's order.
+
+    The first call computes their first responses. In a clone they are copies, made when they are
+    first asked for, which its compiled functions follow from then on. Where `pymc.set_data` or
+    `pymc.observe` gave one other data, its metric is prepared anew, and the responses are the same.
+
+    Raises
+    ------
+    BudgetError, ResponseError, StoreError
+        If the first responses cannot be computed; the next call tries again.
+    TypeError, ValueError
+        If it is no model, or a metric does not take the data that it has now.
+    """
+    computed = {}
+    for rv, simulator in simulators(model).items():
+        node = _observing(simulator.node, known_value(model.rvs_to_values[rv]))
+        if node is not simulator:
+            rv.owner.op.assign(rv.owner, node)
+        computed[rv] = node
+    return computed
 
 
 def required_nodes(model: pm.Model) -> dict[Any, Node]:
     """Return the simulators of a model, or raise if it has none."""
-    found = nodes(model)
-    if not found:
+    required_simulators(model)
+    return nodes(model)
+
+
+def required_simulators(model: pm.Model) -> dict[Any, AnySimulator]:
+    """Return the simulators of a model as far as they are computed, or raise if it has none."""
+    by_variable = simulators(model)
+    if not by_variable:
         raise ValueError(
             "model: got one without a prb.Simulator, expected at least one; add "
             "prb.Simulator(name, response, *inputs, metric=..., observed=...) inside the "
             "`with pm.Model()`"
         )
-    return found
+    return by_variable
 
 
 def model_on_context(model: pm.Model | None, caller: str) -> pm.Model:

@@ -18,6 +18,7 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._checks import (
     Floats,
     called,
+    flag,
     observed_sample,
     plain_text,
     positive_number,
@@ -25,23 +26,23 @@ from prbayes._checks import (
     sample_labels,
     sample_weights,
 )
-from prbayes._progress import shown
 from prbayes.metrics.base import Discrepancy, Metric
-from prbayes.model.costing import Asked, listening
-from prbayes.model.description import without_addresses
-from prbayes.model.first_look import tell_copies, tell_far_data
 from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.model.costing import Asked, listening
+from prbayes.model.first_look import tell_copies
 from prbayes.model.node import (
-    Node,
+    AnySimulator,
     SimulatorDistribution,
+    Specification,
     effective_specimens,
+    has_default_epsilon,
     known_value,
     model_on_context,
-    nodes,
     shared_epsilon,
+    simulators,
 )
 from prbayes.model.specimen_likelihood import SpecimenDistribution, SpecimenLikelihood
-from prbayes.propagation.base import Bound, Propagation, refuse_nested
+from prbayes.propagation.base import Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.response.compilation import PLAIN
 from prbayes.response.distributions import refuse_without_density
@@ -112,7 +113,7 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     propagation : Propagation, optional
         How populations become responses; ``Reweighted(1024)`` by default.
     progressbar : bool
-        Whether work of more than two seconds shows a bar on stderr.
+        Whether the first runs show a bar on stderr if they take more than two seconds.
 
     Returns
     -------
@@ -126,9 +127,15 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     Raises
     ------
     TypeError, ValueError
-        If an argument is not what is described here; before the response is computed.
-    ResponseError
-        If the response raises, returns a wrong shape or type, or is NaN at all points.
+        If an argument is not what is described here.
+
+    Notes
+    -----
+    No response is computed when the model is written. The first use of the model computes the first
+    responses: `minimize`, `sample_smc`, `pymc.sample`, a plot or a prediction. It raises
+    `ResponseError` if the response raises, returns a wrong shape or type, or is NaN at all points;
+    the next use then tries again. A line of the log ("prbayes", level INFO) reports how many runs
+    there are, and how long they take; `cost` reports it before.
 
     References
     ----------
@@ -170,12 +177,12 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     propagation = _propagation(name, propagation)
     size = len(target.observed)
     labels = None if specimens is None else sample_labels(specimens, size, f"{name}: specimens")
-    others = [other for other in nodes(model).values() if other.specimens is not None]
     if labels is not None:
-        _refuse_alike_labels(name, labels, others)
+        _refuse_alike_labels(name, labels, list(simulators(model).values()))
     dims = _checked_dims(name, dims, target.observed.shape, model)
     if epsilon is not None:
         positive_number(epsilon, f"{name}: epsilon")
+    flag(progressbar, "progressbar")
     # As a constant, in which PyMC does not look for missing values to impute.
     data: Any = target.observed
     if isinstance(observed, Variable):
@@ -328,51 +335,38 @@ def _observed_term(
     """Add an observed variable to a model."""
     name = term.name
     target = term.target
-    sorted_inputs = responses.inputs
-    before = list(nodes(model).values())
-    others = [other for other in before if other.specimens is not None]
+    inputs = responses.inputs
+    earlier = list(simulators(model).values())
+    propagation.check_simulator(name, inputs, target)
     asked = listening()
     if asked is not None:
         others_asked = [(one.propagation, one.responses) for one in asked]
         shared = _share(responses, propagation, others_asked)
         asked.append(Asked(responses, propagation, target, shared))
         return pt.as_tensor(target.observed, name=name)
-    _share(responses, propagation, [(other.propagation, other.bound.responses) for other in before])
-    demand = propagation.demand
-    _log.info(
-        "%s: %s; runs for each value of the hyperparameters: %d; more: %s",
-        name,
-        without_addresses(propagation),
-        demand.each,
-        demand.decides,
-    )
-    with shown(progressbar):
-        bound = propagation.bind(name, sorted_inputs, target, responses)
-        bound.aim(target.beside(bound.first_responses, bound.dimensions))
-        target = bound.target
-    labels = (responses.outputs or ONE).names
-    tell_far_data(name, target.observed, bound.first_responses, labels)
+    _share(responses, propagation, [(other.propagation, other.responses) for other in earlier])
     if term.labels is None:
         tell_copies(name, target.observed)
     if epsilon is None:
         epsilon = 1 / effective_specimens(target, term.labels) if target.likelihood else np.nan
-    node = Node(
+    specification = Specification(
         name,
         target,
-        bound,
+        responses,
         propagation,
         shared_epsilon(name, epsilon),
         term.labels,
-        _with_inputs(bound, before, term.group),
+        _with_inputs(inputs, earlier, term.group),
         responses.outputs or ONE,
         term.group,
+        progressbar,
     )
-    _warn_of_shared_specimens(node, others)
+    _warn_of_shared_specimens(specification, earlier)
     place = pt.constant(term.place, dtype="int64")
-    params = [place if is_group(v) else v for v in sorted_inputs.roots]
-    given = {"node": node, "observed": term.data, "dims": term.dims}
+    params = [place if is_group(v) else v for v in inputs.roots]
+    given = {"simulator": specification, "observed": term.data, "dims": term.dims}
     rv = SimulatorDistribution(name, *params, **given)
-    rv.owner.op.own_node(rv.owner)
+    rv.owner.op.own_simulator(rv.owner)
     return rv
 
 
@@ -543,20 +537,20 @@ def _checked_dims(
     return tuple(names)
 
 
-def _with_inputs(bound: Bound, others: list[Node], group: str) -> tuple[str, ...]:
+def _with_inputs(inputs: Inputs, others: list[AnySimulator], group: str) -> tuple[str, ...]:
     """Return the names of the simulators that have an aleatory input of this one.
 
     Specimens of another group are others.
     """
-    own = {id(dist) for dist in bound.inputs.aleatory}
+    own = {id(dist) for dist in inputs.aleatory}
     alike = [other for other in others if other.group == group]
-    theirs = {other.name: map(id, other.bound.inputs.aleatory) for other in alike}
-    return tuple(name for name, inputs in theirs.items() if not own.isdisjoint(inputs))
+    theirs = {other.name: map(id, other.responses.inputs.aleatory) for other in alike}
+    return tuple(name for name, dists in theirs.items() if not own.isdisjoint(dists))
 
 
 def _refuse_simulators(name: str, inputs: Inputs, model: pm.Model) -> None:
     """Refuse a simulator above another one: its value is measured data, and no hyperparameter."""
-    for other in nodes(model):
+    for other in simulators(model):
         if other in inputs.roots:
             raise TypeError(
                 f"{name}: got inputs that depend on the simulator {other.name}, expected "
@@ -565,7 +559,7 @@ def _refuse_simulators(name: str, inputs: Inputs, model: pm.Model) -> None:
             )
 
 
-def _refuse_alike_labels(name: str, labels: NDArray[Any], others: list[Node]) -> None:
+def _refuse_alike_labels(name: str, labels: NDArray[Any], others: list[AnySimulator]) -> None:
     """Raise where labels look the same and are not, as 1 and "1": they would be two specimens."""
     seen: dict[str, tuple[str, object]] = {}
     labelled = [(other.name, other.specimens) for other in others]
@@ -589,21 +583,21 @@ def _read(label: object) -> str:
     return str(label).strip()
 
 
-def _warn_of_shared_specimens(node: Node, others: list[Node]) -> None:
+def _warn_of_shared_specimens(simulator: AnySimulator, others: list[AnySimulator]) -> None:
     """Say so where default epsilons count specimens more than once."""
-    if node.specimens is None:
+    if simulator.specimens is None:
         return
-    own = set(node.specimens.tolist())
+    own = set(simulator.specimens.tolist())
     for other in others:
         theirs = other.specimens
         if theirs is None or own.isdisjoint(theirs.tolist()):
             continue
-        if node.epsilon_is_default or other.epsilon_is_default:
+        if has_default_epsilon(simulator) or has_default_epsilon(other):
             _log.warning(
                 "%s and %s share specimens, and each epsilon counts them: under pm.sample they "
                 "count twice, and the posterior comes out too narrow; call "
                 "prb.set_epsilon(model, prb.calibrate_epsilon(prb.minimize(model))) before, or use "
                 "prb.sample_smc, whose adjustment knows of it",
                 other.name,
-                node.name,
+                simulator.name,
             )

@@ -33,8 +33,7 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._checks import Floats
 from prbayes._finding import Finding
 from prbayes.metrics.likelihood import LogLikelihood
-from prbayes.model.node import Node, known_value, nodes, response_name
-from prbayes.model.node import required_nodes as required_metric_nodes
+from prbayes.model.node import known_value, required_simulators, response_name
 from prbayes.propagation.base import Propagation
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.metrics.readings import Readings
@@ -417,7 +416,7 @@ def specimen_likelihoods(model: pm.Model) -> dict[Any, SpecimenLikelihood]:
     return result
 
 
-def required_nodes(model: pm.Model) -> dict[Any, Node]:
-    """Return the simulators with a metric of distributions, or raise if there is no simulator."""
-    simulators = nodes(model)
-    return simulators if simulators or specimen_likelihoods(model) else required_metric_nodes(model)
+def require_simulator(model: pm.Model) -> None:
+    """Raise if a model has no simulator of any kind; nothing is run."""
+    if not any(isinstance(rv.owner.op, SpecimenRV) for rv in model.observed_RVs):
+        required_simulators(model)

@@ -15,7 +15,7 @@ from weakref import WeakKeyDictionary
 
 import pymc as pm
 
-_locks: WeakKeyDictionary[pm.Model, Any] = WeakKeyDictionary()
+_locks: WeakKeyDictionary[Any, Any] = WeakKeyDictionary()
 _guard = Lock()
 
 
@@ -34,7 +34,7 @@ def in_turn[**P, T](function: Callable[P, T]) -> Callable[P, T]:
         with ExitStack() as turns:
             # In one order, so that no two threads wait for each other.
             for _, model in sorted(found.items()):
-                turns.enter_context(_lock(model))
+                turns.enter_context(lock(model))
             return function(*arguments, **keywords)
 
     return after_others
@@ -54,6 +54,7 @@ def _models(value: Any) -> Iterator[pm.Model]:
             yield model.root
 
 
-def _lock(model: pm.Model) -> Any:
+def lock(owner: object) -> Any:
+    """Return the lock of a model, or of a simulator, which lives as long as that."""
     with _guard:
-        return _locks.setdefault(model, RLock())
+        return _locks.setdefault(owner, RLock())

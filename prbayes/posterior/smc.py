@@ -217,14 +217,14 @@ def sample_smc(
         progressbar=progressbar,
         with_groups=True,
     )
-    evaluator = evaluator_of(model, optimum, "sample_smc")
     stages = () if checkpoint is None else (f"all finished stages ({checkpoint})",)
     with (
         shown(progressbar),
-        explained(evaluator, "prb.sample_smc", *stages),
+        explained(model, "prb.sample_smc", *stages),
         limited(max_seconds, max_runs),
         nullcontext() if cores is None else threadpool_limits(cores),
     ):
+        evaluator = evaluator_of(model, optimum, "sample_smc")
         tree = sample(evaluator, asked)
         if not return_inferencedata:
             return as_multitrace(tree, evaluator)  # type: ignore[no-any-return]

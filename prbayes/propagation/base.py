@@ -1,7 +1,8 @@
 """How a population of inputs becomes responses: `Reweighted`, `Resimulated`, `Fresh`.
 
-A propagation is configuration. ``bind`` makes the moving part for one simulator, a `Bound`, which
-gives the discrepancy as a graph of the hyperparameters and knows how many responses were computed.
+A propagation is configuration. ``check_simulator`` refuses what it cannot do when the model is
+written. At the first use of a simulator ``bind`` makes the moving part, a `Bound`, which gives the
+discrepancy as a graph of the hyperparameters and knows how many responses were computed.
 """
 
 from __future__ import annotations
@@ -129,7 +130,7 @@ class Bound(ABC):
 
     @property
     def known_responses(self) -> Floats:
-        """Responses computed when the simulator was made; the first of them stay the first."""
+        """Responses computed at the first use; the first of them stay the first."""
         return self._probed
 
     @property
@@ -140,7 +141,7 @@ class Bound(ABC):
     @property
     def dimensions(self) -> int:
         """Number of aleatory numbers that make one specimen."""
-        return sum(int(np.prod(shape)) for shape in self.inputs.event_shapes)
+        return self.inputs.dimensions
 
     def aim(self, target: Discrepancy) -> None:
         """Compare with the same data in another way from here on."""
@@ -340,9 +341,20 @@ class Propagation(ABC):
         """What is asked for after the first runs, as far as it is known."""
         return Demand(0, None, f"as {type(self).__name__} asks for them")
 
+    def check_simulator(  # noqa: B027 (one of a user's own may take all)
+        self, name: str, inputs: Inputs, target: Discrepancy
+    ) -> None:
+        """Refuse inputs or a metric that this propagation does not take; computes no response.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If it does not take them.
+        """
+
     @abstractmethod
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
-        """Return the moving part for one simulator; raises what this propagation cannot do."""
+        """Return the moving part for one simulator, at its first use; may compute responses."""
 
 
 def refuse_max_lost(max_lost: object, name: str) -> None:

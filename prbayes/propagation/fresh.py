@@ -70,7 +70,7 @@ class Fresh(Propagation):
         return Demand(self.n, None, BY_EVALUATIONS)
 
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
-        """Prepare the generator of draws."""
+        """Prepare the generator of draws, and try the response."""
         return FreshBound(name, inputs, target, responses, self)
 
 

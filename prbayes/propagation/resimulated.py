@@ -80,9 +80,36 @@ class Resimulated(Propagation):
         """The same number for each value of the hyperparameters."""
         return Demand(self.n, None, BY_EVALUATIONS)
 
+    def check_simulator(self, name: str, inputs: Inputs, target: Discrepancy) -> None:
+        """Refuse inputs without inverse distribution functions; warn of too few responses."""
+        refuse_nested(name, inputs)
+        self._warn_of_few_responses(name, target)
+        for dist, u in zip(inputs.aleatory, self.base_points(inputs), strict=True):
+            quantiles(name, dist, u)
+
+    def _warn_of_few_responses(self, name: str, target: Discrepancy) -> None:
+        per_observation = target.metric.tail_responses
+        enough = per_observation * target.n_effective
+        if self.n < enough:
+            _log.warning(
+                "%s: the log-likelihood of %d resimulated responses sees too little of the tails: "
+                "its standard errors and posterior come out too narrow, expected at least "
+                "%.0f responses, %d for each observation; use prb.Reweighted(n), "
+                "prb.KullbackLeibler() or a larger n%s",
+                name,
+                self.n,
+                enough,
+                per_observation,
+                more_in("choose.md#how-many-responses"),
+            )
+
+    def base_points(self, inputs: Inputs) -> list[Floats]:
+        """Return points of the unit cube for each aleatory input, shapes (n, *event)."""
+        _, points = base_points(inputs, self.n, self.random_seed, points_from(self.points))
+        return points
+
     def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
         """Lay out the base points and find out whether the response accepts PyTensor variables."""
-        refuse_nested(name, inputs)
         return ResimulatedBound(name, inputs, target, responses, self)
 
 
@@ -100,15 +127,11 @@ class ResimulatedBound(Bound):
         super().__init__(name, inputs, target, responses)
         self.n_per_theta = config.n
         self.max_lost = config.max_lost
-        self._warn_of_few_responses()
-        make_points = points_from(config.points)
-        _, points = base_points(inputs, config.n, config.random_seed, make_points)
+        points = config.base_points(inputs)
         # What depends on constants alone, PyTensor computes once and keeps: fast, unless it is too
         # large to keep.
         keep = config.n <= AT_ONCE
         self._points: list[Any] = points if keep else [shared(u) for u in points]
-        for dist, u in zip(inputs.aleatory, self._points, strict=True):
-            quantiles(name, dist, u)  # refuses what has no inverse distribution function
         tried = probe(self, PopulationSampler(inputs), config.random_seed)
         self.symbolic = self._accepts_tensors(*tried)
 
@@ -117,22 +140,6 @@ class ResimulatedBound(Bound):
         other = super().copied()
         other.__dict__.pop("_values", None)
         return other
-
-    def _warn_of_few_responses(self) -> None:
-        per_observation = self.target.metric.tail_responses
-        enough = per_observation * self.target.n_effective
-        if self.n_per_theta < enough:
-            _log.warning(
-                "%s: the log-likelihood of %d resimulated responses sees too little of the tails: "
-                "its standard errors and posterior come out too narrow, expected at least "
-                "%.0f responses, %d for each observation; use prb.Reweighted(n), "
-                "prb.KullbackLeibler() or a larger n%s",
-                self.name,
-                self.n_per_theta,
-                enough,
-                per_observation,
-                more_in("choose.md#how-many-responses"),
-            )
 
     def _accepts_tensors(
         self, expected: Floats, aleatory: list[Floats], epistemic: list[Floats]

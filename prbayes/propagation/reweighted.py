@@ -67,7 +67,7 @@ from prbayes.response.distributions import (
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import lacking
 from prbayes.response.repeats import Known, once_each
-from prbayes.response.response import Responses, refuse_coarse
+from prbayes.response.response import Responses, refuse_coarse, refuse_other_number
 
 _log = logging.getLogger("prbayes")
 
@@ -127,7 +127,7 @@ class Reweighted(Propagation):
         process by default.
     store : path-like, optional
         A folder that keeps every computed response, by simulator: none is computed again, also in
-        another run; but one, each time that a simulator is made, to see that the response is still
+        another run; but one, at the first use of each simulator, to see that the response is still
         the same one: code, or variables of a closure, may have changed, which is refused.
     version : str, optional
         Names the response as it is, such as ``"2"`` or ``"mesh 3"``: runs of different versions are
@@ -197,8 +197,8 @@ class Reweighted(Propagation):
         """The largest number of responses, refinement included."""
         return self.max_points or 32 * self.n
 
-    def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
-        """Compute the responses at the first design points."""
+    def check_simulator(self, name: str, inputs: Inputs, target: Discrepancy) -> None:
+        """Refuse inputs and metrics that stored responses cannot serve, and idle emulators."""
         if inputs.epistemic:
             each = [str(e.name or e) for e in inputs.epistemic]
             names = ", ".join(each)
@@ -220,7 +220,50 @@ class Reweighted(Propagation):
                 "in a FunctionMetric write function(simulated, observed, weights) with "
                 "weighted=True, or use propagation=prb.Resimulated()"
             )
+        if self.emulator is not None and not isinstance(self.emulator, str):
+            self._refuse_emulating(name, inputs)
+        if self.coarse is not None:
+            self._refuse_following(name, inputs)
+            refuse_other_number(f"{name}: coarse", self.coarse, inputs)
+
+    def _refuse_emulating(self, name: str, inputs: Inputs) -> None:
+        """Raise if a user's emulator has nothing to do."""
+        if has_points_between_runs(inputs):
+            return
+        kinds = ", ".join(f"{x.dtype}, {x.type.ndim} dimensions" for x in inputs.aleatory)
+        raise TypeError(
+            f"{name}: emulator: got {type(self.emulator).__name__} for aleatory inputs "
+            f"({kinds}), expected several continuous numbers for each specimen; of one number the "
+            "runs are a quadrature rule, and discrete ones are computed: leave emulator= out"
+        )
+
+    def _refuse_following(self, name: str, inputs: Inputs) -> None:
+        """Raise if there is no emulator that could follow a coarse response."""
+        if not self.emulates(inputs):
+            raise TypeError(
+                f"{name}: coarse: got a coarse response for {inputs.dimensions} aleatory "
+                f"number(s) and n = {self.n}, expected several continuous numbers for each "
+                f"specimen and at most {MOST_RUNS} runs, between which something is emulated: "
+                "leave coarse= out"
+            )
+
+    def emulates(self, inputs: Inputs) -> bool:
+        """Return whether responses between the runs are emulated."""
+        if self.emulator is None:
+            return False
+        # Whoever asks for more than an emulator takes has a response that costs little.
+        wanted = not isinstance(self.emulator, str) or self.n <= MOST_RUNS
+        return wanted and has_points_between_runs(inputs)
+
+    def bind(self, name: str, inputs: Inputs, target: Discrepancy, responses: Responses) -> Bound:
+        """Compute the responses at the first design points."""
         return Design(name, inputs, target, responses, self)
+
+
+def has_points_between_runs(inputs: Inputs) -> bool:
+    """Return whether there are points between runs that need an emulator."""
+    continuous = all(x.dtype.startswith("float") for x in inputs.aleatory)
+    return continuous and inputs.dimensions > 1
 
 
 def _refuse_emulator(emulator: Any) -> None:
@@ -329,38 +372,14 @@ class Design(Bound):
         self._others: deque[tuple[Responses, Floats]] = deque(maxlen=32)
         self._taken_back: Batches | None = None  # all that there were when some were forgotten
         self._moving: tuple[int, ...] | None = None
-        if config.emulator is not None and not isinstance(config.emulator, str):
-            self._refuse_emulating()
         self._coarse: Coarse | None = None
         if config.coarse is not None:
-            self._refuse_following()
             self._coarse = Coarse(config.coarse, responses, config.executor)
         components = prior_draws(inputs.roots, min(config.n, _COMPONENTS), config.random_seed)
         size = self.add(components)
         refuse_all_nan(name, self.values)
         if size < self.required_ess and self.contents.cloud is None:
             self._warn_of_thin_support(size)
-
-    def _refuse_emulating(self) -> None:
-        """Raise if a user's emulator has nothing to do."""
-        if self._between_runs:
-            return
-        kinds = ", ".join(f"{x.dtype}, {x.type.ndim} dimensions" for x in self.inputs.aleatory)
-        raise TypeError(
-            f"{self.name}: emulator: got {type(self.config.emulator).__name__} for aleatory inputs "
-            f"({kinds}), expected several continuous numbers for each specimen; of one number the "
-            "runs are a quadrature rule, and discrete ones are computed: leave emulator= out"
-        )
-
-    def _refuse_following(self) -> None:
-        """Raise if there is no emulator that could follow a coarse response."""
-        if not self.emulates:
-            raise TypeError(
-                f"{self.name}: coarse: got a coarse response for {self.dimensions} aleatory "
-                f"number(s) and n = {self.config.n}, expected several continuous numbers for each "
-                f"specimen and at most {MOST_RUNS} runs, between which something is emulated: "
-                "leave coarse= out"
-            )
 
     def _warn_of_thin_support(self, size: float) -> None:
         # With more inputs weights become so uneven that something else is better (docs/choose.md).
@@ -372,7 +391,8 @@ class Design(Bound):
                 "before pm.sample call prb.refine(model)"
             )
         else:
-            leave = "leave out emulator=None, or " if self._between_runs else ""
+            between = has_points_between_runs(self.inputs)
+            leave = "leave out emulator=None, or " if between else ""
             advice = (
                 f"{self.dimensions} inputs are many for stored responses alone: {leave}use "
                 "propagation=prb.Resimulated(n), which has no design"
@@ -455,18 +475,7 @@ class Design(Bound):
     @property
     def emulates(self) -> bool:
         """Whether responses between the runs are emulated."""
-        emulator = self.config.emulator
-        if emulator is None:
-            return False
-        # Whoever asks for more than an emulator takes has a response that costs little.
-        wanted = not isinstance(emulator, str) or self.config.n <= MOST_RUNS
-        return wanted and self._between_runs
-
-    @property
-    def _between_runs(self) -> bool:
-        """Whether there are points between runs that need an emulator."""
-        continuous = all(x.dtype.startswith("float") for x in self.inputs.aleatory)
-        return continuous and self.dimensions > 1
+        return self.config.emulates(self.inputs)
 
     @property
     def batch_size(self) -> int:

@@ -244,8 +244,16 @@ class Tally:
         return replace(self, failed=dict(self.failed))
 
 
-def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
+def respond(
+    calling: Calling,
+    points: Points,
+    tally: Tally,
+    on_start: Callable[[int, float], None] | None = None,
+) -> Floats:
     """Return responses at points, shape (n, *event), from the store or computed and then stored.
+
+    With ``on_start`` that is called, after the first chunk, with the number of missing runs, and
+    the seconds that one of them takes.
 
     Raises
     ------
@@ -264,6 +272,9 @@ def respond(calling: Calling, points: Points, tally: Tally) -> Floats:
         tolerant = policy.final.goes_on or not last
         raised = {}
         for done in chunks(calling, points, missing, tolerant, tally):
+            if on_start is not None:
+                on_start(missing.size, tally.seconds)
+                on_start = None
             for rows, chunk in done:
                 values = _filled_in(values, rows, tally.aligned(chunk))
                 raised.update({int(rows[i]): text for i, text in chunk.raised.items()})

@@ -93,6 +93,11 @@ class Inputs:
         return tuple(event_shape(x) for x in self.aleatory)
 
     @property
+    def dimensions(self) -> int:
+        """Number of aleatory numbers that make one specimen."""
+        return sum(int(np.prod(shape)) for shape in self.event_shapes)
+
+    @property
     def event_ndims(self) -> tuple[int, ...]:
         """Number of event axes of each aleatory input."""
         return tuple(x.type.ndim for x in self.aleatory)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import inspect
 import logging
+import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -70,7 +71,7 @@ def refuse_misfit(
         refuse(name, sizes(), outputs)
 
 
-def _refuse_other_number(name: str, function: object, inputs: Inputs) -> None:
+def refuse_other_number(name: str, function: object, inputs: Inputs) -> None:
     """Raise if a function says that it takes more or fewer arguments than there are inputs."""
     own: Any = function.function if isinstance(function, scalar) else function
     try:
@@ -179,6 +180,9 @@ class Responses:
         Runs that were needed so far, whether computed here or found in the store.
     scatters : bool or None
         Whether the response has different values at the same point; None while it is not known.
+    on_start : callable or None
+        ``on_start(runs, seconds)``, called with the number of runs that a call takes, and the time
+        of one of them as soon as it is known: NaN before a function is called for a whole batch.
     """
 
     def __init__(
@@ -196,7 +200,7 @@ class Responses:
         outputs: Outputs | None = ONE,
     ) -> None:
         refuse_uncallable(name, function)
-        _refuse_other_number(name, function, inputs)
+        refuse_other_number(name, function, inputs)
         refuse_misfit(name, function, partial(_sizes, inputs), outputs)
         for caveat in caveats_of(function):
             _log.warning("%s", caveat)
@@ -218,6 +222,7 @@ class Responses:
         )
         self.count = 0
         self.scatters: bool | None = None
+        self.on_start: Callable[[int, float], None] | None = None
         self._looked = False  # whether specimens are computed by themselves
         self._found = 0
         self.runs = Runs()
@@ -306,15 +311,23 @@ class Responses:
         if self.plain:
             batch = batch_shape(given, self._event_ndims)
             values = broadcast_batch(given, self._event_ndims, batch)
+            size = int(np.prod(batch, dtype=int))
+            self._started(size, np.nan)
+            clock = time.perf_counter()
             found = self._at_once(self._filled(values), batch)
+            self._started(size, (time.perf_counter() - clock) / max(1, size))
             self._refuse_mixing(values, batch, found)
             return found
         batch, points = self._rows(given)
         self.count += len(points)
-        found = respond(self._calling, points, self._tally)
+        found = respond(self._calling, points, self._tally, self._started)
         if self.outputs is None:
             self.outputs = self._tally.named
         return found.reshape(batch + found.shape[1:])
+
+    def _started(self, runs: int, seconds: float) -> None:
+        if self.on_start is not None:
+            self.on_start(runs, seconds)
 
     def _refuse_mixing(self, values: list[Floats], batch: tuple[int, ...], found: Floats) -> None:
         """Raise if what is computed for a batch is another thing by itself; looked at once."""
