@@ -532,7 +532,7 @@ def _observing(node: Node, values: Any) -> Node:
     return node if np.array_equal(given, own, equal_nan=True) else node.observing(given)
 
 
-@node_rewriter([Shape])
+@node_rewriter([Shape])  # type: ignore[untyped-decorator]
 def shape_without_draw(fgraph: Any, apply: Apply[Any, Any]) -> list[Any] | None:
     """Return the shape of a simulator's variable without a draw, which would compute responses."""
     rv = apply.inputs[0].owner
