@@ -124,7 +124,7 @@ def sample_smc(
     max_seconds : float, optional
         Seconds after which nothing new is begun.
     max_runs : int, optional
-        Largest number of responses to compute, without those found in a store.
+        Largest number of responses to compute, first runs included, those found in a store not.
     checkpoint : path-like, optional
         A file that keeps the state after every stage: a run that was killed goes on from there when
         it is called again, and gives the same draws. Give the propagations a ``store`` as well, so
