@@ -136,10 +136,10 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     Notes
     -----
     No response is computed when the model is written. The first use of the model computes the first
-    responses: `minimize`, `sample_smc`, `pymc.sample`, a plot or a prediction. It raises
-    `ResponseError` if the response raises, returns a wrong shape or type, or is NaN at all points;
-    the next use then tries again. A line of the log ("prbayes", level INFO) reports how many runs
-    there are, and how long they take; `cost` reports it before.
+    responses: `minimize`, `sample_smc`, `pymc.sample`, a plot or a prediction. An executor has to
+    be open then. A response that raises, returns a wrong shape or type, or is NaN at all points is
+    a `ResponseError` there, and the next use tries again. A line of the log ("prbayes", level INFO)
+    reports how many runs there are, and how long they take; `cost` reports it before.
 
     References
     ----------
