@@ -416,13 +416,14 @@ def cover(fibres: Fibres, charts: Charts, normal: Floats) -> Charts:
     fibres : Fibres
     charts : Charts
     normal : ndarray, shape (N, tries, d)
-        Standard normal numbers. Half of the tries start from them, half within .5 of the first
-        mode: random points miss the far side of a small closed fibre beside an extremum.
+        Standard normal numbers. The first half of the tries start from them, the others within
+        .5 of the first mode: random points miss the far side of a small closed fibre beside an extremum.
     """
     n, tries, d = normal.shape
     specimen = np.repeat(np.arange(n), tries)
     nearby = charts.centre[:, :1] + 0.5 * normal
-    start = np.where(np.arange(tries)[:, None] % 2 == 0, normal, nearby).reshape(-1, d)
+    # The first half, as even points of a Sobol sequence lie in one half of the space.
+    start = np.where(np.arange(tries)[:, None] < tries / 2, normal, nearby).reshape(-1, d)
     z, jacobian, converged = fibres.solve(specimen, start)
     log_density = -(z**2).sum(axis=1) / 2
     present = charts.share > 0

@@ -81,10 +81,9 @@ def nonlinear_problem(name: str) -> Problem:
         # |x|^2 / sd^2 of normal inputs with another mean is non-central chi-square.
         y = np.linspace(0.3, 8, 12)
         response = differentiated(lambda x: (x**2).sum(axis=1, keepdims=True))
-        options = {"rounds": 10}
         if name == "sphere":
             y, mean, sd = y + 2, np.r_[mean, 0, 0, 0], np.full(5, 0.9)
-            options |= {"tries": 256, "most_charts": 12}
+            options = {"rounds": 10, "tries": 256, "most_charts": 12}
         exact = ncx2(len(mean), 0.13 / 0.81, scale=0.81).logpdf(y)
     elif name == "exponential":
         y = np.exp(np.linspace(-2, 2, 9))
@@ -120,7 +119,7 @@ STANDARD_ERRORS = {
     "linear 5 2": 2.8e-3,
     "linear 8 4": 3.1e-3,
     "linear 8 1": 9.8e-3,
-    "circle": 2.2e-3,
+    "circle": 2.8e-3,
     "sphere": 1.9e-2,
     "exponential": 1.2e-4,
     "product": 1.4e-4,
@@ -203,7 +202,7 @@ def test_log_likelihoods_are_invariant_under_linear_maps_of_inputs_and_outputs()
     of_map = log_normal(in_map.x @ a.T, mean, sd) + np.log(np.abs(np.linalg.det(a)))
     difference = logsumexp(of_map + in_map.log_a, axis=1) + np.log(np.abs(np.linalg.det(c)))
     difference -= log_likelihoods(points, mean, sd)
-    assert np.abs(difference).max() < 5 * 0.004  # standard error from seeds .004
+    assert np.abs(difference).max() < 5 * 3e-4  # standard error from seeds 3e-4
 
 
 def test_points_are_the_same_for_a_seed_in_any_batch() -> None:
@@ -225,7 +224,7 @@ def test_points_are_the_same_for_a_seed_in_any_batch() -> None:
     assert not np.allclose(many.log_a[12:24], points.log_a)
 
 
-def test_the_order_of_specimens_with_their_numbers_does_not_matter_for_global_state() -> None:
+def test_global_random_state_is_untouched() -> None:
     p = problem("exponential")
     np.random.seed(0)  # noqa: NPY002
     before = np.random.get_state()[1].copy()  # noqa: NPY002
@@ -247,7 +246,7 @@ def test_inputs_where_the_response_has_no_value_have_weight_zero() -> None:
     assert points.failed_share > 0.1
     exact = norm(0, np.sqrt(2)).logpdf(y) + norm(y / 2, np.sqrt(0.5)).logcdf(limit)
     error = log_likelihoods(points, np.zeros(2), np.ones(2)) - exact
-    assert np.abs(error).max() < 5 * 0.004  # standard error from seeds .004
+    assert np.abs(error).max() < 5 * 0.0022  # standard error from seeds .0022
 
 
 @pytest.mark.parametrize("bad", [np.inf, -np.inf, np.nan, 1e300])
@@ -310,7 +309,7 @@ def test_reading_errors_give_the_closed_form(d: int, m: int, size: float) -> Non
     mean, sd = np.full(d, 0.1), np.full(d, 0.9)
     exact = multivariate_normal(a @ mean, a * sd**2 @ a.T + np.diag(error**2)).logpdf(y)
     difference = log_likelihoods(points, mean, sd) - exact
-    assert np.abs(difference).max() < 5 * 0.004  # standard error from seeds .004
+    assert np.abs(difference).max() < 5 * 0.0019  # standard error from seeds .0019
 
 
 def test_moments_of_weighted_points_equal_the_closed_form() -> None:
