@@ -38,4 +38,5 @@ def adjusted_p_values(observed: Floats, null: Floats) -> Floats:
     """
     p_values = upper_p_values(observed[None], null)[0]
     smallest = np.sort(upper_p_values(null, null).min(axis=1))
-    return (np.searchsorted(smallest, p_values, side="right") + 1) / (len(null) + 1)
+    adjusted: Floats = (np.searchsorted(smallest, p_values, side="right") + 1) / (len(null) + 1)
+    return adjusted

@@ -117,7 +117,8 @@ def conflict_findings(
     """
     conflict = prior_conflict(estimate, standard_error, posterior_mean, predictive)
     findings = []
-    for j in np.flatnonzero((conflict.adjusted <= threshold) & (conflict.pulls > pull)):
+    matters = (conflict.adjusted <= threshold) & (conflict.pulls > pull)
+    for j in np.flatnonzero(matters).tolist():
         center, sd = prior[:, j].mean(), prior[:, j].std(ddof=1)
         findings.append(
             Finding(
