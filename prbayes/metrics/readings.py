@@ -91,7 +91,7 @@ class Readings:
             half = self.step[extra] / 2
             low = (self.values[extra] - half - outputs) / sd
             high = (self.values[extra] + half - outputs) / sd
-            with np.errstate(divide="ignore"):
+            with np.errstate(divide="ignore", invalid="ignore"):
                 mean = log_interval_probability(low, high) - np.log(2 * half)
             total = np.where((half > 0) & self.is_measured[extra], mean, total)
         if self.is_censored.any():
