@@ -109,19 +109,10 @@ class Readings:
         normal = -0.5 * away**2 - 0.5 * xp.log(2 * np.pi * variance)
         terms = xp.where(self.is_measured[:, None], normal, 0.0)
         if (self.step > 0).any():
-<<<<<<< HEAD
             step = np.where(self.step > 0, self.step, 1.0)[:, None]
             inside = _log_probability(away - step / (2 * sd), away + step / (2 * sd), xp)
             is_rounded = ((self.step > 0) & self.is_measured)[:, None]
             terms = xp.where(is_rounded, inside - np.log(step), terms)
-=======
-            half = self.step[extra] / 2
-            low = (self.values[extra] - half - outputs) / sd
-            high = (self.values[extra] + half - outputs) / sd
-            with np.errstate(divide="ignore", invalid="ignore"):
-                mean = log_interval_probability(low, high) - np.log(2 * half)
-            total = np.where((half > 0) & self.is_measured[extra], mean, total)
->>>>>>> wt-g
         if self.is_censored.any():
             # Finite bounds far out: the derivative at an infinite one would be NaN.
             far = 1e30

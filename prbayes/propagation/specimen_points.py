@@ -27,6 +27,7 @@ from scipy.special import gammaln, logsumexp, ndtri
 from prbayes._checks import AT_ONCE, Floats
 from prbayes.emulators.interpolant import Interpolant, fit_interpolant
 from prbayes.propagation.base import DesignError
+from prbayes.propagation.guards import half_difference, missing_share, predicted_bias
 from prbayes.propagation.points import sobol
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.roots import Response, Roots, find_roots, nearest_starts
@@ -181,11 +182,14 @@ def emulate(
             error = 2 * np.sqrt((misfit[good] ** 2).mean(axis=0))
             error = np.maximum(error, options.floor * spread)
         some = np.flatnonzero(good[: options.fresh])
-        bias = _predicted_bias(
-            misfit[some], jacobian[some], fresh[some], len(readings), readings.comparison_sd(error)
-        )
+        if len(some) >= 4:
+            unit = _typical(readings.comparison_sd(error))
+            scaled = misfit[some] / unit, jacobian[some] / unit[:, None]
+            biases = predicted_bias(*scaled, fresh[some], len(readings))
+            bias = float(np.abs(biases).max())
         z, y = np.concatenate([z, fresh]), np.concatenate([y, outputs])
     assert emulation is not None
+    options, roots = _all_roots(emulation, readings, options, roots, seed)
     if emulation.bias > options.bias:
         raise DesignError(
             f"{name}: got an emulator whose error would shift a mean or standard deviation of an "
@@ -195,6 +199,11 @@ def emulate(
             "propagation=prb.Reweighted(n)"
         )
     return emulation, roots
+
+
+def _typical(sd: Floats) -> Floats:
+    """Return the median of finite values by output, (N, m) -> (m,)."""
+    return np.array([np.median(column[np.isfinite(column)]) for column in sd.T])
 
 
 def _surface(
@@ -220,6 +229,29 @@ def _surface(
         inside[np.argsort(distance, kind="stable")[: max(8, len(yg) // 4)]] = True
     surface = fit_interpolant(zg, yg, inside)
     return surface, np.sqrt((surface.left_out[inside] ** 2).mean(axis=0))
+
+
+def _all_roots(
+    emulation: Emulation, readings: Readings, options: PointOptions, roots: Roots, seed: int
+) -> tuple[PointOptions, Roots]:
+    """Double the starts until simulated specimens get their own inputs back."""
+    values = readings.values[np.isfinite(readings.values).all(axis=1)]
+    if len(values) < 2 or readings.values.shape[1] < emulation.z.shape[1]:
+        return options, roots
+
+    def find(y: Floats) -> list[Floats]:
+        simulated = specimen_roots(emulation, Readings.exact(y), options)
+        return [simulated.z[simulated.specimen == i] for i in range(len(y))]
+
+    good = np.isfinite(emulation.y).all(axis=1)
+    box = np.stack([emulation.z[good].min(axis=0), emulation.z[good].max(axis=0)])
+    while options.starts < len(emulation.z):
+        share = missing_share(find, lambda z: emulation(z)[0], box, values, seed=seed)
+        if not share > options.missing:
+            break
+        options = replace(options, starts=2 * options.starts)
+        roots = specimen_roots(emulation, readings, options)
+    return options, roots
 
 
 def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptions) -> Roots:
@@ -289,25 +321,6 @@ def _fresh_points(
         picked.append(candidates[best])
         distance = np.minimum(distance, ((candidates - candidates[best]) ** 2).sum(axis=1))
     return np.array(picked) * scale
-
-
-def _predicted_bias(
-    misfit: Floats, jacobian: Floats, z: Floats, size: int, sd: Floats
-) -> float:
-    """Return the predicted bias of a mean or sd of the inputs, in posterior standard deviations."""
-    if len(z) < 4:
-        return np.inf
-    unit = np.where(np.isfinite(sd), sd, np.nan)
-    unit = np.where(np.isnan(unit).all(axis=0), np.inf, np.nanmedian(unit, axis=0))
-    weighted = jacobian / unit[:, None]
-    normal = np.einsum("nmd,nme->nde", weighted, weighted)
-    slope = np.einsum("nmd,nm->nd", weighted, misfit / unit)
-    shift = -np.einsum("nde,ne->nd", np.linalg.pinv(normal, hermitian=True), slope)
-    spread = np.maximum(z.std(axis=0), 1e-300)
-    of_mean = np.abs(shift.mean(axis=0)) / spread * np.sqrt(size)
-    covariance = ((z - z.mean(axis=0)) * shift).mean(axis=0)
-    of_sd = np.abs(covariance + shift.var(axis=0) / 2) / spread**2 * np.sqrt(2 * size)
-    return float(max(of_mean.max(), of_sd.max()))
 
 
 # -- points ------------------------------------------------------------------------------------------
@@ -405,7 +418,7 @@ def draw_points(
             halves = [_normalised(half, components) for half in halves]
         points = _joined(halves)
         difference = max(
-            _half_difference(halves if k == 1.0 else _of_error(halves, readings, error, k), seed)
+            _difference(halves if k == 1.0 else _of_error(halves, readings, error, k), seed)
             for k in scales
         )
         largest = components.table.shape[1] * count
@@ -647,21 +660,20 @@ def _joined(halves: list[_Sample]) -> _Sample:
     )
 
 
-def _half_difference(halves: list[_Sample], seed: int, draws: int = 32) -> float:
-    """Return the standard deviation of half the difference of log L between the halves.
-
-    Over normal populations that are fitted to Bayesian bootstrap samples of the specimens.
-    """
+def _difference(halves: list[_Sample], seed: int, draws: int = 32) -> float:
+    """Return the half difference of log L over normal populations of bootstrapped specimens."""
     joint = _joined(halves)
     populations = normal_populations(joint.z, joint.log_a, draws, seed)
-    differences = []
-    for mean, root in populations:
-        a, b = (
-            logsumexp(normal_log_density(half.z, mean, root) + half.log_a, axis=1).sum()
-            for half in halves
+    values = [
+        np.stack(
+            [
+                logsumexp(normal_log_density(half.z, mean, root) + half.log_a, axis=1)
+                for mean, root in populations
+            ]
         )
-        differences.append((a - b) / 2)
-    return float(np.std(differences))
+        for half in halves
+    ]
+    return half_difference(*values)
 
 
 def normal_populations(
