@@ -26,6 +26,8 @@ def _of_vector(task: Task) -> Any:
 
 def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
     """Return draws of the hyperparameters by a metric."""
+    if task.problem.separate:
+        raise CannotError("this script compares joint outputs, and these are of other specimens")
     metric = BY_NAME[settings["metric"]]
     with pm.Model() as model:
         values = in_pymc.hyperparameters(task.problem)
@@ -45,9 +47,18 @@ def likelihood_model(task: Task) -> pm.Model:
     with pm.Model() as model:
         values = in_pymc.hyperparameters(problem)
         inputs = in_pymc.inputs(problem, values)
+        if problem.separate:
+            for k, observed in enumerate(task.observed.T):
+                prb.Simulator(f"y{k}", _output(task, k), *inputs, observed=observed)
+            return model
         response = _of_vector(task) if problem.correlation else task.response
         prb.Simulator("y", response, *inputs, observed=task.observed)
     return model
+
+
+def _output(task: Task, k: int) -> Any:
+    """Return the response of one output."""
+    return lambda *x: task.response(*x)[..., k]
 
 
 def calibrate_likelihood(task: Task, settings: dict[str, Any]) -> Draws:
