@@ -8,7 +8,7 @@ from scipy.special import logsumexp, ndtr, ndtri
 from scipy.stats import norm
 
 from prbayes._checks import Floats
-from prbayes.inference.checks.min_p import adjusted_p_values
+from prbayes.numerics.min_p import adjusted_p_values
 from prbayes.inference.checks.population_test import (
     PopulationTest,
     mixture_ratio,

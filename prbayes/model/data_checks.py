@@ -18,7 +18,7 @@ from scipy.special import bdtrc
 
 from prbayes._checks import Floats
 from prbayes._finding import Finding
-from prbayes.inference.checks.min_p import adjusted_p_values
+from prbayes.numerics.min_p import adjusted_p_values
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from prbayes._checks import Floats
-from prbayes.inference.checks.data_checks import (
+from prbayes.model.data_checks import (
     DataCheckOptions,
     chance_of_repeats,
     closest_pairs,
