@@ -107,6 +107,26 @@ def test_the_laplace_approximation_is_that_of_a_parabola() -> None:
     np.testing.assert_allclose(charts.location[:, 0], 0, atol=1e-3)
 
 
+def test_the_location_follows_the_slope_of_the_density() -> None:
+    def response(x: Array) -> tuple[Array, Array]:
+        growth = np.exp(0.3 * x[:, 1:])
+        values = (x[:, :1] + 3) * growth
+        return values, np.concatenate([growth, 0.3 * values], axis=1)[:, None, :]
+
+    fibres = unscaled(response, np.array([[2.5], [4.0]]))
+    charts = charts_at_modes(fibres, 1, 1)
+    i, slot, step = np.arange(2), np.zeros(2, dtype=int), 1e-4
+    log_density = []
+    for u in (-step, step):
+        z, jacobian, _ = charts.points(fibres, i, slot, np.full((2, 1), u))
+        determinant = np.linalg.det(jacobian @ charts.solved[:, 0])
+        log_density.append(-(z**2).sum(axis=1) / 2 - np.log(np.abs(determinant)))
+    slope = (log_density[1] - log_density[0]) / (2 * step)
+    assert (np.abs(slope) > 0.05).all()
+    variance = charts.scale[:, 0, 0, 0] ** 2 / INFLATION
+    np.testing.assert_allclose(charts.location[:, 0, 0], variance * slope, rtol=1e-4)
+
+
 def test_cover_adds_charts_where_points_of_the_fibre_have_none() -> None:
     y = np.array([[1.0], [4.0]])
     fibres = unscaled(circle, y)
