@@ -269,6 +269,8 @@ def moments_of(points: FibrePoints, log_weights: Floats) -> ReferencePopulation:
 
     The weights of a specimen are normalised for each draw of theta, so the result is the average
     over draws and specimens of p(x | y_i, theta). Specimens without points are left out.
+    Few specimens make it narrower than the predictive population: by 5 % with 50 specimens, by 20 %
+    with 8. `ReferencePopulation.from_sample` of predictive inputs is not.
 
     Parameters
     ----------
