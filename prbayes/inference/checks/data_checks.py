@@ -125,8 +125,8 @@ def count_at_ends(y: Floats, step: float = 0.0, draws: int = 399, seed: int = 0)
     ================================  ==========  ==========  ==========
 
     At a step of 1 the lognormal population is flagged in .15 and .36, and 30 % censored in .01 and
-    .02. The bootstrap alone has power .75 and 1.00 for 30 % at a step of .5. Limits that differ between
-    specimens leave no pile and are not detected.
+    .02. The bootstrap alone has power .75 and 1.00 for 30 % at a step of .5. Limits that differ
+    between specimens leave no pile and are not detected.
 
     Parameters
     ----------
