@@ -303,6 +303,15 @@ def test_the_first_runs(d: int, n: int) -> None:
     assert first_runs(d) == n
 
 
+def test_runs_far_from_the_data_do_not_count_as_errors() -> None:
+    """A response that is steep beyond the data is emulated well at them."""
+    x = np.random.default_rng(0).uniform(-0.5, 0.2, 20)
+    y = np.exp(np.exp(2 * x))[:, None]
+    emulation, points = points_of(lambda z: np.exp(np.exp(2 * z)), y, 1)
+    assert emulation.error[0] < 0.01 * y.std()
+    assert np.abs(points.z[..., 0] - x[:, None]).max() < 0.02
+
+
 def test_batches_of_runs_are_at_the_roots() -> None:
     sizes: list[int] = []
 
