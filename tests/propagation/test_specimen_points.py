@@ -18,6 +18,7 @@ from prbayes.propagation.specimen_points import (
     Emulation,
     PointOptions,
     SpecimenPoints,
+    _starts,
     draw_points,
     emulate,
     first_runs,
@@ -268,11 +269,10 @@ def test_the_end_of_a_support_jumps_at_the_largest_specimen() -> None:
 # -- loops -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.long
 def test_the_number_of_points_grows_with_the_error_of_the_readings() -> None:
     problem = Linear(1, 1, n=30)
     counts = []
-    for error in (0.0, 0.3):
+    for error in (0.0, 0.05):
         y = problem.y + error * np.random.default_rng(0).normal(size=problem.y.shape)
         _, points = points_of(problem, y, 1, error=error)
         counts.append(points.z.shape[1])
@@ -305,11 +305,23 @@ def test_the_first_runs(d: int, n: int) -> None:
 
 def test_runs_far_from_the_data_do_not_count_as_errors() -> None:
     """A response that is steep beyond the data is emulated well at them."""
-    x = np.random.default_rng(0).uniform(-0.5, 0.2, 20)
-    y = np.exp(np.exp(2 * x))[:, None]
-    emulation, points = points_of(lambda z: np.exp(np.exp(2 * z)), y, 1)
+
+    def steep(z: Floats) -> Floats:
+        return np.exp(np.exp(6 * z - 3.6))
+
+    z = (np.log(np.random.default_rng(0).uniform(0, 2, 25)) + 3.6) / 6
+    y = steep(z[:, None])
+    emulation, points = points_of(steep, y, 1)
     assert emulation.error[0] < 0.01 * y.std()
-    assert np.abs(points.z[..., 0] - x[:, None]).max() < 0.02
+    assert np.abs(points.outputs[..., 0] - y).max() < 0.05 * y.std()
+
+
+def test_starts_are_nearest_in_the_outputs_that_were_measured() -> None:
+    run_z = np.arange(4.0)[:, None]
+    run_y = np.array([[1.0, 9.0], [2.0, 5.0], [3.0, 0.0], [4.0, 7.0]])
+    y, measured = np.array([[4.0, 0.0], [0.0, 9.0]]), np.array([[True, False], [False, True]])
+    starts = _starts(run_z, run_y, y, measured, np.ones(2), 2)
+    assert starts[..., 0].tolist() == [[3.0, 2.0], [0.0, 3.0]]
 
 
 def test_batches_of_runs_are_at_the_roots() -> None:
