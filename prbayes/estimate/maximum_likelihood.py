@@ -6,7 +6,6 @@ its weight, the share of the posterior mass by Laplace's approximation.
 
 from __future__ import annotations
 
-import logging
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -87,7 +86,7 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
         point=point,
         discrepancy=best.value,
         discrepancies={name: -float(v.sum()) for name, v in values.items()},
-        scales={name: 1.0 for name in values},
+        scales=dict.fromkeys(values, 1.0),
         n_evaluations=objective.count,
         n_screened=screened,
         n_responses=evaluator.n_responses - before,
@@ -183,7 +182,7 @@ def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum
         options={"gtol": options.tolerance * 100, "maxiter": left},
     )  # fmt: skip
     theta = np.asarray(result.x) * unit
-    value, gradient = objective(theta)
+    value, _ = objective(theta)
     if not result.success and np.isfinite(value):
         # A support whose end moves has its optimum at a jump: without gradients from there.
         simplex = minimize(
@@ -192,7 +191,7 @@ def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum
         )  # fmt: skip
         if simplex.fun < value - 1e-6:
             theta = np.asarray(simplex.x) * unit
-            value, gradient = objective(theta)
+            value, _ = objective(theta)
     covariance, slope = _inverse_hessian(objective, theta)
     return LocalOptimum(theta, value, covariance, bool(slope < 0.05))
 
@@ -230,8 +229,10 @@ def _inverse_hessian(objective: _Objective, theta: Floats) -> tuple[Floats, floa
     is_flat = values < 1.0 / 25
     inverse = np.where(is_flat, 0.0, 1 / np.where(is_flat, 1.0, values))
     covariance = (vectors * inverse) @ vectors.T
+    # Along directions without curvature in units of the prior: a slope there is no optimum.
     _, gradient = objective(theta)
-    slope = float(np.sqrt(max(0.0, (gradient * unit) @ covariance @ (gradient * unit))))
+    along = vectors.T @ (gradient * unit)
+    slope = float(np.sqrt((along**2 * np.where(is_flat, 1.0, inverse)).sum()))
     covariance = covariance * np.outer(unit, unit)
     touched = (np.abs(vectors[:, is_flat]) > 1e-3).any(axis=1)
     covariance[touched, :] = np.where(touched, np.inf, covariance[touched, :])
@@ -252,7 +253,8 @@ def _distinct(optima: list[LocalOptimum], unit: Floats) -> list[LocalOptimum]:
         new = True
         for other in kept:
             sd = np.sqrt(np.abs(np.diag(other.covariance)))
-            scale = np.where(np.isfinite(sd) & (sd > 0), sd, 0.1 * unit)
+            # Infinite where nothing is identified: a ridge is one optimum.
+            scale = np.where(np.isnan(sd) | (sd == 0), 0.1 * unit, sd)
             new = new and bool((np.abs(optimum.theta - other.theta) > 0.5 * scale).any())
         if new:
             kept.append(optimum)
@@ -278,7 +280,7 @@ def _in_units(
 
 
 def _findings(evaluator: Evaluator, modes: list[LocalOptimum]) -> list[Finding]:
-    """Report several modes, unidentified hyperparameters, and an optimum at the edge of a support."""
+    """Report several modes, unidentified hyperparameters, and an optimum at a support's edge."""
     findings = []
     best = modes[0]
     if np.isnan(best.covariance).any():
@@ -311,7 +313,9 @@ def _findings(evaluator: Evaluator, modes: list[LocalOptimum]) -> list[Finding]:
             continue
         point = _in_units(evaluator, mode.theta, mode.covariance)[0]
         free = [str(rv.name) for rv in evaluator.model.free_RVs]
-        where = ", ".join(f"{name} = {np.array2string(np.asarray(point[name]), precision=4)}" for name in free)
+        where = ", ".join(
+            f"{name} = {np.array2string(np.asarray(point[name]), precision=4)}" for name in free
+        )
         findings.append(
             Finding(
                 "second-mode",

@@ -11,7 +11,8 @@ import pymc as pm
 from prbayes._checks import called, positive_number
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Identity, identity_of, require_same
-from prbayes.model.node import AnySimulator, required_simulators
+from prbayes.model.node import AnySimulator, required_simulators, simulators
+from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.model.turns import in_turn
 
 _log = logging.getLogger("prbayes")
@@ -58,6 +59,17 @@ def checked_epsilon(
     return found
 
 
+def require_scale(model: pm.Model, caller: str) -> None:
+    """Raise if all simulators of a model have a log-likelihood by specimen."""
+    names = [likelihood.name for likelihood in specimen_likelihoods(model).values()]
+    if names and not simulators(model):
+        raise ValueError(
+            f"{caller}: got {names} without epsilon, expected a metric of distributions: "
+            "prb.LogLikelihood() is a likelihood and has no scale to choose; call pm.sample or "
+            "prb.sample_smc on the model"
+        )
+
+
 @in_turn
 def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
     """Set the epsilon of simulators by name.
@@ -71,8 +83,8 @@ def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
     Raises
     ------
     KeyError, TypeError, ValueError
-        If a name is unknown, a value is not a positive number, or `calibrate_epsilon` found them
-        for another problem; then nothing is changed.
+        If a name is unknown, a value is not a positive number, `calibrate_epsilon` found them for
+        another problem, or no simulator has an epsilon; then nothing is changed.
 
     Notes
     -----
@@ -87,9 +99,10 @@ def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
     ...     y = prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=[0.5, 1.0, 4.0])
     >>> prb.set_epsilon(model, {"y": 0.1})
     """
-    simulators = list(required_simulators(model).values())
-    values = checked_epsilon(epsilon, simulators, model, "set_epsilon")
-    for simulator in simulators:
+    require_scale(model, "set_epsilon")
+    changed = list(required_simulators(model).values())
+    values = checked_epsilon(epsilon, changed, model, "set_epsilon")
+    for simulator in changed:
         if simulator.name in values:
             simulator.epsilon.set_value(np.asarray(values[simulator.name]))
     _log.info(

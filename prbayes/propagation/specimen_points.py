@@ -232,8 +232,10 @@ def extended(
     misfit = outputs - values
     good = np.isfinite(misfit).all(axis=1)
     error, bias = emulation.error, np.inf
-    if good.any():
-        error = 2 * np.sqrt((misfit[good] ** 2).mean(axis=0))
+    # Where the response is steep, runs around roots are far from the data.
+    near = good & _is_near(outputs, readings, spread)
+    if near.any():
+        error = 2 * np.sqrt((misfit[near] ** 2).mean(axis=0))
         error = np.maximum(error, options.floor * spread)
     some = np.flatnonzero(good[: options.fresh])
     if len(some) >= 4:
@@ -266,12 +268,9 @@ def surface_near(
     zg, yg = z[good], y[good]
     zg, first = np.unique(zg, axis=0, return_index=True)
     yg = yg[first]
-    values = readings.values
-    low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
-    margin = np.maximum((high - low) / 2, spread)
-    inside = ((yg >= low - margin) & (yg <= high + margin)).all(axis=1)
+    inside = _is_near(yg, readings, spread)
     if inside.sum() < len(yg) // 4:
-        distance = (((yg - np.nanmean(values, axis=0)) / spread) ** 2).sum(axis=1)
+        distance = (((yg - np.nanmean(readings.values, axis=0)) / spread) ** 2).sum(axis=1)
         inside = np.zeros(len(yg), dtype=bool)
         inside[np.argsort(distance, kind="stable")[: max(8, len(yg) // 4)]] = True
     surface = fit_interpolant(zg, yg, inside)
@@ -299,6 +298,13 @@ def _all_roots(
         options = replace(options, starts=2 * options.starts)
         roots = specimen_roots(emulation, readings, options)
     return options, roots
+
+
+def _is_near(y: Floats, readings: Readings, spread: Floats) -> NDArray[np.bool_]:
+    """Return which outputs, (n, m), are within the range of the readings or half of it away."""
+    low, high = np.nanmin(readings.values, axis=0), np.nanmax(readings.values, axis=0)
+    margin = np.maximum((high - low) / 2, spread)
+    return np.asarray(((y >= low - margin) & (y <= high + margin)).all(axis=1))
 
 
 def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptions) -> Roots:
