@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.linalg import expm
 from scipy.special import gammaln
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -35,6 +36,7 @@ from benchmarks.scoreboard.problems import (
     crack_growth,
     folded,
     frame,
+    growth,
     linear,
     tension_304l,
     three_masses,
@@ -134,6 +136,27 @@ def test_the_folded_density_integrates_to_one() -> None:
 
     assert quad(density, 0, 1)[0] + quad(density, 1, 40)[0] == pytest.approx(1, abs=1e-6)
     assert np.allclose(folded.PROBLEM.formula(np, np.array([0.5, 1.5])), 0.25)
+
+
+@pytest.mark.parametrize("dose", growth.DOSES)
+def test_the_density_of_active_receptors_integrates_to_one(dose: float) -> None:
+    share = growth.active_share(np, np.array([0.75, 2.7]), dose)
+    y = np.linspace(*6.5e5 * share, 2001)
+    log_p = growth.log_density(y, dose, np.array([[6.5e5, 77.0, 1.7, 0.2]]))
+    assert np.trapezoid(np.exp(log_p[0]), y) == pytest.approx(1, abs=1e-5)
+
+
+@pytest.mark.parametrize("dose", growth.DOSES)
+def test_active_receptors_are_those_of_the_rate_equations(dose: float) -> None:
+    k1, gain = 1.7, growth.UNBINDING + growth.INTERNALISATION
+    # With a constant third state, whose product with the degradation rate is the production.
+    rates = [
+        [-k1 * dose - growth.DEGRADATION, growth.UNBINDING, growth.DEGRADATION],
+        [k1 * dose, -gain, 0.0],
+        [0.0, 0.0, 0.0],
+    ]
+    states = expm(growth.TIME * np.array(rates)) @ [0.0, 0.0, 1.0]
+    assert growth.active_share(np, k1, dose) == pytest.approx(states[1], rel=1e-12)
 
 
 def test_responses_are_what_they_say() -> None:

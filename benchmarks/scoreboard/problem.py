@@ -96,6 +96,7 @@ class Problem:
     error: float | None = None  # sd of a reading, where it is known
     published: tuple[str, ...] = ()  # results of others, with their source
     correlation: str = ""  # the hyperparameter that correlates the first two inputs, if one does
+    separate: bool = False  # whether each output was measured on specimens of its own
 
     def population(self, values: Draws, z: Any) -> list[Any]:
         """Return inputs of specimens, each (S, n), from standard normal variables (..., n, inputs)."""

@@ -36,10 +36,11 @@ _RUNS, _WIDTHS = (300.0, 3e8), (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 _COSTS = ("data sets", "failures", "runs", "cpu")
 # In the order of the page: by what a rival is, and prbayes first because the page is its own.
 RIVALS = (
+    "prbayes likelihood",
     "prbayes PR",
     "prbayes KLD",
     "prbayes area",
-    "prbayes log-likelihood",
+    "prbayes kernel log-likelihood",
     "hierarchical PyMC",
     "stock PyMC",
     "pyABC Wasserstein",

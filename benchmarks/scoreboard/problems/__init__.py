@@ -8,6 +8,7 @@ from benchmarks.scoreboard.problems import (
     crack_growth,
     folded,
     frame,
+    growth,
     linear,
     tension_304l,
     thermal,
@@ -17,6 +18,6 @@ from benchmarks.scoreboard.problems import (
 )
 
 _ONE = (linear, folded, contaminated, wrong_family, crack_growth, thermal)
-_SEVERAL = (frame, virkler, tension_304l)
+_SEVERAL = (frame, virkler, tension_304l, growth)
 _ALL: tuple[Problem, ...] = (*(file.PROBLEM for file in _ONE + _SEVERAL), *three_masses.PROBLEMS)
 PROBLEMS = {problem.name: problem for problem in _ALL}

@@ -1,6 +1,10 @@
-"""prbayes at its defaults, with each metric: the optimum, then `sample_smc`.
+"""prbayes at its defaults: its log-likelihood by specimen, and each metric.
 
-uv run python -m benchmarks.scoreboard.rivals.prbayes
+    uv run python -m benchmarks.scoreboard.rivals.prbayes
+
+With the log-likelihood by specimen (``prbayes likelihood``) the posterior is sampled by PyMC's NUTS
+from the optimum, and by `prb.sample_smc` where a support moves or the optimum reports several
+modes. With a metric: the optimum, then `prb.sample_smc`.
 """
 
 from __future__ import annotations
@@ -13,7 +17,7 @@ import prbayes as prb
 from benchmarks.metrics import BY_NAME
 from benchmarks.scoreboard import in_pymc
 from benchmarks.scoreboard.problem import Draws
-from benchmarks.scoreboard.study import Rival, Task, main
+from benchmarks.scoreboard.study import CannotError, Rival, Task, main
 
 
 def _of_vector(task: Task) -> Any:
@@ -21,7 +25,9 @@ def _of_vector(task: Task) -> Any:
 
 
 def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
-    """Return draws of the hyperparameters."""
+    """Return draws of the hyperparameters by a metric."""
+    if task.problem.separate:
+        raise CannotError("this script compares joint outputs, and these are of other specimens")
     metric = BY_NAME[settings["metric"]]
     with pm.Model() as model:
         values = in_pymc.hyperparameters(task.problem)
@@ -35,18 +41,63 @@ def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
     return in_pymc.draws(tree.posterior, task.problem)
 
 
+def likelihood_model(task: Task) -> pm.Model:
+    """Return the model of a problem with the log-likelihood by specimen."""
+    problem = task.problem
+    with pm.Model() as model:
+        values = in_pymc.hyperparameters(problem)
+        inputs = in_pymc.inputs(problem, values)
+        if problem.separate:
+            for k, observed in enumerate(task.observed.T):
+                prb.Simulator(f"y{k}", _output(task, k), *inputs, observed=observed)
+            return model
+        response = _of_vector(task) if problem.correlation else task.response
+        prb.Simulator("y", response, *inputs, observed=task.observed)
+    return model
+
+
+def _output(task: Task, k: int) -> Any:
+    """Return the response of one output."""
+    return lambda *x: task.response(*x)[..., k]
+
+
+def calibrate_likelihood(task: Task, settings: dict[str, Any]) -> Draws:
+    """Return draws of the hyperparameters by the log-likelihood by specimen."""
+    if task.problem.degrees is not None:
+        raise CannotError("readings with an error that is not known")
+    model = likelihood_model(task)
+    optimum = prb.minimize(model, progressbar=False)
+    has_edges = any(x.family == "uniform" for x in task.problem.inputs)
+    if has_edges or any(mode["weight"] > settings["second mode"] for mode in optimum.rivals):
+        tree = prb.sample_smc(
+            optimum=optimum, model=model, random_seed=task.seed, progressbar=False
+        )
+    else:
+        with model:
+            tree = pm.sample(
+                settings["draws"], tune=settings["tune"], chains=4, cores=1, nuts_sampler="pymc",
+                initvals=optimum.initvals, init="adapt_diag", random_seed=task.seed,
+                progressbar=False, compute_convergence_checks=False,
+            )  # fmt: skip
+    return in_pymc.draws(tree.posterior, task.problem)
+
+
 PACKAGES = ("prbayes", "pymc", "pytensor", "numpy", "scipy")
 METRICS = {
     "PR": "ProbabilityResidual",
     "KLD": "KullbackLeibler",
     "area": "AreaMetric",
-    "log-likelihood": "LogLikelihood",
+    "kernel log-likelihood": "LogLikelihood",
 }
 # What the defaults were, so that results of other defaults are not gone on with.
 _DEFAULTS = {"adjust": "given the estimate; a log-likelihood as it is"}
-RIVALS = tuple(
-    Rival(f"prbayes {name}", PACKAGES, {"metric": metric} | _DEFAULTS, calibrate)
-    for name, metric in METRICS.items()
+_LIKELIHOOD = {"draws": 1000, "tune": 1000, "second mode": 0.01}
+RIVALS = (
+    Rival("prbayes likelihood", PACKAGES, _LIKELIHOOD, calibrate_likelihood),
+    *(
+        Rival(f"prbayes {name}", PACKAGES, {"metric": metric} | _DEFAULTS, calibrate)
+        for name, metric in METRICS.items()
+    ),
 )
 
 if __name__ == "__main__":
