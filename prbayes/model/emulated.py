@@ -183,7 +183,8 @@ class EmulatedSimulator:
         return "" if groups is None or self.place is None else groups.names[self.place]
 
     @cached_property
-    def _rows(self) -> NDArray[np.intp]:
+    def rows(self) -> NDArray[np.intp]:
+        """Which of the likelihood's specimens these are, (N,)."""
         groups = self.likelihood.groups
         if groups is None:
             return np.arange(len(self.likelihood.observed))
@@ -192,20 +193,20 @@ class EmulatedSimulator:
     @property
     def observed(self) -> Floats:
         """Measured responses, (N,) or (N, m)."""
-        return self.likelihood.observed[self._rows]
+        return self.likelihood.observed[self.rows]
 
     @property
     def weights(self) -> Floats:
         """Weights of the specimens, (N,), which sum to one."""
         weights = self.likelihood.weights
-        own = np.ones(len(self._rows)) if weights is None else weights[self._rows]
+        own = np.ones(len(self.rows)) if weights is None else weights[self.rows]
         return np.asarray(own / own.sum())
 
     @property
     def specimens(self) -> NDArray[Any] | None:
         """Labels, (N,), or None."""
         labels = self.likelihood.specimens
-        return None if labels is None else labels[self._rows]
+        return None if labels is None else labels[self.rows]
 
     @property
     def metric(self) -> Metric:
