@@ -6,7 +6,6 @@ its weight, the share of the posterior mass by Laplace's approximation.
 
 from __future__ import annotations
 
-import logging
 import time
 from dataclasses import dataclass
 from typing import Any

@@ -28,6 +28,7 @@ from prbayes.response.compilation import compiled, ninf_for_invalid, untraced
 # Simulated specimens of a pool: with 100 times the observed ones, replicates from one pool have the
 # size and power of replicates of their own (likelihood_guards, section 2.4).
 _POOL = 2000
+_COMPILED = "weighted log-likelihood"
 
 
 def specimen_refit_obstacle(evaluator: Evaluator) -> str | None:
@@ -115,8 +116,15 @@ def specimen_pool(
     options = replace(options, half_difference=options.half_difference * np.sqrt(copies))
     emulation = likelihood.emulation
     roots = specimen_roots(emulation, readings, options)
+
+    def values_alone(z: Floats) -> tuple[Floats, Floats]:
+        # Points take no Jacobian, which costs more than the values.
+        outputs = emulation.surface.values(z)
+        outputs[emulation.fails(z)] = np.nan
+        return outputs, np.empty((len(z), 0, 0))
+
     points = draw_points(
-        emulation, emulation.error, readings, roots, emulation.box, options, seed=1
+        values_alone, emulation.error, readings, roots, emulation.box, options, seed=1
     )
     log_a = points.log_a + likelihood.coordinates.log_jacobian(points.z)
     return SpecimenPool(copies, likelihood.coordinates.inputs(points.z), log_a, points.z)
@@ -152,6 +160,23 @@ def _set(shared: Sequence[Any], data: Sequence[tuple[list[Floats], Floats]]) -> 
 
 
 @dataclass(frozen=True, eq=False)
+class Refit:
+    """The estimate of one simulated data set.
+
+    Attributes
+    ----------
+    theta : ndarray, shape (d,)
+    converged : bool
+    data : list of tuple
+        Points and numbers A of the data set, by likelihood.
+    """
+
+    theta: Floats
+    converged: bool
+    data: list[tuple[list[Floats], Floats]]
+
+
+@dataclass(frozen=True, eq=False)
 class SpecimenRefits:
     """Maximum-likelihood estimates around an optimum.
 
@@ -168,9 +193,15 @@ class SpecimenRefits:
     theta: Floats
     covariance: Floats
 
-    @cached_property
+    @property
     def _function(self) -> Any:
         """The compiled (theta, *weights) -> minus the weighted log-likelihood, gradient."""
+        compiled_by = vars(self.evaluator)  # lives as long as the evaluator
+        if _COMPILED not in compiled_by:
+            compiled_by[_COMPILED] = self._compile()
+        return compiled_by[_COMPILED]
+
+    def _compile(self) -> Any:
         evaluator = self.evaluator
         model = evaluator.model
         with untraced():
@@ -234,14 +265,15 @@ class SpecimenRefits:
             ]
         return self._pools[seed]
 
-    def simulated(self, draws: int, seed: int) -> Iterator[tuple[Floats, bool]]:
-        """Yield estimates of data sets simulated at the optimum, while the points are theirs."""
+    def simulated(self, draws: int, seed: int) -> Iterator[Refit]:
+        """Yield estimates of data sets simulated at the optimum."""
         pools = self.pools(seed)
         rng = np.random.default_rng([seed, 22])
         for _ in range(draws):
             data = [pool.data_set(rng) for pool in pools]
             with other_specimens(self.evaluator.likelihoods, data):
-                yield self.fit()
+                theta, converged = self.fit()
+            yield Refit(theta, converged, data)
 
     def reweighted(self, weights: Sequence[Floats]) -> tuple[Floats, NDArray[np.bool_]]:
         """Return estimates of weighted data sets, (S, d), and which converged.

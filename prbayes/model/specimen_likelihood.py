@@ -31,12 +31,11 @@ from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats
-from prbayes._finding import Finding
 from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.metrics.readings import Readings
 from prbayes.model.node import known_value, required_simulators, response_name
 from prbayes.propagation.base import Propagation
 from prbayes.propagation.coordinates import Coordinates
-from prbayes.metrics.readings import Readings
 from prbayes.propagation.specimen_points import (
     Emulation,
     PointOptions,

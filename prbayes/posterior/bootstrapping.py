@@ -142,8 +142,8 @@ def _by_specimen(optimum: Optimum, draws: int, *, parametric: bool, seed: int) -
     evaluator = refits.evaluator
     if parametric:
         estimates = list(refits.simulated(draws, seed))
-        thetas = np.array([theta for theta, _ in estimates])
-        converged = np.array([is_converged for _, is_converged in estimates])
+        thetas = np.array([refit.theta for refit in estimates])
+        converged = np.array([refit.converged for refit in estimates])
     else:
         weights = dirichlet_weights(evaluator.emulated, draws, seed)
         thetas, converged = refits.reweighted(weights)

@@ -118,7 +118,9 @@ def _capital(label: str) -> str:
 def _sentences(diagnosis: Diagnosis | None) -> tuple[str, ...]:
     if diagnosis is None:
         return ("not looked at, because that needs the model, which was not given.",)
-    return (*(diagnosis.messages or ("no problem was found.",)), *diagnosis.notes)
+    clear = diagnosis.all_clear
+    messages = diagnosis.messages or (f"{clear[0].lower()}{clear[1:]}",)
+    return (*messages, *diagnosis.notes, *diagnosis.untested)
 
 
 def _support(label: str, support: xr.Dataset) -> list[dict[str, Any]]:
