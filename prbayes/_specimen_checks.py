@@ -34,9 +34,12 @@ from prbayes.inference.checks.population_test import (
 )
 from prbayes.inference.checks.prior_conflict import conflict_findings
 from prbayes.model.evaluator import Evaluator
-from prbayes.propagation.new_specimens import new_specimens
 from prbayes.response.compilation import compile_batched
-from prbayes.response.distributions import compiled_log_density, is_mvnormal
+from prbayes.response.distributions import (
+    PopulationSampler,
+    compiled_log_density,
+    is_mvnormal,
+)
 from prbayes.response.inputs import Inputs, aleatory_names
 
 # Replicates of the tests: 199 suffice (likelihood_guards, section 2.4).
@@ -94,11 +97,12 @@ def emulator_notes(evaluator: Evaluator) -> tuple[str, ...]:
     for likelihood in evaluator.likelihoods:
         emulation, points = likelihood.emulation, likelihood.points
         roots = points.n_roots
-        spread = f"{roots.min()}" if roots.min() == roots.max() else f"{roots.min()} to {roots.max()}"
+        low, high = int(roots.min()), int(roots.max())
+        count = f"{low} root(s)" if low == high else f"{low} to {high} roots"
         notes.append(
             f"{likelihood.name}: the emulator of {len(emulation.z)} runs shifts a mean or standard "
             f"deviation of an input by at most {max(emulation.bias, 0.005):.2f} posterior standard "
-            f"deviations; a specimen has {spread} root(s), and {points.log_a.shape[1]} points."
+            f"deviations; a specimen has {count}, and up to {points.log_a.shape[1]} points."
         )
     return tuple(notes)
 
@@ -367,9 +371,12 @@ def _conflict(evaluator: Evaluator, thetas: Floats) -> Checked:
     pulls = np.abs(draws.mean(axis=0) - optimum.theta) / errors
     names = evaluator.names
     j = int(pulls.argmax())
-    told = f"The prior pulls the posterior mean of {names[j]} by {pulls[j]:.2f} standard errors"
+    shift = (
+        f"The posterior mean of {names[j]} is {pulls[j]:.2f} standard errors from the estimate "
+        "without the prior"
+    )
     if pulls[j] <= _PULL:
-        return Checked(notes=(f"{told} at most, too little for a conflict that matters.",))
+        return Checked(notes=(f"{shift}, less than a conflict with the prior that matters.",))
     prior = evaluator.prior_thetas(_PRIOR_DRAWS, 0)
     predictive = _predictive_estimates(optimum, prior)
     if np.isfinite(predictive).all(axis=1).mean() < 0.5:
@@ -389,7 +396,7 @@ def _conflict(evaluator: Evaluator, thetas: Floats) -> Checked:
     power = np.interp(np.log(n), np.log([10, 20, 50]), [0.86, 0.98, 1.0])
     return Checked(
         notes=(
-            f"{told}; no hyperparameter is in conflict with its prior (p > .05). With {n} specimens "
+            f"{shift}; no hyperparameter is in conflict with its prior (p > .05). With {n} specimens "
             f"the test has a power of {power:.2f} for a mean four prior standard deviations off.",
         )
     )
@@ -403,12 +410,15 @@ def _predictive_estimates(optimum: Optimum, prior: Floats) -> Floats:
     """
     rng = np.random.default_rng(31)
     evaluator = optimum.evaluator
-    densities = [compiled_log_density(each.inputs) for each in evaluator.emulated]
-    complete = _covariance(evaluator, densities, optimum.theta, rng)
+    compiled = [
+        (PopulationSampler(each.inputs), compiled_log_density(each.inputs))
+        for each in evaluator.emulated
+    ]
+    complete = _covariance(evaluator, compiled, optimum.theta, rng)
     ratio = np.sqrt(np.diag(optimum.covariance) / np.diag(complete))
     estimates = np.full(prior.shape, np.nan)
     for row, theta in zip(estimates, prior, strict=True):
-        covariance = _covariance(evaluator, densities, theta, rng)
+        covariance = _covariance(evaluator, compiled, theta, rng)
         if np.isfinite(covariance).all():
             values, vectors = np.linalg.eigh(covariance)
             noise = vectors @ (np.sqrt(np.maximum(values, 0)) * rng.standard_normal(len(theta)))
@@ -417,7 +427,10 @@ def _predictive_estimates(optimum: Optimum, prior: Floats) -> Floats:
 
 
 def _covariance(
-    evaluator: Evaluator, densities: Sequence[Any], theta: Floats, rng: np.random.Generator
+    evaluator: Evaluator,
+    compiled: Sequence[tuple[PopulationSampler, Any]],
+    theta: Floats,
+    rng: np.random.Generator,
 ) -> Floats:
     """Return the inverse information of the inputs of all specimens, (d, d); NaN if singular."""
     step = 1e-3 * evaluator.prior_sd
@@ -425,9 +438,9 @@ def _covariance(
     information = np.zeros((theta.size, theta.size))
     for k, simulator in enumerate(evaluator.emulated, start=len(evaluator.nodes)):
         roots = evaluator.roots(around, k)
-        own = [root[:1] for root in roots]
-        specimens, _ = new_specimens(simulator.name, simulator.inputs, own, _SPECIMENS, rng)
-        (log_p,) = densities[k - len(evaluator.nodes)](*roots, *[x[0] for x in specimens])
+        sampler, log_density = compiled[k - len(evaluator.nodes)]
+        specimens, _ = sampler([root[:1] for root in roots], _SPECIMENS, rng)
+        (log_p,) = log_density(*roots, *[x[0] for x in specimens])
         log_p = np.broadcast_to(log_p, (len(around), _SPECIMENS))
         with np.errstate(invalid="ignore"):
             scores = slopes(log_p, step)

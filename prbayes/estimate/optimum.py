@@ -396,6 +396,8 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
     variables["compared"] = ("simulator", compared)
     is_likelihood = [0] * len(nodes) + [1] * len(likelihoods)
     variables["is_likelihood"] = ("simulator", is_likelihood)
+    runs = [node.bound.n_runs for node in nodes] + [len(each.emulation.z) for each in likelihoods]
+    variables["n_runs"] = ("simulator", runs)
     elements = {"element": optimum.names, "other_element": optimum.names}
     return xr.Dataset(variables, coords={"simulator": names, **elements})
 
