@@ -36,12 +36,15 @@ class LocalOptimum:
     covariance : ndarray, shape (d, d)
         Inverse Hessian; infinite along directions without curvature, NaN at the edge of a support.
     converged : bool
+    steps : slice
+        Its evaluations of the objective, without those of the Hessian.
     """
 
     theta: Floats
     value: float
     covariance: Floats
     converged: bool
+    steps: slice
 
 
 def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
@@ -97,7 +100,7 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
         theta=best.theta,
         names=evaluator.names,
         evaluator=evaluator,
-        trace=objective.trace(),
+        trace=objective.trace(best.steps),
         seconds=time.perf_counter() - clock,
         rivals=rivals,
         warnings=tuple(str(finding) for finding in findings),
@@ -136,12 +139,12 @@ class _Objective:
         self.values.append(value)
         return value, np.where(np.isfinite(gradient), gradient, 0.0)
 
-    def trace(self) -> dict[str, Floats]:
-        """Return the points that were evaluated."""
+    def trace(self, steps: slice) -> dict[str, Floats]:
+        """Return the points of one descent."""
         return {
-            "theta": np.array(self.thetas),
-            "discrepancy": np.array(self.values),
-            "evaluations": np.arange(1, self.count + 1),
+            "theta": np.array(self.thetas[steps]),
+            "discrepancy": np.array(self.values[steps]),
+            "evaluations": np.arange(1, self.count + 1)[steps],
         }
 
 
@@ -171,6 +174,7 @@ def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum
     from scipy.optimize import minimize
 
     unit = objective.unit
+    first = objective.count
 
     def standardised(u: Floats) -> tuple[float, Floats]:
         value, gradient = objective(u * unit)
@@ -192,8 +196,9 @@ def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum
         if simplex.fun < value - 1e-6:
             theta = np.asarray(simplex.x) * unit
             value, _ = objective(theta)
+    steps = slice(first, objective.count)
     covariance, slope = _inverse_hessian(objective, theta)
-    return LocalOptimum(theta, value, covariance, bool(slope < 0.05))
+    return LocalOptimum(theta, value, covariance, bool(slope < 0.05), steps)
 
 
 def _inverse_hessian(objective: _Objective, theta: Floats) -> tuple[Floats, float]:

@@ -59,14 +59,18 @@ def checked_epsilon(
     return found
 
 
-def require_scale(model: pm.Model, caller: str) -> None:
-    """Raise if all simulators of a model have a log-likelihood by specimen."""
-    names = [likelihood.name for likelihood in specimen_likelihoods(model).values()]
-    if names and not simulators(model):
+def refuse_without_epsilon(model: pm.Model, caller: str, advice: str) -> None:
+    """Raise if all simulators of a model have a log-likelihood by specimen, which has no epsilon.
+
+    Raises
+    ------
+    ValueError
+    """
+    if specimen_likelihoods(model) and not simulators(model):
         raise ValueError(
-            f"{caller}: got {names} without epsilon, expected a metric of distributions: "
-            "prb.LogLikelihood() is a likelihood and has no scale to choose; call pm.sample or "
-            "prb.sample_smc on the model"
+            f"{caller}: got a model whose simulators use prb.LogLikelihood(), which has no epsilon "
+            f"and whose draws have the width of the data, expected a metric of distributions; "
+            f"{advice}"
         )
 
 
@@ -99,10 +103,10 @@ def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
     ...     y = prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=[0.5, 1.0, 4.0])
     >>> prb.set_epsilon(model, {"y": 0.1})
     """
-    require_scale(model, "set_epsilon")
-    changed = list(required_simulators(model).values())
-    values = checked_epsilon(epsilon, changed, model, "set_epsilon")
-    for simulator in changed:
+    refuse_without_epsilon(model, "set_epsilon", "sample it with prb.sample_smc or pm.sample")
+    known = list(required_simulators(model).values())
+    values = checked_epsilon(epsilon, known, model, "set_epsilon")
+    for simulator in known:
         if simulator.name in values:
             simulator.epsilon.set_value(np.asarray(values[simulator.name]))
     _log.info(

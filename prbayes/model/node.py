@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from inspect import signature
 from math import ceil
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import pymc as pm
@@ -48,6 +48,7 @@ from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Design, design_of
 from prbayes.response.compilation import PLAIN
 from prbayes.response.costs import in_words
+from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import ONE, Outputs
 from prbayes.response.response import Responses
 
@@ -70,6 +71,8 @@ class Node:
     outputs: Outputs = ONE  # of a run
     group: str = ""  # the name of the group whose specimens it has, if it is of one
 
+    is_emulated: ClassVar[Literal[False]] = False
+
     @property
     def metric(self) -> Metric:
         """The calibration metric."""
@@ -89,6 +92,40 @@ class Node:
     def responses(self) -> Responses:
         """The response, and how it is called."""
         return self.bound.responses
+
+    @property
+    def observed(self) -> Floats:
+        """Measured responses, (N,) or (N, m)."""
+        return self.target.observed
+
+    @property
+    def weights(self) -> Floats:
+        """Weights of the specimens, (N,), which sum to one."""
+        return self.target.weights
+
+    @property
+    def inputs(self) -> Inputs:
+        """The inputs of the response."""
+        return self.bound.inputs
+
+    @property
+    def has_specimens(self) -> bool:
+        """Whether specimens of all populations are there without a run."""
+        return self.bound.stored
+
+    @property
+    def runs_per_theta(self) -> int:
+        """Runs that a population costs."""
+        return self.bound.n_per_theta
+
+    @property
+    def max_lost(self) -> float:
+        """Largest share of a population that may have no response."""
+        return self.bound.max_lost
+
+    def populations(self, roots: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """Return responses and weights of populations, (k, n) or (k, n, m) and (k, n)."""
+        return self.bound.populations(list(roots))
 
     @property
     def design(self) -> Design | None:

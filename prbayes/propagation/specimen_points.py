@@ -26,10 +26,10 @@ from scipy.special import gammaln, logsumexp, ndtri
 
 from prbayes._checks import AT_ONCE, Floats
 from prbayes.emulators.interpolant import Interpolant, fit_interpolant
+from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.guards import half_difference, missing_share, predicted_bias
 from prbayes.propagation.points import sobol
-from prbayes.metrics.readings import Readings
 from prbayes.propagation.roots import Response, Roots, find_roots, nearest_starts
 
 
