@@ -144,7 +144,7 @@ def through_prbayes(url: str, pool: ThreadPoolExecutor, runs: int, store: str | 
             responses._computed = timed
             return super().bind(name, inputs, target, responses)
 
-    with pm.Model():
+    with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
         prb.Simulator(
             "y",
@@ -155,6 +155,7 @@ def through_prbayes(url: str, pool: ThreadPoolExecutor, runs: int, store: str | 
             propagation=Timed(runs, executor=pool, store=store, version="1"),
             progressbar=False,
         )
+    model.logp()  # the first use
     return sum(spent)
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from first_use import first_use
 
 import prbayes as prb
 from prbayes.model.node import nodes
@@ -1112,7 +1113,8 @@ def cases() -> Iterator[Any]:
 @pytest.fixture(scope="module", autouse=True)
 def _shared() -> None:
     """Make what is shared before the response's calls are counted."""
-    for one in (with_epsilon, posterior, predicted, validity, surrogate, comparison):
+    first_use(with_epsilon())
+    for one in (posterior, predicted, validity, surrogate, comparison):
         one()
 
 

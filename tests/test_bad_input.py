@@ -10,6 +10,7 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
+from first_use import first_use
 from pymc.logprob.utils import ParameterValueError
 from scipy.stats import norm
 
@@ -52,8 +53,10 @@ def simulator(
             } | changes
             try:
                 prb.Simulator("y", response, *inputs(mu, sigma), **keywords)
-            finally:
+            except (TypeError, ValueError):
                 assert "y" not in model.named_vars
+                raise
+        first_use(model)
 
     return call
 
@@ -357,12 +360,12 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     ),
     # Priors.
     "flat prior": (
-        lambda: build(never, prior=pm.Flat),
+        lambda: first_use(build(never, prior=pm.Flat)),
         TypeError,
         r"got mu.*replace pm.Flat .*wide pm.Normal",
     ),
     "half-flat prior": (
-        lambda: build(never, prior=pm.HalfFlat),
+        lambda: first_use(build(never, prior=pm.HalfFlat)),
         TypeError,
         r"got mu.*pm.HalfFlat by a wide",
     ),

@@ -33,7 +33,7 @@ from pymc.pytensorf import join_nonshared_inputs
 from pymc.smc.kernels import SMC_KERNEL, systematic_resampling
 from pytensor import shared
 from pytensor.compile import function
-from pytensor.compile.mode import Mode
+from pytensor.compile.mode import Mode, optdb
 from pytensor.gradient import NullTypeGradError, disconnected_grad, grad_undefined
 from pytensor.graph.basic import Apply, Constant, Variable
 from pytensor.graph.op import Op
@@ -45,6 +45,7 @@ from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.elemwise import Elemwise
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.random.type import RandomGeneratorType
+from pytensor.tensor.shape import Shape
 from pytensor.tensor.subtensor import Subtensor
 from pytensor.tensor.variable import TensorVariable
 
@@ -73,6 +74,17 @@ def test_terms_of_a_sum_come_into_one_operation_that_a_late_rewriting_sees() -> 
     xs = [pt.dvector() for _ in range(5)]
     function(xs, sum(xs[1:], start=xs[0]), mode=PLAIN.register((out2in(look), 1000)))
     assert (True, 5) in seen
+
+
+def test_a_shape_needs_no_draw_and_every_mode_does_the_minimal_rewrites() -> None:
+    n = shared(np.array([3, 2]), shape=(2,))
+    rv = pt.random.normal(pt.scalar("mu"), 1.0, size=n).owner
+    _, shape = rv.op.infer_shape(rv, [None, None, *(x.shape for x in rv.inputs[2:])])
+    assert [int(size.eval()) for size in shape] == [3, 2]
+    assert isinstance(rv.outputs[1].shape.owner.op, Shape)
+    bare = Mode(linker="py", optimizer=None)  # that of PyMC's pictures
+    assert "minimum_compile" in bare.linker.required_rewrites
+    assert "optimize_inner_graph" in {rewriter.name for rewriter in optdb.query("+minimum_compile")}
 
 
 def test_an_element_of_each_row_is_a_loop_over_rows_that_tells_its_operation() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from first_use import first_use
 
 import prbayes as prb
 from prbayes.estimate.data_sets import simulated_sets
@@ -187,8 +188,9 @@ def test_an_output_that_is_nan_costs_the_point_all_of_them():
     ],
 )
 def test_a_response_with_other_outputs_than_observed_is_refused(response, expected):
+    model = model_of(response, propagation=prb.Reweighted(64))
     with pytest.raises(prb.response.ResponseError, match=expected):
-        model_of(response, propagation=prb.Reweighted(64))
+        first_use(model)
 
 
 def test_other_keys_than_those_observed_are_refused():

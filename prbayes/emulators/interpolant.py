@@ -107,9 +107,9 @@ def fit_interpolant(z: Floats, y: Floats, near: NDArray[np.bool_] | None = None)
     Examples
     --------
     >>> import numpy as np
-    >>> z = np.linspace(-1, 1, 16)[:, None]
+    >>> z = np.linspace(-1, 1, 24)[:, None]
     >>> values, jacobian = fit_interpolant(z, np.exp(z))(np.array([[0.5]]))
-    >>> bool(np.isclose(values[0, 0], np.exp(0.5))), bool(np.isclose(jacobian[0, 0, 0], np.exp(0.5)))
+    >>> bool(np.isclose(values, np.exp(0.5))), bool(np.isclose(jacobian, np.exp(0.5)))
     (True, True)
     """
     n, d = z.shape
@@ -136,8 +136,11 @@ def fit_interpolant(z: Floats, y: Floats, near: NDArray[np.bool_] | None = None)
             # One step of iterative refinement: close runs make the matrix badly conditioned.
             solution = inverse @ target
             solution += inverse @ (target - matrix @ solution)
+            unsolved = np.abs((target - matrix @ solution)[:n] / spread).max()
             left_out = solution[:n] / np.diag(inverse)[:n, None]
-            error = float(np.sqrt(((left_out[rows] / spread) ** 2).mean()))
+            # Left-out errors look small where the matrix is singular to rounding, so that a
+            # surface that misses its own runs counts with the miss.
+            error = float(np.sqrt(((left_out[rows] / spread) ** 2).mean()) + unsolved)
             if error < least:
                 least = error
                 best = Interpolant(

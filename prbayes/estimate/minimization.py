@@ -107,7 +107,8 @@ def refine(
     max_seconds : float, optional
         Seconds after which nothing new is begun.
     max_runs : int, optional
-        Largest number of responses to compute, without those found in a store.
+        Largest number of responses to compute, the first runs included; those found in a store
+        do not count.
     progressbar : bool
         Whether work of more than two seconds shows a bar on stderr.
 
@@ -251,8 +252,8 @@ def minimize(
         budget gives the optimum that it would have given at once; with a ``store`` it computes
         nothing again.
     max_runs : int, optional
-        Largest number of responses to compute, without those found in a store; as for
-        ``max_seconds``.
+        Largest number of responses to compute, the first runs included; those found in a store
+        do not count. As for ``max_seconds``.
     random_seed : int, sequence of int, numpy.random.Generator or None
         Seed of the starting points.
     progressbar : bool

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
-from prbayes._checks import Floats
+import numpy as np
+
+from prbayes._checks import Floats, flag, real_array
 from prbayes.metrics.base import (
     CellwiseDiscrepancy,
     Discrepancy,
@@ -24,28 +26,58 @@ from prbayes.metrics.density import (
 from prbayes.metrics.readings import Readings
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class LogLikelihood(Metric):
-    r"""Negative mean log-likelihood of observed values, :math:`-\frac{1}{N} \sum_i \log p(z_i)`.
+    r"""Log-likelihood of each specimen's record, or of a kernel density.
 
-    The density p is that of the simulated responses. Only this side is smoothed, which makes the
-    fitted population narrower by about :math:`h^2/(2\sigma^2)`; the default bandwidth keeps that
-    below a tenth of the sampling error of a normal population. Where it is more, as of responses in
-    groups, an optimum warns.
+    Without ``density`` it is the log-likelihood by specimen, exact up to the error of an emulator,
+
+    .. math:: \log L(\theta) = \sum_i \log \int p(y_i \mid f(x))\, p(x \mid \theta)\, dx,
+
+    with the readings :math:`y_i` of specimen i and the response f. It needs a deterministic
+    response and continuous inputs, has no epsilon, and serves every sampler of PyMC. It compares no
+    two samples, so that it has no direct call.
+
+    With ``density`` it is the negative mean log-likelihood
+    :math:`-\frac{1}{N} \sum_i \log p(z_i)` of the observed values under a density estimate of the
+    simulated ones (eq. 3 of [1]_). Only the simulated side is smoothed, which makes the fitted
+    population narrower by about :math:`h^2/(2\sigma^2)`; the default bandwidth keeps that below a
+    tenth of the sampling error of a normal population.
 
     Parameters
     ----------
-    density : GaussianKDE or Histogram
+    error : float, array_like or model variable, optional
+        Standard deviation of the normal error of a reading, in units of the output: one number, one
+        for each output, (m,), or one for each reading, (N,) or (N, m). A variable of the model is
+        estimated. Readings are exact by default.
+    relative : bool
+        Whether ``error`` is a share of the reading.
+    gross_errors : bool, float or model variable
+        Share of specimens with a gross error, whose readings are uniform over twice the range of
+        each output. True adds the variable ``{name}_gross_errors`` with a Beta(1, 9) prior.
+    censored : tuple of (lower, upper), optional
+        Limits of the readings, numbers or arrays as for ``error``, None for no limit: a value at or
+        beyond a limit says only that the output lies there.
+    rounded : float or array_like, optional
+        Width to which values were rounded, as for ``error``. Also the width of an interval whose
+        middle is the reading.
+    density : GaussianKDE or Histogram, optional
         Estimates the simulated density. A `GaussianKDE` without bandwidth has the default one.
 
     Raises
     ------
     TypeError
-        When prepared against observed values without a density.
+        When called, or prepared against observed values, without a density.
+    ValueError
+        If a number is out of its range, or measurement arguments are given beside ``density``.
 
     References
     ----------
     .. [1] Oh et al. (2019), eq. 3, doi:10.1007/s00158-019-02288-6.
+    .. [2] Papadimas, N. and T. Dodwell (2021), A hierarchical Bayesian approach for calibration of
+       stochastic material models, Data-Centric Engineering 2, e20, doi:10.1017/dce.2021.20.
+    .. [3] Hogg, D. W., A. D. Myers and J. Bovy (2010), Inferring the eccentricity distribution,
+       Astrophys. J. 725, 2166-2175, doi:10.1088/0004-637X/725/2/2166.
 
     Examples
     --------
@@ -58,7 +90,12 @@ class LogLikelihood(Metric):
     True
     """
 
-    density: DensityEstimator | None = field(default=None, kw_only=True)
+    error: Any = None
+    relative: bool = False
+    gross_errors: Any = False
+    censored: tuple[Any, Any] | None = None
+    rounded: Any = None
+    density: DensityEstimator | None = None
     minimum: ClassVar[Minimum] = Minimum.QUADRATIC
     counts_failures: ClassVar[bool] = True
     likelihood: ClassVar[bool] = True
@@ -66,27 +103,131 @@ class LogLikelihood(Metric):
     tail_responses: ClassVar[int] = 300  # from which standard errors are right to a tenth
 
     def __post_init__(self) -> None:
-        if self.density is not None:
-            density = density_estimator(self.density, likelihood_bandwidth)
-            object.__setattr__(self, "density", density)
+        measurement = {
+            "error": _hashable(self.error, "error"),
+            "censored": _limits(self.censored),
+            "rounded": _hashable(self.rounded, "rounded"),
+        }
+        flag(self.relative, "LogLikelihood: relative")
+        gross = self.gross_errors
+        if isinstance(gross, int | float) and not isinstance(gross, bool) and not 0 < gross < 1:
+            raise ValueError(
+                f"LogLikelihood: gross_errors: got {gross!r}, expected True, a share in (0, 1) or "
+                "a variable of the model"
+            )
+        for name, value in measurement.items():
+            object.__setattr__(self, name, value)
+        if self.density is None:
+            return
+        given = [name for name, value in measurement.items() if value is not None]
+        given += ["gross_errors"] if gross is not False else []
+        if given:
+            raise ValueError(
+                f"LogLikelihood: got density= with {given}, expected one of them: a kernel density "
+                "knows nothing of single readings; leave density= out"
+            )
+        density = density_estimator(self.density, likelihood_bandwidth)
+        object.__setattr__(self, "density", density)
+
+    def __repr__(self) -> str:
+        """Show the arguments that differ from their defaults."""
+        given = [f for f in fields(self) if getattr(self, f.name) != f.default]
+        arguments = ", ".join(f"{f.name}={getattr(self, f.name)!r}" for f in given)
+        return f"LogLikelihood({arguments})"
 
     @property
     def by_specimen(self) -> bool:
-        """Whether it is the log-likelihood by specimen, which is no distance of two samples."""
+        """Whether it is the log-likelihood by specimen, which compares no two samples."""
         return self.density is None
 
-    def readings(self, values: Floats) -> Readings:
-        """Return measured outputs, (N, m), with what is known of their measurement."""
-        return Readings.exact(values)
+    def readings(self, values: Floats, error: Any = None, event: tuple[int, ...] = ()) -> Readings:
+        """Return measured outputs, (N, m), with what is known of their measurement.
+
+        Parameters
+        ----------
+        values : ndarray, shape (N, m)
+        error : float or array_like, optional
+            In place of an error that is a model variable.
+        event : tuple of int
+            () for one output without an axis of its own, else (m,).
+
+        Raises
+        ------
+        ValueError
+            If an argument does not fit the shape of the values.
+        """
+        error = self.error if error is None else error
+
+        def full(value: Any, name: str) -> Floats:
+            array = np.asarray(value, dtype=np.float64)
+            # One output: an array by reading has the shape (N,).
+            array = array[:, None] if not event and array.ndim == 1 else array
+            try:
+                return np.array(np.broadcast_to(array, values.shape))
+            except ValueError:
+                raise ValueError(
+                    f"LogLikelihood: {name}: got shape {np.shape(value)}, expected a number, or "
+                    f"shape {(len(values), *event)}, one for each reading"
+                    + (f", or {event}, one for each output" if event else "")
+                ) from None
+
+        sd = np.zeros(values.shape) if error is None else full(error, "error")
+        if self.relative:
+            sd = sd * np.abs(values)
+        step = np.zeros(values.shape) if self.rounded is None else full(self.rounded, "rounded")
+        lower, upper = np.full(values.shape, np.nan), np.full(values.shape, np.nan)
+        if self.censored is not None:
+            low, high = self.censored
+            is_low = values <= (full(low, "censored") if low is not None else -np.inf)
+            is_high = values >= (full(high, "censored") if high is not None else np.inf)
+            if low is not None:
+                lower[is_low], upper[is_low] = -np.inf, full(low, "censored")[is_low]
+            if high is not None:
+                lower[is_high], upper[is_high] = full(high, "censored")[is_high], np.inf
+            values = np.where(is_low | is_high, np.nan, values)
+        sd = np.where(np.isfinite(sd), sd, 0.0)
+        return Readings(values, sd, step, lower, upper)
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         if self.density is None:
             raise TypeError(
-                "LogLikelihood: got density=None, expected prb.GaussianKDE() or prb.Histogram(); "
-                "pass prb.LogLikelihood(density=prb.GaussianKDE())"
+                "LogLikelihood: got density=None, expected prb.GaussianKDE() or prb.Histogram(): "
+                "the log-likelihood by specimen compares no two samples; pass "
+                "prb.LogLikelihood(density=prb.GaussianKDE())"
             )
         cells = self.density.cells(observed, weights)
         return LikelihoodDiscrepancy.on_cells(self, observed, weights, cells)
+
+
+def _hashable(value: Any, name: str) -> Any:
+    """Return a number, nested tuples of an array, or a variable of a model, as it is."""
+    if value is None or hasattr(value, "owner"):
+        return value
+    array = real_array(value, f"LogLikelihood: {name}")
+    if not (array > 0).all():
+        raise ValueError(f"LogLikelihood: {name}: got {value!r}, expected positive numbers")
+    return _as_tuples(array)
+
+
+def _limits(censored: Any) -> tuple[Any, Any] | None:
+    """Return lower and upper limits as numbers or nested tuples, None where there is none."""
+    if censored is None:
+        return None
+    if not isinstance(censored, tuple | list) or len(censored) != 2 or censored == (None, None):
+        raise ValueError(
+            f"LogLikelihood: censored: got {censored!r}, expected (lower, upper), one of which may "
+            "be None"
+        )
+    lower, upper = (
+        None if limit is None else _as_tuples(real_array(limit, "LogLikelihood: censored"))
+        for limit in censored
+    )
+    return lower, upper
+
+
+def _as_tuples(array: Floats) -> Any:
+    """Return an array as a number or nested tuples, which compare as values."""
+    return float(array) if array.ndim == 0 else tuple(_as_tuples(row) for row in array)
 
 
 @dataclass(frozen=True, eq=False)

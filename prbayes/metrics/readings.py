@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from prbayes._checks import Floats
-
-_LOG_ROOT_2PI = 0.5 * np.log(2 * np.pi)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,37 +76,68 @@ class Readings:
         sd = np.sqrt(emulator_error**2 + self.error**2 + self.step**2 / 12)
         return np.where(self.is_measured, sd, np.inf)
 
+    def scaled(self, factor: float) -> Readings:
+        """Return the readings with another scale of their error."""
+        return replace(self, error=factor * self.error)
+
     def log_density(self, outputs: Floats, emulator_error: Floats) -> Floats:
-        """Return the log-density of each specimen's readings given outputs, (N, ..., m) -> (N, ...).
+        """Return the log-density of each specimen's readings given outputs, (N, K, m) -> (N, K).
+
+        -inf where an output is NaN.
+        """
+        variance = emulator_error**2 + self.error**2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            result = self.symbolic_log_density(outputs, variance[:, None], np)
+        return np.where(np.isnan(result), -np.inf, result)
+
+    def symbolic_log_density(self, outputs: Floats, variance: Any, xp: Any) -> Any:
+        """Return the same as an array or a graph of the comparison's variance.
 
         A censored reading has the probability of its interval, a rounded one the mean density over
         its step.
+
+        Parameters
+        ----------
+        outputs : ndarray, shape (N, K, m)
+        variance : array or graph that broadcasts against it
+        xp : module
+            ``numpy`` or ``pytensor.tensor``.
         """
-        extra = (slice(None), *(None,) * (outputs.ndim - 2))
-        sd = np.sqrt(emulator_error**2 + self.error**2)[extra]
-        away = (self.values[extra] - outputs) / sd
-        total = np.where(self.is_measured[extra], -0.5 * away**2 - np.log(sd) - _LOG_ROOT_2PI, 0.0)
+        sd = xp.sqrt(variance)
+        values = np.where(self.is_measured, self.values, 0.0)[:, None]
+        away = (values - outputs) / sd
+        normal = -0.5 * away**2 - 0.5 * xp.log(2 * np.pi * variance)
+        terms = xp.where(self.is_measured[:, None], normal, 0.0)
         if (self.step > 0).any():
-            half = self.step[extra] / 2
-            low = (self.values[extra] - half - outputs) / sd
-            high = (self.values[extra] + half - outputs) / sd
-            with np.errstate(divide="ignore"):
-                mean = log_interval_probability(low, high) - np.log(2 * half)
-            total = np.where((half > 0) & self.is_measured[extra], mean, total)
+            step = np.where(self.step > 0, self.step, 1.0)[:, None]
+            inside = _log_probability(away - step / (2 * sd), away + step / (2 * sd), xp)
+            is_rounded = ((self.step > 0) & self.is_measured)[:, None]
+            terms = xp.where(is_rounded, inside - np.log(step), terms)
         if self.is_censored.any():
-            low = (self.lower[extra] - outputs) / sd
-            high = (self.upper[extra] - outputs) / sd
-            inside = log_interval_probability(low, high)
-            total = np.where(self.is_censored[extra], inside, total)
-        result = total.sum(axis=-1)
-        return np.where(np.isnan(result), -np.inf, result)
+            # Finite bounds far out: the derivative at an infinite one would be NaN.
+            far = 1e30
+            lower = np.where(self.is_censored, np.maximum(self.lower, -far), 0.0)[:, None]
+            upper = np.where(self.is_censored, np.minimum(self.upper, far), 1.0)[:, None]
+            inside = _log_probability((lower - outputs) / sd, (upper - outputs) / sd, xp)
+            terms = xp.where(self.is_censored[:, None], inside, terms)
+        return terms.sum(axis=-1)
 
 
-def log_interval_probability(low: Floats, high: Floats) -> Floats:
+def _log_probability(low: Any, high: Any, xp: Any) -> Any:
     """Return log(Phi(high) - Phi(low)) of a standard normal variable, in the tails too."""
-    # In the upper tail both are taken by symmetry, so that no digits are lost.
-    upper = low > 0
-    a, b = np.where(upper, -high, low), np.where(upper, -low, high)
-    log_b, log_a = log_ndtr(b), log_ndtr(a)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(log_b + np.log1p(-np.exp(log_a - log_b)))
+    # In the upper tail both ends are mirrored, so that no digits are lost.
+    is_upper = low > 0
+    a, b = xp.where(is_upper, -high, low), xp.where(is_upper, -low, high)
+    log_a, log_b = _log_distribution(a, xp), _log_distribution(b, xp)
+    return log_b + xp.log1p(-xp.exp(log_a - log_b))
+
+
+def _log_distribution(x: Any, xp: Any) -> Any:
+    """Return log Phi(x)."""
+    if xp is np:
+        return log_ndtr(x)
+    scaled = x / np.sqrt(2)
+    # Each branch is finite where the other one is chosen, so that gradients are.
+    lower = xp.log(xp.erfcx(-xp.minimum(scaled, 0.0)) / 2) - xp.minimum(scaled, 0.0) ** 2
+    upper = xp.log1p(-xp.erfc(xp.maximum(scaled, 0.0)) / 2)
+    return xp.where(x < 0, lower, upper)

@@ -54,6 +54,9 @@ def cost(model: pm.Model | Callable[[], Any] | None = None, *, dry_run: bool = F
 
     Notes
     -----
+    A model is not used by it: of one whose first runs are not made yet, none is made but that of
+    the dry run.
+
     Under `Resimulated` and `Fresh` the first runs are those that show whether the response works;
     how many values of the hyperparameters an optimiser or sampler then asks for is not known
     before. The estimate takes all runs to be as long as that of the dry run.
@@ -156,8 +159,8 @@ def _of_model(model: pm.Model) -> list[Asked]:
     asked: list[Asked] = []
     for simulator in required_simulators(model).values():
         responses = simulator.responses
-        names = [one.responses.name for one in asked if one.responses.runs is responses.runs]
-        shared = "" if simulator.is_computed or not names else names[0]
         computed = simulator.is_computed
+        alike = [earlier for earlier in asked if earlier.responses.runs is responses.runs]
+        shared = alike[0].responses.name if alike and not computed else ""
         asked.append(Asked(responses, simulator.propagation, simulator.target, shared, computed))
     return asked

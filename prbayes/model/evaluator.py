@@ -226,11 +226,10 @@ class Evaluator:
         joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
         return dict(zip(names, joined, strict=True))
 
-    def specimen_roots(self, thetas: Floats, k: int) -> list[Floats]:
-        """Return the roots of the k-th likelihood by specimen at thetas, shapes (P, *shape)."""
-        likelihood = self.likelihoods[k]
+    def specimen_params(self, thetas: Floats, k: int) -> list[Floats]:
+        """Return the variables of the k-th likelihood by specimen at thetas, shapes (P, *shape)."""
         values = self.constrained(thetas)
-        return [values[str(r.name)] for r in likelihood.inputs.roots if not is_group(r)]
+        return [values[str(v.name)] for v in self.likelihoods[k].variables if not is_group(v)]
 
     @cached_property
     def _evaluate_specimens(self) -> Any:

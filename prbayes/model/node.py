@@ -233,11 +233,11 @@ def _log_first_runs(
         return  # known after the first call
     responses.on_start = None
 
-    def number(runs: int) -> str:
-        total = ceil(runs / responses.workers) * seconds
-        if not runs or np.isnan(total):
-            return str(runs)
-        return f"{runs}, {f'about {in_words(total)}' if total >= 1 else 'less than 1 s'}"
+    def with_duration(number: int) -> str:
+        total = ceil(number / responses.workers) * seconds
+        if not number or np.isnan(total):
+            return str(number)
+        return f"{number}, {f'about {in_words(total)}' if total >= 1 else 'less than 1 s'}"
 
     setting = type(propagation).__name__
     if hasattr(propagation, "n"):
@@ -246,8 +246,8 @@ def _log_first_runs(
         "%s: runs at first: %s; for each value of the hyperparameters: %s; to change this, pass "
         "another number in propagation=%s; more: %s",
         responses.name,
-        number(runs),
-        number(demand.each),
+        with_duration(runs),
+        with_duration(demand.each),
         setting,
         demand.decides,
     )
@@ -532,7 +532,7 @@ def _observing(node: Node, values: Any) -> Node:
     return node if np.array_equal(given, own, equal_nan=True) else node.observing(given)
 
 
-@node_rewriter([Shape])
+@node_rewriter([Shape])  # type: ignore[untyped-decorator]
 def shape_without_draw(fgraph: Any, apply: Apply[Any, Any]) -> list[Any] | None:
     """Return the shape of a simulator's variable without a draw, which would compute responses."""
     rv = apply.inputs[0].owner

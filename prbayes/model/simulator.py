@@ -41,7 +41,11 @@ from prbayes.model.node import (
     shared_epsilon,
     simulators,
 )
-from prbayes.model.specimen_likelihood import SpecimenDistribution, SpecimenLikelihood
+from prbayes.model.specimen_likelihood import (
+    SpecimenDistribution,
+    SpecimenLikelihood,
+    reference_error,
+)
 from prbayes.propagation.base import Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
 from prbayes.response.compilation import PLAIN
@@ -132,10 +136,10 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     Notes
     -----
     No response is computed when the model is written. The first use of the model computes the first
-    responses: `minimize`, `sample_smc`, `pymc.sample`, a plot or a prediction. It raises
-    `ResponseError` if the response raises, returns a wrong shape or type, or is NaN at all points;
-    the next use then tries again. A line of the log ("prbayes", level INFO) reports how many runs
-    there are, and how long they take; `cost` reports it before.
+    responses: `minimize`, `sample_smc`, `pymc.sample`, a plot or a prediction. An executor has to
+    be open then. A response that raises, returns a wrong shape or type, or is NaN at all points is
+    a `ResponseError` there, and the next use tries again. A line of the log ("prbayes", level INFO)
+    reports how many runs there are, and how long they take; `cost` reports it before.
 
     References
     ----------
@@ -167,7 +171,7 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     places, measured = _grouped(name, sorted_inputs, observed)
     values, outputs = read_observed(name, _data(name, measured))
     metric = LogLikelihood() if metric is None else metric
-    if isinstance(metric, Metric) and metric.by_specimen:
+    if isinstance(metric, LogLikelihood) and metric.by_specimen:
         return _by_specimen(
             name, model, response, sorted_inputs, metric, values, outputs, observed, places,
             epsilon=epsilon, weights=weights, specimens=specimens, dims=dims,
@@ -207,7 +211,7 @@ def _by_specimen(
     model: pm.Model,
     response: Callable[..., Any],
     inputs: Inputs,
-    metric: Any,
+    metric: LogLikelihood,
     values: Floats,
     outputs: Outputs,
     observed: Any,
@@ -227,11 +231,17 @@ def _by_specimen(
     factors = None
     if weights is not None:
         factors = sample_weights(weights, len(values), f"{name}: weights") * len(values)
+    extras = _measurement_variables(name, model, metric)
+    try:
+        rows = values.reshape(len(values), -1)
+        readings = metric.readings(rows, reference_error(extras), values.shape[1:])
+    except ValueError as error:
+        raise ValueError(f"{name}: metric: {error}") from None
     likelihood = SpecimenLikelihood(
         name,
         metric,
         values,
-        metric.readings(values.reshape(len(values), -1)),
+        readings,
         factors,
         labels,
         inputs,
@@ -239,6 +249,7 @@ def _by_specimen(
         settings,
         outputs,
         groups,
+        extras,
     )
     data: Any = values
     if isinstance(observed, Variable):
@@ -246,7 +257,7 @@ def _by_specimen(
     elif np.isnan(values).any():
         # As a constant, in which PyMC does not look for missing values to impute.
         data = pt.constant(values)
-    params = [pt.constant(groups) if is_group(root) else root for root in inputs.roots]
+    params = [pt.constant(groups) if is_group(v) else v for v in likelihood.variables]
     return SpecimenDistribution(
         name,
         *params,
@@ -254,6 +265,26 @@ def _by_specimen(
         observed=data,
         dims=_checked_dims(name, dims, values.shape, model),
     )
+
+
+def _measurement_variables(
+    name: str, model: pm.Model, metric: LogLikelihood
+) -> dict[str, TensorVariable]:
+    """Return the model variables of the measurement by their role; adds the one of gross errors."""
+    extras: dict[str, TensorVariable] = {}
+    for role in ("error", "gross_errors"):
+        value = getattr(metric, role)
+        if role == "gross_errors" and value is True:
+            value = pm.Beta(f"{name}_gross_errors", 1, 9)
+        if not isinstance(value, Variable):
+            continue
+        if value not in (*model.free_RVs, *model.deterministics):
+            raise TypeError(
+                f"{name}: metric: {role}: got {value}, expected a named variable of the model, "
+                "such as pm.HalfNormal('error', 0.1), or a number"
+            )
+        extras[role] = value
+    return extras
 
 
 def _refuse_by_specimen(

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import logging
 import weakref
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -44,7 +44,7 @@ from prbayes.propagation.specimen_points import (
     draw_points,
     emulate,
 )
-from prbayes.response.distributions import PopulationSampler, log_density
+from prbayes.response.distributions import PopulationSampler, log_density, prior_draws
 from prbayes.response.grouping import is_group
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs
@@ -73,6 +73,9 @@ class SpecimenLikelihood:
     outputs : Outputs
     groups : ndarray of int, shape (N,), or None
         Index of each specimen's group.
+    extras : dict
+        Model variables of the measurement, beside the roots of the inputs: ``error`` and
+        ``gross_errors``.
     """
 
     name: str
@@ -86,7 +89,13 @@ class SpecimenLikelihood:
     propagation: Propagation
     outputs: Outputs
     groups: NDArray[np.intp] | None = None
+    extras: Mapping[str, TensorVariable] = field(default_factory=dict)
     options: PointOptions = PointOptions()
+
+    @property
+    def variables(self) -> tuple[TensorVariable, ...]:
+        """The model variables that the log-density depends on: roots of the inputs, then extras."""
+        return (*self.inputs.roots, *self.extras.values())
 
     @property
     def event(self) -> tuple[int, ...]:
@@ -128,7 +137,13 @@ class SpecimenLikelihood:
         """The points of the specimens."""
         emulation, roots = self._emulated
         return draw_points(
-            emulation, emulation.error, self.readings, roots, emulation.box, self.options
+            emulation,
+            emulation.error,
+            self.readings,
+            roots,
+            emulation.box,
+            self.options,
+            error_is_known="error" not in self.extras,
         )
 
     @cached_property
@@ -136,7 +151,10 @@ class SpecimenLikelihood:
         """Shared variables of the points, (N, K, *event) by input, and of the numbers A, (N, K)."""
         points = self.points
         # The proposal is a density of z: p(x) dx = p(x(z)) |dx/dz| dz.
-        log_a = points.log_a + self.coordinates.log_jacobian(points.z)
+        is_known = "error" not in self.extras
+        log_a = (points.log_a if is_known else -points.log_proposal) + self.coordinates.log_jacobian(
+            points.z
+        )
         shared = [
             pytensor.shared(np.ascontiguousarray(x), name=f"{self.name}_points_{i}")
             for i, x in enumerate(self.coordinates.inputs(points.z))
@@ -144,12 +162,19 @@ class SpecimenLikelihood:
         return shared, pytensor.shared(log_a, name=f"{self.name}_log_a")
 
     def log_likelihood(self, params: Sequence[Any]) -> TensorVariable:
-        """Return the graph of the log-likelihoods of the specimens, (N,), of the roots' values."""
+        """Return the graph of the log-likelihoods of the specimens, (N,).
+
+        Parameters
+        ----------
+        params : sequence
+            Values of `variables`.
+        """
         points, log_a = self.arrays
         n, count = self.observed.shape[0], log_a.shape[1]
         symbols = self.inputs.placeholders()
         dists, _ = self.inputs.rebuilt(symbols)
-        values = dict(zip(symbols, params, strict=True))
+        values = dict(zip(symbols, params[: len(symbols)], strict=True))
+        extras = dict(zip(self.extras, params[len(symbols) :], strict=True))
         if self.groups is not None:
             # A vector of groups in place of one makes vectors of the distributions' parameters.
             (group,) = (s for s, r in zip(symbols, self.inputs.roots, strict=True) if is_group(r))
@@ -161,30 +186,82 @@ class SpecimenLikelihood:
         # After the densities are built: PyMC may clone parameters that are random.
         (log_p,) = graph_replace([log_p], values, strict=False)
         terms = log_p.reshape((n, count)) + log_a
+        if "error" in extras:
+            terms = terms + self._readings_log_density(extras["error"])
         likelihood = logsumexp_finite(terms)
+        share = extras.get("gross_errors", self.metric.gross_errors)
+        if share is not False:
+            gross = pt.log(share) + self.log_gross_density
+            likelihood = pt.logaddexp(pt.log1p(-share) + likelihood, gross)
         return likelihood if self.weights is None else likelihood * self.weights
 
-    def draws(self, rng: np.random.Generator, roots: Sequence[Floats], n: int) -> Floats:
-        """Draw the emulated responses of n specimens of each population.
+    def _readings_log_density(self, error: Any) -> Any:
+        """Return the log-density of the readings at the points, (N, K), for an unknown error."""
+        outputs = self.points.outputs
+        sd = error * np.abs(np.nan_to_num(self.readings.values))[:, None] if (
+            self.metric.relative
+        ) else error
+        variance = self.emulation.error**2 + sd**2
+        # Points that fill up the array have any output.
+        outputs = np.where(np.isfinite(outputs), outputs, 1e30)
+        return self.readings.symbolic_log_density(outputs, variance + pt.zeros((1, 1, 1)), pt)
+
+    @cached_property
+    def log_gross_density(self) -> Floats:
+        """Log-density of a specimen with a gross error, (N,): uniform over twice the ranges."""
+        rows = self.observed.reshape(len(self.observed), -1)
+        width = 2 * (np.nanmax(rows, axis=0) - np.nanmin(rows, axis=0))
+        logs = np.where(np.isnan(rows), 0.0, np.log(np.where(width > 0, width, 1.0)))
+        return np.asarray(-logs.sum(axis=1))
+
+    def draws(self, rng: np.random.Generator, params: Sequence[Floats], n: int) -> Floats:
+        """Draw the emulated readings of n specimens of each population.
 
         Parameters
         ----------
         rng : Generator
-        roots : sequence of ndarray, shapes (P, *shape)
-            Without the group of a specimen: specimens are of the groups of the observed ones.
+        params : sequence of ndarray, shapes (P, *shape)
+            Values of `variables` without the group of a specimen: specimens are of the groups of
+            the observed ones.
         n : int
 
         Returns
         -------
         ndarray, shape (P, n) or (P, n, m)
+            With the error of the readings, and gross errors where the metric has them.
         """
+        count = sum(not is_group(root) for root in self.inputs.roots)
+        roots, extras = params[:count], dict(zip(self.extras, params[count:], strict=True))
         size = len(roots[0])
         if self.groups is None:
             specimens, _ = self._sampler(roots, n, rng)
         else:
             specimens = self._of_groups(rng, roots, n)
         flat = [x.reshape(size * n, *x.shape[2:]) for x in specimens]
-        return self.emulated(flat).reshape(size, n, *self.event)
+        outputs = self.emulated(flat).reshape(size, n, -1)
+        return self._measured(rng, outputs, extras).reshape(size, n, *self.event)
+
+    def _measured(
+        self, rng: np.random.Generator, outputs: Floats, extras: Mapping[str, Floats]
+    ) -> Floats:
+        """Return readings of outputs, (P, n, m): with error, rounding and gross errors."""
+        size, n, m = outputs.shape
+        sd: Any = np.resize(self.readings.error, (n, m))
+        if "error" in extras:
+            sd = extras["error"].reshape(size, 1, -1)
+            sd = sd * np.abs(outputs) if self.metric.relative else sd
+        values = outputs + sd * rng.standard_normal(outputs.shape)
+        step = np.resize(self.readings.step, (n, m))
+        whole = np.where(step > 0, step, 1.0)
+        values = np.where(step > 0, np.round(values / whole) * whole, values)
+        share = extras.get("gross_errors", self.metric.gross_errors)
+        if share is not False:
+            rows = self.observed.reshape(len(self.observed), -1)
+            low, high = np.nanmin(rows, axis=0), np.nanmax(rows, axis=0)
+            anywhere = (low + high) / 2 + (high - low) * (2 * rng.random(outputs.shape) - 1)
+            is_gross = rng.random((size, n)) < np.reshape(share, (-1, 1))
+            values = np.where(is_gross[..., None], anywhere, values)
+        return np.asarray(values)
 
     def _of_groups(
         self, rng: np.random.Generator, roots: Sequence[Floats], n: int
@@ -228,8 +305,17 @@ class SpecimenLikelihood:
                 f"{self.name}: observed: got shape {values.shape}, expected "
                 f"{('N', *self.event)}, as when the simulator was made"
             )
-        readings = self.metric.readings(values.reshape(len(values), -1))
+        rows = values.reshape(len(values), -1)
+        readings = self.metric.readings(rows, reference_error(self.extras), self.event)
         return replace(self, observed=values, readings=readings)
+
+
+def reference_error(extras: Mapping[str, TensorVariable]) -> Floats | None:
+    """Return a plausible value of an unknown reading error: its prior's 84 % quantile."""
+    if "error" not in extras:
+        return None
+    (draws,) = prior_draws([extras["error"]], 512, seed=0)
+    return np.asarray(np.quantile(draws, 0.84, axis=0))
 
 
 def logsumexp_finite(terms: Any) -> TensorVariable:
@@ -309,7 +395,8 @@ class SpecimenRV(RandomVariable):
         likelihood = self.likelihood
         roots = []
         batch: tuple[int, ...] = ()
-        for param, root in zip(params, likelihood.inputs.roots, strict=True):
+        variables = likelihood.variables
+        for param, root in zip(params, variables, strict=True):
             if is_group(root):
                 continue
             leading = param.shape[: param.ndim - root.type.ndim]
@@ -319,7 +406,7 @@ class SpecimenRV(RandomVariable):
         n = len(likelihood.observed) if not shape else shape[-1]
         # The last batch axis is that of the specimens, along which parameters have length one.
         populations = batch[:-1] if batch else ()
-        event_shapes = [r.type.shape for r in likelihood.inputs.roots if not is_group(r)]
+        event_shapes = [r.type.shape for r in variables if not is_group(r)]
         flat = []
         for param, event in zip(roots, event_shapes, strict=True):
             ndim = len(event)
@@ -344,7 +431,7 @@ class SpecimenDistribution(pm.Distribution):
         cls, *params: Any, likelihood: SpecimenLikelihood, size: Any = None, rng: Any = None
     ) -> TensorVariable:
         """Return a random variable that carries a likelihood."""
-        ndims = [r.type.ndim for r in likelihood.inputs.roots]
+        ndims = [r.type.ndim for r in likelihood.variables]
         groups = [
             "(" + ",".join(f"i{k}{axis}" for axis in range(ndim)) + ")"
             for k, ndim in enumerate(ndims)
@@ -378,7 +465,7 @@ def _log_density(
         likelihood = likelihood.observing(data)
     roots = [
         p if is_group(r) else p[(0,) * (p.ndim - r.type.ndim)]
-        for p, r in zip(params, likelihood.inputs.roots, strict=True)
+        for p, r in zip(params, likelihood.variables, strict=True)
     ]
     result = likelihood.log_likelihood(roots)
     if isinstance(value, Constant):

@@ -125,8 +125,8 @@ def _emulated(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) ->
     chains, draws, d = thetas.shape
     drawn = {}
     for k, likelihood in enumerate(evaluator.likelihoods):
-        roots = evaluator.specimen_roots(thetas.reshape(-1, d), k)
-        values = likelihood.draws(rng, roots, len(likelihood.observed))
+        params = evaluator.specimen_params(thetas.reshape(-1, d), k)
+        values = likelihood.draws(rng, params, len(likelihood.observed))
         drawn[likelihood.name] = values.reshape(chains, draws, *values.shape[1:])
     return labelled_responses(evaluator, drawn, (chains, draws))
 

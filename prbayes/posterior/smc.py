@@ -124,7 +124,8 @@ def sample_smc(
     max_seconds : float, optional
         Seconds after which nothing new is begun.
     max_runs : int, optional
-        Largest number of responses to compute, without those found in a store.
+        Largest number of responses to compute, the first runs included; those found in a store
+        do not count.
     checkpoint : path-like, optional
         A file that keeps the state after every stage: a run that was killed goes on from there when
         it is called again, and gives the same draws. Give the propagations a ``store`` as well, so

@@ -17,7 +17,7 @@ material models, Data-Centric Engineering 2, e20, doi:10.1017/dce.2021.20.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from scipy.special import gammaln, logsumexp, ndtri
 from prbayes._checks import AT_ONCE, Floats
 from prbayes.emulators.interpolant import Interpolant, fit_interpolant
 from prbayes.propagation.base import DesignError
+from prbayes.propagation.guards import half_difference, missing_share, predicted_bias
 from prbayes.propagation.points import sobol
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.roots import Response, Roots, find_roots, nearest_starts
@@ -63,7 +64,7 @@ class PointOptions:
     gap: float = 20.0
     points: int = 4
     most_points: int = 4096
-    half_difference: float = 0.15
+    half_difference: float = 0.05
     fresh: int = 16
     bias: float = 0.15
     missing: float = 0.03
@@ -181,11 +182,14 @@ def emulate(
             error = 2 * np.sqrt((misfit[good] ** 2).mean(axis=0))
             error = np.maximum(error, options.floor * spread)
         some = np.flatnonzero(good[: options.fresh])
-        bias = _predicted_bias(
-            misfit[some], jacobian[some], fresh[some], len(readings), readings.comparison_sd(error)
-        )
+        if len(some) >= 4:
+            unit = _typical(readings.comparison_sd(error))
+            scaled = misfit[some] / unit, jacobian[some] / unit[:, None]
+            biases = predicted_bias(*scaled, fresh[some], len(readings))
+            bias = float(np.abs(biases).max())
         z, y = np.concatenate([z, fresh]), np.concatenate([y, outputs])
     assert emulation is not None
+    options, roots = _all_roots(emulation, readings, options, roots, seed)
     if emulation.bias > options.bias:
         raise DesignError(
             f"{name}: got an emulator whose error would shift a mean or standard deviation of an "
@@ -195,6 +199,11 @@ def emulate(
             "propagation=prb.Reweighted(n)"
         )
     return emulation, roots
+
+
+def _typical(sd: Floats) -> Floats:
+    """Return the median of finite values by output, (N, m) -> (m,)."""
+    return np.array([np.median(column[np.isfinite(column)]) for column in sd.T])
 
 
 def _surface(
@@ -222,27 +231,51 @@ def _surface(
     return surface, np.sqrt((surface.left_out[inside] ** 2).mean(axis=0))
 
 
+def _all_roots(
+    emulation: Emulation, readings: Readings, options: PointOptions, roots: Roots, seed: int
+) -> tuple[PointOptions, Roots]:
+    """Double the starts until simulated specimens get their own inputs back."""
+    values = readings.values[np.isfinite(readings.values).all(axis=1)]
+    if len(values) < 2 or readings.values.shape[1] < emulation.z.shape[1]:
+        return options, roots
+
+    def find(y: Floats) -> list[Floats]:
+        simulated = specimen_roots(emulation, Readings.exact(y), options)
+        return [simulated.z[simulated.specimen == i] for i in range(len(y))]
+
+    good = np.isfinite(emulation.y).all(axis=1)
+    box = np.stack([emulation.z[good].min(axis=0), emulation.z[good].max(axis=0)])
+    while options.starts < len(emulation.z):
+        share = missing_share(find, lambda z: emulation(z)[0], box, values, seed=seed)
+        if not share > options.missing:
+            break
+        options = replace(options, starts=2 * options.starts)
+        roots = specimen_roots(emulation, readings, options)
+    return options, roots
+
+
 def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptions) -> Roots:
-    """Return the roots of all specimens on an emulator."""
+    """Return the roots of the specimens with at least as many measured outputs as inputs."""
     good = np.isfinite(emulation.y).all(axis=1)
     run_z, run_y = emulation.z[good], emulation.y[good]
     measured = readings.is_measured
     target = np.where(measured, readings.values, 0.0)
     sd = readings.comparison_sd(emulation.error)
+    solvable = np.flatnonzero(measured.sum(axis=1) >= emulation.z.shape[1])
     parts = []
     # Specimens in blocks, so that memory stays constant.
     block = max(1, AT_ONCE // (options.starts * len(run_z) * 4))
-    for first in range(0, len(readings), block):
-        rows = slice(first, first + block)
+    for first in range(0, len(solvable), block):
+        rows = solvable[first : first + block]
         starts = _starts(run_z, run_y, target[rows], measured[rows], readings.spread(), options.starts)
         roots = find_roots(
             emulation, target[rows], np.where(measured[rows], sd[rows], 1e150), starts,
             emulation.box, gap=options.gap,
         )  # fmt: skip
-        parts.append((roots, first))
+        parts.append((roots, rows))
     names = ("z", "misfit", "residual", "jacobian")
     joined = [np.concatenate([getattr(r, name) for r, _ in parts]) for name in names]
-    specimen = np.concatenate([r.specimen + first for r, first in parts])
+    specimen = np.concatenate([rows[r.specimen] for r, rows in parts])
     return Roots(specimen, *joined)
 
 
@@ -290,25 +323,6 @@ def _fresh_points(
     return np.array(picked) * scale
 
 
-def _predicted_bias(
-    misfit: Floats, jacobian: Floats, z: Floats, size: int, sd: Floats
-) -> float:
-    """Return the predicted bias of a mean or sd of the inputs, in posterior standard deviations."""
-    if len(z) < 4:
-        return np.inf
-    unit = np.where(np.isfinite(sd), sd, np.nan)
-    unit = np.where(np.isnan(unit).all(axis=0), np.inf, np.nanmedian(unit, axis=0))
-    weighted = jacobian / unit[:, None]
-    normal = np.einsum("nmd,nme->nde", weighted, weighted)
-    slope = np.einsum("nmd,nm->nd", weighted, misfit / unit)
-    shift = -np.einsum("nde,ne->nd", np.linalg.pinv(normal, hermitian=True), slope)
-    spread = np.maximum(z.std(axis=0), 1e-300)
-    of_mean = np.abs(shift.mean(axis=0)) / spread * np.sqrt(size)
-    covariance = ((z - z.mean(axis=0)) * shift).mean(axis=0)
-    of_sd = np.abs(covariance + shift.var(axis=0) / 2) / spread**2 * np.sqrt(2 * size)
-    return float(max(of_mean.max(), of_sd.max()))
-
-
 # -- points ------------------------------------------------------------------------------------------
 
 
@@ -349,8 +363,9 @@ class _Components:
     root: Floats  # (R, d, d): lower Cholesky factors of the scale matrices
     log_mass: Floats  # (R,): log of the integral of the readings' density around the root
 
+    @property
     def table(self) -> NDArray[np.intp]:
-        """Return the components of each specimen, (N, most), filled up with -1."""
+        """The components of each specimen, (N, most), filled up with -1."""
         count = np.bincount(self.specimen)
         slot = np.arange(len(self.specimen)) - np.repeat(np.cumsum(count) - count, count)
         table = np.full((len(count), count.max()), -1)
@@ -366,7 +381,7 @@ def draw_points(
     box: Floats,
     options: PointOptions,
     *,
-    normalised: bool = True,
+    error_is_known: bool = True,
     seed: int = 0,
 ) -> SpecimenPoints:
     """Draw points around all roots until two independent halves of them agree.
@@ -377,12 +392,13 @@ def draw_points(
     error : ndarray, shape (m,)
         Standard deviation of its error.
     readings : Readings
-        Every specimen has a root.
+        A specimen without a root, whose readings are censored, gets points of the population.
     roots : Roots
     box : ndarray, shape (2, d)
     options : PointOptions
-    normalised : bool
-        Whether the weights around a root are scaled to its mass, which 256 points measure.
+    error_is_known : bool
+        Whether the error of the readings is the one given; else it is about so large. With a known
+        error the weights around a root are scaled to the root's mass, which 256 points measure.
     seed : int
 
     Raises
@@ -391,17 +407,21 @@ def draw_points(
         If `most_points` are not enough.
     """
     components = _fit_components(emulation, error, readings, roots, box, options, seed)
-    count = options.points
+    count = options.points if error_is_known else 4 * options.points
+    scales = (1.0,) if error_is_known else (0.5, 1.0, 1.3)
     while True:
         halves = [
             _draw(emulation, error, readings, components, max(1, count // 2), options, (seed, h))
             for h in (1, 2)
         ]
-        if normalised:
+        if error_is_known:
             halves = [_normalised(half, components) for half in halves]
         points = _joined(halves)
-        difference = _half_difference(halves, seed)
-        largest = int(points.n_roots.max()) * count
+        difference = max(
+            _difference(halves if k == 1.0 else _of_error(halves, readings, error, k), seed)
+            for k in scales
+        )
+        largest = components.table.shape[1] * count
         if difference <= options.half_difference or 2 * largest > options.most_points:
             break
         count *= 2
@@ -411,9 +431,21 @@ def draw_points(
             f"{difference:.2g} nats, expected at most {options.half_difference}; use another "
             "metric, such as prb.ProbabilityResidual()"
         )
+    n_roots = np.bincount(roots.specimen, minlength=len(readings))
     return SpecimenPoints(
-        points.z, points.outputs, points.log_a, points.log_proposal, points.n_roots, difference
+        points.z, points.outputs, points.log_a, points.log_proposal, n_roots, difference
     )
+
+
+def _of_error(
+    halves: list[_Sample], readings: Readings, error: Floats, factor: float
+) -> list[_Sample]:
+    """Return samples with the weights of another reading error."""
+    other = readings.scaled(factor)
+    return [
+        replace(half, log_a=other.log_density(half.outputs, error) - half.log_proposal)
+        for half in halves
+    ]
 
 
 def _fit_components(
@@ -430,20 +462,71 @@ def _fit_components(
 
     The first scale matrix is that of the Gauss-Newton approximation, within the box. Where the
     weights of 256 points are uneven, as at a turning point of the response, location and scale
-    become their weighted moments, twice.
+    become their weighted moments, twice. Where the readings leave an input about as uncertain as
+    the population does, the component is that of the specimen given a population twice as wide.
     """
-    d = roots.z.shape[1]
+    d = roots.z.shape[1] if len(roots.z) else box.shape[1]
     precision = np.einsum("rmd,rme->rde", roots.jacobian, roots.jacobian)
     precision = precision + np.diag(4.0 / (box[1] - box[0]) ** 2)
     scale = np.linalg.cholesky(1.5 * np.linalg.inv(precision))
     components = _Components(roots.specimen, roots.z, scale, np.zeros(len(scale)))
-    for attempt in range(3):
+    mean, covariance = np.zeros(d), 0.15 * np.eye(d)
+    some = np.unique(roots.specimen)
+    if some.size:
+        # Specimens without a root wait for the population of the others.
+        own = readings.rows(some)
+        rank = _Components(np.searchsorted(some, roots.specimen), *_fields(components)[1:])
+        rank = _moment_matched(emulation, error, own, rank, options, seed, fine)
+        sample = _draw(emulation, error, own, rank, fine, options, (seed, 7))
+        ((mean, root),) = normal_populations(sample.z, sample.log_a, 1, seed, bootstrap=False)
+        covariance = root @ root.T
+        sd = np.sqrt(np.einsum("rde,rde->rd", rank.root, rank.root))
+        if (sd > 0.2 * np.sqrt(np.diag(covariance))).any():
+            wide = np.linalg.inv(4 * covariance)
+            narrow = np.linalg.inv(rank.root @ rank.root.swapaxes(1, 2) / 1.5)
+            combined = np.linalg.inv(narrow + wide)
+            pull = np.einsum("rde,re->rd", narrow, rank.center) + wide @ mean
+            center = np.einsum("rde,re->rd", combined, pull)
+            rank = _Components(
+                rank.specimen, center, np.linalg.cholesky(1.5 * combined), rank.log_mass
+            )
+        components = _Components(some[rank.specimen], *_fields(rank)[1:])
+    without = np.setdiff1d(np.arange(len(readings)), some)
+    if without.size:
+        # Sixteen components of the population stand for as many times the points of a root.
+        specimen = np.repeat(without, 16)
+        center = np.tile(mean, (len(specimen), 1))
+        root = np.tile(2.5 * np.linalg.cholesky(covariance), (len(specimen), 1, 1))
+        added = (specimen, center, root, np.zeros(len(specimen)))
+        joined = [np.concatenate(pair) for pair in zip(_fields(components), added, strict=True)]
+        order = np.argsort(joined[0], kind="stable")
+        components = _Components(*(field[order] for field in joined))
+    sample = _draw(emulation, error, readings, components, fine, options, (seed, 9))
+    _, log_mass = _component_weights(sample, components)
+    return replace(components, log_mass=log_mass)
+
+
+def _fields(components: _Components) -> tuple[Any, ...]:
+    return components.specimen, components.center, components.root, components.log_mass
+
+
+def _moment_matched(
+    emulation: Response,
+    error: Floats,
+    readings: Readings,
+    components: _Components,
+    options: PointOptions,
+    seed: int,
+    fine: int,
+) -> _Components:
+    """Return components with the weighted moments of their points where weights are uneven."""
+    d = components.center.shape[1]
+    for attempt in range(2):
         sample = _draw(emulation, error, readings, components, fine, options, (seed, 3 + attempt))
         weights, log_mass = _component_weights(sample, components)
-        components = _Components(components.specimen, components.center, components.root, log_mass)
         size = 1 / np.maximum((weights**2).sum(axis=1), 1e-300)
         uneven = np.flatnonzero((size < fine / 2) & np.isfinite(log_mass))
-        if attempt == 2 or not uneven.size:
+        if not uneven.size:
             break
         z = _by_component(sample.z, components)[uneven]
         w = weights[uneven]
@@ -457,7 +540,7 @@ def _fit_components(
         new_center, new_root = components.center.copy(), components.root.copy()
         new_center[uneven] = center
         new_root[uneven] = np.linalg.cholesky(covariance + 1e-14 * before)
-        components = _Components(components.specimen, new_center, new_root, log_mass)
+        components = replace(components, center=new_center, root=new_root)
     return components
 
 
@@ -482,7 +565,7 @@ def _draw(
     seed: tuple[int, int],
 ) -> _Sample:
     """Draw points from each component, weighted by the mixture over a specimen's components."""
-    table = components.table()
+    table = components.table
     n, slots = table.shape
     d = components.center.shape[1]
     u = _scrambled(len(components.specimen), count, d + 1, seed)
@@ -535,7 +618,7 @@ def _t_radius(u: Floats, degrees: float) -> Floats:
 
 def _by_component(values: Floats, components: _Components) -> Floats:
     """Return values by component, (R, k, ...), of values by specimen, (N, S * k, ...)."""
-    table = components.table()
+    table = components.table
     n, slots = table.shape
     count = values.shape[1] // slots
     shaped = values.reshape(n, slots, count, *values.shape[2:])
@@ -555,7 +638,7 @@ def _component_weights(sample: _Sample, components: _Components) -> tuple[Floats
 
 def _normalised(sample: _Sample, components: _Components) -> _Sample:
     """Scale the weights of the points around each root to the root's mass."""
-    table = components.table()
+    table = components.table
     n, slots = table.shape
     log_a = sample.log_a.reshape(n, slots, -1)
     total = logsumexp(log_a, axis=2)
@@ -577,25 +660,24 @@ def _joined(halves: list[_Sample]) -> _Sample:
     )
 
 
-def _half_difference(halves: list[_Sample], seed: int, draws: int = 32) -> float:
-    """Return the standard deviation of half the difference of log L between the halves.
-
-    Over normal populations that are fitted to Bayesian bootstrap samples of the specimens.
-    """
+def _difference(halves: list[_Sample], seed: int, draws: int = 32) -> float:
+    """Return the half difference of log L over normal populations of bootstrapped specimens."""
     joint = _joined(halves)
     populations = normal_populations(joint.z, joint.log_a, draws, seed)
-    differences = []
-    for mean, root in populations:
-        a, b = (
-            logsumexp(normal_log_density(half.z, mean, root) + half.log_a, axis=1).sum()
-            for half in halves
+    values = [
+        np.stack(
+            [
+                logsumexp(normal_log_density(half.z, mean, root) + half.log_a, axis=1)
+                for mean, root in populations
+            ]
         )
-        differences.append((a - b) / 2)
-    return float(np.std(differences))
+        for half in halves
+    ]
+    return half_difference(*values)
 
 
 def normal_populations(
-    z: Floats, log_a: Floats, draws: int, seed: int, steps: int = 30
+    z: Floats, log_a: Floats, draws: int, seed: int, steps: int = 30, bootstrap: bool = True
 ) -> list[tuple[Floats, Floats]]:
     """Fit normal populations to Bayesian bootstrap samples of the specimens, by EM.
 
@@ -614,7 +696,7 @@ def normal_populations(
     away = z - start_mean
     start_covariance = np.einsum("nk,nkd,nke->de", weights, away, away) / n + prior
     for _ in range(draws):
-        share = rng.dirichlet(np.ones(n))
+        share = rng.dirichlet(np.ones(n)) if bootstrap else np.full(n, 1 / n)
         mean, covariance = start_mean, start_covariance
         for _ in range(steps):
             log_w = normal_log_density(z, mean, np.linalg.cholesky(covariance)) + log_a

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from first_use import first_use
 
 import prbayes as prb
 from prbayes.model.costing import listening
@@ -60,8 +60,10 @@ def test_nothing_is_computed_and_as_much_is_needed_then(
     assert response.calls == 0
     assert (cost.runs, cost.runs_each, np.isnan(cost.seconds)) == (first, each, True)
     model = build()
+    assert str(prb.cost(model)) == str(cost)
+    assert response.calls == 0
+    first_use(model)
     assert response.calls == first
-    # Of a model that is there the first runs are made.
     again = prb.cost(model)
     assert (again.runs, again.simulators[0].first, again.runs_each) == (0, first, each)
     with model:
@@ -75,7 +77,7 @@ def test_specimens_that_come_again_are_counted_once() -> None:
     build = builder(response, prb.Reweighted(64), x=lambda mu: pm.Poisson.dist(pm.math.exp(mu)))
     cost = prb.cost(build)
     assert cost.runs < 64
-    build()
+    first_use(build())
     assert response.calls == cost.runs
 
 
@@ -95,8 +97,8 @@ def test_a_dry_run_is_one_of_those_that_are_needed_and_goes_on_the_executor(
         assert tried.outputs == {"y": 2 * tried.inputs[0]}
         assert cost.seconds == 11 * tried.seconds
         model = build()
+        (node,) = nodes(model).values()
     assert response.calls == 32
-    (node,) = nodes(model).values()
     (points,) = node.bound.known_points
     rank = int((points < tried.inputs[0]).sum())
     assert rank in (15, 16), "in the middle of 32"
@@ -139,7 +141,9 @@ def test_simulators_that_share_runs_need_them_once() -> None:
     assert (first.first, second.first, cost.runs) == (16, 0, 16)
     assert second.propagation.endswith("with the runs of y")
     assert response.function.calls == 1
-    build()
+    model = build()
+    assert [one.first for one in prb.cost(model).simulators] == [16, 0]
+    first_use(model)
     assert response.function.calls == 17
 
 
@@ -151,16 +155,3 @@ def test_what_is_no_model_is_refused_and_leaves_nothing_behind() -> None:
     assert listening() is None
     with pytest.raises(TypeError, match=r"prb.cost\(\): got no model on the context"):
         prb.cost()
-
-
-def test_the_log_says_what_is_asked_for_before_the_runs(caplog: pytest.LogCaptureFixture) -> None:
-    lines: list[str] = []
-
-    def response(x: float) -> float:
-        lines.append(caplog.text)
-        return x
-
-    with caplog.at_level(logging.INFO, "prbayes"):
-        builder(response, prb.Reweighted(16))()
-    assert "y: Reweighted(n=16" in lines[0]
-    assert "hyperparameters: 0; more: up to 512 in all" in lines[0]

@@ -43,7 +43,7 @@ def test_a_design_is_what_it_was_where_work_is_interrupted(stops: Any, points: i
 
 def test_what_is_kept_is_told(tmp_path: Path) -> None:
     def told(propagation: Any, *also: str) -> str:
-        return kept(Evaluator(build(propagation)[0]), *also)
+        return kept(build(propagation)[0], *also)
 
     assert told(prb.Resimulated(16)) == "nothing is kept: give the propagation a store="
     assert told(prb.Reweighted(16)) == "kept: the responses of the model's designs"
@@ -52,11 +52,11 @@ def test_what_is_kept_is_told(tmp_path: Path) -> None:
 
 
 def test_only_budgets_are_explained() -> None:
-    evaluator = Evaluator(build(prb.Fresh(16))[0])
+    model, _ = build(prb.Fresh(16))
     with (
         pytest.raises(BudgetError, match=r"^prb\.x: spent before there was a result; nothing is"),
-        explained(evaluator, "prb.x"),
+        explained(model, "prb.x"),
     ):
         raise BudgetError("spent")
-    with pytest.raises(ValueError, match=r"^other$"), explained(evaluator, "prb.x"):
+    with pytest.raises(ValueError, match=r"^other$"), explained(model, "prb.x"):
         raise ValueError("other")

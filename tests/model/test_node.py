@@ -16,6 +16,7 @@ import numpy as np
 import pymc as pm
 import pytensor
 import pytest
+from first_use import first_use
 from pymc.logprob.utils import ParameterValueError
 from pymc.model.fgraph import clone_model
 from pymc.model.transform.optimization import freeze_dims_and_data
@@ -244,6 +245,8 @@ def test_a_copy_in_the_same_process_takes_nothing_over() -> None:
 
 def test_operations_are_equal_if_they_carry_the_same_node() -> None:
     first, second = build(prb.Reweighted(64)), build(prb.Reweighted(64))
+    assert first["y"].owner.op == clone_model(first)["y"].owner.op, "before the first use"
+    first_use(first)
     one, other = first["y"].owner.op, second["y"].owner.op
     assert one == clone_model(first)["y"].owner.op
     assert one != other, "two simulators, however alike, are not to be merged in a graph"

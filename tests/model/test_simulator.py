@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from first_use import first_use
 from line_problem import EPSILON, MU, POINTS, QUIET, SIGMA, N, build, line
 from pytensor import config
 from scipy import stats
@@ -292,7 +293,7 @@ def test_reweighted_calls_the_response_n_times_in_all() -> None:
 
 def test_what_is_seen_of_the_data_at_once_is_told(caplog: pytest.LogCaptureFixture) -> None:
     def simulate(observed: Any, specimens: Any = None) -> None:
-        with pm.Model():
+        with pm.Model() as model:
             x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1.0)
             prb.Simulator(
                 "y",
@@ -303,16 +304,20 @@ def test_what_is_seen_of_the_data_at_once_is_told(caplog: pytest.LogCaptureFixtu
                 specimens=specimens,
                 propagation=prb.Reweighted(64),
             )
+        told.append(caplog.text)
+        first_use(model)
 
+    told: list[str] = []
     measured = np.random.default_rng(0).normal(size=10)
     simulate(-1.0 - np.abs(measured))
     assert "y: got observed values from -" in caplog.text
+    assert not told[0], "what is known of responses is told at the first use"
     caplog.clear()
     twice = np.exp(np.tile(measured, 2))
     simulate(twice, np.tile(np.arange(10), 2))
     assert "different" not in caplog.text
     simulate(twice)
-    assert "y: got 20 observed values of which only 10 are different" in caplog.text
+    assert "y: got 20 observed values of which only 10 are different" in told[-1]
 
 
 @pytest.mark.parametrize("response", [line, BlackBox()])
@@ -485,6 +490,8 @@ def two_of_one(propagation: Propagation, second: Any = None) -> tuple[pm.Model, 
 
 def test_simulators_of_one_response_share_their_design_s_runs() -> None:
     model, asked = two_of_one(prb.Reweighted(128))
+    assert not asked
+    first_use(model)
     assert asked == [128]
     first, second = Evaluator(model).nodes
     np.testing.assert_array_equal(first.design.values, second.design.values)
@@ -498,6 +505,7 @@ def test_simulators_of_one_response_share_their_design_s_runs() -> None:
 @pytest.mark.parametrize("propagation", [prb.Resimulated(128), prb.Fresh(128)])
 def test_simulators_of_one_response_share_a_population_s_runs(propagation: Propagation) -> None:
     model, asked = two_of_one(propagation)
+    first_use(model)
     assert sum(size for size in asked if size == 16) == 16  # tried once
     before = len(asked)
     evaluator = Evaluator(model)

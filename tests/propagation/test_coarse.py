@@ -11,6 +11,7 @@ import cloudpickle
 import numpy as np
 import pymc as pm
 import pytest
+from first_use import first_use
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
@@ -185,7 +186,7 @@ def counted(a: Any, b: Any, scale: Any) -> Any:
 def test_what_is_no_coarse_response_is_refused_before_any_run(beside: Any, told: str) -> None:
     RUNS.clear()
     with pytest.raises((ResponseError, TypeError), match=told):
-        build(beside, counted)
+        first_use(build(beside, counted))
     assert sum(RUNS) == 0
 
 
@@ -200,7 +201,7 @@ def test_several_outputs_are_followed_one_by_one() -> None:
     design = design_of(build(coarse_both, both, observed=observed))
     assert "It follows the coarse response in 1 of 2 outputs." in design.told
     with pytest.raises(ResponseError, match=r"y: coarse: .* expected \(\d+, 2\): 2 outputs"):
-        build(coarse, both, observed=observed)
+        first_use(build(coarse, both, observed=observed))
 
 
 def test_what_cannot_follow_is_refused() -> None:

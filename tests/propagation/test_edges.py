@@ -10,6 +10,7 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
+from first_use import first_use
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
@@ -47,7 +48,8 @@ def stored(dist: Callable[[], Any], **keywords: Any) -> Any:
         observed = np.linspace(0.5, 1.5, 20)
         common = {"metric": prb.AreaMetric(), "observed": observed}
         prb.Simulator("y", np.positive, dist(), propagation=prb.Reweighted(64), **common)
-    return Evaluator(model).nodes[0].bound
+    (node,) = first_use(model).values()
+    return node.bound
 
 
 def test_cells_meet_half_way_and_have_the_outermost_points_in_their_middle() -> None:

@@ -9,6 +9,7 @@ import pymc as pm
 import pytensor.tensor as pt
 import pytest
 import xarray as xr
+from first_use import first_use
 from scipy.special import logsumexp
 from scipy.stats import norm
 
@@ -349,8 +350,8 @@ def around_the_truth(size: int = 128) -> Floats:
 def test_refinement_of_two_correlated_inputs(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, logger="prbayes"):
         model, responses = hard(AREA)
-    assert [r.count for r in responses] == [512, 512]
     evaluator, thetas = Evaluator(model), around_the_truth()
+    assert [r.count for r in responses] == [512, 512]
     short = shortcomings(evaluator, thetas)
     assert set(short) == {"sum", "difference"}
     assert short["sum"].ess is not None
@@ -471,7 +472,7 @@ def test_a_wide_population_is_refused_where_a_narrow_design_may_not_grow() -> No
 def test_many_inputs_are_told_what_to_use(caplog: pytest.LogCaptureFixture) -> None:
     for k in (2, 5):
         caplog.clear()
-        with pm.Model():
+        with pm.Model() as model:
             x = pm.MvNormal.dist(pm.Normal("mu", 0, 3, shape=k), 0.1 * np.eye(k))
             observed = [0.0, 1.0, 2.0]
             prb.Simulator(
@@ -480,6 +481,7 @@ def test_many_inputs_are_told_what_to_use(caplog: pytest.LogCaptureFixture) -> N
                 observed=observed,
                 propagation=prb.Reweighted(emulator=None),
             )
+        first_use(model)
         assert ("5 inputs are many for stored responses alone: leave out" in caplog.text) == (
             k == 5
         )
@@ -756,13 +758,12 @@ def test_a_mixture_is_reweighted() -> None:
 
 
 def test_bounds_that_have_probability_and_move_are_refused() -> None:
-    with pm.Model():
+    with pm.Model() as model:
         s = pm.HalfNormal("s", 1)
         x = pm.Censored.dist(pm.Normal.dist(0.0, 1.0), lower=-s, upper=s)
-        with pytest.raises(
-            TypeError, match=r"values that move .* use propagation=prb.Resimulated\(\)"
-        ):
-            prb.Simulator("y", same, x, metric=AREA, observed=OBSERVED)
+        prb.Simulator("y", same, x, metric=AREA, observed=OBSERVED)
+    with pytest.raises(TypeError, match=r"values that move .* use propagation=prb.Resimulated\(\)"):
+        first_use(model)
 
 
 def test_data_that_were_set_anew_are_refused_where_points_are_added() -> None:

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from first_use import first_use
 
 import prbayes as prb
 from prbayes.model.node import nodes
@@ -56,6 +57,7 @@ def model(response: Any, propagation: Any = None, **keywords: Any) -> pm.Model:
             observed=[1, 2, 3, 5.0],
             propagation=propagation,
         )
+    first_use(found)
     return found
 
 
@@ -150,8 +152,8 @@ def test_a_multivariate_input_arrives_whole_at_a_scalar_function() -> None:
             observed=[1, 2.0],
             propagation=prb.Reweighted(N),
         )
-    assert shapes == {(2,)}
     assert (stored(found) > 0).all()
+    assert shapes == {(2,)}
 
 
 def line(n: int) -> Points:
@@ -394,15 +396,16 @@ def test_a_failure_says_where() -> None:
     def root(x: float, y: float) -> float:
         return math.sqrt(x) + y  # which there is none of
 
-    with pm.Model():
+    with pm.Model() as found:
         inputs = [pm.Normal.dist(pm.Normal(name, 0, 1), 1.0) for name in ("mu", "nu")]
         given = {"metric": prb.AreaMetric(), "observed": [1.0, 2.0, 3.0]}
-        with pytest.raises(
-            prb.response.ResponseError,
-            match=r"failed at 1 point\(s\), the first with inputs \(-[\d.]+, -?[\d.]+\): it raised "
-            r"ValueError.*; repair it, keep priors and inputs where it has a response, or pass",
-        ) as raised:
-            prb.Simulator("y", prb.scalar(root), *inputs, **given)
+        prb.Simulator("y", prb.scalar(root), *inputs, **given)
+    with pytest.raises(
+        prb.response.ResponseError,
+        match=r"failed at 1 point\(s\), the first with inputs \(-[\d.]+, -?[\d.]+\): it raised "
+        r"ValueError.*; repair it, keep priors and inputs where it has a response, or pass",
+    ) as raised:
+        first_use(found)
     x, y = map(float, re.findall(r"inputs \((.*?), (.*?)\)", str(raised.value))[0])
     with pytest.raises(ValueError, match="math domain"):
         root(x, y)

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from first_use import first_use
 
 import prbayes as prb
 from prbayes.response.inputs import read_inputs
@@ -16,13 +17,14 @@ OBSERVED = np.linspace(-1, 1, 20)
 def simulate(
     response: Any, *, observed: Any = OBSERVED, metric: Any = None, **keywords: Any
 ) -> None:
-    with pm.Model():
+    with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0, 1), 1)
         metric = metric or prb.AreaMetric()
         propagation = prb.Reweighted(64)
         prb.Simulator(
             "y", response, x, metric=metric, observed=observed, propagation=propagation, **keywords
         )
+    first_use(model)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from first_use import first_use
 
 import prbayes as prb
 from prbayes.model.node import nodes
@@ -136,10 +137,11 @@ def test_a_result_file_that_is_malformed_is_told_with_the_files_that_are_there(
     with pytest.raises(RuntimeError, match=text):
         run(2.0)
     # Before the long work: the first specimen ends the study.
-    with pm.Model():
+    with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu", 0.9, 0.1), 0.5)
-        with pytest.raises(prb.response.ResponseError, match=rf"^y: .*at 1 point.*{text}"):
-            prb.Simulator("y", run, x, metric=prb.AreaMetric(), observed=[0.1, 0.5, 0.8])
+        prb.Simulator("y", run, x, metric=prb.AreaMetric(), observed=[0.1, 0.5, 0.8])
+    with pytest.raises(prb.response.ResponseError, match=rf"^y: .*at 1 point.*{text}"):
+        first_use(model)
 
 
 @pytest.mark.exact

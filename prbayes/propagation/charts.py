@@ -1,0 +1,498 @@
+"""Charts of fibres: local coordinates of the solutions of f(x) = y for fewer outputs than inputs.
+
+A chart describes a part of the fibre {x : f(x) = y} by d - m free coordinates; Newton's method
+solves for the m others. `prbayes.propagation.fibre` derives the density that charts lead to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln, logsumexp, ndtri
+
+from prbayes._checks import Floats
+from prbayes.propagation.points import sobol
+
+Response = Callable[[Floats], tuple[Floats, Floats]]
+"""Inputs (n, d) to outputs (n, m) and Jacobians (n, m, d); NaN where the response has no value."""
+
+Indices = NDArray[np.intp]
+
+# Degrees of freedom of the t distributions; 5 and 20 gave the same effective sample sizes.
+DEGREES = 8.0
+# Inflation of a chart's covariance against that of its weighted points; 1.1 and 1.5 gave the same.
+INFLATION = 1.3
+
+
+@dataclass(frozen=True, eq=False)
+class ReferencePopulation:
+    """Normal population in which inputs are whitened, x = mean + root z.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (d,)
+    root : ndarray, shape (d, d)
+        Lower Cholesky factor of the covariance.
+    """
+
+    mean: Floats
+    root: Floats
+
+    @classmethod
+    def from_sample(cls, x: Floats, weights: Floats | None = None) -> ReferencePopulation:
+        """Return the population with the mean and covariance of a sample.
+
+        For the predictive population of posterior draws, let `x` be inputs drawn for each draw of
+        theta. A Laplace approximation in place of draws is too narrow if the posterior is skewed.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n, d)
+        weights : ndarray, shape (n,), optional
+            Positive, of any sum.
+
+        Raises
+        ------
+        ValueError
+            If the covariance is singular.
+        """
+        weights = np.full(len(x), 1 / len(x)) if weights is None else weights / weights.sum()
+        mean = weights @ x
+        centred = x - mean
+        covariance = (centred.T * weights) @ centred
+        sd = np.sqrt(np.diagonal(covariance))
+        if np.all(sd > 0):
+            # Scaled, so that units of the inputs do not decide what counts as singular.
+            correlation = covariance / np.outer(sd, sd)
+            if np.linalg.eigvalsh(correlation)[0] > 1e-10:
+                return cls(mean, sd[:, None] * np.linalg.cholesky(correlation))
+        raise ValueError(
+            f"covariance of the inputs: got a singular matrix from {len(x)} points, expected "
+            f"{x.shape[1]} linearly independent inputs that vary: pass more points"
+        )
+
+    def inputs(self, z: Floats) -> Floats:
+        """Return the inputs (..., d) at whitened inputs (..., d)."""
+        return self.mean + z @ self.root.T
+
+    def with_errors(self, outputs: int) -> ReferencePopulation:
+        """Return the population of inputs and standard normal reading errors, of d + m inputs.
+
+        Parameters
+        ----------
+        outputs : int
+            Number m of reading errors, as `with_error` adds them to a response.
+        """
+        d = len(self.mean)
+        root = np.eye(d + outputs)
+        root[:d, :d] = self.root
+        return ReferencePopulation(np.concatenate([self.mean, np.zeros(outputs)]), root)
+
+
+@dataclass(frozen=True, eq=False)
+class Fibres:
+    """Fibres {z : g(z) = y_i} of N specimens in whitened inputs.
+
+    g is the response divided by `unit`, as a function of z. No number of this class depends on
+    more than one specimen, and all of them are free of the units of inputs and outputs.
+
+    Attributes
+    ----------
+    response : Response
+    population : ReferencePopulation
+    unit : ndarray, shape (m,)
+        Spread of the outputs in the reference population.
+    y : ndarray, shape (N, m)
+        Measured outputs, divided by `unit`.
+    """
+
+    response: Response
+    population: ReferencePopulation
+    unit: Floats
+    y: Floats
+
+    @classmethod
+    def of(cls, response: Response, y: Floats, population: ReferencePopulation) -> Fibres:
+        """Return the fibres of measured outputs y, (N, m)."""
+        z = ndtri(sobol(64, len(population.mean), 0))
+        values, _ = cls(response, population, np.ones(y.shape[1]), y).outputs(z)
+        values = values[np.isfinite(values).all(axis=1)]
+        unit = np.ones(y.shape[1])
+        if len(values) > 1:
+            # Quantiles, as a pole of the response makes the standard deviation arbitrary.
+            low, high = np.quantile(values, [0.16, 0.84], axis=0)
+            unit = np.where(high > low, (high - low) / 2, 1.0)
+        return cls(response, population, unit, y / unit)
+
+    def subset(self, specimens: slice) -> Fibres:
+        """Return the fibres of some of the specimens."""
+        return Fibres(self.response, self.population, self.unit, self.y[specimens])
+
+    def outputs(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return g(z), (n, m), and its Jacobian, (n, m, d); NaN where either is not finite."""
+        with np.errstate(all="ignore"):
+            values, jacobian = self.response(self.population.inputs(z))
+            values = values / self.unit
+            jacobian = (jacobian / self.unit[:, None]) @ self.population.root
+            # Determinants of larger numbers overflow.
+            usable = (np.abs(values) < 1e12).all(axis=1) & (np.abs(jacobian) < 1e12).all(
+                axis=(1, 2)
+            )
+        values = np.where(usable[:, None], values, np.nan)
+        return values, np.where(usable[:, None, None], jacobian, np.nan)
+
+    def solve(
+        self, specimen: Indices, z: Floats, directions: Floats | None = None
+    ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """Move z onto fibres by at most 15 Newton steps, at most one unit long.
+
+        The same start always gives the same point. Convergence is judged by the length of the
+        step, in units of the population: a tolerance relative to the range of y depends on the
+        batch, and counted points of two charts twice.
+
+        Parameters
+        ----------
+        specimen : ndarray, shape (n,)
+        z : ndarray, shape (n, d)
+        directions : ndarray, shape (n, d, m), optional
+            Span of the steps; by default that of the Jacobian's rows (steps of least norm).
+
+        Returns
+        -------
+        tuple
+            Points (n, d), Jacobians there (n, m, d), and which of them converged (n,).
+        """
+        z = z.copy()
+        jacobian = np.zeros((len(z), self.y.shape[1], z.shape[1]))
+        converged = np.zeros(len(z), dtype=bool)
+        active = np.arange(len(z))
+        for _ in range(15):
+            if not active.size:
+                break
+            values, slopes = self.outputs(z[active])
+            span = slopes.transpose(0, 2, 1) if directions is None else directions[active]
+            coefficients = solve_each(slopes @ span, self.y[specimen[active]] - values)
+            with np.errstate(all="ignore"):
+                step = (span @ coefficients[..., None])[..., 0]
+                length = np.sqrt((step**2).sum(axis=1))
+            # Beyond 12 standard deviations no population of interest has mass.
+            usable = np.isfinite(length) & (np.abs(z[active]) < 12).all(axis=1)
+            active, step, length = active[usable], step[usable], length[usable]
+            jacobian[active] = slopes[usable]
+            z[active] += step / np.maximum(length, 1)[:, None]
+            converged[active] = length < 1e-8
+            active = active[length >= 1e-8]
+        return z, jacobian, converged
+
+
+@dataclass(frozen=True, eq=False)
+class Charts:
+    """Charts of the fibres of N specimens, at most C for each.
+
+    Chart c of specimen i maps free coordinates u to
+
+        z = centre + free u + solved w(u),    w(u) such that g(z) = y_i,
+
+    and u has a t distribution as proposal. The proposal of a specimen is the mixture of its charts.
+    Arrays of some charts have the shape (n, ...) in place of (N, C, ...).
+
+    Attributes
+    ----------
+    centre : ndarray, shape (N, C, d)
+    free, solved : ndarray, shapes (N, C, d, d - m) and (N, C, d, m)
+        Orthonormal columns; at first null space and row space of the Jacobian at the centre.
+    location, scale : ndarray, shapes (N, C, d - m) and (N, C, d - m, d - m)
+        Of the t distribution; `scale` is a lower Cholesky factor.
+    share : ndarray, shape (N, C)
+        Mixing weight, zero where there is no chart.
+    """
+
+    centre: Floats
+    free: Floats
+    solved: Floats
+    location: Floats
+    scale: Floats
+    share: Floats
+
+    @classmethod
+    def empty(cls, n: int, charts: int, d: int, m: int) -> Charts:
+        """Return arrays of n specimens without a chart."""
+        k = d - m
+        shapes = (d,), (d, k), (d, m), (k,)
+        centre, free, solved, location = (np.zeros((n, charts, *shape)) for shape in shapes)
+        scale = np.tile(np.eye(k), (n, charts, 1, 1))
+        return cls(centre, free, solved, location, scale, np.zeros((n, charts)))
+
+    @classmethod
+    def concatenated(cls, parts: list[Charts]) -> Charts:
+        """Return the charts of all specimens of the parts."""
+        return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
+
+    def subset(self, specimens: slice) -> Charts:
+        """Return the charts of some of the specimens."""
+        return Charts(*(getattr(self, f.name)[specimens] for f in fields(self)))
+
+    def including(self, specimen: Indices, slot: Indices, charts: Charts) -> Charts:
+        """Return charts in which (specimen, slot), both (n,), is replaced by `charts`, (n, ...).
+
+        All charts of a specimen get the same share.
+        """
+        arrays = {f.name: getattr(self, f.name).copy() for f in fields(self)}
+        for name, array in arrays.items():
+            array[specimen, slot] = getattr(charts, name)
+        present = arrays["share"] > 0
+        arrays["share"] = present / np.maximum(present.sum(axis=1, keepdims=True), 1)
+        return Charts(**arrays)
+
+    def points(
+        self, fibres: Fibres, specimen: Indices, slot: Indices, u: Floats
+    ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """Return the points at free coordinates u, (n, d - m), as `Fibres.solve` does."""
+        start = self.centre[specimen, slot] + (self.free[specimen, slot] @ u[..., None])[..., 0]
+        return fibres.solve(specimen, start, self.solved[specimen, slot])
+
+    def coordinates(self, specimen: Indices, slot: Indices, z: Floats) -> Floats:
+        """Return the free coordinates (n, d - m) of points z, (n, d)."""
+        away = z - self.centre[specimen, slot]
+        return (away[:, None, :] @ self.free[specimen, slot])[:, 0]
+
+    def reach(
+        self, fibres: Fibres, specimen: Indices, slot: Indices, u: Floats, z: Floats
+    ) -> NDArray[np.bool_]:
+        """Return whether the charts map u, (n, d - m), to the points z, (n, d), of their fibre."""
+        end, _, converged = self.points(fibres, specimen, slot, u)
+        return converged & (np.abs(end - z).max(axis=1) < 1e-5)
+
+    def log_mixture(
+        self, fibres: Fibres, specimen: Indices, slot: Indices, z: Floats, jacobian: Floats
+    ) -> Floats:
+        """Return the log-density of the proposal at its points, by the balance heuristic.
+
+        The density is with respect to the fibre's volume over sqrt(det J J'), the same measure in
+        every chart: the sum of share t(u) |det(J solved)| over the charts that reach the point.
+
+        Parameters
+        ----------
+        fibres : Fibres
+        specimen, slot : ndarray, shape (n,)
+            Chart that the point was drawn from.
+        z, jacobian : ndarray, shapes (n, d) and (n, m, d)
+
+        Returns
+        -------
+        ndarray, shape (n,)
+        """
+        k = self.location.shape[-1]
+        inverse = np.linalg.inv(self.scale)
+        constant = (
+            gammaln((DEGREES + k) / 2) - gammaln(DEGREES / 2) - k / 2 * np.log(DEGREES * np.pi)
+        )
+        with np.errstate(divide="ignore"):
+            constant = constant + np.log(np.diagonal(inverse, axis1=2, axis2=3)).sum(axis=2)
+            constant = constant + np.log(self.share)
+        n, charts = len(z), self.share.shape[1]
+        terms = np.full((n, charts), -np.inf)
+        u = np.zeros((n, charts, k))
+        for c in range(charts):
+            rows = np.flatnonzero(self.share[specimen, c] > 0)
+            i, j = specimen[rows], np.full(len(rows), c)
+            u[rows, c] = self.coordinates(i, j, z[rows])
+            scaled = inverse[i, c] @ (u[rows, c] - self.location[i, c])[..., None]
+            distance = (scaled[..., 0] ** 2).sum(axis=1)
+            with np.errstate(divide="ignore"):
+                log_det = np.log(np.abs(np.linalg.det(jacobian[rows] @ self.solved[i, c])))
+            log_t = constant[i, c] - (DEGREES + k) / 2 * np.log1p(distance / DEGREES)
+            terms[rows, c] = log_t + log_det
+        # Only charts whose term matters need the check that they reach the point.
+        terms[terms < terms[np.arange(n), slot][:, None] - 10] = -np.inf
+        for c in range(charts):
+            rows = np.flatnonzero((terms[:, c] > -np.inf) & (slot != c))
+            j = np.full(len(rows), c)
+            reached = self.reach(fibres, specimen[rows], j, u[rows, c], z[rows])
+            terms[rows[~reached], c] = -np.inf
+        return np.asarray(logsumexp(terms, axis=1))
+
+
+def solve_each(matrices: Floats, right: Floats) -> Floats:
+    """Return the solutions (n, m) of n linear systems, NaN where a matrix is singular."""
+    if matrices.shape[-1] == 1:
+        with np.errstate(all="ignore"):
+            return right / matrices[..., 0]
+    try:
+        return np.linalg.solve(matrices, right[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        with np.errstate(all="ignore"):
+            singular = np.linalg.det(matrices) == 0
+        safe = np.where(singular[:, None, None], np.eye(matrices.shape[-1]), matrices)
+        solution = np.linalg.solve(safe, right[..., None])[..., 0]
+        return np.where(singular[:, None], np.nan, solution)
+
+
+def charts_at_modes(fibres: Fibres, starts: int, charts: int) -> Charts:
+    """Return charts at the modes of the reference population on the fibres.
+
+    Levenberg-Marquardt from z = 0 and Sobol points finds the modes. Modes within 8 nats of the
+    best, and .7 apart from better ones, get a chart: at most four for a specimen.
+
+    Parameters
+    ----------
+    fibres : Fibres
+    starts : int
+        For each specimen.
+    charts : int
+        Largest number of charts of a specimen.
+    """
+    n, m = fibres.y.shape
+    d = len(fibres.population.mean)
+    first = np.concatenate([np.zeros((1, d)), ndtri(sobol(starts, d, 0))])[:starts]
+    specimen = np.repeat(np.arange(n), starts)
+    z = _levenberg_marquardt(fibres, specimen, np.tile(first, (n, 1)))
+    z, jacobian, converged = fibres.solve(specimen, z)
+    log_density = np.where(converged, -(z**2).sum(axis=1) / 2, -np.inf).reshape(n, starts)
+    best = log_density.max(axis=1)
+
+    order = np.argsort(-log_density, axis=1, kind="stable")
+    modes = np.full((n, min(4, charts), d), np.inf)
+    source = np.full(modes.shape[:2], -1)
+    count = np.zeros(n, dtype=int)
+    for rank in range(starts):
+        row = np.arange(n) * starts + order[:, rank]
+        value = log_density.ravel()[row]
+        distance = np.sqrt(((z[row, None] - modes) ** 2).sum(axis=2)).min(axis=1)
+        accepted = np.isfinite(value) & (value > best - 8) & (distance > 0.7)
+        i = np.flatnonzero(accepted & (count < modes.shape[1]))
+        modes[i, count[i]], source[i, count[i]] = z[row[i]], row[i]
+        count[i] += 1
+
+    i, slot = np.nonzero(source >= 0)
+    row = source[i, slot]
+    new = _charts_at(fibres, z[row], jacobian[row])
+    return Charts.empty(n, charts, d, m).including(i, slot, new)
+
+
+def _levenberg_marquardt(fibres: Fibres, specimen: Indices, z: Floats) -> Floats:
+    """Minimise |z|^2 + |(g(z) - y) / .05|^2, in which the population is the weak term."""
+    weight = 1 / 0.05
+    y = fibres.y[specimen] * weight
+    z = z.copy()
+    values, jacobian = fibres.outputs(z)
+    residual, slopes = y - values * weight, jacobian * weight
+    cost = (residual**2).sum(axis=1) + (z**2).sum(axis=1)
+    damping = np.full(len(z), 1e-2)
+    active = np.flatnonzero(np.isfinite(cost))
+    for _ in range(25):
+        if not active.size:
+            break
+        transposed = slopes[active].transpose(0, 2, 1)
+        gradient = (transposed @ residual[active][..., None])[..., 0] - z[active]
+        hessian = transposed @ slopes[active]
+        hessian += (1 + damping[active])[:, None, None] * np.eye(z.shape[1])
+        trial = z[active] + solve_each(hessian, gradient)
+        values, jacobian = fibres.outputs(trial)
+        trial_residual = y[active] - values * weight
+        trial_cost = (trial_residual**2).sum(axis=1) + (trial**2).sum(axis=1)
+        better = trial_cost < cost[active]  # False for NaN
+        gain = cost[active] - trial_cost
+        rows = active[better]
+        z[rows], cost[rows] = trial[better], trial_cost[better]
+        residual[rows], slopes[rows] = trial_residual[better], jacobian[better] * weight
+        damping[active] = np.clip(damping[active] * np.where(better, 0.1, 10), 1e-6, 1e8)
+        active = active[~(better & (gain < 1e-6))]
+    return z
+
+
+def cover(fibres: Fibres, charts: Charts, normal: Floats) -> Charts:
+    """Add charts until random points of the fibres are covered, at most three for a specimen.
+
+    A chart covers a point if it reaches the point, and if the Jacobian there is not steep to the
+    chart: |det(J solved)| >= .3 sqrt(det J J'). The most probable point that no chart covers gets
+    a chart. Other sheets are detected thus, and turns, where the weights of a chart diverge.
+
+    Parameters
+    ----------
+    fibres : Fibres
+    charts : Charts
+    normal : ndarray, shape (N, tries, d)
+        Standard normal numbers. The first half of the tries start from them, the others within
+        .5 of the first mode: random points miss the far side of a small closed fibre beside an extremum.
+    """
+    n, tries, d = normal.shape
+    specimen = np.repeat(np.arange(n), tries)
+    nearby = charts.centre[:, :1] + 0.5 * normal
+    # The first half, as even points of a Sobol sequence lie in one half of the space.
+    start = np.where(np.arange(tries)[:, None] < tries / 2, normal, nearby).reshape(-1, d)
+    z, jacobian, converged = fibres.solve(specimen, start)
+    log_density = -(z**2).sum(axis=1) / 2
+    present = charts.share > 0
+    modes = np.where(present, -(charts.centre**2).sum(axis=2) / 2, -np.inf)
+    rows = np.flatnonzero(converged & (log_density > modes.max(axis=1)[specimen] - 8))
+    rows = rows[np.argsort(-log_density[rows], kind="stable")]  # most probable first
+    volume = np.zeros(len(z))
+    volume[rows] = np.sqrt(np.linalg.det(jacobian[rows] @ jacobian[rows].transpose(0, 2, 1)))
+    rows = rows[volume[rows] > 0]
+
+    def uncovered(rows: Indices, slot: Indices) -> Indices:
+        """Return the points that chart `slot` of their specimen does not cover."""
+        i = specimen[rows]
+        cosine = np.abs(np.linalg.det(jacobian[rows] @ charts.solved[i, slot])) / volume[rows]
+        covered = cosine >= 0.3
+        near, near_slot = rows[covered], slot[covered]
+        u = charts.coordinates(specimen[near], near_slot, z[near])
+        covered[covered] = charts.reach(fibres, specimen[near], near_slot, u, z[near])
+        remaining: Indices = rows[~covered]
+        return remaining
+
+    for c in range(present.shape[1]):
+        has_chart = present[specimen[rows], c]
+        remaining = uncovered(rows[has_chart], np.full(has_chart.sum(), c))
+        rows = rows[~has_chart | np.isin(rows, remaining)]
+    for _ in range(3):
+        count = (charts.share > 0).sum(axis=1)
+        rows = rows[count[specimen[rows]] < charts.share.shape[1]]
+        pick = rows[np.unique(specimen[rows], return_index=True)[1]]
+        if not pick.size:
+            break
+        i = specimen[pick]
+        charts = charts.including(i, count[i], _charts_at(fibres, z[pick], jacobian[pick]))
+        rows = uncovered(rows, count[specimen[rows]])
+    return charts
+
+
+def _charts_at(fibres: Fibres, z: Floats, jacobian: Floats) -> Charts:
+    """Return charts at points of the fibres, (n, d), with the Laplace approximation of u.
+
+    log p(u) = -|z(u)|^2 / 2 - log |det J solved| has a Hessian and a slope that follow from
+    Jacobians beside the centre. The second derivative of the determinant is left out, and
+    eigenvalues of the covariance are clipped: weighted points correct both later.
+    """
+    n, m, d = jacobian.shape
+    right = np.linalg.svd(jacobian)[2].transpose(0, 2, 1)
+    solved, free = right[..., :m], right[..., m:]
+    square = jacobian @ solved
+    radial = (z[:, None, :] @ solved)[:, 0]
+    multiplier = solve_each(square.transpose(0, 2, 1), radial)  # of the constraint g(z) = y
+    slope = -(z[:, None, :] @ free)[:, 0]
+    curvature = np.empty((n, d - m, d - m))
+    step = 1e-3
+    for a in range(d - m):
+        ahead = fibres.outputs(z + step * free[..., a])[1]
+        behind = fibres.outputs(z - step * free[..., a])[1]
+        change = (ahead - behind) / (2 * step)
+        curvature[:, a] = (multiplier[:, None, :] @ change @ free)[:, 0]
+        for o in range(m):
+            # trace(square^-1 change solved), by columns
+            column = solve_each(square, (change @ solved)[..., o])
+            slope[:, a] -= column[:, o]
+    # NaN beside the range of the response, or at a singular Jacobian
+    bad = ~(np.isfinite(curvature).all(axis=(1, 2)) & np.isfinite(slope).all(axis=1))
+    curvature[bad], slope[bad] = 0, 0
+    hessian = np.eye(d - m) - (curvature + curvature.transpose(0, 2, 1)) / 2
+    precision, axes = np.linalg.eigh(hessian)
+    variance = 1 / np.clip(precision, 1 / 1.5, 1 / 0.3)
+    covariance = (axes * variance[:, None, :]) @ axes.transpose(0, 2, 1)
+    shift = (covariance @ slope[..., None])[..., 0]
+    shift /= np.maximum(np.sqrt((shift**2).sum(axis=1, keepdims=True)), 1)
+    return Charts(z, free, solved, shift, np.linalg.cholesky(INFLATION * covariance), np.ones(n))

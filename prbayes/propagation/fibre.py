@@ -1,0 +1,448 @@
+r"""Importance points on the fibres {x : f(x) = y_i} of specimens, for fewer outputs than inputs.
+
+The density of a measured specimen is an integral over the fibre of its inputs,
+
+.. math:: p(y_i | \theta) = \int p(x | \theta) \delta(f(x) - y_i) dx
+          \approx \sum_k \exp(A_{ik}) p(x_{ik} | \theta), \quad f(x_{ik}) = y_i, \qquad (1)
+
+with points and numbers A that do not contain theta. A response with m outputs of d inputs, m < d,
+is g(z) in the inputs x = mean + L z that a reference population whitens; J is its Jacobian.
+
+**Coarea formula.** Let (F, R) be orthonormal, with d - m and m columns, and z = z* + F u + R w.
+Then dx = |L| du dw. The delta function integrates over w at fixed u, where dg/dw = J R:
+
+.. math:: p(y | \theta) = \int \frac{|L|}{|\det J R|} p(x(u) | \theta) du. \qquad (2)
+
+On the fibre dw/du = W = -(J R)^-1 J F, and its volume is dV = sqrt(det(I + W'W)) du. As
+J J' = J R (I + W W') R'J', dV / sqrt(det J J') = du / |det J R|: the measure of (2) is that of the
+coarea formula [1]_, the same in every chart. The proposal t(u) of a chart has the density
+t |det J R| with respect to this measure, so a mixture of charts j with the weights s_j gives, by
+the balance heuristic [2]_,
+
+.. math:: A_{ik} = \log |L| - \log K - \log \sum_j s_j t_j(u_j) |\det J R_j|. \qquad (3)
+
+The sum is over the charts that map u_j = F_j'(z - z*_j) to the point.
+
+**Accuracy.** Errors of specimens add up, so effective sample sizes do not show the error of the
+log-likelihood. Use K = 256 first, then compare two sets of points with different seeds, and join
+more of them until they agree. Theta far outside the reference population needs a new one: let its
+moments come from weighted posterior draws (`ReferencePopulation.from_sample`, `moments_of`), twice.
+A small closed fibre beside an extremum of the response can be missed, and no number shows it.
+
+Papadimas and Dodwell [3]_ integrate over the inputs of specimens by an emulator and quadrature.
+
+References
+----------
+.. [1] Diaconis, P., Holmes, S. and Shahshahani, M. (2012), Sampling from a manifold,
+   arXiv:1206.6913.
+.. [2] Veach, E. and Guibas, L. J. (1995), Optimally combining sampling techniques for Monte Carlo
+   rendering, doi:10.1145/218380.218498.
+.. [3] Papadimas, N. and Dodwell, T. (2021), A hierarchical Bayesian approach for calibration of
+   stochastic material models, Data-Centric Engineering 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincinv, logsumexp, ndtri
+
+from prbayes._checks import Floats
+from prbayes.propagation.charts import (
+    DEGREES,
+    INFLATION,
+    Charts,
+    Fibres,
+    Indices,
+    ReferencePopulation,
+    Response,
+    charts_at_modes,
+    cover,
+)
+from prbayes.propagation.points import sobol
+
+__all__ = [
+    "FibrePoints",
+    "FibreProposal",
+    "ReferencePopulation",
+    "Response",
+    "fit_fibres",
+    "joined",
+    "moments_of",
+    "with_error",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class FibrePoints:
+    """K importance points on the fibre of each of N specimens.
+
+    log L_i(theta) = logsumexp_k(log p(x_ik | theta) + log_a_ik).
+
+    Attributes
+    ----------
+    x : ndarray, shape (N, K, d)
+        Inputs; the mean of the reference population for points of weight zero.
+    log_a : ndarray, shape (N, K)
+        Logarithms of the importance numbers, minus log K; -inf for points of weight zero.
+    failed_share : float
+        Share of Newton solves without a solution, of specimens that have charts.
+    chart : ndarray of int, shape (N, K)
+        Chart of the specimen that made the point.
+    """
+
+    x: Floats
+    log_a: Floats
+    failed_share: float
+    chart: Indices
+
+    @property
+    def has_points(self) -> NDArray[np.bool_]:
+        """Whether a specimen has points on its fibre, (N,); its likelihood is zero if not."""
+        return np.isfinite(self.log_a).any(axis=1)
+
+    def without_errors(self, outputs: int) -> FibrePoints:
+        """Return points over the inputs alone, with log N(e; 0, 1) added to `log_a`.
+
+        For points over inputs and reading errors, from a response with `with_error`.
+
+        Parameters
+        ----------
+        outputs : int
+            Number m of reading errors e, which are the last m inputs.
+        """
+        e = self.x[..., -outputs:]
+        log_normal = -(e**2).sum(axis=-1) / 2 - outputs / 2 * np.log(2 * np.pi)
+        return replace(self, x=self.x[..., :-outputs], log_a=self.log_a + log_normal)
+
+
+@dataclass(frozen=True, eq=False)
+class FibreProposal:
+    """Proposal distribution on the fibres of N specimens: a mixture over charts for each.
+
+    Attributes
+    ----------
+    fibres : Fibres
+        Response, reference population and measured outputs.
+    charts : Charts
+    numbers : ndarray of int, shape (N,)
+        Numbers of the specimens, from which their random numbers follow.
+    """
+
+    fibres: Fibres
+    charts: Charts
+    numbers: Indices
+
+    @property
+    def charts_per_specimen(self) -> Indices:
+        """Number of charts of each specimen, (N,); zero if no point of the fibre was reached."""
+        return (self.charts.share > 0).sum(axis=1)
+
+    def draw(self, points: int, seed: int) -> FibrePoints:
+        """Draw points on all fibres.
+
+        Parameters
+        ----------
+        points : int
+            K, for each specimen. A power of two fills the fibre most evenly.
+        seed : int
+
+        Returns
+        -------
+        FibrePoints
+        """
+        if points < 1:
+            raise ValueError(f"points: got {points}, expected at least 1")
+        n, d = len(self.fibres.y), len(self.fibres.population.mean)
+        x = np.empty((n, points, d))
+        log_a = np.empty((n, points))
+        chart = np.empty((n, points), dtype=np.intp)
+        for block in _blocks(n, points):
+            numbers = self.numbers[block]
+            sample = _draw(
+                self.fibres.subset(block), self.charts.subset(block), points, (1, seed), numbers
+            )
+            x[block], log_a[block], chart[block] = sample.x, sample.log_a, sample.chart
+        failed = ~np.isfinite(log_a[self.charts_per_specimen > 0])
+        return FibrePoints(x, log_a, float(failed.mean()) if failed.size else 0.0, chart)
+
+
+def fit_fibres(
+    response: Response,
+    y: Floats,
+    population: ReferencePopulation,
+    *,
+    starts: int = 8,
+    tries: int = 64,
+    most_charts: int = 8,
+    rounds: int = 2,
+    seed: int = 0,
+    numbers: Indices | None = None,
+) -> FibreProposal:
+    """Fit proposals to the fibres of measured specimens.
+
+    Charts at the modes, more charts until random points of the fibres are covered, then rounds of
+    adaptation to 256 weighted points each. Numbers of a specimen depend on the other specimens
+    only by rounding.
+
+    Parameters
+    ----------
+    response : Response
+        Called with many inputs (n, d); NaN where it has no value.
+    y : ndarray, shape (N, m)
+        Measured outputs, m < d.
+    population : ReferencePopulation
+        Population that the proposals are fitted to; it should cover the plausible populations.
+    starts : int
+        Searches for modes, for each specimen.
+    tries : int
+        Random points of the fibre that decide whether charts are missing.
+    most_charts : int
+        Of a specimen.
+    rounds : int
+        Of adaptation.
+    seed : int
+    numbers : ndarray of int, shape (N,), optional
+        Numbers of the specimens, by default 0 to N - 1. A specimen has the same points alone as in
+        a batch if its number is the same.
+
+    Returns
+    -------
+    FibreProposal
+
+    Raises
+    ------
+    ValueError
+        If there are as many outputs as inputs, or the shapes disagree.
+
+    Examples
+    --------
+    The radius of two standard normal inputs has a Rayleigh distribution.
+
+    >>> import numpy as np
+    >>> from scipy.special import logsumexp
+    >>> def radius(x):
+    ...     r = np.sqrt((x**2).sum(axis=1, keepdims=True))
+    ...     return r, (x / r)[:, None, :]
+    >>> population = ReferencePopulation(np.array([0.1, 0.0]), np.eye(2))
+    >>> points = fit_fibres(radius, np.array([[0.5], [2.0]]), population).draw(1024, seed=1)
+    >>> log_density = -(points.x**2).sum(axis=2) / 2 - np.log(2 * np.pi)
+    >>> likelihood = np.exp(logsumexp(log_density + points.log_a, axis=1))
+    >>> np.allclose(likelihood, [0.5 * np.exp(-0.125), 2 * np.exp(-2)], rtol=0.02)
+    True
+    """
+    y = np.asarray(y, dtype=float)
+    d = len(population.mean)
+    if y.ndim != 2 or not 0 < y.shape[1] < d:
+        raise ValueError(
+            f"y: got shape {y.shape}, expected (N, m) with fewer outputs m than the {d} inputs: "
+            "with as many outputs as inputs the roots of f(x) = y are points"
+        )
+    numbers = np.arange(len(y)) if numbers is None else np.asarray(numbers)
+    if numbers.shape != (len(y),):
+        raise ValueError(f"numbers: got shape {numbers.shape}, expected ({len(y)},)")
+    fibres = Fibres.of(response, y, population)
+    parts = [Charts.empty(0, most_charts, d, y.shape[1])]
+    for block in _blocks(len(y), 256):
+        part, label = fibres.subset(block), numbers[block]
+        charts = charts_at_modes(part, starts, most_charts)
+        charts = cover(part, charts, ndtri(_shifted_sobol(tries, d, (0, seed), label)))
+        for r in range(rounds):
+            sample = _draw(part, charts, 256, (2 + r, seed), label)
+            charts = _adapted(charts, sample)
+        parts.append(charts)
+    return FibreProposal(fibres, Charts.concatenated(parts), numbers)
+
+
+def moments_of(points: FibrePoints, log_weights: Floats) -> ReferencePopulation:
+    """Return the population with the mean and covariance of the specimens' inputs.
+
+    The weights of a specimen are normalised for each draw of theta, so the result is the average
+    over draws and specimens of p(x | y_i, theta). Specimens without points are left out.
+
+    Parameters
+    ----------
+    points : FibrePoints
+    log_weights : ndarray, shape (N, K) or (S, N, K)
+        log p(x_ik | theta) + log_a_ik, for one theta or S draws of theta.
+
+    Raises
+    ------
+    ValueError
+        If the covariance is singular, as it is with few specimens.
+    """
+    has_points = np.isfinite(log_weights.reshape(-1, *points.log_a.shape)).any(axis=2).all(axis=0)
+    log_weights = log_weights[..., has_points, :]
+    weights = np.exp(log_weights - logsumexp(log_weights, axis=-1, keepdims=True))
+    weights = weights.reshape(-1, *weights.shape[-2:]).mean(axis=0)
+    d = points.x.shape[-1]
+    return ReferencePopulation.from_sample(points.x[has_points].reshape(-1, d), weights.ravel())
+
+
+def joined(*sets: FibrePoints) -> FibrePoints:
+    """Return several independent sets of points of the same specimens as one set.
+
+    Parameters
+    ----------
+    *sets : FibrePoints
+        Each with K points for a specimen, drawn with different seeds.
+
+    Raises
+    ------
+    ValueError
+        If the sets differ in shape.
+    """
+    shapes = [s.x.shape for s in sets]
+    if len(set(shapes)) != 1:
+        raise ValueError(f"sets: got points of shapes {shapes}, expected one shape")
+    return FibrePoints(
+        np.concatenate([s.x for s in sets], axis=1),
+        np.concatenate([s.log_a for s in sets], axis=1) - np.log(len(sets)),
+        float(np.mean([s.failed_share for s in sets])),
+        np.concatenate([s.chart for s in sets], axis=1),
+    )
+
+
+def with_error(response: Response, error: Floats) -> Response:
+    """Return the response with the reading's error, f(x) + error e, of d + m inputs (x, e).
+
+    Use it with `ReferencePopulation.with_errors` and `FibrePoints.without_errors`. The number of
+    outputs may then be that of the inputs or more.
+
+    Parameters
+    ----------
+    response : Response
+    error : ndarray, shape (m,)
+        Positive standard deviations of the reading, in units of the outputs.
+
+    Raises
+    ------
+    ValueError
+        If a standard deviation is not positive.
+    """
+    error = np.atleast_1d(np.asarray(error, dtype=float))
+    if not (error > 0).all():
+        raise ValueError(f"error: got {error}, expected positive standard deviations")
+    m = len(error)
+
+    def response_with_error(x: Floats) -> tuple[Floats, Floats]:
+        values, jacobian = response(x[:, :-m])
+        by_error = np.broadcast_to(np.diag(error), (len(x), m, m))
+        return values + x[:, -m:] * error, np.concatenate([jacobian, by_error], axis=2)
+
+    return response_with_error
+
+
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """Points of a block of specimens, with what the adaptation of charts needs."""
+
+    x: Floats  # (n, K, d)
+    log_a: Floats  # (n, K)
+    chart: Indices  # (n, K)
+    z: Floats  # (n, K, d): x, whitened
+    jacobian: Floats  # (n, K, m, d): with respect to z
+
+
+def _draw(
+    fibres: Fibres, charts: Charts, points: int, key: tuple[int, int], numbers: Indices
+) -> _Sample:
+    """Draw points of the fibres from the mixture of their charts."""
+    n, k = len(numbers), charts.location.shape[-1]
+    uniform = _shifted_sobol(points, k + 2, key, numbers)
+    cumulative = np.cumsum(charts.share, axis=1)[:, :-1]
+    slot = (uniform[..., :1] > cumulative[:, None, :]).sum(axis=2).ravel()
+    specimen = np.repeat(np.arange(n), points)
+    chi_square = 2 * gammaincinv(DEGREES / 2, uniform[..., 1].reshape(-1, 1))
+    t = ndtri(uniform[..., 2:].reshape(-1, k)) / np.sqrt(chi_square / DEGREES)
+    u = charts.location[specimen, slot] + (charts.scale[specimen, slot] @ t[..., None])[..., 0]
+    # Specimens without charts have arrays of zeros, so that all their solves fail.
+    z, jacobian, converged = charts.points(fibres, specimen, slot, u)
+
+    rows = np.flatnonzero(converged)
+    log_density = charts.log_mixture(fibres, specimen[rows], slot[rows], z[rows], jacobian[rows])
+    log_a = np.full(len(z), -np.inf)
+    log_units = np.log(np.diagonal(fibres.population.root)).sum() - np.log(fibres.unit).sum()
+    log_a[rows] = log_units - np.log(points) - log_density
+    z = np.where(converged[:, None], z, 0.0)
+    return _Sample(
+        fibres.population.inputs(z).reshape(n, points, -1),
+        log_a.reshape(n, points),
+        slot.reshape(n, points),
+        z.reshape(n, points, -1),
+        np.where(converged[:, None, None], jacobian, 0.0).reshape(n, points, *jacobian.shape[1:]),
+    )
+
+
+def _adapted(charts: Charts, sample: _Sample) -> Charts:
+    """Return charts with directions, location, scale and share of their weighted points.
+
+    The weights are those of the reference population. The solved directions become the row space
+    of the mean Jacobian, which keeps det(J solved) off zero over more of the fibre than the row
+    space at one point. The present values count as 4 (d - m) points.
+    """
+    d, k = charts.free.shape[2:]
+    m = d - k
+    log_weight = sample.log_a - (sample.z**2).sum(axis=2) / 2
+    top = log_weight.max(axis=1, keepdims=True)
+    weight = np.exp(log_weight - np.where(np.isfinite(top), top, 0))
+    weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
+    free, solved = charts.free.copy(), charts.solved.copy()
+    location, scale, share = (
+        charts.location.copy(),
+        charts.scale.copy(),
+        np.zeros_like(charts.share),
+    )
+    for c in range(share.shape[1]):
+        w = np.where(sample.chart == c, weight, 0)
+        share[:, c] = w.sum(axis=1)
+        i = np.flatnonzero(share[:, c] > 1e-6)
+        w = w[i] / share[i, c][:, None]
+        size = share[i, c] ** 2 / (weight[i] ** 2 * (sample.chart[i] == c)).sum(axis=1)
+
+        turned = i[size > d]
+        mean_jacobian = np.einsum("nk,nkmd->nmd", w[size > d], sample.jacobian[turned])
+        right = np.linalg.svd(mean_jacobian)[2].transpose(0, 2, 1)
+        solved[turned, c], free[turned, c] = right[..., :m], right[..., m:]
+
+        # Present location and scale in the new directions
+        turn = free[i, c].transpose(0, 2, 1) @ charts.free[i, c]
+        transposed = turn.transpose(0, 2, 1)
+        present_location = (turn @ charts.location[i, c][..., None])[..., 0]
+        root = turn @ charts.scale[i, c]
+        present = root @ root.transpose(0, 2, 1) / INFLATION + np.eye(k) - turn @ transposed
+
+        u = (sample.z[i] - charts.centre[i, None, c]) @ free[i, c]
+        old, new = 4.0 * k / (size + 4 * k), size / (size + 4 * k)
+        mean = new[:, None] * (w[:, None, :] @ u)[:, 0] + old[:, None] * present_location
+        centred = u - mean[:, None]
+        covariance = (centred * w[..., None]).transpose(0, 2, 1) @ centred
+        covariance = new[:, None, None] * covariance + old[:, None, None] * present
+        location[i, c], scale[i, c] = mean, np.linalg.cholesky(INFLATION * covariance)
+    has_chart = charts.share > 0
+    share = 0.9 * share + 0.1 * has_chart / np.maximum(has_chart.sum(axis=1, keepdims=True), 1)
+    share = np.where(has_chart, share, 0)
+    share /= np.maximum(share.sum(axis=1, keepdims=True), 1e-300)
+    return Charts(charts.centre, free, solved, location, scale, share)
+
+
+def _shifted_sobol(points: int, dimensions: int, key: tuple[int, int], numbers: Indices) -> Floats:
+    """Return Sobol points with a digital shift of the specimen, (n, points, dimensions).
+
+    Errors of specimens are independent, so that they average out in the log-likelihood.
+    """
+    bits = 30  # of SciPy's points, which are multiples of 2^-30
+    net = (sobol(points, dimensions, key[1]) * 2**bits).astype(np.int64)
+    shifts = [np.random.default_rng([*key, i]).integers(0, 2**bits, dimensions) for i in numbers]
+    shifted = net ^ np.reshape(shifts, (len(numbers), 1, dimensions)).astype(np.int64)
+    return np.asarray((shifted + 0.5) / 2**bits)
+
+
+def _blocks(specimens: int, points: int) -> Iterator[slice]:
+    """Return slices of the specimens with some 16 000 points each, which bounds the memory."""
+    size = max(1, 2**14 // points)
+    for start in range(0, specimens, size):
+        yield slice(start, start + size)

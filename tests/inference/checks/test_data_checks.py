@@ -1,0 +1,321 @@
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from prbayes._checks import Floats
+from prbayes.inference.checks.data_checks import (
+    DataCheckOptions,
+    chance_of_repeats,
+    closest_pairs,
+    count_at_ends,
+    data_findings,
+    identical_specimens,
+    resolution,
+)
+
+QUICK = DataCheckOptions(draws=199)
+
+
+def rounded(y: Floats, step: float) -> Floats:
+    return np.round(y / step) * step if step else y
+
+
+def correlated(rng: np.random.Generator, n: int, m: int, step: float = 0.0) -> Floats:
+    """Return normal outputs (n, m) with correlation .7, rounded."""
+    root = np.linalg.cholesky(0.3 * np.eye(m) + 0.7)
+    return rounded(rng.standard_normal((n, m)) @ root.T, step)
+
+
+def with_copies(y: Floats) -> Floats:
+    """Return outputs of which the last fifth repeats the first."""
+    copies = len(y) // 5
+    return np.concatenate([y[:-copies], y[:copies]])
+
+
+def codes(y: Floats, **arguments: object) -> list[str]:
+    return [finding.code for finding in data_findings(y, options=QUICK, **arguments)]  # type: ignore[arg-type]
+
+
+def shares(draw: Callable[[], Floats], data_sets: int) -> dict[str, float]:
+    """Return the share of data sets with a finding, by code."""
+    counts: Counter[str] = Counter()
+    for _ in range(data_sets):
+        counts.update(set(codes(draw())))
+    return {code: count / data_sets for code, count in counts.items()}
+
+
+# Resolution: README 2.6, size 0 of 8000, power 1.00.
+
+
+@pytest.mark.parametrize("n", [3, 5, 20, 50, 200])
+def test_continuous_values_have_no_step(n: int) -> None:
+    rng = np.random.default_rng(n)
+    assert not any(resolution(rng.normal(10, 1, n)) for _ in range(1000))
+
+
+@pytest.mark.parametrize("step", [0.1, 0.25, 0.5, 1.0])
+def test_the_step_of_rounded_values_is_identified(step: float) -> None:
+    rng = np.random.default_rng(0)
+    found = [resolution(rounded(rng.normal(10, 1, 50), step)) for _ in range(200)]
+    assert found == pytest.approx([step] * 200)
+
+
+def test_an_offset_and_the_unit_do_not_matter() -> None:
+    y = np.random.default_rng(1).normal(10, 1, 40).round(1)
+    assert resolution(273.15 + y) == pytest.approx(0.1)
+    assert resolution(25.4e6 * y) == pytest.approx(2.54e6)
+    assert resolution(-y[::-1]) == pytest.approx(0.1)
+
+
+def test_the_smallest_gap_may_be_several_steps() -> None:
+    assert resolution(np.array([0.0, 0.2, 0.5, 1.1, 1.4])) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    "values", [[], [1.0], [1.0, 2.0], [3.0] * 9, [1.0, 1.0, 2.0], [0.1, 0.1 + 1e-16, 0.1]]
+)
+def test_too_few_values_have_no_step(values: list[float]) -> None:
+    assert resolution(np.array(values)) == 0.0
+
+
+def test_data_printed_with_many_digits_are_exact() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(30):
+        y = rng.normal(10, 1, 50)
+        assert "rounded-data" not in codes(y.round(3), several_roots=True)
+        assert "rounded-data" not in codes(y.round(4), several_roots=True)
+        assert "rounded-data" not in codes(y.round(1))  # .1 sd, monotone
+
+
+def test_a_turning_point_lowers_the_largest_step() -> None:
+    y = np.random.default_rng(3).normal(10, 1, 50).round(1)
+    assert codes(y) == []
+    assert codes(y, several_roots=True) == ["rounded-data"]
+    assert codes(y, several_roots=True, rounded=0.1) == []
+
+
+def test_the_finding_names_step_and_argument() -> None:
+    y = rounded(np.random.default_rng(4).normal(10, 1, 50), 0.5)
+    (finding,) = data_findings(y, labels=["length"])
+    assert finding.text.startswith("length: got 50 values that are all multiples of a step of 0.5 ")
+    assert "expected" in finding.text
+    assert finding.text.endswith("pass rounded=0.5")
+
+
+# Ends: README 2.7.
+
+
+def test_exact_values_of_any_population_have_no_pile() -> None:
+    rng = np.random.default_rng(5)
+    for n in (3, 20, 50):
+        for y in (rng.normal(size=(200, n)), rng.exponential(size=(200, n))):
+            assert all(min(count_at_ends(v).p_values) == 1 for v in y)
+
+
+@pytest.mark.parametrize(
+    ("share", "n", "power"), [(0.1, 20, 0.6), (0.1, 50, 0.98), (0.3, 20, 0.99)]
+)
+def test_power_for_censored_values(share: float, n: int, power: float) -> None:
+    limit = {0.1: 1.2816, 0.3: 0.5244}[share]
+    rng = np.random.default_rng(6)
+    y = np.minimum(rng.standard_normal((300, n)), limit)
+    flagged = np.mean([count_at_ends(v).p_values[0] <= 0.05 for v in y])
+    # standard error at most .028, of the study's 1000 data sets .015
+    assert flagged == pytest.approx(power, abs=0.13)
+
+
+def test_either_end_counts_and_units_do_not() -> None:
+    y = np.minimum(np.random.default_rng(7).standard_normal(30), 0.5)
+    ends = count_at_ends(y)
+    assert ends.counts == (np.sum(y == 0.5), 1)
+    assert ends.p_values[0] <= 0.05 < ends.p_values[1]
+    mirrored = count_at_ends(-1000 * y[::-1])
+    assert mirrored.counts == ends.counts[::-1]
+    assert mirrored.p_values == ends.p_values[::-1]
+
+
+def test_copies_are_no_pile() -> None:
+    y = np.random.default_rng(8).standard_normal(30)
+    y[:6] = np.sort(y)[-6:]  # the largest one twice, as five others
+    assert codes(y) == ["identical-specimens"]
+
+
+def test_copies_of_specimens_are_no_pile_in_one_of_several_outputs() -> None:
+    rng = np.random.default_rng(9)
+    for _ in range(30):
+        assert codes(with_copies(correlated(rng, 20, 2))) == ["identical-specimens"]
+
+
+def test_values_at_a_limit_are_not_repeated_specimens() -> None:
+    rng = np.random.default_rng(10)
+    y = correlated(rng, 30, 2)
+    y[:, 0] = np.minimum(y[:, 0], 0.3)
+    assert codes(y) == ["censored-data"]
+    assert codes(y, censored=[0.3, np.nan]) == []
+    assert codes(y, censored=[np.nan, 0.3]) == ["censored-data"]
+    assert codes(np.minimum(y[:, 0], 0.3), censored=0.3) == []
+
+
+def test_the_finding_names_the_limit() -> None:
+    y = np.minimum(np.random.default_rng(11).normal(10, 1, 30), 10.5)
+    (finding,) = data_findings(y)
+    count = np.sum(y == 10.5)
+    assert f"got {count} of 30 values equal to the largest, 10.5" in finding.text
+    assert "pass censored=10.5" in finding.text
+
+
+@pytest.mark.parametrize("step", [0.1, 0.5])
+def test_rounded_values_of_skewed_populations_rarely_have_a_pile(step: float) -> None:
+    rng = np.random.default_rng(12)
+    folded = (rng.normal(2, 0.5, (100, 50)) - 1) ** 2
+    for y in (folded, np.exp(rng.standard_normal((100, 50)))):
+        sd = y.std()
+        p = [min(count_at_ends(rounded(v, step * sd), step * sd, 199).p_values) for v in y]
+        # at most .04 in the table; standard error .02. The bootstrap alone flags .5 to .95.
+        assert np.mean(np.array(p) <= 0.05) <= 0.12
+
+
+@pytest.mark.slow
+def test_the_table_of_rounded_ends() -> None:
+    table = {
+        "normal": [(0.01, 0.01), (0.01, 0.00), (0.00, 0.00)],
+        "folded": [(0.03, 0.04), (0.01, 0.01), (0.00, 0.00)],
+        "lognormal": [(0.02, 0.04), (0.02, 0.00), (0.00, 0.00)],
+        "exponential": [(0.02, 0.02), (0.01, 0.00), (0.00, 0.00)],
+        "beta": [(0.27, 0.52), (0.20, 0.40), (0.04, 0.05)],
+        "censored 10": [(0.25, 0.61), (0.06, 0.20), (0.01, 0.01)],
+        "censored 30": [(0.89, 1.00), (0.47, 0.86), (0.24, 0.51)],
+    }
+    rng = np.random.default_rng(13)
+    draw: dict[str, Callable[[tuple[int, int]], Floats]] = {
+        "normal": lambda shape: rng.standard_normal(shape),
+        "folded": lambda shape: (rng.normal(2, 0.5, shape) - 1) ** 2,
+        "lognormal": lambda shape: np.exp(rng.standard_normal(shape)),
+        "exponential": lambda shape: rng.exponential(size=shape),
+        "beta": lambda shape: rng.beta(0.5, 0.5, shape),
+        "censored 10": lambda shape: np.minimum(rng.standard_normal(shape), 1.2816),
+        "censored 30": lambda shape: np.minimum(rng.standard_normal(shape), 0.5244),
+    }
+    for name, rows in table.items():
+        sd = 1.0 if "censored" in name else draw[name]((1000, 100)).std()
+        for step, row in zip((0.1, 0.25, 0.5), rows, strict=True):
+            for n, rate in zip((20, 50), row, strict=True):
+                y = rounded(draw[name]((300, n)), step * sd)
+                p = [min(count_at_ends(v, step * sd).p_values) for v in y]
+                # standard error of the difference of two shares at most .041; less near 0
+                se = np.sqrt(2 * max(rate * (1 - rate), 0.01) / 300)
+                assert np.mean(np.array(p) <= 0.05) == pytest.approx(rate, abs=4.5 * se), name
+
+
+# Identical specimens and closest pairs: README 2.9.
+
+
+def test_identical_specimens_are_groups_of_indices() -> None:
+    y = np.array([[1, 2], [3, np.nan], [1, 2], [np.nan, np.nan], [3, np.nan], [1, 2], [1, np.nan]])
+    assert identical_specimens(y) == ((0, 2, 5), (1, 4))
+    assert identical_specimens(np.full((4, 2), np.nan)) == ()
+
+
+@pytest.mark.parametrize("m", [1, 2, 3])
+@pytest.mark.parametrize("step", [0.0, 0.01, 0.1, 0.25, 0.5, 1.0])
+def test_size_of_repeats(m: int, step: float) -> None:
+    rng = np.random.default_rng([m, int(100 * step)])
+    p = [chance_of_repeats(correlated(rng, 50, m, step), np.full(m, step), 199) for _ in range(60)]
+    # size .01 to .03; standard error .02
+    assert np.mean(np.array(p) <= 0.01) <= 0.1
+
+
+@pytest.mark.parametrize(("m", "step"), [(1, 0.0), (2, 0.0), (2, 0.01), (2, 0.1), (3, 0.1)])
+def test_copies_are_identified(m: int, step: float) -> None:
+    rng = np.random.default_rng(14)
+    found = [
+        "identical-specimens" in codes(with_copies(correlated(rng, 20, m, step))) for _ in range(20)
+    ]
+    # power 1.00, and .95 with two outputs and a step of .1; standard error .05
+    assert np.mean(found) >= (1.0 if step < 0.1 else 0.75)
+
+
+def test_the_finding_names_the_specimens() -> None:
+    y = np.random.default_rng(15).standard_normal((20, 2))
+    y[17] = y[3]
+    (finding,) = data_findings(y)
+    assert finding.text.startswith("got specimens 3 and 17 (counted from 0) with identical values")
+    (finding,) = data_findings(np.concatenate([y, y]))
+    assert "17 groups more" not in finding.text
+    assert "groups more" in finding.text
+
+
+def test_closest_pairs() -> None:
+    rng = np.random.default_rng(16)
+    simulated = rng.standard_normal((199, 20, 2))
+    independent = [closest_pairs(rng.standard_normal((20, 2)), simulated) for _ in range(50)]
+    # size .01; the null data sets are shared
+    assert np.mean(np.array(independent) <= 0.01) <= 0.08
+    power = []
+    for _ in range(20):
+        y = with_copies(rng.standard_normal((20, 2)))
+        power.append(closest_pairs(y + 0.01 * rng.standard_normal(y.shape), simulated) <= 0.01)
+    assert np.mean(power) >= 0.9  # 1.00 with two frequencies
+    order, unit = rng.permutation(20), np.array([1e3, 1e-3])
+    y = rng.standard_normal((20, 2))
+    expected = closest_pairs(y, simulated)
+    assert closest_pairs(y[order] * unit + 5, simulated * unit) == expected
+    assert 0 < closest_pairs(rng.standard_normal((20, 1)), simulated[:, :, :1]) <= 1
+
+
+# All checks together.
+
+
+def test_size_of_all_checks() -> None:
+    rng = np.random.default_rng(17)
+    assert shares(lambda: correlated(rng, 20, 2), 100) == {}
+    rates = shares(lambda: correlated(rng, 50, 2, 0.1), 60)
+    # standard error .03 at most
+    assert sum(rates.values()) <= 0.12
+
+
+def test_order_and_units_do_not_matter() -> None:
+    rng = np.random.default_rng(18)
+    y = with_copies(correlated(rng, 30, 2))
+    y[:, 1] = np.minimum(y[:, 1], 0.5)
+    expected = sorted(codes(y))
+    assert expected == ["censored-data", "identical-specimens"]
+    assert sorted(codes(y[rng.permutation(30)])) == expected
+    assert sorted(codes(1e-6 * y)) == expected
+    assert sorted(codes(1e6 * y)) == expected
+
+
+def test_missing_values_are_left_out() -> None:
+    rng = np.random.default_rng(19)
+    y = correlated(rng, 40, 3)
+    y[:20, 0] = np.nan
+    y[:, 2] = np.nan
+    assert codes(y) == []
+    y[:, 1] = rounded(y[:, 1], 0.5)
+    (finding,) = data_findings(y)
+    assert finding.text.startswith("observed[1]: got 40 values")
+    y[0, 1] = np.inf  # a specimen that failed
+    assert data_findings(y)[0].text.startswith("observed[1]: got 39 values")
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_small_samples(n: int) -> None:
+    assert data_findings(np.arange(n) ** 0.5) == ()
+    assert data_findings(np.full((n, 2), np.nan)) == ()
+
+
+def test_equal_values_are_a_pile() -> None:
+    assert set(codes(np.full(10, 3.0))) == {"censored-data"}
+    assert codes(np.full(10, 3.0), censored=3.0) == []
+
+
+def test_arguments_have_one_value_or_one_by_output() -> None:
+    y = np.random.default_rng(20).standard_normal((9, 2))
+    with pytest.raises(
+        ValueError, match=r"rounded: got shape \(3,\), expected one value or one by"
+    ):
+        data_findings(y, rounded=[0.1, 0.2, 0.3])

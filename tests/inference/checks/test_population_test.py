@@ -1,0 +1,241 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp, ndtr, ndtri
+from scipy.stats import norm
+
+from prbayes._checks import Floats
+from prbayes.inference.checks.min_p import adjusted_p_values
+from prbayes.inference.checks.population_test import (
+    PopulationTest,
+    mixture_ratio,
+    normal_scores,
+    population_findings,
+    population_statistics,
+    population_test,
+    power_text,
+    zhang_statistic,
+)
+
+# The alternatives of the study: standardised inputs.
+
+
+def two_modes(rng: np.random.Generator, shape: tuple[int, ...]) -> Floats:
+    return 1.2 / 1.342 * np.sign(rng.random(shape) - 0.5) + 0.6 / 1.342 * rng.standard_normal(shape)
+
+
+def gross_errors(rng: np.random.Generator, shape: tuple[int, ...]) -> Floats:
+    z = rng.standard_normal(shape)
+    z[..., : max(1, round(0.05 * shape[-1]))] = 8.0
+    return z
+
+
+ALTERNATIVES: dict[str, Callable[[np.random.Generator, tuple[int, ...]], Floats]] = {
+    "normal": lambda rng, shape: rng.standard_normal(shape),
+    "skewness 1": lambda rng, shape: rng.gamma(4.0, 0.5, shape) - 2.0,
+    "two modes": two_modes,
+    "cut": lambda rng, shape: norm.ppf(0.7 * rng.random(shape)),
+    "gross": gross_errors,
+}
+
+
+def exact_statistics(x: Floats) -> Floats:
+    """Return the statistics of exactly known inputs (R, N) under normal populations fitted to them."""
+    z = (x - x.mean(axis=1, keepdims=True)) / x.std(axis=1, keepdims=True)
+    return np.array([population_statistics(v[:, None, None], np.ones((len(v), 1))) for v in z])
+
+
+def rejected(statistics: Floats, null: Floats) -> float:
+    return float(np.mean([adjusted_p_values(s, null).min() <= 0.05 for s in statistics]))
+
+
+@pytest.mark.parametrize(
+    ("alternative", "n", "power"),
+    [
+        ("normal", 20, 0.05),
+        ("normal", 50, 0.05),
+        ("skewness 1", 50, 0.64),
+        ("two modes", 50, 0.86),
+        ("cut", 50, 0.80),
+        ("gross", 20, 1.00),
+        ("skewness 1", 20, 0.25),
+    ],
+)
+def test_size_and_power_of_the_linear_problem(alternative: str, n: int, power: float) -> None:
+    rng = np.random.default_rng([n, len(alternative)])
+    # Scores of a fitted normal population are pivotal: all data sets share the bootstrap samples.
+    null = exact_statistics(rng.standard_normal((399, n)))
+    share = rejected(exact_statistics(ALTERNATIVES[alternative](rng, (200, n))), null)
+    # Standard errors: .035 here, .035 of the study's 200, .02 of the shared samples
+    se = np.sqrt(2 * max(power * (1 - power), 0.02) / 200 + 0.02**2)
+    assert share == pytest.approx(power, abs=4.5 * se)
+
+
+def folded_statistics(x: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the statistics of y = (x - 1)^2 at inputs (R, N), and fitted means and sds by EM."""
+    distance = np.maximum(np.abs(x - 1), 1e-6)
+    points = np.stack([1 + distance, 1 - distance], axis=-1)
+    mean, sd = np.full((len(x), 1, 1), 2.0), np.full((len(x), 1, 1), 0.5)
+    for _ in range(200):
+        log_weights = -(((points - mean) / sd) ** 2) / 2
+        weights = np.exp(log_weights - logsumexp(log_weights, axis=-1, keepdims=True))
+        mean = (weights * points).sum(axis=(1, 2), keepdims=True) / x.shape[1]
+        sd = np.sqrt((weights * (points - mean) ** 2).sum(axis=(1, 2), keepdims=True) / x.shape[1])
+    z = ((points - mean) / sd)[..., None]
+    statistics = [population_statistics(v, w) for v, w in zip(z, weights, strict=True)]
+    return np.array(statistics), mean[..., 0], sd[..., 0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("alternative", "n", "power"),
+    [
+        ("normal", 50, 0.04),
+        ("skewness 1", 50, 0.59),
+        ("two modes", 50, 0.88),
+        ("cut", 50, 0.72),
+        ("skewness 1", 20, 0.25),
+    ],
+)
+def test_size_and_power_of_the_folded_problem(alternative: str, n: int, power: float) -> None:
+    rng = np.random.default_rng([n, len(alternative), 1])
+    z = ALTERNATIVES[alternative](rng, (1000, n))
+    statistics, mean, sd = folded_statistics(2 + 0.5 * z)
+    # Warp speed: one refitted bootstrap sample of each data set, pooled.
+    null, _, _ = folded_statistics(mean + sd * rng.standard_normal((1000, n)))
+    # The power is steep in the size: the pooled samples alone have a standard error of .03.
+    se = np.sqrt(power * (1 - power) * 2 / 1000 + 2 * 0.03**2 * (alternative != "normal"))
+    assert rejected(statistics, null) == pytest.approx(power, abs=4.5 * se)
+
+
+@pytest.mark.slow
+def test_no_power_for_an_input_that_the_output_determines_in_part() -> None:
+    # y = x1 exp(.3 x2), x2 ~ N(0, 1) is given; README: .06 at N = 50.
+    rng = np.random.default_rng(5)
+    levels = ndtri((np.arange(32) + 0.5) / 32)
+
+    def statistics(x1: Floats) -> tuple[Floats, Floats, Floats]:
+        slope = np.exp(0.3 * levels)
+        y = x1 * np.exp(0.3 * rng.standard_normal(x1.shape))
+        points = y[..., None] / slope
+        mean, sd = np.full((len(y), 1, 1), 10.0), np.ones((len(y), 1, 1))
+        for _ in range(200):
+            log_weights = -(((points - mean) / sd) ** 2) / 2 - np.log(slope)
+            weights = np.exp(log_weights - logsumexp(log_weights, axis=-1, keepdims=True))
+            mean = (weights * points).sum(axis=(1, 2), keepdims=True) / y.shape[1]
+            sd = np.sqrt(
+                (weights * (points - mean) ** 2).sum(axis=(1, 2), keepdims=True) / y.shape[1]
+            )
+        z = ((points - mean) / sd)[..., None]
+        all_statistics = [population_statistics(v, w) for v, w in zip(z, weights, strict=True)]
+        return np.array(all_statistics), mean[..., 0], sd[..., 0]
+
+    observed, mean, sd = statistics(10 + ALTERNATIVES["skewness 1"](rng, (200, 50)))
+    null, _, _ = statistics(mean + sd * rng.standard_normal((200, 50)))
+    # standard error .017, and .02 of the pooled samples
+    assert rejected(observed, null) == pytest.approx(0.06, abs=0.11)
+
+
+def test_zhang_of_exact_inputs_has_its_closed_form() -> None:
+    # N = 2 and u = (1/4, 3/4): -(log(.25) / 1.5 + log(.75) / .5 + log(.75) / .5 + log(.25) / 1.5)
+    z = ndtri(np.array([0.75, 0.25]))[:, None, None]
+    expected = -2 * (np.log(0.25) / 1.5 + np.log(0.75) / 0.5)
+    assert zhang_statistic(z, np.ones((2, 1))) == pytest.approx([expected])
+
+
+def test_a_point_without_weight_changes_nothing() -> None:
+    rng = np.random.default_rng(0)
+    z = rng.standard_normal((30, 1, 2))
+    far = np.concatenate([z, np.full((30, 1, 2), np.inf)], axis=1)
+    weights = np.stack([np.ones(30), np.zeros(30)], axis=1)
+    expected = population_statistics(z, np.ones((30, 1)))
+    assert population_statistics(far, weights) == pytest.approx(expected)
+    # equal points share their weight
+    twice = np.repeat(z, 3, axis=1)
+    assert population_statistics(twice, np.full((30, 3), 1 / 3)) == pytest.approx(expected)
+
+
+def test_order_of_specimens_and_of_inputs() -> None:
+    rng = np.random.default_rng(1)
+    z, weights = rng.standard_normal((30, 1, 3)), np.ones((30, 1))
+    expected = population_statistics(z, weights)
+    order = rng.permutation(30)
+    assert population_statistics(z[order], weights) == pytest.approx(expected)
+    swapped = population_statistics(z[:, :, ::-1], weights).reshape(2, 3)
+    assert swapped[:, ::-1].ravel() == pytest.approx(expected)
+    # a mirrored population: both statistics are symmetric
+    assert population_statistics(-z, weights) == pytest.approx(expected)
+
+
+def test_drawn_inputs_take_the_weights() -> None:
+    # Two roots, standard normal and shifted: the statistic grows with the weight of the wrong one.
+    rng = np.random.default_rng(2)
+    z = np.stack([rng.standard_normal(50), rng.standard_normal(50) + 4], axis=1)[..., None]
+    values = [
+        zhang_statistic(z, np.tile([1 - w, w], (50, 1)))[0] for w in (0.0, 0.1, 0.5, 0.9, 1.0)
+    ]
+    assert values == sorted(values)
+    assert values[0] < values[1] < values[-1]
+
+
+def test_the_mixture_ratio_is_small_at_the_center_and_large_for_two_modes() -> None:
+    rng = np.random.default_rng(3)
+    scores = ndtri((np.arange(100) + 0.5) / 100)[:, None, None]
+    weights = np.ones((100, 1))
+    assert 0 <= mixture_ratio(scores, weights)[0] < 1
+    z = two_modes(rng, (100, 1, 1))
+    assert mixture_ratio(z / z.std(), weights)[0] > 5
+
+
+def test_normal_scores_are_finite_at_the_ends() -> None:
+    u = np.array([0.0, 0.5, ndtr(1.5), 1.0])
+    assert normal_scores(u) == pytest.approx([-5.9978, 0, 1.5, 5.9978], abs=1e-4)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_small_samples(n: int) -> None:
+    rng = np.random.default_rng(n)
+    null = exact_statistics(rng.standard_normal((99, max(n, 2))))
+    test = population_test(rng.standard_normal((n, 1, 1)), np.ones((n, 1)), null)
+    assert 0 < test.p_value <= 1
+    assert test.n == n
+
+
+def test_equal_inputs_are_rejected() -> None:
+    null = exact_statistics(np.random.default_rng(4).standard_normal((199, 20)))
+    test = population_test(np.zeros((20, 1, 1)), np.ones((20, 1)), null)
+    assert test.p_value <= 0.01
+
+
+def test_the_result_has_p_values_by_input() -> None:
+    rng = np.random.default_rng(5)
+    z = rng.standard_normal((50, 1, 2))
+    z[:, 0, 1] = two_modes(rng, (50,))
+    z = (z - z.mean(axis=0)) / z.std(axis=0)
+    first, second = (exact_statistics(rng.standard_normal((199, 50))) for _ in range(2))
+    null = np.stack([first[:, 0], second[:, 0], first[:, 1], second[:, 1]], axis=1)
+    test = population_test(z, np.ones((50, 1)), list(null))
+    assert test.mixture[1] <= 0.01 < test.mixture[0]
+    (finding,) = population_findings(test, ["C", "m"])
+    assert finding.code == "population-misfit"
+    assert "with the smallest p-value for m, expected p > 0.05; compare skewed" in finding.text
+
+
+def test_a_fitting_family_is_no_finding() -> None:
+    test = PopulationTest(0.051, np.array([0.04]), np.array([0.5]), 20)
+    assert population_findings(test, ["C"]) == ()
+    (finding,) = population_findings(test, ["C"], threshold=0.06)
+    assert "got p = 0.051 for the inputs of 20 specimens" in finding.text
+
+
+def test_the_power_is_that_of_the_study() -> None:
+    at_50 = power_text(50)
+    assert "0.59 for skewness 1, 0.84 for two modes, 0.76 for a population cut" in at_50
+    assert "at 50 specimens a power of" in at_50
+    assert "1.00 for skewness 1" in power_text(1000)
+    assert "0.41 for skewness 1" in power_text(round(np.sqrt(20 * 50)))
+    assert "less power than at 20: 0.23 for skewness 1" in power_text(8)
+    assert "no power with fewer outputs (1) than inputs (3)" in power_text(50, inputs=3)

@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from prbayes._checks import Floats
+from prbayes.inference.checks.prior_conflict import conflict_findings, prior_conflict
+
+
+def estimates(mu: Floats, sd: Floats, n: int, rng: np.random.Generator) -> Floats:
+    """Return means and log standard deviations of samples of normal populations, (S, 2)."""
+    y = mu[:, None] + sd[:, None] * rng.standard_normal((len(mu), n))
+    return np.stack([y.mean(axis=1), np.log(y.std(axis=1))], axis=1)
+
+
+def sharp_prior(size: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    return 10 + 0.3 * rng.standard_normal(size), np.exp(0.2 * rng.standard_normal(size))
+
+
+@pytest.mark.parametrize(
+    ("n", "mu_off", "column", "power"),
+    [(10, 4, 0, 0.86), (20, 4, 0, 0.98), (10, 2, 0, 0.21), (20, 3, 0, 0.83)],
+)
+def test_power_for_a_mean_off_the_prior(n: int, mu_off: int, column: int, power: float) -> None:
+    rng = np.random.default_rng(n)
+    predictive = estimates(*sharp_prior(1000, rng), n, rng)
+    observed = estimates(np.full(300, 10 + 0.3 * mu_off), np.ones(300), n, rng)
+    p = [prior_conflict(t, np.ones(2), t, predictive).p_values[column] for t in observed]
+    # standard error .029 at most, and .03 of the 1000 simulated estimates
+    assert np.mean(np.array(p) <= 0.05) == pytest.approx(power, abs=0.16)
+
+
+def test_size_of_single_and_of_adjusted_p_values() -> None:
+    rng = np.random.default_rng(0)
+    predictive = estimates(*sharp_prior(2000, rng), 20, rng)
+    observed = estimates(*sharp_prior(1000, rng), 20, rng)
+    tests = [prior_conflict(t, np.ones(2), t, predictive) for t in observed]
+    single = np.array([test.p_values for test in tests])
+    # standard error .007, and .005 of the simulated estimates
+    assert (single <= 0.05).mean(axis=0) == pytest.approx([0.05, 0.05], abs=0.035)
+    family = np.array([test.adjusted.min() for test in tests])
+    assert np.mean(family <= 0.05) == pytest.approx(0.05, abs=0.035)
+
+
+def test_holm() -> None:
+    predictive = np.tile(np.arange(999.0)[:, None], (1, 4))
+    # p = 2 (k + 1) / 1000 for k simulated estimates as far out
+    test = prior_conflict(np.array([4.5, 994.5, 9.5, 499.0]), np.ones(4), np.zeros(4), predictive)
+    assert test.p_values == pytest.approx([0.012, 0.01, 0.022, 1.0])
+    assert test.adjusted == pytest.approx([0.04, 0.04, 0.044, 1.0])  # never decreasing
+
+
+def test_the_pull_is_in_standard_errors() -> None:
+    predictive = np.random.default_rng(1).standard_normal((100, 2))
+    test = prior_conflict(
+        np.array([1.0, -4.0]), np.array([0.5, 2.0]), np.array([0.25, -3.0]), predictive
+    )
+    assert test.pulls == pytest.approx([1.5, 0.5])
+
+
+def test_a_conflict_needs_both_p_value_and_pull() -> None:
+    rng = np.random.default_rng(2)
+    prior = rng.normal(10, 0.3, (1000, 1))
+    predictive = prior + rng.normal(0, 0.2, prior.shape)
+
+    def codes(estimate: float, posterior: float) -> list[str]:
+        values = (np.array([v]) for v in (estimate, 0.2, posterior))
+        findings = conflict_findings(["mu"], prior, *values, predictive)
+        return [finding.code for finding in findings]
+
+    assert codes(11.6, 11.2) == ["prior-conflict"]
+    assert codes(11.6, 11.55) == []
+    assert codes(10.1, 10.4) == []
+    assert codes(8.4, 8.8) == ["prior-conflict"]
+
+
+def test_the_text_has_both_sides_and_the_unit_is_the_users() -> None:
+    rng = np.random.default_rng(3)
+    prior = rng.normal(10, 0.3, (1000, 1))
+    predictive = prior + rng.normal(0, 0.2, prior.shape)
+    arguments = [np.array([11.8]), np.array([0.2]), np.array([11.2])]
+    (finding,) = conflict_findings(["mu"], prior, *arguments, predictive)
+    assert finding.text.startswith("mu: got prior 10 +- 0.3, data 11.8 +- 0.2 (p = 0.002); ")
+    assert "the prior pulls the posterior mean to 11.2, 3.0 standard errors" in finding.text
+    scaled = [1000 * v for v in arguments]
+    (other,) = conflict_findings(["mu"], 1000 * prior, *scaled, 1000 * predictive)
+    assert "3.0 standard errors" in other.text
+    assert "(p = 0.002)" in other.text
+
+
+def test_failed_estimates_are_left_out() -> None:
+    predictive = np.arange(999.0)[:, None]
+    expected = prior_conflict(np.array([4.5]), np.ones(1), np.zeros(1), predictive).p_values
+    failed = np.concatenate([predictive, np.full((50, 1), np.nan), np.full((9, 1), -np.inf)])
+    assert prior_conflict(np.array([4.5]), np.ones(1), np.zeros(1), failed).p_values == expected
+
+
+def test_without_simulated_estimates_no_conflict_is_reported() -> None:
+    test = prior_conflict(np.array([4.5]), np.ones(1), np.zeros(1), np.full((3, 1), np.nan))
+    assert test.p_values == 1

@@ -1,0 +1,278 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.interpolate import RBFInterpolator
+from scipy.special import logsumexp, ndtri
+from scipy.stats import norm, qmc
+
+from prbayes._checks import Floats
+from prbayes.propagation.guards import (
+    GuardOptions,
+    half_difference,
+    missing_share,
+    predicted_bias,
+    roughness,
+)
+
+OPTIONS = GuardOptions()
+
+# Round trip: README 2.1.
+
+BOX = np.array([[-1.0], [4.5]])
+
+
+def folded(x: Floats) -> Floats:
+    return (x - 1) ** 2
+
+
+def both_roots(y: Floats) -> list[Floats]:
+    return [np.array([[1 - root], [1 + root]]) for root in np.sqrt(y[:, 0])]
+
+
+def upper_root(y: Floats) -> Floats:
+    return 1 + np.sqrt(y)[:, None]
+
+
+def specimens(n: int, seed: int) -> Floats:
+    return folded(np.random.default_rng(seed).normal(2, 0.5, (n, 1)))
+
+
+def test_no_root_is_missing_where_all_are_returned() -> None:
+    shares = [missing_share(both_roots, folded, BOX, specimens(20, s), seed=s) for s in range(100)]
+    assert shares == [0.0] * 100
+
+
+def test_the_share_is_that_of_the_missing_root() -> None:
+    shares = [missing_share(upper_root, folded, BOX, specimens(20, s), seed=s) for s in range(50)]
+    # README: .469, 95 % quantile .531; standard error of one share .044
+    assert np.mean(shares) == pytest.approx(0.469, abs=0.05)
+    assert min(shares) > OPTIONS.missing_share
+
+
+def test_a_share_of_failed_searches_is_counted() -> None:
+    def find(y: Floats) -> list[Floats]:
+        empty = np.empty((0, 1))
+        return [empty if i % 4 == 0 else root for i, root in enumerate(both_roots(y))]
+
+    assert missing_share(find, folded, BOX, specimens(20, 0)) == 0.25
+
+
+def test_units_and_the_order_of_specimens_do_not_matter() -> None:
+    y = specimens(20, 1)
+    expected = missing_share(upper_root, folded, BOX, y)
+    assert missing_share(upper_root, folded, BOX, y[::-1]) == expected
+    scaled = missing_share(
+        lambda v: 1e3 * upper_root(1e6 * v), lambda x: 1e-6 * folded(1e-3 * x), 1e3 * BOX, 1e-6 * y
+    )
+    assert scaled == expected
+
+
+def test_only_responses_near_the_data_count() -> None:
+    sizes: list[int] = []
+
+    def find(y: Floats) -> list[Floats]:
+        sizes.append(len(y))
+        assert (y < 2.5).all()
+        return both_roots(y)
+
+    missing_share(find, folded, BOX, np.array([[1.0], [2.0], [np.nan]]), n=64)
+    assert sizes == [64]
+    assert np.isnan(missing_share(find, folded, BOX, np.array([[100.0], [101.0], [102.0]])))
+
+
+def test_two_outputs_that_are_far_from_all_specimens_together() -> None:
+    # Both outputs are in the range of the data everywhere, near them on the diagonal alone.
+    y = np.repeat(np.linspace(0, 1, 50)[:, None], 2, axis=1)
+    simulated: list[Floats] = []
+
+    def find(values: Floats) -> Floats:
+        simulated.append(values)
+        return values[:, None]
+
+    assert missing_share(find, lambda x: x, np.array([[0.0, 0.0], [1.0, 1.0]]), y) == 0
+    (values,) = simulated
+    assert np.abs(values[:, 0] - values[:, 1]).max() < 2 * y[:, 0].std()
+
+
+# Monte Carlo error: README 2.3.
+
+
+def test_a_tilt_of_the_log_likelihood_is_half_its_size() -> None:
+    rng = np.random.default_rng(0)
+    theta = rng.standard_normal(32)
+    log_likelihood = rng.standard_normal((32, 20))
+    tilted = log_likelihood + 0.3 * (theta / theta.std())[:, None] / 20
+    assert half_difference(log_likelihood, tilted) == pytest.approx(0.15)
+    assert half_difference(tilted, log_likelihood) == pytest.approx(0.15)
+    assert half_difference(log_likelihood, log_likelihood) == 0
+    # a constant does not move the posterior, nor does the order of draws and specimens matter
+    assert half_difference(log_likelihood + 7, tilted) == pytest.approx(0.15)
+    assert half_difference(log_likelihood[::-1, ::-1], tilted[::-1, ::-1]) == pytest.approx(0.15)
+
+
+def half_of_the_points(
+    y: Floats, points: int, mean: Floats, sd: Floats, rng: np.random.Generator
+) -> Floats:
+    """Return log-likelihoods (S, N) of y = x1 exp(.1 v), v ~ N(0, 1), from shifted Sobol points."""
+    u = (qmc.Sobol(1, rng=rng).random(points) + rng.random((len(y), 1, 1))) % 1
+    v = 1.6 * ndtri(u[..., 0].clip(1e-9, 1 - 1e-9))
+    x = y[:, None] / np.exp(0.1 * v)
+    log_a = -0.1 * v + norm.logpdf(v) - norm.logpdf(v, 0, 1.6) - np.log(points)
+    z = (x - mean[:, None, None]) / sd[:, None, None]
+    result: Floats = logsumexp(log_a - z**2 / 2, axis=-1) - np.log(sd)[:, None]
+    return result
+
+
+@pytest.mark.parametrize(("points", "median"), [(4, 1.06), (16, 0.15), (64, 0.019)])
+def test_half_difference_of_the_study(points: int, median: float) -> None:
+    rng = np.random.default_rng(points)
+    values = []
+    for _ in range(60):
+        y = rng.normal(10, 1.5, 20) * np.exp(0.1 * rng.standard_normal(20))
+        spread = np.sqrt(max(y.var() - 1, 0.5))  # of x1: the free input adds 1
+        mean = y.mean() + spread / np.sqrt(20) * rng.standard_normal(32)
+        sd = spread * np.exp(rng.standard_normal(32) / np.sqrt(40))
+        halves = [half_of_the_points(y, points // 2, mean, sd, rng) for _ in range(2)]
+        values.append(half_difference(*halves))
+    # The logarithms scatter by about 1: standard error .16 of the median's.
+    assert np.log(np.median(values)) == pytest.approx(np.log(median), abs=0.8)
+
+
+# Emulator error: README 2.2.
+
+
+def test_a_constant_error_moves_the_mean() -> None:
+    x = np.random.default_rng(1).normal(10, 2, (16, 1))
+    bias = predicted_bias(np.full((16, 1), 0.3), np.full((16, 1, 1), 1.5), x, 50)
+    # The true root is at x - .2: the estimate of the mean is .2 too large.
+    assert bias[0] == pytest.approx(0.2 / x.std() * np.sqrt(50))
+    assert bias[1] == pytest.approx(0, abs=1e-12)
+
+
+def test_biases_are_those_of_the_true_roots() -> None:
+    rng = np.random.default_rng(2)
+    x = rng.normal(0, [1.0, 3.0], (4000, 2))
+    jacobian = np.array([[2.0, 0.5], [0.3, -1.0], [1.0, 1.0]])
+    true = 0.1 + x * [0.95, 1.02]
+    misfit = -(true - x) @ jacobian.T  # run - emulator, both linear
+    bias = predicted_bias(misfit, np.tile(jacobian, (4000, 1, 1)), x, 50)
+    mean = (x.mean(axis=0) - true.mean(axis=0)) / x.std(axis=0) * np.sqrt(50)
+    sd = (1 - true.std(axis=0) / x.std(axis=0)) * np.sqrt(100)
+    assert bias[0] == pytest.approx(mean)
+    assert bias[1] == pytest.approx(sd, abs=0.03)  # of second order in the change of the sd
+
+
+def test_bias_has_no_unit() -> None:
+    rng = np.random.default_rng(3)
+    misfit, x = rng.normal(0, 0.1, (16, 2)), rng.standard_normal((16, 2))
+    jacobian = np.eye(2) + 0.2 * rng.standard_normal((16, 2, 2))
+    expected = predicted_bias(misfit, jacobian, x, 30)
+    outputs, inputs = np.array([1e3, 1e-2]), np.array([10.0, 1e-4])
+    scaled = predicted_bias(misfit * outputs, jacobian * outputs[:, None] / inputs, x * inputs, 30)
+    assert scaled == pytest.approx(expected)
+    order = rng.permutation(16)
+    assert predicted_bias(misfit[order], jacobian[order], x[order], 30) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("runs", "flagged"), [(8, 0.97), (16, 0.02)])
+def test_a_kink_is_flagged_where_runs_are_few(runs: int, flagged: float) -> None:
+    def response(x: Floats) -> Floats:
+        return np.where(x < 10, x, 10 + 0.2 * (x - 10))
+
+    x = 4 + 9.9 * qmc.Sobol(1, seed=3).random(runs)
+    unit = (x - x.mean()) / x.std()
+    emulator = RBFInterpolator(unit, response(x), kernel="quintic", degree=2)
+    grid = np.linspace(4, 13.9, 4001)
+    image = emulator(((grid - x.mean()) / x.std())[:, None])[:, 0]
+    slope = np.gradient(image, grid)
+    true_bias, bias = [], []
+    for seed in range(100):
+        rng = np.random.default_rng([seed, runs])
+        true = np.clip(10 + rng.standard_normal(50), 6, 13.8)
+        # The emulator is monotone enough for a table of its roots.
+        nearest = np.abs(image - response(true)[:, None]).argmin(axis=1)
+        root, jacobian = grid[nearest], slope[nearest]
+        true_bias.append((root.mean() - true.mean()) / true.std() * np.sqrt(50))
+        at = rng.permutation(50)[:16]
+        misfit = response(root[at]) - image[nearest[at]]
+        bias.append(
+            predicted_bias(misfit[:, None], jacobian[at, None, None], root[at, None], 50)[:, 0]
+        )
+    share = np.mean(np.abs(bias).max(axis=1) > OPTIONS.predicted_bias)
+    # standard error at most .025
+    assert share == pytest.approx(flagged, abs=0.12)
+    # README: signed medians within .04; their standard error is .02
+    assert np.median(bias, axis=0)[0] == pytest.approx(np.median(true_bias), abs=0.12)
+
+
+# Roughness: README 2.10.
+
+
+def noise(level: float) -> Callable[[Floats, np.random.Generator], Floats]:
+    def response(x: Floats, rng: np.random.Generator) -> Floats:
+        y = np.exp(x)
+        return y + level * y.std() * rng.standard_normal(y.shape)
+
+    return response
+
+
+def jump(x: Floats, rng: np.random.Generator) -> Floats:
+    y = np.exp(x)
+    return y + y.std() * (x > 0.47)
+
+
+def kink(x: Floats, rng: np.random.Generator) -> Floats:
+    return np.abs(x - 0.4)
+
+
+@pytest.mark.parametrize(
+    ("response", "runs", "share"),
+    [
+        (noise(0.0), 16, 0.0),
+        (noise(0.0), 32, 0.0),
+        (noise(0.001), 32, 0.0),
+        (noise(0.01), 16, 0.95),
+        (noise(0.01), 32, 0.99),
+        (jump, 32, 0.67),
+        (kink, 32, 0.10),
+    ],
+)
+def test_size_and_power_of_roughness(
+    response: Callable[[Floats, np.random.Generator], Floats], runs: int, share: float
+) -> None:
+    flagged = []
+    for seed in range(60):
+        rng = np.random.default_rng([seed, runs])
+        x = qmc.Sobol(1, seed=seed).random(runs)[rng.permutation(runs)]
+        flagged.append(bool(roughness(x, response(x, rng)).text()))
+    # standard error at most .07
+    assert np.mean(flagged) == pytest.approx(
+        share, abs=4 * np.sqrt(max(share - share**2, 0.01) / 60)
+    )
+
+
+def test_the_error_is_about_the_noise() -> None:
+    rng = np.random.default_rng(4)
+    x = rng.random((128, 2))
+    y = np.stack([np.exp(x[:, 0]), 1e6 * (x[:, 0] + x[:, 1] ** 2)], axis=1)
+    smooth = roughness(x, y)
+    assert smooth.text() == ""
+    y[:, 1] += 0.05 * y[:, 1].std() * rng.standard_normal(128)
+    rough = roughness(x, y)
+    assert 0.04 < rough.error < 0.08
+    assert rough.gain > 1.2
+    assert rough.text().startswith("The response is not smooth: noise")
+    # other units, and a run that failed
+    scaled = roughness(x * [1e3, 1e-3] + 5, y * [1e-4, 1e4])
+    assert scaled.error == pytest.approx(rough.error, rel=1e-3)
+    failed = roughness(np.r_[x, x[:1]], np.r_[y, [[np.nan, 1.0]]])
+    assert failed.error == pytest.approx(rough.error)
+
+
+def test_a_polynomial_is_smooth() -> None:
+    x = np.linspace(0, 1, 32)[np.random.default_rng(5).permutation(32), None]
+    assert roughness(x, (6 * x - 2) ** 2).text() == ""
+    assert roughness(x, np.ones_like(x)).text() == ""

@@ -1,0 +1,247 @@
+"""All roots of f(x) = y: counts and places in closed form, bounds, invariances."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from prbayes._checks import Floats
+from prbayes.propagation.points import sobol
+from prbayes.propagation.roots import Roots, find_roots, nearest_starts
+
+BOX = np.array([[-3.0], [3.0]])
+SQUARE = np.array([[-2.0, -2.0], [2.0, 2.0]])
+
+
+def fold(z: Floats) -> tuple[Floats, Floats]:
+    return z**2, 2 * z[:, :, None]
+
+
+def sphere(z: Floats) -> tuple[Floats, Floats]:
+    """Sum and product of two numbers, which are the same for (a, b) and (b, a)."""
+    values = np.stack([z.sum(axis=1), z.prod(axis=1)], axis=1)
+    jacobian = np.stack([np.ones_like(z), z[:, ::-1]], axis=1)
+    return values, jacobian
+
+
+def frame(z: Floats) -> tuple[Floats, Floats]:
+    """Two stiffnesses of a frame with two outputs that a mirror root gives back exactly."""
+    k, g = np.exp(z[:, 0]), np.exp(z[:, 1])
+    # Eigenvalues of [[k + g, -g], [-g, g]]
+    trace, determinant = k + 2 * g, k * g
+    values = np.stack([trace, determinant], axis=1)
+    jacobian = np.empty((len(z), 2, 2))
+    jacobian[:, 0, 0], jacobian[:, 0, 1] = k, 2 * g
+    jacobian[:, 1, 0] = jacobian[:, 1, 1] = k * g
+    return values, jacobian
+
+
+def line(a: Floats) -> Any:
+    return lambda z: (z @ a.T, np.broadcast_to(a, (len(z), *a.shape)))
+
+
+def spread_starts(n: int, count: int, box: Floats) -> Floats:
+    points = box[0] + (box[1] - box[0]) * sobol(count, box.shape[1], 0)
+    return np.broadcast_to(points, (n, *points.shape)).copy()
+
+
+def of(roots: Roots, i: int) -> Floats:
+    z = roots.z[roots.specimen == i]
+    return z[np.lexsort(z.T[::-1])]
+
+
+def test_a_folded_response_has_both_roots() -> None:
+    y = np.array([[0.25], [1.0], [4.0]])
+    roots = find_roots(fold, y, np.array([0.01]), spread_starts(3, 8, BOX), BOX)
+    assert np.bincount(roots.specimen).tolist() == [2, 2, 2]
+    for i, root in enumerate(np.sqrt(y[:, 0])):
+        assert np.allclose(of(roots, i).ravel(), [-root, root], atol=1e-5)
+    assert roots.misfit.max() < 1e-6
+
+
+def test_sums_and_products_have_two_roots() -> None:
+    y = np.array([[0.5, -0.5], [1.0, 0.1]])
+    roots = find_roots(sphere, y, np.array([1e-3, 1e-3]), spread_starts(2, 16, SQUARE), SQUARE)
+    for i, (total, product) in enumerate(y):
+        exact = np.sort(np.roots([1, -total, product]).real)
+        assert np.allclose(of(roots, i), [exact, exact[::-1]], atol=1e-5)
+
+
+def test_a_frame_has_its_root_and_the_mirror_root() -> None:
+    truth = np.array([[0.6, 0.9], [0.2, -1.2]])
+    y, _ = frame(truth)
+    roots = find_roots(frame, y, 1e-3 * y.std(axis=0), spread_starts(2, 16, SQUARE), SQUARE)
+    for i, (k, g) in enumerate(np.exp(truth)):
+        # k' + 2 g' = k + 2 g and k' g' = k g: the other solution is (2 g, k / 2)
+        exact = np.log([[k, g], [2 * g, k / 2]])
+        assert np.allclose(of(roots, i), exact[np.lexsort(exact.T[::-1])], atol=1e-5)
+
+
+def test_more_outputs_than_inputs_are_least_squares() -> None:
+    rng = np.random.default_rng(3)
+    a, y, sd = rng.normal(size=(5, 2)), rng.normal(size=(4, 5)), rng.uniform(0.5, 2, 5)
+    roots = find_roots(line(a), y, sd, spread_starts(4, 6, 5 * SQUARE), 5 * SQUARE)
+    assert roots.specimen.tolist() == [0, 1, 2, 3]
+    for i in range(4):
+        exact, *_ = np.linalg.lstsq(a / sd[:, None], y[i] / sd, rcond=None)
+        assert np.allclose(roots.z[i], exact, atol=1e-6)
+        residual = (y[i] - a @ exact) / sd
+        assert np.allclose(roots.residual[i], residual, atol=1e-6)
+        assert roots.misfit[i] == pytest.approx((residual**2).sum() / 2, abs=1e-8)
+        assert np.allclose(roots.jacobian[i], -(-a / sd[:, None]))
+
+
+def test_the_standard_deviation_may_be_of_each_specimen() -> None:
+    a = np.array([[1.0], [1.0]])
+    y, sd = np.array([[0.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 1.0], [1.0, 0.5]])
+    roots = find_roots(line(a), y, sd, spread_starts(2, 4, BOX), BOX)
+    assert np.allclose(roots.z.ravel(), [0.5, 0.8], atol=1e-6)  # weighted means
+
+
+def test_beyond_a_turning_point_the_root_is_there() -> None:
+    """The response reaches 0 and no less: the nearest input is that of the turning point."""
+    y, sd = np.array([[-0.1]]), np.array([0.1])
+    roots = find_roots(fold, y, sd, spread_starts(1, 8, BOX), BOX)
+    assert np.abs(roots.z).max() < 2e-3
+    assert roots.misfit[0] == pytest.approx(0.5, abs=1e-6)
+
+
+@pytest.mark.parametrize("y", [1e-4, 1e-3, 1e-2])
+def test_roots_beside_a_fold_are_different_where_the_error_separates_them(y: float) -> None:
+    starts = spread_starts(1, 16, BOX)
+    fine = find_roots(fold, np.array([[y]]), np.array([1e-3 * y]), starts, BOX)
+    assert np.allclose(of(fine, 0).ravel(), [-np.sqrt(y), np.sqrt(y)], rtol=1e-4)
+    # The error of the comparison covers both, and the distance is below a hundredth of the box.
+    coarse = find_roots(fold, np.array([[y]]), np.array([10 * y]), starts, BOX)
+    if 2 * np.sqrt(y) < 0.06:
+        assert len(coarse.z) == 1
+
+
+def test_each_root_is_returned_once() -> None:
+    starts = spread_starts(1, 64, BOX)
+    roots = find_roots(fold, np.array([[1.0]]), np.array([0.01]), starts, BOX)
+    assert np.allclose(np.sort(roots.z.ravel()), [-1, 1], atol=1e-5)
+
+
+def test_where_no_response_exists_no_root_is_found() -> None:
+    def half(z: Floats) -> tuple[Floats, Floats]:
+        values, jacobian = fold(z)
+        values[z[:, 0] < 0], jacobian[z[:, 0] < 0] = np.nan, np.nan
+        return values, jacobian
+
+    y = np.array([[1.0], [4.0]])
+    roots = find_roots(half, y, np.array([0.01]), spread_starts(2, 8, BOX), BOX)
+    assert np.allclose(roots.z.ravel(), [1, 2], atol=1e-5)
+
+
+def test_a_specimen_without_any_response_has_no_root() -> None:
+    def right(z: Floats) -> tuple[Floats, Floats]:
+        values, jacobian = fold(z)
+        values[z[:, 0] < 0], jacobian[z[:, 0] < 0] = np.nan, np.nan
+        return values, jacobian
+
+    starts = np.array([[[-1.0], [-2.0]], [[1.0], [2.0]]])
+    roots = find_roots(right, np.array([[1.0], [1.0]]), np.array([0.01]), starts, BOX)
+    assert roots.specimen.tolist() == [1]
+
+
+def test_roots_stay_within_the_box() -> None:
+    box = np.array([[-0.5], [1.5]])
+    y = np.array([[1.0], [9.0]])
+    roots = find_roots(fold, y, np.array([0.1]), spread_starts(2, 8, box), box)
+    assert roots.z.min() >= -0.5
+    assert roots.z.max() <= 1.5
+    # The second is not reached: its best is the end of the box.
+    assert of(roots, 1).ravel().tolist() == [1.5]
+    assert roots.misfit[-1] == pytest.approx((9 - 1.5**2) ** 2 / 0.02)
+
+
+def test_poorer_roots_are_kept_within_the_gap_alone() -> None:
+    def tilted(z: Floats) -> tuple[Floats, Floats]:
+        """Two outputs: the second separates both roots of the first by .2."""
+        values = np.stack([z[:, 0] ** 2, 0.1 * z[:, 0]], axis=1)
+        return values, np.stack([2 * z, np.full_like(z, 0.1)], axis=1)
+
+    y, starts = np.array([[1.0, 0.1]]), spread_starts(1, 16, BOX)
+    # The misfit of the mirror root is .2^2 / 2 sd^2: 2 nats, and 200.
+    for sd, count in ((0.1, 2), (0.01, 1)):
+        roots = find_roots(tilted, y, np.array([sd, sd]), starts, BOX)
+        assert len(roots.z) == count
+    assert len(find_roots(tilted, y, np.array([0.1, 0.1]), starts, BOX, gap=1.0).z) == 1
+
+
+def test_the_same_call_gives_the_same_bits() -> None:
+    y, _ = frame(np.random.default_rng(0).uniform(-1, 1, (20, 2)))
+    arguments = (frame, y, np.array([0.01, 0.01]), spread_starts(20, 12, SQUARE), SQUARE)
+    first, second = find_roots(*arguments), find_roots(*arguments)
+    for name in ("specimen", "z", "misfit", "residual", "jacobian"):
+        assert np.array_equal(getattr(first, name), getattr(second, name))
+
+
+def test_specimens_have_the_same_roots_alone_and_in_another_order() -> None:
+    y, _ = frame(np.random.default_rng(0).uniform(-1, 1, (9, 2)))
+    sd, starts = np.array([0.01, 0.01]), spread_starts(9, 12, SQUARE)
+    together = find_roots(frame, y, sd, starts, SQUARE)
+    backwards = find_roots(frame, y[::-1], sd, starts[::-1], SQUARE)
+    for i in range(9):
+        alone = find_roots(frame, y[i : i + 1], sd, starts[i : i + 1], SQUARE)
+        assert np.allclose(of(alone, 0), of(together, i), atol=1e-10)
+        assert np.allclose(of(backwards, 8 - i), of(together, i), atol=1e-10)
+
+
+@pytest.mark.parametrize("unit", [1e-8, 1e8])
+def test_units_of_outputs_do_not_matter(unit: float) -> None:
+    y, _ = frame(np.random.default_rng(0).uniform(-1, 1, (9, 2)))
+    sd, starts = np.array([0.01, 0.01]), spread_starts(9, 12, SQUARE)
+
+    def other(z: Floats) -> tuple[Floats, Floats]:
+        values, jacobian = frame(z)
+        return unit * values, unit * jacobian
+
+    first = find_roots(frame, y, sd, starts, SQUARE)
+    second = find_roots(other, unit * y, unit * sd, starts, SQUARE)
+    assert np.array_equal(first.specimen, second.specimen)
+    assert np.allclose(first.z, second.z, atol=1e-6)
+    assert np.allclose(first.misfit, second.misfit, atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_units_of_coordinates_do_not_matter(unit: float) -> None:
+    y, _ = frame(np.random.default_rng(0).uniform(-1, 1, (9, 2)))
+    sd, starts = np.array([0.01, 0.01]), spread_starts(9, 12, SQUARE)
+
+    def other(z: Floats) -> tuple[Floats, Floats]:
+        values, jacobian = frame(z / unit)
+        return values, jacobian / unit
+
+    first = find_roots(frame, y, sd, starts, SQUARE)
+    second = find_roots(other, y, sd, unit * starts, unit * SQUARE)
+    assert np.array_equal(first.specimen, second.specimen)
+    assert np.allclose(first.z, second.z / unit, atol=1e-6)
+
+
+def test_a_coordinate_without_influence_stays_where_it_starts() -> None:
+    def first_alone(z: Floats) -> tuple[Floats, Floats]:
+        jacobian = np.zeros((len(z), 2, 2))
+        jacobian[:, :, 0] = [1.0, 2.0]
+        return z[:, :1] * [1.0, 2.0], jacobian
+
+    starts = np.array([[[1.0, 0.7]]])
+    roots = find_roots(first_alone, np.array([[0.5, 1.0]]), np.ones(2), starts, SQUARE)
+    assert np.allclose(roots.z, [[0.5, 0.7]], atol=1e-6)
+
+
+def test_nearest_starts_are_the_runs_with_the_nearest_outputs() -> None:
+    z = np.arange(6.0)[:, None]
+    run_y = np.array([[0, 0], [1, 0], [2, 0], [0, 100], [1, 100], [2, 100]], dtype=float)
+    starts = nearest_starts(
+        z, run_y, np.array([[0.9, 0.0], [1.9, 100.0]]), np.array([1.0, 100.0]), 2
+    )
+    assert starts[:, 0].ravel().tolist() == [1, 5]
+    assert starts[:, 1].ravel().tolist() == [0, 4]
+    # In units of the spread: a distance of 100 in the second output is as one of 1 in the first.
+    y = np.array([[2.0, 60.0]])
+    starts = nearest_starts(z, run_y, y, np.array([1.0, 100.0]), 2)
+    assert starts.ravel().tolist() == [5, 2]
