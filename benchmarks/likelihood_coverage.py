@@ -17,6 +17,7 @@ import argparse
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -129,8 +130,13 @@ def likelihood_of(problem: Problem) -> SpecimenLikelihood:
 
 def thetas_of(problem: Problem, u: Any) -> Any:
     """Return hyperparameters (S, q) of standard normal coordinates: u is normal under the prior."""
-    columns = zip(problem.priors.values(), np.transpose(u), strict=True)
-    return np.stack([prior.distribution().ppf(ndtr(column)) for prior, column in columns], axis=1)
+    columns = zip(_frozen(problem.name), np.transpose(u), strict=True)
+    return np.stack([prior.ppf(ndtr(column)) for prior, column in columns], axis=1)
+
+
+@cache
+def _frozen(name: str) -> list[Any]:
+    return [prior.distribution() for prior in PROBLEMS[name].priors.values()]
 
 
 def log_likelihood(problem: Problem, x: Any, log_a: Any) -> Functions:
@@ -259,7 +265,7 @@ def data_set(problem: Problem, likelihood: SpecimenLikelihood, number: int) -> d
     y = problem.response(*[np.ravel(x) for x in problem.population.population(values, z)])
     row: dict[str, Any] = {"number": number}
     other = likelihood.observing(y)
-    # The coordinates are those of the prior, whatever the data.
+    # Coordinates are those of the prior, whatever the data.
     other.__dict__["coordinates"] = likelihood.coordinates
     try:
         points = other.points

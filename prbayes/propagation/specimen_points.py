@@ -178,11 +178,11 @@ def emulate(
         outputs = run(fresh)
         misfit = outputs - values
         good = np.isfinite(misfit).all(axis=1)
-        if good.any():
-            error = 2 * np.sqrt((misfit[good] ** 2).mean(axis=0))
-            error = np.maximum(error, options.floor * spread)
         some = np.flatnonzero(good[: options.fresh])
         if len(some) >= 4:
+            # At the roots alone: points around them may lie far out, where nothing was measured.
+            error = 2 * np.sqrt((misfit[some] ** 2).mean(axis=0))
+            error = np.maximum(error, options.floor * spread)
             unit = _typical(readings.comparison_sd(error))
             scaled = misfit[some] / unit, jacobian[some] / unit[:, None]
             biases = predicted_bias(*scaled, fresh[some], len(readings))
