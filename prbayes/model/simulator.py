@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -250,6 +251,7 @@ def _by_specimen(
         outputs,
         groups,
         extras,
+        weakref.ref(model),
     )
     data: Any = values
     if isinstance(observed, Variable):

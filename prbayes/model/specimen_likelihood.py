@@ -31,12 +31,16 @@ from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats
-from prbayes._finding import Finding
+from prbayes._finding import Finding, report
 from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.model.data_checks import data_findings
 from prbayes.model.node import known_value, required_simulators, response_name
+from prbayes.model.population_draws import Populations, specimens_of
 from prbayes.propagation.base import Propagation
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.metrics.readings import Readings
+from prbayes.propagation.fibre_points import fibre_points
+from prbayes.propagation.roots import Roots
 from prbayes.propagation.specimen_points import (
     Emulation,
     PointOptions,
@@ -90,6 +94,8 @@ class SpecimenLikelihood:
     outputs: Outputs
     groups: NDArray[np.intp] | None = None
     extras: Mapping[str, TensorVariable] = field(default_factory=dict)
+    model: Any = None  # weak reference to the pymc.Model
+    known: SpecimenLikelihood | None = None  # of the same runs, for other data
     options: PointOptions = PointOptions()
 
     @property
@@ -114,29 +120,24 @@ class SpecimenLikelihood:
         return np.where(np.isfinite(values), values, np.nan)
 
     @cached_property
-    def _emulated(self) -> tuple[Emulation, Any]:
-        d = self.coordinates.size
+    def _prepared(self) -> tuple[Emulation, SpecimenPoints, tuple[Finding, ...]]:
+        """The emulator, the points and what is to be reported of them."""
+        name, n = self.name, self.propagation.emulator_runs
+        bounds, d = self.coordinates.bounds, self.coordinates.size
+        if (self.readings.is_measured.sum(axis=1) < d).any() and self._is_partial:
+            populations = Populations(self.model, self.inputs, self.coordinates, self.groups)
+            prior = specimens_of(populations, populations.hyperparameters.prior_thetas(2048, 0), 1)
+            emulation, points = fibre_points(
+                self.run, self.readings, bounds, prior, populations.posterior, self.options, n=n,
+                name=name,
+            )  # fmt: skip
+            return emulation, points, report(self._data_findings(several_roots=True))
         box = np.stack([-np.ones(d), np.ones(d)])
-        return emulate(
-            self.run,
-            self.readings,
-            box,
-            self.coordinates.bounds,
-            self.options,
-            n=self.propagation.emulator_runs,
-            name=self.name,
+        known = None if self.known is None else self.known.emulation
+        emulation, roots = emulate(
+            self.run, self.readings, box, bounds, self.options, n=n, known=known, name=name
         )
-
-    @property
-    def emulation(self) -> Emulation:
-        """The emulator; the first access computes its runs."""
-        return self._emulated[0]
-
-    @cached_property
-    def points(self) -> SpecimenPoints:
-        """The points of the specimens."""
-        emulation, roots = self._emulated
-        return draw_points(
+        points = draw_points(
             emulation,
             emulation.error,
             self.readings,
@@ -145,6 +146,45 @@ class SpecimenLikelihood:
             self.options,
             error_is_known="error" not in self.extras,
         )
+        findings = [
+            *self._data_findings(several_roots=bool((points.n_roots > 1).any())),
+            *misfit_findings(self.name, self.readings, roots, emulation.error),
+        ]
+        return emulation, points, report(findings)
+
+    @property
+    def _is_partial(self) -> bool:
+        """Whether specimens have fewer readings than inputs, without censored ones in place."""
+        present = self.readings.is_measured | self.readings.is_censored
+        return bool((present.sum(axis=1) < self.coordinates.size).any())
+
+    def _data_findings(self, *, several_roots: bool) -> tuple[Finding, ...]:
+        """Return findings of rounded, censored and repeated readings that are taken as exact."""
+        steps = self.readings.step.max(axis=0)
+        # A reading error that the user gives covers rounding.
+        steps = np.where((steps > 0) | (self.metric.error is not None), np.maximum(steps, 1e-300), np.nan)
+        names = self.outputs.names
+        return data_findings(
+            self.readings.values,
+            labels=[f"{self.name}[{label}]" for label in names] or [self.name],
+            several_roots=several_roots,
+            rounded=steps,
+        )
+
+    @property
+    def emulation(self) -> Emulation:
+        """The emulator; the first access computes its runs."""
+        return self._prepared[0]
+
+    @property
+    def points(self) -> SpecimenPoints:
+        """The points of the specimens."""
+        return self._prepared[1]
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What the data and the runs show before the fit."""
+        return self._prepared[2]
 
     @cached_property
     def arrays(self) -> tuple[list[Any], Any]:
@@ -307,7 +347,55 @@ class SpecimenLikelihood:
             )
         rows = values.reshape(len(values), -1)
         readings = self.metric.readings(rows, reference_error(self.extras), self.event)
-        return replace(self, observed=values, readings=readings)
+        if len(values) != len(self.observed) and not (
+            self.groups is None and self.weights is None and self.specimens is None
+        ):
+            raise ValueError(
+                f"{self.name}: observed: got {len(values)} specimens, expected "
+                f"{len(self.observed)}, as many as there are groups, weights= or specimens=; build "
+                "the model again with those of the new ones"
+            )
+        known = self if "_prepared" in vars(self) else self.known
+        return replace(self, observed=values, readings=readings, known=known)
+
+
+def misfit_findings(
+    name: str, readings: Readings, roots: Roots, error: Floats, largest: float = 50.0
+) -> list[Finding]:
+    """Report specimens whose readings no inputs reproduce.
+
+    Parameters
+    ----------
+    name : str
+    readings : Readings
+    roots : Roots
+    error : ndarray, shape (m,)
+        Standard deviation of the emulator's error.
+    largest : float
+        Misfit in nats that is still an error of the emulator: ten standard deviations.
+    """
+    best = np.full(len(readings), np.inf)
+    np.minimum.at(best, roots.specimen, roots.misfit)
+    has_root = np.isfinite(best)
+    poor = np.flatnonzero(has_root & (best > largest))
+    if not poor.size:
+        return []
+    rows = [int(np.flatnonzero(roots.specimen == i)[np.argmin(roots.misfit[roots.specimen == i])])
+            for i in poor]  # fmt: skip
+    sd = np.where(readings.is_measured, readings.comparison_sd(error), 0.0)[poor]
+    off = np.sqrt(np.mean((roots.residual[rows] * sd) ** 2, axis=0))
+    outputs = ", ".join(f"{value:.2g}" for value in off)
+    return [
+        Finding(
+            "readings-misfit",
+            f"{name}: no inputs in the range of the priors reproduce the readings of "
+            f"{poor.size} of {int(has_root.sum())} specimens, which are off by {outputs} (root mean "
+            "square, by output), expected less than the error of the readings; pass "
+            "prb.LogLikelihood(error=...) with its standard deviation, or gross_errors=True for "
+            "single specimens, or look at the response and the priors",
+            "likelihood.md#readings-that-no-inputs-reproduce",
+        )
+    ]
 
 
 def reference_error(extras: Mapping[str, TensorVariable]) -> Floats | None:

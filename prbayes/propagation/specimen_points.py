@@ -96,14 +96,40 @@ class Emulation:
     bias : float
         Predicted bias of a mean or standard deviation of an input, in posterior standard
         deviations.
+    range : ndarray, shape (2, d)
+        Of the roots at which runs were made.
     """
 
     z: Floats
     y: Floats
     box: Floats
-    surface: Interpolant
+    surface: Response
     error: Floats
     bias: float
+    range: Floats
+
+    @classmethod
+    def first(
+        cls,
+        run: Callable[[Floats], Floats],
+        z: Floats,
+        box: Floats,
+        readings: Readings,
+        options: PointOptions,
+        name: str,
+    ) -> Emulation:
+        """Return the emulation of runs at first points."""
+        y = run(z)
+        spread = readings.spread()
+        surface, left_out = surface_near(z, y, readings, spread, name)
+        error = np.maximum(2 * left_out, options.floor * spread)
+        empty = np.stack([np.full(z.shape[1], np.inf), np.full(z.shape[1], -np.inf)])
+        return cls(z, y, box, surface, error, np.inf, empty)
+
+    def covers(self, z: Floats) -> bool:
+        """Return whether points lie in the range of the roots at which runs were made."""
+        margin = 0.1 * np.maximum(self.range[1] - self.range[0], 0.0)
+        return bool(((z >= self.range[0] - margin) & (z <= self.range[1] + margin)).all())
 
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
         """Return values and Jacobian, NaN where the nearest run has no response."""
@@ -133,6 +159,7 @@ def emulate(
     options: PointOptions,
     *,
     n: int | None = None,
+    known: Emulation | None = None,
     seed: int = 0,
     name: str = "response",
 ) -> tuple[Emulation, Roots]:
@@ -148,6 +175,8 @@ def emulate(
     options : PointOptions
     n : int, optional
         First runs.
+    known : Emulation, optional
+        Of the same response for other data: runs are added where the roots leave its range.
     seed : int
     name : str
         For messages.
@@ -159,41 +188,28 @@ def emulate(
     """
     d = box.shape[1]
     n = first_runs(d) if n is None else n
-    z = box[0] + (box[1] - box[0]) * sobol(n, d, seed)
-    y = run(z)
     spread = readings.spread()
+    if known is None:
+        first = box[0] + (box[1] - box[0]) * sobol(n, d, seed)
+        emulation = Emulation.first(run, first, search_box, readings, options, name)
+    else:
+        emulation = known
     rng = np.random.default_rng([seed, 1])
-    emulation, error, bias = None, None, np.inf
-    most = 6
-    for batch in range(most):
-        surface, left_out = _surface(z, y, readings, spread, name)
-        if error is None:
-            error = np.maximum(2 * left_out, options.floor * spread)
-        emulation = Emulation(z, y, search_box, surface, error, bias)
+    for batch in range(6):
         roots = specimen_roots(emulation, readings, options)
-        if (batch >= 2 and bias <= options.bias) or batch == most - 1:
+        enough = batch >= 2 if known is None else emulation.covers(roots.z)
+        if enough and emulation.bias <= options.bias:
             break
-        fresh = _fresh_points(roots, search_box, max(n // 2, options.fresh), options.fresh, rng)
-        values, jacobian = surface(fresh)
-        outputs = run(fresh)
-        misfit = outputs - values
-        good = np.isfinite(misfit).all(axis=1)
-        some = np.flatnonzero(good[: options.fresh])
-        if len(some) >= 4:
-            # At the roots alone: points around them may lie far out, where nothing was measured.
-            error = 2 * np.sqrt((misfit[some] ** 2).mean(axis=0))
-            error = np.maximum(error, options.floor * spread)
-            unit = _typical(readings.comparison_sd(error))
-            scaled = misfit[some] / unit, jacobian[some] / unit[:, None]
-            biases = predicted_bias(*scaled, fresh[some], len(readings))
-            bias = float(np.abs(biases).max())
-        z, y = np.concatenate([z, fresh]), np.concatenate([y, outputs])
-    assert emulation is not None
+        count = max(n // 2, options.fresh)
+        fresh = spread_out(roots.z, search_box, count, options.fresh, rng)
+        emulation = extended(emulation, run, fresh, readings, options, spread, name)
+    else:
+        roots = specimen_roots(emulation, readings, options)
     options, roots = _all_roots(emulation, readings, options, roots, seed)
     if emulation.bias > options.bias:
         raise DesignError(
             f"{name}: got an emulator whose error would shift a mean or standard deviation of an "
-            f"input by {emulation.bias:.2g} posterior standard deviations after {len(z)} runs, "
+            f"input by {emulation.bias:.2g} posterior standard deviations after {len(emulation.z)} runs, "
             f"expected at most {options.bias}; the response is not smooth enough for "
             "prb.LogLikelihood(): use metric=prb.ProbabilityResidual(), or more first runs with "
             "propagation=prb.Reweighted(n)"
@@ -201,12 +217,43 @@ def emulate(
     return emulation, roots
 
 
-def _typical(sd: Floats) -> Floats:
+def extended(
+    emulation: Emulation,
+    run: Callable[[Floats], Floats],
+    fresh: Floats,
+    readings: Readings,
+    options: PointOptions,
+    spread: Floats,
+    name: str,
+) -> Emulation:
+    """Return the emulation with runs at fresh points, whose misfit gives its error and bias."""
+    values, jacobian = emulation.surface(fresh)
+    outputs = run(fresh)
+    misfit = outputs - values
+    good = np.isfinite(misfit).all(axis=1)
+    error, bias = emulation.error, np.inf
+    some = np.flatnonzero(good[: options.fresh])
+    if len(some) >= 4:
+        # At the roots alone: points around them may lie far out, where nothing was measured.
+        error = 2 * np.sqrt((misfit[some] ** 2).mean(axis=0))
+        error = np.maximum(error, options.floor * spread)
+        unit = typical_sd(readings.comparison_sd(error))
+        scaled = misfit[some] / unit, jacobian[some] / unit[:, None]
+        bias = float(np.abs(predicted_bias(*scaled, fresh[some], len(readings))).max())
+    z = np.concatenate([emulation.z, fresh])
+    y = np.concatenate([emulation.y, outputs])
+    surface, _ = surface_near(z, y, readings, spread, name)
+    reach = np.concatenate([emulation.range, fresh])
+    extremes = np.stack([reach.min(axis=0), reach.max(axis=0)])
+    return Emulation(z, y, emulation.box, surface, error, bias, extremes)
+
+
+def typical_sd(sd: Floats) -> Floats:
     """Return the median of finite values by output, (N, m) -> (m,)."""
     return np.array([np.median(column[np.isfinite(column)]) for column in sd.T])
 
 
-def _surface(
+def surface_near(
     z: Floats, y: Floats, readings: Readings, spread: Floats, name: str
 ) -> tuple[Interpolant, Floats]:
     """Return the interpolant, and its root mean square left-out error near the data, (m,)."""
@@ -300,15 +347,14 @@ def _starts(
     return starts
 
 
-def _fresh_points(
-    roots: Roots, box: Floats, count: int, sampled: int, rng: np.random.Generator
+def spread_out(
+    z: Floats, box: Floats, count: int, sampled: int, rng: np.random.Generator
 ) -> Floats:
-    """Return points for new runs, (count, d): a sample of the roots, then the rest spread out.
+    """Return points for new runs, (count, d): a sample of the given ones, then others spread out.
 
-    The spread ones are chosen one by one, each farthest from all others, among the roots and
-    points around them.
+    The spread ones are chosen one by one, each farthest from all others, among the given points
+    and points around them.
     """
-    z = roots.z
     scale = np.maximum(z.std(axis=0), 1e-9 * (box[1] - box[0]))
     chosen = z[rng.permutation(len(z))[: min(sampled, len(z))]]
     around = z[rng.integers(0, len(z), 8 * count)]
