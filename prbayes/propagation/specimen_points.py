@@ -209,7 +209,7 @@ def emulate(
     if emulation.bias > options.bias:
         raise DesignError(
             f"{name}: got an emulator whose error would shift a mean or standard deviation of an "
-            f"input by {emulation.bias:.2g} posterior standard deviations after {len(z)} runs, "
+            f"input by {emulation.bias:.2g} posterior standard deviations after {len(emulation.z)} runs, "
             f"expected at most {options.bias}; the response is not smooth enough for "
             "prb.LogLikelihood(): use metric=prb.ProbabilityResidual(), or more first runs with "
             "propagation=prb.Reweighted(n)"
@@ -232,13 +232,11 @@ def extended(
     misfit = outputs - values
     good = np.isfinite(misfit).all(axis=1)
     error, bias = emulation.error, np.inf
-    # Where the response is steep, runs around roots are far from the data.
-    near = good & _is_near(outputs, readings, spread)
-    if near.any():
-        error = 2 * np.sqrt((misfit[near] ** 2).mean(axis=0))
-        error = np.maximum(error, options.floor * spread)
     some = np.flatnonzero(good[: options.fresh])
     if len(some) >= 4:
+        # At the roots alone: points around them may lie far out, where nothing was measured.
+        error = 2 * np.sqrt((misfit[some] ** 2).mean(axis=0))
+        error = np.maximum(error, options.floor * spread)
         unit = typical_sd(readings.comparison_sd(error))
         scaled = misfit[some] / unit, jacobian[some] / unit[:, None]
         bias = float(np.abs(predicted_bias(*scaled, fresh[some], len(readings))).max())
