@@ -266,9 +266,7 @@ def _points(
 # -- draws -----------------------------------------------------------------------------------
 
 
-def check_draws(
-    evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats | None
-) -> Checked:
+def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats | None) -> Checked:
     """Return what the checks of draws report.
 
     Parameters

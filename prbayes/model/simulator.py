@@ -228,7 +228,9 @@ def _by_specimen(
     _refuse_by_specimen(name, inputs, epsilon, propagation)
     values = checked_specimens(name, values)
     settings = _propagation(name, propagation)
-    labels = None if specimens is None else sample_labels(specimens, len(values), f"{name}: specimens")
+    labels = (
+        None if specimens is None else sample_labels(specimens, len(values), f"{name}: specimens")
+    )
     factors = None
     if weights is not None:
         factors = sample_weights(weights, len(values), f"{name}: weights") * len(values)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +77,40 @@ def first_runs(dimensions: int) -> int:
     return 64 if dimensions <= 2 else 128 if dimensions <= 4 else 512
 
 
+class Surface(Protocol):
+    """Outputs at coordinates between runs, with their Jacobian."""
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian, (k, d) -> (k, m), (k, m, d)."""
+
+    def values(self, z: Floats) -> Floats:
+        """Return the values alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class DifferencedResponse:
+    """The response itself, with central differences for its Jacobian: 2 d + 1 runs a point.
+
+    Attributes
+    ----------
+    values : callable
+        Coordinates (k, d) -> outputs (k, m).
+    step : float
+        In units of the coordinates.
+    """
+
+    values: Callable[[Floats], Floats]
+    step: float = 1e-5
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian."""
+        k, d = z.shape
+        shifts = self.step * np.concatenate([np.zeros((1, d)), np.eye(d), -np.eye(d)])
+        values = self.values((z + shifts[:, None]).reshape(-1, d)).reshape(2 * d + 1, k, -1)
+        slopes = (values[1 : d + 1] - values[d + 1 :]) / (2 * self.step)
+        return values[0], np.moveaxis(slopes, 0, -1)
+
+
 @dataclass(frozen=True, eq=False)
 class Emulation:
     """Runs of the response, and the emulator through them.
@@ -103,7 +137,7 @@ class Emulation:
     z: Floats
     y: Floats
     box: Floats
-    surface: Response
+    surface: Surface
     error: Floats
     bias: float
     range: Floats
@@ -126,9 +160,25 @@ class Emulation:
         empty = np.stack([np.full(z.shape[1], np.inf), np.full(z.shape[1], -np.inf)])
         return cls(z, y, box, surface, error, np.inf, empty)
 
+    @classmethod
+    def of_function(
+        cls,
+        run: Callable[[Floats], Floats],
+        box: Floats,
+        search_box: Floats,
+        readings: Readings,
+        options: PointOptions,
+    ) -> Emulation:
+        """Return the response itself in place of an emulator, with runs as starts of a search."""
+        z = box[0] + (box[1] - box[0]) * sobol(first_runs(box.shape[1]), box.shape[1], 0)
+        error = options.floor * readings.spread()
+        whole = np.stack([np.full(box.shape[1], -np.inf), np.full(box.shape[1], np.inf)])
+        return cls(z, run(z), search_box, DifferencedResponse(run), error, 0.0, whole)
+
     def covers(self, z: Floats) -> bool:
         """Return whether points lie in the range of the roots at which runs were made."""
-        margin = 0.1 * np.maximum(self.range[1] - self.range[0], 0.0)
+        with np.errstate(invalid="ignore"):
+            margin = np.nan_to_num(0.1 * np.maximum(self.range[1] - self.range[0], 0.0))
         return bool(((z >= self.range[0] - margin) & (z <= self.range[1] + margin)).all())
 
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
@@ -138,6 +188,12 @@ class Emulation:
         if failed.any():
             values[failed], jacobian[failed] = np.nan, np.nan
         return values, jacobian
+
+    def values(self, z: Floats) -> Floats:
+        """Return the values alone."""
+        values = self.surface.values(z)
+        values[self.fails(z)] = np.nan
+        return values
 
     def fails(self, z: Floats) -> NDArray[np.bool_]:
         """Return where the nearest run has no response."""
@@ -209,8 +265,8 @@ def emulate(
     if emulation.bias > options.bias:
         raise DesignError(
             f"{name}: got an emulator whose error would shift a mean or standard deviation of an "
-            f"input by {emulation.bias:.2g} posterior standard deviations after {len(emulation.z)} runs, "
-            f"expected at most {options.bias}; the response is not smooth enough for "
+            f"input by {emulation.bias:.2g} posterior standard deviations after "
+            f"{len(emulation.z)} runs, expected at most {options.bias}; the response is not smooth enough for "
             "prb.LogLikelihood(): use metric=prb.ProbabilityResidual(), or more first runs with "
             "propagation=prb.Reweighted(n)"
         )
@@ -318,7 +374,9 @@ def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptio
     block = max(1, AT_ONCE // (options.starts * len(run_z) * 4))
     for first in range(0, len(solvable), block):
         rows = solvable[first : first + block]
-        starts = _starts(run_z, run_y, target[rows], measured[rows], readings.spread(), options.starts)
+        starts = _starts(
+            run_z, run_y, target[rows], measured[rows], readings.spread(), options.starts
+        )
         roots = find_roots(
             emulation, target[rows], np.where(measured[rows], sd[rows], 1e150), starts,
             emulation.box, gap=options.gap,
@@ -370,10 +428,10 @@ def spread_out(
         best = int(np.argmax(distance))
         picked.append(candidates[best])
         distance = np.minimum(distance, ((candidates - candidates[best]) ** 2).sum(axis=1))
-    return np.array(picked) * scale
+    return np.asarray(np.array(picked) * scale)
 
 
-# -- points ------------------------------------------------------------------------------------------
+# -- points ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -653,7 +711,7 @@ def _in_blocks(emulation: Response, z: Floats) -> Floats:
 
 
 def _scrambled(components: int, count: int, dimensions: int, seed: tuple[int, int]) -> Floats:
-    """Return Sobol points with a random shift for each component, (components, count, dimensions)."""
+    """Return Sobol points with a random shift for each component, (components, count, d)."""
     base = sobol(count, dimensions, seed[0] * 1009 + seed[1])
     shift = np.random.default_rng(seed).random((components, 1, dimensions))
     return np.clip((base + shift) % 1.0, 1e-9, 1 - 1e-9)
@@ -663,7 +721,7 @@ def _t_radius(u: Floats, degrees: float) -> Floats:
     """Return the factors that turn normal vectors into vectors of a t distribution."""
     from scipy.special import chdtri
 
-    return np.sqrt(degrees / chdtri(degrees, u))
+    return np.asarray(np.sqrt(degrees / chdtri(degrees, u)))
 
 
 def _by_component(values: Floats, components: _Components) -> Floats:
@@ -694,8 +752,8 @@ def _normalised(sample: _Sample, components: _Components) -> _Sample:
     total = logsumexp(log_a, axis=2)
     mass = np.where(table >= 0, components.log_mass[np.maximum(table, 0)], -np.inf)
     shift = np.where(np.isfinite(total), mass - np.where(np.isfinite(total), total, 0.0), 0.0)
-    log_a = (log_a + shift[..., None]).reshape(n, -1)
-    return _Sample(sample.z, sample.outputs, log_a, sample.log_proposal, sample.n_roots)
+    scaled = (log_a + shift[..., None]).reshape(n, -1)
+    return replace(sample, log_a=scaled)
 
 
 def _joined(halves: list[_Sample]) -> _Sample:
