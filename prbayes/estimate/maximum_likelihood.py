@@ -44,7 +44,7 @@ class LocalOptimum:
     value: float
     covariance: Floats
     converged: bool
-    steps: slice
+    steps: slice = slice(0)
 
 
 def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:

@@ -204,7 +204,8 @@ def test_the_number_of_evaluations_is_limited(most: int) -> None:
     optimum = fit(normal_model(), max_evaluations=most)
     # A descent has ten evaluations at least, and the Hessian up to twelve of them.
     assert optimum.n_evaluations <= most + 40
-    assert len(optimum.trace["theta"]) == optimum.n_evaluations
+    # The trace is that of the best descent.
+    assert len(optimum.trace["theta"]) <= optimum.n_evaluations
 
 
 @pytest.mark.long

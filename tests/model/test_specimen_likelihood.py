@@ -471,7 +471,7 @@ def test_data_that_are_no_readings_are_refused(observed: Floats, message: str) -
 
 
 def test_there_is_no_epsilon_to_set_or_to_calibrate() -> None:
-    message = "prb.LogLikelihood.. is a likelihood and has no scale"
+    message = "prb.LogLikelihood.., which has no epsilon"
     with pytest.raises(ValueError, match=message):
         prb.set_epsilon(shared(), 0.1)
     with pytest.raises(ValueError, match=message):
