@@ -175,7 +175,7 @@ def _polynomials(u: Floats, powers: NDArray[np.intp]) -> tuple[Floats, list[Floa
     """Return products of Legendre polynomials, (k, terms), and their d partial derivatives."""
     k, d = u.shape
     degree = int(powers.max())
-    single = np.polynomial.legendre.legvander(u, degree)  # (k, d, degree + 1)
+    single: Floats = np.polynomial.legendre.legvander(u, degree)  # (k, d, degree + 1)
     slope = np.zeros_like(single)
     # P'_{p+1} = P'_{p-1} + (2 p + 1) P_p
     for p in range(degree):
@@ -186,7 +186,7 @@ def _polynomials(u: Floats, powers: NDArray[np.intp]) -> tuple[Floats, list[Floa
     terms = np.ones((k, len(powers)))
     for factor in factors:
         terms *= factor
-    slopes = []
+    slopes: list[Floats] = []
     for a in range(d):
         derivative = slope[:, a, powers[:, a]].copy()
         for b, factor in enumerate(factors):

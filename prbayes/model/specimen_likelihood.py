@@ -14,7 +14,7 @@ from __future__ import annotations
 import logging
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -73,6 +73,9 @@ class SpecimenLikelihood:
     outputs : Outputs
     groups : ndarray of int, shape (N,), or None
         Index of each specimen's group.
+    options : PointOptions
+    runs : dict
+        Outputs of runs by their coordinates; likelihoods of other observed responses share it.
     """
 
     name: str
@@ -87,6 +90,7 @@ class SpecimenLikelihood:
     outputs: Outputs
     groups: NDArray[np.intp] | None = None
     options: PointOptions = PointOptions()
+    runs: dict[bytes, Floats] = field(default_factory=dict)
 
     @property
     def event(self) -> tuple[int, ...]:
@@ -100,9 +104,14 @@ class SpecimenLikelihood:
 
     def run(self, z: Floats) -> Floats:
         """Return the outputs of runs at coordinates, (n, d) -> (n, m); NaN where there is none."""
-        values = self.responses(self.coordinates.inputs(z), [])
-        values = values.reshape(len(z), -1)
-        return np.where(np.isfinite(values), values, np.nan)
+        keys = [row.tobytes() for row in z]
+        new = [i for i, key in enumerate(keys) if key not in self.runs]
+        if new:
+            values = self.responses(self.coordinates.inputs(z[new]), [])
+            values = values.reshape(len(new), -1)
+            values = np.where(np.isfinite(values), values, np.nan)
+            self.runs.update(zip([keys[i] for i in new], values, strict=True))
+        return np.array([self.runs[key] for key in keys])
 
     @cached_property
     def _emulated(self) -> tuple[Emulation, Any]:
