@@ -180,9 +180,7 @@ def _sparse_powers(d: int, degree: int) -> list[tuple[int, ...]]:
     """Return the same without the many combinations whose total is too high."""
     if d == 1:
         return [(p,) for p in range(degree + 1)]
-    return [
-        (p, *rest) for p in range(degree + 1) for rest in _sparse_powers(d - 1, degree - p)
-    ]
+    return [(p, *rest) for p in range(degree + 1) for rest in _sparse_powers(d - 1, degree - p)]
 
 
 def _polynomials(u: Floats, powers: NDArray[np.intp]) -> tuple[Floats, list[Floats]]:
