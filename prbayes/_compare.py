@@ -18,7 +18,7 @@ from prbayes._weighted import INTERVAL
 from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.estimate.refinement import reached
 from prbayes.metrics.area import AreaMetric
-from prbayes.metrics.base import Metric
+from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.metrics.density import GaussianKDE
 from prbayes.metrics.divergence import KullbackLeibler
 from prbayes.metrics.joint import Joint
@@ -36,22 +36,22 @@ from prbayes.model.elements import (
     variable_of,
     with_coordinates,
 )
+from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import as_attributes, require_together
 from prbayes.model.labels import labelled
-from prbayes.model.node import Node, nodes
+from prbayes.model.node import simulators
+from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.model.support import shortcomings
 from prbayes.model.turns import in_turn
 from prbayes.response.inputs import event_shape
 
 # What a comparison has by result besides scores.
 COSTS = ("n_responses", "seconds")
-_METRICS = (
-    ProbabilityResidual(),
-    KullbackLeibler(),
-    AreaMetric(),
-    LogLikelihood(density=GaussianKDE()),
-)
+_KERNEL = LogLikelihood(density=GaussianKDE())
+_METRICS = (ProbabilityResidual(), KullbackLeibler(), AreaMetric(), _KERNEL)
+# Minus the mean log-likelihood of a specimen, where a simulator has that.
+_BY_SPECIMEN = "LogLikelihood by specimen"
 
 
 @in_turn
@@ -87,7 +87,8 @@ def compare(
         result's sd); and by result: ``n_responses`` and ``seconds``, NaN where a result does not
         tell, and the discrepancy of the estimate's population under each metric, by the metric's
         class, with the simulator's name before it if there are several; NaN where stored responses
-        do not support it. A notebook shows it as a table.
+        do not support it. Of a simulator with the log-likelihood by specimen, populations are
+        emulated, and ``LogLikelihood by specimen`` is minus its mean over the specimens. A notebook shows it as a table.
 
     Raises
     ------
@@ -146,7 +147,7 @@ def compare(
     data["shift"] = (dims, shift)
     for key in COSTS:
         data[key] = ("result", [getattr(column, key) for column in columns.values()])
-    if model is not None and nodes(model):
+    if model is not None and (simulators(model) or specimen_likelihoods(model)):
         scored = _table(columns, every)[..., 0]
         # An optimum of this model was found on the designs as they are.
         here = any(isinstance(each, Optimum) and each.model is model for each in results.values())
@@ -328,21 +329,38 @@ def _scored(
     """Return the same of thetas, shape (results, d)."""
     thin = [shortcomings(evaluator, theta[None]) for theta in thetas]
     found = {}
-    for k, node in enumerate(evaluator.nodes):
-        supported = np.array([node.name not in lacking for lacking in thin])
-        roots = evaluator.roots(thetas, k)
-        before = f"{node.name} " if len(evaluator.nodes) > 1 else ""
-        for metric in _usual(node) if metrics is None else metrics:
-            target = metric.against(node.target.observed, node.target.weights)
-            scores = node.bound.discrepancies(roots, target)
+    several = len(evaluator.simulators) > 1
+    for k, simulator in enumerate(evaluator.simulators):
+        supported = np.array([simulator.name not in lacking for lacking in thin])
+        before = f"{simulator.name} " if several else ""
+        for metric in _usual(simulator) if metrics is None else metrics:
+            target = metric.against(simulator.observed, simulator.weights)
+            scores = _discrepancies(evaluator, thetas, k, target)
             key = f"{before}{_class_of(metric)}"
             found[key] = np.where(supported, scores, np.nan)
+    for name, values in evaluator.specimen_log_likelihoods(thetas).items():
+        before = f"{name} " if several else ""
+        found[f"{before}{_BY_SPECIMEN}"] = -values.mean(axis=1)
     return found
 
 
-def _usual(node: Node) -> Sequence[Metric]:
-    """Return the metrics of all, or of several outputs the same in all directions."""
-    return [Joint(own) for own in _METRICS] if node.target.observed.ndim > 1 else _METRICS
+def _discrepancies(evaluator: Evaluator, thetas: Floats, k: int, target: Discrepancy) -> Floats:
+    """Return the discrepancies of the k-th simulator's populations from a target, (results,)."""
+    simulator = evaluator.simulators[k]
+    if not simulator.is_emulated:
+        return simulator.bound.discrepancies(evaluator.roots(thetas, k), target)
+    values, weights = evaluator.populations(thetas, k)
+    rows = [target.of(values[[i]], weights[[i]])[0] for i in range(len(thetas))]
+    return np.array(rows)
+
+
+def _usual(simulator: PopulationSimulator) -> Sequence[Metric]:
+    """Return the metrics of all, or of several outputs the same in all directions.
+
+    Where there is the log-likelihood by specimen, it takes the place of the kernel form.
+    """
+    metrics = [own for own in _METRICS if not (simulator.is_emulated and own is _KERNEL)]
+    return [Joint(own) for own in metrics] if simulator.observed.ndim > 1 else metrics
 
 
 def _class_of(metric: Metric) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
@@ -12,8 +12,10 @@ import pymc as pm
 import xarray as xr
 
 from prbayes._checks import Floats
+from prbayes._finding import Finding
 from prbayes._html import view
 from prbayes._pages import more_in
+from prbayes._specimen_checks import Checked, check_draws, check_optimum, separate_modes
 from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.disagreement import disagreement
 from prbayes.estimate.goodness import UNLIKELY, Refitted, of_another_family, of_held_away
@@ -66,27 +68,42 @@ class Diagnosis:
     notes : tuple of str
         By what many outputs are compared; what was not looked at, and why; and which of several
         outputs disagree.
+    findings : tuple of Finding
+        Those of the messages that have a code, by which they are filtered.
+    untested : tuple of str
+        Tests of the log-likelihood by specimen that were not run, and why.
     """
 
     messages: tuple[str, ...]
     support: xr.Dataset = field(repr=False)
     notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    untested: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
         """Whether nothing is wrong."""
         return not self.messages
 
+    @property
+    def all_clear(self) -> str:
+        """What is said where nothing is wrong, by whether all tests were run."""
+        if self.untested:
+            return "No problem was found by the tests that were run."
+        return "No problem was found."
+
     def __str__(self) -> str:
-        return "\n".join([*(self.messages or ["No problem was found."]), *self.notes])
+        return "\n".join([*(self.messages or [self.all_clear]), *self.notes, *self.untested])
 
     def _repr_html_(self) -> str:
         """Show the sentences in a notebook, what is wrong first."""
+        remarks = (*self.notes, *self.untested)
         if self.ok:
-            return view("Diagnosis: no problem was found", sentences=self.notes)
+            clear = self.all_clear.removesuffix(".")
+            return view(f"Diagnosis: {clear[0].lower()}{clear[1:]}", sentences=remarks)
         count = len(self.messages)
         heading = f"Diagnosis: {count} problem{'s' if count > 1 else ''}"
-        return view(heading, sentences=[*self.messages, *self.notes])
+        return view(heading, sentences=[*self.messages, *remarks])
 
 
 @in_turn
@@ -99,6 +116,11 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     of optima on stored responses and of adjusted draws, whether the data can have come from the
     best population, by refits (p < .01). If they cannot, notes tell which of several outputs, and
     which correlations of two, disagree. No response is computed; what was not looked at is said.
+
+    With the log-likelihood by specimen: whether chains are in different modes; of optima, a test of
+    the family of the population of the inputs, with its power at this number of specimens; of
+    draws, the conflict of prior and data, and specimens on which the posterior depends (Pareto k,
+    where the result has a log-likelihood by specimen).
 
     Parameters
     ----------
@@ -161,7 +183,12 @@ def _refuse_other(result: object) -> None:
 
 
 def _of_optimum(optimum: Optimum) -> Diagnosis:
-    family, notes = _of_family(optimum)
+    checked = Checked()
+    if optimum.evaluator.nodes:
+        family, notes = _of_family(optimum)
+    else:
+        checked = check_optimum(optimum)
+        family, notes = [], checked.notes
     messages = _sentences([*optimum.warnings, *family])
     told = optimum.at_edge or optimum.stopped  # by the warnings
     if not optimum.converged and not told:
@@ -173,7 +200,19 @@ def _of_optimum(optimum: Optimum) -> Diagnosis:
     )
     failed, harmless = _failed(optimum.failures, lost, broken)
     notes = (*_compared(optimum.to_datatree()), *_left_out(lost), *harmless, *notes)
-    return Diagnosis((*messages, *failed, *_unsupported(designs)), designs.support, notes)
+    messages += _texts(checked.findings)
+    return Diagnosis(
+        (*messages, *failed, *_unsupported(designs)),
+        designs.support,
+        notes,
+        checked.findings,
+        checked.untested,
+    )
+
+
+def _texts(findings: Iterable[Finding]) -> list[str]:
+    """Return findings as sentences."""
+    return _sentences(map(str, findings))
 
 
 def _of_family(optimum: Optimum) -> tuple[list[str], tuple[str, ...]]:
@@ -221,10 +260,24 @@ def _of_stored_optimum(result: xr.DataTree) -> Diagnosis:
     messages = _warnings(attrs)
     if not attrs.get("converged", True) and not attrs.get("stopped"):
         messages.append(_not_converged(str(attrs.get("message", ""))))
-    refits = _not_looked_at("refits need the model; pass the Optimum itself")
     failed, harmless = _failed_in(result)
-    notes = (*_compared(result), *_left_out(_lost_in(result)), *harmless, *refits)
-    return Diagnosis((*messages, *failed), xr.Dataset(), notes)
+    notes = (*_compared(result), *_left_out(_lost_in(result)), *harmless)
+    if _is_by_specimen(result):
+        untested = (
+            "The family of the population was not tested: that needs the model; pass the Optimum "
+            "itself.",
+        )
+        return Diagnosis((*messages, *failed), xr.Dataset(), notes, untested=untested)
+    refits = _not_looked_at("refits need the model; pass the Optimum itself")
+    return Diagnosis((*messages, *failed), xr.Dataset(), (*notes, *refits))
+
+
+def _is_by_specimen(result: xr.DataTree) -> bool:
+    """Return whether all simulators of a result have the log-likelihood by specimen."""
+    if "calibration" not in result or "is_likelihood" not in result["calibration"]:
+        return False
+    is_likelihood = result["calibration"].to_dataset()["is_likelihood"]
+    return bool(is_likelihood.values.all())
 
 
 def _failed_in(result: xr.DataTree) -> tuple[list[str], list[str]]:
@@ -319,34 +372,61 @@ def _not_converged(message: str) -> str:
 def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
     posterior = result["posterior"]
     variables = posterior.to_dataset()
+    evaluator, thetas = None, None
     if "calibration" in result:
         # A model that was built again has not yet the designs that these draws are of.
         designs = _stored(result["calibration"].to_dataset())
+        by_specimen = _is_by_specimen(result)
+        if model is not None and by_specimen:
+            evaluator = Evaluator(model)
+            thetas = _thetas(posterior, model)
     else:
         model = model_on_context(model, "prb.diagnose")
         require_of_model(result, model, "diagnose", Level.OPTIMUM)
-        designs = _computed(Evaluator(model), _thetas(posterior, model))
+        evaluator = Evaluator(model)
+        thetas = _thetas(posterior, model)
+        designs = _computed(evaluator, thetas)
+        by_specimen = not evaluator.nodes
     if model is not None:
         variables = variables[[str(rv.name) for rv in model.free_RVs]]
+    checked = Checked()
+    modes: tuple[Finding, ...] = ()
+    if by_specimen:
+        shape = (posterior.sizes["chain"], posterior.sizes["draw"], -1)
+        if thetas is not None:
+            thetas = thetas.reshape(shape)
+        checked = check_draws(evaluator, result, thetas)
+        columns = _columns(variables)
+        modes = separate_modes(np.stack(list(columns.values()), axis=-1), list(columns))
     failed, harmless = _failed_in(result)
     messages = [
         *_warnings(posterior.attrs),
-        *_convergence(variables),
+        *_texts(modes),
+        *_convergence(variables, in_modes=bool(modes)),
         *_copies(_before_adjustment(result, variables)),
         *_motion(result),
         *failed,
         *_unsupported(designs),
+        *_texts(checked.findings),
     ]
-    refits = _of_refits(posterior.attrs, several=_has_several_outputs(result))
     lost = _lost_in(result) or _lost_by(designs)
-    notes = (
-        *_compared(result),
-        *_left_out(lost),
-        *harmless,
-        *_unadjusted(posterior.attrs),
-        *refits,
-    )
-    return Diagnosis(tuple(messages), designs.support, notes)
+    notes = (*_compared(result), *_left_out(lost), *harmless, *checked.notes)
+    if not by_specimen:
+        refits = _of_refits(posterior.attrs, several=_has_several_outputs(result))
+        notes = (*notes, *_unadjusted(posterior.attrs), *refits)
+    findings = (*modes, *checked.findings)
+    return Diagnosis(tuple(messages), designs.support, notes, findings, checked.untested)
+
+
+def _columns(variables: xr.Dataset) -> dict[str, Floats]:
+    """Return the draws of each element, (chains, draws)."""
+    columns = {}
+    for name, values in variables.data_vars.items():
+        table = values.transpose("chain", "draw", ...).values
+        flat = table.reshape(*table.shape[:2], -1)
+        for j in range(flat.shape[-1]):
+            columns[f"{name}[{j}]" if values.ndim > 2 else str(name)] = flat[..., j]
+    return columns
 
 
 def _unadjusted(attrs: Mapping[Any, Any]) -> tuple[str, ...]:
@@ -397,8 +477,13 @@ def _sentences(lines: Any) -> list[str]:
     return [f"{line[0].upper()}{line[1:]}." for line in lines if line]
 
 
-def _convergence(posterior: xr.Dataset) -> list[str]:
-    """Say where chains disagree, and where there are too few independent draws."""
+def _convergence(posterior: xr.Dataset, *, in_modes: bool = False) -> list[str]:
+    """Say where chains disagree, and where there are too few independent draws.
+
+    Of chains in different modes both are said already.
+    """
+    if in_modes:
+        return []
     # ArviZ gives NaN for shorter chains.
     if posterior.sizes["draw"] < 4:
         return []
@@ -499,7 +584,7 @@ def _motion(result: xr.DataTree) -> list[str]:
         return []
     chains = "chains" if len(stuck) > 1 else "chain"
     calibration = result["calibration"]
-    noise = float((calibration["discrepancy_error"] / calibration["epsilon"]).max())
+    noise = float((calibration["discrepancy_error"] / calibration["epsilon"]).max())  # or NaN
     why = f" (its Monte Carlo error is {noise:.1f} epsilon)" if noise > 1 else ""
     return [
         f"Particles hardly moved in the last stage of {chains} {', '.join(stuck)} "

@@ -6,21 +6,27 @@ import hashlib
 import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
 
 import numpy as np
 import pymc as pm
-import pytensor.tensor as pt
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from prbayes._checks import Floats, Seed, flag, plain_text, positive_integer, seed_number
+from prbayes._finding import Finding, report
 from prbayes._progress import shown
 from prbayes._weighted import reached
 from prbayes.estimate.optimum import Optimum, identity_in, require_of_model
 from prbayes.model.elements import finite_draws
+from prbayes.model.emulated import (
+    EmulatedResponse,
+    EmulatedSimulator,
+    PopulationSimulator,
+    population_simulators,
+)
 from prbayes.model.identity import (
     Level,
     as_attributes,
@@ -28,14 +34,12 @@ from prbayes.model.identity import (
     require_same_responses,
 )
 from prbayes.model.labels import versions
-from prbayes.model.node import Node, model_on_context, nodes
+from prbayes.model.node import Node, model_on_context
 from prbayes.model.support import TOLERABLE, shortcoming
 from prbayes.model.turns import in_turn
 from prbayes.propagation.base import MAX_LOST, DesignError, refuse_max_lost
-from prbayes.propagation.points import base_points, inside
+from prbayes.propagation.new_specimens import new_specimens
 from prbayes.propagation.reweighted import Design, UntoldError
-from prbayes.response.compilation import compile_batched
-from prbayes.response.distributions import PopulationSampler, quantiles
 from prbayes.response.failures import Abort, ResponseError
 from prbayes.response.grouping import is_group
 from prbayes.response.inadequacy import caveats_of
@@ -71,7 +75,9 @@ def predict(
     drawn; an optimum is one population. Where the model has a simulator with `Reweighted` and the
     same ``.dist()`` objects, the specimens are its design points, resampled by their weights: its
     own response then costs nothing, and any other one is computed once per design point, not once
-    per draw, specimen or call. Elsewhere specimens are new: Sobol points through the inverse
+    per draw, specimen or call. Where it has a simulator with the log-likelihood by specimen,
+    specimens are new. Its own response is then that of its emulator, without a run; any other one
+    is computed at the points of the emulator's runs, and interpolated. Elsewhere specimens are new: Sobol points through the inverse
     distribution functions, with another shift for each draw, or random draws where there is no
     inverse.
 
@@ -92,7 +98,7 @@ def predict(
     draws : int
         Largest number of populations, over all chains; the posterior's draws are thinned evenly.
     stored : bool
-        Whether design points may serve. With False the response is computed for draws x n_samples
+        Whether design points or an emulator may serve. With False the response is computed for draws x n_samples
         specimens.
     max_lost : float, optional
         Largest share of the predicted responses that may be NaN; by default what the model's
@@ -116,7 +122,8 @@ def predict(
         are known: those of the simulator with this response, or the keys of a mapping. Where inputs
         depend on `prbayes.response.group`, that dimension is before the samples. Attributes:
         ``source`` (how specimens were made), ``responses``
-        (how many were computed), ``nan`` (how many values are NaN), ``caveats`` (what the response
+        (how many were computed), ``emulator_error`` (of an emulator, by output: the root mean
+        square error of runs that are left out), ``nan`` (how many values are NaN), ``caveats`` (what the response
         says of itself, such as that its inadequacy extrapolates), ``specimens_id`` (equal for
         predictions with the same specimens), ``calibration_data`` and ``calibration_specimens``
         (digests of the data, and specimen labels, of the calibration, by which `area_test` knows
@@ -164,7 +171,8 @@ def predict(
     model = model_of(result, model, "prb.predict")
     points, coords = populations_of(result, model, draws, "prb.predict")
     sorted_inputs = read_inputs(label, inputs, model)
-    found = list(nodes(model).values())
+    simulators = population_simulators(model)
+    before = sum(each.responses.count for each in simulators)
     responses = Responses(
         label,
         response,
@@ -172,17 +180,18 @@ def predict(
         executor=executor,
         store=store,
         version=version,
-        outputs=known_outputs(found, response),
+        outputs=known_outputs(simulators, response),
     )
     seed = None if random_seed is None else seed_number(random_seed)
     rng = np.random.default_rng(seed)
-    node = serving(found, responses) if stored else None
+    simulator = serving(simulators, responses) if stored else None
     groups = sorted_inputs.groups
     with shown(progressbar):
-        drawn = _drawn(node, responses, _in_groups(points, sorted_inputs), n_samples, rng)
+        drawn = _drawn(simulator, responses, _in_groups(points, sorted_inputs), n_samples, rng)
     if max_lost is None:
-        max_lost = max((node.bound.max_lost for node in found), default=MAX_LOST)
+        max_lost = max((each.max_lost for each in simulators), default=MAX_LOST)
     missing = _count_missing(label, drawn.values, max_lost)
+    _report_rough_surface(label, drawn)
     among = () if groups is None else (len(groups.labels),)
     event = drawn.values.shape[2 + len(among) :]
     outputs = responses.outputs or Outputs(tuple(range(event[0] if event else 0)))
@@ -196,7 +205,8 @@ def predict(
         name=label,
         attrs={
             "source": drawn.source,
-            "responses": responses.count,
+            "responses": responses.count + sum(e.responses.count for e in simulators) - before,
+            **({} if drawn.error is None else {"emulator_error": drawn.error.tolist()}),
             "nan": missing,
             "specimens_id": _digest(*drawn.specimens),
             "random_seed": str(seed),
@@ -230,23 +240,28 @@ def _in_groups(points: dict[str, Floats], inputs: Inputs) -> list[dict[str, Floa
 
 
 def _drawn(
-    node: Node | None,
+    simulator: PopulationSimulator | None,
     responses: Responses,
     of_groups: list[dict[str, Floats]],
     n: int,
     rng: np.random.Generator,
 ) -> _Drawn:
     """Return responses of n specimens from each population, of one group after the other."""
-    each = []
+    each: list[_Drawn] = []
+    emulated: EmulatedResponse | None = None
     for points in of_groups:
-        if node is None:
+        if simulator is None:
             each.append(_new_responses(responses.name, responses, points, n, rng))
+        elif simulator.is_emulated:
+            emulated = emulated or simulator.emulator(responses)
+            each.append(_emulated_responses(simulator, emulated, responses, points, n, rng))
         else:
-            each.append(_resampled_responses(node, responses, points, n, rng))
+            each.append(_resampled_responses(simulator, responses, points, n, rng))
     if len(each) == 1:
         return each[0]
     specimens = [x for one in each for x in one.specimens]
-    return _Drawn(np.stack([one.values for one in each], axis=1), specimens, each[0].source)
+    values = np.stack([one.values for one in each], axis=1)
+    return replace(each[0], values=values, specimens=specimens)
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,6 +272,7 @@ class _Drawn:
     values: Floats
     specimens: list[Floats]  # (k, n, *event): aleatory inputs
     source: str  # how specimens were made
+    error: Floats | None = None  # of an emulator, by output, (m,)
 
 
 def _label(response: Callable[..., Any], name: str | None, store: object) -> str:
@@ -350,32 +366,86 @@ def _refuse_incomplete(known: Any, names: list[str], caller: str) -> None:
         )
 
 
-def known_outputs(among: Sequence[Node], response: Callable[..., Any]) -> Outputs | None:
+def known_outputs(
+    among: Sequence[PopulationSimulator], response: Callable[..., Any]
+) -> Outputs | None:
     """Return the outputs of a response that is a simulator's; None where its runs tell."""
     for node in among:
-        if node.bound.responses.function is response:
+        if node.responses.function is response:
             return node.outputs
     return None
 
 
-def serving(among: Sequence[Node], responses: Responses) -> Node | None:
-    """Return the simulator whose design points are specimens of these inputs, if any.
+def serving(
+    among: Sequence[PopulationSimulator], responses: Responses
+) -> PopulationSimulator | None:
+    """Return the simulator whose specimens have these inputs, if any.
 
     Best is one with this very response.
     """
-    able = [node for node in among if _serves(node, responses.inputs)]
-    for node in able:
-        if responses.same_as(node.bound.responses):
-            return node
+    able = [each for each in among if _serves(each, responses.inputs)]
+    for each in able:
+        if responses.same_as(each.responses):
+            return each
     return able[0] if able else None
 
 
-def _serves(node: Node, wanted: Inputs) -> bool:
-    """Return whether a simulator has a design over all of these inputs."""
-    if not node.bound.stored or wanted.epistemic:
+def _serves(simulator: PopulationSimulator, wanted: Inputs) -> bool:
+    """Return whether a simulator has stored or emulated specimens with all of these inputs."""
+    if not simulator.has_specimens or wanted.epistemic:
         return False
-    known = node.bound.inputs.aleatory
+    known = simulator.inputs.aleatory
     return all(any(x is y for y in known) for x in wanted.aleatory)
+
+
+def _emulated_responses(
+    simulator: EmulatedSimulator,
+    emulated: EmulatedResponse,
+    responses: Responses,
+    points: dict[str, Floats],
+    n: int,
+    rng: np.random.Generator,
+) -> _Drawn:
+    """Return emulated responses of n new specimens for each population."""
+    inputs = responses.inputs
+    roots = [points[str(rv.name)] for rv in inputs.roots]
+    specimens, _ = new_specimens(responses.name, inputs, roots, n, rng)
+    flat = [x.reshape(-1, *x.shape[2:]) for x in specimens]
+    values = emulated(flat).reshape(len(roots[0]), n, *emulated.event)
+    runs = len(emulated.z)
+    is_own = responses.same_as(simulator.responses)
+    source = (
+        f"new specimens, by the emulator of {simulator.name} ({runs} runs)"
+        if is_own
+        else f"new specimens, by an interpolant through {runs} runs at those of {simulator.name}"
+    )
+    return _Drawn(values, specimens, source, emulated.error)
+
+
+# Standard deviations of the predicted responses that an emulator may be off by without a finding.
+_ROUGH_SURFACE = 0.05
+
+
+def _report_rough_surface(label: str, drawn: _Drawn) -> None:
+    """Report an emulator whose error is visible beside the scatter of the predicted responses."""
+    if drawn.error is None:
+        return
+    flat = drawn.values.reshape(-1, drawn.error.size)
+    good = np.isfinite(flat).all(axis=1)
+    spread = flat[good].std(axis=0) if good.any() else np.full(drawn.error.shape, np.nan)
+    share = float(np.max(drawn.error / np.where(spread > 0, spread, np.inf)))
+    if share > _ROUGH_SURFACE:
+        report(
+            [
+                Finding(
+                    "rough-prediction",
+                    f"{label}: the interpolant between runs has an error of {share:.0%} of the "
+                    "standard deviation of the predicted responses; pass stored=False, which "
+                    "computes the response at new specimens",
+                    "likelihood.md#predictions",
+                )
+            ]
+        )
 
 
 def _resampled_responses(
@@ -441,51 +511,9 @@ def _new_responses(
     """Return responses of n new specimens from each population."""
     inputs = responses.inputs
     roots = [points[str(rv.name)] for rv in inputs.roots]
-    specimens, epistemic = _new_specimens(label, inputs, roots, n, rng)
+    specimens, epistemic = new_specimens(label, inputs, roots, n, rng)
     values = responses(specimens, epistemic)
     return _Drawn(values, specimens, "new specimens")
-
-
-def _new_specimens(
-    label: str, inputs: Inputs, roots: list[Floats], n: int, rng: np.random.Generator
-) -> tuple[list[Floats], list[Floats]]:
-    """Return aleatory values, shapes (k, n, *event), and epistemic ones that broadcast."""
-    symbols = inputs.placeholders()
-    uniforms = [pt.tensor(dtype="float64", shape=(None, *s)) for s in inputs.event_shapes]
-    try:
-        placed, epistemic = through_inverses(label, inputs, symbols, uniforms)
-    except TypeError:
-        return PopulationSampler(inputs)(roots, n, rng)
-
-    # Sobol points in random order, with another shift for each draw.
-    _, base = base_points(inputs, n, int(rng.integers(2**31)))
-    order = rng.permutation(n)
-    k = len(roots[0])
-    shifted = []
-    for points in base:
-        shift = rng.random((k, 1, *points.shape[1:]))
-        shifted.append(inside((points[order] + shift) % 1))
-    function = compile_batched([*symbols, *uniforms], [*placed, *epistemic])
-    values = function(*roots, *shifted)
-    aleatory = values[: len(placed)]
-    return aleatory, [v[:, None] for v in values[len(placed) :]]
-
-
-def through_inverses(
-    label: str, inputs: Inputs, symbols: list[Any], uniforms: list[Any]
-) -> tuple[list[Any], list[Any]]:
-    """Return aleatory inputs as inverse distribution functions of uniforms, and epistemic ones.
-
-    Raises
-    ------
-    TypeError
-        If a distribution has no inverse, or depends on another one.
-    """
-    if inputs.nested:
-        raise TypeError("no inverse of a conditional distribution")
-    dists, epistemic = inputs.rebuilt(symbols)
-    placed = [quantiles(label, d, u) for d, u in zip(dists, uniforms, strict=True)]
-    return placed, epistemic
 
 
 def specimen_names(labels: ArrayLike) -> list[str]:
@@ -521,7 +549,7 @@ def _digest(*arrays: Floats) -> str:
 def _calibration(result: Optimum | xr.DataTree, model: pm.Model) -> dict[str, list[str]]:
     """Return attributes that tell on what data the result was calibrated."""
     is_optimum = isinstance(result, Optimum)
-    simulators = result.evaluator.nodes if is_optimum else list(nodes(model).values())
+    simulators = result.evaluator.simulators if is_optimum else population_simulators(model)
     # As a set that keeps its order.
     labels: dict[str, None] = {}
     digests = []
@@ -534,10 +562,10 @@ def _calibration(result: Optimum | xr.DataTree, model: pm.Model) -> dict[str, li
     return {key: value for key, value in found.items() if value}
 
 
-def _calibration_data(result: Optimum | xr.DataTree, node: Node) -> Floats:
+def _calibration_data(result: Optimum | xr.DataTree, node: PopulationSimulator) -> Floats:
     """Return what a simulator was calibrated on: the result's own data where it has them."""
     if isinstance(result, xr.DataTree) and "observed_data" in result:
         kept = result["observed_data"]
         if node.name in kept:
             return np.asarray(kept[node.name])
-    return node.target.observed
+    return node.observed

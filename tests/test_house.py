@@ -48,7 +48,7 @@ LAYERS = (
     ("propagation",),
     ("model",),
     ("estimate", "inference", "surrogate"),
-    ("optimize",),
+    ("optimize", "_specimen_checks"),
     ("posterior", "_predict", "_compare", "_diagnose"),
     ("results",),
     ("validation", "decision"),

@@ -147,8 +147,8 @@ def sensitivity(
     own = _of_hyperparameters(told, quantity, samples, seed)
     inputs = scatter(told, quantity, samples, seed, computed=computed)
     evaluator = populations.evaluator
-    node = evaluator.nodes[told.k]
-    names = aleatory_names(node.bound.inputs, node.bound.responses.function)
+    simulator = evaluator.simulators[told.k]
+    names = aleatory_names(simulator.inputs, simulator.responses.function)
     columns = {}
     for name in ("first", "total", "derivative"):
         for key in (name, f"{name}_error"):

@@ -75,7 +75,8 @@ def of_a_specimen(told: Told, metric: Metric | None) -> Floats:
     r"""Return the information of one specimen, (d, d), in units of the prior's spread.
 
     The Godambe information :math:`H J^{-1} H` of an ideal sample of the population at the centre,
-    divided by its size, and at most the Fisher information of the response.
+    divided by its size, and at most the Fisher information of the response. Of a simulator with the
+    log-likelihood by specimen, the Fisher information itself.
 
     Parameters
     ----------
@@ -84,6 +85,14 @@ def of_a_specimen(told: Told, metric: Metric | None) -> Floats:
     metric : Metric, optional
     """
     evaluator = told.populations.evaluator
+    if not told.design.has_runs:
+        if metric is not None:
+            raise ValueError(
+                f"prb.plan: {told.responses.name}: metric: got {metric!r} of a simulator with the "
+                "log-likelihood by specimen, whose posterior takes all the information of the "
+                "response; leave metric= out"
+            )
+        return fisher_information(told)
     node = evaluator.nodes[told.k]
     center = told.populations.center
     n = max(round(node.n_specimens), _IDEAL)
@@ -115,7 +124,11 @@ def fisher_information(told: Told) -> Floats:
     step = _LOG_WEIGHT_STEP * unit
     around = cross(center, step)
     _, weights = told.design.populations(evaluator.roots(around, told.k))
-    used = (weights[0] > 0) & observable(told.every, evaluator.nodes[told.k].target)
+    if told.emulator is None:
+        seen = observable(told.every, evaluator.nodes[told.k].target)
+    else:
+        seen = np.isfinite(told.every.reshape(len(told.every), -1)).all(axis=1)
+    used = (weights[0] > 0) & seen
     weights = weights[:, used]
     with np.errstate(divide="ignore", invalid="ignore"):
         scores = slopes(np.log(weights), step) * unit

@@ -22,6 +22,7 @@ from prbayes._predict import (
 )
 from prbayes.decision.quantities import Quantity
 from prbayes.estimate.optimum import Optimum, require_sampling
+from prbayes.model.emulated import EmulatedResponse, EmulatedSample, EmulatedSimulator
 from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.points import sobol
@@ -77,26 +78,37 @@ class Populations:
             label,
             response,
             sorted_inputs,
-            outputs=known_outputs(self.evaluator.nodes, response),
+            outputs=known_outputs(self.evaluator.simulators, response),
             **calling,
         )
 
     def design_for(self, responses: Responses) -> int:
-        """Return which simulator's design has the specimens of a response.
+        """Return which simulator has stored or emulated specimens of a response.
 
         Raises
         ------
         TypeError
             If none has.
         """
-        node = serving(self.evaluator.nodes, responses)
-        if node is None:
+        simulator = serving(self.evaluator.simulators, responses)
+        if simulator is None:
             raise TypeError(
                 f"{self.caller}: {responses.name}: got inputs of which no simulator of the model "
                 "has stored responses, expected the .dist() objects of one with prb.Reweighted(), "
                 "and constants"
             )
-        return self.evaluator.nodes.index(node)
+        return self.evaluator.simulators.index(simulator)
+
+    @cached_property
+    def _samples(self) -> dict[int, EmulatedSample]:
+        return {}
+
+    def _sample(self, k: int, simulator: EmulatedSimulator) -> EmulatedSample:
+        """Return the weighted specimens of a simulator whose responses are emulated."""
+        if k not in self._samples:
+            roots = self.evaluator.roots(self.thetas, k)
+            self._samples[k] = EmulatedSample.of(simulator, roots)
+        return self._samples[k]
 
     def told(
         self, response: Callable[..., Any], inputs: Sequence[Any], output: Any, **calling: Any
@@ -117,9 +129,16 @@ class Populations:
         """Return the same of all outputs together."""
         responses = self.responses(response, inputs, **calling)
         k = self.design_for(responses)
-        design = self.evaluator.nodes[k].design
-        assert design is not None
-        found = Told(self, k, design, responses, design.values_of(responses), None)
+        simulator = self.evaluator.simulators[k]
+        if simulator.is_emulated:
+            sample = self._sample(k, simulator)
+            emulator = simulator.emulator(responses)
+            values = emulator(sample.points_of(responses.inputs))
+            found = Told(self, k, sample, responses, values, None, emulator)
+        else:
+            design = simulator.design
+            assert design is not None
+            found = Told(self, k, design, responses, design.values_of(responses), None)
         found.refuse_unsupported()
         return found
 
@@ -130,10 +149,38 @@ class Told:
 
     populations: Populations
     k: int  # which simulator has the design
-    design: Design
+    design: Design | EmulatedSample
     responses: Responses
     every: Floats  # (n,) or (n, m): all outputs at the design's points
     place: int | None  # of the output; None where there is one
+    emulator: EmulatedResponse | None = None  # of the response, where it is not stored
+
+    def emulated(self, points: Sequence[Floats]) -> list[Floats]:
+        """Return the output at specimens as emulators give it, (n,) each: the best one first.
+
+        The others differ from it by its error: they lack a block of the runs each, or are off by
+        the error at runs that are left out. Empty where responses are stored and not emulated.
+
+        Parameters
+        ----------
+        points : sequence of ndarray, shapes (n, *event)
+            Of the inputs of the design.
+        """
+        if self.emulator is None:
+            assert self.design.has_runs
+            return [self.column(v) for v in self.design.emulated(self.responses, list(points))]
+        own = self.design.inputs.aleatory
+        wanted = self.responses.inputs.aleatory
+        places = [next(i for i, x in enumerate(own) if x is w) for w in wanted]
+        values = self.emulator([points[place] for place in places])
+        error = self.emulator.error.reshape(self.emulator.event)
+        return [self.column(values), self.column(values + error)]
+
+    @property
+    def points(self) -> list[Floats]:
+        """The specimens, shapes (n, *event), by input."""
+        design = self.design
+        return list(design.contents.table.points if design.has_runs else design.points)
 
     def column(self, values: Floats) -> Floats:
         """Return the output, (..., n) or (..., n, m) -> (..., n)."""
@@ -185,7 +232,10 @@ class Told:
         """Raise if the design does not support the populations, or they lose too much of it."""
         thetas = self.populations.thetas[:: max(1, len(self.populations.thetas) // _SUPPORTED_AT)]
         roots = self.populations.evaluator.roots(thetas, self.k)
-        refuse_unsupported(self.responses.name, self.design, roots)
+        if self.design.has_runs:
+            refuse_unsupported(self.responses.name, self.design, roots)
+        else:
+            self.design.refuse_unsupported(self.responses.name, roots)
         _, weights = self.design.populations(roots)
         lost = float(np.nanmedian(weights[:, lacking(self.every)].sum(axis=1)))
         if lost > self.design.max_lost:

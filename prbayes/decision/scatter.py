@@ -131,15 +131,14 @@ def _responses(told: Told, specimens: Specimens, z: Floats, *, computed: bool) -
     """Return the response at normal numbers, (N,), and as emulators without a block of runs say."""
     if computed:
         return [told.column(specimens.computed(told.responses, z))]
-    if told.design.is_line:
+    if told.design.has_runs and told.design.is_line:
         return [_on_a_line(told, specimens.at(z)[0])]
-    every = told.design.emulated(told.responses, specimens.at(z))
-    return [told.column(values) for values in every]
+    return told.emulated(specimens.at(z))
 
 
 def _on_a_line(told: Told, x: Floats) -> Floats:
     """Return the response of one input, straight between the runs, (N,)."""
-    (at,) = told.design.contents.table.points
+    (at,) = told.points
     values = told.column(told.every)
     order = np.argsort(at)
     at = at[order]

@@ -13,7 +13,7 @@ import pytensor.tensor as pt
 from scipy.special import ndtr
 
 from prbayes._checks import Floats
-from prbayes._predict import through_inverses
+from prbayes.propagation.new_specimens import through_inverses
 from prbayes.propagation.points import inside
 from prbayes.response.compilation import compile_batched
 from prbayes.response.distributions import compiled_log_density

@@ -251,7 +251,8 @@ class _Asked:
                 self._error_of_draws(known),
             ]
         )
-        source = f"stored responses of {self.populations.evaluator.nodes[told.k].name}"
+        kind = "stored" if told.emulator is None else "emulated"
+        source = f"{kind} responses of {self.populations.evaluator.simulators[told.k].name}"
         return _Found(known, float(error), told.responses.count, source)
 
     def _by_points(self, inputs: Sequence[Any]) -> _Found:
@@ -312,7 +313,7 @@ def _error_of_points(told: Told, quantity: Exceedance) -> float:
 def _error_of_emulator(told: Told, quantity: Exceedance) -> float:
     """Return the error of the mean probability, by emulators without a block of the runs each."""
     design = told.design
-    said = design.emulated(told.responses, design.contents.table.points)
+    said = told.emulated(told.points)
     if not said:
         return 0.0
     # Of some populations: those emulators differ by far less than populations do.
@@ -320,7 +321,7 @@ def _error_of_emulator(told: Told, quantity: Exceedance) -> float:
     roots = told.populations.evaluator.roots(thetas, told.k)
     _, weights = design.populations(roots)
     mass = np.nanmean(weights, axis=0)
-    shares = [mass @ quantity.of_specimen(told.column(values), np.nan) for values in said]
+    shares = [mass @ quantity.of_specimen(values, np.nan) for values in said]
     return float(np.sqrt(np.sum((np.array(shares[1:]) - shares[0]) ** 2)))
 
 

@@ -61,6 +61,18 @@ class Interpolant:
             values[rows], jacobian[rows] = self._evaluate(z[rows])
         return values, jacobian
 
+    def values(self, z: Floats) -> Floats:
+        """Return values at points, (k, d) -> (k, m), without the Jacobian."""
+        values = np.empty((len(z), self.weights.shape[1]))
+        step = max(1, AT_ONCE // (4 * len(self.z)))
+        for first in range(0, len(z), step):
+            rows = slice(first, first + step)
+            square = _squared_distances(z[rows], self.z)
+            scaled = (z[rows] - self.center) / self.half_width
+            terms = _terms(_legendre(scaled, self.powers), self.powers)
+            values[rows] = terms @ self.coefficients - (square**2 * np.sqrt(square)) @ self.weights
+        return values
+
     def _evaluate(self, z: Floats) -> tuple[Floats, Floats]:
         square = _squared_distances(z, self.z)
         cube = square * np.sqrt(square)
@@ -168,16 +180,14 @@ def _sparse_powers(d: int, degree: int) -> list[tuple[int, ...]]:
     """Return the same without the many combinations whose total is too high."""
     if d == 1:
         return [(p,) for p in range(degree + 1)]
-    return [
-        (p, *rest) for p in range(degree + 1) for rest in _sparse_powers(d - 1, degree - p)
-    ]
+    return [(p, *rest) for p in range(degree + 1) for rest in _sparse_powers(d - 1, degree - p)]
 
 
 def _polynomials(u: Floats, powers: NDArray[np.intp]) -> tuple[Floats, list[Floats]]:
     """Return products of Legendre polynomials, (k, terms), and their d partial derivatives."""
-    k, d = u.shape
+    d = u.shape[1]
     degree = int(powers.max())
-    single = np.polynomial.legendre.legvander(u, degree)  # (k, d, degree + 1)
+    single = _legendre(u, powers)
     slope = np.zeros_like(single)
     # P'_{p+1} = P'_{p-1} + (2 p + 1) P_p
     for p in range(degree):
@@ -185,9 +195,7 @@ def _polynomials(u: Floats, powers: NDArray[np.intp]) -> tuple[Floats, list[Floa
         if p > 0:
             slope[..., p + 1] += slope[..., p - 1]
     factors = [single[:, a, powers[:, a]] for a in range(d)]
-    terms = np.ones((k, len(powers)))
-    for factor in factors:
-        terms *= factor
+    terms = _terms(single, powers)
     slopes = []
     for a in range(d):
         derivative = slope[:, a, powers[:, a]].copy()
@@ -196,6 +204,19 @@ def _polynomials(u: Floats, powers: NDArray[np.intp]) -> tuple[Floats, list[Floa
                 derivative *= factor
         slopes.append(derivative)
     return terms, slopes
+
+
+def _legendre(u: Floats, powers: NDArray[np.intp]) -> Floats:
+    """Return the Legendre polynomials of each variable, (k, d, degree + 1)."""
+    return np.asarray(np.polynomial.legendre.legvander(u, int(powers.max())))
+
+
+def _terms(single: Floats, powers: NDArray[np.intp]) -> Floats:
+    """Return products of Legendre polynomials, (k, terms)."""
+    terms = np.ones((len(single), len(powers)))
+    for a in range(powers.shape[1]):
+        terms *= single[:, a, powers[:, a]]
+    return terms
 
 
 def _squared_distances(a: Floats, b: Floats) -> Floats:

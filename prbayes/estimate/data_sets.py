@@ -7,6 +7,7 @@ together: they are drawn, or get their weight, together.
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from prbayes._checks import AT_ONCE, Floats
 from prbayes.metrics.base import Discrepancy
+from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import Node
 from prbayes.response.distributions import PopulationSampler
@@ -37,7 +39,7 @@ class DataSets:
     weights: list[Floats]
 
 
-def specimens(nodes: list[Node]) -> tuple[list[NDArray[np.intp]], int]:
+def specimens(nodes: Sequence[PopulationSimulator]) -> tuple[list[NDArray[np.intp]], int]:
     """Return the specimen's number of each observation, by simulator, and the number of specimens.
 
     Observations without labels are specimens of their own.
@@ -53,12 +55,12 @@ def specimens(nodes: list[Node]) -> tuple[list[NDArray[np.intp]], int]:
     return out, len(numbers)
 
 
-def _labels(node: Node, k: int) -> list[object]:
+def _labels(node: PopulationSimulator, k: int) -> list[object]:
     """Return the labels of the k-th simulator's observations; one for each if there are none."""
     labels = node.specimens
     if labels is not None:
         return list(labels.tolist())
-    size = len(node.target.observed)
+    size = len(node.observed)
     return [(k, i) for i in range(size)]
 
 
@@ -433,16 +435,24 @@ def one_set(
     return observed, counted
 
 
+def dirichlet_weights(
+    simulators: Sequence[PopulationSimulator], n_sets: int, seed: int = 0
+) -> list[Floats]:
+    """Return Dirichlet weights of the observed specimens, times their own, (n_sets, N) each.
+
+    Observations with the same label are weighted together.
+    """
+    rng = np.random.default_rng([seed, 2])
+    numbers, total = specimens(simulators)
+    gains = rng.standard_exponential((n_sets, total))
+    weights = []
+    for number, simulator in zip(numbers, simulators, strict=True):
+        w = gains[:, number] * simulator.weights
+        weights.append(w / w.sum(axis=-1, keepdims=True))
+    return weights
+
+
 def reweighted_sets(evaluator: Evaluator, n_sets: int, seed: int = 0) -> DataSets:
     """Give the observed specimens Dirichlet weights (Bayesian bootstrap), times their own."""
-    rng = np.random.default_rng([seed, 2])
-    numbers, total = specimens(evaluator.nodes)
-    gains = rng.standard_exponential((n_sets, total))
-    values = []
-    weights = []
-    for number, node in zip(numbers, evaluator.nodes, strict=True):
-        w = gains[:, number] * node.target.weights
-        normalised = w / w.sum(axis=-1, keepdims=True)
-        values.append(node.target.observed)
-        weights.append(normalised)
-    return DataSets(values, weights)
+    values = [node.target.observed for node in evaluator.nodes]
+    return DataSets(values, dirichlet_weights(evaluator.nodes, n_sets, seed))

@@ -6,7 +6,6 @@ its weight, the share of the posterior mass by Laplace's approximation.
 
 from __future__ import annotations
 
-import logging
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -37,12 +36,15 @@ class LocalOptimum:
     covariance : ndarray, shape (d, d)
         Inverse Hessian; infinite along directions without curvature, NaN at the edge of a support.
     converged : bool
+    steps : slice
+        Its evaluations of the objective, without those of the Hessian.
     """
 
     theta: Floats
     value: float
     covariance: Floats
     converged: bool
+    steps: slice
 
 
 def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
@@ -87,7 +89,7 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
         point=point,
         discrepancy=best.value,
         discrepancies={name: -float(v.sum()) for name, v in values.items()},
-        scales={name: 1.0 for name in values},
+        scales=dict.fromkeys(values, 1.0),
         n_evaluations=objective.count,
         n_screened=screened,
         n_responses=evaluator.n_responses - before,
@@ -98,7 +100,7 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
         theta=best.theta,
         names=evaluator.names,
         evaluator=evaluator,
-        trace=objective.trace(),
+        trace=objective.trace(best.steps),
         seconds=time.perf_counter() - clock,
         rivals=rivals,
         warnings=tuple(str(finding) for finding in findings),
@@ -137,12 +139,12 @@ class _Objective:
         self.values.append(value)
         return value, np.where(np.isfinite(gradient), gradient, 0.0)
 
-    def trace(self) -> dict[str, Floats]:
-        """Return the points that were evaluated."""
+    def trace(self, steps: slice) -> dict[str, Floats]:
+        """Return the points of one descent."""
         return {
-            "theta": np.array(self.thetas),
-            "discrepancy": np.array(self.values),
-            "evaluations": np.arange(1, self.count + 1),
+            "theta": np.array(self.thetas[steps]),
+            "discrepancy": np.array(self.values[steps]),
+            "evaluations": np.arange(1, self.count + 1)[steps],
         }
 
 
@@ -172,6 +174,7 @@ def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum
     from scipy.optimize import minimize
 
     unit = objective.unit
+    first = objective.count
 
     def standardised(u: Floats) -> tuple[float, Floats]:
         value, gradient = objective(u * unit)
@@ -183,7 +186,7 @@ def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum
         options={"gtol": options.tolerance * 100, "maxiter": left},
     )  # fmt: skip
     theta = np.asarray(result.x) * unit
-    value, gradient = objective(theta)
+    value, _ = objective(theta)
     if not result.success and np.isfinite(value):
         # A support whose end moves has its optimum at a jump: without gradients from there.
         simplex = minimize(
@@ -192,9 +195,10 @@ def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum
         )  # fmt: skip
         if simplex.fun < value - 1e-6:
             theta = np.asarray(simplex.x) * unit
-            value, gradient = objective(theta)
+            value, _ = objective(theta)
+    steps = slice(first, objective.count)
     covariance, slope = _inverse_hessian(objective, theta)
-    return LocalOptimum(theta, value, covariance, bool(slope < 0.05))
+    return LocalOptimum(theta, value, covariance, bool(slope < 0.05), steps)
 
 
 def _inverse_hessian(objective: _Objective, theta: Floats) -> tuple[Floats, float]:
@@ -230,8 +234,10 @@ def _inverse_hessian(objective: _Objective, theta: Floats) -> tuple[Floats, floa
     is_flat = values < 1.0 / 25
     inverse = np.where(is_flat, 0.0, 1 / np.where(is_flat, 1.0, values))
     covariance = (vectors * inverse) @ vectors.T
+    # Along directions without curvature in units of the prior: a slope there is no optimum.
     _, gradient = objective(theta)
-    slope = float(np.sqrt(max(0.0, (gradient * unit) @ covariance @ (gradient * unit))))
+    along = vectors.T @ (gradient * unit)
+    slope = float(np.sqrt((along**2 * np.where(is_flat, 1.0, inverse)).sum()))
     covariance = covariance * np.outer(unit, unit)
     touched = (np.abs(vectors[:, is_flat]) > 1e-3).any(axis=1)
     covariance[touched, :] = np.where(touched, np.inf, covariance[touched, :])
@@ -252,7 +258,8 @@ def _distinct(optima: list[LocalOptimum], unit: Floats) -> list[LocalOptimum]:
         new = True
         for other in kept:
             sd = np.sqrt(np.abs(np.diag(other.covariance)))
-            scale = np.where(np.isfinite(sd) & (sd > 0), sd, 0.1 * unit)
+            # Infinite where nothing is identified: a ridge is one optimum.
+            scale = np.where(np.isnan(sd) | (sd == 0), 0.1 * unit, sd)
             new = new and bool((np.abs(optimum.theta - other.theta) > 0.5 * scale).any())
         if new:
             kept.append(optimum)
@@ -278,7 +285,7 @@ def _in_units(
 
 
 def _findings(evaluator: Evaluator, modes: list[LocalOptimum]) -> list[Finding]:
-    """Report several modes, unidentified hyperparameters, and an optimum at the edge of a support."""
+    """Report several modes, unidentified hyperparameters, and an optimum at a support's edge."""
     findings = []
     best = modes[0]
     if np.isnan(best.covariance).any():
@@ -311,7 +318,9 @@ def _findings(evaluator: Evaluator, modes: list[LocalOptimum]) -> list[Finding]:
             continue
         point = _in_units(evaluator, mode.theta, mode.covariance)[0]
         free = [str(rv.name) for rv in evaluator.model.free_RVs]
-        where = ", ".join(f"{name} = {np.array2string(np.asarray(point[name]), precision=4)}" for name in free)
+        where = ", ".join(
+            f"{name} = {np.array2string(np.asarray(point[name]), precision=4)}" for name in free
+        )
         findings.append(
             Finding(
                 "second-mode",

@@ -76,7 +76,8 @@ from prbayes.estimate.solution import assemble, rival_record
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS, Hyperparameters
 from prbayes.model.interruption import explained, kept
-from prbayes.model.node import model_on_context
+from prbayes.model.node import model_on_context, simulators
+from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.model.support import shortcomings
 from prbayes.model.turns import in_turn
 from prbayes.response.budget import BudgetError, limited, unlimited
@@ -139,6 +140,13 @@ def refine(
     {'y': 1024}
     """
     model = model_on_context(model, "prb.refine")
+    if specimen_likelihoods(model) and not simulators(model):
+        raise ValueError(
+            "refine: got a model whose simulators use prb.LogLikelihood(), whose emulator gets the "
+            "runs that it needs at the first use, expected a simulator with prb.Reweighted; leave "
+            "the call out, or give the emulator more first runs with "
+            "propagation=prb.Reweighted(n)"
+        )
     wanted = None if thetas is None else _thetas(Hyperparameters(model), thetas)
     with (
         shown(progressbar),

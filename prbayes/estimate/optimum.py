@@ -376,21 +376,35 @@ def _trace_dataset(optimum: Optimum) -> xr.Dataset:
 
 
 def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
-    names = list(optimum.discrepancies)
-    metrics = [without_addresses(n.metric) for n in optimum.evaluator.nodes]
+    evaluator = optimum.evaluator
+    nodes, likelihoods = evaluator.nodes, evaluator.likelihoods
+    discrepancies = {name: -float(v.sum()) for name, v in _log_likelihoods(optimum).items()}
+    discrepancies |= optimum.discrepancies
+    names = [node.name for node in nodes] + [each.name for each in likelihoods]
     variables: dict[str, Any] = {
-        "discrepancy": ("simulator", list(optimum.discrepancies.values())),
-        "scale": ("simulator", list(optimum.scales.values())),
+        "discrepancy": ("simulator", [discrepancies[name] for name in names]),
+        "scale": ("simulator", [optimum.scales.get(name, 1.0) for name in names]),
     }
     for key in ("weight_ess", "mean_weight", "lost_mass", "failed_mass"):
         values = [optimum.support.get(n, {}).get(key, np.nan) for n in names]
         variables[key] = ("simulator", values)
     variables["theta"] = ("element", optimum.theta)
     variables["covariance"] = (["element", "other_element"], optimum.covariance)
-    variables["metric"] = ("simulator", metrics)
-    variables["compared"] = ("simulator", [n.target.told for n in optimum.evaluator.nodes])
+    metrics = [node.metric for node in nodes] + [each.metric for each in likelihoods]
+    variables["metric"] = ("simulator", [without_addresses(metric) for metric in metrics])
+    compared = [node.target.told for node in nodes] + [""] * len(likelihoods)
+    variables["compared"] = ("simulator", compared)
+    is_likelihood = [0] * len(nodes) + [1] * len(likelihoods)
+    variables["is_likelihood"] = ("simulator", is_likelihood)
+    runs = [node.bound.n_runs for node in nodes] + [len(each.emulation.z) for each in likelihoods]
+    variables["n_runs"] = ("simulator", runs)
     elements = {"element": optimum.names, "other_element": optimum.names}
     return xr.Dataset(variables, coords={"simulator": names, **elements})
+
+
+def _log_likelihoods(optimum: Optimum) -> dict[str, Floats]:
+    """Return the log-likelihoods of the specimens at the optimum, by simulator, (1, N)."""
+    return optimum.evaluator.specimen_log_likelihoods(optimum.theta[None])
 
 
 def compared_in(calibration: xr.Dataset) -> tuple[str, ...]:

@@ -6,16 +6,23 @@ import logging
 from collections.abc import Callable
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
+import numpy as np
 import pymc as pm
 
 from prbayes._checks import called, flag
 from prbayes.metrics.base import Discrepancy
 from prbayes.model.description import without_addresses
-from prbayes.model.node import model_on_context, required_simulators
+from prbayes.model.node import model_on_context, simulators
+from prbayes.model.specimen_likelihood import (
+    SpecimenLikelihood,
+    require_simulator,
+    specimen_likelihoods,
+)
 from prbayes.propagation.base import Propagation
-from prbayes.response.costs import Cost, SimulatorCost
+from prbayes.propagation.specimen_points import first_runs
+from prbayes.response.costs import Cost, Demand, SimulatorCost
 from prbayes.response.rehearsal import Rehearsal
 from prbayes.response.response import Responses
 
@@ -94,6 +101,13 @@ def cost(model: pm.Model | Callable[[], Any] | None = None, *, dry_run: bool = F
     return Cost(tuple(each.counted(dry_run) for each in asked))
 
 
+class Countable(Protocol):
+    """A simulator whose runs can be counted before they are made."""
+
+    def counted(self, dry_run: bool) -> SimulatorCost:
+        """Return the runs that are needed, after one was made where asked for."""
+
+
 @dataclass(frozen=True, eq=False)
 class Asked:
     """What a simulator asks for."""
@@ -130,17 +144,22 @@ class Asked:
 
 
 # Where simulators say what they ask for, in place of asking.
-_listening: ContextVar[list[Asked] | None] = ContextVar("listening", default=None)
+_listening: ContextVar[list[Countable] | None] = ContextVar("listening", default=None)
 
 
-def listening() -> list[Asked] | None:
+def listening() -> list[Countable] | None:
     """Return where a simulator that is made here says what it asks for, None if it may begin."""
     return _listening.get()
 
 
-def _of_function(build: Callable[[], Any]) -> list[Asked]:
+def with_points(asked: list[Countable]) -> list[Asked]:
+    """Return the simulators that can share runs with others."""
+    return [simulator for simulator in asked if isinstance(simulator, Asked)]
+
+
+def _of_function(build: Callable[[], Any]) -> list[Countable]:
     """Return what the simulators ask for that a function makes."""
-    asked: list[Asked] = []
+    asked: list[Countable] = []
     token = _listening.set(asked)
     try:
         build()
@@ -154,13 +173,53 @@ def _of_function(build: Callable[[], Any]) -> list[Asked]:
     return asked
 
 
-def _of_model(model: pm.Model) -> list[Asked]:
+def _of_model(model: pm.Model) -> list[Countable]:
     """Return what the simulators of a model ask for, or asked for at the first use."""
+    require_simulator(model)
     asked: list[Asked] = []
-    for simulator in required_simulators(model).values():
+    for simulator in simulators(model).values():
         responses = simulator.responses
         computed = simulator.is_computed
         alike = [earlier for earlier in asked if earlier.responses.runs is responses.runs]
         shared = alike[0].responses.name if alike and not computed else ""
         asked.append(Asked(responses, simulator.propagation, simulator.target, shared, computed))
-    return asked
+    return [*asked, *map(SpecimenRuns, specimen_likelihoods(model).values())]
+
+
+@dataclass(frozen=True, eq=False)
+class SpecimenRuns:
+    """What the emulator of a log-likelihood by specimen asks for."""
+
+    likelihood: SpecimenLikelihood
+
+    def counted(self, dry_run: bool) -> SimulatorCost:
+        """Return the runs that are needed, after one was made where asked for."""
+        likelihood = self.likelihood
+        responses = likelihood.responses
+        d = likelihood.coordinates.size
+        first = likelihood.propagation.emulator_runs or first_runs(d)
+        batch = max(first // 2, likelihood.options.fresh)
+        is_emulated = "_emulated" in vars(likelihood)
+        known = len(likelihood.emulation.z) if is_emulated else 0
+        tried = None
+        if dry_run:
+            rehearsal = Rehearsal(responses)
+            inputs = likelihood.coordinates.inputs(np.zeros((1, d)))
+            points = rehearsal.asked(lambda responses: responses(inputs, []))
+            tried = None if points is None else rehearsal.tried(points)
+        least = first + 2 * batch
+        return SimulatorCost(
+            responses.name,
+            f"{likelihood.metric!r} by an emulator",
+            max(least, known),
+            known,
+            Demand(
+                0,
+                first + 5 * batch,
+                f"up to {first + 5 * batch} in all, {batch} at a time at the roots of the "
+                "specimens, until the emulator shifts no estimate by more than "
+                f"{likelihood.options.bias} standard deviations",
+            ),
+            responses.workers,
+            tried,
+        )

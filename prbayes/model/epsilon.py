@@ -11,7 +11,8 @@ import pymc as pm
 from prbayes._checks import called, positive_number
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Identity, identity_of, require_same
-from prbayes.model.node import AnySimulator, required_simulators
+from prbayes.model.node import AnySimulator, required_simulators, simulators
+from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.model.turns import in_turn
 
 _log = logging.getLogger("prbayes")
@@ -58,6 +59,21 @@ def checked_epsilon(
     return found
 
 
+def refuse_without_epsilon(model: pm.Model, caller: str, advice: str) -> None:
+    """Raise if all simulators of a model have a log-likelihood by specimen, which has no epsilon.
+
+    Raises
+    ------
+    ValueError
+    """
+    if specimen_likelihoods(model) and not simulators(model):
+        raise ValueError(
+            f"{caller}: got a model whose simulators use prb.LogLikelihood(), which has no epsilon "
+            f"and whose draws have the width of the data, expected a metric of distributions; "
+            f"{advice}"
+        )
+
+
 @in_turn
 def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
     """Set the epsilon of simulators by name.
@@ -71,8 +87,8 @@ def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
     Raises
     ------
     KeyError, TypeError, ValueError
-        If a name is unknown, a value is not a positive number, or `calibrate_epsilon` found them
-        for another problem; then nothing is changed.
+        If a name is unknown, a value is not a positive number, `calibrate_epsilon` found them for
+        another problem, or no simulator has an epsilon; then nothing is changed.
 
     Notes
     -----
@@ -87,9 +103,10 @@ def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
     ...     y = prb.Simulator("y", np.square, x, metric=prb.AreaMetric(), observed=[0.5, 1.0, 4.0])
     >>> prb.set_epsilon(model, {"y": 0.1})
     """
-    simulators = list(required_simulators(model).values())
-    values = checked_epsilon(epsilon, simulators, model, "set_epsilon")
-    for simulator in simulators:
+    refuse_without_epsilon(model, "set_epsilon", "sample it with prb.sample_smc or pm.sample")
+    known = list(required_simulators(model).values())
+    values = checked_epsilon(epsilon, known, model, "set_epsilon")
+    for simulator in known:
         if simulator.name in values:
             simulator.epsilon.set_value(np.asarray(values[simulator.name]))
     _log.info(

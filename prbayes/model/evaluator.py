@@ -18,8 +18,15 @@ from numpy.typing import NDArray
 
 from prbayes._checks import AT_ONCE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
+from prbayes.model.emulated import PopulationSimulator, emulated_simulators
 from prbayes.model.hyperparameters import Hyperparameters
-from prbayes.model.node import Node, log_kernel, nodes, priors_alone
+from prbayes.model.node import (
+    Node,
+    log_kernel,
+    nodes,
+    priors_alone,
+    without_epsilon_warning,
+)
 from prbayes.model.specimen_likelihood import require_simulator, specimen_likelihoods
 from prbayes.propagation.base import Bound
 from prbayes.propagation.cloud import CLOUD
@@ -69,6 +76,8 @@ class Evaluator:
         The simulators with a metric of distributions.
     likelihoods : list of SpecimenLikelihood
         The simulators with a log-likelihood by specimen.
+    emulated : list of EmulatedSimulator
+        The populations of these, by group.
     hyperparameters : Hyperparameters
     """
 
@@ -81,6 +90,7 @@ class Evaluator:
         self._variables = list(by_variable)
         # Simulators with a likelihood by specimen: ordinary observed variables.
         self.likelihoods = list(specimen_likelihoods(model).values())
+        self.emulated = emulated_simulators(model)
         # Compiled, by what they were asked for; they live as long as this evaluator.
         self._objectives: dict[tuple[bool, bool], Any] = {}
         names = self.hyperparameters
@@ -149,6 +159,11 @@ class Evaluator:
         """Runs of all designs; those that several simulators share count once."""
         return self._once([0 if n.design is None else n.design.n_runs for n in self.nodes])
 
+    @property
+    def simulators(self) -> list[PopulationSimulator]:
+        """All simulators: `nodes`, then those whose responses are emulated, by group."""
+        return [*self.nodes, *self.emulated]
+
     def _once(self, counts: list[int]) -> int:
         """Return the sum of counts by simulator, with one of those that share their runs."""
         shared: dict[int, int] = {}
@@ -192,7 +207,7 @@ class Evaluator:
 
     def _log_other(self) -> Any:
         ordinary = [rv for rv in self.model.observed_RVs if rv not in self._variables]
-        with priors_alone():
+        with without_epsilon_warning():
             likelihood = self.model.logp(vars=ordinary) if ordinary else pt.constant(0.0)
         return likelihood + self.model.potentiallogp
 
@@ -399,7 +414,9 @@ class Evaluator:
         return function, np.cumsum([0, *map(len, params)])
 
     def roots(self, thetas: Floats, k: int) -> list[Floats]:
-        """Return the values of the k-th simulator's roots, shapes (P, *shape)."""
+        """Return the values of the roots of the k-th of `simulators`, shapes (P, *shape)."""
+        if k >= len(self.nodes):
+            return self._emulated_roots(thetas, k)
         function, ends = self._roots
         values = function(np.ascontiguousarray(thetas))
         size = len(thetas)
@@ -408,6 +425,15 @@ class Evaluator:
             shape = (size, *np.shape(value)[1:])
             found.append(np.broadcast_to(value, shape))
         return found
+
+    def _emulated_roots(self, thetas: Floats, k: int) -> list[Floats]:
+        """Return the roots of a simulator whose responses are emulated, its group among them."""
+        simulator = self.emulated[k - len(self.nodes)]
+        values = self.constrained(thetas)
+        return [
+            np.full(len(thetas), simulator.place) if is_group(root) else values[str(root.name)]
+            for root in simulator.inputs.roots
+        ]
 
     @cached_property
     def _roots_slopes(self) -> dict[int, Any]:
@@ -434,8 +460,8 @@ class Evaluator:
             return compile_batched([theta, *cotangents], [slopes])
 
     def populations(self, thetas: Floats, k: int) -> tuple[Floats, Floats]:
-        """Return responses and weights, (P, n) each, of the k-th simulator's populations."""
-        return self.nodes[k].bound.populations(self.roots(thetas, k))
+        """Return responses and weights, (P, n) each, of populations of the k-th of `simulators`."""
+        return self.simulators[k].populations(self.roots(thetas, k))
 
     def missing(self, theta: Floats, k: int) -> dict[str, float]:
         """Return the shares of a population without numbers, by what they are.

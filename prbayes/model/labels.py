@@ -13,6 +13,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.node import Node
+from prbayes.model.specimen_likelihood import SpecimenLikelihood
 from prbayes.response.outputs import Outputs
 
 
@@ -105,7 +107,8 @@ def labelled_responses(
     """
     sizes = dict(zip(("chain", "draw"), leading, strict=False))
     data = labelled(evaluator, values, sizes)
-    for simulator in (*evaluator.nodes, *evaluator.likelihoods):
+    simulators: list[Node | SpecimenLikelihood] = [*evaluator.nodes, *evaluator.likelihoods]
+    for simulator in simulators:
         if simulator.name not in values:
             continue
         if simulator.outputs.event:

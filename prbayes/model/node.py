@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from inspect import signature
 from math import ceil
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import pymc as pm
@@ -48,6 +48,7 @@ from prbayes.propagation.base import Bound, Propagation
 from prbayes.propagation.reweighted import Design, design_of
 from prbayes.response.compilation import PLAIN
 from prbayes.response.costs import in_words
+from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import ONE, Outputs
 from prbayes.response.response import Responses
 
@@ -70,6 +71,8 @@ class Node:
     outputs: Outputs = ONE  # of a run
     group: str = ""  # the name of the group whose specimens it has, if it is of one
 
+    is_emulated: ClassVar[Literal[False]] = False
+
     @property
     def metric(self) -> Metric:
         """The calibration metric."""
@@ -89,6 +92,40 @@ class Node:
     def responses(self) -> Responses:
         """The response, and how it is called."""
         return self.bound.responses
+
+    @property
+    def observed(self) -> Floats:
+        """Measured responses, (N,) or (N, m)."""
+        return self.target.observed
+
+    @property
+    def weights(self) -> Floats:
+        """Weights of the specimens, (N,), which sum to one."""
+        return self.target.weights
+
+    @property
+    def inputs(self) -> Inputs:
+        """The inputs of the response."""
+        return self.bound.inputs
+
+    @property
+    def has_specimens(self) -> bool:
+        """Whether specimens of all populations are there without a run."""
+        return self.bound.stored
+
+    @property
+    def runs_per_theta(self) -> int:
+        """Runs that a population costs."""
+        return self.bound.n_per_theta
+
+    @property
+    def max_lost(self) -> float:
+        """Largest share of a population that may have no response."""
+        return self.bound.max_lost
+
+    def populations(self, roots: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """Return responses and weights of populations, (k, n) or (k, n, m) and (k, n)."""
+        return self.bound.populations(list(roots))
 
     @property
     def design(self) -> Design | None:
@@ -461,18 +498,35 @@ def _places(index: tuple[int, ...], batch: tuple[int, ...]) -> tuple[int | slice
     return tuple(slice(None) if n == 1 else i for i, n in pairs)
 
 
-# Whether densities are made of which only those of hyperparameters are taken: PyMC makes all.
-_PRIORS_ALONE: ContextVar[bool] = ContextVar("priors alone", default=False)
+# PyMC builds the log-densities of all variables, also where a part of them is asked for.
+_QUIET: ContextVar[bool] = ContextVar("no warning of epsilon", default=False)
+_PRIORS_ALONE: ContextVar[bool] = ContextVar("densities of hyperparameters alone", default=False)
+
+
+@contextmanager
+def without_epsilon_warning() -> Iterator[None]:
+    """Log nothing of an unset epsilon, which the terms that are built do without."""
+    token = _QUIET.set(True)
+    try:
+        yield
+    finally:
+        _QUIET.reset(token)
 
 
 @contextmanager
 def priors_alone() -> Iterator[None]:
-    """Say nothing of epsilon meanwhile, which priors do without."""
+    """Build the densities of hyperparameters: likelihoods by specimen are left out."""
     token = _PRIORS_ALONE.set(True)
     try:
-        yield
+        with without_epsilon_warning():
+            yield
     finally:
         _PRIORS_ALONE.reset(token)
+
+
+def builds_priors_alone() -> bool:
+    """Return whether the densities of hyperparameters alone are built."""
+    return _PRIORS_ALONE.get()
 
 
 @_logprob.register(SimulatorRV)  # type: ignore[untyped-decorator]
@@ -492,7 +546,7 @@ def _log_density(
     if np.isnan(node.epsilon_value):
         # nutpie tells no more of an error than its number; nobody else has to be told who may yet
         # calibrate it
-        blunt = "nutpie" in sys.modules and not _PRIORS_ALONE.get()
+        blunt = "nutpie" in sys.modules and not _QUIET.get()
         _log.log(logging.WARNING if blunt else logging.DEBUG, "%s", unset)
     check = CheckParameterValue(unset)
     epsilon = check(node.epsilon, pt.gt(node.epsilon, 0.0))

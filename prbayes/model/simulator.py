@@ -29,7 +29,7 @@ from prbayes._checks import (
 )
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.metrics.likelihood import LogLikelihood
-from prbayes.model.costing import Asked, listening
+from prbayes.model.costing import Asked, SpecimenRuns, listening, with_points
 from prbayes.model.first_look import tell_copies
 from prbayes.model.node import (
     AnySimulator,
@@ -253,6 +253,10 @@ def _by_specimen(
         extras,
         weakref.ref(model),
     )
+    asked = listening()
+    if asked is not None:
+        asked.append(SpecimenRuns(likelihood))
+        return pt.as_tensor(values, name=name)
     data: Any = values
     if isinstance(observed, Variable):
         data = observed
@@ -373,7 +377,7 @@ def _observed_term(
     propagation.check_simulator(name, inputs, target)
     asked = listening()
     if asked is not None:
-        others_asked = [(one.propagation, one.responses) for one in asked]
+        others_asked = [(one.propagation, one.responses) for one in with_points(asked)]
         shared = _share(responses, propagation, others_asked)
         asked.append(Asked(responses, propagation, target, shared))
         return pt.as_tensor(target.observed, name=name)

@@ -34,7 +34,12 @@ from prbayes._checks import Floats
 from prbayes._finding import Finding, report
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.model.data_checks import data_findings
-from prbayes.model.node import known_value, required_simulators, response_name
+from prbayes.model.node import (
+    builds_priors_alone,
+    known_value,
+    required_simulators,
+    response_name,
+)
 from prbayes.model.population_draws import Populations, specimens_of
 from prbayes.propagation.base import Propagation
 from prbayes.propagation.coordinates import Coordinates
@@ -548,6 +553,8 @@ def _log_density(
     """Return the log-likelihoods of the specimens, (N,)."""
     (value,) = values
     likelihood = op.likelihood
+    if builds_priors_alone():
+        return pt.zeros(len(likelihood.observed))
     data = known_value(value)
     if data is not None and not _same(data, likelihood.observed):
         likelihood = likelihood.observing(data)

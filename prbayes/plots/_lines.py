@@ -37,7 +37,7 @@ class Axis:
             places = np.array(outputs.labels, dtype=np.float64)
             order = np.argsort(places)
             return cls(output, places, order, np.zeros(m), np.ones(m))
-        observed = output.node.target.observed
+        observed = output.node.observed
         finite = np.where(np.isfinite(observed), observed, np.nan)
         center = np.nanmean(finite, axis=0)
         spread = np.nanstd(finite, axis=0)
@@ -115,7 +115,7 @@ def draw_lines(
     what : str
         What is before.
     """
-    measured = axis.scaled(axis.output.node.target.observed)
+    measured = axis.scaled(axis.output.node.observed)
     of_populations = axis.scaled(after)
     earlier = None if before is None else axis.scaled(before)
     ylim = _limits(measured, of_populations, earlier)

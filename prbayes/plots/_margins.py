@@ -51,9 +51,9 @@ def margins(evaluator: Evaluator) -> list[Margin]:
     found: list[Margin] = []
     variables = evaluator.model.basic_RVs
     taken = {str(variable.name) for variable in variables}
-    for k, node in enumerate(evaluator.nodes):
-        inputs = node.bound.inputs
-        names = aleatory_names(inputs, node.bound.responses.function)
+    for k, node in enumerate(evaluator.simulators):
+        inputs = node.inputs
+        names = aleatory_names(inputs, node.responses.function)
         for position, dist in enumerate(inputs.aleatory):
             if any(margin.dist is dist and margin.group == node.group for margin in found):
                 continue
@@ -113,7 +113,7 @@ def margin_densities(
     """
     drawn = {}
     for k in sorted({margin.node for margin in wanted}):
-        sampler = PopulationSampler(evaluator.nodes[k].bound.inputs)
+        sampler = PopulationSampler(evaluator.simulators[k].inputs)
         drawn[k] = _Draws(sampler, evaluator.roots(thetas, k))
     ranges: dict[Any, tuple[float, float]] = {}
     for margin in wanted:
@@ -123,7 +123,7 @@ def margin_densities(
     found = {}
     for margin in wanted:
         of_node = drawn[margin.node]
-        inputs = evaluator.nodes[margin.node].bound.inputs
+        inputs = evaluator.simulators[margin.node].inputs
         grid = _grid(margin, *ranges[margin.axis])
         y = None if inputs.nested else _exact(inputs, margin, of_node.roots, grid)
         if y is None:

@@ -33,10 +33,10 @@ def named(name: str, labels: Mapping[str, str] | None) -> str:
 def names_of_model(evaluator: Evaluator) -> set[str]:
     """Return what a model has that may have a label: variables, simulators, outputs, inputs."""
     found = {str(name) for name in evaluator.model.named_vars}
-    for node in evaluator.nodes:
+    for node in evaluator.simulators:
         found |= {node.name, node.outputs.dim}
         found |= {str(name) for name in node.outputs.names}
-        names = aleatory_names(node.bound.inputs, node.bound.responses.function)
+        names = aleatory_names(node.inputs, node.responses.function)
         for name in names:
             found |= {variable_of(name), f"{variable_of(name)} of {node.name}"}
     return found

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes.model.node import Node
+from prbayes.model.emulated import PopulationSimulator
 from prbayes.plots._names import named
 from prbayes.response.outputs import Outputs
 
@@ -20,7 +20,7 @@ _MOST_PANELS = 8
 class Output:
     """One output of a simulator, or the only one, or all of a curve."""
 
-    node: Node
+    node: PopulationSimulator
     column: int | None  # of several outputs; None where there is one, or all are meant
     alone: bool  # whether the model has no other simulator
 
@@ -66,15 +66,15 @@ class Output:
 
     def measured(self) -> tuple[Floats, Floats]:
         """Return what was measured of one output, without NaN, and weights that sum to one."""
-        values = self.of(self.node.target.observed)
-        weights = self.node.target.weights
+        values = self.of(self.node.observed)
+        weights = self.node.weights
         known = ~np.isnan(values)
         if known.all():
             return values, weights
         return values[known], weights[known] / weights[known].sum()
 
 
-def panels_of(nodes: list[Node]) -> list[list[Output]]:
+def panels_of(nodes: Sequence[PopulationSimulator]) -> list[list[Output]]:
     """Return by simulator what has a panel: each output; a curve, or many outputs, as one."""
     alone = len(nodes) == 1
     found = []
@@ -86,7 +86,7 @@ def panels_of(nodes: list[Node]) -> list[list[Output]]:
     return found
 
 
-def outputs_of(node: Node, *, alone: bool) -> list[Output]:
+def outputs_of(node: PopulationSimulator, *, alone: bool) -> list[Output]:
     """Return all of several outputs of a simulator."""
     return [Output(node, j, alone) for j in range(len(node.outputs.labels))]
 

@@ -14,8 +14,8 @@ import xarray as xr
 from prbayes._checks import Floats, called, positive_integer
 from prbayes._weighted import INTERVAL
 from prbayes.estimate.optimum import Optimum
+from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.node import Node
 from prbayes.model.turns import in_turn
 from prbayes.plots._canvas import BLUE, DASHED, INK, VERMILION, Canvas, Limits, Panel, refuse_look
 from prbayes.plots._curves import central_range
@@ -125,7 +125,7 @@ def plot_outputs(
     start, what = read_before(result, evaluator, before)
     k = _simulator(evaluator, simulator)
     chosen = _chosen(evaluator, k, outputs)
-    refuse_labels(labels, evaluator.nodes[k].outputs.names, evaluator=evaluator)
+    refuse_labels(labels, evaluator.simulators[k].outputs.names, evaluator=evaluator)
     if len(start) and not supported(evaluator, start)[0]:
         _log.warning(
             "plot_outputs: before (%s): left out, because stored responses do not reach there",
@@ -176,8 +176,8 @@ def plot_outputs(
 
 def _simulator(evaluator: Evaluator, wanted: str | None) -> int:
     """Return which simulator is drawn: the one of a name, or the first with several outputs."""
-    names = [node.name for node in evaluator.nodes]
-    several = [node.name for node in evaluator.nodes if len(node.outputs.labels) > 1]
+    names = [node.name for node in evaluator.simulators]
+    several = [node.name for node in evaluator.simulators if len(node.outputs.labels) > 1]
     if not several:
         raise ValueError(
             f"plot_outputs: got simulators {names} of one output, expected one with several; draw "
@@ -194,8 +194,8 @@ def _simulator(evaluator: Evaluator, wanted: str | None) -> int:
 
 def _chosen(evaluator: Evaluator, k: int, wanted: Sequence[Any] | None) -> list[Output]:
     """Return the outputs that are drawn."""
-    node = evaluator.nodes[k]
-    every = outputs_of(node, alone=len(evaluator.nodes) == 1)
+    node = evaluator.simulators[k]
+    every = outputs_of(node, alone=len(evaluator.simulators) == 1)
     if wanted is None:
         varying = [output for output in every if _varies(output)]
         every = varying if len(varying) > 1 else every
@@ -224,7 +224,7 @@ def _varies(output: Output) -> bool:
     return bool(np.ptp(finite) > 1e-9 * np.abs(finite).max())
 
 
-def _place(node: Node, label: Any) -> int:
+def _place(node: PopulationSimulator, label: Any) -> int:
     """Return which output has a label."""
     outputs = node.outputs
     for known in (outputs.labels, outputs.names):
@@ -233,7 +233,7 @@ def _place(node: Node, label: Any) -> int:
     raise KeyError(f"outputs: got {label!r:.60}, expected some of {_listed(node)}")
 
 
-def _listed(node: Node) -> str:
+def _listed(node: PopulationSimulator) -> str:
     """Return the labels of a simulator's outputs, not all of many."""
     labels = list(node.outputs.labels)
     many = len(labels) > 2 * _MOST
@@ -256,7 +256,7 @@ class _Population:
     def of(cls, evaluator: Evaluator, thetas: Floats, k: int) -> _Population:
         """Return the k-th simulator's population at thetas, one for all of them."""
         values, weights = evaluator.populations(thetas, k)
-        if evaluator.nodes[k].bound.stored:
+        if evaluator.simulators[k].design is not None:  # whose points are all populations'
             values = values[0]
             weights = weights.mean(axis=0)
         else:
@@ -298,8 +298,8 @@ def _covered(output: Output, after: _Population, earlier: _Population | None) ->
 
 def _draw_measured(panel: Panel, x: Output, y: Output) -> float:
     """Draw the specimens that have both outputs; return their correlation."""
-    observed = x.node.target.observed
-    weights = x.node.target.weights
+    observed = x.node.observed
+    weights = x.node.weights
     points = np.column_stack([x.of(observed), y.of(observed)])
     known = np.isfinite(points).all(axis=1)
     points = points[known]

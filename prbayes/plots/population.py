@@ -139,7 +139,7 @@ def _draw_pair(panel: Panel, shown: Ensemble, x: Margin, y: Margin, level: float
     """
     thetas = shown.center if len(shown.center) else shown.thetas
     evaluator = shown.evaluator
-    sampler = PopulationSampler(evaluator.nodes[x.node].bound.inputs)
+    sampler = PopulationSampler(evaluator.simulators[x.node].inputs)
     roots = evaluator.roots(thetas, x.node)
     number = max(2, _OUTLINED // len(thetas))
     aleatory, _ = sampler(roots, number, np.random.default_rng(0))

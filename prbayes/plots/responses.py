@@ -129,10 +129,10 @@ def plot_responses(
             what,
         )
         start = start[:0]
-    by_simulator = panels_of(shown.evaluator.nodes)
+    by_simulator = panels_of(shown.evaluator.simulators)
     names = [output.name for panels in by_simulator for output in panels]
     refuse_labels(labels, names, evaluator=shown.evaluator)
-    lines = any(in_one_panel(node.outputs) for node in shown.evaluator.nodes)
+    lines = any(in_one_panel(node.outputs) for node in shown.evaluator.simulators)
     size = (7.2, 4.8) if lines else (5.4, 4.2)
     canvas = Canvas(names, size=size, backend=backend, pc_kwargs=pc_kwargs)
     drawing = _Drawing(shown, what, level, labels, ecdf=ecdf)
@@ -209,7 +209,7 @@ class _Drawing:
             (start,) = quantiles(earlier.values, earlier.weights, LEVELS)
         found = quantiles(after.values, after.weights, LEVELS)
         ylim = draw_lines(panel, axis, self.shown, found, start, self.level, self.what)
-        observed = output.node.target.observed
+        observed = output.node.observed
         incomplete = np.count_nonzero(np.isnan(observed).any(axis=1))
         failed = np.count_nonzero(np.isinf(observed).any(axis=1))
         title = f"{len(observed)} measured specimens"

@@ -16,6 +16,7 @@ from prbayes.estimate.minimization import Minimisation, find_optimum, require_fi
 from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, require_of_model, require_sampling
 from prbayes.model.elements import finite_draws
+from prbayes.model.epsilon import refuse_without_epsilon
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import Level
 from prbayes.model.interruption import designs_as_before
@@ -114,6 +115,7 @@ def adjust(
             f"adjust: optimum: got {called(optimum)}, expected an Optimum from prb.minimize"
         )
     flag(refine, "refine")
+    refuse_without_epsilon(model, "adjust", "use its draws as they are")
     _refuse_other(idata)
     require_of_model(idata, model, "adjust", Level.OPTIMUM)
     evaluator = evaluator_of(model, optimum, "adjust")

@@ -10,10 +10,11 @@ import xarray as xr
 
 from prbayes._checks import Seed, flag, positive_integer, seed_number
 from prbayes._progress import shown
-from prbayes.estimate.data_sets import reweighted_sets, simulated_sets
+from prbayes.estimate.data_sets import dirichlet_weights, reweighted_sets, simulated_sets
 from prbayes.estimate.identifiability import unidentified_directions
 from prbayes.estimate.optimum import Optimum, require_refits
 from prbayes.estimate.prepared_anew import as_prepared_anew, of_few_pairs
+from prbayes.estimate.specimen_refits import is_specimen_optimum, specimen_refits
 from prbayes.model.turns import in_turn
 from prbayes.posterior.trees import bootstrap_tree
 
@@ -40,7 +41,8 @@ def bootstrap(
     With `Reweighted` each minimisation is exact and computes no response; with `Resimulated` it is
     of first order. A metric of several outputs takes from the data in which coordinates it looks at
     them: some minimisations are of the metric as it is prepared for their data set, and tell where
-    all are.
+    all are. With the log-likelihood by specimen the minimisers are maximum-likelihood estimates;
+    simulated data sets are drawn from one pool of simulated specimens, and nothing is run.
 
     Parameters
     ----------
@@ -83,6 +85,10 @@ def bootstrap(
     >>> prb.bootstrap(prb.minimize(model), draws=50).posterior["mu"].shape
     (1, 50)
     """
+    if is_specimen_optimum(optimum):
+        return _by_specimen(
+            optimum, draws, parametric=parametric, seed=seed_number(random_seed)
+        )
     clock = time.perf_counter()
     evaluator = require_refits(optimum, "bootstrap", "; use prb.sample_smc").evaluator
     positive_integer(draws, "draws", minimum=2)
@@ -113,6 +119,39 @@ def bootstrap(
         sampler="parametric bootstrap" if parametric else "loss-likelihood bootstrap",
         converged=float(converged.mean()),
         warnings=tuple(doubts),
+        seed=seed,
+        n_responses=optimum.n_responses,
+        seconds=time.perf_counter() - clock,
+    )
+
+
+def _by_specimen(optimum: Optimum, draws: int, *, parametric: bool, seed: int) -> xr.DataTree:
+    """Return estimates of data sets that resemble the observed one, by maximum likelihood."""
+    clock = time.perf_counter()
+    positive_integer(draws, "draws", minimum=2)
+    flag(parametric, "parametric")
+    refits = specimen_refits(optimum, "bootstrap", simulated=parametric)
+    unidentified = np.isinf(np.diag(optimum.covariance))
+    if unidentified.any():
+        names = [n for n, is_flat in zip(optimum.names, unidentified, strict=True) if is_flat]
+        raise ValueError(
+            f"bootstrap: the data tell less than the prior about {', '.join(names)}, along which "
+            "the estimate is arbitrary; use prb.sample_smc, whose posterior falls back on the "
+            "prior there, or fix a hyperparameter"
+        )
+    evaluator = refits.evaluator
+    if parametric:
+        estimates = list(refits.simulated(draws, seed))
+        thetas = np.array([refit.theta for refit in estimates])
+        converged = np.array([refit.converged for refit in estimates])
+    else:
+        weights = dirichlet_weights(evaluator.emulated, draws, seed)
+        thetas, converged = refits.reweighted(weights)
+    return bootstrap_tree(
+        evaluator,
+        thetas[None],
+        sampler="parametric bootstrap" if parametric else "loss-likelihood bootstrap",
+        converged=float(converged.mean()),
         seed=seed,
         n_responses=optimum.n_responses,
         seconds=time.perf_counter() - clock,

@@ -18,7 +18,7 @@ from prbayes.estimate.optimum import Optimum, require_minimiser, require_samplin
 from prbayes.estimate.sampling import first_order_shifts, local_sampling
 from prbayes.estimate.sandwich import Information, LinearArea
 from prbayes.metrics.base import Minimum
-from prbayes.model.epsilon import Epsilon
+from prbayes.model.epsilon import Epsilon, refuse_without_epsilon
 from prbayes.model.turns import in_turn
 
 # Thetas that carry each simulated data set's posterior: half or twice changes epsilon by 3%, as
@@ -72,7 +72,8 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
         minimum: their epsilon has to be given.
     ValueError
         If nothing is known around the optimum (``at_edge`` and ``at_jump`` of `Optimum`), or
-        nothing is identified; if the prior was part of it, or its model has changed since.
+        nothing is identified; if the prior was part of it, its model has changed since, or no
+        simulator has an epsilon.
 
     References
     ----------
@@ -97,6 +98,9 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
             f"calibrate_epsilon: got {type(optimum).__name__}, expected an Optimum; call "
             "prb.calibrate_epsilon(prb.minimize(model))"
         )
+    refuse_without_epsilon(
+        optimum.model, "calibrate_epsilon", "sample it with prb.sample_smc or pm.sample"
+    )
     evaluator = require_sampling(optimum, "calibrate_epsilon").evaluator
     require_minimiser(optimum, "calibrate_epsilon")
     found = {}

@@ -20,6 +20,11 @@ import xarray as xr
 from prbayes._checks import Floats, Seed, executes, flag, positive_integer, seed_number
 from prbayes._progress import progress, shown
 from prbayes.estimate.data_sets import fresh_data
+from prbayes.estimate.specimen_refits import (
+    other_specimens,
+    simulation_obstacle,
+    specimen_pool,
+)
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import model_on_context
 from prbayes.model.turns import in_turn
@@ -47,7 +52,8 @@ def simulation_based_calibration(
     """Calibrate many data sets with known hyperparameters, and rank these among the draws.
 
     Each time hyperparameters are drawn from the prior, and specimens from their populations, for
-    which the response is called; then epsilon, `sample_smc` and its adjustment run as they would on
+    which the response is called; with the log-likelihood by specimen its emulator gives the
+    responses, nothing is run, and the emulator itself is not checked. Then epsilon, `sample_smc` and its adjustment run as they would on
     measurements. If posteriors have the right width and place, the ranks are uniform. A wide prior
     asks more than one true value does: it shows what happens all over the prior.
 
@@ -113,7 +119,13 @@ def simulation_based_calibration(
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
     evaluator = Evaluator(model)
-    if evaluator.has_other_terms:
+    obstacle = None if evaluator.nodes else simulation_obstacle(evaluator)
+    if obstacle is not None:
+        raise ValueError(
+            f"simulation_based_calibration: {obstacle}, so that data sets cannot be drawn; "
+            "calibrate data of your own simulations with prb.sample_smc"
+        )
+    if evaluator.nodes and evaluator.has_other_terms:
         raise ValueError(
             "simulation_based_calibration: got a model with likelihood terms or potentials "
             "besides its simulators, whose data cannot be drawn; expected prb.Simulator nodes only"
@@ -201,13 +213,20 @@ def _one(evaluator: Evaluator, job: _Job, rng: np.random.Generator) -> dict[str,
     """Draw hyperparameters, and data from their population, and rank them among the draws."""
     theta_seed = int(rng.integers(2**31))
     theta = evaluator.prior_thetas(1, theta_seed)[0]
-    data = fresh_data(evaluator, theta, rng)
+    # Of a likelihood by specimen the emulator is the response.
+    pools, data = [], {}
+    if evaluator.nodes:
+        data = fresh_data(evaluator, theta, rng)
+    for k, likelihood in enumerate(evaluator.likelihoods):
+        params = evaluator.specimen_params(theta[None], k)
+        pools.append(specimen_pool(likelihood, params, rng, size=len(likelihood.observed)))
     draws_seed = int(rng.integers(2**31))
     adjust = job.adjust
     if isinstance(adjust, Affine):  # the same refits for all data sets would err alike
         adjust = replace(adjust, random_seed=draws_seed)
     asked = Sampling(draws=job.draws, adjust=adjust, random_seed=draws_seed)
-    posterior = sample(evaluator.observing(data), asked)["posterior"]
+    with other_specimens(evaluator.likelihoods, [pool.data_set(rng) for pool in pools]):
+        posterior = sample(evaluator.observing(data), asked)["posterior"]
     row = {}
     for name, (truth,) in evaluator.constrained(theta[None]).items():
         found = np.asarray(posterior[name])[0]

@@ -20,6 +20,7 @@ from prbayes.model.labels import (
     observed_dataset,
     versions,
 )
+from prbayes.propagation.base import MAX_LOST
 
 
 def posterior_tree(
@@ -77,7 +78,7 @@ def posterior_tree(
     if unadjusted is not None:
         discrepancies = _discrepancies_again(evaluator, thetas, discrepancies)
     attrs = {
-        "sampler": "SMC-ABC",
+        "sampler": "SMC-ABC" if evaluator.nodes else "SMC",
         "n_responses": n_responses,
         "seconds": seconds,
         "random_seed": "None" if seed is None else str(seed),
@@ -208,7 +209,7 @@ def _calibration(
     for key in ("lost_mass", "failed_mass"):
         shares = [missing.get(node.name, {}).get(key, np.nan) for node in evaluator.nodes]
         at_the_best[f"{key}_at_best"] = ("simulator", shares)
-    return xr.Dataset(
+    by_metric = xr.Dataset(
         {
             "discrepancy": (_EACH_DRAW, discrepancies),
             **support,
@@ -224,6 +225,42 @@ def _calibration(
             "draw": np.arange(draws),
         },
     )
+    if not evaluator.likelihoods:
+        return by_metric
+    by_specimen = _by_specimen(evaluator, thetas, by_metric)
+    return xr.concat(
+        [by_metric, by_specimen], "simulator", data_vars="minimal", coords="minimal",
+        compat="override", join="outer",
+    )  # fmt: skip
+
+
+def _by_specimen(evaluator: Evaluator, thetas: Floats, beside: xr.Dataset) -> xr.Dataset:
+    """Return the same variables of the simulators with a log-likelihood by specimen.
+
+    Minus the log-likelihood is the discrepancy, with an epsilon of one.
+    """
+    chains, draws, d = thetas.shape
+    likelihoods = evaluator.likelihoods
+    values = evaluator.specimen_log_likelihoods(thetas.reshape(-1, d))
+    names = [likelihood.name for likelihood in likelihoods]
+    discrepancies = np.stack([-values[name].sum(axis=1) for name in names], axis=-1)
+    runs = [len(likelihood.emulation.z) for likelihood in likelihoods]
+    known: dict[str, Any] = {
+        "discrepancy": (_EACH_DRAW, discrepancies.reshape(chains, draws, -1)),
+        "epsilon": ("simulator", np.ones(len(names))),
+        "max_lost": ("simulator", np.full(len(names), MAX_LOST)),
+        "metric": ("simulator", [without_addresses(each.metric) for each in likelihoods]),
+        "compared": ("simulator", [""] * len(names)),
+        "propagation": ("simulator", [f"emulator of {count} runs" for count in runs]),
+        "n_points": ("simulator", [each.points.log_a.size for each in likelihoods]),
+        "n_runs": ("simulator", runs),
+        "is_likelihood": ("simulator", np.ones(len(names), dtype=int)),
+    }
+    for name, variable in beside.data_vars.items():
+        if name not in known and "simulator" in variable.dims:
+            shape = [len(names) if dim == "simulator" else n for dim, n in variable.sizes.items()]
+            known[str(name)] = (variable.dims, np.full(shape, np.nan))
+    return xr.Dataset(known, coords={**beside.coords, "simulator": names})
 
 
 _EACH_DRAW = ["chain", "draw", "simulator"]
@@ -299,6 +336,7 @@ def _by_simulator(evaluator: Evaluator) -> dict[str, Any]:
         "propagation": ("simulator", [without_addresses(node.propagation) for node in nodes]),
         "n_points": ("simulator", [node.bound.n_points for node in nodes]),
         "n_runs": ("simulator", [node.bound.n_runs for node in nodes]),
+        "is_likelihood": ("simulator", np.zeros(len(nodes), dtype=int)),
     }
 
 

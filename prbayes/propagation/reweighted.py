@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 import pytensor
@@ -358,6 +358,7 @@ class Design(Bound):
     """
 
     stored: ClassVar[bool] = True
+    has_runs: ClassVar[Literal[True]] = True  # as points, unlike emulated specimens
 
     def __init__(
         self, name: str, inputs: Any, target: Discrepancy, responses: Responses, config: Reweighted

@@ -26,10 +26,10 @@ from scipy.special import gammaln, logsumexp, ndtri
 
 from prbayes._checks import AT_ONCE, Floats
 from prbayes.emulators.interpolant import Interpolant, fit_interpolant
+from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.guards import half_difference, missing_share, predicted_bias
 from prbayes.propagation.points import sobol
-from prbayes.metrics.readings import Readings
 from prbayes.propagation.roots import Response, Roots, find_roots, nearest_starts
 
 
@@ -266,12 +266,9 @@ def surface_near(
     zg, yg = z[good], y[good]
     zg, first = np.unique(zg, axis=0, return_index=True)
     yg = yg[first]
-    values = readings.values
-    low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
-    margin = np.maximum((high - low) / 2, spread)
-    inside = ((yg >= low - margin) & (yg <= high + margin)).all(axis=1)
+    inside = _is_near(yg, readings, spread)
     if inside.sum() < len(yg) // 4:
-        distance = (((yg - np.nanmean(values, axis=0)) / spread) ** 2).sum(axis=1)
+        distance = (((yg - np.nanmean(readings.values, axis=0)) / spread) ** 2).sum(axis=1)
         inside = np.zeros(len(yg), dtype=bool)
         inside[np.argsort(distance, kind="stable")[: max(8, len(yg) // 4)]] = True
     surface = fit_interpolant(zg, yg, inside)
@@ -299,6 +296,13 @@ def _all_roots(
         options = replace(options, starts=2 * options.starts)
         roots = specimen_roots(emulation, readings, options)
     return options, roots
+
+
+def _is_near(y: Floats, readings: Readings, spread: Floats) -> NDArray[np.bool_]:
+    """Return which outputs, (n, m), are within the range of the readings or half of it away."""
+    low, high = np.nanmin(readings.values, axis=0), np.nanmax(readings.values, axis=0)
+    margin = np.maximum((high - low) / 2, spread)
+    return np.asarray(((y >= low - margin) & (y <= high + margin)).all(axis=1))
 
 
 def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptions) -> Roots:

@@ -96,7 +96,8 @@ def diagnostics(m: Material) -> list[Section]:
         if diagnosis is not None:
             rows += _support(label, diagnosis.support)
     for label, tree in m.posteriors.items():
-        text += [f"{_capital(label)}: {sentence}" for sentence in _of_itself(tree)]
+        sentences = _of_itself(tree, by_specimen=m.is_by_specimen)
+        text += [f"{_capital(label)}: {sentence}" for sentence in sentences]
     if not text:
         return []
     sections = [Section("Diagnostics", text)]
@@ -118,7 +119,9 @@ def _capital(label: str) -> str:
 def _sentences(diagnosis: Diagnosis | None) -> tuple[str, ...]:
     if diagnosis is None:
         return ("not looked at, because that needs the model, which was not given.",)
-    return (*(diagnosis.messages or ("no problem was found.",)), *diagnosis.notes)
+    clear = diagnosis.all_clear
+    messages = diagnosis.messages or (f"{clear[0].lower()}{clear[1:]}",)
+    return (*messages, *diagnosis.notes, *diagnosis.untested)
 
 
 def _support(label: str, support: xr.Dataset) -> list[dict[str, Any]]:
@@ -142,7 +145,7 @@ def _support(label: str, support: xr.Dataset) -> list[dict[str, Any]]:
     return rows
 
 
-def _of_itself(tree: xr.DataTree) -> list[str]:
+def _of_itself(tree: xr.DataTree, *, by_specimen: bool) -> list[str]:
     """Say what `sample_smc` says of itself; nothing of other samplers."""
     if "sample_stats" not in tree or "stage" not in tree["sample_stats"].dims:
         return []
@@ -159,16 +162,17 @@ def _of_itself(tree: xr.DataTree) -> list[str]:
     ]
     attrs = tree["posterior"].attrs
     if "log_marginal_likelihood" in attrs:
-        sentences.append(_evidence(attrs))
+        sentences.append(_evidence(attrs, by_specimen=by_specimen))
     return sentences
 
 
-def _evidence(attrs: Mapping[Any, Any]) -> str:
+def _evidence(attrs: Mapping[Any, Any], *, by_specimen: bool) -> str:
     value = float(attrs["log_marginal_likelihood"])
     spread = float(attrs["log_marginal_likelihood_sd"])
     return (
         f"log marginal likelihood {plus_minus(value, spread)} (spread between chains); "
-        "comparable between models with the same metric and epsilon only."
+        "comparable between models "
+        f"{'of the same data' if by_specimen else 'with the same metric and epsilon'} only."
     )
 
 

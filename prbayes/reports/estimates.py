@@ -41,7 +41,9 @@ def optima(m: Material) -> list[Section]:
                 point = labelled(evaluator, rival["point"], {}).data_vars
                 text.append(_other_optimum(rival, point, _read_of(tree)))
         text.append(
-            "Standard errors are those of the estimator over repeated sets of as many specimens."
+            "Standard errors are those of the curvature of the log-likelihood."
+            if m.is_by_specimen
+            else "Standard errors are those of the estimator over repeated sets of as many specimens."
         )
         title = _titled("Optimum", label, m.optima)
         sections.append(Section(title, text, rows_table(_optimum_rows(tree))))
@@ -95,7 +97,7 @@ def posteriors(m: Material) -> list[Section]:
     """Return a section for each posterior."""
     sections = []
     for label, tree in m.posteriors.items():
-        text = [_size(tree["posterior"]), *_width(tree)]
+        text = [_size(tree["posterior"]), *([] if m.is_by_specimen else _width(tree))]
         title = _titled("Posterior", label, m.posteriors)
         sections.append(Section(title, text, rows_table(_posterior_rows(tree))))
         rows = _correlation_rows(tree)

@@ -12,7 +12,9 @@ from typing import Any
 import pymc as pm
 
 from prbayes.model.elements import variable_of
+from prbayes.model.emulated import population_simulators
 from prbayes.model.node import nodes
+from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.plots.comparison import plot_comparison
 from prbayes.plots.influences import plot_sensitivity
 from prbayes.plots.landscape import plot_landscape
@@ -72,7 +74,7 @@ def _first(results: Mapping[str, Any]) -> Any:
 
 def _computes_responses(model: pm.Model) -> bool:
     """Return whether a draw of the model's simulators computes responses: a report spends none."""
-    return any(node.bound.n_per_theta for node in nodes(model).values())
+    return any(simulator.runs_per_theta for simulator in population_simulators(model))
 
 
 def _population(m: Material) -> Request:
@@ -192,16 +194,16 @@ ILLUSTRATIONS = (
         function=plot_optimizer,
         request=_optimizer,
         title="Path of the optimiser",
-        alt="Discrepancy, and hyperparameters, against the number of evaluations.",
+        alt="Objective, and hyperparameters, against the number of evaluations.",
         caption="The objective at the points that the optimiser asked for.",
     ),
     Illustration(
         after="Optimum",
         function=plot_landscape,
         request=_landscape,
-        title="Discrepancy around the optimum",
-        alt="Discrepancy over the hyperparameters, with the optimum marked.",
-        caption="How the discrepancy rises around the optimum.",
+        title="Objective around the optimum",
+        alt="Objective over the hyperparameters, with the optimum marked.",
+        caption="How the objective rises around the optimum.",
     ),
     Illustration(
         after="Posterior",
@@ -407,7 +409,8 @@ def _observed_formatter(model: pm.Model) -> Callable[[Any], dict[str, Any]]:
     """Return a function from an observed variable to what Graphviz is told of it."""
     graphs: Any = import_module("pymc.model_graph")
     plain = graphs.DEFAULT_NODE_FORMATTERS[graphs.NodeType.OBSERVED_RV]
-    simulators = {node.name for node in nodes(model).values()}
+    simulators = {each.name for each in nodes(model).values()}
+    simulators |= {each.name for each in specimen_likelihoods(model).values()}
 
     def formatted(rv: Any) -> dict[str, Any]:
         style: dict[str, Any] = plain(rv)

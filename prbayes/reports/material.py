@@ -15,6 +15,7 @@ from prbayes._compare import compare
 from prbayes._diagnose import Diagnosis, diagnose
 from prbayes.estimate.optimum import Optimum, identity_in
 from prbayes.model.description import describe, from_attributes
+from prbayes.model.emulated import population_simulators
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import (
     Identity,
@@ -25,7 +26,6 @@ from prbayes.model.identity import (
     require_together,
 )
 from prbayes.model.identity import from_attributes as identity_of_attributes
-from prbayes.model.node import nodes
 from prbayes.plots._names import refuse_labels
 from prbayes.response.outputs import ONE, Outputs, read_observed
 from prbayes.validation.probability_transform import u_values
@@ -79,6 +79,16 @@ class Material:
     def attrs(self, label: str) -> dict[Any, Any]:
         """Return what a result says about itself."""
         return dict(_answer(self.results[label]).attrs)
+
+    @property
+    def is_by_specimen(self) -> bool:
+        """Whether all simulators of all results have the log-likelihood by specimen."""
+        known = [
+            calibration["is_likelihood"].values
+            for calibration in self.calibrations.values()
+            if "is_likelihood" in calibration
+        ]
+        return bool(known) and all(bool(own.all()) for own in known)
 
     @property
     def variables(self) -> list[dict[str, Any]]:
@@ -207,7 +217,7 @@ def _require_validation(validation: Any) -> None:
 
 def _require_prior(identities: Mapping[str, Identity | None], model: pm.Model | None) -> None:
     """Refuse draws none of which is under the prior of the model, which the report prints."""
-    if model is None or not nodes(model):
+    if model is None or not population_simulators(model):
         return
     expected = identity_of_model(model)
     found = {}
@@ -337,9 +347,9 @@ def _observed(
 ) -> tuple[dict[str, Floats], dict[str, Outputs]]:
     """Return the measured responses, and what their columns are, by simulator."""
     if model is not None:
-        known = nodes(model).values()
-        observed = {node.name: node.target.observed for node in known}
-        return observed, {node.name: node.outputs for node in known}
+        known = population_simulators(model)
+        observed = {simulator.name: simulator.observed for simulator in known}
+        return observed, {simulator.name: simulator.outputs for simulator in known}
     for tree in results.values():
         if "observed_data" in tree:
             stored = tree["observed_data"].data_vars.items()

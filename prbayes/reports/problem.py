@@ -192,6 +192,8 @@ def metric(m: Material) -> list[Section]:
     metrics = _metrics(m)
     if not rows and not metrics:
         return []
+    if m.is_by_specimen:
+        return [_log_likelihood(rows)]
     about = (
         "The metric measures how far the distribution of the simulated responses is "
         "from that of the measured ones; smaller is better."
@@ -206,6 +208,26 @@ def metric(m: Material) -> list[Section]:
     named += dict.fromkeys(compared)
     table = rows_table(rows) if rows else None
     return [Section("Metric and epsilon", (about, *named), table)]
+
+
+def _log_likelihood(rows: list[dict[str, Any]]) -> Section:
+    """Return the section of results of the log-likelihood by specimen."""
+    about = (
+        "The log-likelihood compares specimens: the density of each measured response in the "
+        "population, through the inputs that reproduce it. It is evaluated on an emulator of the "
+        "response, whose runs are counted here. The log-likelihood of a posterior is the mean over "
+        "its draws."
+    )
+    table = [
+        {
+            "result": row["result"],
+            "simulator": row["simulator"],
+            "log-likelihood": -row["discrepancy"],
+            "runs": row["runs"],
+        }
+        for row in rows
+    ]
+    return Section("Log-likelihood", about, rows_table(table))
 
 
 def _discrepancies(label: str, calibration: xr.Dataset) -> list[dict[str, Any]]:

@@ -238,6 +238,8 @@ def _trust(m: Material) -> str:
         if not found.ok:
             problems.append(f"{counted(len(found.messages), 'problem')} with {label}")
     if not problems:
+        if any(found.untested for found in known.values()):
+            return "The diagnostics that were run found no problem."
         return "The diagnostics found no problem."
     return (
         f"The diagnostics found {_enumerated(problems)}; "

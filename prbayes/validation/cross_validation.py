@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,10 +14,11 @@ from prbayes._checks import Floats, Seed, positive_integer, seed_number
 from prbayes._progress import shown
 from prbayes.estimate.data_sets import DataSets, specimens
 from prbayes.estimate.optimum import Optimum, require_refits
+from prbayes.estimate.specimen_refits import is_specimen_optimum, specimen_refits
 from prbayes.metrics.base import Discrepancy
+from prbayes.model.emulated import PopulationSimulator
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import versions
-from prbayes.model.node import Node
 from prbayes.model.turns import in_turn
 from prbayes.validation.scores import Scoring
 
@@ -60,7 +62,8 @@ def cross_validate(
     -------
     xarray.Dataset
         Dims (fold, simulator): ``discrepancy`` of the specimens left out, ``calibrated`` of the
-        others, in units of the metric; ``n_held_out``; and ``converged`` by fold. Where a fold has
+        others, in units of the metric, of the log-likelihood by specimen minus its mean over the
+        specimens; ``n_held_out``; and ``converged`` by fold. Where a fold has
         no observation of a simulator its discrepancy is NaN. Dim (specimen), in the order of the
         observations: ``score``, the log density of what was left out under the population of the
         others, whatever the metric, of which a hundredth is spread widely over the data; and
@@ -91,22 +94,28 @@ def cross_validate(
     >>> found.discrepancy.dims, bool((found.discrepancy > found.calibrated).mean() > 0.5)
     (('fold', 'simulator'), True)
     """
-    evaluator = require_refits(optimum, "cross_validate", _ADVICE).evaluator
+    by_specimen = is_specimen_optimum(optimum)
+    evaluator = _refitted(optimum).evaluator
     folds = most_folds(optimum, _FOLDS) if folds is None else folds
     folds = positive_integer(folds, "folds", minimum=2)
     seed = seed_number(random_seed)
-    parts = _Folds.dealt(evaluator.nodes, folds, seed)
+    parts = _Folds.dealt(evaluator.simulators, folds, seed)
 
     # Calibrate on the others of each fold.
-    observed = [node.target.observed for node in evaluator.nodes]
-    sampling = optimum.sampling()
     with shown(progressbar):
-        x, converged = sampling.refit(DataSets(observed, parts.kept))
-    thetas = sampling.thetas(x)
+        if by_specimen:
+            refits = specimen_refits(optimum, "cross_validate")
+            thetas, converged = refits.reweighted(parts.kept)
+        else:
+            observed = [node.target.observed for node in evaluator.nodes]
+            sampling = optimum.sampling()
+            x, converged = sampling.refit(DataSets(observed, parts.kept))
+            thetas = sampling.thetas(x)
 
     # Compare what was found with both parts.
-    left_out = _discrepancies(evaluator, thetas, parts.left_out)
-    calibrated = _discrepancies(evaluator, thetas, parts.kept)
+    compare = _mean_log_losses if by_specimen else _discrepancies
+    left_out = compare(evaluator, thetas, parts.left_out)
+    calibrated = compare(evaluator, thetas, parts.kept)
     scores, weights = _scores(evaluator, thetas, parts.left_out)
 
     where = ["fold", "simulator"]
@@ -118,11 +127,11 @@ def cross_validate(
             "converged": ("fold", converged),
             "score": ("specimen", scores),
             "weight": ("specimen", weights),
-            "data": ("simulator", [_digest(node) for node in evaluator.nodes]),
+            "data": ("simulator", [_digest(each) for each in evaluator.simulators]),
         },
         coords={
             "fold": np.arange(folds),
-            "simulator": [node.name for node in evaluator.nodes],
+            "simulator": [simulator.name for simulator in evaluator.simulators],
         },
         attrs={"random_seed": str(seed), **versions()},
     )
@@ -130,9 +139,16 @@ def cross_validate(
 
 def most_folds(optimum: Optimum, wanted: int) -> int:
     """Return how many folds there are of a wanted number, each of two specimens at least."""
-    evaluator = require_refits(optimum, "cross_validate", _ADVICE).evaluator
-    _, total = specimens(evaluator.nodes)
+    _, total = specimens(_refitted(optimum).evaluator.simulators)
     return max(2, min(wanted, total // 2))
+
+
+def _refitted(optimum: Optimum) -> Optimum:
+    """Return an optimum whose model can be calibrated to parts of the specimens, or raise."""
+    if is_specimen_optimum(optimum):
+        specimen_refits(optimum, "cross_validate")
+        return optimum
+    return require_refits(optimum, "cross_validate", _ADVICE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +162,7 @@ class _Folds:
     sizes: NDArray[np.intp]  # (folds, simulators): observations left out
 
     @classmethod
-    def dealt(cls, nodes: list[Node], folds: int, random_seed: int) -> _Folds:
+    def dealt(cls, nodes: Sequence[PopulationSimulator], folds: int, random_seed: int) -> _Folds:
         """Deal specimens out at random, those with the same label together."""
         numbers, total = specimens(nodes)
         if total < 2 * folds:
@@ -161,7 +177,7 @@ class _Folds:
         sizes = []
         few = []
         for node, number in zip(nodes, numbers, strict=True):
-            weights = node.target.weights
+            weights = node.weights
             out = fold_of[number] == np.arange(folds)[:, None]
             others = np.where(out, 0.0, weights)
             left = (others > 0).sum(axis=1)
@@ -205,16 +221,34 @@ def _discrepancies(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> 
     return np.array(columns).T
 
 
+def _mean_log_losses(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> Floats:
+    """Return minus the mean log-likelihood of weighted specimens, (folds, simulators).
+
+    Arguments are those of `_discrepancies`.
+    """
+    by_name = evaluator.specimen_log_likelihoods(thetas)
+    columns = []
+    for simulator, weights in zip(evaluator.emulated, data, strict=True):
+        logs = by_name[simulator.likelihood.name][:, simulator.rows]
+        own = simulator.likelihood.weights
+        if own is not None:
+            logs = logs / np.where(own > 0, own, 1.0)[simulator.rows]
+        total = weights.sum(axis=1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            columns.append(-np.where(weights > 0, weights * logs, 0.0).sum(axis=1) / total)
+    return np.array(columns).T
+
+
 def _scores(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> tuple[Floats, Floats]:
     """Return score and weight of each specimen, (specimens,), under the population of the others.
 
     Arguments are those of `_discrepancies`.
     """
-    numbers, total = specimens(evaluator.nodes)
+    numbers, total = specimens(evaluator.simulators)
     scores = np.zeros(total)
     counted = np.zeros(total)
-    for k, node in enumerate(evaluator.nodes):
-        weights = node.target.weights
+    for k, simulator in enumerate(evaluator.simulators):
+        weights = simulator.weights
         counted += np.bincount(numbers[k], weights * weights.size, total)
         own = _observation_scores(evaluator, thetas, data[k], k)
         scores += np.bincount(numbers[k], own, total)
@@ -223,10 +257,10 @@ def _scores(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -> tuple[F
 
 def _observation_scores(evaluator: Evaluator, thetas: Floats, data: Floats, k: int) -> Floats:
     """Return the scores of the k-th simulator's observations, (n_k,); NaN without a density."""
-    target = evaluator.nodes[k].target
-    scores = np.zeros(len(target.observed))
+    simulator = evaluator.simulators[k]
+    scores = np.zeros(len(simulator.observed))
     try:
-        scoring = Scoring.of(target.observed, target.weights)
+        scoring = Scoring.of(simulator.observed, simulator.weights)
     except ValueError:  # as where all observations are equal
         return np.full(scores.shape, np.nan)
     values, weights = evaluator.populations(thetas, k)
@@ -236,11 +270,10 @@ def _observation_scores(evaluator: Evaluator, thetas: Floats, data: Floats, k: i
     return scores
 
 
-def _digest(node: Node) -> str:
+def _digest(simulator: PopulationSimulator) -> str:
     """Return what observed values, weights and labels of a simulator are known by, in order."""
-    target = node.target
-    labels = [] if node.specimens is None else node.specimens.tolist()
-    content = target.observed.tobytes() + target.weights.tobytes() + repr(labels).encode()
+    labels = [] if simulator.specimens is None else simulator.specimens.tolist()
+    content = simulator.observed.tobytes() + simulator.weights.tobytes() + repr(labels).encode()
     return hashlib.sha256(content).hexdigest()[:16]
 
 

@@ -1,0 +1,377 @@
+"""Emulated populations of simulators with the log-likelihood by specimen.
+
+Such a simulator stores no weighted responses. Its populations are new specimens whose responses an
+emulator gives. `EmulatedSimulator` has what `Node` has for that, so that predictions, decisions,
+plots and reports treat both alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import pymc as pm
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from prbayes._checks import AT_ONCE, Floats
+from prbayes.emulators.interpolant import Interpolant, fit_interpolant
+from prbayes.metrics.base import Metric
+from prbayes.model.node import Node, nodes
+from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
+from prbayes.propagation.base import MAX_LOST, DesignError
+from prbayes.propagation.coordinates import Coordinates
+from prbayes.propagation.new_specimens import new_specimens
+from prbayes.response.distributions import compiled_log_density
+from prbayes.response.inputs import Inputs
+from prbayes.response.outputs import Outputs
+from prbayes.response.response import Responses
+
+# Specimens of a population in plots and scores: the error of a quantile of them is far below the
+# width of a posterior band.
+_SPECIMENS = 1024
+# Populations of the result, and specimens of each, that make the weighted sample of a decision.
+# Twice as many change probabilities by less than their reported error.
+_POPULATIONS, _OF_EACH = 64, 64
+_BLOCKS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class EmulatedResponse:
+    """A response between its runs, as a function of the inputs.
+
+    Attributes
+    ----------
+    coordinates : Coordinates
+    z : ndarray, shape (n, d)
+        Coordinates of the runs.
+    y : ndarray, shape (n, m)
+        Their outputs; +inf is a specimen that failed, NaN a run without response.
+    surface : Interpolant
+        Through the finite runs.
+    event : tuple
+        Shape of a specimen's outputs, () or (m,).
+    error : ndarray, shape (m,)
+        Root mean square error of runs that are left out, near the specimens.
+    """
+
+    coordinates: Coordinates
+    z: Floats
+    y: Floats
+    surface: Interpolant
+    event: tuple[int, ...]
+    error: Floats
+
+    @classmethod
+    def of_likelihood(cls, likelihood: SpecimenLikelihood) -> EmulatedResponse:
+        """Return the emulator of a likelihood; its first use computes the runs."""
+        emulation = likelihood.emulation
+        return cls(
+            likelihood.coordinates,
+            emulation.z,
+            emulation.y,
+            emulation.surface,
+            likelihood.event,
+            emulation.error,
+        )
+
+    @classmethod
+    def of_runs(cls, likelihood: SpecimenLikelihood, responses: Responses) -> EmulatedResponse:
+        """Compute another response at the points of a likelihood's runs, and interpolate it.
+
+        Raises
+        ------
+        DesignError
+            If fewer than eight runs have a finite response.
+        """
+        own = likelihood.inputs.aleatory
+        runs = likelihood.coordinates.inputs(likelihood.emulation.z)
+        wanted = responses.inputs.aleatory
+        points = [runs[next(i for i, x in enumerate(own) if x is w)] for w in wanted]
+        values = responses(points, [])
+        coordinates = Coordinates.of_prior(responses.inputs)
+        z = coordinates.of(points, 1)
+        y = values.reshape(len(z), -1)
+        good = np.isfinite(y).all(axis=1)
+        if good.sum() < 8:
+            raise DesignError(
+                f"{responses.name}: got {int(good.sum())} finite responses at {len(z)} points of "
+                f"the runs of {likelihood.name}, expected at least 8; pass stored=False to "
+                "prb.predict, which computes responses at new specimens"
+            )
+        near = _near_specimens(likelihood, points, coordinates, z)
+        distinct = np.unique(z[good], axis=0, return_index=True)[1]
+        rows = np.flatnonzero(good)[distinct]
+        surface = fit_interpolant(z[rows], y[rows], near[rows] if near[rows].any() else None)
+        left_out = surface.left_out[near[rows]] if near[rows].any() else surface.left_out
+        error = np.sqrt((left_out**2).mean(axis=0))
+        return cls(coordinates, z, y, surface, values.shape[1:], error)
+
+    def __call__(self, inputs: Sequence[Floats]) -> Floats:
+        """Return responses of specimens, (n, *event) by input -> (n, *event); no run is made.
+
+        Beyond the runs' range an input has the response at the end of the range. Where the nearest
+        run has no finite response, the response is that of the run.
+        """
+        z = self.coordinates.of(inputs, 1)
+        z = np.clip(z, self.z.min(axis=0), self.z.max(axis=0))
+        values = self.surface.values(z)
+        good = np.isfinite(self.y).all(axis=1)
+        if not good.all():
+            nearest = _nearest(self.z, z)
+            values = np.where(good[nearest, None], values, self.y[nearest])
+        return values.reshape(len(z), *self.event)
+
+
+def _near_specimens(
+    likelihood: SpecimenLikelihood, points: Sequence[Floats], coordinates: Coordinates, z: Floats
+) -> NDArray[np.bool_]:
+    """Return which runs are within the range of the specimens' roots, (n,)."""
+    own = likelihood.points
+    roots = own.z[np.isfinite(own.log_a)]
+    low, high = np.quantile(roots, [0.01, 0.99], axis=0)
+    run_z = likelihood.emulation.z
+    near = ((run_z >= low) & (run_z <= high)).all(axis=1)
+    return near if near.sum() >= 16 else np.ones(len(z), dtype=bool)
+
+
+def _nearest(runs: Floats, z: Floats) -> NDArray[np.intp]:
+    """Return the nearest run of each point, (k,)."""
+    from scipy.spatial import cKDTree
+
+    width = np.maximum(np.ptp(runs, axis=0), 1e-300)
+    _, nearest = cKDTree(runs / width).query(z / width)
+    return np.asarray(nearest)
+
+
+@dataclass(frozen=True, eq=False)
+class EmulatedSimulator:
+    """The specimens of a simulator, or of one of its groups, whose responses are emulated.
+
+    Attributes
+    ----------
+    likelihood : SpecimenLikelihood
+    place : int or None
+        Index of the group; None without groups.
+    """
+
+    likelihood: SpecimenLikelihood
+    place: int | None = None
+
+    is_emulated: ClassVar[Literal[True]] = True
+    # As of a Node: no response is weighted, and a population costs no run.
+    design: ClassVar[None] = None
+    has_specimens: ClassVar[bool] = True
+    runs_per_theta: ClassVar[int] = 0
+    max_lost: ClassVar[float] = MAX_LOST
+
+    @property
+    def name(self) -> str:
+        """Name of the simulator, such as 'y', or 'y[Adler]' of a group."""
+        groups = self.inputs.groups
+        if groups is None or self.place is None:
+            return self.likelihood.name
+        return groups.name(self.likelihood.name, self.place)
+
+    @property
+    def group(self) -> str:
+        """Name of the group, empty without groups."""
+        groups = self.inputs.groups
+        return "" if groups is None or self.place is None else groups.names[self.place]
+
+    @cached_property
+    def rows(self) -> NDArray[np.intp]:
+        """Which of the likelihood's specimens these are, (N,)."""
+        groups = self.likelihood.groups
+        if groups is None:
+            return np.arange(len(self.likelihood.observed))
+        return np.flatnonzero(groups == self.place)
+
+    @property
+    def observed(self) -> Floats:
+        """Measured responses, (N,) or (N, m)."""
+        return self.likelihood.observed[self.rows]
+
+    @property
+    def weights(self) -> Floats:
+        """Weights of the specimens, (N,), which sum to one."""
+        weights = self.likelihood.weights
+        own = np.ones(len(self.rows)) if weights is None else weights[self.rows]
+        return np.asarray(own / own.sum())
+
+    @property
+    def specimens(self) -> NDArray[Any] | None:
+        """Labels, (N,), or None."""
+        labels = self.likelihood.specimens
+        return None if labels is None else labels[self.rows]
+
+    @property
+    def metric(self) -> Metric:
+        """The log-likelihood by specimen."""
+        return self.likelihood.metric
+
+    @property
+    def inputs(self) -> Inputs:
+        """The inputs of the response."""
+        return self.likelihood.inputs
+
+    @property
+    def responses(self) -> Responses:
+        """The response, and how it is called."""
+        return self.likelihood.responses
+
+    @property
+    def outputs(self) -> Outputs:
+        """The outputs of a run."""
+        return self.likelihood.outputs
+
+    @property
+    def n_specimens(self) -> float:
+        """Effective number of specimens."""
+        return float(1 / (self.weights**2).sum())
+
+    @property
+    def n_runs(self) -> int:
+        """Runs of the emulator."""
+        return len(self.likelihood.emulation.z)
+
+    @cached_property
+    def _emulated(self) -> EmulatedResponse:
+        return EmulatedResponse.of_likelihood(self.likelihood)
+
+    def emulator(self, responses: Responses) -> EmulatedResponse:
+        """Return a response of the same inputs as a function of them.
+
+        The simulator's own response costs no run. Another one is computed at the points of the
+        emulator's runs.
+        """
+        if responses.same_as(self.responses):
+            return self._emulated
+        return EmulatedResponse.of_runs(self.likelihood, responses)
+
+    def populations(self, roots: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """Return emulated responses and weights of populations, (k, n) or (k, n, m) and (k, n).
+
+        The quasi-random numbers are the same for all calls.
+        """
+        rng = np.random.default_rng(0)
+        specimens, _ = new_specimens(self.name, self.inputs, list(roots), _SPECIMENS, rng)
+        count = len(roots[0])
+        flat = [x.reshape(count * _SPECIMENS, *x.shape[2:]) for x in specimens]
+        values = self._emulated(flat).reshape(count, _SPECIMENS, *self.likelihood.event)
+        return values, np.full((count, _SPECIMENS), 1 / _SPECIMENS)
+
+
+type PopulationSimulator = Node | EmulatedSimulator
+
+
+def emulated_simulators(model: pm.Model) -> list[EmulatedSimulator]:
+    """Return the simulators with a likelihood by specimen, one by one for groups with specimens."""
+    result = []
+    for likelihood in specimen_likelihoods(model).values():
+        if likelihood.groups is None:
+            result.append(EmulatedSimulator(likelihood))
+        else:
+            places = np.unique(likelihood.groups).tolist()
+            result += [EmulatedSimulator(likelihood, place) for place in places]
+    return result
+
+
+def population_simulators(model: pm.Model) -> list[PopulationSimulator]:
+    """Return all simulators of a model: those with a metric of distributions first."""
+    return [*nodes(model).values(), *emulated_simulators(model)]
+
+
+@dataclass(frozen=True, eq=False)
+class EmulatedSample:
+    """Weighted specimens whose responses are emulated, for populations of one result.
+
+    Specimens are drawn from a mixture of populations. A population of the mixture's range is the
+    specimens with importance weights.
+
+    Attributes
+    ----------
+    simulator : EmulatedSimulator
+    points : list of ndarray, shapes (n, *event)
+    log_mixture : ndarray, shape (n,)
+        Log-density of the specimens in the mixture.
+    blocks : ndarray of int, shape (n,)
+        Eight parts, each of which represents the mixture.
+    """
+
+    simulator: EmulatedSimulator
+    points: list[Floats]
+    log_mixture: Floats
+    blocks: NDArray[np.intp]
+
+    has_runs: ClassVar[Literal[False]] = False  # as points, which a design has
+
+    @classmethod
+    def of(cls, simulator: EmulatedSimulator, roots: Sequence[Floats]) -> EmulatedSample:
+        """Draw specimens from populations at roots, shapes (k, *shape)."""
+        count = len(roots[0])
+        chosen = np.unique(np.linspace(0, count - 1, _POPULATIONS).round().astype(int))
+        roots = [root[chosen] for root in roots]
+        of_each = -(-_POPULATIONS * _OF_EACH // len(chosen) // _BLOCKS) * _BLOCKS
+        specimens, _ = new_specimens(
+            simulator.name, simulator.inputs, list(roots), of_each, np.random.default_rng(0)
+        )
+        flat = [x.reshape(-1, *x.shape[2:]) for x in specimens]
+        log_p = _log_density(simulator.inputs, roots, flat)
+        log_mixture = logsumexp(log_p, axis=0) - np.log(len(chosen))
+        blocks = np.tile(np.arange(of_each) % _BLOCKS, len(chosen))
+        return cls(simulator, flat, log_mixture, blocks)
+
+    @property
+    def inputs(self) -> Inputs:
+        """The inputs of the specimens."""
+        return self.simulator.inputs
+
+    @property
+    def n_points(self) -> int:
+        """Number of specimens."""
+        return len(self.log_mixture)
+
+    @property
+    def max_lost(self) -> float:
+        """Largest share of a population that may have no response."""
+        return MAX_LOST
+
+    def points_of(self, inputs: Inputs) -> list[Floats]:
+        """Return the specimens' values of some inputs."""
+        own = self.inputs.aleatory
+        return [self.points[next(i for i, x in enumerate(own) if x is w)] for w in inputs.aleatory]
+
+    def populations(self, roots: Sequence[Floats]) -> tuple[None, Floats]:
+        """Return nothing, and the weights of the specimens in populations at roots, (k, n)."""
+        log_p = _log_density(self.inputs, roots, self.points) - self.log_mixture
+        largest = log_p.max(axis=1, keepdims=True)
+        with np.errstate(invalid="ignore"):
+            weights = np.exp(log_p - largest)
+            return None, weights / weights.sum(axis=1, keepdims=True)
+
+    def refuse_unsupported(self, name: str, roots: Sequence[Floats]) -> None:
+        """Raise if the weights of most populations are those of a few specimens."""
+        _, weights = self.populations(roots)
+        size = float(np.median(1 / (weights**2).sum(axis=1)))
+        if not size >= _OF_EACH / 2:
+            raise DesignError(
+                f"{name}: got a weight effective sample size of {size:.0f} of {self.n_points} "
+                "emulated specimens (median over the populations), expected at least "
+                f"{_OF_EACH // 2}; the populations of this result are too different from each "
+                "other; compute the quantity from prb.predict"
+            )
+
+
+def _log_density(inputs: Inputs, roots: Sequence[Floats], points: Sequence[Floats]) -> Floats:
+    """Return log-densities of specimens in populations, (k, n)."""
+    function = compiled_log_density(inputs)
+    step = max(1, AT_ONCE // len(points[0]))
+    parts = []
+    for first in range(0, len(roots[0]), step):
+        (log_p,) = function(*[root[first : first + step] for root in roots], *points)
+        parts.append(np.broadcast_to(log_p, (len(log_p), len(points[0]))))
+    return np.concatenate(parts)
