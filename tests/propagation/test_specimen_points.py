@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
-
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -296,7 +295,7 @@ def test_a_response_that_cannot_be_emulated_is_refused() -> None:
         return z + 0.5 * np.sin(1e4 * z)
 
     y = rough(0.2 * np.random.default_rng(0).normal(size=(20, 1)))
-    with pytest.raises(DesignError, match=r"not smooth enough .* metric=prb.ProbabilityResidual"):
+    with pytest.raises(DesignError, match=r"metric=prb.ProbabilityResidual"):
         points_of(rough, y, 1)
 
 
