@@ -17,12 +17,13 @@ import argparse
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pymc as pm
 from scipy import optimize, stats
-from scipy.special import lambertw, logsumexp, ndtr, ndtri
+from scipy.special import i0e, lambertw, logsumexp, ndtr, ndtri
 
 import prbayes as prb
 from benchmarks import record
@@ -50,7 +51,9 @@ class Problem:
     inputs: tuple[Input, ...]
     formula: Callable[..., Any]
     # Readings (N, m) -> roots (N, K, d), log |dx/dy| (N, K).
-    roots: Callable[[Any], tuple[Any, Any]]
+    roots: Callable[[Any], tuple[Any, Any]] | None = None
+    # Readings (N, m), populations (S, q) -> exact log-likelihoods (S,), where there are no roots.
+    exact: Callable[[Any, Any], Any] | None = None
 
     @property
     def population(self) -> Population:
@@ -81,6 +84,14 @@ def _mirror_roots(y: Any) -> tuple[Any, Any]:
     return np.stack([x1, x2], axis=2), log_slope
 
 
+def _squared_rice(y: Any, theta: Any) -> Any:
+    # y = a^2 + b^2 of independent normal a, b with means mu, 0 and one standard deviation.
+    mu, sd = theta[:, :1], theta[:, 1:]
+    root = np.sqrt(y.T)
+    log_p = -0.5 * ((root - mu) / sd) ** 2 + np.log(i0e(mu * root / sd**2)) - np.log(2 * sd**2)
+    return log_p.sum(axis=1)
+
+
 PROBLEMS = {
     problem.name: problem
     for problem in (
@@ -105,12 +116,20 @@ PROBLEMS = {
             formula=lambda xp, a, b: [xp.exp(0.3 * a + 0.1 * b), xp.exp(b - 1) - (b - 1)],
             roots=_mirror_roots,
         ),
+        Problem(
+            name="circle",
+            size=20,
+            priors={"mu": truncated(2.0, 0.7, low=0.5), "sd": half_normal(0.5)},
+            inputs=(Input("normal", "mu", "sd"), Input("normal", 0.0, "sd")),
+            formula=lambda xp, a, b: a**2 + b**2,
+            exact=_squared_rice,
+        ),
     )
 }
 
 
-def likelihood_of(problem: Problem) -> SpecimenLikelihood:
-    """Return the likelihood of a model with this problem's inputs; its data are arbitrary."""
+def likelihood_of(problem: Problem) -> tuple[pm.Model, SpecimenLikelihood]:
+    """Return a model with this problem's inputs, and its likelihood; its data are arbitrary."""
     population = problem.population
     middle = {name: p.distribution().median() for name, p in problem.priors.items()}
     z = stats.norm.ppf((np.arange(problem.size) + 0.5) / problem.size)
@@ -121,7 +140,7 @@ def likelihood_of(problem: Problem) -> SpecimenLikelihood:
         observed = problem.response(*[np.ravel(column) for column in x])
         prb.Simulator("y", problem.response, *inputs, observed=observed)
     (likelihood,) = specimen_likelihoods(model).values()
-    return likelihood
+    return model, likelihood
 
 
 # -- posterior ---------------------------------------------------------------------------------------
@@ -151,12 +170,23 @@ def log_likelihood(problem: Problem, x: Any, log_a: Any) -> Functions:
     def function(theta: Any) -> Any:
         log_p = log_a[None]
         for j, one in enumerate(problem.inputs):
-            mean, sd = (theta[:, names.index(str(p)), None, None] for p in (one.first, one.second))
+            mean, sd = (
+                theta[:, names.index(p), None, None] if isinstance(p, str) else p
+                for p in (one.first, one.second)
+            )
             log_p = log_p - 0.5 * ((x[None, ..., j] - mean) / sd) ** 2 - np.log(sd)
         largest = log_p.max(axis=2)
         return (largest + np.log(np.exp(log_p - largest[..., None]).sum(axis=2))).sum(axis=1)
 
     return function
+
+
+def exact_log_likelihood(problem: Problem, y: Any) -> Functions:
+    """Return the exact log-likelihood (S,) of populations (S, q) from readings (N, m)."""
+    if problem.roots is None:
+        assert problem.exact is not None
+        return partial(problem.exact, y)
+    return log_likelihood(problem, *problem.roots(y))
 
 
 def posterior(problem: Problem, function: Functions, start: Any) -> tuple[Any, Any, float]:
@@ -282,9 +312,12 @@ def data_set(problem: Problem, likelihood: SpecimenLikelihood, number: int) -> d
         [a.reshape(*a.shape[:2], -1) for a in likelihood.coordinates.inputs(points.z)], axis=2
     )
     log_a = points.log_a + likelihood.coordinates.log_jacobian(points.z)
-    of_exact = problem.roots(y.reshape(problem.size, -1))
-    for name, (at, log_mass) in {"prbayes": (x, log_a), "exact": of_exact}.items():
-        u, weights, k = posterior(problem, log_likelihood(problem, at, log_mass), start)
+    functions = {
+        "prbayes": log_likelihood(problem, x, log_a),
+        "exact": exact_log_likelihood(problem, y.reshape(problem.size, -1)),
+    }
+    for name, function in functions.items():
+        u, weights, k = posterior(problem, function, start)
         below = {p: float(weights @ (u[:, j] < start[j])) for j, p in enumerate(problem.priors)}
         mean = weights @ u
         row[name] = {
@@ -334,7 +367,7 @@ def main() -> None:
     found = record.load(OUT, {"rows": {}, "summary": {}})
     for name in arguments.problems:
         problem = PROBLEMS[name]
-        likelihood = likelihood_of(problem)
+        _model, likelihood = likelihood_of(problem)
         rows = found["rows"].setdefault(name, [])
         while len(rows) < arguments.data_sets:
             rows += [data_set(problem, likelihood, len(rows) + i) for i in range(_BLOCK)]

@@ -131,7 +131,7 @@ def test_families(truth: str, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("name", list(likelihood_coverage.PROBLEMS))
 def test_the_posterior_of_the_likelihood_by_specimen_is_the_exact_one(name: str) -> None:
     problem = likelihood_coverage.PROBLEMS[name]
-    likelihood = likelihood_coverage.likelihood_of(problem)
+    _model, likelihood = likelihood_coverage.likelihood_of(problem)
     rows = [likelihood_coverage.data_set(problem, likelihood, number) for number in range(12)]
     found = likelihood_coverage.summary(rows)
     assert found["refused"] == 0

@@ -103,6 +103,15 @@ class SpecimenLikelihood:
     known: SpecimenLikelihood | None = None  # of the same runs, for other data
     options: PointOptions = field(default_factory=PointOptions)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Replace the weak reference, which has no pickle, by the model."""
+        return {**vars(self), "model": None if self.model is None else self.model()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore the weak reference."""
+        model = state["model"]
+        vars(self).update({**state, "model": None if model is None else weakref.ref(model)})
+
     @property
     def variables(self) -> tuple[TensorVariable, ...]:
         """The model variables that the log-density depends on: roots of the inputs, then extras."""

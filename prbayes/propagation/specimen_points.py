@@ -254,21 +254,30 @@ def emulate(
     for batch in range(6):
         roots = specimen_roots(emulation, readings, options)
         enough = batch >= 2 if known is None else emulation.covers(roots.z)
-        if enough and emulation.bias <= options.bias:
+        # Twice at most: a reading that no inputs reproduce is reported.
+        wider = _widened(emulation.box, roots) if batch < 2 else emulation.box
+        if enough and emulation.bias <= options.bias and np.array_equal(wider, emulation.box):
             break
+        emulation = replace(emulation, box=wider)
         count = max(n // 2, options.fresh)
-        fresh = spread_out(roots.z, search_box, count, options.fresh, rng)
+        fresh = spread_out(roots.z, wider, count, options.fresh, rng)
         emulation = extended(emulation, run, fresh, readings, options, spread, name)
     else:
         roots = specimen_roots(emulation, readings, options)
     options, roots = _all_roots(emulation, readings, options, roots, seed)
+    if (emulation.error > spread).any():
+        raise DesignError(
+            f"{name}: got an emulator with errors of {emulation.error} at the specimens, expected "
+            f"less than the data's standard deviations {spread}; look at the response and the "
+            "priors, or use metric=prb.ProbabilityResidual()"
+        )
     if emulation.bias > options.bias:
         raise DesignError(
             f"{name}: got an emulator whose error would shift a mean or standard deviation of an "
             f"input by {emulation.bias:.2g} posterior standard deviations after "
-            f"{len(emulation.z)} runs, expected at most {options.bias}; the response is not smooth enough for "
-            "prb.LogLikelihood(): use metric=prb.ProbabilityResidual(), or more first runs with "
-            "propagation=prb.Reweighted(n)"
+            f"{len(emulation.z)} runs, expected at most {options.bias}; the response is not smooth "
+            "enough for prb.LogLikelihood(): use metric=prb.ProbabilityResidual(), or more first "
+            "runs with propagation=prb.Reweighted(n)"
         )
     return emulation, roots
 
@@ -329,6 +338,16 @@ def surface_near(
         inside[np.argsort(distance, kind="stable")[: max(8, len(yg) // 4)]] = True
     surface = fit_interpolant(zg, yg, inside)
     return surface, np.sqrt((surface.left_out[inside] ** 2).mean(axis=0))
+
+
+def _widened(box: Floats, roots: Roots, misfit: float = 50.0) -> Floats:
+    """Return the box with more room where the search for a root ends at its side with a misfit."""
+    poor = roots.z[roots.misfit > misfit]
+    if not len(poor):
+        return box
+    width = box[1] - box[0]
+    ends = np.stack([poor <= box[0] + 1e-6 * width, poor >= box[1] - 1e-6 * width])
+    return np.asarray(box + 0.25 * width * np.array([[-1.0], [1.0]]) * ends.any(axis=1))
 
 
 def _all_roots(
@@ -517,6 +536,7 @@ def draw_points(
     components = _fit_components(emulation, error, readings, roots, box, options, seed)
     count = options.points if error_is_known else 4 * options.points
     scales = (1.0,) if error_is_known else (0.5, 1.0, 1.3)
+    populations: list[tuple[Floats, Floats]] = []
     while True:
         halves = [
             _draw(emulation, error, readings, components, max(1, count // 2), options, (seed, h))
@@ -525,8 +545,9 @@ def draw_points(
         if error_is_known:
             halves = [_normalised(half, components) for half in halves]
         points = _joined(halves)
+        populations = populations or normal_populations(points.z, points.log_a, 32, seed)
         difference = max(
-            _difference(halves if k == 1.0 else _of_error(halves, readings, error, k), seed)
+            _difference(halves if k == 1.0 else _of_error(halves, readings, error, k), populations)
             for k in scales
         )
         largest = components.table.shape[1] * count
@@ -768,10 +789,8 @@ def _joined(halves: list[_Sample]) -> _Sample:
     )
 
 
-def _difference(halves: list[_Sample], seed: int, draws: int = 32) -> float:
-    """Return the half difference of log L over normal populations of bootstrapped specimens."""
-    joint = _joined(halves)
-    populations = normal_populations(joint.z, joint.log_a, draws, seed)
+def _difference(halves: list[_Sample], populations: list[tuple[Floats, Floats]]) -> float:
+    """Return the half difference of log L over normal populations."""
     values = [
         np.stack(
             [
@@ -796,24 +815,28 @@ def normal_populations(
     """
     rng = np.random.default_rng([seed, 7])
     n, _, d = z.shape
-    flat = z.reshape(-1, d)
-    prior = 1e-12 * np.diag(np.maximum(flat.var(axis=0), 1e-300))
-    weights = np.exp(log_a - logsumexp(log_a, axis=1, keepdims=True))
-    result = []
-    start_mean = np.einsum("nk,nkd->d", weights, z) / n
-    away = z - start_mean
-    start_covariance = np.einsum("nk,nkd,nke->de", weights, away, away) / n + prior
-    for _ in range(draws):
-        share = rng.dirichlet(np.ones(n)) if bootstrap else np.full(n, 1 / n)
-        mean, covariance = start_mean, start_covariance
+    prior = 1e-12 * np.diag(np.maximum(z.reshape(-1, d).var(axis=0), 1e-300))
+
+    def moments(weights: Floats) -> tuple[Floats, Floats]:
+        mean = np.einsum("nk,nkd->d", weights, z)
+        away = z - mean
+        return mean, np.einsum("nk,nkd,nke->de", weights, away, away) + prior
+
+    def fit(start: tuple[Floats, Floats], share: Floats, steps: int) -> tuple[Floats, Floats]:
+        mean, covariance = start
         for _ in range(steps):
             log_w = normal_log_density(z, mean, np.linalg.cholesky(covariance)) + log_a
             w = np.exp(log_w - logsumexp(log_w, axis=1, keepdims=True)) * share[:, None]
-            mean = np.einsum("nk,nkd->d", w, z)
-            away = z - mean
-            covariance = np.einsum("nk,nkd,nke->de", w, away, away) + prior
-        result.append((mean, np.linalg.cholesky(covariance)))
-    return result
+            mean, covariance = moments(w)
+        return mean, covariance
+
+    equal = np.full(n, 1 / n)
+    weights = np.exp(log_a - logsumexp(log_a, axis=1, keepdims=True)) / n
+    whole = fit(moments(weights), equal, steps)
+    shares = [rng.dirichlet(np.ones(n)) for _ in range(draws)] if bootstrap else [equal]
+    # A bootstrap sample has its fit near that of all specimens.
+    fits = [fit(whole, share, 5) if bootstrap else whole for share in shares]
+    return [(mean, np.linalg.cholesky(covariance)) for mean, covariance in fits]
 
 
 def normal_log_density(z: Floats, mean: Floats, root: Floats) -> Floats:
