@@ -288,6 +288,56 @@ def gross_errors() -> Iterator[Row]:
         ]
 
 
+# By rival of the scoreboard: the metric, what it estimates, failures, gross errors.
+_PRICES = {
+    "prbayes likelihood": (
+        "log-likelihood by specimen",
+        "populations that explain the record of each specimen",
+        "refused",
+        "`gross_errors=`",
+    ),
+    "prbayes KLD": ("KLD", "the population with the density of the data", "counted", "follows"),
+    "prbayes kernel log-likelihood": (
+        "kernel log-likelihood",
+        "the population whose smoothed density makes the data likely",
+        "counted",
+        "follows",
+    ),
+    "prbayes area": (
+        "area",
+        "the population with the distribution function of the data",
+        "counted",
+        "robust",
+    ),
+    "prbayes PR": ("PR", "the population of the bulk of the data", "counted", "robust"),
+}
+
+
+def metric_prices() -> Iterator[Row]:
+    """Return the rows of metrics with runs, seconds and errors on three problems."""
+    table = found("scoreboard")
+    cells = [
+        table[name][size] for name, size in (("linear", "50"), ("folded", "50"), ("frame", "20"))
+    ]
+    for rival, columns in _PRICES.items():
+        scores = [cell.get(rival) for cell in cells]
+        yield [
+            *columns,
+            _over(scores, lambda score: f"{score['runs']:.0f}"),
+            _over(scores, lambda score: f"{score['cpu']:.2g}"),
+            _over(scores, lambda score: short(max(_rms(score)))),
+        ]
+
+
+def _rms(score: dict[str, Any]) -> list[float]:
+    return [value["rms"] for value in score.values() if isinstance(value, dict)]
+
+
+def _over(scores: Iterable[Any], shown: Callable[[Any], str]) -> str:
+    """Return a cell with a value for each problem, a dash where a metric was not run."""
+    return " / ".join("-" if score is None else shown(score) for score in scores)
+
+
 def measurement_error() -> Iterator[Row]:
     """Return the rows of readings with an error."""
     table = found("measurement_error")
@@ -849,6 +899,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "small groups": small_groups,
     "measurement error": measurement_error,
     "gross errors": gross_errors,
+    "metric prices": metric_prices,
     "landscapes": landscapes,
     "wrong families, many data": lambda: families((100_000,)),
     "wrong families, few data": lambda: families((20, 50)),

@@ -317,7 +317,7 @@ def separate_modes(thetas: Floats, names: Sequence[str]) -> tuple[Finding, ...]:
             f"The means of the chains differ by {listed} within-chain standard deviations: the "
             "chains are in different modes, and their number of draws is not the mass of a mode; "
             "sample with prb.sample_smc, which weighs the modes",
-            "likelihood.md#several-modes",
+            "likelihood.md#chains-in-different-modes",
         ),
     )
 

@@ -105,7 +105,7 @@ class GaussianKDE(DensityEstimator):
     ----------
     bandwidth : float or callable, optional
         In units of the response, or a rule ``(observed, weights) -> float``. By default the rule of
-        the metric: `likelihood_bandwidth` in `LogLikelihood`, two Silverman bandwidths elsewhere.
+        the metric: ``likelihood_bandwidth`` in `LogLikelihood`, two Silverman bandwidths elsewhere.
 
     Raises
     ------

@@ -349,15 +349,18 @@ def _rounded(label: str, values: Floats, step: float, largest: float) -> Finding
         f"{label}: got {len(values)} values that are all multiples of a step of {step:.4g} "
         f"({share:.3g} standard deviations), expected exact values, or a step of at most "
         f"{largest:g} standard deviations; pass rounded={step:.4g}",
+        "likelihood.md#rounded-data",
     )
 
 
 def _censored(label: str, side: str, count: int, n: int, limit: float) -> Finding:
+    limits = f"(None, {limit:.6g})" if side == "largest" else f"({limit:.6g}, None)"
     return Finding(
         "censored-data",
         f"{label}: got {count} of {n} values equal to the {side}, {limit:.6g}, expected fewer "
-        f"without a limit of measurement; pass censored={limit:.6g} if they lie beyond it, or "
+        f"without a limit of measurement; pass censored={limits} if they lie beyond it, or "
         "leave out copies",
+        "likelihood.md#censored-data",
     )
 
 
@@ -369,4 +372,5 @@ def _identical(groups: tuple[tuple[int, ...], ...]) -> Finding:
         f"got specimens {shown}{more} (counted from 0) with identical values of all outputs, "
         "expected different ones; leave out copies, pass specimens= for repeated readings, or "
         "rounded= for coarse ones",
+        "likelihood.md#identical-specimens",
     )

@@ -179,7 +179,7 @@ def test_the_finding_names_the_limit() -> None:
     (finding,) = data_findings(y)
     count = np.sum(y == 10.5)
     assert f"got {count} of 30 values equal to the largest, 10.5" in finding.text
-    assert "pass censored=10.5" in finding.text
+    assert "pass censored=(None, 10.5)" in finding.text
 
 
 @pytest.mark.parametrize("step", [0.1, 0.5])

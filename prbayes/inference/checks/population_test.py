@@ -230,5 +230,6 @@ def population_findings(
             f"specimens, with the smallest p-value for {worst}, expected p > {threshold:g}; "
             "compare skewed families, two-part families, gross_errors=True, and a limit beyond "
             "which no specimen was measured",
+            "likelihood.md#population-misfit",
         ),
     )

@@ -128,6 +128,7 @@ def conflict_findings(
                 f"posterior mean to {posterior_mean[j]:.3g}, {conflict.pulls[j]:.1f} standard "
                 f"errors from the data, expected at most {pull:g}; check the units and the prior, "
                 "or widen it",
+                "likelihood.md#prior-conflict",
             )
         )
     return tuple(findings)
