@@ -30,7 +30,7 @@ from pytensor.graph.replace import graph_replace, vectorize_graph
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, called
 from prbayes._finding import Finding, report
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.readings import Readings
@@ -100,7 +100,7 @@ class SpecimenLikelihood:
     groups: NDArray[np.intp] | None = None
     extras: Mapping[str, TensorVariable] = field(default_factory=dict)
     model: Any = None  # weak reference to the pymc.Model
-    known: SpecimenLikelihood | None = None  # of the same runs, for other data
+    known: Emulation | None = None  # of the same response, for other data
     options: PointOptions = field(default_factory=PointOptions)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -152,7 +152,7 @@ class SpecimenLikelihood:
             )  # fmt: skip
             return emulation, points, report(self._data_findings(several_roots=True))
         box = np.stack([-np.ones(d), np.ones(d)])
-        known = None if self.known is None else self.known.emulation
+        known = self.known
         if self.propagation.calls_response:
             known = Emulation.of_function(self.run, box, bounds, self.readings, self.options)
         emulation, roots = emulate(
@@ -376,7 +376,7 @@ class SpecimenLikelihood:
                 f"{len(self.observed)}, as many as there are groups, weights= or specimens=; build "
                 "the model again with those of the new ones"
             )
-        known = self if "_prepared" in vars(self) else self.known
+        known = self.emulation if "_prepared" in vars(self) else self.known
         return replace(self, observed=values, readings=readings, known=known)
 
 
@@ -598,7 +598,15 @@ def _same(data: Any, observed: Floats) -> bool:
 
 
 def specimen_likelihoods(model: pm.Model) -> dict[Any, SpecimenLikelihood]:
-    """Return the likelihoods by specimen of a model, by their observed variables."""
+    """Return the likelihoods by specimen of a model, by their observed variables.
+
+    Raises
+    ------
+    TypeError
+        If it is no model.
+    """
+    if not isinstance(model, pm.Model):
+        raise TypeError(f"model: got {called(model)}, expected a pm.Model")
     result = {}
     for rv in model.observed_RVs:
         if isinstance(rv.owner.op, SpecimenRV):
