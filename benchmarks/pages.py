@@ -185,6 +185,17 @@ def ranks() -> Iterator[Row]:
             yield [model, labels[model], name, str(told["data sets"]), mean, off, within, p]
 
 
+def likelihood_ranks() -> Iterator[Row]:
+    """Yield coverage and uniformity of the log-likelihood by specimen, by problem."""
+    for problem, table in found("likelihood_coverage")["summary"].items():
+        for j, (name, within) in enumerate(table["prbayes"]["coverage"].items()):
+            exact = table["exact"]["coverage"][name]
+            p = short(table["prbayes"]["p of uniformity"][name])
+            bias = f"{short(table['bias'][j], 3)}, {short(table['rms'][j], 3)}"
+            width, sets = short(table["width"][j], 3), str(table["data sets"])
+            yield [problem, name, sets, short(within, 3), short(exact, 3), p, bias, width]
+
+
 def _mean_ratio(ratios: Any) -> str:
     return short(float(np.exp(np.log(ratios).mean())))
 
@@ -810,6 +821,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "given the estimate, pooled": given_estimate,
     "given the estimate, by problem": given_estimate_by_problem,
     "ranks": ranks,
+    "likelihood, ranks": likelihood_ranks,
     "hard posteriors": hard_posteriors,
     "samplers": samplers,
     "size": sizes,

@@ -9,6 +9,7 @@ import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
+from first_use import first_use
 from scipy import stats
 
 import prbayes as prb
@@ -139,19 +140,15 @@ def test_a_cholesky_factor_is_no_covariance_and_refused_before_any_response(
     def never(x: Any) -> Any:
         raise AssertionError("no response is to be computed")
 
-    with pm.Model():
+    with pm.Model() as model:
         deviations = pm.HalfNormal("sds", 2.0, shape=2)
         factor = pm.LKJCorr("factor", n=2, eta=2)
         x = pm.MvNormal.dist(np.zeros(2), factor * np.ones((2, 1)) * deviations)
-        with pytest.raises(ValueError, match=r"y: got an input whose covariance is not symm"):
-            prb.Simulator(
-                "y",
-                never,
-                x,
-                metric=prb.AreaMetric(),
-                observed=[0.0, 1.0],
-                propagation=propagation,
-            )
+        prb.Simulator(
+            "y", never, x, metric=prb.AreaMetric(), observed=[0.0, 1.0], propagation=propagation
+        )
+    with pytest.raises(ValueError, match=r"y: got an input whose covariance is not symm"):
+        first_use(model)
 
 
 def test_marginal_responses_tell_the_standard_deviations_and_no_correlation() -> None:

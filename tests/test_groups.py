@@ -66,9 +66,8 @@ def specimen(model: pm.Model) -> Any:
 
 def test_all_groups_are_of_one_design() -> None:
     before = calls
-    model = build()
+    evaluator = Evaluator(build())
     assert calls == before + 256
-    evaluator = Evaluator(model)
     assert [node.name for node in evaluator.nodes] == PARTS
     first, second = (node.bound for node in evaluator.nodes)
     assert first.same_points(second)

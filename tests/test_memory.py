@@ -19,6 +19,7 @@ import prbayes as prb
 from prbayes.metrics.density import twice_silverman
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import nodes
+from prbayes.model.specimen_likelihood import specimen_likelihoods
 
 MIB = 1 << 20
 GROWTH = """
@@ -153,3 +154,82 @@ def test_readings_in_parts_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("prbayes.metrics.cells.AT_ONCE", 20 * whole.reading.size)  # type: ignore[attr-defined]
     parts = prb.LogLikelihood(density=prb.GaussianKDE()).against(observed)
     assert np.allclose(parts.reading, whole.reading, rtol=1e-12, atol=1e-15)  # type: ignore[attr-defined]
+
+
+def by_specimen() -> pm.Model:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", line, x, observed=OBSERVED)
+    return model
+
+
+def minimize_by_specimen(made: list[pm.Model] = []) -> None:  # noqa: B006 (one model for all calls)
+    if not made:
+        made.append(by_specimen())
+    prb.minimize(made[0], progressbar=False)
+
+
+def build_by_specimen() -> None:
+    model = by_specimen()
+    specimen_likelihoods(model)[model["y"]].arrays  # noqa: B018 (draws the points)
+
+
+@pytest.mark.long
+def test_points_go_with_their_model_and_stay_with_what_was_compiled() -> None:
+    model = by_specimen()
+    prb.minimize(model, progressbar=False)
+    log_density = model.compile_logp()
+    (likelihood,) = specimen_likelihoods(model).values()
+    points = weakref.ref(likelihood.points)
+    start = model.initial_point()
+    del model, likelihood
+    gc.collect()
+    assert np.isfinite(log_density(start))
+    del log_density
+    gc.collect()
+    # Not the shared variables: Numba keeps the graphs that PyTensor compiles for it.
+    assert points() is None
+
+
+@pytest.mark.long
+def test_shared_variables_of_points_go_with_their_optimum() -> None:
+    model = by_specimen()
+    prb.minimize(model, progressbar=False)
+    (likelihood,) = specimen_likelihoods(model).values()
+    arrays = [weakref.ref(array) for array in (*likelihood.arrays[0], likelihood.arrays[1])]
+    del model, likelihood
+    gc.collect()
+    assert [array() for array in arrays] == [None, None]
+
+
+@pytest.mark.long
+def test_points_of_other_data_replace_those_before() -> None:
+    with pm.Model() as model:
+        data = pm.Data("data", OBSERVED)
+        x = pm.Normal.dist(pm.Normal("mu", 2, 1), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", line, x, observed=data)
+    prb.minimize(model, progressbar=False)
+    (likelihood,) = specimen_likelihoods(model).values()
+    before = weakref.ref(likelihood.points)
+    del likelihood
+    with model:
+        pm.set_data({"data": OBSERVED + 0.1})
+    prb.minimize(model, progressbar=False)
+    gc.collect()
+    assert before() is None
+
+
+def test_points_of_a_model_that_was_never_compiled_go() -> None:
+    model = by_specimen()
+    (likelihood,) = specimen_likelihoods(model).values()
+    points = weakref.ref(likelihood.points)
+    del model, likelihood
+    gc.collect()
+    assert points() is None
+
+
+@linux
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["build_by_specimen", "minimize_by_specimen"])
+def test_hundred_calls_by_specimen_grow_by_less_than_twenty_mib(what: str) -> None:
+    assert grown(what, 100) < 20

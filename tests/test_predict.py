@@ -9,6 +9,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from first_use import first_use
 from scipy.special import ndtri
 
 import prbayes as prb
@@ -145,6 +146,7 @@ def test_a_posterior_of_stock_pymc_serves() -> None:
 def test_the_simulators_own_response_is_not_computed_again() -> None:
     response = Counted()
     model, x = build(response=response)
+    first_use(model)
     before = response.count
     found = prb.predict(POSTERIOR, response, x, model=model, random_seed=1)
     assert response.count == before

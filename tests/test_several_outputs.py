@@ -116,7 +116,7 @@ def test_a_run_with_two_outputs_is_one_entry_of_the_store(tmp_path):
 
 
 def test_a_store_of_other_outputs_is_refused(tmp_path):
-    model_of(propagation=prb.Reweighted(64, store=tmp_path, version="1"))
+    first_use(model_of(propagation=prb.Reweighted(64, store=tmp_path, version="1")))
 
     def three(a, b):
         return np.stack([a, b, a * b], axis=-1)
@@ -134,7 +134,7 @@ def test_two_simulators_of_a_response_with_outputs_share_its_runs():
             calls.append(np.size(a))
         return two(a, b)
 
-    with pm.Model():
+    with pm.Model() as model:
         a = pm.Normal.dist(pm.Normal("m", 1, 0.2), 0.3)
         b = pm.Normal.dist(2.0, 0.2)
         for name, seed in (("y", 1), ("z", 2)):
@@ -142,6 +142,7 @@ def test_two_simulators_of_a_response_with_outputs_share_its_runs():
             prb.Simulator(
                 name, counted, a, b, metric=JOINT, observed=data, propagation=prb.Reweighted(64)
             )
+    first_use(model)
     assert sum(calls) == 64
 
 
@@ -197,7 +198,7 @@ def test_other_keys_than_those_observed_are_refused():
     with pytest.raises(
         prb.response.ResponseError, match=r"keys \['sum', 'difference'\], expected \['a'"
     ):
-        model_of(as_mapping, {"a": observed()[:, 0], "b": observed()[:, 1]})
+        first_use(model_of(as_mapping, {"a": observed()[:, 0], "b": observed()[:, 1]}))
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from scipy.stats import norm
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks import contamination, coverage, families
+from benchmarks import contamination, coverage, families, likelihood_coverage, record
 
 pytestmark = pytest.mark.slow
 
@@ -126,3 +126,26 @@ def test_families(truth: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert narrow["right"] + narrow["wrong"] <= 0.25
     for found in (wide, narrow):
         assert 0.8 - 4 * 0.09 < found["z_sd"] < 1.25 + 4 * 0.14
+
+
+@pytest.mark.parametrize("name", list(likelihood_coverage.PROBLEMS))
+def test_the_posterior_of_the_likelihood_by_specimen_is_the_exact_one(name: str) -> None:
+    problem = likelihood_coverage.PROBLEMS[name]
+    _model, likelihood = likelihood_coverage.likelihood_of(problem)
+    rows = [likelihood_coverage.data_set(problem, likelihood, number) for number in range(12)]
+    found = likelihood_coverage.summary(rows)
+    assert found["refused"] == 0
+    # Distances from the exact posterior of the same data, which have no sampling error.
+    assert np.max(found["rms"]) < 0.1
+    assert np.abs(np.array(found["width"]) - 1).max() < 0.05
+
+
+def test_the_likelihood_by_specimen_covers_over_a_whole_prior() -> None:
+    results = record.load(likelihood_coverage.OUT, None)
+    for name, rows in results["rows"].items():
+        found = likelihood_coverage.summary(rows)
+        assert found == results["summary"][name]
+        assert found["data sets"] >= 400
+        assert min(found["prbayes"]["p of uniformity"].values()) > 0.01
+        # The standard error of a coverage that is pooled over two to four hyperparameters is .008 to .011.
+        assert 0.855 < found["prbayes"]["pooled coverage"] < 0.925

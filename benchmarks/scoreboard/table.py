@@ -120,7 +120,7 @@ def _summary(one: dict[str, Any] | None, key: str) -> str:
 
 def rows(found: dict[str, Any], problem: str) -> Iterator[list[str]]:
     """Yield the rows of a problem: every rival at every number of specimens."""
-    for size, cell in found[problem].items():
+    for size, cell in found.get(problem, {}).items():
         for rival in RIVALS:
             if rival in cell and "cannot" not in cell[rival]:
                 yield [size, rival, *_cells(cell[rival])]

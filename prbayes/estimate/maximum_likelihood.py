@@ -19,10 +19,6 @@ from prbayes.estimate.optimum import Optimum, plain
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import identity_of
 
-# Sobol points of the prior that are screened as starts, and descents from the best of them. Half
-# or twice as many find the same optima on the problems of the scoreboard.
-_SCREENED, _DESCENTS = 1024, 8
-
 
 @dataclass(frozen=True, eq=False)
 class LocalOptimum:
@@ -44,7 +40,7 @@ class LocalOptimum:
     value: float
     covariance: Floats
     converged: bool
-    steps: slice
+    steps: slice = slice(0)
 
 
 def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
@@ -69,7 +65,8 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
     modes = _distinct(optima, evaluator.prior_sd)
     best = modes[0]
     point, stderr = _in_units(evaluator, best.theta, best.covariance)
-    findings = report(_findings(evaluator, modes))
+    findings = [f for likelihood in evaluator.likelihoods for f in likelihood.findings]
+    findings += report(_findings(evaluator, modes))
     weights = mode_weights(modes)
     rivals = tuple(
         {
@@ -89,7 +86,7 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
         point=point,
         discrepancy=best.value,
         discrepancies={name: -float(v.sum()) for name, v in values.items()},
-        scales={name: 1.0 for name in values},
+        scales=dict.fromkeys(values, 1.0),
         n_evaluations=objective.count,
         n_screened=screened,
         n_responses=evaluator.n_responses - before,
@@ -148,17 +145,19 @@ class _Objective:
         }
 
 
-def _starts(evaluator: Evaluator, options: Any) -> tuple[list[Floats], int]:
+def _starts(
+    evaluator: Evaluator, options: Any, screened: int = 1024, descents: int = 8
+) -> tuple[list[Floats], int]:
     """Return the given start, or the most likely points of the prior, and the number screened."""
     if options.start is not None:
         return [evaluator.unconstrained(options.start)], 0
-    thetas = evaluator.prior_points(_SCREENED, options.random_seed)
+    thetas = evaluator.prior_points(screened, options.random_seed)
     values = evaluator.total(thetas, np.empty(0))
     order = np.argsort(values, kind="stable")
-    count = _DESCENTS if options.starts is None else max(1, options.starts)
+    count = descents if options.starts is None else max(1, options.starts)
     order = order[np.isfinite(values[order])]
     if not order.size:
-        return [evaluator.initial], _SCREENED
+        return [evaluator.initial], screened
     # The best one, and of the better quarter those farthest from all chosen before.
     candidates = thetas[order[: max(count, order.size // 4)]] / evaluator.prior_sd
     chosen = [0]
@@ -166,7 +165,7 @@ def _starts(evaluator: Evaluator, options: Any) -> tuple[list[Floats], int]:
     while len(chosen) < min(count, len(candidates)):
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, ((candidates - candidates[chosen[-1]]) ** 2).sum(axis=1))
-    return list(candidates[chosen] * evaluator.prior_sd), _SCREENED
+    return list(candidates[chosen] * evaluator.prior_sd), screened
 
 
 def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum:
@@ -186,7 +185,7 @@ def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum
         options={"gtol": options.tolerance * 100, "maxiter": left},
     )  # fmt: skip
     theta = np.asarray(result.x) * unit
-    value, gradient = objective(theta)
+    value, _ = objective(theta)
     if not result.success and np.isfinite(value):
         # A support whose end moves has its optimum at a jump: without gradients from there.
         simplex = minimize(
@@ -195,7 +194,7 @@ def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum
         )  # fmt: skip
         if simplex.fun < value - 1e-6:
             theta = np.asarray(simplex.x) * unit
-            value, gradient = objective(theta)
+            value, _ = objective(theta)
     steps = slice(first, objective.count)
     covariance, slope = _inverse_hessian(objective, theta)
     return LocalOptimum(theta, value, covariance, bool(slope < 0.05), steps)
@@ -234,8 +233,10 @@ def _inverse_hessian(objective: _Objective, theta: Floats) -> tuple[Floats, floa
     is_flat = values < 1.0 / 25
     inverse = np.where(is_flat, 0.0, 1 / np.where(is_flat, 1.0, values))
     covariance = (vectors * inverse) @ vectors.T
+    # Along directions without curvature in units of the prior: a slope there is no optimum.
     _, gradient = objective(theta)
-    slope = float(np.sqrt(max(0.0, (gradient * unit) @ covariance @ (gradient * unit))))
+    along = vectors.T @ (gradient * unit)
+    slope = float(np.sqrt((along**2 * np.where(is_flat, 1.0, inverse)).sum()))
     covariance = covariance * np.outer(unit, unit)
     touched = (np.abs(vectors[:, is_flat]) > 1e-3).any(axis=1)
     covariance[touched, :] = np.where(touched, np.inf, covariance[touched, :])
@@ -256,7 +257,8 @@ def _distinct(optima: list[LocalOptimum], unit: Floats) -> list[LocalOptimum]:
         new = True
         for other in kept:
             sd = np.sqrt(np.abs(np.diag(other.covariance)))
-            scale = np.where(np.isfinite(sd) & (sd > 0), sd, 0.1 * unit)
+            # Infinite where nothing is identified: a ridge is one optimum.
+            scale = np.where(np.isnan(sd) | (sd == 0), 0.1 * unit, sd)
             new = new and bool((np.abs(optimum.theta - other.theta) > 0.5 * scale).any())
         if new:
             kept.append(optimum)
@@ -282,7 +284,7 @@ def _in_units(
 
 
 def _findings(evaluator: Evaluator, modes: list[LocalOptimum]) -> list[Finding]:
-    """Report several modes, unidentified hyperparameters, and an optimum at the edge of a support."""
+    """Report several modes, unidentified hyperparameters, and an optimum at a support's edge."""
     findings = []
     best = modes[0]
     if np.isnan(best.covariance).any():
@@ -315,7 +317,9 @@ def _findings(evaluator: Evaluator, modes: list[LocalOptimum]) -> list[Finding]:
             continue
         point = _in_units(evaluator, mode.theta, mode.covariance)[0]
         free = [str(rv.name) for rv in evaluator.model.free_RVs]
-        where = ", ".join(f"{name} = {np.array2string(np.asarray(point[name]), precision=4)}" for name in free)
+        where = ", ".join(
+            f"{name} = {np.array2string(np.asarray(point[name]), precision=4)}" for name in free
+        )
         findings.append(
             Finding(
                 "second-mode",

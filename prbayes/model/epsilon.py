@@ -87,8 +87,8 @@ def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
     Raises
     ------
     KeyError, TypeError, ValueError
-        If a name is unknown, a value is not a positive number, or `calibrate_epsilon` found them
-        for another problem; then nothing is changed.
+        If a name is unknown, a value is not a positive number, `calibrate_epsilon` found them for
+        another problem, or no simulator has an epsilon; then nothing is changed.
 
     Notes
     -----

@@ -20,7 +20,13 @@ from prbayes._checks import AT_ONCE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import PopulationSimulator, emulated_simulators
 from prbayes.model.hyperparameters import Hyperparameters
-from prbayes.model.node import Node, log_kernel, nodes, priors_alone
+from prbayes.model.node import (
+    Node,
+    log_kernel,
+    nodes,
+    priors_alone,
+    without_epsilon_warning,
+)
 from prbayes.model.specimen_likelihood import require_simulator, specimen_likelihoods
 from prbayes.propagation.base import Bound
 from prbayes.propagation.cloud import CLOUD
@@ -201,7 +207,7 @@ class Evaluator:
 
     def _log_other(self) -> Any:
         ordinary = [rv for rv in self.model.observed_RVs if rv not in self._variables]
-        with priors_alone():
+        with without_epsilon_warning():
             likelihood = self.model.logp(vars=ordinary) if ordinary else pt.constant(0.0)
         return likelihood + self.model.potentiallogp
 

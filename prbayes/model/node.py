@@ -498,18 +498,35 @@ def _places(index: tuple[int, ...], batch: tuple[int, ...]) -> tuple[int | slice
     return tuple(slice(None) if n == 1 else i for i, n in pairs)
 
 
-# Whether densities are made of which only those of hyperparameters are taken: PyMC makes all.
-_PRIORS_ALONE: ContextVar[bool] = ContextVar("priors alone", default=False)
+# PyMC builds the log-densities of all variables, also where a part of them is asked for.
+_QUIET: ContextVar[bool] = ContextVar("no warning of epsilon", default=False)
+_PRIORS_ALONE: ContextVar[bool] = ContextVar("densities of hyperparameters alone", default=False)
+
+
+@contextmanager
+def without_epsilon_warning() -> Iterator[None]:
+    """Log nothing of an unset epsilon, which the terms that are built do without."""
+    token = _QUIET.set(True)
+    try:
+        yield
+    finally:
+        _QUIET.reset(token)
 
 
 @contextmanager
 def priors_alone() -> Iterator[None]:
-    """Say nothing of epsilon meanwhile, which priors do without."""
+    """Build the densities of hyperparameters: likelihoods by specimen are left out."""
     token = _PRIORS_ALONE.set(True)
     try:
-        yield
+        with without_epsilon_warning():
+            yield
     finally:
         _PRIORS_ALONE.reset(token)
+
+
+def builds_priors_alone() -> bool:
+    """Return whether the densities of hyperparameters alone are built."""
+    return _PRIORS_ALONE.get()
 
 
 @_logprob.register(SimulatorRV)  # type: ignore[untyped-decorator]
@@ -529,7 +546,7 @@ def _log_density(
     if np.isnan(node.epsilon_value):
         # nutpie tells no more of an error than its number; nobody else has to be told who may yet
         # calibrate it
-        blunt = "nutpie" in sys.modules and not _PRIORS_ALONE.get()
+        blunt = "nutpie" in sys.modules and not _QUIET.get()
         _log.log(logging.WARNING if blunt else logging.DEBUG, "%s", unset)
     check = CheckParameterValue(unset)
     epsilon = check(node.epsilon, pt.gt(node.epsilon, 0.0))

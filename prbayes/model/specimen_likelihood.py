@@ -31,11 +31,21 @@ from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
 from prbayes._checks import Floats
+from prbayes._finding import Finding, report
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.readings import Readings
-from prbayes.model.node import known_value, required_simulators, response_name
+from prbayes.model.data_checks import data_findings
+from prbayes.model.node import (
+    builds_priors_alone,
+    known_value,
+    required_simulators,
+    response_name,
+)
+from prbayes.model.population_draws import Populations, specimens_of
 from prbayes.propagation.base import Propagation
 from prbayes.propagation.coordinates import Coordinates
+from prbayes.propagation.fibre_points import fibre_points
+from prbayes.propagation.roots import Roots
 from prbayes.propagation.specimen_points import (
     Emulation,
     PointOptions,
@@ -89,7 +99,18 @@ class SpecimenLikelihood:
     outputs: Outputs
     groups: NDArray[np.intp] | None = None
     extras: Mapping[str, TensorVariable] = field(default_factory=dict)
-    options: PointOptions = PointOptions()
+    model: Any = None  # weak reference to the pymc.Model
+    known: SpecimenLikelihood | None = None  # of the same runs, for other data
+    options: PointOptions = field(default_factory=PointOptions)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Replace the weak reference, which has no pickle, by the model."""
+        return {**vars(self), "model": None if self.model is None else self.model()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore the weak reference."""
+        model = state["model"]
+        vars(self).update({**state, "model": None if model is None else weakref.ref(model)})
 
     @property
     def variables(self) -> tuple[TensorVariable, ...]:
@@ -113,29 +134,31 @@ class SpecimenLikelihood:
         return np.where(np.isfinite(values), values, np.nan)
 
     @cached_property
-    def _emulated(self) -> tuple[Emulation, Any]:
-        d = self.coordinates.size
+    def _prepared(self) -> tuple[Emulation, SpecimenPoints, tuple[Finding, ...]]:
+        """The emulator, the points and what is to be reported of them."""
+        name, n = self.name, self.propagation.emulator_runs
+        bounds, d = self.coordinates.bounds, self.coordinates.size
+        if self._is_partial:
+            if self.propagation.calls_response:
+                raise TypeError(
+                    f"{name}: propagation: got prb.Resimulated, expected stored responses where "
+                    "specimens have fewer readings than inputs; leave propagation= out"
+                )
+            populations = Populations(self.model, self.inputs, self.coordinates, self.groups)
+            prior = specimens_of(populations, populations.hyperparameters.prior_thetas(2048, 0), 1)
+            emulation, points = fibre_points(
+                self.run, self.readings, bounds, prior, populations.posterior, self.options, n=n,
+                name=name,
+            )  # fmt: skip
+            return emulation, points, report(self._data_findings(several_roots=True))
         box = np.stack([-np.ones(d), np.ones(d)])
-        return emulate(
-            self.run,
-            self.readings,
-            box,
-            self.coordinates.bounds,
-            self.options,
-            n=self.propagation.emulator_runs,
-            name=self.name,
+        known = None if self.known is None else self.known.emulation
+        if self.propagation.calls_response:
+            known = Emulation.of_function(self.run, box, bounds, self.readings, self.options)
+        emulation, roots = emulate(
+            self.run, self.readings, box, bounds, self.options, n=n, known=known, name=name
         )
-
-    @property
-    def emulation(self) -> Emulation:
-        """The emulator; the first access computes its runs."""
-        return self._emulated[0]
-
-    @cached_property
-    def points(self) -> SpecimenPoints:
-        """The points of the specimens."""
-        emulation, roots = self._emulated
-        return draw_points(
+        points = draw_points(
             emulation,
             emulation.error,
             self.readings,
@@ -144,6 +167,46 @@ class SpecimenLikelihood:
             self.options,
             error_is_known="error" not in self.extras,
         )
+        findings = [
+            *self._data_findings(several_roots=bool((points.n_roots > 1).any())),
+            *misfit_findings(self.name, self.readings, roots, emulation.error),
+        ]
+        return emulation, points, report(findings)
+
+    @property
+    def _is_partial(self) -> bool:
+        """Whether specimens have fewer readings than inputs, without censored ones in place."""
+        present = self.readings.is_measured | self.readings.is_censored
+        return bool((present.sum(axis=1) < self.coordinates.size).any())
+
+    def _data_findings(self, *, several_roots: bool) -> tuple[Finding, ...]:
+        """Return findings of rounded, censored and repeated readings that are taken as exact."""
+        steps = self.readings.step.max(axis=0)
+        # A reading error that the user gives covers rounding.
+        is_stated = (steps > 0) | (self.metric.error is not None)
+        steps = np.where(is_stated, np.maximum(steps, 1e-300), np.nan)
+        names = self.outputs.names
+        return data_findings(
+            self.readings.values,
+            labels=[f"{self.name}[{label}]" for label in names] or [self.name],
+            several_roots=several_roots,
+            rounded=steps,
+        )
+
+    @property
+    def emulation(self) -> Emulation:
+        """The emulator; the first access computes its runs."""
+        return self._prepared[0]
+
+    @property
+    def points(self) -> SpecimenPoints:
+        """The points of the specimens."""
+        return self._prepared[1]
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What the data and the runs show before the fit."""
+        return self._prepared[2]
 
     @cached_property
     def arrays(self) -> tuple[list[Any], Any]:
@@ -151,9 +214,8 @@ class SpecimenLikelihood:
         points = self.points
         # The proposal is a density of z: p(x) dx = p(x(z)) |dx/dz| dz.
         is_known = "error" not in self.extras
-        log_a = (points.log_a if is_known else -points.log_proposal) + self.coordinates.log_jacobian(
-            points.z
-        )
+        log_a = points.log_a if is_known else -points.log_proposal
+        log_a = log_a + self.coordinates.log_jacobian(points.z)
         shared = [
             pytensor.shared(np.ascontiguousarray(x), name=f"{self.name}_points_{i}")
             for i, x in enumerate(self.coordinates.inputs(points.z))
@@ -197,9 +259,11 @@ class SpecimenLikelihood:
     def _readings_log_density(self, error: Any) -> Any:
         """Return the log-density of the readings at the points, (N, K), for an unknown error."""
         outputs = self.points.outputs
-        sd = error * np.abs(np.nan_to_num(self.readings.values))[:, None] if (
-            self.metric.relative
-        ) else error
+        sd = (
+            error * np.abs(np.nan_to_num(self.readings.values))[:, None]
+            if (self.metric.relative)
+            else error
+        )
         variance = self.emulation.error**2 + sd**2
         # Points that fill up the array have any output.
         outputs = np.where(np.isfinite(outputs), outputs, 1e30)
@@ -262,9 +326,7 @@ class SpecimenLikelihood:
             values = np.where(is_gross[..., None], anywhere, values)
         return np.asarray(values)
 
-    def _of_groups(
-        self, rng: np.random.Generator, roots: Sequence[Floats], n: int
-    ) -> list[Floats]:
+    def _of_groups(self, rng: np.random.Generator, roots: Sequence[Floats], n: int) -> list[Floats]:
         """Return specimens of each population, each of the group of an observed one."""
         assert self.groups is not None
         groups = np.resize(self.groups, n)
@@ -306,7 +368,55 @@ class SpecimenLikelihood:
             )
         rows = values.reshape(len(values), -1)
         readings = self.metric.readings(rows, reference_error(self.extras), self.event)
-        return replace(self, observed=values, readings=readings)
+        if len(values) != len(self.observed) and not (
+            self.groups is None and self.weights is None and self.specimens is None
+        ):
+            raise ValueError(
+                f"{self.name}: observed: got {len(values)} specimens, expected "
+                f"{len(self.observed)}, as many as there are groups, weights= or specimens=; build "
+                "the model again with those of the new ones"
+            )
+        known = self if "_prepared" in vars(self) else self.known
+        return replace(self, observed=values, readings=readings, known=known)
+
+
+def misfit_findings(
+    name: str, readings: Readings, roots: Roots, error: Floats, largest: float = 50.0
+) -> list[Finding]:
+    """Report specimens whose readings no inputs reproduce.
+
+    Parameters
+    ----------
+    name : str
+    readings : Readings
+    roots : Roots
+    error : ndarray, shape (m,)
+        Standard deviation of the emulator's error.
+    largest : float
+        Misfit in nats that is still an error of the emulator: ten standard deviations.
+    """
+    best = np.full(len(readings), np.inf)
+    np.minimum.at(best, roots.specimen, roots.misfit)
+    has_root = np.isfinite(best)
+    poor = np.flatnonzero(has_root & (best > largest))
+    if not poor.size:
+        return []
+    rows = [int(np.flatnonzero(roots.specimen == i)[np.argmin(roots.misfit[roots.specimen == i])])
+            for i in poor]  # fmt: skip
+    sd = np.where(readings.is_measured, readings.comparison_sd(error), 0.0)[poor]
+    off = np.sqrt(np.mean((roots.residual[rows] * sd) ** 2, axis=0))
+    outputs = ", ".join(f"{value:.2g}" for value in off)
+    return [
+        Finding(
+            "readings-misfit",
+            f"{name}: no inputs in the range of the priors reproduce the readings of "
+            f"{poor.size} of {int(has_root.sum())} specimens, which are off by {outputs} (root "
+            "mean square, by output), expected less than the error of the readings; pass "
+            "prb.LogLikelihood(error=...) with its standard deviation, or gross_errors=True for "
+            "single specimens, or look at the response and the priors",
+            "likelihood.md#readings-that-no-inputs-reproduce",
+        )
+    ]
 
 
 def reference_error(extras: Mapping[str, TensorVariable]) -> Floats | None:
@@ -330,7 +440,7 @@ def logsumexp_finite(terms: Any) -> TensorVariable:
     return pt.switch(is_empty, -np.inf, log_total)
 
 
-class SpecimenRV(RandomVariable):
+class SpecimenRV(RandomVariable):  # type: ignore[misc]
     """The operation of the observed variable: draws data sets, and carries the likelihood.
 
     PyTensor's rewriters keep every operation that they have met. The likelihood with its arrays is
@@ -420,7 +530,7 @@ class SpecimenRV(RandomVariable):
         return [pt.constant(n, dtype="int64") for n in self.likelihood.event]
 
 
-class SpecimenDistribution(pm.Distribution):
+class SpecimenDistribution(pm.Distribution):  # type: ignore[misc]
     """The distribution that PyMC makes the observed variable from."""
 
     rv_type = SpecimenRV
@@ -459,6 +569,8 @@ def _log_density(
     """Return the log-likelihoods of the specimens, (N,)."""
     (value,) = values
     likelihood = op.likelihood
+    if builds_priors_alone():
+        return pt.zeros(len(likelihood.observed))
     data = known_value(value)
     if data is not None and not _same(data, likelihood.observed):
         likelihood = likelihood.observing(data)

@@ -72,7 +72,8 @@ def calibrate_epsilon(optimum: Optimum) -> dict[str, float]:
         minimum: their epsilon has to be given.
     ValueError
         If nothing is known around the optimum (``at_edge`` and ``at_jump`` of `Optimum`), or
-        nothing is identified; if the prior was part of it, or its model has changed since.
+        nothing is identified; if the prior was part of it, its model has changed since, or no
+        simulator has an epsilon.
 
     References
     ----------

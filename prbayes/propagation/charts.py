@@ -417,7 +417,8 @@ def cover(fibres: Fibres, charts: Charts, normal: Floats) -> Charts:
     charts : Charts
     normal : ndarray, shape (N, tries, d)
         Standard normal numbers. The first half of the tries start from them, the others within
-        .5 of the first mode: random points miss the far side of a small closed fibre beside an extremum.
+        .5 of the first mode: random points miss the far side of a small closed fibre beside an
+        extremum.
     """
     n, tries, d = normal.shape
     specimen = np.repeat(np.arange(n), tries)

@@ -185,8 +185,10 @@ def fit_fibres(
     """Fit proposals to the fibres of measured specimens.
 
     Charts at the modes, more charts until random points of the fibres are covered, then rounds of
-    adaptation to 256 weighted points each. Numbers of a specimen depend on the other specimens
-    only by rounding.
+    adaptation to 256 weighted points each. Charts turn in all rounds but the last, before which
+    the cover is repeated: without that, single specimens of a study with three inputs and two
+    outputs lacked up to .35 in log L. Numbers of a specimen depend on the other specimens only by
+    rounding.
 
     Parameters
     ----------
@@ -203,7 +205,7 @@ def fit_fibres(
     most_charts : int
         Of a specimen.
     rounds : int
-        Of adaptation.
+        Of adaptation. With one round charts do not turn.
     seed : int
     numbers : ndarray of int, shape (N,), optional
         Numbers of the specimens, by default 0 to N - 1. A specimen has the same points alone as in
@@ -249,10 +251,15 @@ def fit_fibres(
     for block in _blocks(len(y), 256):
         part, label = fibres.subset(block), numbers[block]
         charts = charts_at_modes(part, starts, most_charts)
-        charts = cover(part, charts, ndtri(_shifted_sobol(tries, d, (0, seed), label)))
+        normal = ndtri(_shifted_sobol(tries, d, (0, seed), label))
+        charts = cover(part, charts, normal)
         for r in range(rounds):
+            last = r == rounds - 1
+            if last and r > 0:
+                # Charts that turned end elsewhere; those of the last round keep their directions.
+                charts = cover(part, charts, normal)
             sample = _draw(part, charts, 256, (2 + r, seed), label)
-            charts = _adapted(charts, sample)
+            charts = _adapted(charts, sample, turn=not last)
         parts.append(charts)
     return FibreProposal(fibres, Charts.concatenated(parts), numbers)
 
@@ -262,6 +269,8 @@ def moments_of(points: FibrePoints, log_weights: Floats) -> ReferencePopulation:
 
     The weights of a specimen are normalised for each draw of theta, so the result is the average
     over draws and specimens of p(x | y_i, theta). Specimens without points are left out.
+    Few specimens make it narrower than the predictive population: by 5 % with 50 specimens, by 20 %
+    with 8. `ReferencePopulation.from_sample` of predictive inputs is not.
 
     Parameters
     ----------
@@ -377,12 +386,12 @@ def _draw(
     )
 
 
-def _adapted(charts: Charts, sample: _Sample) -> Charts:
-    """Return charts with directions, location, scale and share of their weighted points.
+def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
+    """Return charts with location, scale and share of their weighted points.
 
-    The weights are those of the reference population. The solved directions become the row space
-    of the mean Jacobian, which keeps det(J solved) off zero over more of the fibre than the row
-    space at one point. The present values count as 4 (d - m) points.
+    The weights are those of the reference population. With `turn` the solved directions become
+    the row space of the mean Jacobian, which keeps det(J solved) off zero over more of the fibre
+    than the row space at one point. The present values count as 4 (d - m) points.
     """
     d, k = charts.free.shape[2:]
     m = d - k
@@ -403,17 +412,17 @@ def _adapted(charts: Charts, sample: _Sample) -> Charts:
         w = w[i] / share[i, c][:, None]
         size = share[i, c] ** 2 / (weight[i] ** 2 * (sample.chart[i] == c)).sum(axis=1)
 
-        turned = i[size > d]
-        mean_jacobian = np.einsum("nk,nkmd->nmd", w[size > d], sample.jacobian[turned])
+        turned = i[(size > d) & turn]
+        mean_jacobian = np.einsum("nk,nkmd->nmd", w[(size > d) & turn], sample.jacobian[turned])
         right = np.linalg.svd(mean_jacobian)[2].transpose(0, 2, 1)
         solved[turned, c], free[turned, c] = right[..., :m], right[..., m:]
 
         # Present location and scale in the new directions
-        turn = free[i, c].transpose(0, 2, 1) @ charts.free[i, c]
-        transposed = turn.transpose(0, 2, 1)
-        present_location = (turn @ charts.location[i, c][..., None])[..., 0]
-        root = turn @ charts.scale[i, c]
-        present = root @ root.transpose(0, 2, 1) / INFLATION + np.eye(k) - turn @ transposed
+        rotation = free[i, c].transpose(0, 2, 1) @ charts.free[i, c]
+        transposed = rotation.transpose(0, 2, 1)
+        present_location = (rotation @ charts.location[i, c][..., None])[..., 0]
+        root = rotation @ charts.scale[i, c]
+        present = root @ root.transpose(0, 2, 1) / INFLATION + np.eye(k) - rotation @ transposed
 
         u = (sample.z[i] - charts.centre[i, None, c]) @ free[i, c]
         old, new = 4.0 * k / (size + 4 * k), size / (size + 4 * k)

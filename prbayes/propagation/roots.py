@@ -97,7 +97,8 @@ def find_roots(
         values, jacobian = response(z)
         residual = (target[rows] - values) / scale[rows]
         misfit = (residual**2).sum(axis=1) / 2
-        return residual, jacobian / scale[rows][:, :, None], np.where(np.isnan(misfit), np.inf, misfit)
+        misfit = np.where(np.isnan(misfit), np.inf, misfit)
+        return residual, jacobian / scale[rows][:, :, None], misfit
 
     z = starts.reshape(-1, d).copy()
     residual, jacobian, misfit = evaluate(z, slice(None))
@@ -120,6 +121,8 @@ def find_roots(
         unfinished = (misfit[active] > 1e-8) & (length > 1e-11) & (damping[active] < 1e11)
         active = active[unfinished]
     kept = _distinct(specimen, z, misfit, jacobian, gap, width)
+    # By place: misfits of nearly zero are in an order of rounding.
+    kept = kept[np.lexsort((*z[kept].T[::-1], specimen[kept]))]
     return Roots(specimen[kept], z[kept], misfit[kept], residual[kept], jacobian[kept])
 
 
@@ -157,10 +160,9 @@ def _distinct(
                 break
             away = z[row] - z[other]
             # In units of the box, and in standard deviations of the Gauss-Newton approximation.
-            close = np.abs(away / width).max() < 1e-6
-            same = same or close or ((jacobian[other] @ away) ** 2).sum() < 1.0 and bool(
-                np.abs(away / width).max() < 1e-2
-            )
+            distance = np.abs(away / width).max()
+            is_within_error = ((jacobian[other] @ away) ** 2).sum() < 1.0
+            same = same or bool(distance < 1e-6 or (is_within_error and distance < 1e-2))
         if not same:
             kept.append(row)
     return np.array(kept, dtype=np.intp)

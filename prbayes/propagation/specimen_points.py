@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +77,40 @@ def first_runs(dimensions: int) -> int:
     return 64 if dimensions <= 2 else 128 if dimensions <= 4 else 512
 
 
+class Surface(Protocol):
+    """Outputs at coordinates between runs, with their Jacobian."""
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian, (k, d) -> (k, m), (k, m, d)."""
+
+    def values(self, z: Floats) -> Floats:
+        """Return the values alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class DifferencedResponse:
+    """The response itself, with central differences for its Jacobian: 2 d + 1 runs a point.
+
+    Attributes
+    ----------
+    values : callable
+        Coordinates (k, d) -> outputs (k, m).
+    step : float
+        In units of the coordinates.
+    """
+
+    values: Callable[[Floats], Floats]
+    step: float = 1e-5
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian."""
+        k, d = z.shape
+        shifts = self.step * np.concatenate([np.zeros((1, d)), np.eye(d), -np.eye(d)])
+        values = self.values((z + shifts[:, None]).reshape(-1, d)).reshape(2 * d + 1, k, -1)
+        slopes = (values[1 : d + 1] - values[d + 1 :]) / (2 * self.step)
+        return values[0], np.moveaxis(slopes, 0, -1)
+
+
 @dataclass(frozen=True, eq=False)
 class Emulation:
     """Runs of the response, and the emulator through them.
@@ -96,14 +130,56 @@ class Emulation:
     bias : float
         Predicted bias of a mean or standard deviation of an input, in posterior standard
         deviations.
+    range : ndarray, shape (2, d)
+        Of the roots at which runs were made.
     """
 
     z: Floats
     y: Floats
     box: Floats
-    surface: Interpolant
+    surface: Surface
     error: Floats
     bias: float
+    range: Floats
+
+    @classmethod
+    def first(
+        cls,
+        run: Callable[[Floats], Floats],
+        z: Floats,
+        box: Floats,
+        readings: Readings,
+        options: PointOptions,
+        name: str,
+    ) -> Emulation:
+        """Return the emulation of runs at first points."""
+        y = run(z)
+        spread = readings.spread()
+        surface, left_out = surface_near(z, y, readings, spread, name)
+        error = np.maximum(2 * left_out, options.floor * spread)
+        empty = np.stack([np.full(z.shape[1], np.inf), np.full(z.shape[1], -np.inf)])
+        return cls(z, y, box, surface, error, np.inf, empty)
+
+    @classmethod
+    def of_function(
+        cls,
+        run: Callable[[Floats], Floats],
+        box: Floats,
+        search_box: Floats,
+        readings: Readings,
+        options: PointOptions,
+    ) -> Emulation:
+        """Return the response itself in place of an emulator, with runs as starts of a search."""
+        z = box[0] + (box[1] - box[0]) * sobol(first_runs(box.shape[1]), box.shape[1], 0)
+        error = options.floor * readings.spread()
+        whole = np.stack([np.full(box.shape[1], -np.inf), np.full(box.shape[1], np.inf)])
+        return cls(z, run(z), search_box, DifferencedResponse(run), error, 0.0, whole)
+
+    def covers(self, z: Floats) -> bool:
+        """Return whether points lie in the range of the roots at which runs were made."""
+        with np.errstate(invalid="ignore"):
+            margin = np.nan_to_num(0.1 * np.maximum(self.range[1] - self.range[0], 0.0))
+        return bool(((z >= self.range[0] - margin) & (z <= self.range[1] + margin)).all())
 
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
         """Return values and Jacobian, NaN where the nearest run has no response."""
@@ -112,6 +188,12 @@ class Emulation:
         if failed.any():
             values[failed], jacobian[failed] = np.nan, np.nan
         return values, jacobian
+
+    def values(self, z: Floats) -> Floats:
+        """Return the values alone."""
+        values = self.surface.values(z)
+        values[self.fails(z)] = np.nan
+        return values
 
     def fails(self, z: Floats) -> NDArray[np.bool_]:
         """Return where the nearest run has no response."""
@@ -133,6 +215,7 @@ def emulate(
     options: PointOptions,
     *,
     n: int | None = None,
+    known: Emulation | None = None,
     seed: int = 0,
     name: str = "response",
 ) -> tuple[Emulation, Roots]:
@@ -148,6 +231,8 @@ def emulate(
     options : PointOptions
     n : int, optional
         First runs.
+    known : Emulation, optional
+        Of the same response for other data: runs are added where the roots leave its range.
     seed : int
     name : str
         For messages.
@@ -159,54 +244,81 @@ def emulate(
     """
     d = box.shape[1]
     n = first_runs(d) if n is None else n
-    z = box[0] + (box[1] - box[0]) * sobol(n, d, seed)
-    y = run(z)
     spread = readings.spread()
+    if known is None:
+        first = box[0] + (box[1] - box[0]) * sobol(n, d, seed)
+        emulation = Emulation.first(run, first, search_box, readings, options, name)
+    else:
+        emulation = known
     rng = np.random.default_rng([seed, 1])
-    emulation, error, bias = None, None, np.inf
-    most = 6
-    for batch in range(most):
-        surface, left_out = _surface(z, y, readings, spread, name)
-        if error is None:
-            error = np.maximum(2 * left_out, options.floor * spread)
-        emulation = Emulation(z, y, search_box, surface, error, bias)
+    for batch in range(6):
         roots = specimen_roots(emulation, readings, options)
-        if (batch >= 2 and bias <= options.bias) or batch == most - 1:
+        enough = batch >= 2 if known is None else emulation.covers(roots.z)
+        # Twice at most: a reading that no inputs reproduce is reported.
+        wider = _widened(emulation.box, roots) if batch < 2 else emulation.box
+        if enough and emulation.bias <= options.bias and np.array_equal(wider, emulation.box):
             break
-        fresh = _fresh_points(roots, search_box, max(n // 2, options.fresh), options.fresh, rng)
-        values, jacobian = surface(fresh)
-        outputs = run(fresh)
-        misfit = outputs - values
-        good = np.isfinite(misfit).all(axis=1)
-        if good.any():
-            error = 2 * np.sqrt((misfit[good] ** 2).mean(axis=0))
-            error = np.maximum(error, options.floor * spread)
-        some = np.flatnonzero(good[: options.fresh])
-        if len(some) >= 4:
-            unit = _typical(readings.comparison_sd(error))
-            scaled = misfit[some] / unit, jacobian[some] / unit[:, None]
-            biases = predicted_bias(*scaled, fresh[some], len(readings))
-            bias = float(np.abs(biases).max())
-        z, y = np.concatenate([z, fresh]), np.concatenate([y, outputs])
-    assert emulation is not None
+        emulation = replace(emulation, box=wider)
+        count = max(n // 2, options.fresh)
+        fresh = spread_out(roots.z, wider, count, options.fresh, rng)
+        emulation = extended(emulation, run, fresh, readings, options, spread, name)
+    else:
+        roots = specimen_roots(emulation, readings, options)
     options, roots = _all_roots(emulation, readings, options, roots, seed)
+    if (emulation.error > spread).any():
+        raise DesignError(
+            f"{name}: got an emulator with errors of {emulation.error} at the specimens, expected "
+            f"less than the data's standard deviations {spread}; look at the response and the "
+            "priors, or use metric=prb.ProbabilityResidual()"
+        )
     if emulation.bias > options.bias:
         raise DesignError(
             f"{name}: got an emulator whose error would shift a mean or standard deviation of an "
-            f"input by {emulation.bias:.2g} posterior standard deviations after {len(z)} runs, "
-            f"expected at most {options.bias}; the response is not smooth enough for "
-            "prb.LogLikelihood(): use metric=prb.ProbabilityResidual(), or more first runs with "
-            "propagation=prb.Reweighted(n)"
+            f"input by {emulation.bias:.2g} posterior standard deviations after "
+            f"{len(emulation.z)} runs, expected at most {options.bias}; the response is not smooth "
+            "enough for prb.LogLikelihood(): use metric=prb.ProbabilityResidual(), or more first "
+            "runs with propagation=prb.Reweighted(n)"
         )
     return emulation, roots
 
 
-def _typical(sd: Floats) -> Floats:
+def extended(
+    emulation: Emulation,
+    run: Callable[[Floats], Floats],
+    fresh: Floats,
+    readings: Readings,
+    options: PointOptions,
+    spread: Floats,
+    name: str,
+) -> Emulation:
+    """Return the emulation with runs at fresh points, whose misfit gives its error and bias."""
+    values, jacobian = emulation.surface(fresh)
+    outputs = run(fresh)
+    misfit = outputs - values
+    good = np.isfinite(misfit).all(axis=1)
+    error, bias = emulation.error, np.inf
+    some = np.flatnonzero(good[: options.fresh])
+    if len(some) >= 4:
+        # At the roots alone: points around them may lie far out, where nothing was measured.
+        error = 2 * np.sqrt((misfit[some] ** 2).mean(axis=0))
+        error = np.maximum(error, options.floor * spread)
+        unit = typical_sd(readings.comparison_sd(error))
+        scaled = misfit[some] / unit, jacobian[some] / unit[:, None]
+        bias = float(np.abs(predicted_bias(*scaled, fresh[some], len(readings))).max())
+    z = np.concatenate([emulation.z, fresh])
+    y = np.concatenate([emulation.y, outputs])
+    surface, _ = surface_near(z, y, readings, spread, name)
+    reach = np.concatenate([emulation.range, fresh])
+    extremes = np.stack([reach.min(axis=0), reach.max(axis=0)])
+    return Emulation(z, y, emulation.box, surface, error, bias, extremes)
+
+
+def typical_sd(sd: Floats) -> Floats:
     """Return the median of finite values by output, (N, m) -> (m,)."""
     return np.array([np.median(column[np.isfinite(column)]) for column in sd.T])
 
 
-def _surface(
+def surface_near(
     z: Floats, y: Floats, readings: Readings, spread: Floats, name: str
 ) -> tuple[Interpolant, Floats]:
     """Return the interpolant, and its root mean square left-out error near the data, (m,)."""
@@ -219,16 +331,23 @@ def _surface(
     zg, yg = z[good], y[good]
     zg, first = np.unique(zg, axis=0, return_index=True)
     yg = yg[first]
-    values = readings.values
-    low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
-    margin = np.maximum((high - low) / 2, spread)
-    inside = ((yg >= low - margin) & (yg <= high + margin)).all(axis=1)
+    inside = _is_near(yg, readings, spread)
     if inside.sum() < len(yg) // 4:
-        distance = (((yg - np.nanmean(values, axis=0)) / spread) ** 2).sum(axis=1)
+        distance = (((yg - np.nanmean(readings.values, axis=0)) / spread) ** 2).sum(axis=1)
         inside = np.zeros(len(yg), dtype=bool)
         inside[np.argsort(distance, kind="stable")[: max(8, len(yg) // 4)]] = True
     surface = fit_interpolant(zg, yg, inside)
     return surface, np.sqrt((surface.left_out[inside] ** 2).mean(axis=0))
+
+
+def _widened(box: Floats, roots: Roots, misfit: float = 50.0) -> Floats:
+    """Return the box with more room where the search for a root ends at its side with a misfit."""
+    poor = roots.z[roots.misfit > misfit]
+    if not len(poor):
+        return box
+    width = box[1] - box[0]
+    ends = np.stack([poor <= box[0] + 1e-6 * width, poor >= box[1] - 1e-6 * width])
+    return np.asarray(box + 0.25 * width * np.array([[-1.0], [1.0]]) * ends.any(axis=1))
 
 
 def _all_roots(
@@ -254,6 +373,13 @@ def _all_roots(
     return options, roots
 
 
+def _is_near(y: Floats, readings: Readings, spread: Floats) -> NDArray[np.bool_]:
+    """Return which outputs, (n, m), are within the range of the readings or half of it away."""
+    low, high = np.nanmin(readings.values, axis=0), np.nanmax(readings.values, axis=0)
+    margin = np.maximum((high - low) / 2, spread)
+    return np.asarray(((y >= low - margin) & (y <= high + margin)).all(axis=1))
+
+
 def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptions) -> Roots:
     """Return the roots of the specimens with at least as many measured outputs as inputs."""
     good = np.isfinite(emulation.y).all(axis=1)
@@ -267,7 +393,9 @@ def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptio
     block = max(1, AT_ONCE // (options.starts * len(run_z) * 4))
     for first in range(0, len(solvable), block):
         rows = solvable[first : first + block]
-        starts = _starts(run_z, run_y, target[rows], measured[rows], readings.spread(), options.starts)
+        starts = _starts(
+            run_z, run_y, target[rows], measured[rows], readings.spread(), options.starts
+        )
         roots = find_roots(
             emulation, target[rows], np.where(measured[rows], sd[rows], 1e150), starts,
             emulation.box, gap=options.gap,
@@ -300,15 +428,14 @@ def _starts(
     return starts
 
 
-def _fresh_points(
-    roots: Roots, box: Floats, count: int, sampled: int, rng: np.random.Generator
+def spread_out(
+    z: Floats, box: Floats, count: int, sampled: int, rng: np.random.Generator
 ) -> Floats:
-    """Return points for new runs, (count, d): a sample of the roots, then the rest spread out.
+    """Return points for new runs, (count, d): a sample of the given ones, then others spread out.
 
-    The spread ones are chosen one by one, each farthest from all others, among the roots and
-    points around them.
+    The spread ones are chosen one by one, each farthest from all others, among the given points
+    and points around them.
     """
-    z = roots.z
     scale = np.maximum(z.std(axis=0), 1e-9 * (box[1] - box[0]))
     chosen = z[rng.permutation(len(z))[: min(sampled, len(z))]]
     around = z[rng.integers(0, len(z), 8 * count)]
@@ -320,10 +447,10 @@ def _fresh_points(
         best = int(np.argmax(distance))
         picked.append(candidates[best])
         distance = np.minimum(distance, ((candidates - candidates[best]) ** 2).sum(axis=1))
-    return np.array(picked) * scale
+    return np.asarray(np.array(picked) * scale)
 
 
-# -- points ------------------------------------------------------------------------------------------
+# -- points ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -409,6 +536,7 @@ def draw_points(
     components = _fit_components(emulation, error, readings, roots, box, options, seed)
     count = options.points if error_is_known else 4 * options.points
     scales = (1.0,) if error_is_known else (0.5, 1.0, 1.3)
+    populations: list[tuple[Floats, Floats]] = []
     while True:
         halves = [
             _draw(emulation, error, readings, components, max(1, count // 2), options, (seed, h))
@@ -417,8 +545,9 @@ def draw_points(
         if error_is_known:
             halves = [_normalised(half, components) for half in halves]
         points = _joined(halves)
+        populations = populations or normal_populations(points.z, points.log_a, 32, seed)
         difference = max(
-            _difference(halves if k == 1.0 else _of_error(halves, readings, error, k), seed)
+            _difference(halves if k == 1.0 else _of_error(halves, readings, error, k), populations)
             for k in scales
         )
         largest = components.table.shape[1] * count
@@ -603,7 +732,7 @@ def _in_blocks(emulation: Response, z: Floats) -> Floats:
 
 
 def _scrambled(components: int, count: int, dimensions: int, seed: tuple[int, int]) -> Floats:
-    """Return Sobol points with a random shift for each component, (components, count, dimensions)."""
+    """Return Sobol points with a random shift for each component, (components, count, d)."""
     base = sobol(count, dimensions, seed[0] * 1009 + seed[1])
     shift = np.random.default_rng(seed).random((components, 1, dimensions))
     return np.clip((base + shift) % 1.0, 1e-9, 1 - 1e-9)
@@ -613,7 +742,7 @@ def _t_radius(u: Floats, degrees: float) -> Floats:
     """Return the factors that turn normal vectors into vectors of a t distribution."""
     from scipy.special import chdtri
 
-    return np.sqrt(degrees / chdtri(degrees, u))
+    return np.asarray(np.sqrt(degrees / chdtri(degrees, u)))
 
 
 def _by_component(values: Floats, components: _Components) -> Floats:
@@ -644,8 +773,8 @@ def _normalised(sample: _Sample, components: _Components) -> _Sample:
     total = logsumexp(log_a, axis=2)
     mass = np.where(table >= 0, components.log_mass[np.maximum(table, 0)], -np.inf)
     shift = np.where(np.isfinite(total), mass - np.where(np.isfinite(total), total, 0.0), 0.0)
-    log_a = (log_a + shift[..., None]).reshape(n, -1)
-    return _Sample(sample.z, sample.outputs, log_a, sample.log_proposal, sample.n_roots)
+    scaled = (log_a + shift[..., None]).reshape(n, -1)
+    return replace(sample, log_a=scaled)
 
 
 def _joined(halves: list[_Sample]) -> _Sample:
@@ -660,10 +789,8 @@ def _joined(halves: list[_Sample]) -> _Sample:
     )
 
 
-def _difference(halves: list[_Sample], seed: int, draws: int = 32) -> float:
-    """Return the half difference of log L over normal populations of bootstrapped specimens."""
-    joint = _joined(halves)
-    populations = normal_populations(joint.z, joint.log_a, draws, seed)
+def _difference(halves: list[_Sample], populations: list[tuple[Floats, Floats]]) -> float:
+    """Return the half difference of log L over normal populations."""
     values = [
         np.stack(
             [
@@ -688,24 +815,28 @@ def normal_populations(
     """
     rng = np.random.default_rng([seed, 7])
     n, _, d = z.shape
-    flat = z.reshape(-1, d)
-    prior = 1e-12 * np.diag(np.maximum(flat.var(axis=0), 1e-300))
-    weights = np.exp(log_a - logsumexp(log_a, axis=1, keepdims=True))
-    result = []
-    start_mean = np.einsum("nk,nkd->d", weights, z) / n
-    away = z - start_mean
-    start_covariance = np.einsum("nk,nkd,nke->de", weights, away, away) / n + prior
-    for _ in range(draws):
-        share = rng.dirichlet(np.ones(n)) if bootstrap else np.full(n, 1 / n)
-        mean, covariance = start_mean, start_covariance
+    prior = 1e-12 * np.diag(np.maximum(z.reshape(-1, d).var(axis=0), 1e-300))
+
+    def moments(weights: Floats) -> tuple[Floats, Floats]:
+        mean = np.einsum("nk,nkd->d", weights, z)
+        away = z - mean
+        return mean, np.einsum("nk,nkd,nke->de", weights, away, away) + prior
+
+    def fit(start: tuple[Floats, Floats], share: Floats, steps: int) -> tuple[Floats, Floats]:
+        mean, covariance = start
         for _ in range(steps):
             log_w = normal_log_density(z, mean, np.linalg.cholesky(covariance)) + log_a
             w = np.exp(log_w - logsumexp(log_w, axis=1, keepdims=True)) * share[:, None]
-            mean = np.einsum("nk,nkd->d", w, z)
-            away = z - mean
-            covariance = np.einsum("nk,nkd,nke->de", w, away, away) + prior
-        result.append((mean, np.linalg.cholesky(covariance)))
-    return result
+            mean, covariance = moments(w)
+        return mean, covariance
+
+    equal = np.full(n, 1 / n)
+    weights = np.exp(log_a - logsumexp(log_a, axis=1, keepdims=True)) / n
+    whole = fit(moments(weights), equal, steps)
+    shares = [rng.dirichlet(np.ones(n)) for _ in range(draws)] if bootstrap else [equal]
+    # A bootstrap sample has its fit near that of all specimens.
+    fits = [fit(whole, share, 5) if bootstrap else whole for share in shares]
+    return [(mean, np.linalg.cholesky(covariance)) for mean, covariance in fits]
 
 
 def normal_log_density(z: Floats, mean: Floats, root: Floats) -> Floats:

@@ -9,6 +9,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from first_use import first_use
 from scipy import stats
 
 import prbayes as prb
@@ -113,6 +114,7 @@ def test_stored_responses_cost_nothing_and_others_as_little_as_said(
             return np.asarray(x)
 
         model = build(propagation, counted)
+        first_use(model)
         seen.clear()
         pc = prb.plot_responses(posterior, model=model, backend="none")
         assert "after" in pc.viz

@@ -11,6 +11,7 @@ import numpy as np
 import pymc as pm
 import pytest
 import xarray as xr
+from first_use import first_use
 from scipy.stats import norm
 
 import prbayes as prb
@@ -361,6 +362,7 @@ def test_responses_are_counted_under_other_propagations() -> None:
                 epsilon=0.1,
                 propagation=propagation,
             )
+        first_use(model)
         counted = 0
         idata = sample(model, 60, chains=2)
         assert idata.posterior.attrs["n_responses"] == counted > 60 * 2 * 64

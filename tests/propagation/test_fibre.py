@@ -119,11 +119,11 @@ STANDARD_ERRORS = {
     "linear 5 2": 2.8e-3,
     "linear 8 4": 3.1e-3,
     "linear 8 1": 9.8e-3,
-    "circle": 2.8e-3,
-    "sphere": 1.9e-2,
+    "circle": 2.5e-3,
+    "sphere": 1.5e-2,
     "exponential": 1.2e-4,
     "product": 1.4e-4,
-    "fold": 7.3e-3,
+    "fold": 2.0e-3,
 }
 
 
@@ -149,6 +149,32 @@ def test_log_likelihood_of_a_sphere_with_few_points() -> None:
     points = fit_fibres(p.response, p.y[::4], p.reference).draw(256, seed=1)
     error = log_likelihoods(points, p.mean, p.sd) - p.exact[::4]
     assert np.abs(error).max() < 5 * 0.1  # standard error with 256 points .09
+
+
+def test_proposals_of_different_seeds_agree_on_fibres_with_turns() -> None:
+    # Charts that turn during adaptation can leave a piece of these fibres without a chart.
+    rng = np.random.default_rng(0)
+    a = rng.standard_normal((2, 3)) / np.sqrt(3)
+    b = rng.standard_normal((2, 3, 3)) / 3
+
+    def curved(z: Any) -> Any:
+        product = np.stack([z[:, 0] * z[:, 1], z[:, 1] * z[:, 2]], axis=1)
+        quadratic = np.einsum("nd,mde,ne->nm", z, b, z)
+        return np.exp(0.35 * z @ a.T) + 0.3 * quadratic + 0.3 * np.sin(product)
+
+    response = differentiated(curved)
+    population = ReferencePopulation(np.zeros(3), np.full(3, 0.5) * np.eye(3))
+    y = response(0.5 * np.random.default_rng([1, 50]).standard_normal((50, 3)))[0][[7, 20]]
+    values = [
+        log_likelihoods(
+            fit_fibres(response, y, population, seed=seed).draw(4096, seed=seed),
+            population.mean,
+            np.diag(population.root),
+        )
+        for seed in range(6)
+    ]
+    away = values - np.mean(values, axis=0)
+    assert np.abs(away).max() < 5 * 0.0022  # standard error from seeds .0022
 
 
 def test_all_points_of_positive_weight_lie_on_the_fibre() -> None:

@@ -26,8 +26,10 @@ def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
     error = problem.error or settings["error"] * y.std(axis=0)
     with pm.Model():
         values = in_pymc.hyperparameters(problem)
-        latent = in_pymc.latent(problem, values, len(y))
+        latent = in_pymc.latent(problem, values, y.size if problem.separate else len(y))
         outputs = problem.formula(pt, *latent)
+        if problem.separate:
+            outputs = [output[k * len(y) : (k + 1) * len(y)] for k, output in enumerate(outputs)]
         mean = pt.stack(outputs, axis=-1) if type(outputs) is list else outputs
         pm.Normal("y", mean, error, observed=y)
         tree = pm.sample(

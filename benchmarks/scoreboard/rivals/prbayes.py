@@ -43,16 +43,21 @@ def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
 
 def likelihood_model(task: Task) -> pm.Model:
     """Return the model of a problem with the log-likelihood by specimen."""
-    problem = task.problem
+    problem, observed = task.problem, task.observed
     with pm.Model() as model:
         values = in_pymc.hyperparameters(problem)
         inputs = in_pymc.inputs(problem, values)
         if problem.separate:
-            for k, observed in enumerate(task.observed.T):
-                prb.Simulator(f"y{k}", _output(task, k), *inputs, observed=observed)
+            for k, column in enumerate(observed.T):
+                prb.Simulator(f"y{k}", _output(task, k), *inputs, observed=column)
             return model
+        error = None
+        if problem.degrees is not None:
+            # Readings of a curve, whose error is not known.
+            error = pm.HalfNormal("error", 0.1 * observed.std(axis=0))
+        metric = prb.LogLikelihood(error=error, gross_errors=problem.name in _GROSS)
         response = _of_vector(task) if problem.correlation else task.response
-        prb.Simulator("y", response, *inputs, observed=task.observed)
+        prb.Simulator("y", response, *inputs, metric=metric, observed=observed)
     return model
 
 
@@ -63,8 +68,6 @@ def _output(task: Task, k: int) -> Any:
 
 def calibrate_likelihood(task: Task, settings: dict[str, Any]) -> Draws:
     """Return draws of the hyperparameters by the log-likelihood by specimen."""
-    if task.problem.degrees is not None:
-        raise CannotError("readings with an error that is not known")
     model = likelihood_model(task)
     optimum = prb.minimize(model, progressbar=False)
     has_edges = any(x.family == "uniform" for x in task.problem.inputs)
@@ -91,6 +94,7 @@ METRICS = {
 }
 # What the defaults were, so that results of other defaults are not gone on with.
 _DEFAULTS = {"adjust": "given the estimate; a log-likelihood as it is"}
+_GROSS = ("contaminated",)  # problems whose data may have gross errors
 _LIKELIHOOD = {"draws": 1000, "tune": 1000, "second mode": 0.01}
 RIVALS = (
     Rival("prbayes likelihood", PACKAGES, _LIKELIHOOD, calibrate_likelihood),

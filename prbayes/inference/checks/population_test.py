@@ -24,7 +24,7 @@ from scipy.special import ndtr, ndtri
 
 from prbayes._checks import Floats
 from prbayes._finding import Finding
-from prbayes.inference.checks.min_p import adjusted_p_values, upper_p_values
+from prbayes.numerics.min_p import adjusted_p_values, upper_p_values
 
 
 def normal_scores(u: Floats) -> Floats:

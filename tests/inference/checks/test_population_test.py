@@ -8,7 +8,6 @@ from scipy.special import logsumexp, ndtr, ndtri
 from scipy.stats import norm
 
 from prbayes._checks import Floats
-from prbayes.inference.checks.min_p import adjusted_p_values
 from prbayes.inference.checks.population_test import (
     PopulationTest,
     mixture_ratio,
@@ -19,6 +18,7 @@ from prbayes.inference.checks.population_test import (
     power_text,
     zhang_statistic,
 )
+from prbayes.numerics.min_p import adjusted_p_values
 
 # The alternatives of the study: standardised inputs.
 
@@ -219,6 +219,10 @@ def test_the_result_has_p_values_by_input() -> None:
     null = np.stack([first[:, 0], second[:, 0], first[:, 1], second[:, 1]], axis=1)
     test = population_test(z, np.ones((50, 1)), list(null))
     assert test.mixture[1] <= 0.01 < test.mixture[0]
+    single = [population_test(z[:, :, [j]], np.ones((50, 1)), null[:, [j, j + 2]]) for j in (0, 1)]
+    assert test.zhang == pytest.approx([single[0].zhang[0], single[1].zhang[0]])
+    assert test.mixture == pytest.approx([single[0].mixture[0], single[1].mixture[0]])
+    assert test.p_value >= min(single[0].p_value, single[1].p_value)
     (finding,) = population_findings(test, ["C", "m"])
     assert finding.code == "population-misfit"
     assert "with the smallest p-value for m, expected p > 0.05; compare skewed" in finding.text

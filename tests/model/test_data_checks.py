@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from prbayes._checks import Floats
-from prbayes.inference.checks.data_checks import (
+from prbayes.model.data_checks import (
     DataCheckOptions,
     chance_of_repeats,
     closest_pairs,
@@ -150,6 +150,20 @@ def test_copies_of_specimens_are_no_pile_in_one_of_several_outputs() -> None:
         assert codes(with_copies(correlated(rng, 20, 2))) == ["identical-specimens"]
 
 
+def test_a_copy_of_the_largest_specimen_is_no_pile() -> None:
+    y = correlated(np.random.default_rng(21), 20, 2)
+    y[4] = y[y[:, 0].argmax()]
+    assert codes(y) == ["identical-specimens"]
+
+
+def test_a_tie_at_a_fine_step_may_be_chance() -> None:
+    # The binomial test alone has p = .0003: it does not know that an end has at least one value.
+    y = np.sort(rounded(np.random.default_rng(22).standard_normal(30), 0.01))
+    y[-2] = y[-1]
+    assert count_at_ends(y, 0.01).counts == (2, 1)
+    assert count_at_ends(y, 0.01).p_values[0] > 0.005
+
+
 def test_values_at_a_limit_are_not_repeated_specimens() -> None:
     rng = np.random.default_rng(10)
     y = correlated(rng, 30, 2)
@@ -171,12 +185,12 @@ def test_the_finding_names_the_limit() -> None:
 @pytest.mark.parametrize("step", [0.1, 0.5])
 def test_rounded_values_of_skewed_populations_rarely_have_a_pile(step: float) -> None:
     rng = np.random.default_rng(12)
-    folded = (rng.normal(2, 0.5, (100, 50)) - 1) ** 2
-    for y in (folded, np.exp(rng.standard_normal((100, 50)))):
+    folded = (rng.normal(2, 0.5, (60, 50)) - 1) ** 2
+    for y in (folded, np.exp(rng.standard_normal((60, 50)))):
         sd = y.std()
         p = [min(count_at_ends(rounded(v, step * sd), step * sd, 199).p_values) for v in y]
-        # at most .04 in the table; standard error .02. The bootstrap alone flags .5 to .95.
-        assert np.mean(np.array(p) <= 0.05) <= 0.12
+        # at most .04 in the table; standard error .025. The bootstrap alone flags .5 to .95.
+        assert np.mean(np.array(p) <= 0.05) <= 0.15
 
 
 @pytest.mark.slow
@@ -224,9 +238,9 @@ def test_identical_specimens_are_groups_of_indices() -> None:
 @pytest.mark.parametrize("step", [0.0, 0.01, 0.1, 0.25, 0.5, 1.0])
 def test_size_of_repeats(m: int, step: float) -> None:
     rng = np.random.default_rng([m, int(100 * step)])
-    p = [chance_of_repeats(correlated(rng, 50, m, step), np.full(m, step), 199) for _ in range(60)]
-    # size .01 to .03; standard error .02
-    assert np.mean(np.array(p) <= 0.01) <= 0.1
+    p = [chance_of_repeats(correlated(rng, 50, m, step), np.full(m, step), 199) for _ in range(30)]
+    # size 0 to .03; standard error .03
+    assert np.mean(np.array(p) <= 0.01) <= 0.14
 
 
 @pytest.mark.parametrize(("m", "step"), [(1, 0.0), (2, 0.0), (2, 0.01), (2, 0.1), (3, 0.1)])
@@ -273,9 +287,9 @@ def test_closest_pairs() -> None:
 def test_size_of_all_checks() -> None:
     rng = np.random.default_rng(17)
     assert shares(lambda: correlated(rng, 20, 2), 100) == {}
-    rates = shares(lambda: correlated(rng, 50, 2, 0.1), 60)
-    # standard error .03 at most
-    assert sum(rates.values()) <= 0.12
+    rates = shares(lambda: correlated(rng, 50, 2, 0.1), 30)
+    # about .04; standard error .04
+    assert sum(rates.values()) <= 0.2
 
 
 def test_order_and_units_do_not_matter() -> None:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from prbayes.inference.checks.min_p import adjusted_p_values, upper_p_values
+from prbayes.numerics.min_p import adjusted_p_values, upper_p_values
 
 
 def test_p_values_count_the_null_values_that_are_as_large() -> None:

@@ -1,0 +1,179 @@
+"""Draws of the hyperparameters given importance points of the specimens.
+
+The draws need no gradient: adaptive importance sampling with a multivariate t proposal. They give
+the population in which the fibres of specimens are covered, and the unit of Monte Carlo errors.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pymc as pm
+from numpy.typing import NDArray
+from scipy.special import chdtri, logsumexp, ndtri
+
+from prbayes._checks import AT_ONCE, Floats
+from prbayes.model.hyperparameters import Hyperparameters
+from prbayes.propagation.coordinates import Coordinates
+from prbayes.propagation.points import sobol
+from prbayes.response.distributions import PopulationSampler, compiled_log_density
+from prbayes.response.grouping import is_group
+from prbayes.response.inputs import Inputs
+
+
+@dataclass(frozen=True, eq=False)
+class Populations:
+    """Populations of a model's hyperparameters, evaluated at points of specimens.
+
+    Attributes
+    ----------
+    model : weak reference to a pymc.Model
+    inputs : Inputs
+    coordinates : Coordinates
+    groups : ndarray of int, shape (N,), or None
+    """
+
+    model: weakref.ref[pm.Model]
+    inputs: Inputs
+    coordinates: Coordinates
+    groups: NDArray[np.intp] | None
+
+    @cached_property
+    def hyperparameters(self) -> Hyperparameters:
+        """The hyperparameters of the model."""
+        model = self.model()
+        if model is None:
+            raise RuntimeError("got a simulator whose model is gone; build the model again")
+        return Hyperparameters(model)
+
+    @cached_property
+    def _log_density(self) -> Any:
+        return compiled_log_density(self.inputs)
+
+    @cached_property
+    def _sampler(self) -> PopulationSampler:
+        return PopulationSampler(self.inputs)
+
+    def _roots(self, thetas: Floats, group: int) -> list[Floats]:
+        """Return the roots of the inputs at thetas, shapes (S, *shape)."""
+        values = self.hyperparameters.constrained(thetas)
+        return [
+            np.full(len(thetas), group) if is_group(root) else values[str(root.name)]
+            for root in self.inputs.roots
+        ]
+
+    def log_likelihoods(self, thetas: Floats, z: Floats, log_a: Floats) -> Floats:
+        """Return log p(y_i | theta), (S, N), from points (N, K, d) and their numbers (N, K)."""
+        n, count, _ = z.shape
+        weights = log_a + self.coordinates.log_jacobian(z)
+        x = self.coordinates.inputs(z)
+        result = np.empty((len(thetas), n))
+        groups = np.zeros(n, dtype=np.intp) if self.groups is None else self.groups
+        for group in np.unique(groups):
+            rows = np.flatnonzero(groups == group)
+            flat = [np.ascontiguousarray(v[rows].reshape(-1, *v.shape[2:])) for v in x]
+            step = max(1, AT_ONCE // (len(rows) * count))
+            for first in range(0, len(thetas), step):
+                some = slice(first, first + step)
+                roots = self._roots(thetas[some], int(group))
+                with np.errstate(all="ignore"):
+                    (logs,) = self._log_density(*roots, *flat)
+                logs = np.nan_to_num(logs, nan=-np.inf).reshape(-1, len(rows), count)
+                result[some, rows] = logsumexp(logs + weights[rows], axis=2)
+        return result
+
+    def posterior(self, z: Floats, log_a: Floats, seed: int = 0) -> PopulationDraws:
+        """Return draws of the posterior of the hyperparameters given points of the specimens.
+
+        Weights are tempered until their effective sample size is ten times the number of
+        hyperparameters, so that a few draws do not decide the next proposal.
+        """
+        names = self.hyperparameters
+        d = names.size
+
+        def log_posterior(thetas: Floats) -> Floats:
+            prior = names.log_prior(thetas)
+            inside = np.isfinite(prior)
+            total = np.full(len(thetas), -np.inf)
+            if inside.any():
+                likelihood = self.log_likelihoods(thetas[inside], z, log_a).sum(axis=1)
+                total[inside] = prior[inside] + likelihood
+            return total
+
+        thetas = names.prior_points(2048, seed)
+        log_weights = log_posterior(thetas) - names.log_prior(thetas)
+        weights, _ = _tempered(log_weights, 10 * d)
+        for attempt in range(12):
+            mean = weights @ thetas
+            away = thetas - mean
+            covariance = (away.T * weights) @ away + 1e-12 * np.diag(names.prior_sd**2)
+            root = np.linalg.cholesky(1.2 * covariance)
+            u = sobol(1024, d + 1, seed + 1 + attempt)
+            standard = ndtri(u[:, :d]) * np.sqrt(5 / chdtri(5, u[:, d]))[:, None]
+            thetas = mean + standard @ root.T
+            log_proposal = -(5 + d) / 2 * np.log1p((standard**2).sum(axis=1) / 5)
+            weights, temper = _tempered(log_posterior(thetas) - log_proposal, 10 * d)
+            if temper == 1.0 and attempt >= 2 and 1 / (weights**2).sum() > 200:
+                break
+        rng = np.random.default_rng([seed, 5])
+        chosen = thetas[rng.choice(len(thetas), 256, p=weights)]
+        return PopulationDraws(self, chosen)
+
+
+def _tempered(log_weights: Floats, least: int) -> tuple[Floats, float]:
+    """Return normalised weights, tempered to an effective sample size, and the temper."""
+    if not np.isfinite(log_weights).any():
+        raise ValueError(
+            "log-likelihood: got no population of the prior that reaches the specimens, expected "
+            "one at least; look at the priors and at the data's units"
+        )
+    temper = 1.0
+    while True:
+        scaled = temper * (log_weights - log_weights.max())
+        weights = np.exp(np.nan_to_num(scaled, nan=-np.inf))
+        weights /= weights.sum()
+        if 1 / (weights**2).sum() >= least or temper < 1e-6:
+            return weights, temper
+        temper *= 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class PopulationDraws:
+    """Draws of the hyperparameters.
+
+    Attributes
+    ----------
+    populations : Populations
+    thetas : ndarray, shape (S, d)
+    """
+
+    populations: Populations
+    thetas: Floats
+
+    def log_likelihoods(self, z: Floats, log_a: Floats, draws: int = 32) -> Floats:
+        """Return log p(y_i | theta) at some of the draws, (draws, N)."""
+        return self.populations.log_likelihoods(self.thetas[:draws], z, log_a)
+
+    def specimens(self, each: int = 16, seed: int = 0) -> Floats:
+        """Return coordinates of specimens of all groups and draws, (n, d)."""
+        return specimens_of(self.populations, self.thetas, each, seed)
+
+
+def specimens_of(populations: Populations, thetas: Floats, each: int, seed: int = 0) -> Floats:
+    """Return coordinates of specimens of the populations at thetas, (n, d)."""
+    rng = np.random.default_rng([seed, 3])
+    groups: Sequence[int] = [0]
+    if populations.groups is not None:
+        groups = np.unique(populations.groups).tolist()
+    parts = []
+    for group in groups:
+        drawn, _ = populations._sampler(populations._roots(thetas, group), each, rng)
+        z = populations.coordinates.of(drawn, 2)
+        parts.append(z.reshape(-1, z.shape[-1]))
+    z = np.concatenate(parts)
+    return z[np.isfinite(z).all(axis=1)]

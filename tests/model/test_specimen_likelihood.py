@@ -1,0 +1,634 @@
+"""The observed variable of the log-likelihood by specimen, as PyMC, ArviZ and samplers use it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import arviz as az
+import cloudpickle
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+from pymc.model.fgraph import clone_model
+from scipy import stats
+
+import prbayes as prb
+from prbayes._checks import Floats
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.response.compilation import PLAIN
+
+N = 20
+Y = 1 + 2 * np.random.default_rng(1).normal(1.0, 0.5, N)
+POINT = {"mu": 0.8, "sigma_log__": -0.5}
+
+
+class Line:
+    """The response 1 + 2 x, which counts its runs; a specimen by itself is no run."""
+
+    def __init__(self) -> None:
+        self.runs = 0
+
+    def __call__(self, x: Any) -> Any:
+        self.runs += np.size(x) if np.size(x) > 1 else 0
+        return 1 + 2 * np.asarray(x)
+
+
+def priors() -> tuple[Any, Any]:
+    return pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1)
+
+
+def build(response: Any = None, observed: Any = Y, **given: Any) -> pm.Model:
+    with pm.Model() as model:
+        prb.Simulator(
+            "y", response or Line(), pm.Normal.dist(*priors()), observed=observed, **given
+        )
+    return model
+
+
+def with_data() -> tuple[pm.Model, Line]:
+    response = Line()
+    with pm.Model() as model:
+        data = pm.Data("data", Y)
+        prb.Simulator("y", response, pm.Normal.dist(*priors()), observed=data)
+    return model, response
+
+
+def in_closed_form(observed: Floats = Y) -> pm.Model:
+    with pm.Model() as model:
+        mu, sigma = priors()
+        pm.Normal("y", 1 + 2 * mu, 2 * sigma, observed=observed)
+    return model
+
+
+@cache
+def shared() -> pm.Model:
+    """Return a model whose points are drawn already, for tests that leave it as it is."""
+    model = build()
+    values(model)
+    return model
+
+
+def values(model: pm.Model, point: dict[str, Any] = POINT, rv: str = "y") -> Floats:
+    """Return the log-density of an observed variable, without a compiler."""
+    graph = model.logp(vars=[model[rv]], sum=False)[0]
+    function = model.compile_fn(
+        graph, inputs=model.value_vars, mode=PLAIN, on_unused_input="ignore"
+    )
+    return np.asarray(function(point))
+
+
+def exact(point: dict[str, Any] = POINT, observed: Floats = Y) -> Floats:
+    return np.asarray(
+        stats.norm.logpdf(observed, 1 + 2 * point["mu"], 2 * np.exp(point["sigma_log__"]))
+    )
+
+
+# -- log-density -------------------------------------------------------------------------------------
+
+
+def test_the_log_density_has_an_element_for_each_specimen() -> None:
+    ours = values(shared())
+    assert ours.shape == (N,)
+    assert np.allclose(ours, exact(), atol=0.03)
+    other = {"mu": 1.1, "sigma_log__": -0.7}
+    difference = values(shared(), other) - ours
+    assert np.allclose(difference, exact(other) - exact(), atol=1e-4)
+
+
+def test_gradients_are_those_of_differences() -> None:
+    model = shared()
+    total, slopes = model.logp(vars=[model["y"]]), model.dlogp()
+    value = model.compile_fn(total, mode=PLAIN)
+    ordinary = in_closed_form()
+    gradient, reference = (
+        m.compile_fn(g, mode=PLAIN)(POINT)
+        for m, g in ((model, slopes), (ordinary, ordinary.dlogp()))
+    )
+    assert np.allclose(gradient, reference, atol=1e-4)
+    step = 1e-5
+    for i, name in enumerate(POINT):
+        ahead, behind = (value(POINT | {name: POINT[name] + s}) for s in (step, -step))
+        likelihood_slope = (ahead - behind) / (2 * step)
+        prior_slope = {"mu": -0.8 / 4, "sigma_log__": 1 - np.exp(-1.0)}[name]
+        assert gradient[i] == pytest.approx(likelihood_slope + prior_slope, abs=1e-4)
+
+
+def test_no_run_is_made_when_a_model_is_written_and_128_at_its_first_use() -> None:
+    response = Line()
+    model = build(response)
+    assert response.runs == 0
+    evaluator = Evaluator(model)
+    assert response.runs == 0
+    values(model)
+    assert response.runs == 128
+    assert evaluator.n_responses == 128
+    values(model, {"mu": 0.0, "sigma_log__": 0.0})
+    assert response.runs == 128
+
+
+def test_two_uses_share_points() -> None:
+    (likelihood,) = specimen_likelihoods(shared()).values()
+    assert likelihood.points is likelihood.points
+    assert np.array_equal(values(shared()), values(shared()))
+
+
+def test_weights_are_factors_that_sum_to_the_number_of_specimens() -> None:
+    weights = np.arange(1.0, N + 1)
+    ours = values(build(weights=weights))
+    assert np.allclose(ours, weights * N / weights.sum() * exact(), atol=0.03)
+
+
+def test_outside_the_support_of_a_population_gradients_are_finite() -> None:
+    x = np.random.default_rng(0).uniform(0, 2, N)
+    with pm.Model() as model:
+        end = pm.HalfNormal("end", 3)
+        prb.Simulator("y", lambda x: np.exp(x / 2), pm.Uniform.dist(0, end), observed=np.exp(x / 2))
+    graphs = [model.logp(vars=[model["y"]]), model.dlogp()]
+    functions = [model.compile_fn(g, mode=PLAIN) for g in graphs]
+    for end_value, slope in ((1.0, None), (x.max() - 0.01, None), (x.max() + 0.01, -N), (3.0, -N)):
+        value, gradient = (f({"end_log__": np.log(end_value)}) for f in functions)
+        assert np.isfinite(gradient).all()
+        if slope is None:
+            assert value == -np.inf
+        else:
+            prior = 1 - end_value**2 / 9
+            assert gradient[0] == pytest.approx(slope + prior, abs=1e-6)
+            assert value == pytest.approx(
+                -N * np.log(end_value) - (x / 2 + np.log(0.5)).sum(), abs=0.1
+            )
+
+
+# -- inputs ------------------------------------------------------------------------------------------
+
+
+def test_correlated_inputs_as_one_vector() -> None:
+    covariance = np.array([[1.0, 0.5], [0.5, 2.0]])
+    matrix = np.array([[1.0, 1.0], [1.0, -2.0]])
+    y = np.random.default_rng(0).multivariate_normal([1.0, 2.0], covariance, 15) @ matrix.T
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, 2, shape=2)
+        x = pm.MvNormal.dist(mu, covariance)
+        prb.Simulator("y", lambda x: x @ matrix.T, x, observed=y)
+    for mu in ([0.3, 0.4], [1.0, 2.0]):
+        p = stats.multivariate_normal(matrix @ mu, matrix @ covariance @ matrix.T)
+        assert np.allclose(values(model, {"mu": np.array(mu)}), p.logpdf(y), atol=0.05)
+    assert pm.draw(model["y"], 3, random_seed=1, mode=PLAIN).shape == (3, 15, 2)
+
+
+def test_a_correlation_that_is_a_hyperparameter() -> None:
+    y = np.random.default_rng(0).normal(size=(15, 2))
+    with pm.Model() as model:
+        rho = pm.Uniform("rho", -0.9, 0.9)
+        covariance = pm.math.stack([pm.math.stack([1.0, rho]), pm.math.stack([rho, 1.0])])
+        prb.Simulator("y", lambda x: x, pm.MvNormal.dist(np.zeros(2), covariance), observed=y)
+    zero = values(model, {"rho_interval__": 0.0})
+    half = values(model, {"rho_interval__": np.log((0.5 + 0.9) / (0.9 - 0.5))})
+    p = stats.multivariate_normal([0, 0], [[1, 0.5], [0.5, 1]])
+    difference = p.logpdf(y) - stats.multivariate_normal([0, 0], np.eye(2)).logpdf(y)
+    assert np.allclose(half - zero, difference, atol=1e-3)
+
+
+def test_lognormal_inputs_and_constants() -> None:
+    y = 3 * np.exp(np.random.default_rng(0).normal(0.5, 0.7, 15))
+    with pm.Model() as model:
+        mu, sigma = priors()
+        prb.Simulator("y", lambda x, c: c * x, pm.LogNormal.dist(mu, sigma), 3.0, observed=y)
+    expected = stats.lognorm(np.exp(-0.5), scale=3 * np.exp(0.8)).logpdf(y)
+    assert np.allclose(values(model), expected, atol=0.03)
+
+
+def test_a_mixture_of_two_populations() -> None:
+    with pm.Model() as model:
+        mu, sigma = priors()
+        x = pm.NormalMixture.dist([0.3, 0.7], pm.math.stack([mu, mu + 1.0]), sigma)
+        prb.Simulator("y", Line(), x, observed=Y)
+    s = np.exp(-0.5)
+    parts = [stats.norm.pdf(Y, 1 + 2 * m, 2 * s) for m in (0.8, 1.8)]
+    assert np.allclose(values(model), np.log(0.3 * parts[0] + 0.7 * parts[1]), atol=0.03)
+
+
+def test_two_inputs_of_a_response_with_two_outputs() -> None:
+    rng = np.random.default_rng(2)
+    a, b = rng.normal(1.0, 0.5, N), rng.normal(0.0, 1.0, N)
+    with pm.Model() as model:
+        mu, sigma = priors()
+        inputs = pm.Normal.dist(mu, sigma), pm.Normal.dist(0.0, 1.0)
+        observed = {"sum": a + b, "difference": a - b}
+        prb.Simulator(
+            "y", lambda a, b: {"sum": a + b, "difference": a - b}, *inputs, observed=observed
+        )
+    expected = stats.norm.logpdf(a, 0.8, np.exp(-0.5)) + stats.norm.logpdf(b) - np.log(2)
+    assert np.allclose(values(model), expected, atol=0.05)
+
+
+def test_missing_outputs_are_no_values_to_impute() -> None:
+    rng = np.random.default_rng(2)
+    a = rng.normal(1.0, 0.5, N)
+    y = np.stack([a, 2 * a], axis=1)
+    y[::4, 0] = np.nan
+    with pm.Model() as model:
+        x = pm.Normal.dist(*priors())
+        prb.Simulator("y", lambda x: np.stack([x, 2 * x], axis=-1), x, observed=y)
+    assert [rv.name for rv in model.free_RVs] == ["mu", "sigma"]
+    difference = values(model, {"mu": 1.2, "sigma_log__": -0.5}) - values(model)
+    s = np.exp(-0.5)
+    expected = stats.norm.logpdf(a, 1.2, s) - stats.norm.logpdf(a, 0.8, s)
+    assert np.allclose(difference, expected, atol=1e-3)
+
+
+def labelled(groups: list[str]) -> xr.DataArray:
+    rng = np.random.default_rng(5)
+    index = np.array([groups.index(g) for g in np.resize(groups, N)])
+    names = np.array(groups)[index]
+    return xr.DataArray(rng.normal(index, 0.3), {"supplier": ("specimen", names)}, "specimen")
+
+
+def grouped(response: Any) -> tuple[pm.Model, xr.DataArray]:
+    names = ["Adler", "Busch"]
+    data = labelled(names)
+    with pm.Model(coords={"supplier": names}) as model:
+        mu, sigma = pm.Normal("mu", 0, 2, dims="supplier"), pm.HalfNormal("sigma", 1)
+        x = pm.Normal.dist(mu[prb.response.group("supplier")], sigma)
+        prb.Simulator("y", response, x, observed=data)
+    return model, data
+
+
+def test_groups_have_populations_of_their_own_and_share_runs() -> None:
+    response = Line()
+    model, data = grouped(response)
+    means = np.array([0.3, 0.9])
+    index = (data["supplier"].values == "Busch").astype(int)
+    ours = values(model, {"mu": means, "sigma_log__": -0.5})
+    expected = stats.norm.logpdf(data.values, 1 + 2 * means[index], 2 * np.exp(-0.5))
+    assert np.allclose(ours, expected, atol=0.03)
+    assert response.runs == 128
+    known = pm.do(model, {"mu": [0.0, 10.0], "sigma": 0.1})
+    drawn = pm.draw(known["y"], random_seed=1, mode=PLAIN)
+    assert drawn[index == 0].mean() < drawn[index == 1].mean()
+
+
+# -- several simulators ------------------------------------------------------------------------------
+
+
+def test_simulators_with_equal_inputs_stay_apart() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(*priors())
+        prb.Simulator("one", Line(), x, observed=Y)
+        prb.Simulator("two", lambda x: 3 * x, x, observed=Y)
+    assert np.allclose(values(model, rv="one"), exact(), atol=0.03)
+    expected = stats.norm.logpdf(Y, 3 * 0.8, 3 * np.exp(-0.5))
+    assert np.allclose(values(model, rv="two"), expected, atol=0.03)
+    total = model.compile_fn(model.logp(vars=model.observed_RVs), mode=PLAIN)(POINT)
+    assert total == pytest.approx(exact().sum() + expected.sum(), abs=0.1)
+
+
+@pytest.mark.long
+def test_draws_of_simulators_with_equal_inputs_stay_apart() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(*priors())
+        prb.Simulator("one", Line(), x, observed=Y)
+        prb.Simulator("two", lambda x: 3 * x, x, observed=Y)
+    known = pm.do(model, {"mu": 1.0, "sigma": 0.1})
+    one, two = pm.draw([known["one"], known["two"]], 50, random_seed=1)
+    # 1000 draws of sd .2 and .3: standard errors .006 and .01
+    assert one.mean() == pytest.approx(3.0, abs=0.04)
+    assert two.mean() == pytest.approx(3.0, abs=0.06)
+    assert one.std() == pytest.approx(0.2, rel=0.1)
+    assert two.std() == pytest.approx(0.3, rel=0.1)
+
+
+@pytest.mark.long
+def test_a_metric_and_a_likelihood_in_one_model() -> None:
+    metric = prb.KullbackLeibler()
+    with pm.Model() as model:
+        x = pm.Normal.dist(*priors())
+        prb.Simulator("by specimen", Line(), x, observed=Y)
+        prb.Simulator("by metric", lambda x: 3 * x, x, metric=metric, observed=(Y - 1) * 1.5)
+    evaluator = Evaluator(model)
+    assert [node.name for node in evaluator.nodes] == ["by metric"]
+    assert [each.name for each in evaluator.likelihoods] == ["by specimen"]
+    optimum = prb.minimize(model, progressbar=False)
+    x = (Y - 1) / 2
+    assert optimum.point["mu"] == pytest.approx(x.mean(), abs=0.1)
+    draws = prb.sample_smc(200, chains=2, model=model, random_seed=1, progressbar=False)
+    assert float(draws.posterior["mu"].mean()) == pytest.approx(x.mean(), abs=0.2)
+
+
+# -- names and dimensions ----------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_dims_are_those_of_results() -> None:
+    with pm.Model(coords={"specimen": np.arange(N)}) as model:
+        x = pm.Normal.dist(*priors())
+        prb.Simulator("y", Line(), x, observed=Y, dims="specimen")
+    draws = prb.sample_smc(100, chains=2, model=model, random_seed=1, progressbar=False)
+    for group in ("log_likelihood", "posterior_predictive"):
+        assert draws[group]["y"].dims == ("chain", "draw", "specimen")
+    assert draws.observed_data["y"].dims == ("specimen",)
+
+
+def test_dims_of_another_length_are_refused() -> None:
+    with pm.Model(coords={"specimen": np.arange(3)}):
+        x = pm.Normal.dist(*priors())
+        with pytest.raises(ValueError, match="dims: got 'specimen' of length 3, expected 20"):
+            prb.Simulator("y", Line(), x, observed=Y, dims="specimen")
+
+
+def test_a_model_prints() -> None:
+    assert "Simulator[Line, LogLikelihood]" in shared().str_repr()
+    assert r"\text{Line, LogLikelihood}" in shared().str_repr(formatting="latex")
+
+
+# -- copies and other data ---------------------------------------------------------------------------
+
+
+COPIES: dict[str, Callable[[pm.Model], pm.Model]] = {
+    "clone_model": clone_model,
+    "copy": copy.copy,
+    "deepcopy": copy.deepcopy,
+    "cloudpickle": lambda model: cloudpickle.loads(cloudpickle.dumps(model)),
+}
+
+
+@pytest.mark.parametrize("make", COPIES)
+@pytest.mark.parametrize("used", [False, True])
+def test_copies_have_the_same_points(make: str, used: bool) -> None:
+    response = Line()
+    model = build(response)
+    if used:
+        values(model)
+    other = COPIES[make](model)
+    assert np.allclose(values(other), values(model), rtol=1e-12)
+    if make != "cloudpickle":
+        assert response.runs == 128
+    elif used:
+        assert specimen_likelihoods(other)[other["y"]].responses.function.runs == 128
+
+
+def test_a_hyperparameter_that_is_set_needs_no_run() -> None:
+    response = Line()
+    model = build(response)
+    values(model)
+    for change in (pm.do, pm.observe):
+        other = change(model, {"sigma": 0.5})
+        ours = values(other, {"mu": 0.8})
+        assert np.allclose(ours, stats.norm.logpdf(Y, 2.6, 1.0), atol=0.03)
+    assert response.runs == 128
+
+
+def test_other_data_of_the_same_model() -> None:
+    model, response = with_data()
+    before = values(model)
+    other = Y + 1
+    with model:
+        pm.set_data({"data": other})
+    ours = values(model)
+    assert np.allclose(ours, exact(observed=other), atol=0.03)
+    assert not np.allclose(ours, before, atol=0.03)
+    # The runs cover the roots of the other data too.
+    assert Evaluator(model).n_responses == response.runs == 128
+    with model:
+        pm.set_data({"data": Y})
+    assert np.array_equal(values(model), before)
+    assert response.runs == 128
+
+
+def test_data_of_another_length() -> None:
+    model, _ = with_data()
+    with model:
+        pm.set_data({"data": Y[:7]})
+    assert np.allclose(values(model), exact(observed=Y[:7]), atol=0.03)
+
+
+def test_data_of_another_shape_are_refused() -> None:
+    (likelihood,) = specimen_likelihoods(shared()).values()
+    with pytest.raises(ValueError, match=r"y: observed: got shape \(20, 1\), expected \('N',\)"):
+        likelihood.observing(Y[:, None])
+
+
+def test_what_was_compiled_for_other_data_refuses_them() -> None:
+    model, _ = with_data()
+    function = model.compile_fn(model.logp(), mode=PLAIN)
+    assert np.isfinite(function(POINT))
+    with model:
+        pm.set_data({"data": Y + 1})
+    with pytest.raises(Exception, match="got other observed values than when this was compiled"):
+        function(POINT)
+
+
+def test_data_may_be_observed_later() -> None:
+    other = pm.observe(build(), {"y": Y + 1})
+    assert np.allclose(values(other), exact(observed=Y + 1), atol=0.03)
+
+
+@pytest.mark.long
+def test_an_optimum_of_other_data_is_refused() -> None:
+    model, _ = with_data()
+    optimum = prb.minimize(model, progressbar=False)
+    with model:
+        pm.set_data({"data": Y + 1})
+    with pytest.raises(ValueError, match="got a result of another problem"):
+        prb.sample_smc(10, model=model, optimum=optimum, progressbar=False)
+
+
+# -- refusals ----------------------------------------------------------------------------------------
+
+
+def test_an_epsilon_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"epsilon: got 0\.1, expected none.*leave epsilon= out"):
+        build(epsilon=0.1)
+    with pytest.raises(ValueError, match=r"epsilon: got 0\.1, expected none.*leave epsilon= out"):
+        prb.sample_smc(10, model=shared(), epsilon=0.1)
+
+
+def test_random_propagation_is_refused() -> None:
+    with pytest.raises(TypeError, match=r"got Fresh .*metric=prb\.ProbabilityResidual"):
+        build(propagation=prb.Fresh(64))
+
+
+def test_discrete_inputs_are_refused() -> None:
+    with pm.Model():
+        x = pm.Poisson.dist(pm.math.exp(pm.Normal("mu")))
+        with pytest.raises(TypeError, match=r"poisson.* is discrete.*prb\.ProbabilityResidual"):
+            prb.Simulator("y", Line(), x, observed=Y)
+
+
+def test_epistemic_inputs_are_refused() -> None:
+    with pm.Model():
+        c = pm.Normal("c")
+        message = "got c, which goes into the response as a model variable.*prb.ProbabilityResidual"
+        with pytest.raises(TypeError, match=message):
+            prb.Simulator("y", lambda x, c: x + c, pm.Normal.dist(*priors()), c, observed=Y)
+
+
+@pytest.mark.parametrize(
+    ("observed", "message"),
+    [
+        (np.append(Y, np.inf), "got infinite values, expected finite .*prb.ProbabilityResidual"),
+        (np.append(Y, np.nan), "got no measured output of specimen 20.*leave the specimen out"),
+        (Y[:1], r"got shape \(1,\), expected \(N,\) or \(N, m\) with at least 2 specimens"),
+    ],
+)
+def test_data_that_are_no_readings_are_refused(observed: Floats, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        build(observed=observed)
+
+
+def test_there_is_no_epsilon_to_set_or_to_calibrate() -> None:
+    message = "prb.LogLikelihood.., which has no epsilon"
+    with pytest.raises(ValueError, match=message):
+        prb.set_epsilon(shared(), 0.1)
+    with pytest.raises(ValueError, match=message):
+        prb.set_epsilon(shared(), {"y": 0.1})
+    optimum = prb.minimize(shared(), progressbar=False)
+    with pytest.raises(ValueError, match=message):
+        prb.calibrate_epsilon(optimum)
+
+
+def test_two_samples_have_no_log_likelihood_by_specimen() -> None:
+    with pytest.raises(TypeError, match=r"prb.LogLikelihood\(density=prb.GaussianKDE\(\)\)"):
+        prb.LogLikelihood()([1.0, 2.0], [1.0, 2.0])
+
+
+# -- samplers ----------------------------------------------------------------------------------------
+
+
+@cache
+def posterior() -> dict[str, tuple[float, float]]:
+    """Return mean and standard deviation of both hyperparameters, by quadrature."""
+    mu, log_sigma = np.linspace(0.4, 1.7, 201)[:, None, None], np.linspace(-2.2, 0, 201)[:, None]
+    sigma = np.exp(log_sigma)
+    logs = stats.norm.logpdf(Y, 1 + 2 * mu, 2 * sigma).sum(axis=-1)
+    logs += (stats.norm.logpdf(mu, 0, 2) + stats.halfnorm.logpdf(sigma) + log_sigma)[..., 0]
+    p = np.exp(logs - logs.max())
+    p /= p.sum()
+    result = {}
+    for name, x in (("mu", mu[..., 0]), ("sigma", sigma[:, 0])):
+        mean = (p * x).sum()
+        result[name] = mean, np.sqrt((p * (x - mean) ** 2).sum())
+    return result
+
+
+def assert_posterior(draws: Any, mean_error: float = 0.2, sd_error: float = 0.15) -> None:
+    """Compare with quadrature: several hundred effective draws have standard errors of .04 sd."""
+    for name, (mean, sd) in posterior().items():
+        x = np.asarray(draws[name])
+        assert abs(x.mean() - mean) < mean_error * sd, name
+        assert abs(x.std() / sd - 1) < sd_error, name
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning"
+)
+@pytest.mark.parametrize("sampler", ["pymc", "nutpie", "numpyro"])
+def test_nuts_has_the_exact_posterior(sampler: str) -> None:
+    pytest.importorskip(sampler)
+    response = Line()
+    with build(response) as model:
+        draws = pm.sample(
+            1000,
+            tune=500,
+            chains=2,
+            cores=1,
+            nuts_sampler=sampler,
+            random_seed=1,
+            progressbar=False,
+        )
+    assert model
+    assert response.runs == 128
+    assert_posterior(draws.posterior)
+
+
+@pytest.mark.long
+def test_starts_at_the_optimum() -> None:
+    model = shared()
+    optimum = prb.minimize(model, progressbar=False)
+    with model:
+        draws = pm.sample(
+            1000, tune=500, chains=2, cores=1, nuts_sampler="pymc", initvals=optimum.initvals,
+            init="adapt_diag", random_seed=1, progressbar=False,
+        )  # fmt: skip
+    assert_posterior(draws.posterior)
+
+
+@pytest.mark.long
+def test_sample_smc_has_the_exact_posterior() -> None:
+    draws = prb.sample_smc(model=shared(), random_seed=1, progressbar=False)
+    assert_posterior(draws.posterior)
+    assert draws.log_likelihood["y"].shape[2:] == (N,)
+
+
+@pytest.mark.long
+def test_the_smc_of_pymc_has_the_exact_posterior() -> None:
+    with shared():
+        draws = pm.sample_smc(1000, chains=2, cores=1, random_seed=1, progressbar=False)
+    assert_posterior(draws.posterior)
+
+
+@pytest.mark.long
+def test_variational_inference_comes_near_the_exact_posterior() -> None:
+    with shared():
+        optimizer = pm.adagrad_window(learning_rate=0.02)
+        fit = pm.fit(8000, random_seed=1, progressbar=False, obj_optimizer=optimizer)
+        draws = fit.sample(2000, random_seed=2)
+    assert_posterior(draws.posterior)
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore:`find_MAP` will:FutureWarning")
+def test_find_map_and_minimize_have_the_exact_optimum() -> None:
+    ours, exact_map = (
+        pm.find_MAP(model=model, progressbar=False) for model in (shared(), in_closed_form())
+    )
+    for name in ("mu", "sigma"):
+        assert ours[name] == pytest.approx(exact_map[name], abs=1e-3)
+    x = (Y - 1) / 2
+    optimum = prb.minimize(shared(), progressbar=False)
+    assert optimum.point["mu"] == pytest.approx(x.mean(), abs=1e-4)
+    assert optimum.point["sigma"] == pytest.approx(x.std(), abs=1e-4)
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_arviz_compares_models_by_specimen() -> None:
+    trees = {}
+    for name, model in (("points", shared()), ("closed form", in_closed_form())):
+        with model:
+            draws = pm.sample(
+                500, tune=500, chains=2, cores=1, nuts_sampler="pymc", random_seed=1,
+                progressbar=False,
+            )  # fmt: skip
+            pm.compute_log_likelihood(draws, progressbar=False)
+            drawn = pm.sample_posterior_predictive(draws, random_seed=1, progressbar=False)
+        draws["posterior_predictive"] = drawn["posterior_predictive"]
+        assert draws.log_likelihood["y"].shape == (2, 500, N)
+        trees[name] = draws
+    ours, reference = (az.loo(tree) for tree in trees.values())
+    # The same posterior by other draws: elpd to about .1
+    assert ours.elpd == pytest.approx(reference.elpd, abs=0.5)
+    assert ours.p == pytest.approx(reference.p, abs=0.3)
+    table = az.compare(trees)
+    assert table["dse"].max() < 0.5
+    pits = [az.loo_pit(tree)["y"].values for tree in trees.values()]
+    assert pits[0].shape == (N,)
+    # Predictive draws of 1000: standard error of a PIT below .016
+    assert np.abs(pits[0] - pits[1]).max() < 0.1
+
+
+@pytest.mark.long
+def test_predictive_draws_are_those_of_the_population() -> None:
+    known = pm.do(shared(), {"mu": 1.0, "sigma": 0.5})
+    drawn = pm.draw(known["y"], 200, random_seed=1)
+    assert drawn.shape == (200, N)
+    # 4000 draws of sd 1: standard errors .016 and .011
+    assert drawn.mean() == pytest.approx(3.0, abs=0.08)
+    assert drawn.std() == pytest.approx(1.0, abs=0.06)
+    # Different specimens, and different data sets
+    assert len(np.unique(drawn.round(12))) == drawn.size

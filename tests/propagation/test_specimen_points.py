@@ -1,0 +1,429 @@
+"""Log-likelihoods of specimens from points, against closed forms and quadrature."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal, norm
+
+from prbayes._checks import Floats
+from prbayes.metrics.readings import Readings
+from prbayes.propagation.base import DesignError
+from prbayes.propagation.specimen_points import (
+    Emulation,
+    PointOptions,
+    SpecimenPoints,
+    _starts,
+    draw_points,
+    emulate,
+    first_runs,
+    normal_log_density,
+)
+
+Density = Callable[[Floats], Floats]
+
+
+def cube(d: int, half_width: float = 1.0) -> Floats:
+    return np.stack([np.full(d, -half_width), np.full(d, half_width)])
+
+
+def readings(y: Floats, error: float = 0.0) -> Readings:
+    exact = Readings.exact(y)
+    return Readings(y, np.full_like(y, error), exact.step, exact.lower, exact.upper)
+
+
+def points_of(
+    run: Callable[[Floats], Floats],
+    y: Floats,
+    d: int,
+    *,
+    error: float = 0.0,
+    unit: float = 1.0,
+    seed: int = 0,
+    options: PointOptions = PointOptions(),  # noqa: B008 (frozen)
+) -> tuple[Emulation, SpecimenPoints]:
+    data = readings(y, error)
+    boxes = unit * cube(d), unit * cube(d, 1.5)
+    emulation, roots = emulate(run, data, *boxes, options, seed=seed)
+    points = draw_points(emulation, emulation.error, data, roots, boxes[1], options, seed=seed)
+    return emulation, points
+
+
+def log_likelihoods(points: SpecimenPoints, density: Density) -> Floats:
+    return np.asarray(logsumexp(density(points.z) + points.log_a, axis=1))
+
+
+def normal(mean: Any, covariance: Any) -> Density:
+    root = np.linalg.cholesky(np.atleast_2d(covariance))
+    return lambda z: normal_log_density(z, np.atleast_1d(mean), root)
+
+
+# -- linear responses of normal inputs ---------------------------------------------------------------
+
+
+class Linear:
+    def __init__(self, d: int, m: int, n: int = 12) -> None:
+        rng = np.random.default_rng([d, m])
+        self.matrix, self.offset = rng.normal(size=(m, d)), rng.normal(size=m)
+        self.x = 0.3 * rng.normal(size=(n, d))
+        self.y = self(self.x)
+
+    def __call__(self, z: Floats) -> Floats:
+        return z @ self.matrix.T + self.offset
+
+    def sharp(self, mean: Floats, covariance: Floats, sd: Floats) -> Floats:
+        """Return the log-density of the outputs with errors that are small, where p is constant."""
+        scaled = self.matrix / sd[:, None]
+        log_mass = -np.linalg.slogdet(scaled.T @ scaled)[1] / 2 - np.log(sd).sum()
+        log_mass -= (len(sd) - len(mean)) / 2 * np.log(2 * np.pi)
+        return normal_log_density(self.x, mean, np.linalg.cholesky(covariance)) + log_mass
+
+    def exact(self, mean: Floats, covariance: Floats, sd: Any) -> Floats:
+        """Return the log-density of the outputs with errors."""
+        variance = self.matrix @ covariance @ self.matrix.T + np.diag(np.asarray(sd) ** 2)
+        center = self.matrix @ mean + self.offset
+        root = np.linalg.cholesky(variance)
+        return normal_log_density(self.y, center, root)
+
+
+def populations(d: int, count: int = 4) -> list[tuple[Floats, Floats]]:
+    rng = np.random.default_rng(d)
+    result = []
+    for _ in range(count):
+        factor = 0.2 * rng.normal(size=(d, d))
+        result.append((0.2 * rng.normal(size=d), factor @ factor.T + 0.05 * np.eye(d)))
+    return result
+
+
+SHAPES = [(1, 1), (2, 2), (2, 3), (3, 4)]
+
+
+@pytest.mark.parametrize(("d", "m"), SHAPES)
+def test_a_linear_response_of_normal_inputs(d: int, m: int) -> None:
+    problem = Linear(d, m)
+    emulation, points = points_of(problem, problem.y, d)
+    assert points.n_roots.tolist() == [1] * len(problem.y)
+    ours, exact = (
+        np.array([f(mean, cov) for mean, cov in populations(d)])
+        for f in (
+            lambda mean, cov: log_likelihoods(points, normal(mean, cov)),
+            lambda mean, cov: problem.sharp(mean, cov, emulation.error),
+        )
+    )
+    # The mass around a root is measured by 256 quasi-random points.
+    assert np.allclose(ours, exact, atol=3e-2)
+    assert np.allclose(ours.mean(axis=1), exact.mean(axis=1), atol=1e-2)
+    # That error is the same for all populations.
+    differences = [(a - a[0])[1:] for a in (ours, exact)]
+    assert np.abs(differences[0] - differences[1]).max() < 1e-4
+    assert np.abs(np.mean(differences[0] - differences[1])) < 1e-6
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("d", "m"), SHAPES)
+def test_a_linear_response_with_an_error_of_the_readings(d: int, m: int) -> None:
+    problem = Linear(d, m)
+    problem.y = problem.y + 0.1 * np.random.default_rng(0).normal(size=problem.y.shape)
+    emulation, points = points_of(problem, problem.y, d, error=0.1)
+    sd = np.hypot(emulation.error, 0.1)
+    ours, exact = [], []
+    for mean, covariance in populations(d):
+        ours.append(log_likelihoods(points, normal(mean, covariance)).sum())
+        exact.append(problem.exact(mean, covariance, sd).sum())
+    # Within a few of the tolerance of half differences, .15 nats
+    assert np.abs(np.subtract(ours, exact)).max() < 0.6
+
+
+def test_points_are_the_roots_of_a_precise_response() -> None:
+    problem = Linear(2, 2)
+    _, points = points_of(problem, problem.y, 2)
+    assert np.abs(points.z - problem.x[:, None]).max() < 1e-3
+    assert points.z.shape == (12, PointOptions().points, 2)
+    assert np.allclose(points.outputs, problem(points.z), atol=1e-5)
+
+
+def test_a_mixture_of_populations() -> None:
+    problem = Linear(2, 2)
+    emulation, points = points_of(problem, problem.y, 2)
+    (first, second, *_), shares = populations(2), np.log([0.3, 0.7])
+
+    def density(z: Floats) -> Floats:
+        parts = [normal(*p)(z) + s for p, s in zip((first, second), shares, strict=True)]
+        return np.logaddexp(*parts)
+
+    parts = [problem.sharp(*p, emulation.error) for p in (first, second)]
+    exact = logsumexp(np.stack(parts) + shares[:, None], axis=0)
+    assert np.allclose(log_likelihoods(points, density), exact, atol=3e-2)
+
+
+@pytest.mark.parametrize("d", [1, 2])
+def test_a_missing_output_is_integrated_over(d: int) -> None:
+    """One output of d + 1 is missing: the others determine the inputs."""
+    problem = Linear(d, d + 1)
+    y = problem.y.copy()
+    y[::3, 0] = np.nan
+    emulation, points = points_of(problem, y, d)
+    mean, covariance = populations(d)[0]
+    exact = problem.sharp(mean, covariance, emulation.error)
+    some = Linear(d, d + 1)
+    some.matrix = some.matrix[1:]
+    exact[::3] = some.sharp(mean, covariance, emulation.error[1:])[::3]
+    assert np.allclose(log_likelihoods(points, normal(mean, covariance)), exact, atol=3e-2)
+
+
+# -- several roots -----------------------------------------------------------------------------------
+
+
+def square(z: Floats) -> Floats:
+    return z**2
+
+
+def test_a_folded_normal_population() -> None:
+    x = 0.15 + 0.3 * np.random.default_rng(0).normal(size=20)
+    x = x[np.abs(x) > 0.02]
+    _, points = points_of(square, x[:, None] ** 2, 1)
+    assert set(points.n_roots) == {2}
+    for mean, sd in ((0.15, 0.3), (0.0, 0.2), (-0.3, 0.25)):
+        # p(y) = [p(x) + p(-x)] / |2 x|
+        exact = np.logaddexp(norm.logpdf(x, mean, sd), norm.logpdf(-x, mean, sd))
+        exact -= np.log(2 * np.abs(x))
+        ours = log_likelihoods(points, normal(mean, sd**2))
+        assert np.allclose(ours, exact, atol=2e-2)
+        # Beside the fold the density is not constant over the emulator's error.
+        assert ours.sum() == pytest.approx(exact.sum(), abs=3e-2)
+
+
+def two_roots(z: Floats) -> Floats:
+    """Sum and product of two stiffnesses, which are the same when these are exchanged."""
+    k, g = np.exp(z[:, 0]), np.exp(z[:, 1])
+    return np.stack([k + g, k * g], axis=1)
+
+
+def test_a_response_with_a_mirror_root() -> None:
+    rng = np.random.default_rng(1)
+    x = np.array([0.3, -0.4]) + 0.15 * rng.normal(size=(15, 2))
+    _, points = points_of(two_roots, two_roots(x), 2)
+    assert set(points.n_roots) == {2}
+    k, g = np.exp(x).T
+    log_det = np.log(np.abs(k - g) * k * g)
+    for mean in ([0.3, -0.4], [0.0, 0.0], [-0.2, 0.1]):
+        covariance = np.array([[0.05, 0.02], [0.02, 0.08]])
+        p = multivariate_normal(mean, covariance)
+        exact = np.logaddexp(p.logpdf(x), p.logpdf(x[:, ::-1])) - log_det
+        assert np.allclose(log_likelihoods(points, normal(mean, covariance)), exact, atol=2e-2)
+
+
+def turned(y: float, error: float, mean: float, sd: float) -> float:
+    """Return the log-density of a reading of z^2 of a normal population, by quadrature."""
+
+    def integrand(z: float) -> float:
+        return float(norm.pdf(y, z**2, error) * norm.pdf(z, mean, sd))
+
+    return float(np.log(quad(integrand, -1.5, 1.5, points=[-0.3, 0.0, 0.3], limit=200)[0]))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("error", [0.02, 0.1])
+def test_readings_around_a_turning_point(error: float) -> None:
+    """y = z^2 + error: near zero both roots merge, and some readings are beyond the response."""
+    rng = np.random.default_rng(2)
+    x = 0.1 + 0.25 * rng.normal(size=20)
+    y = (x**2 + error * rng.normal(size=20))[:, None]
+    _, points = points_of(square, y, 1, error=error)
+    differences = []
+    for mean, sd in ((0.1, 0.25), (0.0, 0.15), (0.3, 0.3)):
+        exact = [turned(value, error, mean, sd) for value in y[:, 0]]
+        ours = log_likelihoods(points, normal(mean, sd**2))
+        differences.append(ours.sum() - np.sum(exact))
+        assert np.abs(ours - exact).max() < 0.3
+    assert np.abs(differences).max() < 0.6
+
+
+# -- ends of a support -------------------------------------------------------------------------------
+
+
+def test_the_end_of_a_support_jumps_at_the_largest_specimen() -> None:
+    """The likelihood of a uniform population's end is theta^-N above the largest x, else zero."""
+    x = np.random.default_rng(0).uniform(-0.8, 0.6, 30)
+    _, points = points_of(lambda z: np.exp(z), np.exp(x)[:, None], 1)
+
+    def total(end: float) -> float:
+        with np.errstate(divide="ignore"):
+            inside = np.log((points.z[..., 0] > -1) & (points.z[..., 0] < end))
+        terms = inside - np.log(end + 1) + points.log_a
+        return float(logsumexp(terms, axis=1).sum())
+
+    above, far = x.max() + 1e-4, x.max() + 0.3
+    assert total(above) - total(far) == pytest.approx(
+        30 * np.log((far + 1) / (above + 1)), abs=1e-6
+    )
+    assert total(above) == pytest.approx(-30 * np.log(above + 1) - x.sum(), abs=0.05)
+    assert total(x.max() - 1e-3) == -np.inf
+
+
+# -- loops -------------------------------------------------------------------------------------------
+
+
+def test_the_number_of_points_grows_with_the_error_of_the_readings() -> None:
+    problem = Linear(1, 1, n=30)
+    counts = []
+    for error in (0.0, 0.05):
+        y = problem.y + error * np.random.default_rng(0).normal(size=problem.y.shape)
+        _, points = points_of(problem, y, 1, error=error)
+        counts.append(points.z.shape[1])
+        assert points.difference <= PointOptions().half_difference
+    assert counts[0] == 4
+    assert counts[1] >= 8
+
+
+def test_too_few_points_are_refused() -> None:
+    problem = Linear(1, 1, n=30)
+    options = PointOptions(half_difference=1e-9, most_points=8)
+    y = problem.y + 0.3 * np.random.default_rng(0).normal(size=problem.y.shape)
+    with pytest.raises(DesignError, match=r"two halves of .* points a specimen that differ by .*"):
+        points_of(problem, y, 1, error=0.3, options=options)
+
+
+def test_a_response_that_cannot_be_emulated_is_refused() -> None:
+    def rough(z: Floats) -> Floats:
+        return z + 0.5 * np.sin(1e4 * z)
+
+    y = rough(0.2 * np.random.default_rng(0).normal(size=(20, 1)))
+    with pytest.raises(DesignError, match=r"metric=prb.ProbabilityResidual"):
+        points_of(rough, y, 1)
+
+
+@pytest.mark.parametrize(("d", "n"), [(1, 64), (2, 64), (3, 128), (4, 128), (5, 512)])
+def test_the_first_runs(d: int, n: int) -> None:
+    assert first_runs(d) == n
+
+
+def test_runs_far_from_the_data_do_not_count_as_errors() -> None:
+    """A response that is steep beyond the data is emulated well at them."""
+
+    def steep(z: Floats) -> Floats:
+        return np.exp(np.exp(6 * z - 3.6))
+
+    z = (np.log(np.random.default_rng(0).uniform(0, 2, 25)) + 3.6) / 6
+    y = steep(z[:, None])
+    emulation, points = points_of(steep, y, 1)
+    # Twice the error at 16 roots; at the steepest fresh run it is a thousand times the spread.
+    assert emulation.error[0] < 0.02 * y.std()
+    counts = points.log_a > points.log_a.max(axis=1, keepdims=True) - 10
+    assert np.abs(points.outputs[..., 0] - y)[counts].max() < 0.1 * y.std()
+
+
+def test_starts_are_nearest_in_the_outputs_that_were_measured() -> None:
+    run_z = np.arange(4.0)[:, None]
+    run_y = np.array([[1.0, 9.0], [2.0, 5.0], [3.0, 0.0], [4.0, 7.0]])
+    y, measured = np.array([[4.0, 0.0], [0.0, 9.0]]), np.array([[True, False], [False, True]])
+    starts = _starts(run_z, run_y, y, measured, np.ones(2), 2)
+    assert starts[..., 0].tolist() == [[3.0, 2.0], [0.0, 3.0]]
+
+
+def test_batches_of_runs_are_at_the_roots() -> None:
+    sizes: list[int] = []
+
+    def counted(z: Floats) -> Floats:
+        sizes.append(len(z))
+        return square(z)
+
+    x = np.random.default_rng(0).uniform(0.2, 0.5, 20)
+    emulation, _ = points_of(counted, x[:, None] ** 2, 1)
+    assert sizes == [64, 32, 32]
+    assert len(emulation.z) == 128
+    fresh = np.abs(emulation.z[64:])
+    # Within the roots' range, and .4 of a standard deviation of roots of both signs around it
+    assert np.mean((fresh > 0.1) & (fresh < 0.7)) > 0.8
+
+
+# -- invariances -------------------------------------------------------------------------------------
+
+
+def of_folded(points: SpecimenPoints, unit: float = 1.0) -> Floats:
+    density = normal(0.15 * unit, (0.3 * unit) ** 2)
+    return log_likelihoods(points, density)
+
+
+FOLDED = (0.2 + 0.1 * np.random.default_rng(4).random(12))[:, None] ** 2
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_units_of_outputs_shift_the_log_likelihood(unit: float) -> None:
+    _, points = points_of(square, FOLDED, 1)
+    _, other = points_of(lambda z: unit * square(z), unit * FOLDED, 1)
+    assert np.array_equal(points.n_roots, other.n_roots)
+    assert np.allclose(of_folded(other), of_folded(points) - np.log(unit), atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_units_of_inputs_do_not_matter(unit: float) -> None:
+    _, points = points_of(square, FOLDED, 1)
+    _, other = points_of(lambda z: square(z / unit), FOLDED, 1, unit=unit)
+    assert np.allclose(of_folded(other, unit), of_folded(points), atol=1e-6)
+
+
+def test_the_order_of_specimens_does_not_matter() -> None:
+    _, points = points_of(square, FOLDED, 1)
+    _, other = points_of(square, FOLDED[::-1], 1)
+    assert np.allclose(of_folded(other)[::-1], of_folded(points), atol=5e-3)
+
+
+def test_the_order_of_inputs_and_outputs_does_not_matter() -> None:
+    problem = Linear(2, 3)
+    _, points = points_of(problem, problem.y, 2)
+    _, other = points_of(lambda z: problem(z[:, ::-1])[:, ::-1], problem.y[:, ::-1], 2)
+    mean, covariance = populations(2)[0]
+    first = log_likelihoods(points, normal(mean, covariance))
+    second = log_likelihoods(other, normal(mean[::-1], covariance[::-1, ::-1]))
+    assert np.allclose(first - first[0], second - second[0], atol=2e-2)
+
+
+def test_the_same_seed_gives_the_same_bits() -> None:
+    (_, first), (_, second), (_, third) = (points_of(square, FOLDED, 1, seed=s) for s in (0, 0, 1))
+    for name in ("z", "outputs", "log_a", "log_proposal"):
+        assert np.array_equal(getattr(first, name), getattr(second, name))
+        assert not np.array_equal(getattr(first, name), getattr(third, name))
+
+
+def test_numbers_and_proposal_densities_belong_together() -> None:
+    """log_a is the readings' density minus the proposal's where the error is not known."""
+    values = readings(FOLDED)
+    data = replace(values, error=np.full_like(values.error, 0.01))
+    emulation, roots = emulate(square, data, cube(1), cube(1, 1.5), PointOptions())
+    points = draw_points(
+        emulation, emulation.error, data, roots, cube(1, 1.5), PointOptions(), error_is_known=False
+    )
+    density = data.log_density(points.outputs, emulation.error)
+    exists = np.isfinite(points.log_a)
+    assert np.allclose((density - points.log_proposal)[exists], points.log_a[exists])
+
+
+# -- where there is no response ----------------------------------------------------------------------
+
+
+def test_a_response_of_a_part_of_the_box() -> None:
+    def positive(z: Floats) -> Floats:
+        return np.where(z > 0, z**2, np.nan)
+
+    x = np.random.default_rng(3).uniform(0.15, 0.6, 20)
+    _, points = points_of(positive, x[:, None] ** 2, 1)
+    assert set(points.n_roots) == {1}
+    exact = norm.logpdf(x, 0.3, 0.2) - np.log(2 * x)
+    assert np.allclose(log_likelihoods(points, normal(0.3, 0.04)), exact, atol=2e-2)
+
+
+def test_a_response_that_hardly_exists_is_refused() -> None:
+    with pytest.raises(DesignError, match="got 0 runs with a response of 64, expected at least 8"):
+        points_of(lambda z: np.full_like(z, np.nan), FOLDED, 1)
+
+
+def test_two_specimens_are_enough() -> None:
+    _, points = points_of(square, FOLDED[:2], 1)
+    assert np.isfinite(of_folded(points)).all()
