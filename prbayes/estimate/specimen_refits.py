@@ -49,6 +49,9 @@ def simulation_obstacle(evaluator: Evaluator) -> str | None:
     for likelihood in evaluator.likelihoods:
         if likelihood.readings.is_censored.any():
             return f"{likelihood.name} has censored readings, of which new ones cannot be drawn"
+        is_measured = likelihood.readings.is_measured
+        if (is_measured.sum(axis=1) < likelihood.coordinates.size).any():
+            return f"{likelihood.name} has specimens with fewer readings than inputs"
         if "error" in likelihood.extras:
             return f"{likelihood.name} has an unknown reading error"
     return None

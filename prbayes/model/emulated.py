@@ -168,11 +168,19 @@ class EmulatedSimulator:
     place: int | None = None
 
     is_emulated: ClassVar[Literal[True]] = True
-    # As of a Node: no response is weighted, and a population costs no run.
+    # As of a Node: no response is weighted.
     design: ClassVar[None] = None
-    has_specimens: ClassVar[bool] = True
-    runs_per_theta: ClassVar[int] = 0
     max_lost: ClassVar[float] = MAX_LOST
+
+    @property
+    def has_specimens(self) -> bool:
+        """Whether specimens of all populations are there without a run."""
+        return not self.likelihood.propagation.calls_response
+
+    @property
+    def runs_per_theta(self) -> int:
+        """Runs that a population costs; none by an emulator."""
+        return 0 if self.has_specimens else _SPECIMENS
 
     @property
     def name(self) -> str:
