@@ -122,8 +122,8 @@ def _population(optimum: Optimum) -> Checked:
         ([x.get_value() for x in points], log_a.get_value())
         for points, log_a in (each.arrays for each in evaluator.likelihoods)
     ]
-    own = _points(evaluator, scores, optimum.theta, observed)
-    null: list[list[Floats]] = [[] for _ in own]
+    samples = _points(evaluator, scores, optimum.theta, observed)
+    null: list[list[Floats]] = [[] for _ in samples]
     for refit in refits.simulated(_REPLICATES, seed=0):
         if not refit.converged:
             continue
@@ -134,8 +134,10 @@ def _population(optimum: Optimum) -> Checked:
         return _not_tested(f"{len(null[0])} of {_REPLICATES} refits converged")
     findings: list[Finding] = []
     notes = []
-    threshold = 0.05 / len(own)
-    for likelihood, (z, weights), statistics in zip(evaluator.likelihoods, own, null, strict=True):
+    threshold = 0.05 / len(samples)
+    for likelihood, (z, weights), statistics in zip(
+        evaluator.likelihoods, samples, null, strict=True
+    ):
         labels = _labels(likelihood.inputs, likelihood.responses.function)
         misfit = population_findings(
             population_test(z, weights, statistics), labels, threshold=threshold

@@ -88,10 +88,8 @@ class EmulatedResponse:
         DesignError
             If fewer than eight runs have a finite response.
         """
-        own = likelihood.inputs.aleatory
         runs = likelihood.coordinates.inputs(likelihood.emulation.z)
-        wanted = responses.inputs.aleatory
-        points = [runs[next(i for i, x in enumerate(own) if x is w)] for w in wanted]
+        points = values_of(runs, likelihood.inputs, responses.inputs)
         values = responses(points, [])
         coordinates = Coordinates.of_prior(responses.inputs)
         z = coordinates.of(points, 1)
@@ -103,7 +101,7 @@ class EmulatedResponse:
                 f"the runs of {likelihood.name}, expected at least 8; pass stored=False to "
                 "prb.predict, which computes responses at new specimens"
             )
-        near = _near_specimens(likelihood, points, coordinates, z)
+        near = _near_specimens(likelihood)
         distinct = np.unique(z[good], axis=0, return_index=True)[1]
         rows = np.flatnonzero(good)[distinct]
         surface = fit_interpolant(z[rows], y[rows], near[rows] if near[rows].any() else None)
@@ -127,16 +125,23 @@ class EmulatedResponse:
         return values.reshape(len(z), *self.event)
 
 
-def _near_specimens(
-    likelihood: SpecimenLikelihood, points: Sequence[Floats], coordinates: Coordinates, z: Floats
-) -> NDArray[np.bool_]:
+def values_of(values: Sequence[Floats], inputs: Inputs, wanted: Inputs) -> list[Floats]:
+    """Return the values of some inputs, from those of all inputs of a response."""
+    places = [
+        next(place for place, dist in enumerate(inputs.aleatory) if dist is x)
+        for x in wanted.aleatory
+    ]
+    return [values[place] for place in places]
+
+
+def _near_specimens(likelihood: SpecimenLikelihood) -> NDArray[np.bool_]:
     """Return which runs are within the range of the specimens' roots, (n,)."""
-    own = likelihood.points
-    roots = own.z[np.isfinite(own.log_a)]
+    specimens = likelihood.points
+    roots = specimens.z[np.isfinite(specimens.log_a)]
     low, high = np.quantile(roots, [0.01, 0.99], axis=0)
     run_z = likelihood.emulation.z
     near = ((run_z >= low) & (run_z <= high)).all(axis=1)
-    return near if near.sum() >= 16 else np.ones(len(z), dtype=bool)
+    return near if near.sum() >= 16 else np.ones(len(run_z), dtype=bool)
 
 
 def _nearest(runs: Floats, z: Floats) -> NDArray[np.intp]:
@@ -163,11 +168,19 @@ class EmulatedSimulator:
     place: int | None = None
 
     is_emulated: ClassVar[Literal[True]] = True
-    # As of a Node: no response is weighted, and a population costs no run.
+    # As of a Node: no response is weighted.
     design: ClassVar[None] = None
-    has_specimens: ClassVar[bool] = True
-    runs_per_theta: ClassVar[int] = 0
     max_lost: ClassVar[float] = MAX_LOST
+
+    @property
+    def has_specimens(self) -> bool:
+        """Whether specimens of all populations are there without a run."""
+        return not self.likelihood.propagation.calls_response
+
+    @property
+    def runs_per_theta(self) -> int:
+        """Runs that a population costs; none by an emulator."""
+        return 0 if self.has_specimens else _SPECIMENS
 
     @property
     def name(self) -> str:
@@ -200,8 +213,8 @@ class EmulatedSimulator:
     def weights(self) -> Floats:
         """Weights of the specimens, (N,), which sum to one."""
         weights = self.likelihood.weights
-        own = np.ones(len(self.rows)) if weights is None else weights[self.rows]
-        return np.asarray(own / own.sum())
+        factors = np.ones(len(self.rows)) if weights is None else weights[self.rows]
+        return np.asarray(factors / factors.sum())
 
     @property
     def specimens(self) -> NDArray[Any] | None:
@@ -343,8 +356,7 @@ class EmulatedSample:
 
     def points_of(self, inputs: Inputs) -> list[Floats]:
         """Return the specimens' values of some inputs."""
-        own = self.inputs.aleatory
-        return [self.points[next(i for i, x in enumerate(own) if x is w)] for w in inputs.aleatory]
+        return values_of(self.points, self.inputs, inputs)
 
     def populations(self, roots: Sequence[Floats]) -> tuple[None, Floats]:
         """Return nothing, and the weights of the specimens in populations at roots, (k, n)."""
