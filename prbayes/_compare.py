@@ -88,7 +88,8 @@ def compare(
         tell, and the discrepancy of the estimate's population under each metric, by the metric's
         class, with the simulator's name before it if there are several; NaN where stored responses
         do not support it. Of a simulator with the log-likelihood by specimen, populations are
-        emulated, and ``LogLikelihood by specimen`` is minus its mean over the specimens. A notebook shows it as a table.
+        emulated, and ``LogLikelihood by specimen`` is minus its mean over the specimens. A notebook
+        shows it as a table.
 
     Raises
     ------

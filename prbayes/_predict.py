@@ -77,9 +77,9 @@ def predict(
     own response then costs nothing, and any other one is computed once per design point, not once
     per draw, specimen or call. Where it has a simulator with the log-likelihood by specimen,
     specimens are new. Its own response is then that of its emulator, without a run; any other one
-    is computed at the points of the emulator's runs, and interpolated. Elsewhere specimens are new: Sobol points through the inverse
-    distribution functions, with another shift for each draw, or random draws where there is no
-    inverse.
+    is computed at the points of the emulator's runs, and interpolated. Elsewhere specimens are new:
+    Sobol points through the inverse distribution functions, with another shift for each draw, or
+    random draws where there is no inverse.
 
     Parameters
     ----------
@@ -98,8 +98,8 @@ def predict(
     draws : int
         Largest number of populations, over all chains; the posterior's draws are thinned evenly.
     stored : bool
-        Whether design points or an emulator may serve. With False the response is computed for draws x n_samples
-        specimens.
+        Whether design points or an emulator may serve. With False the response is computed for
+        draws x n_samples specimens.
     max_lost : float, optional
         Largest share of the predicted responses that may be NaN; by default what the model's
         simulators allow, the largest.
@@ -123,8 +123,8 @@ def predict(
         depend on `prbayes.response.group`, that dimension is before the samples. Attributes:
         ``source`` (how specimens were made), ``responses``
         (how many were computed), ``emulator_error`` (of an emulator, by output: the root mean
-        square error of runs that are left out), ``nan`` (how many values are NaN), ``caveats`` (what the response
-        says of itself, such as that its inadequacy extrapolates), ``specimens_id`` (equal for
+        square error of runs that are left out), ``nan`` (how many values are NaN), ``caveats``
+        (what the response says of itself, such as that its inadequacy extrapolates), ``specimens_id`` (equal for
         predictions with the same specimens), ``calibration_data`` and ``calibration_specimens``
         (digests of the data, and specimen labels, of the calibration, by which `area_test` knows
         them), ``identity`` (of the problem that was calibrated).

@@ -266,9 +266,7 @@ def _points(
 # -- draws -----------------------------------------------------------------------------------
 
 
-def check_draws(
-    evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats | None
-) -> Checked:
+def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats | None) -> Checked:
     """Return what the checks of draws report.
 
     Parameters
@@ -335,9 +333,10 @@ def influence(result: xr.DataTree) -> tuple[Finding, ...]:
         if values.ndim != 3 or values.shape[-1] < 2:  # of all specimens together
             continue
         limit = min(0.7, 1 - 1 / np.log10(max(values.sizes["chain"] * values.sizes["draw"], 11)))
-        log_weights = -values.stack(sample=("chain", "draw")).transpose(..., "sample")
+        by_sample = values.stack(sample=("chain", "draw")).transpose(..., "sample")
         with np.errstate(all="ignore"):
-            _, k = stats.base.array_stats.psislw(log_weights.values, axis=-1)
+            # Of the log-likelihood itself: ArviZ takes its negative for log weights.
+            _, k = stats.base.array_stats.psislw(by_sample.values, axis=-1)
         k = np.atleast_1d(k)
         high = np.flatnonzero(k > limit)
         if high.size:
@@ -396,8 +395,9 @@ def _conflict(evaluator: Evaluator, thetas: Floats) -> Checked:
     power = np.interp(np.log(n), np.log([10, 20, 50]), [0.86, 0.98, 1.0])
     return Checked(
         notes=(
-            f"{shift}; no hyperparameter is in conflict with its prior (p > .05). With {n} specimens "
-            f"the test has a power of {power:.2f} for a mean four prior standard deviations off.",
+            f"{shift}; no hyperparameter is in conflict with its prior (p > .05). With {n} "
+            f"specimens the test has a power of {power:.2f} for a mean four prior standard "
+            "deviations off.",
         )
     )
 

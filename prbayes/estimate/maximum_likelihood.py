@@ -19,10 +19,6 @@ from prbayes.estimate.optimum import Optimum, plain
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import identity_of
 
-# Sobol points of the prior that are screened as starts, and descents from the best of them. Half
-# or twice as many find the same optima on the problems of the scoreboard.
-_SCREENED, _DESCENTS = 1024, 8
-
 
 @dataclass(frozen=True, eq=False)
 class LocalOptimum:
@@ -44,7 +40,7 @@ class LocalOptimum:
     value: float
     covariance: Floats
     converged: bool
-    steps: slice
+    steps: slice = slice(0)
 
 
 def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
@@ -69,7 +65,8 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
     modes = _distinct(optima, evaluator.prior_sd)
     best = modes[0]
     point, stderr = _in_units(evaluator, best.theta, best.covariance)
-    findings = report(_findings(evaluator, modes))
+    findings = [f for likelihood in evaluator.likelihoods for f in likelihood.findings]
+    findings += report(_findings(evaluator, modes))
     weights = mode_weights(modes)
     rivals = tuple(
         {
@@ -148,17 +145,19 @@ class _Objective:
         }
 
 
-def _starts(evaluator: Evaluator, options: Any) -> tuple[list[Floats], int]:
+def _starts(
+    evaluator: Evaluator, options: Any, screened: int = 1024, descents: int = 8
+) -> tuple[list[Floats], int]:
     """Return the given start, or the most likely points of the prior, and the number screened."""
     if options.start is not None:
         return [evaluator.unconstrained(options.start)], 0
-    thetas = evaluator.prior_points(_SCREENED, options.random_seed)
+    thetas = evaluator.prior_points(screened, options.random_seed)
     values = evaluator.total(thetas, np.empty(0))
     order = np.argsort(values, kind="stable")
-    count = _DESCENTS if options.starts is None else max(1, options.starts)
+    count = descents if options.starts is None else max(1, options.starts)
     order = order[np.isfinite(values[order])]
     if not order.size:
-        return [evaluator.initial], _SCREENED
+        return [evaluator.initial], screened
     # The best one, and of the better quarter those farthest from all chosen before.
     candidates = thetas[order[: max(count, order.size // 4)]] / evaluator.prior_sd
     chosen = [0]
@@ -166,7 +165,7 @@ def _starts(evaluator: Evaluator, options: Any) -> tuple[list[Floats], int]:
     while len(chosen) < min(count, len(candidates)):
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, ((candidates - candidates[chosen[-1]]) ** 2).sum(axis=1))
-    return list(candidates[chosen] * evaluator.prior_sd), _SCREENED
+    return list(candidates[chosen] * evaluator.prior_sd), screened
 
 
 def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum:

@@ -35,7 +35,9 @@ def specimen_refit_obstacle(evaluator: Evaluator) -> str | None:
     """Return why a model of log-likelihoods by specimen cannot be fitted to other data, or None."""
     others = len(evaluator.model.observed_RVs) > len(evaluator.likelihoods)
     if evaluator.nodes or others or evaluator.model.potentials:
-        return "the model has likelihood terms or potentials besides its log-likelihoods by specimen"
+        return (
+            "the model has likelihood terms or potentials besides its log-likelihoods by specimen"
+        )
     return None
 
 

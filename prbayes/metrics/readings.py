@@ -110,7 +110,7 @@ class Readings:
         terms = xp.where(self.is_measured[:, None], normal, 0.0)
         if (self.step > 0).any():
             step = np.where(self.step > 0, self.step, 1.0)[:, None]
-            inside = _log_probability(away - step / (2 * sd), away + step / (2 * sd), xp)
+            inside = log_interval_probability(away - step / (2 * sd), away + step / (2 * sd), xp)
             is_rounded = ((self.step > 0) & self.is_measured)[:, None]
             terms = xp.where(is_rounded, inside - np.log(step), terms)
         if self.is_censored.any():
@@ -118,12 +118,12 @@ class Readings:
             far = 1e30
             lower = np.where(self.is_censored, np.maximum(self.lower, -far), 0.0)[:, None]
             upper = np.where(self.is_censored, np.minimum(self.upper, far), 1.0)[:, None]
-            inside = _log_probability((lower - outputs) / sd, (upper - outputs) / sd, xp)
+            inside = log_interval_probability((lower - outputs) / sd, (upper - outputs) / sd, xp)
             terms = xp.where(self.is_censored[:, None], inside, terms)
         return terms.sum(axis=-1)
 
 
-def _log_probability(low: Any, high: Any, xp: Any) -> Any:
+def log_interval_probability(low: Any, high: Any, xp: Any = np) -> Any:
     """Return log(Phi(high) - Phi(low)) of a standard normal variable, in the tails too."""
     # In the upper tail both ends are mirrored, so that no digits are lost.
     is_upper = low > 0

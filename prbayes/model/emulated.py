@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from prbayes._checks import AT_ONCE, Floats
-from prbayes.emulators.interpolant import Interpolant, fit_interpolant
+from prbayes.emulators.interpolant import fit_interpolant
 from prbayes.metrics.base import Metric
 from prbayes.model.node import Node, nodes
 from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.new_specimens import new_specimens
+from prbayes.propagation.specimen_points import Surface
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs
@@ -50,7 +51,7 @@ class EmulatedResponse:
         Coordinates of the runs.
     y : ndarray, shape (n, m)
         Their outputs; +inf is a specimen that failed, NaN a run without response.
-    surface : Interpolant
+    surface : Surface
         Through the finite runs.
     event : tuple
         Shape of a specimen's outputs, () or (m,).
@@ -61,7 +62,7 @@ class EmulatedResponse:
     coordinates: Coordinates
     z: Floats
     y: Floats
-    surface: Interpolant
+    surface: Surface
     event: tuple[int, ...]
     error: Floats
 

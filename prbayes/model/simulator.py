@@ -172,7 +172,7 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
     places, measured = _grouped(name, sorted_inputs, observed)
     values, outputs = read_observed(name, _data(name, measured))
     metric = LogLikelihood() if metric is None else metric
-    if isinstance(metric, LogLikelihood) and metric.by_specimen:
+    if isinstance(metric, Metric) and metric.by_specimen:
         return _by_specimen(
             name, model, response, sorted_inputs, metric, values, outputs, observed, places,
             epsilon=epsilon, weights=weights, specimens=specimens, dims=dims,
@@ -212,7 +212,7 @@ def _by_specimen(
     model: pm.Model,
     response: Callable[..., Any],
     inputs: Inputs,
-    metric: LogLikelihood,
+    metric: Any,
     values: Floats,
     outputs: Outputs,
     observed: Any,
@@ -228,7 +228,9 @@ def _by_specimen(
     _refuse_by_specimen(name, inputs, epsilon, propagation)
     values = checked_specimens(name, values)
     settings = _propagation(name, propagation)
-    labels = None if specimens is None else sample_labels(specimens, len(values), f"{name}: specimens")
+    labels = (
+        None if specimens is None else sample_labels(specimens, len(values), f"{name}: specimens")
+    )
     factors = None
     if weights is not None:
         factors = sample_weights(weights, len(values), f"{name}: weights") * len(values)

@@ -33,6 +33,7 @@ from pytensor.tensor.variable import TensorVariable
 from prbayes._checks import Floats
 from prbayes._finding import Finding, report
 from prbayes.metrics.likelihood import LogLikelihood
+from prbayes.metrics.readings import Readings
 from prbayes.model.data_checks import data_findings
 from prbayes.model.node import (
     builds_priors_alone,
@@ -43,7 +44,6 @@ from prbayes.model.node import (
 from prbayes.model.population_draws import Populations, specimens_of
 from prbayes.propagation.base import Propagation
 from prbayes.propagation.coordinates import Coordinates
-from prbayes.metrics.readings import Readings
 from prbayes.propagation.fibre_points import fibre_points
 from prbayes.propagation.roots import Roots
 from prbayes.propagation.specimen_points import (
@@ -101,7 +101,16 @@ class SpecimenLikelihood:
     extras: Mapping[str, TensorVariable] = field(default_factory=dict)
     model: Any = None  # weak reference to the pymc.Model
     known: SpecimenLikelihood | None = None  # of the same runs, for other data
-    options: PointOptions = PointOptions()
+    options: PointOptions = field(default_factory=PointOptions)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Replace the weak reference, which has no pickle, by the model."""
+        return {**vars(self), "model": None if self.model is None else self.model()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore the weak reference."""
+        model = state["model"]
+        vars(self).update({**state, "model": None if model is None else weakref.ref(model)})
 
     @property
     def variables(self) -> tuple[TensorVariable, ...]:
@@ -129,7 +138,12 @@ class SpecimenLikelihood:
         """The emulator, the points and what is to be reported of them."""
         name, n = self.name, self.propagation.emulator_runs
         bounds, d = self.coordinates.bounds, self.coordinates.size
-        if (self.readings.is_measured.sum(axis=1) < d).any() and self._is_partial:
+        if self._is_partial:
+            if self.propagation.calls_response:
+                raise TypeError(
+                    f"{name}: propagation: got prb.Resimulated, expected stored responses where "
+                    "specimens have fewer readings than inputs; leave propagation= out"
+                )
             populations = Populations(self.model, self.inputs, self.coordinates, self.groups)
             prior = specimens_of(populations, populations.hyperparameters.prior_thetas(2048, 0), 1)
             emulation, points = fibre_points(
@@ -139,6 +153,8 @@ class SpecimenLikelihood:
             return emulation, points, report(self._data_findings(several_roots=True))
         box = np.stack([-np.ones(d), np.ones(d)])
         known = None if self.known is None else self.known.emulation
+        if self.propagation.calls_response:
+            known = Emulation.of_function(self.run, box, bounds, self.readings, self.options)
         emulation, roots = emulate(
             self.run, self.readings, box, bounds, self.options, n=n, known=known, name=name
         )
@@ -167,7 +183,8 @@ class SpecimenLikelihood:
         """Return findings of rounded, censored and repeated readings that are taken as exact."""
         steps = self.readings.step.max(axis=0)
         # A reading error that the user gives covers rounding.
-        steps = np.where((steps > 0) | (self.metric.error is not None), np.maximum(steps, 1e-300), np.nan)
+        is_stated = (steps > 0) | (self.metric.error is not None)
+        steps = np.where(is_stated, np.maximum(steps, 1e-300), np.nan)
         names = self.outputs.names
         return data_findings(
             self.readings.values,
@@ -197,9 +214,8 @@ class SpecimenLikelihood:
         points = self.points
         # The proposal is a density of z: p(x) dx = p(x(z)) |dx/dz| dz.
         is_known = "error" not in self.extras
-        log_a = (points.log_a if is_known else -points.log_proposal) + self.coordinates.log_jacobian(
-            points.z
-        )
+        log_a = points.log_a if is_known else -points.log_proposal
+        log_a = log_a + self.coordinates.log_jacobian(points.z)
         shared = [
             pytensor.shared(np.ascontiguousarray(x), name=f"{self.name}_points_{i}")
             for i, x in enumerate(self.coordinates.inputs(points.z))
@@ -243,9 +259,11 @@ class SpecimenLikelihood:
     def _readings_log_density(self, error: Any) -> Any:
         """Return the log-density of the readings at the points, (N, K), for an unknown error."""
         outputs = self.points.outputs
-        sd = error * np.abs(np.nan_to_num(self.readings.values))[:, None] if (
-            self.metric.relative
-        ) else error
+        sd = (
+            error * np.abs(np.nan_to_num(self.readings.values))[:, None]
+            if (self.metric.relative)
+            else error
+        )
         variance = self.emulation.error**2 + sd**2
         # Points that fill up the array have any output.
         outputs = np.where(np.isfinite(outputs), outputs, 1e30)
@@ -308,9 +326,7 @@ class SpecimenLikelihood:
             values = np.where(is_gross[..., None], anywhere, values)
         return np.asarray(values)
 
-    def _of_groups(
-        self, rng: np.random.Generator, roots: Sequence[Floats], n: int
-    ) -> list[Floats]:
+    def _of_groups(self, rng: np.random.Generator, roots: Sequence[Floats], n: int) -> list[Floats]:
         """Return specimens of each population, each of the group of an observed one."""
         assert self.groups is not None
         groups = np.resize(self.groups, n)
@@ -394,8 +410,8 @@ def misfit_findings(
         Finding(
             "readings-misfit",
             f"{name}: no inputs in the range of the priors reproduce the readings of "
-            f"{poor.size} of {int(has_root.sum())} specimens, which are off by {outputs} (root mean "
-            "square, by output), expected less than the error of the readings; pass "
+            f"{poor.size} of {int(has_root.sum())} specimens, which are off by {outputs} (root "
+            "mean square, by output), expected less than the error of the readings; pass "
             "prb.LogLikelihood(error=...) with its standard deviation, or gross_errors=True for "
             "single specimens, or look at the response and the priors",
             "likelihood.md#readings-that-no-inputs-reproduce",
@@ -424,7 +440,7 @@ def logsumexp_finite(terms: Any) -> TensorVariable:
     return pt.switch(is_empty, -np.inf, log_total)
 
 
-class SpecimenRV(RandomVariable):
+class SpecimenRV(RandomVariable):  # type: ignore[misc]
     """The operation of the observed variable: draws data sets, and carries the likelihood.
 
     PyTensor's rewriters keep every operation that they have met. The likelihood with its arrays is
@@ -514,7 +530,7 @@ class SpecimenRV(RandomVariable):
         return [pt.constant(n, dtype="int64") for n in self.likelihood.event]
 
 
-class SpecimenDistribution(pm.Distribution):
+class SpecimenDistribution(pm.Distribution):  # type: ignore[misc]
     """The distribution that PyMC makes the observed variable from."""
 
     rv_type = SpecimenRV

@@ -86,9 +86,7 @@ def bootstrap(
     (1, 50)
     """
     if is_specimen_optimum(optimum):
-        return _by_specimen(
-            optimum, draws, parametric=parametric, seed=seed_number(random_seed)
-        )
+        return _by_specimen(optimum, draws, parametric=parametric, seed=seed_number(random_seed))
     clock = time.perf_counter()
     evaluator = require_refits(optimum, "bootstrap", "; use prb.sample_smc").evaluator
     positive_integer(draws, "draws", minimum=2)

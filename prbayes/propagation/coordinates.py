@@ -12,11 +12,6 @@ from prbayes._checks import Floats
 from prbayes.response.distributions import PopulationSampler, prior_draws
 from prbayes.response.inputs import Inputs
 
-# Specimens of the prior predictive population that determine the box.
-_SPECIMENS = 4096
-# Ratio of the ends of a positive input's prior range from which on it is emulated as a logarithm.
-_DECADE = 10.0
-
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
@@ -41,14 +36,14 @@ class Coordinates:
     bounds: Floats
 
     @classmethod
-    def of_prior(cls, inputs: Inputs, seed: int = 0) -> Coordinates:
-        """Return the coordinates for the prior predictive population of the inputs."""
-        roots = prior_draws(inputs.roots, _SPECIMENS, seed)
+    def of_prior(cls, inputs: Inputs, specimens: int = 4096, seed: int = 0) -> Coordinates:
+        """Return the coordinates for specimens of the prior predictive population."""
+        roots = prior_draws(inputs.roots, specimens, seed)
         drawn, _ = PopulationSampler(inputs)(roots, 1, np.random.default_rng([seed, 11]))
-        flat = np.concatenate([x.reshape(_SPECIMENS, -1) for x in drawn], axis=1)
+        flat = np.concatenate([x.reshape(specimens, -1) for x in drawn], axis=1)
         flat = flat[np.isfinite(flat).all(axis=1)]
         low, high = np.quantile(flat, [0.005, 0.995], axis=0)
-        is_log = (flat > 0).all(axis=0) & (high > _DECADE * low)
+        is_log = (flat > 0).all(axis=0) & (high > 10 * low)
         flat = np.where(is_log, np.log(np.where(is_log, flat, 1.0)), flat)
         low, high = np.quantile(flat, [0.005, 0.995], axis=0)
         half_width = np.where(high > low, (high - low) / 2, 1.0)

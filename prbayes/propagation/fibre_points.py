@@ -20,6 +20,7 @@ from prbayes.propagation.base import DesignError
 from prbayes.propagation.fibre import ReferencePopulation, fit_fibres, with_error
 from prbayes.propagation.guards import half_difference
 from prbayes.propagation.points import sobol
+from prbayes.propagation.roots import Response
 from prbayes.propagation.specimen_points import (
     Emulation,
     PointOptions,
@@ -27,7 +28,6 @@ from prbayes.propagation.specimen_points import (
     extended,
     first_runs,
     spread_out,
-    surface_near,
     typical_sd,
 )
 
@@ -92,9 +92,7 @@ def fibre_points(
     d = bounds.shape[1]
     n = first_runs(d) if n is None else n
     spread = readings.spread()
-    emulation = Emulation.first(
-        run, 2 * sobol(n, d, seed) - 1, bounds, readings, options, name
-    )
+    emulation = Emulation.first(run, 2 * sobol(n, d, seed) - 1, bounds, readings, options, name)
     population = ReferencePopulation.from_sample(prior_specimens)
     rng = np.random.default_rng([seed, 1])
     for attempt in range(6):
@@ -208,7 +206,7 @@ def _draw(
     return _Points(z, outputs, np.where(np.isnan(log_a), -np.inf, log_a), log_proposal)
 
 
-def _columns(emulation: Emulation, columns: NDArray[np.intp]) -> Callable[[Floats], tuple[Floats, Floats]]:
+def _columns(emulation: Emulation, columns: NDArray[np.intp]) -> Response:
     """Return the response of some outputs."""
 
     def response(z: Floats) -> tuple[Floats, Floats]:
@@ -250,7 +248,7 @@ def _fresh(
 ) -> Floats:
     """Return points for new runs: a sample of the specimens' inputs, and the rest spread out."""
     specimens = draws.specimens()
-    n, each, d = points.z.shape
+    _, each, d = points.z.shape
     # Weights of the points under the normal population of the draws.
     mean, covariance = specimens.mean(axis=0), np.cov(specimens.T).reshape(d, d)
     away = points.z - mean

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +77,40 @@ def first_runs(dimensions: int) -> int:
     return 64 if dimensions <= 2 else 128 if dimensions <= 4 else 512
 
 
+class Surface(Protocol):
+    """Outputs at coordinates between runs, with their Jacobian."""
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian, (k, d) -> (k, m), (k, m, d)."""
+
+    def values(self, z: Floats) -> Floats:
+        """Return the values alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class DifferencedResponse:
+    """The response itself, with central differences for its Jacobian: 2 d + 1 runs a point.
+
+    Attributes
+    ----------
+    values : callable
+        Coordinates (k, d) -> outputs (k, m).
+    step : float
+        In units of the coordinates.
+    """
+
+    values: Callable[[Floats], Floats]
+    step: float = 1e-5
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian."""
+        k, d = z.shape
+        shifts = self.step * np.concatenate([np.zeros((1, d)), np.eye(d), -np.eye(d)])
+        values = self.values((z + shifts[:, None]).reshape(-1, d)).reshape(2 * d + 1, k, -1)
+        slopes = (values[1 : d + 1] - values[d + 1 :]) / (2 * self.step)
+        return values[0], np.moveaxis(slopes, 0, -1)
+
+
 @dataclass(frozen=True, eq=False)
 class Emulation:
     """Runs of the response, and the emulator through them.
@@ -103,7 +137,7 @@ class Emulation:
     z: Floats
     y: Floats
     box: Floats
-    surface: Response
+    surface: Surface
     error: Floats
     bias: float
     range: Floats
@@ -126,9 +160,25 @@ class Emulation:
         empty = np.stack([np.full(z.shape[1], np.inf), np.full(z.shape[1], -np.inf)])
         return cls(z, y, box, surface, error, np.inf, empty)
 
+    @classmethod
+    def of_function(
+        cls,
+        run: Callable[[Floats], Floats],
+        box: Floats,
+        search_box: Floats,
+        readings: Readings,
+        options: PointOptions,
+    ) -> Emulation:
+        """Return the response itself in place of an emulator, with runs as starts of a search."""
+        z = box[0] + (box[1] - box[0]) * sobol(first_runs(box.shape[1]), box.shape[1], 0)
+        error = options.floor * readings.spread()
+        whole = np.stack([np.full(box.shape[1], -np.inf), np.full(box.shape[1], np.inf)])
+        return cls(z, run(z), search_box, DifferencedResponse(run), error, 0.0, whole)
+
     def covers(self, z: Floats) -> bool:
         """Return whether points lie in the range of the roots at which runs were made."""
-        margin = 0.1 * np.maximum(self.range[1] - self.range[0], 0.0)
+        with np.errstate(invalid="ignore"):
+            margin = np.nan_to_num(0.1 * np.maximum(self.range[1] - self.range[0], 0.0))
         return bool(((z >= self.range[0] - margin) & (z <= self.range[1] + margin)).all())
 
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
@@ -138,6 +188,12 @@ class Emulation:
         if failed.any():
             values[failed], jacobian[failed] = np.nan, np.nan
         return values, jacobian
+
+    def values(self, z: Floats) -> Floats:
+        """Return the values alone."""
+        values = self.surface.values(z)
+        values[self.fails(z)] = np.nan
+        return values
 
     def fails(self, z: Floats) -> NDArray[np.bool_]:
         """Return where the nearest run has no response."""
@@ -198,21 +254,30 @@ def emulate(
     for batch in range(6):
         roots = specimen_roots(emulation, readings, options)
         enough = batch >= 2 if known is None else emulation.covers(roots.z)
-        if enough and emulation.bias <= options.bias:
+        # Twice at most: a reading that no inputs reproduce is reported.
+        wider = _widened(emulation.box, roots) if batch < 2 else emulation.box
+        if enough and emulation.bias <= options.bias and np.array_equal(wider, emulation.box):
             break
+        emulation = replace(emulation, box=wider)
         count = max(n // 2, options.fresh)
-        fresh = spread_out(roots.z, search_box, count, options.fresh, rng)
+        fresh = spread_out(roots.z, wider, count, options.fresh, rng)
         emulation = extended(emulation, run, fresh, readings, options, spread, name)
     else:
         roots = specimen_roots(emulation, readings, options)
     options, roots = _all_roots(emulation, readings, options, roots, seed)
+    if (emulation.error > spread).any():
+        raise DesignError(
+            f"{name}: got an emulator with errors of {emulation.error} at the specimens, expected "
+            f"less than the data's standard deviations {spread}; look at the response and the "
+            "priors, or use metric=prb.ProbabilityResidual()"
+        )
     if emulation.bias > options.bias:
         raise DesignError(
             f"{name}: got an emulator whose error would shift a mean or standard deviation of an "
-            f"input by {emulation.bias:.2g} posterior standard deviations after {len(emulation.z)} runs, "
-            f"expected at most {options.bias}; the response is not smooth enough for "
-            "prb.LogLikelihood(): use metric=prb.ProbabilityResidual(), or more first runs with "
-            "propagation=prb.Reweighted(n)"
+            f"input by {emulation.bias:.2g} posterior standard deviations after "
+            f"{len(emulation.z)} runs, expected at most {options.bias}; the response is not smooth "
+            "enough for prb.LogLikelihood(): use metric=prb.ProbabilityResidual(), or more first "
+            "runs with propagation=prb.Reweighted(n)"
         )
     return emulation, roots
 
@@ -275,6 +340,16 @@ def surface_near(
     return surface, np.sqrt((surface.left_out[inside] ** 2).mean(axis=0))
 
 
+def _widened(box: Floats, roots: Roots, misfit: float = 50.0) -> Floats:
+    """Return the box with more room where the search for a root ends at its side with a misfit."""
+    poor = roots.z[roots.misfit > misfit]
+    if not len(poor):
+        return box
+    width = box[1] - box[0]
+    ends = np.stack([poor <= box[0] + 1e-6 * width, poor >= box[1] - 1e-6 * width])
+    return np.asarray(box + 0.25 * width * np.array([[-1.0], [1.0]]) * ends.any(axis=1))
+
+
 def _all_roots(
     emulation: Emulation, readings: Readings, options: PointOptions, roots: Roots, seed: int
 ) -> tuple[PointOptions, Roots]:
@@ -318,7 +393,9 @@ def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptio
     block = max(1, AT_ONCE // (options.starts * len(run_z) * 4))
     for first in range(0, len(solvable), block):
         rows = solvable[first : first + block]
-        starts = _starts(run_z, run_y, target[rows], measured[rows], readings.spread(), options.starts)
+        starts = _starts(
+            run_z, run_y, target[rows], measured[rows], readings.spread(), options.starts
+        )
         roots = find_roots(
             emulation, target[rows], np.where(measured[rows], sd[rows], 1e150), starts,
             emulation.box, gap=options.gap,
@@ -370,10 +447,10 @@ def spread_out(
         best = int(np.argmax(distance))
         picked.append(candidates[best])
         distance = np.minimum(distance, ((candidates - candidates[best]) ** 2).sum(axis=1))
-    return np.array(picked) * scale
+    return np.asarray(np.array(picked) * scale)
 
 
-# -- points ------------------------------------------------------------------------------------------
+# -- points ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -459,6 +536,7 @@ def draw_points(
     components = _fit_components(emulation, error, readings, roots, box, options, seed)
     count = options.points if error_is_known else 4 * options.points
     scales = (1.0,) if error_is_known else (0.5, 1.0, 1.3)
+    populations: list[tuple[Floats, Floats]] = []
     while True:
         halves = [
             _draw(emulation, error, readings, components, max(1, count // 2), options, (seed, h))
@@ -467,8 +545,9 @@ def draw_points(
         if error_is_known:
             halves = [_normalised(half, components) for half in halves]
         points = _joined(halves)
+        populations = populations or normal_populations(points.z, points.log_a, 32, seed)
         difference = max(
-            _difference(halves if k == 1.0 else _of_error(halves, readings, error, k), seed)
+            _difference(halves if k == 1.0 else _of_error(halves, readings, error, k), populations)
             for k in scales
         )
         largest = components.table.shape[1] * count
@@ -653,7 +732,7 @@ def _in_blocks(emulation: Response, z: Floats) -> Floats:
 
 
 def _scrambled(components: int, count: int, dimensions: int, seed: tuple[int, int]) -> Floats:
-    """Return Sobol points with a random shift for each component, (components, count, dimensions)."""
+    """Return Sobol points with a random shift for each component, (components, count, d)."""
     base = sobol(count, dimensions, seed[0] * 1009 + seed[1])
     shift = np.random.default_rng(seed).random((components, 1, dimensions))
     return np.clip((base + shift) % 1.0, 1e-9, 1 - 1e-9)
@@ -663,7 +742,7 @@ def _t_radius(u: Floats, degrees: float) -> Floats:
     """Return the factors that turn normal vectors into vectors of a t distribution."""
     from scipy.special import chdtri
 
-    return np.sqrt(degrees / chdtri(degrees, u))
+    return np.asarray(np.sqrt(degrees / chdtri(degrees, u)))
 
 
 def _by_component(values: Floats, components: _Components) -> Floats:
@@ -694,8 +773,8 @@ def _normalised(sample: _Sample, components: _Components) -> _Sample:
     total = logsumexp(log_a, axis=2)
     mass = np.where(table >= 0, components.log_mass[np.maximum(table, 0)], -np.inf)
     shift = np.where(np.isfinite(total), mass - np.where(np.isfinite(total), total, 0.0), 0.0)
-    log_a = (log_a + shift[..., None]).reshape(n, -1)
-    return _Sample(sample.z, sample.outputs, log_a, sample.log_proposal, sample.n_roots)
+    scaled = (log_a + shift[..., None]).reshape(n, -1)
+    return replace(sample, log_a=scaled)
 
 
 def _joined(halves: list[_Sample]) -> _Sample:
@@ -710,10 +789,8 @@ def _joined(halves: list[_Sample]) -> _Sample:
     )
 
 
-def _difference(halves: list[_Sample], seed: int, draws: int = 32) -> float:
-    """Return the half difference of log L over normal populations of bootstrapped specimens."""
-    joint = _joined(halves)
-    populations = normal_populations(joint.z, joint.log_a, draws, seed)
+def _difference(halves: list[_Sample], populations: list[tuple[Floats, Floats]]) -> float:
+    """Return the half difference of log L over normal populations."""
     values = [
         np.stack(
             [
@@ -738,24 +815,28 @@ def normal_populations(
     """
     rng = np.random.default_rng([seed, 7])
     n, _, d = z.shape
-    flat = z.reshape(-1, d)
-    prior = 1e-12 * np.diag(np.maximum(flat.var(axis=0), 1e-300))
-    weights = np.exp(log_a - logsumexp(log_a, axis=1, keepdims=True))
-    result = []
-    start_mean = np.einsum("nk,nkd->d", weights, z) / n
-    away = z - start_mean
-    start_covariance = np.einsum("nk,nkd,nke->de", weights, away, away) / n + prior
-    for _ in range(draws):
-        share = rng.dirichlet(np.ones(n)) if bootstrap else np.full(n, 1 / n)
-        mean, covariance = start_mean, start_covariance
+    prior = 1e-12 * np.diag(np.maximum(z.reshape(-1, d).var(axis=0), 1e-300))
+
+    def moments(weights: Floats) -> tuple[Floats, Floats]:
+        mean = np.einsum("nk,nkd->d", weights, z)
+        away = z - mean
+        return mean, np.einsum("nk,nkd,nke->de", weights, away, away) + prior
+
+    def fit(start: tuple[Floats, Floats], share: Floats, steps: int) -> tuple[Floats, Floats]:
+        mean, covariance = start
         for _ in range(steps):
             log_w = normal_log_density(z, mean, np.linalg.cholesky(covariance)) + log_a
             w = np.exp(log_w - logsumexp(log_w, axis=1, keepdims=True)) * share[:, None]
-            mean = np.einsum("nk,nkd->d", w, z)
-            away = z - mean
-            covariance = np.einsum("nk,nkd,nke->de", w, away, away) + prior
-        result.append((mean, np.linalg.cholesky(covariance)))
-    return result
+            mean, covariance = moments(w)
+        return mean, covariance
+
+    equal = np.full(n, 1 / n)
+    weights = np.exp(log_a - logsumexp(log_a, axis=1, keepdims=True)) / n
+    whole = fit(moments(weights), equal, steps)
+    shares = [rng.dirichlet(np.ones(n)) for _ in range(draws)] if bootstrap else [equal]
+    # A bootstrap sample has its fit near that of all specimens.
+    fits = [fit(whole, share, 5) if bootstrap else whole for share in shares]
+    return [(mean, np.linalg.cholesky(covariance)) for mean, covariance in fits]
 
 
 def normal_log_density(z: Floats, mean: Floats, root: Floats) -> Floats:

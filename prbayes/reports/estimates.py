@@ -43,7 +43,8 @@ def optima(m: Material) -> list[Section]:
         text.append(
             "Standard errors are those of the curvature of the log-likelihood."
             if m.is_by_specimen
-            else "Standard errors are those of the estimator over repeated sets of as many specimens."
+            else "Standard errors are those of the estimator over repeated sets of as many "
+            "specimens."
         )
         title = _titled("Optimum", label, m.optima)
         sections.append(Section(title, text, rows_table(_optimum_rows(tree))))

@@ -105,14 +105,12 @@ def test_the_mode_with_the_prior() -> None:
     assert fit(model).point["mu"] == pytest.approx(X.mean(), abs=1e-4)
 
 
-@pytest.mark.long
-@pytest.mark.xfail(strict=True, reason="roots are searched within the range of the prior alone")
 def test_a_specimen_beyond_all_draws_of_the_prior() -> None:
     sd, prior_sd = 0.5, 0.1
     precision = N / sd**2 + 1 / prior_sd**2
     optimum = fit(normal_model(sigma=sd, prior_sd=prior_sd), prior=True)
     exact = X.sum() / sd**2 / precision
-    assert optimum.warnings or optimum.point["mu"] == pytest.approx(exact, abs=1e-3)
+    assert optimum.point["mu"] == pytest.approx(exact, abs=1e-3)
 
 
 # -- several modes -----------------------------------------------------------------------------------
@@ -204,7 +202,8 @@ def test_the_number_of_evaluations_is_limited(most: int) -> None:
     optimum = fit(normal_model(), max_evaluations=most)
     # A descent has ten evaluations at least, and the Hessian up to twelve of them.
     assert optimum.n_evaluations <= most + 40
-    assert len(optimum.trace["theta"]) == optimum.n_evaluations
+    # The trace is that of the best descent.
+    assert len(optimum.trace["theta"]) <= optimum.n_evaluations
 
 
 @pytest.mark.long

@@ -196,12 +196,3 @@ def test_the_spread_is_that_of_measured_values_and_never_zero() -> None:
     y = readings([[1.0, 5.0, NAN], [3.0, 5.0, NAN], [NAN, 5.0, NAN]])
     assert y.spread().tolist() == [1.0, 1.0, 1.0]
     assert readings([[1.0], [5.0]]).spread().tolist() == [2.0]
-
-
-def test_several_batch_axes_are_points() -> None:
-    y = readings([[1.0], [2.0]])
-    points = np.random.default_rng(0).normal(size=(2, 3, 4, 1))
-    density = y.log_density(points, np.array([0.5]))
-    assert density.shape == (2, 3, 4)
-    flat = y.log_density(points.reshape(2, 12, 1), np.array([0.5]))
-    assert np.array_equal(density.reshape(2, 12), flat)

@@ -8,7 +8,6 @@ from scipy.special import logsumexp, ndtr, ndtri
 from scipy.stats import norm
 
 from prbayes._checks import Floats
-from prbayes.numerics.min_p import adjusted_p_values
 from prbayes.inference.checks.population_test import (
     PopulationTest,
     mixture_ratio,
@@ -19,6 +18,7 @@ from prbayes.inference.checks.population_test import (
     power_text,
     zhang_statistic,
 )
+from prbayes.numerics.min_p import adjusted_p_values
 
 # The alternatives of the study: standardised inputs.
 

@@ -1,0 +1,552 @@
+"""Results of models with the log-likelihood by specimen, in everything after the posterior."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import arviz as az
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+from scipy.stats import norm
+
+import prbayes as prb
+from prbayes._specimen_checks import influence, separate_modes
+from prbayes.estimate.specimen_refits import other_specimens, specimen_pool, specimen_refits
+
+N = 20
+
+
+class Growth:
+    """A response that counts its runs."""
+
+    def __init__(self, rate: float) -> None:
+        self.rate = rate
+        self.runs = 0
+
+    def __call__(self, x: Any) -> Any:
+        self.runs += np.size(x)
+        return np.exp(self.rate * x)
+
+
+@dataclass
+class Problem:
+    """A model, its response and input, and data of another condition."""
+
+    model: pm.Model
+    growth: Growth
+    x: Any
+    observed: np.ndarray
+    later: np.ndarray
+
+
+def build(observed: np.ndarray) -> Problem:
+    growth = Growth(0.5)
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 1.0, 1.0)
+        sigma = pm.HalfNormal("sigma", 1.0)
+        x = pm.Normal.dist(mu, sigma)
+        prb.Simulator("y", growth, x, observed=observed)
+    later = np.exp(0.7 * np.random.default_rng(8).normal(1.0, 0.4, 15))
+    return Problem(model, growth, x, observed, later)
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    return build(np.exp(0.5 * np.random.default_rng(7).normal(1.0, 0.4, N)))
+
+
+@pytest.fixture(scope="module")
+def optimum(problem: Problem) -> prb.Optimum:
+    return prb.minimize(problem.model)
+
+
+@pytest.fixture(scope="module")
+def posterior(problem: Problem, optimum: prb.Optimum) -> xr.DataTree:
+    return prb.sample_smc(
+        model=problem.model, optimum=optimum, draws=200, chains=2, random_seed=1, progressbar=False
+    )
+
+
+@pytest.fixture(scope="module")
+def chains(problem: Problem, posterior: xr.DataTree) -> xr.DataTree:
+    """Draws without anything that prbayes adds, as of pm.sample, from a file perhaps."""
+    return xr.DataTree.from_dict(
+        {name: posterior[name].to_dataset() for name in ("posterior", "observed_data")}
+    ).map_over_datasets(lambda group: group.drop_attrs(deep=False))
+
+
+@pytest.fixture
+def results(
+    optimum: prb.Optimum, posterior: xr.DataTree, chains: xr.DataTree
+) -> dict[str, prb.Optimum | xr.DataTree]:
+    return {"optimum": optimum, "posterior": posterior, "chains": chains}
+
+
+@pytest.fixture
+def no_run(problem: Problem, optimum: prb.Optimum) -> Any:
+    """The test makes no run of the model's response."""
+    before = problem.growth.runs
+    yield
+    assert problem.growth.runs == before
+
+
+# -- comparison, predictions, validity -------------------------------------------------------
+
+
+@pytest.mark.usefixtures("no_run")
+def test_compare_scores_by_likelihood_and_metrics(problem: Problem, results: Any) -> None:
+    table = prb.compare(results, model=problem.model)
+    assert table.result.values.tolist() == ["optimum", "posterior", "chains"]
+    own = table["LogLikelihood by specimen"]
+    assert own.values.argmin() == 0  # of the maximum of the likelihood
+    assert float(own[0]) == pytest.approx(results["optimum"].discrepancy / N)
+    assert {"AreaMetric", "KullbackLeibler", "ProbabilityResidual"} <= set(table.data_vars)
+    areas = prb.compare(results, model=problem.model, metrics=[prb.AreaMetric()])["AreaMetric"]
+    np.testing.assert_allclose(areas, table["AreaMetric"])
+
+
+@pytest.mark.usefixtures("no_run")
+@pytest.mark.parametrize("name", ["optimum", "posterior", "chains"])
+def test_own_response_is_predicted_by_the_emulator(
+    problem: Problem, results: Any, name: str
+) -> None:
+    predicted = prb.predict(results[name], problem.growth, problem.x, model=problem.model)
+    assert predicted.attrs["responses"] == 0
+    assert "by the emulator of y" in predicted.attrs["source"]
+    if name == "optimum":
+        point = results[name].point
+        sample = np.sort(predicted.values.ravel())
+        exact = np.exp(0.5 * norm.ppf((np.arange(500) + 0.5) / 500, point["mu"], point["sigma"]))
+        # Quasi-random specimens: quantiles differ by less than one of 500 specimens apart.
+        np.testing.assert_allclose(sample[25:-25], exact[25:-25], rtol=0.02)
+
+
+def test_another_response_costs_a_hundred_odd_runs(problem: Problem, results: Any) -> None:
+    later = Growth(0.7)
+    predicted = prb.predict(results["posterior"], later, problem.x, model=problem.model)
+    runs = later.runs - 1  # one shows whether specimens are independent of each other
+    assert runs == predicted.attrs["responses"] <= 200
+    assert "interpolant" in predicted.attrs["source"]
+    computed = prb.predict(
+        results["posterior"], later, problem.x, model=problem.model, stored=False
+    )
+    assert computed.attrs["specimens_id"] == predicted.attrs["specimens_id"]
+    np.testing.assert_allclose(predicted, computed, rtol=1e-4)
+
+
+def test_rough_response_is_reported(
+    problem: Problem, optimum: prb.Optimum, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING, "prbayes"):
+        prb.predict(optimum, lambda x: np.sin(400 * x), problem.x, name="rough")
+    assert "stored=False" in caplog.text
+
+
+def test_failed_specimens_are_predicted(problem: Problem, optimum: prb.Optimum) -> None:
+    limit = optimum.point["mu"] + optimum.point["sigma"]
+    failing = prb.predict(
+        optimum, lambda x: np.where(x > limit, np.inf, x), problem.x, name="failing"
+    )
+    # A run decides where the response fails: by how much is the distance between runs.
+    assert np.isinf(failing).mean() == pytest.approx(norm.sf(1), abs=0.05)
+
+
+def test_area_test(problem: Problem, posterior: xr.DataTree) -> None:
+    predicted = prb.predict(posterior, Growth(0.7), problem.x, model=problem.model, name="later")
+    assert not prb.area_test(problem.later, predicted).rejected
+    assert prb.area_test(3 * problem.later, predicted).rejected
+    own = prb.predict(posterior, problem.growth, problem.x, model=problem.model)
+    with pytest.raises(ValueError, match="the very data of the calibration"):
+        prb.area_test(problem.observed, own)
+
+
+# -- decisions -------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("no_run")
+def test_exceedance(problem: Problem, optimum: prb.Optimum) -> None:
+    limit = float(np.exp(0.5 * (optimum.point["mu"] + optimum.point["sigma"])))
+    risk = prb.exceedance(optimum, problem.growth, limit, problem.x, draws=200)
+    assert risk.attrs["responses"] == 0
+    thetas = optimum.theta + norm.ppf(0.5 + np.zeros((1, 2)))  # the centre
+    mu, sigma = thetas[0, 0], np.exp(thetas[0, 1])
+    at_center = norm.sf((2 * np.log(limit) - mu) / sigma)
+    # The mean over uncertain hyperparameters is larger than the probability at the centre.
+    assert at_center < float(risk.probability) < at_center + 0.05
+    assert float(risk.lower) < at_center < float(risk.upper)
+
+
+@pytest.mark.usefixtures("no_run")
+def test_sensitivity_and_plan(problem: Problem, posterior: xr.DataTree) -> None:
+    mean = prb.decision.Mean(problem.growth, problem.x)
+    shares = prb.sensitivity(posterior, mean, model=problem.model, samples=128)
+    assert float(shares["first"].sel(factor="mu")) > 0.5
+    plan = prb.plan(
+        posterior,
+        {"same": prb.decision.Condition(problem.growth, problem.x)},
+        k=3 * N,
+        model=problem.model,
+    )
+    # Three times as many specimens again: half the standard deviation, but for what a prior adds.
+    ratio = plan.sd.sel(candidate="same", k=3 * N, name="mu") / plan.now.sel(name="mu")
+    assert float(ratio) == pytest.approx(0.5, abs=0.08)
+    with pytest.raises(ValueError, match="leave metric= out"):
+        prb.plan(
+            posterior,
+            {"area": prb.decision.Condition(problem.growth, problem.x, metric=prb.AreaMetric())},
+            model=problem.model,
+        )
+
+
+# -- refits ----------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("no_run")
+def test_refit_of_the_observed_data_is_the_optimum(optimum: prb.Optimum) -> None:
+    refits = specimen_refits(optimum, "test")
+    theta, converged = refits.fit()
+    assert converged
+    np.testing.assert_allclose(theta, optimum.theta, atol=1e-3)
+    thetas, _ = refits.reweighted([np.full((1, N), 1 / N)])
+    np.testing.assert_allclose(thetas[0], theta, atol=1e-3)
+
+
+@pytest.mark.usefixtures("no_run")
+def test_bootstrap_has_the_width_of_the_standard_errors(optimum: prb.Optimum) -> None:
+    draws = prb.bootstrap(optimum, draws=200)
+    assert draws.posterior.attrs["converged"] == 1
+    # Twenty specimens, and 200 draws: a standard deviation has a standard error of 5 %, and the
+    # ratio to the curvature's depends on the data's fourth moment.
+    assert float(draws.posterior["mu"].std()) == pytest.approx(optimum.stderr["mu"], rel=0.2)
+
+
+@pytest.mark.usefixtures("no_run")
+def test_refits_of_simulated_data_are_maximum_likelihood_estimates(optimum: prb.Optimum) -> None:
+    """Of a normal population in x they are mean and standard deviation of the inputs."""
+    evaluator = optimum.evaluator
+    (likelihood,) = evaluator.likelihoods
+    params = evaluator.specimen_params(optimum.theta[None], 0)
+    pool = specimen_pool(likelihood, params, np.random.default_rng(3), size=1)
+    (points,), log_a = data = pool.data_set(np.random.default_rng(4))
+    before = evaluator.specimen_log_likelihoods(optimum.theta[None])["y"]
+    refits = specimen_refits(optimum, "test")
+    with other_specimens(evaluator.likelihoods, [data]):
+        theta, _ = refits.fit()
+    weights = np.exp(log_a - log_a.max(axis=1, keepdims=True))
+    inputs = (weights * points).sum(axis=1) / weights.sum(axis=1)
+    assert theta[0] == pytest.approx(inputs.mean(), abs=1e-3)
+    assert np.exp(theta[1]) == pytest.approx(inputs.std(), rel=1e-2)
+    after = evaluator.specimen_log_likelihoods(optimum.theta[None])["y"]
+    np.testing.assert_array_equal(after, before)
+
+
+@pytest.mark.usefixtures("no_run")
+def test_cross_validation_is_the_log_density_of_specimens_left_out(optimum: prb.Optimum) -> None:
+    table = prb.cross_validate(optimum)
+    assert table.sizes == {"fold": 5, "simulator": 1, "specimen": N}
+    assert bool(table.converged.all())
+    assert float(table.discrepancy.mean()) > float(table.calibrated.mean())
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("no_run")
+def test_simulation_based_calibration(problem: Problem) -> None:
+    ranks = prb.simulation_based_calibration(
+        20, model=problem.model, draws=100, progressbar=False
+    ).prior_sbc
+    assert ranks.attrs["failed"] == 0
+    # Twenty uniform ranks: a mean of .5 with a standard error of .065.
+    for name in ("mu", "sigma"):
+        assert float(ranks[name].mean()) == pytest.approx(0.5, abs=0.29)
+
+
+# -- diagnosis -------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("no_run")
+def test_diagnosis_of_an_optimum_states_the_power(optimum: prb.Optimum) -> None:
+    found = prb.diagnose(optimum)
+    assert found.ok
+    assert not found.untested
+    assert any("a power of 0.23 for skewness 1" in note for note in found.notes)
+    assert any("the emulator of" in note for note in found.notes)
+    assert prb.diagnose(optimum).notes == found.notes
+
+
+@pytest.mark.long
+def test_population_with_two_modes_is_found() -> None:
+    rng = np.random.default_rng(5)
+    x = np.where(rng.random(60) < 0.5, 0.4, 1.6) + 0.1 * rng.standard_normal(60)
+    found = prb.diagnose(prb.minimize(build(np.exp(0.5 * x)).model))
+    assert [finding.code for finding in found.findings] == ["population-misfit"]
+    assert "population" in found.messages[0]
+
+
+@pytest.mark.usefixtures("no_run")
+@pytest.mark.parametrize("name", ["posterior", "chains"])
+def test_diagnosis_of_draws(problem: Problem, results: Any, name: str) -> None:
+    found = prb.diagnose(results[name], model=problem.model)
+    assert found.ok
+    text = str(found)
+    assert "No problem was found." not in text  # the population's family was not tested
+    assert "by the tests that were run" in text
+    assert "family of the population was not tested" in text
+    assert "epsilon" not in text
+
+
+def test_diagnosis_without_the_model_says_what_was_not_tested(
+    optimum: prb.Optimum, posterior: xr.DataTree
+) -> None:
+    for result in (posterior, optimum.to_datatree()):
+        found = prb.diagnose(result)
+        assert found.untested
+        assert str(found).startswith("No problem was found by the tests that were run.")
+
+
+def test_chains_in_different_modes() -> None:
+    draws = np.random.default_rng(0).normal(0, 1, (4, 200, 2))
+    assert not separate_modes(draws, ["mu", "sigma"])
+    draws[2, :, 0] += 5
+    (finding,) = separate_modes(draws, ["mu", "sigma"])
+    assert finding.code == "chains-in-different-modes"
+    assert "for mu within-chain" in finding.text
+    assert "prb.sample_smc" in finding.text
+
+
+def test_chains_in_different_modes_take_the_place_of_r_hat(
+    problem: Problem, chains: xr.DataTree
+) -> None:
+    apart = chains.copy(deep=True)
+    apart["posterior"]["mu"][{"chain": 1}] += 2.0
+    found = prb.diagnose(apart, model=problem.model)
+    assert "chains-in-different-modes" in [finding.code for finding in found.findings]
+    assert not any("R-hat" in message for message in found.messages)
+
+
+def test_conflict_of_prior_and_data() -> None:
+    observed = np.exp(0.5 * np.random.default_rng(7).normal(1.0, 0.4, N))
+    with pm.Model() as model:
+        mu = pm.Normal("mu", -1.0, 0.1)
+        x = pm.Normal.dist(mu, pm.HalfNormal("sigma", 1.0))
+        prb.Simulator("y", lambda x: np.exp(0.5 * x), x, observed=observed)
+    posterior = prb.sample_smc(model=model, draws=200, chains=2, random_seed=1, progressbar=False)
+    found = prb.diagnose(posterior, model=model)
+    assert [finding.code for finding in found.findings] == ["prior-conflict"]
+    assert found.messages[0].startswith("Mu: got prior")
+
+
+def test_influential_specimen_is_reported(posterior: xr.DataTree) -> None:
+    assert not influence(posterior)
+    heavy = posterior.copy(deep=True)
+    # Importance weights with a Pareto tail of shape 1.5.
+    heavy["log_likelihood"]["y"][..., 3] = -np.random.default_rng(1).exponential(1.5, (2, 200))
+    (finding,) = influence(heavy)
+    assert finding.code == "influential-specimens"
+    assert "indices 3" in finding.text
+
+
+# -- refusals --------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("no_run")
+def test_what_has_no_meaning_is_refused(
+    problem: Problem, optimum: prb.Optimum, posterior: xr.DataTree
+) -> None:
+    calls: list[tuple[Callable[[], Any], str]] = [
+        (lambda: prb.refine(problem.model), "leave the call out"),
+        (lambda: prb.calibrate_epsilon(optimum), "has no epsilon"),
+        (lambda: prb.set_epsilon(problem.model, {"y": 0.1}), "has no epsilon"),
+        (lambda: prb.adjust(posterior, model=problem.model), "use its draws as they are"),
+    ]
+    for call, message in calls:
+        with pytest.raises(ValueError, match=message):
+            call()
+
+
+def test_refusals_come_before_the_first_run() -> None:
+    fresh = build(np.exp(0.5 * np.random.default_rng(7).normal(1.0, 0.4, N)))
+    for call in (
+        lambda: prb.refine(fresh.model),
+        lambda: prb.set_epsilon(fresh.model, {"y": 0.1}),
+    ):
+        with pytest.raises(ValueError, match=r"prb\.LogLikelihood\(\)"):
+            call()
+    assert fresh.growth.runs == 0
+
+
+# -- cost ------------------------------------------------------------------------------------
+
+
+def test_cost_before_and_after(problem: Problem, optimum: prb.Optimum) -> None:
+    data = problem.observed
+    fresh = build(data)
+    before = prb.cost(fresh.model)
+    assert fresh.growth.runs == 0
+    assert before.runs == 128
+    assert "128 to compute" in str(before)
+    assert prb.cost(lambda: build(data)).runs == 128
+    tried = prb.cost(fresh.model, dry_run=True)
+    assert fresh.growth.runs == 1
+    assert tried.seconds > 0
+    assert prb.cost(problem.model).runs == 0
+
+
+# -- plots and report ------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("no_run")
+def test_plots(problem: Problem, optimum: prb.Optimum, posterior: xr.DataTree) -> None:
+    look = {"backend": "none"}
+    shown = [
+        prb.plot_population(optimum, **look),
+        prb.plot_population(posterior, model=problem.model, **look),
+        prb.plot_responses(optimum, **look),
+        prb.plot_responses(posterior, model=problem.model, draws=20, **look),
+        prb.plot_posterior(posterior, optimum, model=problem.model, **look),
+        prb.plot_optimizer(optimum, **look),
+        prb.plot_stages(posterior, **look),
+        prb.plot_comparison(prb.compare({"a": optimum, "b": posterior}), **look),
+        prb.plot_landscape(optimum, points=9, **look),
+    ]
+    assert all(list(collection.viz.children) for collection in shown)
+    # The path is that of the descent that found the optimum.
+    assert np.isfinite(optimum.trace["discrepancy"][-1])
+    np.testing.assert_allclose(optimum.trace["theta"][-1], optimum.theta, atol=1e-3)
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("no_run")
+def test_report(
+    problem: Problem, optimum: prb.Optimum, posterior: xr.DataTree, tmp_path: Path
+) -> None:
+    report = prb.Report("Growth", model=problem.model, optimum=optimum, posterior=posterior)
+    text = report.to_html(tmp_path / "report.html").read_text(encoding="utf-8")
+    titles = [section.title for section in report.sections]
+    assert "Log-likelihood" in titles
+    assert "Metric and epsilon" not in titles
+    assert "emulator of 128 runs" in text
+    assert "width is that of epsilon" not in text
+    assert "could not be made" not in text
+    assert "The diagnostics found no problem." not in text
+    assert "was not tested" in text
+
+
+# -- files -----------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("no_run")
+def test_files_answer_without_a_run(
+    problem: Problem, optimum: prb.Optimum, posterior: xr.DataTree, tmp_path: Path
+) -> None:
+    posterior.to_netcdf(tmp_path / "posterior.nc")
+    optimum.to_datatree().to_netcdf(tmp_path / "optimum.nc")
+    stored = xr.load_datatree(tmp_path / "posterior.nc")
+    loo = az.loo(stored, var_name="y")
+    assert np.isfinite(loo.elpd)
+    predicted = prb.predict(stored, problem.growth, problem.x, model=problem.model)
+    direct = prb.predict(posterior, problem.growth, problem.x, model=problem.model)
+    np.testing.assert_allclose(predicted, direct)
+    table = prb.compare({"a": xr.load_datatree(tmp_path / "optimum.nc"), "b": stored})
+    assert table.sizes["result"] == 2
+
+
+def test_fresh_model_computes_its_emulator_and_says_so(
+    problem: Problem, posterior: xr.DataTree
+) -> None:
+    fresh = build(problem.observed)
+    predicted = prb.predict(posterior, fresh.growth, fresh.x, model=fresh.model)
+    assert predicted.attrs["responses"] == 128
+    assert "(128 runs)" in predicted.attrs["source"]
+
+
+# -- several inputs, groups, mixed models ----------------------------------------------------
+
+
+@pytest.mark.long
+def test_two_inputs_and_outputs() -> None:
+    rng = np.random.default_rng(2)
+
+    def response(a: Any, b: Any) -> Any:
+        a, b = np.broadcast_arrays(a, b)
+        return np.stack([a * b, a + b**2], axis=-1)
+
+    observed = response(rng.normal(1, 0.3, N), np.exp(rng.normal(0, 0.2, N)))
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 0.5))
+        b = pm.LogNormal.dist(0.0, pm.HalfNormal("tau", 0.5))
+        prb.Simulator("y", response, a, b, observed=observed)
+    optimum = prb.minimize(model)
+    predicted = prb.predict(optimum, response, a, b)
+    assert predicted.dims[-1] == "output"
+    of_one = prb.predict(optimum, lambda a: 2 * a, a, name="double")
+    assert float(of_one.mean()) == pytest.approx(2 * optimum.point["mu"], abs=0.01)
+    prb.plot_outputs(optimum, backend="none")
+    assert prb.diagnose(optimum).ok
+    table = prb.compare({"optimum": optimum}, model=model)
+    assert "Joint(AreaMetric)" in table
+
+
+@pytest.mark.long
+def test_groups() -> None:
+    rng = np.random.default_rng(3)
+    suppliers = np.repeat(["a", "b", "c"], 8)
+    x = rng.normal(np.repeat([0.8, 1.0, 1.3], 8), 0.4)
+    data = xr.DataArray(np.exp(0.5 * x), {"supplier": ("specimen", suppliers)}, "specimen")
+    with pm.Model(coords={"supplier": ["a", "b", "c"]}) as model:
+        mu = pm.Normal("mu", 1.0, 1.0, dims="supplier")
+        supplier = prb.response.group("supplier")
+        inputs = pm.Normal.dist(mu[supplier], pm.HalfNormal("sigma", 1.0))
+        growth = Growth(0.5)
+        prb.Simulator("y", growth, inputs, observed=data)
+    optimum = prb.minimize(model)
+    np.testing.assert_allclose(optimum.point["mu"], x.reshape(3, 8).mean(axis=1), atol=0.01)
+    predicted = prb.predict(optimum, growth, inputs)
+    assert predicted.sizes["supplier"] == 3
+    medians = predicted.median("sample").values.ravel()
+    np.testing.assert_allclose(medians, np.exp(0.5 * optimum.point["mu"]), rtol=0.01)
+    names = [simulator.name for simulator in optimum.evaluator.simulators]
+    assert names == ["y[a]", "y[b]", "y[c]"]
+    prb.plot_responses(optimum, backend="none")
+    prb.plot_population(optimum, backend="none")
+    # The population is tested with the refits of all groups; its p-value is uniform.
+    assert any("root(s)" in note for note in prb.diagnose(optimum).notes)
+    assert prb.cross_validate(optimum).sizes["simulator"] == 3
+    with pytest.raises(TypeError, match="group"):
+        prb.exceedance(optimum, growth, 2.0, inputs)
+
+
+@pytest.mark.long
+def test_mixed_model() -> None:
+    rng = np.random.default_rng(4)
+    growth, later = Growth(0.5), Growth(0.7)
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 1, 1), pm.HalfNormal("sigma", 1))
+        prb.Simulator("y", growth, x, observed=np.exp(0.5 * rng.normal(1, 0.4, N)))
+        prb.Simulator(
+            "w",
+            later,
+            x,
+            metric=prb.ProbabilityResidual(),
+            observed=np.exp(0.7 * rng.normal(1, 0.4, 30)),
+            epsilon=0.01,
+        )
+    optimum = prb.minimize(model)
+    tree = optimum.to_datatree()
+    assert tree["calibration"]["simulator"].values.tolist() == ["w", "y"]
+    assert tree["calibration"]["is_likelihood"].values.tolist() == [0, 1]
+    posterior = prb.sample_smc(model=model, draws=100, chains=2, random_seed=1, progressbar=False)
+    assert posterior["calibration"].sizes["simulator"] == 2
+    prb.plot_responses(posterior, model=model, backend="none")
+    prb.diagnose(posterior, model=model)
+    prb.compare({"optimum": optimum, "posterior": posterior}, model=model)
+    own = prb.predict(posterior, growth, x, model=model)
+    assert "emulator of y" in own.attrs["source"]
+    with pytest.raises(ValueError, match=r"prb\.sample_smc"):
+        prb.bootstrap(optimum)
