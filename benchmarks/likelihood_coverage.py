@@ -60,8 +60,9 @@ class Problem:
         """The problem as one of the scoreboard, for its inputs and priors."""
         return Population(
             name=self.name, what="", licence="", priors=self.priors, inputs=self.inputs,
-            formula=self.formula, sizes=(self.size,), data=lambda n, k: None, reference=None,
-        )  # type: ignore[arg-type]  # fmt: skip
+            formula=self.formula, sizes=(self.size,), data=lambda n, k: None,
+            reference=None,  # type: ignore[arg-type]
+        )  # fmt: skip
 
     def response(self, *x: Any) -> Any:
         """Return outputs, (..., m), or (...) of a single one."""
@@ -191,7 +192,7 @@ def exact_log_likelihood(problem: Problem, y: Any) -> Functions:
 
 def posterior(problem: Problem, function: Functions, start: Any) -> tuple[Any, Any, float]:
     """Return coordinates (S, q) with normalised weights (S,), and Pareto k."""
-    from arviz_stats.base import array_stats
+    from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
     d = len(problem.priors)
 

@@ -25,9 +25,6 @@ from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likel
 from prbayes.propagation.specimen_points import draw_points, specimen_roots
 from prbayes.response.compilation import compiled, ninf_for_invalid, untraced
 
-# Simulated specimens of a pool: with 100 times the observed ones, replicates from one pool have the
-# size and power of replicates of their own (likelihood_guards, section 2.4).
-_POOL = 2000
 _COMPILED = "weighted log-likelihood"
 
 
@@ -89,7 +86,7 @@ def specimen_pool(
     likelihood: SpecimenLikelihood,
     params: Sequence[Floats],
     rng: np.random.Generator,
-    size: int = _POOL,
+    size: int = 2000,
 ) -> SpecimenPool:
     """Simulate specimens of one population, and draw their points.
 

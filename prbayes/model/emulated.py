@@ -31,13 +31,30 @@ from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs
 from prbayes.response.response import Responses
 
-# Specimens of a population in plots and scores: the error of a quantile of them is far below the
-# width of a posterior band.
-_SPECIMENS = 1024
-# Populations of the result, and specimens of each, that make the weighted sample of a decision.
-# Twice as many change probabilities by less than their reported error.
-_POPULATIONS, _OF_EACH = 64, 64
-_BLOCKS = 8
+
+@dataclass(frozen=True)
+class EmulatedSizes:
+    """Sizes of emulated samples.
+
+    Attributes
+    ----------
+    specimens : int
+        Of a population in plots and scores: the error of a quantile of them is far below the width
+        of a posterior band.
+    populations, of_each : int
+        Populations of the result, and specimens of each, that make the weighted sample of a
+        decision. Twice as many change probabilities by less than their reported error.
+    blocks : int
+        Parts of the sample whose differences give its error.
+    """
+
+    specimens: int = 1024
+    populations: int = 64
+    of_each: int = 64
+    blocks: int = 8
+
+
+_SIZES = EmulatedSizes()
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +197,7 @@ class EmulatedSimulator:
     @property
     def runs_per_theta(self) -> int:
         """Runs that a population costs; none by an emulator."""
-        return 0 if self.has_specimens else _SPECIMENS
+        return 0 if self.has_specimens else _SIZES.specimens
 
     @property
     def name(self) -> str:
@@ -272,11 +289,11 @@ class EmulatedSimulator:
         The quasi-random numbers are the same for all calls.
         """
         rng = np.random.default_rng(0)
-        specimens, _ = new_specimens(self.name, self.inputs, list(roots), _SPECIMENS, rng)
+        specimens, _ = new_specimens(self.name, self.inputs, list(roots), _SIZES.specimens, rng)
         count = len(roots[0])
-        flat = [x.reshape(count * _SPECIMENS, *x.shape[2:]) for x in specimens]
-        values = self._emulated(flat).reshape(count, _SPECIMENS, *self.likelihood.event)
-        return values, np.full((count, _SPECIMENS), 1 / _SPECIMENS)
+        flat = [x.reshape(count * _SIZES.specimens, *x.shape[2:]) for x in specimens]
+        values = self._emulated(flat).reshape(count, _SIZES.specimens, *self.likelihood.event)
+        return values, np.full((count, _SIZES.specimens), 1 / _SIZES.specimens)
 
 
 type PopulationSimulator = Node | EmulatedSimulator
@@ -327,16 +344,18 @@ class EmulatedSample:
     def of(cls, simulator: EmulatedSimulator, roots: Sequence[Floats]) -> EmulatedSample:
         """Draw specimens from populations at roots, shapes (k, *shape)."""
         count = len(roots[0])
-        chosen = np.unique(np.linspace(0, count - 1, _POPULATIONS).round().astype(int))
+        chosen = np.unique(np.linspace(0, count - 1, _SIZES.populations).round().astype(int))
         roots = [root[chosen] for root in roots]
-        of_each = -(-_POPULATIONS * _OF_EACH // len(chosen) // _BLOCKS) * _BLOCKS
+        of_each = (
+            -(-_SIZES.populations * _SIZES.of_each // len(chosen) // _SIZES.blocks) * _SIZES.blocks
+        )
         specimens, _ = new_specimens(
             simulator.name, simulator.inputs, list(roots), of_each, np.random.default_rng(0)
         )
         flat = [x.reshape(-1, *x.shape[2:]) for x in specimens]
         log_p = _log_density(simulator.inputs, roots, flat)
         log_mixture = logsumexp(log_p, axis=0) - np.log(len(chosen))
-        blocks = np.tile(np.arange(of_each) % _BLOCKS, len(chosen))
+        blocks = np.tile(np.arange(of_each) % _SIZES.blocks, len(chosen))
         return cls(simulator, flat, log_mixture, blocks)
 
     @property
@@ -370,12 +389,12 @@ class EmulatedSample:
         """Raise if the weights of most populations are those of a few specimens."""
         _, weights = self.populations(roots)
         size = float(np.median(1 / (weights**2).sum(axis=1)))
-        if not size >= _OF_EACH / 2:
+        if not size >= _SIZES.of_each / 2:
             raise DesignError(
                 f"{name}: got a weight effective sample size of {size:.0f} of {self.n_points} "
                 "emulated specimens (median over the populations), expected at least "
-                f"{_OF_EACH // 2}; the populations of this result are too different from each "
-                "other; compute the quantity from prb.predict"
+                f"{_SIZES.of_each // 2}; the populations of this result are too different from "
+                "each other; compute the quantity from prb.predict"
             )
 
 
