@@ -275,6 +275,19 @@ def small_groups() -> Iterator[Row]:
         yield [*columns, str(cell["data sets"]), f"{cell['seconds']:.1f}"]
 
 
+def gross_errors() -> Iterator[Row]:
+    """Return the rows of the price and the gain of gross errors in a likelihood by specimen."""
+    for row in found("gross_errors"):
+        biases = zip(row["bias"], row["error"], strict=True)
+        yield [
+            str(row["size"]),
+            f"{row['shift']:g} sd" if row["shift"] else "none",
+            str(row["gross_errors"]),
+            " / ".join(f"{bias + 0.0:+.2f} ± {error:.2f}" for bias, error in biases),
+            " / ".join(f"{width:.2f}" for width in row["width"]),
+        ]
+
+
 def measurement_error() -> Iterator[Row]:
     """Return the rows of readings with an error."""
     table = found("measurement_error")
@@ -835,6 +848,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "partial pooling": partial_pooling,
     "small groups": small_groups,
     "measurement error": measurement_error,
+    "gross errors": gross_errors,
     "landscapes": landscapes,
     "wrong families, many data": lambda: families((100_000,)),
     "wrong families, few data": lambda: families((20, 50)),

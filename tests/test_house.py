@@ -24,8 +24,12 @@ PACKAGE = Path(prbayes.__file__).parent
 ROOT = PACKAGE.parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-README_OUTPUT = re.findall(r"^```text\n(.*?)^```", README, re.MULTILINE | re.DOTALL)[0]
-README_SCRIPT = re.findall(r"^```python\n(.*?)^```", README, re.MULTILINE | re.DOTALL)[0]
+README_OUTPUT, LIKELIHOOD_OUTPUT = re.findall(
+    r"^```text\n(.*?)^```", README, re.MULTILINE | re.DOTALL
+)
+README_SCRIPT, LIKELIHOOD_SCRIPT = re.findall(
+    r"^```python\n(.*?)^```", README, re.MULTILINE | re.DOTALL
+)
 
 # Rooms below everything else, which may import each other.
 _GROUND = (
@@ -341,6 +345,27 @@ def test_the_first_script_of_the_readme_runs(
     assert len(printed) == len(shown) == 16
     for ours, theirs in zip(printed, shown, strict=True):
         assert float(ours) == pytest.approx(float(theirs), abs=0.011)
+
+
+@pytest.mark.long
+def test_the_likelihood_of_the_readme_prints_what_it_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    preamble, _ = README_SCRIPT.split("with pm.Model()")
+    script = tmp_path / "example.py"
+    script.write_text(preamble + LIKELIHOOD_SCRIPT, encoding="utf-8")
+    variables = runpy.run_path(str(script))
+    assert variables["optimum"].n_responses == 128
+    printed = capsys.readouterr().out
+    printed = printed[printed.index(LIKELIHOOD_OUTPUT.splitlines()[0]) :]
+    number = re.compile(r"\d+\.\d+|\d+")
+    numbers = [
+        [float(value) for value in number.findall(text)] for text in (printed, LIKELIHOOD_OUTPUT)
+    ]
+    assert len(numbers[0]) == len(numbers[1])
+    # Estimates to the last digit; the leave-one-out estimate to four Monte Carlo standard errors.
+    assert numbers[0][:16] == pytest.approx(numbers[1][:16], abs=0.011)
+    assert numbers[0][16:] == pytest.approx(numbers[1][16:], abs=0.2)
 
 
 @pytest.mark.slow
