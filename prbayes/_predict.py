@@ -126,8 +126,8 @@ def predict(
         square error of runs that are left out), ``nan`` (how many values are NaN), ``caveats``
         (what the response says of itself, such as that its inadequacy extrapolates),
         ``specimens_id`` (equal for predictions with the same specimens), ``calibration_data`` and
-        ``calibration_specimens`` (digests of the data, and specimen labels, of the calibration, by which `area_test` knows
-        them), ``identity`` (of the problem that was calibrated).
+        ``calibration_specimens`` (digests of the data, and specimen labels, of the calibration, by
+        which `area_test` knows them), ``identity`` (of the problem that was calibrated).
 
     Raises
     ------
