@@ -53,6 +53,7 @@ from prbayes.propagation.specimen_points import (
     draw_points,
     emulate,
 )
+from prbayes.response.costs import in_words
 from prbayes.response.distributions import PopulationSampler, log_density, prior_draws
 from prbayes.response.grouping import is_group
 from prbayes.response.inputs import Inputs
@@ -136,6 +137,29 @@ class SpecimenLikelihood:
     @cached_property
     def _prepared(self) -> tuple[Emulation, SpecimenPoints, tuple[Finding, ...]]:
         """The emulator, the points and what is to be reported of them."""
+        self.responses.on_start = self._log_first_runs
+        try:
+            return self._prepare()
+        finally:
+            self.responses.on_start = None
+
+    def _log_first_runs(self, runs: int, seconds: float) -> None:
+        """Log how many runs there are, how long they take, and which number changes them."""
+        self.responses.on_start = None
+        total = np.ceil(runs / self.responses.workers) * seconds
+        duration = f", about {in_words(float(total))}" if total >= 1 else ""
+        more = max(runs // 2, self.options.fresh)
+        _log.info(
+            "%s: runs at first: %d%s; then %d at a time at the roots of the specimens; to change "
+            "this, pass another number in propagation=prb.Reweighted(n=%d)",
+            self.name,
+            runs,
+            duration,
+            more,
+            runs,
+        )
+
+    def _prepare(self) -> tuple[Emulation, SpecimenPoints, tuple[Finding, ...]]:
         name, n = self.name, self.propagation.emulator_runs
         bounds, d = self.coordinates.bounds, self.coordinates.size
         if self._is_partial:
