@@ -36,6 +36,7 @@ OUT = record.RESULTS / "likelihood_coverage.json"
 PROB = 0.89
 _POINTS = 4096
 _DEGREES = 5.0
+_AT_ONCE = 4_000_000  # numbers of an array
 # Data sets between two writes of the results.
 _BLOCK = 20
 Functions = Callable[[Any], Any]
@@ -60,8 +61,9 @@ class Problem:
         """The problem as one of the scoreboard, for its inputs and priors."""
         return Population(
             name=self.name, what="", licence="", priors=self.priors, inputs=self.inputs,
-            formula=self.formula, sizes=(self.size,), data=lambda n, k: None, reference=None,
-        )  # type: ignore[arg-type]  # fmt: skip
+            formula=self.formula, sizes=(self.size,), data=lambda n, k: None,
+            reference=None,  # type: ignore[arg-type]
+        )  # fmt: skip
 
     def response(self, *x: Any) -> Any:
         """Return outputs, (..., m), or (...) of a single one."""
@@ -168,6 +170,11 @@ def log_likelihood(problem: Problem, x: Any, log_a: Any) -> Functions:
     names = list(problem.priors)
 
     def function(theta: Any) -> Any:
+        # In blocks, so that memory stays small.
+        blocks = max(1, len(theta) * log_a.size // _AT_ONCE)
+        return np.concatenate([block(part) for part in np.array_split(theta, blocks)])
+
+    def block(theta: Any) -> Any:
         log_p = log_a[None]
         for j, one in enumerate(problem.inputs):
             mean, sd = (
@@ -191,7 +198,7 @@ def exact_log_likelihood(problem: Problem, y: Any) -> Functions:
 
 def posterior(problem: Problem, function: Functions, start: Any) -> tuple[Any, Any, float]:
     """Return coordinates (S, q) with normalised weights (S,), and Pareto k."""
-    from arviz_stats.base import array_stats
+    from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
     d = len(problem.priors)
 
@@ -244,7 +251,8 @@ def _modes(log_density: Functions, start: Any, d: int) -> list[Component]:
 def _slope(log_density: Functions, u: Any, step: float = 1e-4) -> Any:
     shifts = step * np.eye(len(u))
     values = log_density(np.concatenate([u + shifts, u - shifts]))
-    slope = (values[: len(u)] - values[len(u) :]) / (2 * step)
+    with np.errstate(invalid="ignore"):
+        slope = (values[: len(u)] - values[len(u) :]) / (2 * step)
     return np.where(np.isfinite(slope), slope, 0.0)
 
 

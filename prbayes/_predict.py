@@ -124,10 +124,10 @@ def predict(
         ``source`` (how specimens were made), ``responses``
         (how many were computed), ``emulator_error`` (of an emulator, by output: the root mean
         square error of runs that are left out), ``nan`` (how many values are NaN), ``caveats``
-        (what the response says of itself, such as that its inadequacy extrapolates), ``specimens_id`` (equal for
-        predictions with the same specimens), ``calibration_data`` and ``calibration_specimens``
-        (digests of the data, and specimen labels, of the calibration, by which `area_test` knows
-        them), ``identity`` (of the problem that was calibrated).
+        (what the response says of itself, such as that its inadequacy extrapolates),
+        ``specimens_id`` (equal for predictions with the same specimens), ``calibration_data`` and
+        ``calibration_specimens`` (digests of the data, and specimen labels, of the calibration, by
+        which `area_test` knows them), ``identity`` (of the problem that was calibrated).
 
     Raises
     ------
@@ -188,9 +188,8 @@ def predict(
     groups = sorted_inputs.groups
     with shown(progressbar):
         drawn = _drawn(simulator, responses, _in_groups(points, sorted_inputs), n_samples, rng)
-    if max_lost is None:
-        max_lost = max((each.max_lost for each in simulators), default=MAX_LOST)
-    missing = _count_missing(label, drawn.values, max_lost)
+    allowed = [each.max_lost for each in simulators] if max_lost is None else [max_lost]
+    missing = _count_missing(label, drawn.values, max(allowed, default=MAX_LOST))
     _report_rough_surface(label, drawn)
     among = () if groups is None else (len(groups.labels),)
     event = drawn.values.shape[2 + len(among) :]
@@ -422,10 +421,6 @@ def _emulated_responses(
     return _Drawn(values, specimens, source, emulated.error)
 
 
-# Standard deviations of the predicted responses that an emulator may be off by without a finding.
-_ROUGH_SURFACE = 0.05
-
-
 def _report_rough_surface(label: str, drawn: _Drawn) -> None:
     """Report an emulator whose error is visible beside the scatter of the predicted responses."""
     if drawn.error is None:
@@ -434,7 +429,7 @@ def _report_rough_surface(label: str, drawn: _Drawn) -> None:
     good = np.isfinite(flat).all(axis=1)
     spread = flat[good].std(axis=0) if good.any() else np.full(drawn.error.shape, np.nan)
     share = float(np.max(drawn.error / np.where(spread > 0, spread, np.inf)))
-    if share > _ROUGH_SURFACE:
+    if share > 0.05:
         report(
             [
                 Finding(

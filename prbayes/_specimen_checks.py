@@ -42,15 +42,33 @@ from prbayes.response.distributions import (
 )
 from prbayes.response.inputs import Inputs, aleatory_names
 
-# Replicates of the tests: 199 suffice (likelihood_guards, section 2.4).
-_REPLICATES = 199
-# Draws of the prior, and specimens of each from which its information is computed.
-_PRIOR_DRAWS, _SPECIMENS = 500, 256
-# Within-chain standard deviations between the means of two chains that are in different modes.
-# Chains of one mode with ten independent draws each differ by one.
-_APART = 2.0
-# Pull of the prior, in standard errors, above which a conflict matters (likelihood_guards, 2.11).
-_PULL = 0.5
+
+@dataclass(frozen=True)
+class CheckOptions:
+    """Sizes and thresholds of the checks.
+
+    Attributes
+    ----------
+    replicates : int
+        Of the tests: 199 suffice (likelihood_guards, section 2.4).
+    prior_draws, specimens : int
+        Draws of the prior, and specimens of each from which its information is computed.
+    apart : float
+        Within-chain standard deviations between the means of two chains that are in different
+        modes. Chains of one mode with ten independent draws each differ by one.
+    pull : float
+        Pull of the prior, in standard errors, above which a conflict matters (likelihood_guards,
+        section 2.11).
+    """
+
+    replicates: int = 199
+    prior_draws: int = 500
+    specimens: int = 256
+    apart: float = 2.0
+    pull: float = 0.5
+
+
+_OPTIONS = CheckOptions()
 
 
 @dataclass(frozen=True)
@@ -122,20 +140,22 @@ def _population(optimum: Optimum) -> Checked:
         ([x.get_value() for x in points], log_a.get_value())
         for points, log_a in (each.arrays for each in evaluator.likelihoods)
     ]
-    own = _points(evaluator, scores, optimum.theta, observed)
-    null: list[list[Floats]] = [[] for _ in own]
-    for refit in refits.simulated(_REPLICATES, seed=0):
+    samples = _points(evaluator, scores, optimum.theta, observed)
+    null: list[list[Floats]] = [[] for _ in samples]
+    for refit in refits.simulated(_OPTIONS.replicates, seed=0):
         if not refit.converged:
             continue
         replicates = _points(evaluator, scores, refit.theta, refit.data)
         for statistics, (z, weights) in zip(null, replicates, strict=True):
             statistics.append(population_statistics(z, weights))
-    if len(null[0]) < _REPLICATES / 2:
-        return _not_tested(f"{len(null[0])} of {_REPLICATES} refits converged")
+    if len(null[0]) < _OPTIONS.replicates / 2:
+        return _not_tested(f"{len(null[0])} of {_OPTIONS.replicates} refits converged")
     findings: list[Finding] = []
     notes = []
-    threshold = 0.05 / len(own)
-    for likelihood, (z, weights), statistics in zip(evaluator.likelihoods, own, null, strict=True):
+    threshold = 0.05 / len(samples)
+    for likelihood, (z, weights), statistics in zip(
+        evaluator.likelihoods, samples, null, strict=True
+    ):
         labels = _labels(likelihood.inputs, likelihood.responses.function)
         misfit = population_findings(
             population_test(z, weights, statistics), labels, threshold=threshold
@@ -307,7 +327,7 @@ def separate_modes(thetas: Floats, names: Sequence[str]) -> tuple[Finding, ...]:
         return ()
     within = np.sqrt(thetas.var(axis=1).mean(axis=0))
     apart = np.ptp(thetas.mean(axis=1), axis=0) / np.where(within > 0, within, np.inf)
-    far = np.flatnonzero(apart > _APART)
+    far = np.flatnonzero(apart > _OPTIONS.apart)
     if not far.size:
         return ()
     listed = ", ".join(f"{apart[j]:.1f} for {names[j]}" for j in far.tolist())
@@ -374,9 +394,9 @@ def _conflict(evaluator: Evaluator, thetas: Floats) -> Checked:
         f"The posterior mean of {names[j]} is {pulls[j]:.2f} standard errors from the estimate "
         "without the prior"
     )
-    if pulls[j] <= _PULL:
+    if pulls[j] <= _OPTIONS.pull:
         return Checked(notes=(f"{shift}, less than a conflict with the prior that matters.",))
-    prior = evaluator.prior_thetas(_PRIOR_DRAWS, 0)
+    prior = evaluator.prior_thetas(_OPTIONS.prior_draws, 0)
     predictive = _predictive_estimates(optimum, prior)
     if np.isfinite(predictive).all(axis=1).mean() < 0.5:
         reason = "the information of most populations of the prior is not finite"
@@ -439,12 +459,12 @@ def _covariance(
     for k, simulator in enumerate(evaluator.emulated, start=len(evaluator.nodes)):
         roots = evaluator.roots(around, k)
         sampler, log_density = compiled[k - len(evaluator.nodes)]
-        specimens, _ = sampler([root[:1] for root in roots], _SPECIMENS, rng)
+        specimens, _ = sampler([root[:1] for root in roots], _OPTIONS.specimens, rng)
         (log_p,) = log_density(*roots, *[x[0] for x in specimens])
-        log_p = np.broadcast_to(log_p, (len(around), _SPECIMENS))
+        log_p = np.broadcast_to(log_p, (len(around), _OPTIONS.specimens))
         with np.errstate(invalid="ignore"):
             scores = slopes(log_p, step)
-        information += len(simulator.observed) / _SPECIMENS * scores.T @ scores
+        information += len(simulator.observed) / _OPTIONS.specimens * scores.T @ scores
     nothing = np.full_like(information, np.nan)
     if not np.isfinite(information).all():
         return nothing

@@ -342,7 +342,7 @@ TABLE: dict[str, Row] = {
             "name": (None, 3, "", "  ", "mu", b"y", ["y"]),
             "response": (3, "line", None, dict),
             "input": (None, "a", np.nan, np.inf, pm.Normal, ["a"], 1j, True, {"a": 1}),
-            "metric": (None, "area", 3, prb.AreaMetric, np.mean),
+            "metric": ("area", 3, prb.AreaMetric, np.mean),
             "observed": (*NO_DATA, [1.0]),
             "epsilon": (*[v for v in POSITIVE if v is not None], {"y": 1.0}, 1j),
             "weights": (

@@ -16,6 +16,7 @@ import xarray as xr
 from scipy.stats import norm
 
 import prbayes as prb
+from prbayes import _specimen_checks
 from prbayes._specimen_checks import influence, separate_modes
 from prbayes.estimate.specimen_refits import other_specimens, specimen_pool, specimen_refits
 
@@ -278,6 +279,21 @@ def test_diagnosis_of_an_optimum_states_the_power(optimum: prb.Optimum) -> None:
     assert any("a power of 0.23 for skewness 1" in note for note in found.notes)
     assert any("the emulator of" in note for note in found.notes)
     assert prb.diagnose(optimum).notes == found.notes
+
+
+@pytest.mark.usefixtures("no_run")
+def test_scores_of_the_population_test_are_those_of_the_inputs(
+    problem: Problem, optimum: prb.Optimum
+) -> None:
+    evaluator = optimum.evaluator
+    (likelihood,) = evaluator.likelihoods
+    (points,), log_a = likelihood.arrays
+    data = [([points.get_value()], log_a.get_value())]
+    scores = [_specimen_checks._Scores.of(likelihood.inputs)]
+    ((z, weights),) = _specimen_checks._points(evaluator, scores, optimum.theta, data)
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+    exact = (2 * np.log(problem.observed) - optimum.point["mu"]) / optimum.point["sigma"]
+    np.testing.assert_allclose((weights * z[..., 0]).sum(axis=1), exact, atol=1e-3)
 
 
 @pytest.mark.long

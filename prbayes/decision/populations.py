@@ -22,7 +22,12 @@ from prbayes._predict import (
 )
 from prbayes.decision.quantities import Quantity
 from prbayes.estimate.optimum import Optimum, require_sampling
-from prbayes.model.emulated import EmulatedResponse, EmulatedSample, EmulatedSimulator
+from prbayes.model.emulated import (
+    EmulatedResponse,
+    EmulatedSample,
+    EmulatedSimulator,
+    values_of,
+)
 from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.points import sobol
@@ -169,10 +174,7 @@ class Told:
         if self.emulator is None:
             assert self.design.has_runs
             return [self.column(v) for v in self.design.emulated(self.responses, list(points))]
-        own = self.design.inputs.aleatory
-        wanted = self.responses.inputs.aleatory
-        places = [next(i for i, x in enumerate(own) if x is w) for w in wanted]
-        values = self.emulator([points[place] for place in places])
+        values = self.emulator(values_of(points, self.design.inputs, self.responses.inputs))
         error = self.emulator.error.reshape(self.emulator.event)
         return [self.column(values), self.column(values + error)]
 

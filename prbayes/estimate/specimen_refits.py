@@ -25,9 +25,6 @@ from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likel
 from prbayes.propagation.specimen_points import draw_points, specimen_roots
 from prbayes.response.compilation import compiled, ninf_for_invalid, untraced
 
-# Simulated specimens of a pool: with 100 times the observed ones, replicates from one pool have the
-# size and power of replicates of their own (likelihood_guards, section 2.4).
-_POOL = 2000
 _COMPILED = "weighted log-likelihood"
 
 
@@ -48,7 +45,10 @@ def simulation_obstacle(evaluator: Evaluator) -> str | None:
         return obstacle
     for likelihood in evaluator.likelihoods:
         if likelihood.readings.is_censored.any():
-            return f"{likelihood.name} has censored readings, whose limits of new specimens are unknown"
+            return f"{likelihood.name} has censored readings, of which new ones cannot be drawn"
+        is_measured = likelihood.readings.is_measured
+        if (is_measured.sum(axis=1) < likelihood.coordinates.size).any():
+            return f"{likelihood.name} has specimens with fewer readings than inputs"
         if "error" in likelihood.extras:
             return f"{likelihood.name} has an unknown reading error"
     return None
@@ -86,7 +86,7 @@ def specimen_pool(
     likelihood: SpecimenLikelihood,
     params: Sequence[Floats],
     rng: np.random.Generator,
-    size: int = _POOL,
+    size: int = 2000,
 ) -> SpecimenPool:
     """Simulate specimens of one population, and draw their points.
 
@@ -102,14 +102,14 @@ def specimen_pool(
     n = len(likelihood.observed)
     copies = max(1, -(-size // n))
     values = likelihood.draws(rng, params, copies * n)[0].reshape(copies * n, -1)
-    own = likelihood.readings
+    measurement = likelihood.readings
     shape = values.shape
-    measured = np.resize(own.is_measured, shape)
+    measured = np.resize(measurement.is_measured, shape)
     missing = np.full(shape, np.nan)
     readings = Readings(
         np.where(measured, values, np.nan),
-        np.resize(own.error, shape),
-        np.resize(own.step, shape),
+        np.resize(measurement.error, shape),
+        np.resize(measurement.step, shape),
         missing,
         missing,
     )
@@ -289,13 +289,13 @@ class SpecimenRefits:
         emulated = self.evaluator.emulated
         for likelihood in self.evaluator.likelihoods:
             n = len(likelihood.observed)
-            own = np.zeros((len(weights[0]), n))
+            factors = np.zeros((len(weights[0]), n))
             for simulator, part in zip(emulated, weights, strict=True):
                 if simulator.likelihood is likelihood:
-                    own[:, simulator.rows] = part * len(simulator.rows)
+                    factors[:, simulator.rows] = part * len(simulator.rows)
             if likelihood.weights is not None:  # which are in the likelihood, and in the weights
-                own = own / np.where(likelihood.weights > 0, likelihood.weights, 1.0)
-            by_likelihood.append(own)
+                factors = factors / np.where(likelihood.weights > 0, likelihood.weights, 1.0)
+            by_likelihood.append(factors)
         estimates = [self.fit(list(rows)) for rows in zip(*by_likelihood, strict=True)]
         thetas, converged = zip(*estimates, strict=True)
         return np.array(thetas), np.array(converged)

@@ -199,7 +199,7 @@ class SpecimenRuns:
         d = likelihood.coordinates.size
         first = likelihood.propagation.emulator_runs or first_runs(d)
         batch = max(first // 2, likelihood.options.fresh)
-        is_emulated = "_emulated" in vars(likelihood)
+        is_emulated = "_prepared" in vars(likelihood)
         known = len(likelihood.emulation.z) if is_emulated else 0
         tried = None
         if dry_run:

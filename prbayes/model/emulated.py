@@ -31,13 +31,30 @@ from prbayes.response.inputs import Inputs
 from prbayes.response.outputs import Outputs
 from prbayes.response.response import Responses
 
-# Specimens of a population in plots and scores: the error of a quantile of them is far below the
-# width of a posterior band.
-_SPECIMENS = 1024
-# Populations of the result, and specimens of each, that make the weighted sample of a decision.
-# Twice as many change probabilities by less than their reported error.
-_POPULATIONS, _OF_EACH = 64, 64
-_BLOCKS = 8
+
+@dataclass(frozen=True)
+class EmulatedSizes:
+    """Sizes of emulated samples.
+
+    Attributes
+    ----------
+    specimens : int
+        Of a population in plots and scores: the error of a quantile of them is far below the width
+        of a posterior band.
+    populations, of_each : int
+        Populations of the result, and specimens of each, that make the weighted sample of a
+        decision. Twice as many change probabilities by less than their reported error.
+    blocks : int
+        Parts of the sample whose differences give its error.
+    """
+
+    specimens: int = 1024
+    populations: int = 64
+    of_each: int = 64
+    blocks: int = 8
+
+
+_SIZES = EmulatedSizes()
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +105,8 @@ class EmulatedResponse:
         DesignError
             If fewer than eight runs have a finite response.
         """
-        own = likelihood.inputs.aleatory
         runs = likelihood.coordinates.inputs(likelihood.emulation.z)
-        wanted = responses.inputs.aleatory
-        points = [runs[next(i for i, x in enumerate(own) if x is w)] for w in wanted]
+        points = values_of(runs, likelihood.inputs, responses.inputs)
         values = responses(points, [])
         coordinates = Coordinates.of_prior(responses.inputs)
         z = coordinates.of(points, 1)
@@ -103,7 +118,7 @@ class EmulatedResponse:
                 f"the runs of {likelihood.name}, expected at least 8; pass stored=False to "
                 "prb.predict, which computes responses at new specimens"
             )
-        near = _near_specimens(likelihood, points, coordinates, z)
+        near = _near_specimens(likelihood)
         distinct = np.unique(z[good], axis=0, return_index=True)[1]
         rows = np.flatnonzero(good)[distinct]
         surface = fit_interpolant(z[rows], y[rows], near[rows] if near[rows].any() else None)
@@ -127,16 +142,23 @@ class EmulatedResponse:
         return values.reshape(len(z), *self.event)
 
 
-def _near_specimens(
-    likelihood: SpecimenLikelihood, points: Sequence[Floats], coordinates: Coordinates, z: Floats
-) -> NDArray[np.bool_]:
+def values_of(values: Sequence[Floats], inputs: Inputs, wanted: Inputs) -> list[Floats]:
+    """Return the values of some inputs, from those of all inputs of a response."""
+    places = [
+        next(place for place, dist in enumerate(inputs.aleatory) if dist is x)
+        for x in wanted.aleatory
+    ]
+    return [values[place] for place in places]
+
+
+def _near_specimens(likelihood: SpecimenLikelihood) -> NDArray[np.bool_]:
     """Return which runs are within the range of the specimens' roots, (n,)."""
-    own = likelihood.points
-    roots = own.z[np.isfinite(own.log_a)]
+    specimens = likelihood.points
+    roots = specimens.z[np.isfinite(specimens.log_a)]
     low, high = np.quantile(roots, [0.01, 0.99], axis=0)
     run_z = likelihood.emulation.z
     near = ((run_z >= low) & (run_z <= high)).all(axis=1)
-    return near if near.sum() >= 16 else np.ones(len(z), dtype=bool)
+    return near if near.sum() >= 16 else np.ones(len(run_z), dtype=bool)
 
 
 def _nearest(runs: Floats, z: Floats) -> NDArray[np.intp]:
@@ -163,11 +185,19 @@ class EmulatedSimulator:
     place: int | None = None
 
     is_emulated: ClassVar[Literal[True]] = True
-    # As of a Node: no response is weighted, and a population costs no run.
+    # As of a Node: no response is weighted.
     design: ClassVar[None] = None
-    has_specimens: ClassVar[bool] = True
-    runs_per_theta: ClassVar[int] = 0
     max_lost: ClassVar[float] = MAX_LOST
+
+    @property
+    def has_specimens(self) -> bool:
+        """Whether specimens of all populations are there without a run."""
+        return not self.likelihood.propagation.calls_response
+
+    @property
+    def runs_per_theta(self) -> int:
+        """Runs that a population costs; none by an emulator."""
+        return 0 if self.has_specimens else _SIZES.specimens
 
     @property
     def name(self) -> str:
@@ -200,8 +230,8 @@ class EmulatedSimulator:
     def weights(self) -> Floats:
         """Weights of the specimens, (N,), which sum to one."""
         weights = self.likelihood.weights
-        own = np.ones(len(self.rows)) if weights is None else weights[self.rows]
-        return np.asarray(own / own.sum())
+        factors = np.ones(len(self.rows)) if weights is None else weights[self.rows]
+        return np.asarray(factors / factors.sum())
 
     @property
     def specimens(self) -> NDArray[Any] | None:
@@ -259,11 +289,11 @@ class EmulatedSimulator:
         The quasi-random numbers are the same for all calls.
         """
         rng = np.random.default_rng(0)
-        specimens, _ = new_specimens(self.name, self.inputs, list(roots), _SPECIMENS, rng)
+        specimens, _ = new_specimens(self.name, self.inputs, list(roots), _SIZES.specimens, rng)
         count = len(roots[0])
-        flat = [x.reshape(count * _SPECIMENS, *x.shape[2:]) for x in specimens]
-        values = self._emulated(flat).reshape(count, _SPECIMENS, *self.likelihood.event)
-        return values, np.full((count, _SPECIMENS), 1 / _SPECIMENS)
+        flat = [x.reshape(count * _SIZES.specimens, *x.shape[2:]) for x in specimens]
+        values = self._emulated(flat).reshape(count, _SIZES.specimens, *self.likelihood.event)
+        return values, np.full((count, _SIZES.specimens), 1 / _SIZES.specimens)
 
 
 type PopulationSimulator = Node | EmulatedSimulator
@@ -314,16 +344,18 @@ class EmulatedSample:
     def of(cls, simulator: EmulatedSimulator, roots: Sequence[Floats]) -> EmulatedSample:
         """Draw specimens from populations at roots, shapes (k, *shape)."""
         count = len(roots[0])
-        chosen = np.unique(np.linspace(0, count - 1, _POPULATIONS).round().astype(int))
+        chosen = np.unique(np.linspace(0, count - 1, _SIZES.populations).round().astype(int))
         roots = [root[chosen] for root in roots]
-        of_each = -(-_POPULATIONS * _OF_EACH // len(chosen) // _BLOCKS) * _BLOCKS
+        of_each = (
+            -(-_SIZES.populations * _SIZES.of_each // len(chosen) // _SIZES.blocks) * _SIZES.blocks
+        )
         specimens, _ = new_specimens(
             simulator.name, simulator.inputs, list(roots), of_each, np.random.default_rng(0)
         )
         flat = [x.reshape(-1, *x.shape[2:]) for x in specimens]
         log_p = _log_density(simulator.inputs, roots, flat)
         log_mixture = logsumexp(log_p, axis=0) - np.log(len(chosen))
-        blocks = np.tile(np.arange(of_each) % _BLOCKS, len(chosen))
+        blocks = np.tile(np.arange(of_each) % _SIZES.blocks, len(chosen))
         return cls(simulator, flat, log_mixture, blocks)
 
     @property
@@ -343,8 +375,7 @@ class EmulatedSample:
 
     def points_of(self, inputs: Inputs) -> list[Floats]:
         """Return the specimens' values of some inputs."""
-        own = self.inputs.aleatory
-        return [self.points[next(i for i, x in enumerate(own) if x is w)] for w in inputs.aleatory]
+        return values_of(self.points, self.inputs, inputs)
 
     def populations(self, roots: Sequence[Floats]) -> tuple[None, Floats]:
         """Return nothing, and the weights of the specimens in populations at roots, (k, n)."""
@@ -358,12 +389,12 @@ class EmulatedSample:
         """Raise if the weights of most populations are those of a few specimens."""
         _, weights = self.populations(roots)
         size = float(np.median(1 / (weights**2).sum(axis=1)))
-        if not size >= _OF_EACH / 2:
+        if not size >= _SIZES.of_each / 2:
             raise DesignError(
                 f"{name}: got a weight effective sample size of {size:.0f} of {self.n_points} "
                 "emulated specimens (median over the populations), expected at least "
-                f"{_OF_EACH // 2}; the populations of this result are too different from each "
-                "other; compute the quantity from prb.predict"
+                f"{_SIZES.of_each // 2}; the populations of this result are too different from "
+                "each other; compute the quantity from prb.predict"
             )
 
 

@@ -46,6 +46,7 @@ from prbayes.model.specimen_likelihood import (
     SpecimenDistribution,
     SpecimenLikelihood,
     reference_error,
+    specimen_likelihoods,
 )
 from prbayes.propagation.base import Propagation, refuse_nested
 from prbayes.propagation.reweighted import Reweighted
@@ -87,14 +88,16 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         point at which it could not be computed, all outputs of it, +inf a specimen that failed. It
         is a function of its inputs: where these repeat, as discrete ones do, a design computes it
         once, unless four that are computed again differ. Scatter of its own is best an input, as
-        ``pm.Normal.dist(0, 1)``. Simulators with the same response object, inputs and propagation
-        share its runs.
+        ``pm.Normal.dist(0, 1)``. Simulators with the same response object, inputs and propagation,
+        and metrics of distributions, share its runs.
     *inputs
         Each is a ``.dist()`` (aleatory: varies between specimens), a model variable (epistemic:
         common to all specimens) or a constant. The same ``.dist()`` in two simulators means the
         same population; that values were measured on the same specimens is said by ``specimens``.
-    metric : Metric
-        How simulated and observed responses are compared.
+    metric : Metric, optional
+        How simulated and observed responses are compared. By default `LogLikelihood`, the
+        log-likelihood by specimen, for a deterministic response of continuous inputs: it needs a
+        hundred-odd runs, and no epsilon.
     observed : array_like, shape (N,) or (N, m), DataFrame, DataArray, mapping or pymc.Data
         Measured responses, of at least two specimens. Several outputs of each, (N, m), go with a
         metric that sees them together, such as `Joint`: an array, a DataFrame whose columns are
@@ -231,6 +234,7 @@ def _by_specimen(
     labels = (
         None if specimens is None else sample_labels(specimens, len(values), f"{name}: specimens")
     )
+    _refuse_shared_specimens(name, labels, model)
     factors = None
     if weights is not None:
         factors = sample_weights(weights, len(values), f"{name}: weights") * len(values)
@@ -273,6 +277,29 @@ def _by_specimen(
         observed=data,
         dims=_checked_dims(name, dims, values.shape, model),
     )
+
+
+def _refuse_shared_specimens(name: str, labels: NDArray[Any] | None, model: pm.Model) -> None:
+    """Raise if a specimen has several readings of an output, or is in another simulator too."""
+    if labels is None:
+        return
+    texts = [_read(label) for label in labels.tolist()]
+    repeated = sorted({text for text in texts if texts.count(text) > 1})
+    if repeated:
+        raise ValueError(
+            f"{name}: specimens: got the label {repeated[0]!r} several times, expected each once: "
+            "readings of one specimen share its inputs; pass observed= as (N, R), a row for each "
+            "specimen, with a response that returns the output R times, and error="
+        )
+    for other in (*simulators(model).values(), *specimen_likelihoods(model).values()):
+        own = [] if other.specimens is None else [_read(x) for x in other.specimens.tolist()]
+        shared = sorted(set(texts) & set(own))
+        if shared:
+            raise ValueError(
+                f"{name}: specimens: got {shared[0]!r}, which {other.name} has too, expected each "
+                "specimen in one simulator with prb.LogLikelihood(): return all outputs from one "
+                "response, and pass observed= as (N, m), with NaN where an output is missing"
+            )
 
 
 def _measurement_variables(

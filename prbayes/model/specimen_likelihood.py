@@ -30,7 +30,7 @@ from pytensor.graph.replace import graph_replace, vectorize_graph
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import Floats
+from prbayes._checks import Floats, called
 from prbayes._finding import Finding, report
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.metrics.readings import Readings
@@ -53,6 +53,7 @@ from prbayes.propagation.specimen_points import (
     draw_points,
     emulate,
 )
+from prbayes.response.costs import in_words
 from prbayes.response.distributions import PopulationSampler, log_density, prior_draws
 from prbayes.response.grouping import is_group
 from prbayes.response.inputs import Inputs
@@ -100,7 +101,7 @@ class SpecimenLikelihood:
     groups: NDArray[np.intp] | None = None
     extras: Mapping[str, TensorVariable] = field(default_factory=dict)
     model: Any = None  # weak reference to the pymc.Model
-    known: SpecimenLikelihood | None = None  # of the same runs, for other data
+    known: Emulation | None = None  # of the same response, for other data
     options: PointOptions = field(default_factory=PointOptions)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -136,6 +137,29 @@ class SpecimenLikelihood:
     @cached_property
     def _prepared(self) -> tuple[Emulation, SpecimenPoints, tuple[Finding, ...]]:
         """The emulator, the points and what is to be reported of them."""
+        self.responses.on_start = self._log_first_runs
+        try:
+            return self._prepare()
+        finally:
+            self.responses.on_start = None
+
+    def _log_first_runs(self, runs: int, seconds: float) -> None:
+        """Log how many runs there are, how long they take, and which number changes them."""
+        self.responses.on_start = None
+        total = np.ceil(runs / self.responses.workers) * seconds
+        duration = f", about {in_words(float(total))}" if total >= 1 else ""
+        more = max(runs // 2, self.options.fresh)
+        _log.info(
+            "%s: runs at first: %d%s; then %d at a time at the roots of the specimens; to change "
+            "this, pass another number in propagation=prb.Reweighted(n=%d)",
+            self.name,
+            runs,
+            duration,
+            more,
+            runs,
+        )
+
+    def _prepare(self) -> tuple[Emulation, SpecimenPoints, tuple[Finding, ...]]:
         name, n = self.name, self.propagation.emulator_runs
         bounds, d = self.coordinates.bounds, self.coordinates.size
         if self._is_partial:
@@ -152,7 +176,7 @@ class SpecimenLikelihood:
             )  # fmt: skip
             return emulation, points, report(self._data_findings(several_roots=True))
         box = np.stack([-np.ones(d), np.ones(d)])
-        known = None if self.known is None else self.known.emulation
+        known = self.known
         if self.propagation.calls_response:
             known = Emulation.of_function(self.run, box, bounds, self.readings, self.options)
         emulation, roots = emulate(
@@ -376,7 +400,7 @@ class SpecimenLikelihood:
                 f"{len(self.observed)}, as many as there are groups, weights= or specimens=; build "
                 "the model again with those of the new ones"
             )
-        known = self if "_prepared" in vars(self) else self.known
+        known = self.emulation if "_prepared" in vars(self) else self.known
         return replace(self, observed=values, readings=readings, known=known)
 
 
@@ -598,7 +622,15 @@ def _same(data: Any, observed: Floats) -> bool:
 
 
 def specimen_likelihoods(model: pm.Model) -> dict[Any, SpecimenLikelihood]:
-    """Return the likelihoods by specimen of a model, by their observed variables."""
+    """Return the likelihoods by specimen of a model, by their observed variables.
+
+    Raises
+    ------
+    TypeError
+        If it is no model.
+    """
+    if not isinstance(model, pm.Model):
+        raise TypeError(f"model: got {called(model)}, expected a pm.Model")
     result = {}
     for rv in model.observed_RVs:
         if isinstance(rv.owner.op, SpecimenRV):

@@ -53,9 +53,10 @@ def simulation_based_calibration(
 
     Each time hyperparameters are drawn from the prior, and specimens from their populations, for
     which the response is called; with the log-likelihood by specimen its emulator gives the
-    responses, nothing is run, and the emulator itself is not checked. Then epsilon, `sample_smc` and its adjustment run as they would on
-    measurements. If posteriors have the right width and place, the ranks are uniform. A wide prior
-    asks more than one true value does: it shows what happens all over the prior.
+    responses, nothing is run, and the emulator itself is not checked. Then epsilon,
+    `sample_smc` and its adjustment run as they would on measurements. If posteriors have the right
+    width and place, the ranks are uniform. A wide prior asks more than one true value does: it
+    shows what happens all over the prior.
 
     Parameters
     ----------

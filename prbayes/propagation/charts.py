@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +21,6 @@ Response = Callable[[Floats], tuple[Floats, Floats]]
 """Inputs (n, d) to outputs (n, m) and Jacobians (n, m, d); NaN where the response has no value."""
 
 Indices = NDArray[np.intp]
-
-# Degrees of freedom of the t distributions; 5 and 20 gave the same effective sample sizes.
-DEGREES = 8.0
-# Inflation of a chart's covariance against that of its weighted points; 1.1 and 1.5 gave the same.
-INFLATION = 1.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +206,11 @@ class Charts:
         Mixing weight, zero where there is no chart.
     """
 
+    # Degrees of freedom of the t distributions; 5 and 20 gave the same effective sample sizes.
+    degrees: ClassVar[float] = 8.0
+    # Inflation of the covariance against that of weighted points; 1.1 and 1.5 gave the same.
+    inflation: ClassVar[float] = 1.3
+
     centre: Floats
     free: Floats
     solved: Floats
@@ -288,7 +289,9 @@ class Charts:
         k = self.location.shape[-1]
         inverse = np.linalg.inv(self.scale)
         constant = (
-            gammaln((DEGREES + k) / 2) - gammaln(DEGREES / 2) - k / 2 * np.log(DEGREES * np.pi)
+            gammaln((Charts.degrees + k) / 2)
+            - gammaln(Charts.degrees / 2)
+            - k / 2 * np.log(Charts.degrees * np.pi)
         )
         with np.errstate(divide="ignore"):
             constant = constant + np.log(np.diagonal(inverse, axis1=2, axis2=3)).sum(axis=2)
@@ -304,7 +307,7 @@ class Charts:
             distance = (scaled[..., 0] ** 2).sum(axis=1)
             with np.errstate(divide="ignore"):
                 log_det = np.log(np.abs(np.linalg.det(jacobian[rows] @ self.solved[i, c])))
-            log_t = constant[i, c] - (DEGREES + k) / 2 * np.log1p(distance / DEGREES)
+            log_t = constant[i, c] - (Charts.degrees + k) / 2 * np.log1p(distance / Charts.degrees)
             terms[rows, c] = log_t + log_det
         # Only charts whose term matters need the check that they reach the point.
         terms[terms < terms[np.arange(n), slot][:, None] - 10] = -np.inf
@@ -496,4 +499,6 @@ def _charts_at(fibres: Fibres, z: Floats, jacobian: Floats) -> Charts:
     covariance = (axes * variance[:, None, :]) @ axes.transpose(0, 2, 1)
     shift = (covariance @ slope[..., None])[..., 0]
     shift /= np.maximum(np.sqrt((shift**2).sum(axis=1, keepdims=True)), 1)
-    return Charts(z, free, solved, shift, np.linalg.cholesky(INFLATION * covariance), np.ones(n))
+    return Charts(
+        z, free, solved, shift, np.linalg.cholesky(Charts.inflation * covariance), np.ones(n)
+    )

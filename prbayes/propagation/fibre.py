@@ -52,8 +52,6 @@ from scipy.special import gammaincinv, logsumexp, ndtri
 
 from prbayes._checks import Floats
 from prbayes.propagation.charts import (
-    DEGREES,
-    INFLATION,
     Charts,
     Fibres,
     Indices,
@@ -365,8 +363,8 @@ def _draw(
     cumulative = np.cumsum(charts.share, axis=1)[:, :-1]
     slot = (uniform[..., :1] > cumulative[:, None, :]).sum(axis=2).ravel()
     specimen = np.repeat(np.arange(n), points)
-    chi_square = 2 * gammaincinv(DEGREES / 2, uniform[..., 1].reshape(-1, 1))
-    t = ndtri(uniform[..., 2:].reshape(-1, k)) / np.sqrt(chi_square / DEGREES)
+    chi_square = 2 * gammaincinv(Charts.degrees / 2, uniform[..., 1].reshape(-1, 1))
+    t = ndtri(uniform[..., 2:].reshape(-1, k)) / np.sqrt(chi_square / Charts.degrees)
     u = charts.location[specimen, slot] + (charts.scale[specimen, slot] @ t[..., None])[..., 0]
     # Specimens without charts have arrays of zeros, so that all their solves fail.
     z, jacobian, converged = charts.points(fibres, specimen, slot, u)
@@ -422,7 +420,9 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
         transposed = rotation.transpose(0, 2, 1)
         present_location = (rotation @ charts.location[i, c][..., None])[..., 0]
         root = rotation @ charts.scale[i, c]
-        present = root @ root.transpose(0, 2, 1) / INFLATION + np.eye(k) - rotation @ transposed
+        present = (
+            root @ root.transpose(0, 2, 1) / Charts.inflation + np.eye(k) - rotation @ transposed
+        )
 
         u = (sample.z[i] - charts.centre[i, None, c]) @ free[i, c]
         old, new = 4.0 * k / (size + 4 * k), size / (size + 4 * k)
@@ -430,7 +430,7 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
         centred = u - mean[:, None]
         covariance = (centred * w[..., None]).transpose(0, 2, 1) @ centred
         covariance = new[:, None, None] * covariance + old[:, None, None] * present
-        location[i, c], scale[i, c] = mean, np.linalg.cholesky(INFLATION * covariance)
+        location[i, c], scale[i, c] = mean, np.linalg.cholesky(Charts.inflation * covariance)
     has_chart = charts.share > 0
     share = 0.9 * share + 0.1 * has_chart / np.maximum(has_chart.sum(axis=1, keepdims=True), 1)
     share = np.where(has_chart, share, 0)

@@ -632,3 +632,35 @@ def test_predictive_draws_are_those_of_the_population() -> None:
     assert drawn.std() == pytest.approx(1.0, abs=0.06)
     # Different specimens, and different data sets
     assert len(np.unique(drawn.round(12))) == drawn.size
+
+
+def test_specimens_with_several_readings_are_refused() -> None:
+    with pm.Model():
+        x = pm.Normal.dist(pm.Normal("mu"), 1.0)
+        with pytest.raises(ValueError, match="got the label 'a' several times"):
+            prb.Simulator("y", np.positive, x, observed=[1.0, 2.0], specimens=["a", "a"])
+        prb.Simulator("y", np.positive, x, observed=[1.0, 2.0], specimens=["a", "b"])
+        with pytest.raises(ValueError, match="'b', which y has too"):
+            prb.Simulator("z", np.square, x, observed=[1.0, 2.0], specimens=["b", "c"])
+
+
+def test_the_first_use_logs_the_number_of_runs(caplog: pytest.LogCaptureFixture) -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu"), 1.0)
+        prb.Simulator("y", np.positive, x, observed=[1.0, 2.0, 0.5, -0.3])
+        assert "runs at first" not in caplog.text
+        with caplog.at_level("INFO", logger="prbayes"):
+            model.compile_logp()
+    assert "y: runs at first: 64" in caplog.text
+    assert "propagation=prb.Reweighted(n=64)" in caplog.text
+
+
+def test_the_response_itself_serves_in_place_of_an_emulator() -> None:
+    observed = np.random.default_rng(5).normal(1.0, 0.5, 12) ** 2
+    values = []
+    for propagation in (None, prb.Resimulated(64)):
+        with pm.Model() as model:
+            x = pm.Normal.dist(pm.Normal("mu", 1, 0.3), 0.5)
+            prb.Simulator("y", np.square, x, observed=observed, propagation=propagation)
+            values.append(model.compile_logp()({"mu": 0.9}))
+    assert values[0] == pytest.approx(values[1], abs=0.05)

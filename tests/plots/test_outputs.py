@@ -101,9 +101,8 @@ def several() -> SimpleNamespace:
 def test_by_default_an_output_that_does_not_vary_is_left_out() -> None:
     data = np.column_stack([np.full(5, 0.1), np.arange(5.0), np.arange(5.0) ** 2])
     outputs = Outputs(("none", "one", "two"))
-    target = SimpleNamespace(observed=data, weights=np.full(5, 0.2))
-    node: Any = SimpleNamespace(name="y", outputs=outputs, target=target)
-    evaluator: Any = SimpleNamespace(nodes=[node])
+    node: Any = SimpleNamespace(name="y", outputs=outputs, observed=data, weights=np.full(5, 0.2))
+    evaluator: Any = SimpleNamespace(simulators=[node])
     assert [output.name for output in _chosen(evaluator, 0, None)] == ["y[one]", "y[two]"]
 
 

@@ -64,8 +64,8 @@ def test_the_text_of_an_output(
 
 def test_what_was_not_measured_is_left_out() -> None:
     observed = np.array([[1.0, np.nan], [2.0, 5.0], [3.0, np.inf]])
-    target = SimpleNamespace(observed=observed, weights=np.array([0.5, 0.3, 0.2]))
-    y = SimpleNamespace(name="y", outputs=Outputs(("a", "b")), target=target)
+    weights = np.array([0.5, 0.3, 0.2])
+    y = SimpleNamespace(name="y", outputs=Outputs(("a", "b")), observed=observed, weights=weights)
     values, weights = Output(y, 1, True).measured()
     np.testing.assert_array_equal(values, [5.0, np.inf])
     np.testing.assert_allclose(weights, [0.6, 0.4])
