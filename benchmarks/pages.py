@@ -324,7 +324,7 @@ def metric_prices() -> Iterator[Row]:
         yield [
             *columns,
             _over(scores, lambda score: f"{score['runs']:.0f}"),
-            _over(scores, lambda score: f"{score['cpu']:.2g}"),
+            _over(scores, lambda score: f"{score['cpu']:.{int(score['cpu'] < 10)}f}"),
             _over(scores, lambda score: short(max(_rms(score)))),
         ]
 
