@@ -19,6 +19,7 @@ import xarray as xr
 from prbayes._checks import Floats
 from prbayes._finding import Finding
 from prbayes.estimate.differences import cross, slopes
+from prbayes.estimate.failing_region import failing_region_findings
 from prbayes.estimate.minimization import Minimisation, find_optimum
 from prbayes.estimate.optimum import Optimum
 from prbayes.estimate.specimen_refits import (
@@ -305,7 +306,8 @@ def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats
                 _ELSEWHERE,
             )
         )
-    checked += Checked(notes=emulator_notes(evaluator))
+    center = thetas.reshape(-1, evaluator.size).mean(axis=0)
+    checked += Checked(failing_region_findings(evaluator, center), emulator_notes(evaluator))
     return checked + _conflict(evaluator, thetas) + Checked(untested=(_ELSEWHERE,))
 
 

@@ -7,6 +7,7 @@ its weight, the share of the posterior mass by Laplace's approximation.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,8 +16,11 @@ import numpy as np
 from prbayes._checks import Floats
 from prbayes._finding import Finding, report
 from prbayes.estimate.differences import cross, slopes
+from prbayes.estimate.failing_region import failing_region_findings
 from prbayes.estimate.optimum import Optimum, plain
+from prbayes.estimate.prior_ends import PriorEnd, end_of_range, of_prior_ends
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.hyperparameters import THETAS
 from prbayes.model.identity import identity_of
 
 
@@ -65,8 +69,9 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
     modes = _distinct(optima, evaluator.prior_sd)
     best = modes[0]
     point, stderr = _in_units(evaluator, best.theta, best.covariance)
+    ends = _prior_ends(evaluator, best, lambda theta: objective(theta)[0])
     findings = [f for likelihood in evaluator.likelihoods for f in likelihood.findings]
-    findings += report(_findings(evaluator, modes))
+    findings += report(_findings(evaluator, modes, ends))
     weights = mode_weights(modes)
     rivals = tuple(
         {
@@ -283,10 +288,50 @@ def _in_units(
     return point, stderr
 
 
-def _findings(evaluator: Evaluator, modes: list[LocalOptimum]) -> list[Finding]:
-    """Report several modes, unidentified hyperparameters, and an optimum at a support's edge."""
-    findings = []
+def _prior_ends(
+    evaluator: Evaluator, optimum: LocalOptimum, objective: Callable[[Floats], float]
+) -> list[PriorEnd]:
+    """Return the hyperparameters that the data push to a finite end of their prior.
+
+    In unconstrained space the end is at infinity, and nothing changes on the way there. Back at the
+    middle of the prior the log-likelihood is lower by more than three nats, whatever the others do.
+    """
+    from scipy.optimize import minimize
+
+    theta, unit = optimum.theta, evaluator.prior_sd
+    flat = np.flatnonzero(np.isinf(np.diag(optimum.covariance)))
+    ends = []
+    prior = evaluator.prior_thetas(THETAS, 0) if flat.size else np.empty((0, theta.size))
+    for i in flat.tolist():
+        below = float((prior[:, i] <= theta[i]).mean())
+        if 0.05 <= below <= 0.95:
+            continue
+        value, bound = end_of_range(evaluator, theta, i, up=below > 0.5)
+        if not np.isfinite(bound):
+            continue
+        start = theta.copy()
+        start[i] = np.median(prior[:, i])
+
+        def along(u: Floats, start: Floats = start, i: int = i) -> float:
+            return objective(start + np.insert(u, i, 0.0) * unit)
+
+        nothing = np.zeros(theta.size - 1)
+        back = along(nothing)
+        if theta.size > 1 and np.isfinite(back):
+            options = {"maxfev": 100 * theta.size, "xatol": 1e-2, "fatol": 1e-2}
+            back = minimize(along, nothing, method="Nelder-Mead", options=options).fun
+        if back > optimum.value + 3.0:
+            ends.append(PriorEnd(evaluator.readable_names[i], value, bound))
+    return ends
+
+
+def _findings(
+    evaluator: Evaluator, modes: list[LocalOptimum], ends: list[PriorEnd]
+) -> list[Finding]:
+    """Report a failing region, ends of priors, several modes and what is not identified."""
     best = modes[0]
+    findings = list(failing_region_findings(evaluator, best.theta))
+    findings += [Finding("prior-end", text) for text in of_prior_ends(ends)]
     if np.isnan(best.covariance).any():
         findings.append(
             Finding(
@@ -300,7 +345,7 @@ def _findings(evaluator: Evaluator, modes: list[LocalOptimum]) -> list[Finding]:
     flat = [
         name
         for name, v in zip(evaluator.readable_names, np.diag(best.covariance), strict=True)
-        if np.isinf(v)
+        if np.isinf(v) and name not in {end.name for end in ends}
     ]
     if flat:
         findings.append(

@@ -60,13 +60,13 @@ def at_prior_ends(sampling: SamplingDistribution, seed: int = 0) -> list[PriorEn
     found = []
     for i in np.flatnonzero(alone & outermost):
         up = bool(below[i] > 0.5)
-        value, bound = _bound(evaluator, theta, int(i), up=up)
+        value, bound = end_of_range(evaluator, theta, int(i), up=up)
         if np.isfinite(bound) and _pushed(sampling, int(i), float(np.median(prior[:, i]))):
             found.append(PriorEnd(evaluator.readable_names[i], value, bound))
     return found
 
 
-def _bound(evaluator: Evaluator, theta: Floats, i: int, *, up: bool) -> tuple[float, float]:
+def end_of_range(evaluator: Evaluator, theta: Floats, i: int, *, up: bool) -> tuple[float, float]:
     """Return an element in the users' own units, and where its range ends on one side, or NaN."""
     steps = np.outer([0.0, *_FAR_OUTSIDE, *np.negative(_FAR_OUTSIDE)], np.eye(theta.size)[i])
     thetas = theta + steps * evaluator.prior_sd

@@ -42,7 +42,14 @@ from prbayes.model.node import (
     response_name,
 )
 from prbayes.model.population_draws import Populations, specimens_of
-from prbayes.propagation.base import Propagation
+from prbayes.model.run_checks import (
+    emulator_findings,
+    refuse_scatter,
+    refuse_undetermined,
+    refuse_unreachable,
+    unreached,
+)
+from prbayes.propagation.base import DesignError, Propagation
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.fibre_points import fibre_points
 from prbayes.propagation.roots import Roots
@@ -56,7 +63,7 @@ from prbayes.propagation.specimen_points import (
 from prbayes.response.costs import in_words
 from prbayes.response.distributions import PopulationSampler, log_density, prior_draws
 from prbayes.response.grouping import is_group
-from prbayes.response.inputs import Inputs
+from prbayes.response.inputs import Inputs, aleatory_names
 from prbayes.response.outputs import Outputs
 from prbayes.response.response import Responses
 
@@ -129,10 +136,33 @@ class SpecimenLikelihood:
         return Coordinates.of_prior(self.inputs)
 
     def run(self, z: Floats) -> Floats:
-        """Return the outputs of runs at coordinates, (n, d) -> (n, m); NaN where there is none."""
+        """Return the outputs of runs at coordinates, (n, d) -> (n, m); NaN where there is none.
+
+        The first runs are checked for scatter and for the range of the readings.
+        """
+        before = self.responses.computed
         values = self.responses(self.coordinates.inputs(z), [])
         values = values.reshape(len(z), -1)
-        return np.where(np.isfinite(values), values, np.nan)
+        values = np.where(np.isfinite(values), values, np.nan)
+        if self.known is None and self._first_outputs is None:
+            if self.responses.computed > before:
+                last = self.coordinates.inputs(z[-1:])
+                refuse_scatter(self.name, values, lambda: self.responses.alone(last).ravel())
+            refuse_unreachable(self.name, values, self.readings)
+            vars(self)["_first_outputs"] = values
+        return values
+
+    @cached_property
+    def _first_outputs(self) -> Floats | None:
+        """Outputs of the first runs, (n, m), once they were made and checked."""
+        return None
+
+    @property
+    def _coordinate_names(self) -> list[str]:
+        """The name of the input of each coordinate."""
+        names = aleatory_names(self.inputs, self.responses.function)
+        sizes = [int(np.prod(shape, dtype=int)) for shape in self.inputs.event_shapes]
+        return [name for name, size in zip(names, sizes, strict=True) for _ in range(size)]
 
     @cached_property
     def _prepared(self) -> tuple[Emulation, SpecimenPoints, tuple[Finding, ...]]:
@@ -179,9 +209,16 @@ class SpecimenLikelihood:
         known = self.known
         if self.propagation.calls_response:
             known = Emulation.of_function(self.run, box, bounds, self.readings, self.options)
-        emulation, roots = emulate(
-            self.run, self.readings, box, bounds, self.options, n=n, known=known, name=name
-        )
+        try:
+            emulation, roots = emulate(
+                self.run, self.readings, box, bounds, self.options, n=n, known=known, name=name
+            )
+        except DesignError as error:
+            first = self._first_outputs
+            cause = "" if first is None else unreached(first, self.readings)
+            raise DesignError(f"{error}{cause}") from None
+        if not self.propagation.calls_response:
+            refuse_undetermined(name, emulation, roots, self._coordinate_names)
         points = draw_points(
             emulation,
             emulation.error,
@@ -194,6 +231,7 @@ class SpecimenLikelihood:
         findings = [
             *self._data_findings(several_roots=bool((points.n_roots > 1).any())),
             *misfit_findings(self.name, self.readings, roots, emulation.error),
+            *emulator_findings(self.name, self.readings, emulation.error),
         ]
         return emulation, points, report(findings)
 

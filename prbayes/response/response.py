@@ -8,7 +8,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -305,6 +305,14 @@ class Responses:
         found = self._computed(given)
         self.runs.note(given, found)
         return found
+
+    def alone(self, aleatory: Sequence[Floats]) -> Floats:
+        """Compute one specimen by itself, (1, *event) by input; no run, and not in the store."""
+        given = [np.asarray(v, dtype=np.float64) for v in aleatory]
+        if self.plain:
+            return self._at_once(self._filled(given), (1,), counted=False)
+        _, points = self._rows(given)
+        return respond(replace(self._calling, store=None), points, self._tally.copied())
 
     def _computed(self, given: list[Floats]) -> Floats:
         """Call the function for values of the inputs."""

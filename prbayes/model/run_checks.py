@@ -1,0 +1,180 @@
+"""Checks of the first runs against the log-likelihood by specimen, before any further run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from prbayes._checks import Floats
+from prbayes._finding import Finding
+from prbayes.metrics.readings import Readings
+from prbayes.propagation.base import DesignError
+from prbayes.propagation.roots import Response, Roots
+from prbayes.response.failures import ResponseError
+
+# Relative difference of two runs of one specimen that is rounding.
+_ROUNDING = 1e-6
+# Difference of a specimen by itself from the same among others, in standard deviations of the runs,
+# that is the tolerance of a solver which takes the batch as one system.
+_ONE_SYSTEM = 0.01
+# The emulator's error in robust standard deviations of the readings, from which it is reported.
+_LARGE_ERROR = 0.1
+
+
+def refuse_scatter(name: str, outputs: Floats, alone: Callable[[], Floats]) -> None:
+    """Raise if the last run is another one when it is computed again: noise, or a hidden state.
+
+    Parameters
+    ----------
+    name : str
+    outputs : ndarray, shape (n, m)
+        Of the first runs.
+    alone : callable
+        Computes the last run by itself, (m,).
+
+    Raises
+    ------
+    ResponseError
+    """
+    finite = np.isfinite(outputs).all(axis=1)
+    if finite.sum() < 2 or not finite[-1]:
+        return
+    last, again = outputs[-1], alone()
+    rounding = _ROUNDING * np.abs(outputs[finite]).max(axis=0)
+    if not (np.abs(again - last) > rounding).any():
+        return
+    differs = (np.abs(alone() - again) > rounding).any()
+    if not differs and not (np.abs(again - last) > _ONE_SYSTEM * outputs[finite].std(axis=0)).any():
+        return
+    j = int(np.nanargmax(np.abs(again - last) / np.where(rounding > 0, rounding, 1.0)))
+    raise ResponseError(
+        f"{name}: got outputs {last[j]:.6g} and {again[j]:.6g} of the same inputs, expected the "
+        "same for prb.LogLikelihood(): the response has scatter of its own, or a state from one "
+        "specimen to the next; fix its random seed or state, or use "
+        "metric=prb.ProbabilityResidual() with propagation=prb.Resimulated()"
+    )
+
+
+def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
+    """Raise if the response is constant, or all readings are far outside the range of the runs.
+
+    Far is more than the width of the range of the runs over all populations of the prior.
+
+    Parameters
+    ----------
+    name : str
+    outputs : ndarray, shape (n, m)
+        Of the first runs.
+    readings : Readings
+
+    Raises
+    ------
+    DesignError
+    """
+    finite = outputs[np.isfinite(outputs).all(axis=1)]
+    if len(finite) < 2:
+        return
+    low, high = finite.min(axis=0), finite.max(axis=0)
+    size = np.abs(finite).max(axis=0)
+    for j, width in enumerate(high - low):
+        output = f"output {j} of {outputs.shape[1]}" if outputs.shape[1] > 1 else "the output"
+        if width <= _ROUNDING * 1e-3 * size[j]:
+            raise DesignError(
+                f"{name}: got {high[j]:.6g} for {output} at all {len(finite)} runs, expected a "
+                "response that depends on its inputs; check the response, or leave the output out"
+            )
+        values = readings.values[np.isfinite(readings.values[:, j]), j]
+        beyond = np.maximum(values - high[j], low[j] - values)
+        if values.size and (beyond > width).all():
+            raise DesignError(
+                f"{name}: got readings from {values.min():.4g} to {values.max():.4g}, but "
+                f"{low[j]:.4g} to {high[j]:.4g} for {output} at {len(finite)} runs over the range "
+                "of the priors, expected ranges that overlap; check the units of the readings, "
+                "the response and the priors"
+            )
+
+
+def unreached(outputs: Floats, readings: Readings) -> str:
+    """Return a sentence about readings outside the range of the runs; empty if most are inside."""
+    finite = outputs[np.isfinite(outputs).all(axis=1)]
+    with np.errstate(invalid="ignore"):
+        outside = (readings.values < finite.min(axis=0)) | (readings.values > finite.max(axis=0))
+    count = int(outside.any(axis=1).sum())
+    if not len(finite) or 2 * count <= len(readings):
+        return ""
+    return (
+        f". The readings of {count} of {len(readings)} specimens are outside the range of all "
+        "runs over the priors: check the response, the priors and the units, or pass "
+        "prb.LogLikelihood(error=...)"
+    )
+
+
+def refuse_undetermined(
+    name: str, emulation: Any, roots: Roots, inputs: Sequence[str], smallest: float = 3.0
+) -> None:
+    """Raise if readings leave a direction of the inputs open, although there are enough outputs.
+
+    Along such a direction the outputs change over half the prior's range by less than a few errors
+    of the emulator.
+
+    Parameters
+    ----------
+    name : str
+    emulation : Emulation
+    roots : Roots
+    inputs : sequence of str
+        Names of the coordinates.
+    smallest : float
+        Change in errors of the emulator, at the median root. Responses without such a direction
+        have 97 and more, those with one less than .01.
+
+    Raises
+    ------
+    DesignError
+    """
+    d = len(inputs)
+    if d < 2 or not len(roots.z):
+        return
+    response: Response = emulation
+    _, jacobian = response(roots.z)
+    scaled = jacobian / emulation.error[:, None]
+    _, values, directions = np.linalg.svd(scaled[np.isfinite(scaled).all(axis=(1, 2))])
+    if not len(values) or values.shape[1] < d or np.median(values[:, -1]) >= smallest:
+        return
+    weights = np.median(directions[:, -1] ** 2, axis=0)
+    involved = ", ".join(inputs[j] for j in np.flatnonzero(weights > 0.05 * weights.max()))
+    raise DesignError(
+        f"{name}: got {scaled.shape[1]} outputs that leave a direction of {involved} open, "
+        f"expected outputs that determine the {d} inputs of a specimen; make an input without "
+        "influence a constant, replace inputs that enter only through their sum or product by it, "
+        "or pass independent outputs alone"
+    )
+
+
+def emulator_findings(name: str, readings: Readings, error: Floats) -> tuple[Finding, ...]:
+    """Report an emulator whose error is not small beside the scatter of the readings.
+
+    Parameters
+    ----------
+    name : str
+    readings : Readings
+    error : ndarray, shape (m,)
+        Standard deviation of the emulator's error.
+    """
+    low, high = np.nanquantile(readings.values, [0.25, 0.75], axis=0)
+    scatter = (high - low) / 1.349
+    scatter = np.where(scatter > 0, scatter, readings.spread())
+    share = error / scatter
+    if not (share > _LARGE_ERROR).any():
+        return ()
+    return (
+        Finding(
+            "emulator-error",
+            f"{name}: the emulator's error is up to {share.max():.2g} standard deviations of the "
+            f"readings, expected at most {_LARGE_ERROR}: the response has a pole, a jump or a kink "
+            "in the range of the priors; narrow the priors, give more first runs with "
+            "propagation=prb.Reweighted(n), or use metric=prb.ProbabilityResidual()",
+        ),
+    )
