@@ -71,8 +71,8 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
     point, stderr = _in_units(evaluator, best.theta, best.covariance)
     ends = _prior_ends(evaluator, best, lambda theta: objective(theta)[0])
     findings = [f for likelihood in evaluator.likelihoods for f in likelihood.findings]
-    findings += report(_findings(evaluator, modes, ends))
-    weights = mode_weights(modes)
+    weights = _posterior_weights(evaluator, modes, with_prior=options.prior)
+    findings += report(_findings(evaluator, modes, weights, ends))
     rivals = tuple(
         {
             "point": _in_units(evaluator, mode.theta, mode.covariance)[0],
@@ -111,14 +111,47 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
     )
 
 
-def mode_weights(modes: list[LocalOptimum]) -> Floats:
-    """Return the share of each mode in the mass, by Laplace's approximation."""
-    logs = []
-    for mode in modes:
-        finite = np.isfinite(mode.covariance).all()
-        sign, log_det = np.linalg.slogdet(mode.covariance) if finite else (0.0, 0.0)
-        logs.append(-mode.value + (log_det / 2 if sign > 0 else 0.0))
-    shares = np.exp(np.array(logs) - max(logs))
+def _posterior_weights(
+    evaluator: Evaluator, modes: list[LocalOptimum], *, with_prior: bool
+) -> Floats:
+    """Return the share of each mode in the posterior's mass."""
+    if with_prior or len(modes) == 1:
+        return mode_weights(modes)
+    log_prior = evaluator.hyperparameters.log_prior(np.stack([mode.theta for mode in modes]))
+    return mode_weights(modes, log_prior, evaluator.prior_sd)
+
+
+def mode_weights(
+    modes: list[LocalOptimum], log_prior: Floats | None = None, prior_sd: Floats | None = None
+) -> Floats:
+    """Return the share of each mode in the posterior's mass, by Laplace's approximation.
+
+    Parameters
+    ----------
+    modes : list of LocalOptimum
+    log_prior : ndarray, shape (M,), optional
+        Log-density of the prior at each mode, in unconstrained space; none by default, as where
+        the optima are those of the posterior.
+    prior_sd : ndarray, shape (d,), optional
+        Spread of the prior, which bounds the mass along directions that the data do not identify.
+    """
+    logs = np.array([-mode.value for mode in modes])
+    if log_prior is not None:
+        logs = logs + log_prior
+    for k, mode in enumerate(modes):
+        covariance = mode.covariance
+        if np.isnan(covariance).any():
+            continue
+        open_directions = np.isinf(np.diag(covariance))
+        covariance = np.where(np.isinf(covariance), 0.0, covariance)
+        if prior_sd is not None:
+            covariance = covariance + 1e6 * np.diag(open_directions * prior_sd**2)
+            precision = np.linalg.inv(covariance) + np.diag(prior_sd**-2.0)
+            logs[k] -= np.linalg.slogdet(precision)[1] / 2
+        elif not open_directions.any():
+            sign, log_det = np.linalg.slogdet(covariance)
+            logs[k] += log_det / 2 if sign > 0 else 0.0
+    shares = np.exp(logs - logs.max())
     return np.asarray(shares / shares.sum())
 
 
@@ -326,7 +359,7 @@ def _prior_ends(
 
 
 def _findings(
-    evaluator: Evaluator, modes: list[LocalOptimum], ends: list[PriorEnd]
+    evaluator: Evaluator, modes: list[LocalOptimum], weights: Floats, ends: list[PriorEnd]
 ) -> list[Finding]:
     """Report a failing region, ends of priors, several modes and what is not identified."""
     best = modes[0]
@@ -356,7 +389,6 @@ def _findings(
                 "likelihood.md#identification",
             )
         )
-    weights = mode_weights(modes)
     for mode, weight in zip(modes[1:], weights[1:], strict=True):
         if weight < 0.01:
             continue
@@ -368,7 +400,7 @@ def _findings(
         findings.append(
             Finding(
                 "second-mode",
-                f"A second optimum at {where} has {weight:.0%} of the likelihood's mass; NUTS "
+                f"A second optimum at {where} has {weight:.0%} of the posterior's mass; NUTS "
                 "chains stay in the mode where they start, prb.sample_smc samples both",
                 "likelihood.md#several-modes",
             )

@@ -119,7 +119,7 @@ def test_a_specimen_beyond_all_draws_of_the_prior() -> None:
 def test_a_folded_response_has_two_modes(codes: list[str]) -> None:
     optimum = fit(folded_model())
     assert codes == ["second-mode"]
-    assert "has 50% of the likelihood's mass" in optimum.warnings[0]
+    assert "of the posterior's mass" in optimum.warnings[0]
     (rival,) = optimum.rivals
     assert rival["point"]["mu"] == pytest.approx(-optimum.point["mu"], abs=1e-3)
     assert rival["point"]["sigma"] == pytest.approx(optimum.point["sigma"], abs=1e-3)
