@@ -358,8 +358,10 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     )
     off = (means["prbayes"] - means["exact"]) / sds["exact"]
     width = sds["prbayes"] / sds["exact"]
-    result["bias"] = off.mean(axis=0).tolist()
-    result["rms"] = np.sqrt((off**2).mean(axis=0)).tolist()
+    distance = np.abs(off)
+    result["median distance"] = np.median(distance, axis=0).tolist()
+    result["distance of 99%"] = np.quantile(distance, 0.99, axis=0).tolist()
+    result["largest distance"] = distance.max(axis=0).tolist()
     result["width"] = np.median(width, axis=0).tolist()
     return result
 
