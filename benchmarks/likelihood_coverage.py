@@ -28,7 +28,14 @@ from scipy.special import i0e, lambertw, logsumexp, ndtr, ndtri
 import prbayes as prb
 from benchmarks import record
 from benchmarks.scoreboard import in_pymc
-from benchmarks.scoreboard.problem import Input, Prior, half_normal, normal, truncated
+from benchmarks.scoreboard.problem import (
+    Input,
+    Prior,
+    Reference,
+    half_normal,
+    normal,
+    truncated,
+)
 from benchmarks.scoreboard.problem import Problem as Population
 from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
 
@@ -40,6 +47,10 @@ _AT_ONCE = 4_000_000  # numbers of an array
 # Data sets between two writes of the results.
 _BLOCK = 20
 Functions = Callable[[Any], Any]
+
+
+def _no_reference(size: int, replicate: int) -> Reference:
+    raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -61,8 +72,8 @@ class Problem:
         """The problem as one of the scoreboard, for its inputs and priors."""
         return Population(
             name=self.name, what="", licence="", priors=self.priors, inputs=self.inputs,
-            formula=self.formula, sizes=(self.size,), data=lambda n, k: None, reference=None,
-        )  # type: ignore[arg-type]  # fmt: skip
+            formula=self.formula, sizes=(self.size,), data=lambda n, k: None, reference=_no_reference,
+        )  # fmt: skip
 
     def response(self, *x: Any) -> Any:
         """Return outputs, (..., m), or (...) of a single one."""
@@ -197,7 +208,7 @@ def exact_log_likelihood(problem: Problem, y: Any) -> Functions:
 
 def posterior(problem: Problem, function: Functions, start: Any) -> tuple[Any, Any, float]:
     """Return coordinates (S, q) with normalised weights (S,), and Pareto k."""
-    from arviz_stats.base import array_stats
+    from arviz_stats.base.array import array_stats
 
     d = len(problem.priors)
 
