@@ -191,9 +191,10 @@ def likelihood_ranks() -> Iterator[Row]:
         for j, (name, within) in enumerate(table["prbayes"]["coverage"].items()):
             exact = table["exact"]["coverage"][name]
             p = short(table["prbayes"]["p of uniformity"][name])
-            bias = f"{short(table['bias'][j], 3)}, {short(table['rms'][j], 3)}"
-            width, sets = short(table["width"][j], 3), str(table["data sets"])
-            yield [problem, name, sets, short(within, 3), short(exact, 3), p, bias, width]
+            keys = ("median distance", "distance of 99%", "largest distance")
+            distance = [short(table[key][j], 3) for key in keys]
+            sets = str(table["data sets"])
+            yield [problem, name, sets, short(within, 3), short(exact, 3), p, *distance]
 
 
 def _mean_ratio(ratios: Any) -> str:

@@ -48,7 +48,8 @@ def active_share(xp: Any, k1: Any, dose: float) -> Any:
 
 
 def formula(xp: Any, receptors: Any, k1: Any) -> list[Any]:
-    """Return active receptors of a cell at either dose."""
+    """Return active receptors of a cell at either dose; NaN of negative rates, which explode."""
+    k1 = xp.where(k1 > 0, k1, np.nan)
     return [receptors * active_share(xp, k1, dose) for dose in DOSES]
 
 
