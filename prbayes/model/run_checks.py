@@ -9,6 +9,7 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes._finding import Finding
+from prbayes.emulators.interpolant import fit_interpolant
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.roots import Response, Roots
@@ -20,7 +21,7 @@ _ROUNDING = 1e-6
 # that is the tolerance of a solver which takes the batch as one system.
 _ONE_SYSTEM = 0.01
 # The emulator's error in robust standard deviations of the readings, from which it is reported.
-_LARGE_ERROR = 0.1
+_LARGE_ERROR = 0.03
 
 
 def refuse_scatter(name: str, outputs: Floats, alone: Callable[[], Floats]) -> None:
@@ -134,22 +135,67 @@ def refuse_undetermined(
     ------
     DesignError
     """
-    d = len(inputs)
-    if d < 2 or not len(roots.z):
+    if len(inputs) < 2 or not len(roots.z):
         return
     response: Response = emulation
     _, jacobian = response(roots.z)
     scaled = jacobian / emulation.error[:, None]
-    _, values, directions = np.linalg.svd(scaled[np.isfinite(scaled).all(axis=(1, 2))])
-    if not len(values) or values.shape[1] < d or np.median(values[:, -1]) >= smallest:
+    values, directions = _singular(scaled)
+    if len(values) and np.median(values[:, -1]) < smallest:
+        raise _undetermined(name, scaled.shape[1], directions, inputs)
+
+
+def refuse_unused_inputs(
+    name: str, z: Floats, outputs: Floats, inputs: Sequence[str], smallest: float = 1e-3
+) -> None:
+    """Raise if the first runs show a direction of the inputs without influence.
+
+    Parameters
+    ----------
+    name : str
+    z : ndarray, shape (n, d)
+        Coordinates of the first runs.
+    outputs : ndarray, shape (n, m)
+    inputs : sequence of str
+        Names of the coordinates.
+    smallest : float
+        Influence relative to the direction with the largest, at the median run. Responses of
+        which all inputs matter have .05 and more, others 1e-4 and less.
+
+    Raises
+    ------
+    DesignError
+    """
+    good = np.isfinite(outputs).all(axis=1)
+    d, m = len(inputs), outputs.shape[1]
+    if d < 2 or m < d or good.sum() < 4 * d:
         return
+    z, outputs = z[good], outputs[good]
+    surface = fit_interpolant(z, outputs, np.ones(len(z), dtype=bool))
+    _, jacobian = surface(z)
+    values, directions = _singular(jacobian / outputs.std(axis=0)[:, None])
+    if len(values) and np.median(values[:, -1] / values[:, 0]) < smallest:
+        raise _undetermined(name, m, directions, inputs)
+
+
+def _singular(jacobian: Floats) -> tuple[Floats, Floats]:
+    """Return singular values, (k, d), and right singular vectors, (k, d, d)."""
+    finite = jacobian[np.isfinite(jacobian).all(axis=(1, 2))]
+    if finite.shape[1] < finite.shape[2]:
+        return np.empty((0, 0)), np.empty((0, 0, 0))
+    _, values, directions = np.linalg.svd(finite)
+    return values, directions
+
+
+def _undetermined(name: str, m: int, directions: Floats, inputs: Sequence[str]) -> DesignError:
     weights = np.median(directions[:, -1] ** 2, axis=0)
-    involved = ", ".join(inputs[j] for j in np.flatnonzero(weights > 0.05 * weights.max()))
-    raise DesignError(
-        f"{name}: got {scaled.shape[1]} outputs that leave a direction of {involved} open, "
-        f"expected outputs that determine the {d} inputs of a specimen; make an input without "
-        "influence a constant, replace inputs that enter only through their sum or product by it, "
-        "or pass independent outputs alone"
+    named = np.flatnonzero(weights > 0.05 * weights.max()).tolist()
+    involved = ", ".join(inputs[j] for j in named)
+    return DesignError(
+        f"{name}: got {m} outputs that leave a direction of {involved} open, expected outputs that "
+        f"determine the {len(inputs)} inputs of a specimen; make an input without influence a "
+        "constant, replace inputs that enter only through their sum or product by it, or pass "
+        "independent outputs alone"
     )
 
 
@@ -174,7 +220,8 @@ def emulator_findings(name: str, readings: Readings, error: Floats) -> tuple[Fin
             "emulator-error",
             f"{name}: the emulator's error is up to {share.max():.2g} standard deviations of the "
             f"readings, expected at most {_LARGE_ERROR}: the response has a pole, a jump or a kink "
-            "in the range of the priors; narrow the priors, give more first runs with "
+            "in the range of the priors, or more detail than the runs; posterior means may be off "
+            "by more than .1 standard deviations. Narrow the priors, give more first runs with "
             "propagation=prb.Reweighted(n), or use metric=prb.ProbabilityResidual()",
         ),
     )

@@ -47,6 +47,7 @@ from prbayes.model.run_checks import (
     refuse_scatter,
     refuse_undetermined,
     refuse_unreachable,
+    refuse_unused_inputs,
     unreached,
 )
 from prbayes.propagation.base import DesignError, Propagation
@@ -148,6 +149,7 @@ class SpecimenLikelihood:
                 last = self.coordinates.inputs(z[-1:])
                 refuse_scatter(self.name, values, lambda: self.responses.alone(last).ravel())
             refuse_unreachable(self.name, values, self.readings)
+            refuse_unused_inputs(self.name, z, values, self._coordinate_names)
             vars(self)["_first_outputs"] = values
         return values
 
