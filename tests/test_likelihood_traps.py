@@ -544,7 +544,7 @@ def crossing_shift(seed: int) -> float:
 
         return np.logaddexp(log_density(*x), log_density(*x[::-1])).sum(axis=1)
 
-    return shift(model, *around_normal(*x), exact)
+    return shift(model, *around_normal(*x, n=4000, wide=2.2), exact)
 
 
 def is_repaired_or_reported(

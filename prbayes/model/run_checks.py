@@ -19,12 +19,12 @@ from prbayes.response.failures import ResponseError
 def refuse_scatter(
     name: str,
     outputs: Floats,
-    alone: Callable[[], Floats],
+    alone: Callable[[int], Floats],
     *,
     rounding: float = 1e-6,
     one_system: float = 0.01,
 ) -> None:
-    """Raise if the last run is another one when it is computed again: noise, or a hidden state.
+    """Raise if the last good run differs when it is computed again: noise, or a hidden state.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def refuse_scatter(
     outputs : ndarray, shape (n, m)
         Of the first runs.
     alone : callable
-        Computes the last run by itself, (m,).
+        Row -> outputs of this run computed by itself, (m,).
     rounding : float
         Largest relative difference of two runs of one specimen.
     one_system : float
@@ -44,13 +44,14 @@ def refuse_scatter(
     ResponseError
     """
     finite = np.isfinite(outputs).all(axis=1)
-    if finite.sum() < 2 or not finite[-1]:
+    if finite.sum() < 2:
         return
-    last, again = outputs[-1], alone()
+    row = int(np.flatnonzero(finite)[-1])
+    last, again = outputs[row], alone(row)
     accuracy = rounding * np.abs(outputs[finite]).max(axis=0)
     if not (np.abs(again - last) > accuracy).any():
         return
-    differs = (np.abs(alone() - again) > accuracy).any()
+    differs = (np.abs(alone(row) - again) > accuracy).any()
     if not differs and not (np.abs(again - last) > one_system * outputs[finite].std(axis=0)).any():
         return
     j = int(np.nanargmax(np.abs(again - last) / np.where(accuracy > 0, accuracy, 1.0)))
@@ -216,7 +217,7 @@ def emulator_findings(
         Standard deviation of the emulator's error.
     largest : float
         In robust standard deviations of the readings. Jumps, poles and crossing modes with less
-        have posterior means within .1 standard deviations (36 data sets, but one at .15).
+        have posterior means within .1 standard deviations (33 data sets, one of them .15).
     """
     low, high = np.nanquantile(readings.values, [0.25, 0.75], axis=0)
     scatter = (high - low) / 1.349

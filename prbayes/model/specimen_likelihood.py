@@ -146,8 +146,12 @@ class SpecimenLikelihood:
         values = np.where(np.isfinite(values), values, np.nan)
         if self.known is None and self._first_outputs is None:
             if self.responses.computed > before:
-                last = self.coordinates.inputs(z[-1:])
-                refuse_scatter(self.name, values, lambda: self.responses.alone(last).ravel())
+
+                def alone(row: int) -> Floats:
+                    inputs = self.coordinates.inputs(z[row : row + 1])
+                    return self.responses.alone(inputs).ravel()
+
+                refuse_scatter(self.name, values, alone)
             refuse_unreachable(self.name, values, self.readings)
             refuse_unused_inputs(self.name, z, values, self._coordinate_names)
             vars(self)["_first_outputs"] = values
