@@ -387,13 +387,12 @@ def around_optimum(model: pm.Model, n: int = 1000, wide: float = 1.4) -> tuple[F
     return optimum.theta + u @ root.T, -(u**2).sum(axis=1) / 2
 
 
-def around_normal(*samples: Floats, n: int = 1000, wide: float = 1.4) -> tuple[Floats, Floats]:
-    """Return the same around the exact optimum of normal inputs: means, then log deviations."""
-    size = len(samples[0])
-    center = [x.mean() for x in samples] + [np.log(x.std()) for x in samples]
-    error = [x.std() / np.sqrt(size) for x in samples] + [1 / np.sqrt(2 * size)] * len(samples)
-    u = np.random.default_rng(5).standard_normal((n, len(center)))
-    return np.array(center) + wide * u * np.array(error), -(u**2).sum(axis=1) / 2
+def around_normal(x: Floats, n: int = 1000, wide: float = 1.4) -> tuple[Floats, Floats]:
+    """Return the same around the exact optimum of a normal input: mean and log deviation."""
+    center = np.array([x.mean(), np.log(x.std())])
+    error = np.array([x.std() / np.sqrt(len(x)), 1 / np.sqrt(2 * len(x))])
+    u = np.random.default_rng(5).standard_normal((n, 2))
+    return center + wide * u * error, -(u**2).sum(axis=1) / 2
 
 
 def over_box(bounds: Floats, n: int = 2000) -> tuple[Floats, Floats]:
@@ -544,7 +543,7 @@ def crossing_shift(seed: int) -> float:
 
         return np.logaddexp(log_density(*x), log_density(*x[::-1])).sum(axis=1)
 
-    return shift(model, *around_normal(*x, n=4000, wide=2.2), exact)
+    return shift(model, *around_optimum(model, n=4000), exact)
 
 
 def is_repaired_or_reported(
