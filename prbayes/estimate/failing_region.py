@@ -9,23 +9,25 @@ from prbayes._finding import Finding
 from prbayes.model.evaluator import Evaluator
 from prbayes.response.distributions import PopulationSampler
 
-# Simulated specimens of a population, and the number of lost specimens that is reported.
-_SPECIMENS, _LOST = 4096, 0.25
 
-
-def failing_region_findings(evaluator: Evaluator, theta: Floats) -> tuple[Finding, ...]:
+def failing_region_findings(
+    evaluator: Evaluator, theta: Floats, specimens: int = 4096, lost: float = 0.25
+) -> tuple[Finding, ...]:
     """Report populations of which a part has no response; no run is made.
 
     The likelihood of a specimen integrates over inputs with a response. The density elsewhere is
     probability where no specimen can be measured, so that a population moves away from there.
-    Where as much as a quarter of a specimen is expected there, among the observed number, a
-    finding ``failing-region`` has the share.
+    The finding ``failing-region`` has the share.
 
     Parameters
     ----------
     evaluator : Evaluator
     theta : ndarray, shape (d,)
         In unconstrained space.
+    specimens : int
+        Number of simulated specimens.
+    lost : float
+        Expected number of specimens in the region that is reported.
     """
     findings = []
     rng = np.random.default_rng(23)
@@ -35,18 +37,18 @@ def failing_region_findings(evaluator: Evaluator, theta: Floats) -> tuple[Findin
         if np.isfinite(emulation.y).all():
             continue
         sampler = PopulationSampler(likelihood.inputs)
-        drawn, _ = sampler(evaluator.roots(theta[None], k), _SPECIMENS, rng)
+        drawn, _ = sampler(evaluator.roots(theta[None], k), specimens, rng)
         z = likelihood.coordinates.of([x[0] for x in drawn], 1)
         fails = emulation.fails(np.clip(z, emulation.box[0], emulation.box[1]))
         share = float(fails.mean())
         n = len(simulator.rows)
-        if share * n < _LOST:
+        if share * n < lost:
             continue
         findings.append(
             Finding(
                 "failing-region",
                 f"{simulator.name}: got no response (NaN) for {share:.1%} of the population, "
-                f"expected less than {_LOST / n:.1%}: the likelihood takes it for inputs with "
+                f"expected less than {lost / n:.1%}: the likelihood takes it for inputs with "
                 "which no specimen is measured, and the population moves away from there. If "
                 "specimens with these inputs were measured, repair the response; if they were "
                 "discarded, give the inputs a truncated distribution (pm.Truncated)",

@@ -47,6 +47,7 @@ from prbayes.model.run_checks import (
     refuse_scatter,
     refuse_undetermined,
     refuse_unreachable,
+    refuse_unused_inputs,
     unreached,
 )
 from prbayes.propagation.base import DesignError, Propagation
@@ -146,9 +147,14 @@ class SpecimenLikelihood:
         values = np.where(np.isfinite(values), values, np.nan)
         if self.known is None and self._first_outputs is None:
             if self.responses.computed > before:
-                last = self.coordinates.inputs(z[-1:])
-                refuse_scatter(self.name, values, lambda: self.responses.alone(last).ravel())
+
+                def alone(row: int) -> Floats:
+                    inputs = self.coordinates.inputs(z[row : row + 1])
+                    return self.responses.alone(inputs).ravel()
+
+                refuse_scatter(self.name, values, alone)
             refuse_unreachable(self.name, values, self.readings)
+            refuse_unused_inputs(self.name, z, values, self._coordinate_names)
             vars(self)["_first_outputs"] = values
         return values
 

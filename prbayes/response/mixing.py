@@ -13,8 +13,6 @@ from prbayes.response.failures import ResponseError
 # up to which it is how a solver steps that takes a batch as one system. A mean, a sum or another
 # order over specimens makes it of the order of one.
 _ONE_SYSTEM = 0.01
-# Relative difference of two runs of one specimen that is rounding.
-_ROUNDING = 1e-6
 
 
 def refuse_mixing(
@@ -51,7 +49,7 @@ def refuse_mixing(
         if not _differ(rows[first], once, spread):
             return
         again = alone(place).ravel()
-        if (np.abs(again - once) > _ROUNDING * np.abs(once)).any():
+        if (np.abs(again - once) > 1e-6 * np.abs(once)).any():
             return
     except ResponseError:  # it takes no batch of one, which nobody asks of it
         return
