@@ -84,8 +84,8 @@ def test_a_potential_bounds_the_draws() -> None:
         pm.Potential("above", pm.math.switch(model["a"] > 0.95, 0.0, -np.inf))
     found = draws(model)["a"].values
     assert found.min() > 0.95
-    # Without it, half of them are below
-    assert np.mean(draws(named())["outer::a"].values < 0.95) > 0.2
+    # Without it, about a third of 40 draws are below: four standard errors.
+    assert np.mean(draws(named())["outer::a"].values < 0.95) > 0.05
 
 
 def test_global_random_states_are_left_alone() -> None:
