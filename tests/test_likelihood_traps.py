@@ -812,3 +812,9 @@ def test_the_joint_size_of_checks_before_the_fit(outcome: Any) -> None:
     _ = base.points
     flagged = [bool(base.observing(y).findings) for y in data]
     assert np.mean(flagged) <= 0.07
+
+
+def test_both_roots_beside_an_output_with_a_large_reading_error() -> None:
+    observed = frame.data(20, 0)
+    model = model_of(frame_response, frame_inputs, observed, error=[0.002, 0.002, 0.2])
+    assert (likelihood_of(model).points.n_roots == 2).all()

@@ -359,7 +359,8 @@ def _all_roots(
         return options, roots
 
     def find(y: Floats) -> list[Floats]:
-        simulated = specimen_roots(emulation, Readings.exact(y), options)
+        error = np.broadcast_to(np.median(readings.error, axis=0), y.shape)
+        simulated = specimen_roots(emulation, replace(Readings.exact(y), error=error), options)
         return [simulated.z[simulated.specimen == i] for i in range(len(y))]
 
     good = np.isfinite(emulation.y).all(axis=1)
@@ -388,14 +389,14 @@ def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptio
     target = np.where(measured, readings.values, 0.0)
     sd = readings.comparison_sd(emulation.error)
     solvable = np.flatnonzero(measured.sum(axis=1) >= emulation.z.shape[1])
+    # Runs are not chosen by an output that a reading error dominates.
+    unit = np.hypot(readings.spread(), 10 * np.median(readings.error, axis=0))
     parts = []
     # Specimens in blocks, so that memory stays constant.
     block = max(1, AT_ONCE // (options.starts * len(run_z) * 4))
     for first in range(0, len(solvable), block):
         rows = solvable[first : first + block]
-        starts = _starts(
-            run_z, run_y, target[rows], measured[rows], readings.spread(), options.starts
-        )
+        starts = _starts(run_z, run_y, target[rows], measured[rows], unit, options.starts)
         roots = find_roots(
             emulation, target[rows], np.where(measured[rows], sd[rows], 1e150), starts,
             emulation.box, gap=options.gap,
