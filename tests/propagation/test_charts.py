@@ -9,7 +9,6 @@ import pytest
 from scipy.special import ndtri
 
 from prbayes.propagation.charts import (
-    INFLATION,
     Charts,
     Fibres,
     ReferencePopulation,
@@ -103,7 +102,7 @@ def test_the_laplace_approximation_is_that_of_a_parabola() -> None:
     y = np.array([0.3, -0.5, -9.0])
     charts = charts_at_modes(unscaled(parabola, y[:, None]), 1, 1)
     variance = np.clip(1 / (1 - y), 0.3, 1.5)
-    np.testing.assert_allclose(charts.scale[:, 0, 0, 0] ** 2, INFLATION * variance, rtol=1e-3)
+    np.testing.assert_allclose(charts.scale[:, 0, 0, 0] ** 2, Charts.inflation * variance, rtol=1e-3)
     np.testing.assert_allclose(charts.location[:, 0], 0, atol=1e-3)
 
 
@@ -123,7 +122,7 @@ def test_the_location_follows_the_slope_of_the_density() -> None:
         log_density.append(-(z**2).sum(axis=1) / 2 - np.log(np.abs(determinant)))
     slope = (log_density[1] - log_density[0]) / (2 * step)
     assert (np.abs(slope) > 0.05).all()
-    variance = charts.scale[:, 0, 0, 0] ** 2 / INFLATION
+    variance = charts.scale[:, 0, 0, 0] ** 2 / Charts.inflation
     np.testing.assert_allclose(charts.location[:, 0, 0], variance * slope, rtol=1e-4)
 
 
