@@ -102,7 +102,9 @@ def test_the_laplace_approximation_is_that_of_a_parabola() -> None:
     y = np.array([0.3, -0.5, -9.0])
     charts = charts_at_modes(unscaled(parabola, y[:, None]), 1, 1)
     variance = np.clip(1 / (1 - y), 0.3, 1.5)
-    np.testing.assert_allclose(charts.scale[:, 0, 0, 0] ** 2, Charts.inflation * variance, rtol=1e-3)
+    np.testing.assert_allclose(
+        charts.scale[:, 0, 0, 0] ** 2, Charts.inflation * variance, rtol=1e-3
+    )
     np.testing.assert_allclose(charts.location[:, 0], 0, atol=1e-3)
 
 
