@@ -231,6 +231,7 @@ def _by_specimen(
     _refuse_by_specimen(name, inputs, epsilon, propagation)
     values = checked_specimens(name, values)
     settings = _propagation(name, propagation)
+    settings.check_likelihood(name)
     labels = (
         None if specimens is None else sample_labels(specimens, len(values), f"{name}: specimens")
     )

@@ -330,6 +330,9 @@ class Propagation(ABC):
         """Number of first runs that the user asks for where a likelihood has its own emulator."""
         return None
 
+    def check_likelihood(self, name: str) -> None:  # noqa: B027
+        """Refuse options that the log-likelihood by specimen does not use."""
+
     def check(self) -> None:
         """Refuse what is no executor, folder or policy."""
         refuse_calling(self.executor, self.store, self.version, self.on_failure)

@@ -226,6 +226,17 @@ class Reweighted(Propagation):
             self._refuse_following(name, inputs)
             refuse_other_number(f"{name}: coarse", self.coarse, inputs)
 
+    def check_likelihood(self, name: str) -> None:
+        """Refuse options that the log-likelihood by specimen, with its own emulator, lacks."""
+        for option, default in (("emulator", "auto"), ("coarse", None), ("max_points", None)):
+            value = getattr(self, option)
+            if value != default:
+                raise TypeError(
+                    f"{name}: propagation: got Reweighted({option}={value!r}), which "
+                    "prb.LogLikelihood() does not use, as it has its own emulator; use "
+                    f"metric=prb.ProbabilityResidual(), or leave {option}= out"
+                )
+
     def _refuse_emulating(self, name: str, inputs: Inputs) -> None:
         """Raise if a user's emulator has nothing to do."""
         if has_points_between_runs(inputs):

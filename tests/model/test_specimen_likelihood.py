@@ -452,6 +452,13 @@ def test_random_propagation_is_refused() -> None:
         build(propagation=prb.Fresh(64))
 
 
+@pytest.mark.parametrize("option", [{"emulator": None}, {"coarse": np.sinh}, {"max_points": 4096}])
+def test_options_that_the_likelihood_does_not_use_are_refused(option: dict[str, Any]) -> None:
+    (name,) = option
+    with pytest.raises(TypeError, match=rf"got Reweighted\({name}=.*leave {name}= out"):
+        build(propagation=prb.Reweighted(64, **option))
+
+
 def test_discrete_inputs_are_refused() -> None:
     with pm.Model():
         x = pm.Poisson.dist(pm.math.exp(pm.Normal("mu")))
