@@ -1,49 +1,18 @@
 """Guards of the log-likelihood by specimen: missing roots, emulator error, Monte Carlo error.
 
 They return numbers, with which loops add starts, runs or points. The study is likelihood_guards,
-sections 2.1, 2.2, 2.3 and 2.10. No guard detects a root outside the box of the runs, or an emulator
+sections 2.1 to 2.3. No guard detects a root outside the box of the runs, or an emulator
 error that is smooth between the fresh runs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.propagation.points import sobol
-
-
-@dataclass(frozen=True)
-class GuardOptions:
-    """Largest values of the guards, beyond which a loop goes on.
-
-    All were chosen on the cases of the study.
-
-    Parameters
-    ----------
-    missing_share : float
-        Share of simulated specimens whose inputs are not among their roots. Else double the starts.
-    half_difference : float
-        Monte Carlo error of the log-likelihood, in nats. Else double the points.
-    predicted_bias : float
-        Bias of mean and standard deviation, in posterior standard deviations. Else add 16 runs.
-    roughness : float
-        Gain of smoothing.
-    rough_error : float
-        Left-out error in standard deviations of the runs, below which a response is smooth.
-    jump : float
-        Share of the squared error in the worst tenth of the runs, above which it is a jump.
-    """
-
-    missing_share: float = 0.03
-    half_difference: float = 0.15
-    predicted_bias: float = 0.15
-    roughness: float = 1.1
-    rough_error: float = 0.002
-    jump: float = 0.6
 
 
 def missing_share(
@@ -157,85 +126,3 @@ def predicted_bias(misfit: Floats, jacobian: Floats, x: Floats, size: int) -> Fl
     # var(x) = var(x + shift) - 2 cov(x, shift) - var(shift)
     sd_bias = -(covariance + shift.var(axis=0) / 2) / sd**2 * np.sqrt(2 * size)
     return np.stack([mean_bias, sd_bias])
-
-
-@dataclass(frozen=True)
-class Roughness:
-    """Roughness of the output that the best emulator follows worst.
-
-    Parameters
-    ----------
-    error : float
-        Left-out error of the better of interpolation and smoothing, in standard deviations.
-    gain : float
-        Left-out error of interpolation over that error.
-    worst_tenth : float
-        Share of the squared error of interpolation in the worst tenth of the runs.
-    """
-
-    error: float
-    gain: float
-    worst_tenth: float
-
-    def text(self, options: GuardOptions | None = None) -> str:
-        """Return an explanation for a refusal, or an empty string for a smooth response."""
-        options = GuardOptions() if options is None else options
-        if not (self.error > options.rough_error and self.gain > options.roughness):
-            return ""
-        cause = "a jump" if self.worst_tenth > options.jump else "noise, or a jump"
-        return (
-            f"The response is not smooth: {cause} of about {self.error:.2g} standard deviations. "
-            "Pass error=, or use a metric."
-        )
-
-
-def roughness(x: Floats, y: Floats, folds: int = 8) -> Roughness:
-    """Return how much smoothing improves an emulator: noise, or a jump, of the response.
-
-    Left-out errors of radial basis functions (quintic, with a polynomial tail) with and without
-    smoothing, away from the ends of the box. Error > .002 and gain > 1.1: size .00 for smooth
-    responses (.18 for a sine of five periods on 16 runs), .10 to .37 for kinks; power .95 to 1.00
-    for noise of 1 %, .63 to .77 for jumps (1 input: 16 and 32 runs, 2 inputs: 64 and 128 runs, 200
-    designs). Noise of .1 % is not seen. A worst tenth > .6 separates jump and noise with 128 runs
-    alone.
-
-    Parameters
-    ----------
-    x : ndarray, shape (n, d)
-        Inputs of the runs, in any order but that of a design.
-    y : ndarray, shape (n, m)
-        Responses. Runs with values that are not finite are left out.
-    folds : int
-    """
-    from scipy.interpolate import RBFInterpolator  # takes long to import
-
-    finite = np.isfinite(y).all(axis=1)
-    x, y = x[finite], y[finite]
-    unit = (x - x.min(axis=0)) / np.ptp(x, axis=0)
-    inner = ((unit > 0.05) & (unit < 0.95)).all(axis=1)  # left-out runs at the ends extrapolate
-    y = (y - y.mean(axis=0)) / np.where(y.std(axis=0) > 0, y.std(axis=0), 1.0)
-    z = (x - x.mean(axis=0)) / x.std(axis=0)
-    n, d = x.shape
-    fold = np.arange(n) % folds
-    squares = []
-    for smoothing in (0.0, 1e-3, 1e-1, 1e1):
-        error = np.empty_like(y)
-        for k in range(folds):
-            train = fold != k
-            terms = (d + 1) * (d + 2) * (d + 3) // 6  # of a cubic polynomial
-            degree = 3 if train.sum() > 2 * terms else 2
-            emulator = RBFInterpolator(
-                z[train], y[train], smoothing=smoothing, kernel="quintic", degree=degree
-            )
-            error[~train] = emulator(z[~train]) - y[~train]
-        squares.append(error[inner] ** 2)
-    rms = np.sqrt(np.mean(squares, axis=1))  # (smoothings, m)
-    best = rms.min(axis=0)
-    worst = int(best.argmax())
-    largest = np.sort(squares[0][:, worst])[::-1]
-    tenth = largest[: max(1, len(largest) // 10)].sum()
-    if not best[worst]:
-        return Roughness(0.0, 1.0, 0.0)
-    return Roughness(
-        float(best[worst]), float(rms[0, worst] / best[worst]), float(tenth / largest.sum())
-    )
