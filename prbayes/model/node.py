@@ -611,7 +611,7 @@ class SimulatorDistribution(pm.Distribution):
         cls, *params: Any, simulator: Specification, size: Any = None, rng: Any = None
     ) -> TensorVariable:
         """Return a random variable that carries a simulator."""
-        signature = _signature([p.type.ndim for p in params], len(simulator.target.event))
+        signature = rv_signature([p.type.ndim for p in params], len(simulator.target.event))
         op = SimulatorRV(signature=signature, simulator=simulator)
         generator = pt.random.shared_rng(seed=None) if rng is None else rng
         _, rv = op(*params, size=size, rng=generator, return_next_rng=True)
@@ -628,7 +628,7 @@ class SimulatorDistribution(pm.Distribution):
         return pt.zeros_like(rv)
 
 
-def _signature(ndims: Sequence[int], ndim_supp: int) -> str:
+def rv_signature(ndims: Sequence[int], ndim_supp: int) -> str:
     """Return the signature of a random variable, such as '(),(i10,i11)->()', or '->(o)'."""
     groups = []
     for k, ndim in enumerate(ndims):

@@ -40,6 +40,7 @@ from prbayes.model.node import (
     known_value,
     required_simulators,
     response_name,
+    rv_signature,
 )
 from prbayes.model.population_draws import Populations, specimens_of
 from prbayes.model.run_checks import (
@@ -608,12 +609,7 @@ class SpecimenDistribution(pm.Distribution):  # type: ignore[misc]
         cls, *params: Any, likelihood: SpecimenLikelihood, size: Any = None, rng: Any = None
     ) -> TensorVariable:
         """Return a random variable that carries a likelihood."""
-        ndims = [r.type.ndim for r in likelihood.variables]
-        groups = [
-            "(" + ",".join(f"i{k}{axis}" for axis in range(ndim)) + ")"
-            for k, ndim in enumerate(ndims)
-        ]
-        signature = ",".join(groups) + ("->(o)" if likelihood.event else "->()")
+        signature = rv_signature([r.type.ndim for r in likelihood.variables], len(likelihood.event))
         op = SpecimenRV(signature=signature, likelihood=likelihood)
         generator = pt.random.shared_rng(seed=None) if rng is None else rng
         _, rv = op(*params, size=size, rng=generator, return_next_rng=True)
