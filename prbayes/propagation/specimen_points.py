@@ -265,19 +265,20 @@ def emulate(
     else:
         roots = specimen_roots(emulation, readings, options)
     options, roots = _all_roots(emulation, readings, options, roots, seed)
+    rough = (
+        "the response is not smooth enough for prb.LogLikelihood(): use "
+        "metric=prb.ProbabilityResidual(), or more first runs with propagation=prb.Reweighted(n)"
+    )
     if (emulation.error > spread).any():
         raise DesignError(
             f"{name}: got an emulator with errors of {emulation.error} at the specimens, expected "
-            f"less than the data's standard deviations {spread}; look at the response and the "
-            "priors, or use metric=prb.ProbabilityResidual()"
+            f"less than the data's standard deviations {spread}; {rough}"
         )
     if emulation.bias > options.bias:
         raise DesignError(
             f"{name}: got an emulator whose error would shift a mean or standard deviation of an "
             f"input by {emulation.bias:.2g} posterior standard deviations after "
-            f"{len(emulation.z)} runs, expected at most {options.bias}; the response is not smooth "
-            "enough for prb.LogLikelihood(): use metric=prb.ProbabilityResidual(), or more first "
-            "runs with propagation=prb.Reweighted(n)"
+            f"{len(emulation.z)} runs, expected at most {options.bias}; {rough}"
         )
     return emulation, roots
 

@@ -310,13 +310,18 @@ def test_runs_far_from_the_data_do_not_count_as_errors() -> None:
     def steep(z: Floats) -> Floats:
         return np.exp(np.exp(6 * z - 3.6))
 
-    z = (np.log(np.random.default_rng(0).uniform(0, 2, 25)) + 3.6) / 6
-    y = steep(z[:, None])
-    emulation, points = points_of(steep, y, 1)
-    # Twice the error at 16 roots; at the steepest fresh run it is a thousand times the spread.
-    assert emulation.error[0] < 0.02 * y.std()
-    counts = points.log_a > points.log_a.max(axis=1, keepdims=True) - 10
-    assert np.abs(points.outputs[..., 0] - y)[counts].max() < 0.1 * y.std()
+    errors, misfits = [], []
+    for seed in range(6):
+        z = (np.log(np.random.default_rng(seed).uniform(0, 2, 25)) + 3.6) / 6
+        y = steep(z[:, None])
+        emulation, points = points_of(steep, y, 1)
+        counts = points.log_a > points.log_a.max(axis=1, keepdims=True) - 10
+        errors.append(emulation.error[0] / y.std())
+        misfits.append(np.abs(points.outputs[..., 0] - y)[counts].max() / y.std())
+    # Twice the error at 16 roots; at the steepest fresh run it is a thousand times the spread. The
+    # worst of six data sets depends on the last digits.
+    assert np.sort(errors)[-2] < 0.02
+    assert np.sort(misfits)[-2] < 0.1
 
 
 def test_starts_are_nearest_in_the_outputs_that_were_measured() -> None:
