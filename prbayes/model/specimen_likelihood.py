@@ -420,8 +420,7 @@ class SpecimenLikelihood:
         """
         z = self.coordinates.of(inputs, 1)
         z = np.clip(z, self.emulation.box[0], self.emulation.box[1])
-        values, _ = self.emulation(z)
-        return values.reshape(len(z), *self.event)
+        return self.emulation.values(z).reshape(len(z), *self.event)
 
     @cached_property
     def _sampler(self) -> PopulationSampler:

@@ -30,6 +30,8 @@ def posterior_tree(
     lost: Floats,
     stats: list[dict[str, list[float]]],
     *,
+    sampler: Mapping[str, Any] | None = None,
+    sample_stats: xr.Dataset | None = None,
     unadjusted: Floats | None = None,
     adjustment: str = "none",
     measured: dict[str, float] | None = None,
@@ -55,6 +57,10 @@ def posterior_tree(
         Before an adjustment: shares of populations without response; NaN of stored responses.
     stats : list of dict
         By chain: statistics by name, one value per stage.
+    sampler : mapping, optional
+        Attributes with the name of another sampler than SMC and its diagnostics.
+    sample_stats : Dataset, optional
+        Statistics of such a sampler, in place of those by stage.
     unadjusted : ndarray, shape (chains, draws, d), or None
     adjustment : str
         What was done to the draws.
@@ -84,6 +90,7 @@ def posterior_tree(
         "random_seed": "None" if seed is None else str(seed),
         "adjustment": adjustment,
         **(measured or {}),
+        **(sampler or {}),
         "stopped": stopped,
         "warnings": "\n".join(warnings),
         **versions(),
@@ -93,7 +100,7 @@ def posterior_tree(
     tree = {
         "posterior": _posterior(evaluator, thetas, attrs | _evidence(stats)),
         **(groups or {}),
-        "sample_stats": _sample_stats(stats),
+        "sample_stats": _sample_stats(stats) if sample_stats is None else sample_stats,
         "calibration": _calibration(
             evaluator,
             thetas,

@@ -1,0 +1,103 @@
+"""Importance sampling from Laplace approximations, against densities with known integrals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal, multivariate_t
+
+from prbayes._checks import Floats
+from prbayes.posterior.importance import ImportanceOptions, importance_sample, laplace
+
+MEAN = np.array([1.0, -2.0, 0.5])
+COVARIANCE = np.array([[1.0, 0.6, 0.0], [0.6, 0.5, -0.1], [0.0, -0.1, 0.3]])
+SCALE = np.array([3.0, 5.0, 2.0])
+NORMAL = multivariate_normal(MEAN, COVARIANCE)
+
+
+def normal(thetas: Floats) -> Floats:
+    return np.asarray(7.0 + NORMAL.logpdf(thetas))
+
+
+def two_modes(thetas: Floats) -> Floats:
+    """Return a mixture with .3 of its mass at -4 and .7 at 4, in two dimensions."""
+    low = multivariate_normal([-4.0, 0.0], [1.0, 0.2]).logpdf(thetas)
+    high = multivariate_normal([4.0, 1.0], [0.5, 1.0]).logpdf(thetas)
+    return np.asarray(np.logaddexp(np.log(0.3) + low, np.log(0.7) + high))
+
+
+def test_laplace_is_exact_for_a_normal_density() -> None:
+    (mode,) = laplace(normal, MEAN[None] + [2.0, 1.0, -1.0], SCALE)
+    np.testing.assert_allclose(mode.mode, MEAN, atol=1e-3)
+    np.testing.assert_allclose(mode.covariance, COVARIANCE, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(mode.log_mass, 7.0, atol=1e-3)
+
+
+def test_a_direction_without_curvature_has_ten_times_the_scale() -> None:
+    (mode,) = laplace(lambda t: -0.5 * t[:, 0] ** 2, np.zeros((1, 2)), np.array([1.0, 2.0]))
+    np.testing.assert_allclose(np.sqrt(np.diag(mode.covariance)), [1.0, 20.0], rtol=1e-3)
+
+
+def test_laplace_refuses_the_end_of_a_support() -> None:
+    with pytest.raises(ValueError, match="not finite"):
+        laplace(
+            lambda t: np.where(t[:, 0] > 0, -t[:, 0], -np.inf), np.full((1, 1), 1e-3), np.ones(1)
+        )
+
+
+def test_moments_and_evidence_of_a_normal_density() -> None:
+    sample = importance_sample(normal, laplace(normal, MEAN[None], SCALE), 4000, seed=1)
+    assert sample.is_reliable(ImportanceOptions())
+    assert sample.efficiency > 0.7
+    np.testing.assert_allclose(sample.log_evidence, 7.0, atol=0.01)
+    # Five standard errors of 4000 independent draws.
+    sd = np.sqrt(np.diag(COVARIANCE))
+    assert (np.abs(sample.draws.mean(axis=0) - MEAN) < 5 * sd / np.sqrt(4000)).all()
+    np.testing.assert_allclose(np.cov(sample.draws.T), COVARIANCE, atol=5 * np.sqrt(2 / 4000))
+    np.testing.assert_allclose(sample.log_density, normal(sample.draws))
+
+
+def test_two_modes_have_their_masses() -> None:
+    scale = np.array([5.0, 5.0])
+    starts = np.array([[-3.0, 1.0], [3.0, 0.0]])
+    modes = laplace(two_modes, starts, scale)
+    sample = importance_sample(two_modes, modes, 4000, seed=2)
+    assert sample.is_reliable(ImportanceOptions())
+    share = (sample.draws[:, 0] < 0).mean()
+    assert abs(share - 0.3) < 5 * np.sqrt(0.3 * 0.7 / 4000)
+    np.testing.assert_allclose(sample.log_evidence, 0.0, atol=0.02)
+
+
+def test_a_second_round_repairs_a_narrow_proposal() -> None:
+    (mode,) = laplace(normal, MEAN[None], SCALE)
+    narrow = type(mode)(mode.mode + 0.5, mode.covariance / 4, mode.log_mass)
+    one = importance_sample(normal, [narrow], 2000, 0, ImportanceOptions(rounds=1))
+    two = importance_sample(normal, [narrow], 2000, 0)
+    assert one.efficiency < 0.25
+    assert two.efficiency > 0.5
+    assert two.is_reliable(ImportanceOptions())
+
+
+def test_a_tail_that_the_proposal_lacks_is_not_reliable() -> None:
+    """A Cauchy density in five dimensions has heavier tails than t(5)."""
+    heavy = multivariate_t(np.zeros(5), np.eye(5), df=1)
+    modes = laplace(heavy.logpdf, np.zeros((1, 5)), np.full(5, 3.0))
+    sample = importance_sample(heavy.logpdf, modes, 2000, 0, ImportanceOptions(rounds=1))
+    assert not sample.is_reliable(ImportanceOptions())
+
+
+def test_draws_depend_on_the_seed_alone() -> None:
+    (mode,) = laplace(normal, MEAN[None], SCALE)
+    first, again, other = (importance_sample(normal, [mode], 100, seed) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(first.draws, again.draws)
+    assert not np.array_equal(first.draws, other.draws)
+
+
+def test_chains_are_independent_halves() -> None:
+    """Resampled rows are in random order: halves have the same mean."""
+    sample = importance_sample(normal, laplace(normal, MEAN[None], SCALE), 4000, seed=5)
+    halves = sample.draws.reshape(2, 2000, -1).mean(axis=1)
+    sd = np.sqrt(np.diag(COVARIANCE))
+    assert (np.abs(halves[0] - halves[1]) < 5 * sd * np.sqrt(2 / 2000)).all()
+    assert np.isfinite(logsumexp(sample.log_density))
