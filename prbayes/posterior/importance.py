@@ -55,11 +55,13 @@ class Laplace:
     covariance : ndarray, shape (d, d)
     log_mass : float
         Logarithm of the mass by Laplace's approximation.
+    converged : bool
     """
 
     mode: Floats
     covariance: Floats
     log_mass: float
+    converged: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,23 +117,27 @@ def laplace(
         value, gradient, hessian = _derivatives(log_density, modes, 0.05 * sd)
         # In units of the prior.
         values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
-        inverse = (vectors / np.maximum(values, 0.01)[:, None, :]) @ vectors.swapaxes(1, 2)
+        # Absolute values: a step away from a saddle, and Newton's at a mode.
+        size = np.maximum(np.abs(values), 0.01)
+        inverse = (vectors / size[:, None, :]) @ vectors.swapaxes(1, 2)
         covariance = inverse * np.outer(scale, scale)
         direction = np.einsum("mde,me->md", covariance, gradient)
         decrement = np.einsum("md,md->m", gradient, direction)
         new_sd = np.sqrt(np.einsum("mdd->md", covariance))
-        settled = ((new_sd < 2 * sd) & (sd < 2 * new_sd)).all(axis=1) & (decrement < 1e-3)
+        same_step = ((new_sd < 2 * sd) & (sd < 2 * new_sd)).all(axis=1)
+        settled = same_step & (decrement < 1e-3) & (values.min(axis=1) > -0.01)
         if settled.all():
             break
         sd = np.minimum(new_sd, 10 * sd)
         trials = modes[:, None] + lengths[:, None] * direction[:, None]
-        found = np.nan_to_num(log_density(trials.reshape(-1, d)), nan=-np.inf)
-        found = found.reshape(count, -1)
-        best = found.argmax(axis=1)
-        rises = ~settled & (found[np.arange(count), best] > value)
+        heights = np.nan_to_num(log_density(trials.reshape(-1, d)), nan=-np.inf)
+        heights = heights.reshape(count, -1)
+        best = heights.argmax(axis=1)
+        rises = ~settled & (heights[np.arange(count), best] > value)
         modes[rises] = trials[rises, best[rises]]
     log_mass = value + np.linalg.slogdet(covariance)[1] / 2 + d / 2 * np.log(2 * np.pi)
-    return [Laplace(*parts) for parts in zip(modes, covariance, log_mass.tolist(), strict=True)]
+    parts = zip(modes, covariance, log_mass.tolist(), settled.tolist(), strict=True)
+    return [Laplace(*part) for part in parts]
 
 
 def _derivatives(

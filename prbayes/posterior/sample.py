@@ -201,14 +201,15 @@ def _modes(
         candidates = laplace(density, np.stack(starts), evaluator.prior_sd)
     except (ValueError, np.linalg.LinAlgError):
         return None
-    candidates.sort(key=lambda mode: -mode.log_mass)
+    candidates.sort(key=lambda mode: (not mode.converged, -mode.log_mass))
     modes: list[Laplace] = []
     for mode in candidates:
         distances = [
             np.abs(mode.mode - each.mode) / np.sqrt(np.diag(each.covariance)) for each in modes
         ]
         negligible = mode.log_mass < candidates[0].log_mass - 10
-        if not negligible and all(distance.max() > 0.5 for distance in distances):
+        unusable = negligible or (bool(modes) and not mode.converged)
+        if not unusable and all(distance.max() > 0.5 for distance in distances):
             modes.append(mode)
     return modes
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import logsumexp
@@ -71,7 +73,7 @@ def test_two_modes_have_their_masses() -> None:
 
 def test_a_second_round_repairs_a_narrow_proposal() -> None:
     (mode,) = laplace(normal, MEAN[None], SCALE)
-    narrow = type(mode)(mode.mode + 0.5, mode.covariance / 4, mode.log_mass)
+    narrow = replace(mode, mode=mode.mode + 0.5, covariance=mode.covariance / 4)
     one = importance_sample(normal, [narrow], 2000, 0, ImportanceOptions(rounds=1))
     two = importance_sample(normal, [narrow], 2000, 0)
     assert one.efficiency < 0.25
