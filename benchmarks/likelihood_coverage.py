@@ -318,7 +318,7 @@ def data_set(problem: Problem, likelihood: SpecimenLikelihood, number: int) -> d
     values = dict(zip(problem.priors, truth, strict=True))
     y = problem.response(*[np.ravel(x) for x in problem.population.population(values, z)])
     row: dict[str, Any] = {"number": number}
-    other = likelihood.observing(y)
+    other = likelihood.observing({likelihood.name: y})
     # Coordinates are those of the prior, whatever the data.
     other.__dict__["coordinates"] = likelihood.coordinates
     try:

@@ -157,7 +157,7 @@ def _population(optimum: Optimum) -> Checked:
     for likelihood, (z, weights), statistics in zip(
         evaluator.likelihoods, samples, null, strict=True
     ):
-        labels = _labels(likelihood.inputs, likelihood.responses.function)
+        labels = _labels(likelihood.inputs, likelihood.measurements[0].responses.function)
         misfit = population_findings(
             population_test(z, weights, statistics), labels, threshold=threshold
         )
@@ -276,7 +276,10 @@ def _points(
         for k, simulator in enumerate(evaluator.emulated, start=len(evaluator.nodes)):
             if simulator.likelihood is not likelihood:
                 continue
-            rows = simulator.rows
+            groups = likelihood.stacked.groups
+            rows = np.flatnonzero(
+                np.full(len(z), True) if groups is None else groups == simulator.place
+            )
             roots = evaluator.roots(theta[None], k)
             some = [x[rows] for x in points]
             z[rows], weights[rows] = own.at(likelihood.inputs, roots, some, log_a[rows])
@@ -413,7 +416,7 @@ def _conflict(evaluator: Evaluator, thetas: Floats) -> Checked:
     )
     if findings:
         return Checked(findings=findings)
-    n = sum(len(each.observed) for each in evaluator.likelihoods)
+    n = sum(len(each.readings) for each in evaluator.likelihoods)
     power = np.interp(np.log(n), np.log([10, 20, 50]), [0.86, 0.98, 1.0])
     return Checked(
         notes=(
@@ -466,7 +469,8 @@ def _covariance(
         log_p = np.broadcast_to(log_p, (len(around), _OPTIONS.specimens))
         with np.errstate(invalid="ignore"):
             scores = slopes(log_p, step)
-        information += len(simulator.observed) / _OPTIONS.specimens * scores.T @ scores
+        n = int(simulator.has_likelihood.sum())
+        information += n / _OPTIONS.specimens * scores.T @ scores
     nothing = np.full_like(information, np.nan)
     if not np.isfinite(information).all():
         return nothing

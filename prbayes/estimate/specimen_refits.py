@@ -6,7 +6,7 @@ specimens whose points are computed once. Both cost no run.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -30,7 +30,7 @@ _COMPILED = "weighted log-likelihood"
 
 def specimen_refit_obstacle(evaluator: Evaluator) -> str | None:
     """Return why a model of log-likelihoods by specimen cannot be fitted to other data, or None."""
-    others = len(evaluator.model.observed_RVs) > len(evaluator.likelihoods)
+    others = len(evaluator.model.observed_RVs) > len(evaluator.measurements)
     if evaluator.nodes or others or evaluator.model.potentials:
         return (
             "the model has likelihood terms or potentials besides its log-likelihoods by specimen"
@@ -49,7 +49,7 @@ def simulation_obstacle(evaluator: Evaluator) -> str | None:
         is_measured = likelihood.readings.is_measured
         if (is_measured.sum(axis=1) < likelihood.coordinates.size).any():
             return f"{likelihood.name} has specimens with fewer readings than inputs"
-        if "error" in likelihood.extras:
+        if not likelihood.error_is_known:
             return f"{likelihood.name} has an unknown reading error"
     return None
 
@@ -84,7 +84,7 @@ class SpecimenPool:
 
 def specimen_pool(
     likelihood: SpecimenLikelihood,
-    params: Sequence[Floats],
+    params: Mapping[Any, Floats],
     rng: np.random.Generator,
     size: int = 2000,
 ) -> SpecimenPool:
@@ -93,13 +93,13 @@ def specimen_pool(
     Parameters
     ----------
     likelihood : SpecimenLikelihood
-    params : sequence of ndarray, shapes (1, *shape)
-        Values of its variables without the group.
+    params : mapping
+        Values by its variables without the group, shapes (1, *shape).
     rng : Generator
     size : int
         Number of specimens, rounded up to a multiple of the observed ones.
     """
-    n = len(likelihood.observed)
+    n = len(likelihood.readings)
     copies = max(1, -(-size // n))
     values = likelihood.draws(rng, params, copies * n)[0].reshape(copies * n, -1)
     measurement = likelihood.readings
@@ -232,11 +232,10 @@ class SpecimenRefits:
         Parameters
         ----------
         weights : sequence of ndarray, shapes (N,), optional
-            Of the specimens, by likelihood, with sum N; all one by default.
+            Of the specimens, by simulator, with sum N; all one by default.
         """
-        likelihoods = self.evaluator.likelihoods
         if weights is None:
-            weights = [np.ones(len(each.observed)) for each in likelihoods]
+            weights = [np.ones(len(each.observed)) for each in self.evaluator.measurements]
         root = self._root
 
         def objective(u: Floats) -> tuple[float, Floats]:
@@ -285,18 +284,19 @@ class SpecimenRefits:
         weights : sequence of ndarray, shapes (S, n_k)
             Of the specimens of each of `Evaluator.emulated`; of one data set they may have any sum.
         """
-        by_likelihood = []
+        by_measurement = []
         emulated = self.evaluator.emulated
-        for likelihood in self.evaluator.likelihoods:
-            n = len(likelihood.observed)
+        for measurement in self.evaluator.measurements:
+            n = len(measurement.observed)
             factors = np.zeros((len(weights[0]), n))
             for simulator, part in zip(emulated, weights, strict=True):
-                if simulator.likelihood is likelihood:
+                if simulator.measurement is measurement:
                     factors[:, simulator.rows] = part * len(simulator.rows)
-            if likelihood.weights is not None:  # which are in the likelihood, and in the weights
-                factors = factors / np.where(likelihood.weights > 0, likelihood.weights, 1.0)
-            by_likelihood.append(factors)
-        estimates = [self.fit(list(rows)) for rows in zip(*by_likelihood, strict=True)]
+            own = measurement.weights
+            if own is not None:  # which are in the likelihood, and in the weights
+                factors = factors / np.where(own > 0, own, 1.0)
+            by_measurement.append(factors)
+        estimates = [self.fit(list(rows)) for rows in zip(*by_measurement, strict=True)]
         thetas, converged = zip(*estimates, strict=True)
         return np.array(thetas), np.array(converged)
 

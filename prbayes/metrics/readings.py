@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -45,8 +46,12 @@ class Readings:
 
     def rows(self, index: NDArray[np.intp]) -> Readings:
         """Return the readings of some specimens."""
-        fields = ("values", "error", "step", "lower", "upper")
-        return replace(self, **{name: getattr(self, name)[index] for name in fields})
+        return Readings(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    @classmethod
+    def beside(cls, parts: Sequence[Readings]) -> Readings:
+        """Return the readings of different outputs of the same specimens as one."""
+        return cls(*_beside(cls, parts))
 
     @property
     def is_measured(self) -> NDArray[np.bool_]:
@@ -121,6 +126,110 @@ class Readings:
             inside = log_interval_probability((lower - outputs) / sd, (upper - outputs) / sd, xp)
             terms = xp.where(self.is_censored[:, None], inside, terms)
         return terms.sum(axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Repeats:
+    r"""What repeated readings add to the log-density of their weighted mean.
+
+    Readings :math:`y_r` with standard deviations :math:`e c_r` have the mean :math:`\bar y` with
+    :math:`e c`, :math:`c^{-2} = \sum c_r^{-2}`, and
+
+    .. math:: \prod_r N(y_r;\, f,\, e^2 c_r^2) = N(\bar y;\, f,\, e^2 c^2)\,
+        \frac{c}{(2 \pi e^2)^{(R-1)/2} \prod_r c_r}
+        \exp\Bigl(-\frac{1}{2 e^2} \sum_r \frac{(y_r - \bar y)^2}{c_r^2}\Bigr).
+
+    Attributes
+    ----------
+    count : ndarray, shape (N, m)
+        Number of readings less one.
+    within : ndarray, shape (N, m)
+        Sum of squares around the mean.
+    constant : ndarray, shape (N, m)
+    """
+
+    count: Floats
+    within: Floats
+    constant: Floats
+
+    @classmethod
+    def beside(cls, parts: Sequence[Repeats]) -> Repeats:
+        """Return the repeats of different outputs of the same specimens as one."""
+        return cls(*_beside(cls, parts))
+
+    def log_density(self, error: Any, xp: Any) -> Any:
+        """Return the sum over outputs, (N,), as an array or a graph of the error e, (m,)."""
+        terms = self.constant - self.count * xp.log(error) - self.within / (2 * error**2)
+        return terms.sum(axis=-1)
+
+
+def _beside(kind: Any, parts: Sequence[Any]) -> list[Floats]:
+    """Return the arrays of records, joined along the axis of the outputs."""
+    return [np.concatenate([getattr(p, f.name) for p in parts], axis=1) for f in fields(kind)]
+
+
+def averaged(
+    readings: Readings, scale: Floats, numbers: NDArray[np.intp], count: NDArray[np.intp]
+) -> tuple[Readings, Floats, Repeats]:
+    """Return the readings of S specimens, repeated ones by their weighted mean.
+
+    Parameters
+    ----------
+    readings : Readings
+        N rows.
+    scale : ndarray, shape (N, m)
+        Standard deviation of each reading's error, in any unit e; positive for repeated readings.
+    numbers : ndarray of int, shape (N,)
+        Specimen of each row.
+    count : ndarray of int, shape (S, m)
+        Number of readings of each output.
+
+    Returns
+    -------
+    readings : Readings
+        S rows.
+    scale : ndarray, shape (S, m)
+    repeats : Repeats
+    """
+    present = np.nonzero(readings.is_measured | readings.is_censored)
+    places = numbers[present[0]], present[1]
+
+    def by_specimen(values: Floats, missing: Any) -> Floats:
+        result = np.empty(count.shape)
+        result[:] = missing
+        result[numbers] = values  # outputs that were not measured keep what was given
+        result[places] = values[present]
+        return result
+
+    names = ("values", "lower", "upper")
+    given = {name: by_specimen(getattr(readings, name), np.nan) for name in names}
+    for name in ("error", "step"):
+        values = getattr(readings, name)
+        given[name] = by_specimen(values, np.median(values, axis=0))
+    combined = by_specimen(scale, np.median(scale, axis=0))
+    repeated = count > 1
+    zero = np.zeros(count.shape)
+    if not repeated.any():
+        return Readings(**given), combined, Repeats(zero, zero, zero)
+
+    def total(values: Floats) -> Floats:
+        result = np.zeros(count.shape)
+        np.add.at(result, places, np.where(repeated[places], values, 0.0))
+        return np.where(repeated, result, 0.0)
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        c, y = scale[present], readings.values[present]
+        precision = total(c**-2.0)
+        mean = total(y / c**2) / precision
+        within = total(((y - mean[places]) / c) ** 2)
+        new = precision**-0.5
+        given["error"] = np.where(repeated, given["error"] / combined * new, given["error"])
+        constant = np.log(new) - total(np.log(c)) - (count - 1) / 2 * np.log(2 * np.pi)
+    given["values"] = np.where(repeated, mean, given["values"])
+    repeats = Repeats(
+        np.where(repeated, count - 1.0, 0.0), within, np.where(repeated, constant, 0.0)
+    )
+    return Readings(**given), np.where(repeated, new, combined), repeats
 
 
 def log_interval_probability(low: Any, high: Any, xp: Any = np) -> Any:

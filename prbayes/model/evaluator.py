@@ -20,6 +20,7 @@ from prbayes._checks import AT_ONCE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import PopulationSimulator, emulated_simulators
 from prbayes.model.hyperparameters import Hyperparameters
+from prbayes.model.measurement import Measurement
 from prbayes.model.node import (
     Node,
     log_kernel,
@@ -27,7 +28,12 @@ from prbayes.model.node import (
     priors_alone,
     without_epsilon_warning,
 )
-from prbayes.model.specimen_likelihood import require_simulator, specimen_likelihoods
+from prbayes.model.specimen_likelihood import (
+    SpecimenLikelihood,
+    measurements_of,
+    require_simulator,
+    specimen_likelihoods,
+)
 from prbayes.propagation.base import Bound
 from prbayes.propagation.cloud import CLOUD
 from prbayes.propagation.reweighted import Design
@@ -75,6 +81,8 @@ class Evaluator:
     nodes : list of Node
         The simulators with a metric of distributions.
     likelihoods : list of SpecimenLikelihood
+        The log-likelihoods by specimen, one for simulators with common specimens.
+    measurements : list of Measurement
         The simulators with a log-likelihood by specimen.
     emulated : list of EmulatedSimulator
         The populations of these, by group.
@@ -89,7 +97,8 @@ class Evaluator:
         self.nodes: list[Node] = list(by_variable.values())
         self._variables = list(by_variable)
         # Simulators with a likelihood by specimen: ordinary observed variables.
-        self.likelihoods = list(specimen_likelihoods(model).values())
+        self.likelihoods = list(dict.fromkeys(specimen_likelihoods(model).values()))
+        self.measurements = list(measurements_of(model).values())
         self.emulated = emulated_simulators(model)
         # Compiled, by what they were asked for; they live as long as this evaluator.
         self._objectives: dict[tuple[bool, bool], Any] = {}
@@ -152,12 +161,16 @@ class Evaluator:
     def n_responses(self) -> int:
         """Scalar responses computed so far; those that several simulators share count once."""
         by_metric = self._once([node.bound.responses.count for node in self.nodes])
-        return by_metric + sum(each.responses.count for each in self.likelihoods)
+        return by_metric + sum(each.responses.count for each in self.measurements)
 
     @property
     def n_runs(self) -> int:
         """Runs of all designs; those that several simulators share count once."""
         return self._once([0 if n.design is None else n.design.n_runs for n in self.nodes])
+
+    def likelihood_of(self, measurement: Measurement) -> SpecimenLikelihood:
+        """Return the log-likelihood of a simulator's specimens."""
+        return next(each for each in self.likelihoods if measurement in each.measurements)
 
     @property
     def simulators(self) -> list[PopulationSimulator]:
@@ -229,7 +242,10 @@ class Evaluator:
         return np.array(np.broadcast_to(found, len(thetas)))
 
     def specimen_log_likelihoods(self, thetas: Floats) -> dict[str, Floats]:
-        """Return log p(y_i | theta) by simulator, shapes (P, N), of those with a likelihood."""
+        """Return log p(y_i | theta) by simulator, shapes (P, N), of those with a likelihood.
+
+        Zero in rows of specimens whose log-likelihood is in another row.
+        """
         if not self.likelihoods:
             return {}
         rows = max(1, AT_ONCE // max(each.points.log_a.size for each in self.likelihoods))
@@ -237,14 +253,15 @@ class Evaluator:
             self._evaluate_specimens(np.ascontiguousarray(thetas[first : first + rows]))
             for first in range(0, len(thetas), rows)
         ]
-        names = [each.name for each in self.likelihoods]
+        names = [each.name for each in self.measurements]
         joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
         return dict(zip(names, joined, strict=True))
 
-    def specimen_params(self, thetas: Floats, k: int) -> list[Floats]:
+    def specimen_params(self, thetas: Floats, k: int) -> dict[Any, Floats]:
         """Return the variables of the k-th likelihood by specimen at thetas, shapes (P, *shape)."""
         values = self.constrained(thetas)
-        return [values[str(v.name)] for v in self.likelihoods[k].variables if not is_group(v)]
+        variables = self.likelihoods[k].variables()
+        return {v: values[str(v.name)] for v in variables if not is_group(v)}
 
     @cached_property
     def _evaluate_specimens(self) -> Any:

@@ -126,8 +126,9 @@ def _emulated(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) ->
     drawn = {}
     for k, likelihood in enumerate(evaluator.likelihoods):
         params = evaluator.specimen_params(thetas.reshape(-1, d), k)
-        values = likelihood.draws(rng, params, len(likelihood.observed))
-        drawn[likelihood.name] = values.reshape(chains, draws, *values.shape[1:])
+        for each in likelihood.measurements:
+            values = likelihood.draws(rng, params, len(each.observed), each)
+            drawn[each.name] = values.reshape(chains, draws, *values.shape[1:])
     return labelled_responses(evaluator, drawn, (chains, draws))
 
 

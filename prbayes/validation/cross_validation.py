@@ -229,8 +229,9 @@ def _mean_log_losses(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -
     by_name = evaluator.specimen_log_likelihoods(thetas)
     columns = []
     for simulator, weights in zip(evaluator.emulated, data, strict=True):
-        logs = by_name[simulator.likelihood.name][:, simulator.rows]
-        own = simulator.likelihood.weights
+        logs = by_name[simulator.measurement.name][:, simulator.rows]
+        weights = np.where(simulator.has_likelihood, weights, 0.0)
+        own = simulator.measurement.weights
         if own is not None:
             logs = logs / np.where(own > 0, own, 1.0)[simulator.rows]
         total = weights.sum(axis=1)

@@ -368,7 +368,7 @@ def test_copies_have_the_same_points(make: str, used: bool) -> None:
     if make != "cloudpickle":
         assert response.runs == 128
     elif used:
-        assert specimen_likelihoods(other)[other["y"]].responses.function.runs == 128
+        assert specimen_likelihoods(other)[other["y"]].measurements[0].responses.function.runs == 128
 
 
 def test_a_hyperparameter_that_is_set_needs_no_run() -> None:
@@ -409,7 +409,7 @@ def test_data_of_another_length() -> None:
 def test_data_of_another_shape_are_refused() -> None:
     (likelihood,) = specimen_likelihoods(shared()).values()
     with pytest.raises(ValueError, match=r"y: observed: got shape \(20, 1\), expected \('N',\)"):
-        likelihood.observing(Y[:, None])
+        likelihood.observing({"y": Y[:, None]})
 
 
 def test_what_was_compiled_for_other_data_refuses_them() -> None:
