@@ -339,13 +339,10 @@ def _scored(
             scores = _discrepancies(evaluator, thetas, k, target)
             key = f"{before}{_class_of(metric)}"
             found[key] = np.where(supported, scores, np.nan)
-    by_simulator = evaluator.specimen_log_likelihoods(thetas)
-    for measurement in evaluator.measurements:
-        rows = evaluator.likelihood_of(measurement).rows(measurement)
-        before = f"{measurement.name} " if several else ""
-        if rows.size:
-            losses = -by_simulator[measurement.name][:, rows].mean(axis=1)
-            found[f"{before}{_BY_SPECIMEN}"] = losses
+    for name, values in evaluator.specimen_log_likelihoods(thetas).items():
+        before = f"{name} " if several else ""
+        if values.size:
+            found[f"{before}{_BY_SPECIMEN}"] = -values.mean(axis=1)
     return found
 
 

@@ -273,14 +273,8 @@ def _points(
     for likelihood, own, (points, log_a) in zip(evaluator.likelihoods, scores, data, strict=True):
         z = np.empty((*log_a.shape, likelihood.coordinates.size))
         weights = np.empty(log_a.shape)
-        for k, simulator in enumerate(evaluator.emulated, start=len(evaluator.nodes)):
-            if simulator.likelihood is not likelihood:
-                continue
-            groups = likelihood.stacked.groups
-            rows = np.flatnonzero(
-                np.full(len(z), True) if groups is None else groups == simulator.place
-            )
-            roots = evaluator.roots(theta[None], k)
+        for place, rows in likelihood.by_group:
+            roots = evaluator.roots_of(theta[None], likelihood.inputs, place)
             some = [x[rows] for x in points]
             z[rows], weights[rows] = own.at(likelihood.inputs, roots, some, log_a[rows])
         result.append((z, weights))
@@ -437,7 +431,7 @@ def _predictive_estimates(optimum: Optimum, prior: Floats) -> Floats:
     evaluator = optimum.evaluator
     compiled = [
         (PopulationSampler(each.inputs), compiled_log_density(each.inputs))
-        for each in evaluator.emulated
+        for each in evaluator.likelihoods
     ]
     complete = _covariance(evaluator, compiled, optimum.theta, rng)
     ratio = np.sqrt(np.diag(optimum.covariance) / np.diag(complete))
@@ -461,16 +455,15 @@ def _covariance(
     step = 1e-3 * evaluator.prior_sd
     around = cross(theta, step)
     information = np.zeros((theta.size, theta.size))
-    for k, simulator in enumerate(evaluator.emulated, start=len(evaluator.nodes)):
-        roots = evaluator.roots(around, k)
-        sampler, log_density = compiled[k - len(evaluator.nodes)]
-        specimens, _ = sampler([root[:1] for root in roots], _OPTIONS.specimens, rng)
-        (log_p,) = log_density(*roots, *[x[0] for x in specimens])
-        log_p = np.broadcast_to(log_p, (len(around), _OPTIONS.specimens))
-        with np.errstate(invalid="ignore"):
-            scores = slopes(log_p, step)
-        n = int(simulator.has_likelihood.sum())
-        information += n / _OPTIONS.specimens * scores.T @ scores
+    for likelihood, (sampler, log_density) in zip(evaluator.likelihoods, compiled, strict=True):
+        for place, rows in likelihood.by_group:
+            roots = evaluator.roots_of(around, likelihood.inputs, place)
+            specimens, _ = sampler([root[:1] for root in roots], _OPTIONS.specimens, rng)
+            (log_p,) = log_density(*roots, *[x[0] for x in specimens])
+            log_p = np.broadcast_to(log_p, (len(around), _OPTIONS.specimens))
+            with np.errstate(invalid="ignore"):
+                scores = slopes(log_p, step)
+            information += len(rows) / _OPTIONS.specimens * scores.T @ scores
     nothing = np.full_like(information, np.nan)
     if not np.isfinite(information).all():
         return nothing

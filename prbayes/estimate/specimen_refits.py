@@ -21,7 +21,7 @@ from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum, require_minimiser, require_sampling
 from prbayes.metrics.readings import Readings
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
+from prbayes.model.specimen_likelihood import SpecimenLikelihood
 from prbayes.propagation.specimen_points import draw_points, specimen_roots
 from prbayes.response.compilation import compiled, ninf_for_invalid, untraced
 
@@ -205,9 +205,8 @@ class SpecimenRefits:
 
     def _compile(self) -> Any:
         evaluator = self.evaluator
-        model = evaluator.model
         with untraced():
-            graphs = model.logp(vars=list(specimen_likelihoods(model)), sum=False)
+            graphs = evaluator.specimen_graphs()
             weights = [pt.dvector(f"weights_{k}") for k in range(len(graphs))]
             terms = [
                 pt.switch(pt.gt(w, 0), w * g, 0.0).sum()
@@ -232,10 +231,10 @@ class SpecimenRefits:
         Parameters
         ----------
         weights : sequence of ndarray, shapes (N,), optional
-            Of the specimens, by simulator, with sum N; all one by default.
+            Of the specimens, by likelihood, with sum N; all one by default.
         """
         if weights is None:
-            weights = [np.ones(len(each.observed)) for each in self.evaluator.measurements]
+            weights = [np.ones(len(each.readings)) for each in self.evaluator.likelihoods]
         root = self._root
 
         def objective(u: Floats) -> tuple[float, Floats]:
@@ -284,19 +283,22 @@ class SpecimenRefits:
         weights : sequence of ndarray, shapes (S, n_k)
             Of the specimens of each of `Evaluator.emulated`; of one data set they may have any sum.
         """
-        by_measurement = []
+        by_likelihood = []
         emulated = self.evaluator.emulated
-        for measurement in self.evaluator.measurements:
-            n = len(measurement.observed)
-            factors = np.zeros((len(weights[0]), n))
+        for likelihood in self.evaluator.likelihoods:
+            factors = np.zeros((len(weights[0]), len(likelihood.readings)))
+            count = np.zeros(len(likelihood.readings))
             for simulator, part in zip(emulated, weights, strict=True):
-                if simulator.measurement is measurement:
-                    factors[:, simulator.rows] = part * len(simulator.rows)
-            own = measurement.weights
+                if simulator.likelihood is likelihood:
+                    specimens = likelihood.numbers(simulator.measurement)[simulator.rows]
+                    np.add.at(factors.T, specimens, part.T * len(specimens))
+                    np.add.at(count, specimens, 1)
+            factors /= count
+            own = likelihood.measurements[0].weights
             if own is not None:  # which are in the likelihood, and in the weights
                 factors = factors / np.where(own > 0, own, 1.0)
-            by_measurement.append(factors)
-        estimates = [self.fit(list(rows)) for rows in zip(*by_measurement, strict=True)]
+            by_likelihood.append(factors)
+        estimates = [self.fit(list(rows)) for rows in zip(*by_likelihood, strict=True)]
         thetas, converged = zip(*estimates, strict=True)
         return np.array(thetas), np.array(converged)
 

@@ -250,11 +250,6 @@ class EmulatedSimulator:
         return np.flatnonzero(groups == self.place)
 
     @property
-    def has_likelihood(self) -> NDArray[np.bool_]:
-        """Which rows have the log-likelihood of their specimen, (N,); others have a zero."""
-        return np.isin(self.rows, self.likelihood.rows(self.measurement))
-
-    @property
     def observed(self) -> Floats:
         """Measured responses, (N,) or (N, m)."""
         return self.measurement.observed[self.rows]

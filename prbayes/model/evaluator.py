@@ -40,6 +40,7 @@ from prbayes.propagation.reweighted import Design
 from prbayes.response.budget import budget
 from prbayes.response.compilation import compile_batched, compiled, ninf_for_invalid, untraced
 from prbayes.response.grouping import is_group
+from prbayes.response.inputs import Inputs
 
 # Points of a design from which on an eighth of them serve on the way to an answer: those of the
 # smallest cloud.
@@ -242,9 +243,9 @@ class Evaluator:
         return np.array(np.broadcast_to(found, len(thetas)))
 
     def specimen_log_likelihoods(self, thetas: Floats) -> dict[str, Floats]:
-        """Return log p(y_i | theta) by simulator, shapes (P, N), of those with a likelihood.
+        """Return log p(y_i | theta) by simulator, shapes (P, S), of those with a likelihood.
 
-        Zero in rows of specimens whose log-likelihood is in another row.
+        Of simulators with common specimens the last has those of all, and the others have none.
         """
         if not self.likelihoods:
             return {}
@@ -253,9 +254,10 @@ class Evaluator:
             self._evaluate_specimens(np.ascontiguousarray(thetas[first : first + rows]))
             for first in range(0, len(thetas), rows)
         ]
-        names = [each.name for each in self.measurements]
-        joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
-        return dict(zip(names, joined, strict=True))
+        result = {each.name: np.empty((len(thetas), 0)) for each in self.measurements}
+        for likelihood, columns in zip(self.likelihoods, zip(*parts, strict=True), strict=True):
+            result[likelihood.measurements[-1].name] = np.concatenate(columns)
+        return result
 
     def specimen_params(self, thetas: Floats, k: int) -> dict[Any, Floats]:
         """Return the variables of the k-th likelihood by specimen at thetas, shapes (P, *shape)."""
@@ -265,9 +267,14 @@ class Evaluator:
 
     @cached_property
     def _evaluate_specimens(self) -> Any:
-        variables = list(specimen_likelihoods(self.model))
-        graphs = self.model.logp(vars=variables, sum=False)
-        return self.hyperparameters.compile(graphs)
+        return self.hyperparameters.compile(self.specimen_graphs())
+
+    def specimen_graphs(self) -> list[Any]:
+        """Return the graphs of the log-likelihoods of the specimens, by likelihood, (S,)."""
+        last = {each.measurements[-1]: k for k, each in enumerate(self.likelihoods)}
+        variables = {v: last[m] for v, m in measurements_of(self.model).items() if m in last}
+        graphs = self.model.logp(vars=sorted(variables, key=variables.__getitem__), sum=False)
+        return list(graphs)
 
     def discrepancies(self, thetas: Floats, k: int, target: Discrepancy | None = None) -> Floats:
         """Return the k-th simulator's discrepancies, shape (P,), or those from another target."""
@@ -446,10 +453,14 @@ class Evaluator:
     def _emulated_roots(self, thetas: Floats, k: int) -> list[Floats]:
         """Return the roots of a simulator whose responses are emulated, its group among them."""
         simulator = self.emulated[k - len(self.nodes)]
+        return self.roots_of(thetas, simulator.inputs, simulator.place)
+
+    def roots_of(self, thetas: Floats, inputs: Inputs, place: int | None) -> list[Floats]:
+        """Return the roots of inputs in the group with this index, shapes (P, *shape)."""
         values = self.constrained(thetas)
         return [
-            np.full(len(thetas), simulator.place) if is_group(root) else values[str(root.name)]
-            for root in simulator.inputs.roots
+            np.full(len(thetas), place) if is_group(root) else values[str(root.name)]
+            for root in inputs.roots
         ]
 
     @cached_property

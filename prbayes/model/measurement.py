@@ -133,9 +133,6 @@ class StackedReadings:
         None if no output of a specimen was read repeatedly.
     numbers : tuple of ndarray of int, shapes (N,)
         Specimen of each row, by simulator.
-    rows : tuple of ndarray of int
-        By simulator, the first row of each specimen whose readings in later simulators are none:
-        the row with the specimen's log-likelihood.
     groups : ndarray of int, shape (S,), or None
     log_gross : ndarray, shape (S,)
         Log-density of a specimen with a gross error: uniform over twice the range of each output.
@@ -145,7 +142,6 @@ class StackedReadings:
     scale: Floats
     repeats: Repeats | None
     numbers: tuple[NDArray[np.intp], ...]
-    rows: tuple[NDArray[np.intp], ...]
     groups: NDArray[np.intp] | None
     log_gross: Floats
 
@@ -172,7 +168,6 @@ class StackedReadings:
             np.concatenate(scales, axis=1),
             Repeats.beside(repeats) if any(part.count.any() for part in repeats) else None,
             tuple(numbers),
-            _rows_with_likelihood(numbers, size),
             _groups(measurements, numbers, size),
             log_gross,
         )
@@ -222,20 +217,6 @@ def _averaged(
             "equal; pass metric=prb.LogLikelihood(error=...) with their standard deviation"
         )
     return averaged(readings, measurement.scale, numbers, count)
-
-
-def _rows_with_likelihood(
-    numbers: Sequence[NDArray[np.intp]], size: int
-) -> tuple[NDArray[np.intp], ...]:
-    """Return the first row of each specimen in the last simulator that measured it."""
-    last = np.zeros(size, dtype=np.intp)
-    for k, own in enumerate(numbers):
-        last[own] = k
-    rows = []
-    for k, own in enumerate(numbers):
-        specimens, first = np.unique(own, return_index=True)
-        rows.append(np.sort(first[last[specimens] == k]))
-    return tuple(rows)
 
 
 def _groups(

@@ -268,6 +268,12 @@ def _by_specimen(
         data = pt.constant(values)
     joined = [rv for rv, each in specimen_likelihoods(model).items() if each in partners]
     simulators = tuple(each.name for each in likelihood.measurements)
+    named = [rv.name for rv in joined if model.named_vars_to_dims.get(rv.name)]
+    if likelihood.labels is not None and (named or dims is not None):
+        raise ValueError(
+            f"{name}: dims: got dimensions of {(named or [name])[0]}, whose specimens have several "
+            "readings, expected none: log-likelihoods are by specimen; leave dims= out"
+        )
     params = [pt.constant(groups) if is_group(v) else v for v in likelihood.variables(simulators)]
     rv = SpecimenDistribution(
         name,

@@ -9,8 +9,8 @@ computed at the first use, from runs and an emulator (`prbayes.propagation.speci
 contain no hyperparameter, so that NUTS, SMC and optimisers evaluate the graph without a run.
 
 Simulators that measured the same specimens have one likelihood: y_i are the readings of all. The
-last simulator that measured a specimen has its element, and the earlier ones a zero; observed
-variables of these are parameters of the last one's.
+log-density of the last one has an element for each specimen, those of the others have none; their
+observed variables are parameters of the last one's.
 """
 
 from __future__ import annotations
@@ -166,9 +166,22 @@ class SpecimenLikelihood:
         """Return the specimen of each row of a simulator, (N,)."""
         return self.stacked.numbers[self.measurements.index(measurement)]
 
-    def rows(self, measurement: Measurement) -> NDArray[np.intp]:
-        """Return the rows of a simulator with the log-likelihood of their specimen."""
-        return self.stacked.rows[self.measurements.index(measurement)]
+    @property
+    def labels(self) -> NDArray[Any] | None:
+        """Labels of the specimens, (S,); None if these are the rows of a single simulator."""
+        if len(self.measurements) == 1 and len(self.readings) == len(self.measurements[0].observed):
+            return None
+        labels = np.concatenate([np.asarray(each.specimens) for each in self.measurements])
+        _, first = np.unique(np.concatenate(self.stacked.numbers), return_index=True)
+        return labels[first]
+
+    @property
+    def by_group(self) -> list[tuple[int | None, NDArray[np.intp]]]:
+        """The index of each group, None without groups, and its specimens."""
+        groups = self.stacked.groups
+        if groups is None:
+            return [(None, np.arange(len(self.readings)))]
+        return [(place, np.flatnonzero(groups == place)) for place in np.unique(groups).tolist()]
 
     def run(self, z: Floats) -> Floats:
         """Return the outputs of runs at coordinates, (n, d) -> (n, M); NaN where there is none.
@@ -338,41 +351,23 @@ class SpecimenLikelihood:
         ]
         return shared, pytensor.shared(log_a, name=f"{self.name}_log_a")
 
-    def log_likelihood(self, measurement: Measurement, params: Mapping[Any, Any]) -> TensorVariable:
-        """Return the graph of the log-likelihoods of specimens by the rows of a simulator, (N,).
-
-        The first row of a specimen in the last simulator that measured it has its log-likelihood
-        given the readings of all simulators. Other rows are zero.
+    def log_likelihood(self, params: Mapping[Any, Any]) -> TensorVariable:
+        """Return the graph of the log-likelihoods of the specimens, (S,).
 
         Parameters
         ----------
-        measurement : Measurement
         params : mapping
-            Values by `variables` of this simulator and of those with the same specimens before it.
+            Values by `variables`.
         """
-        rows, n = self.rows(measurement), len(measurement.observed)
-        if not len(rows):
-            return pt.zeros(n)
-        result = self._of_specimens(self.numbers(measurement)[rows], params)
-        if measurement.weights is not None:
-            result = result * measurement.weights
-        return result if len(rows) == n else pt.zeros(n)[rows].set(result)
-
-    def _of_specimens(
-        self, specimens: NDArray[np.intp], params: Mapping[Any, Any]
-    ) -> TensorVariable:
-        """Return the graph of the log-likelihoods of some specimens, (n,)."""
         points, log_a = self.arrays
-        n, count = len(specimens), log_a.shape[1]
-        if n < len(self.readings):
-            points, log_a = [x[specimens] for x in points], log_a[specimens]
+        n, count = len(self.readings), log_a.shape[1]
         symbols = self.inputs.placeholders()
         dists, _ = self.inputs.rebuilt(symbols)
         values = {s: params[r] for s, r in zip(symbols, self.inputs.roots, strict=True)}
         if self.stacked.groups is not None:
             # A vector of groups in place of one makes vectors of the distributions' parameters.
             (group,) = (s for s, r in zip(symbols, self.inputs.roots, strict=True) if is_group(r))
-            of_points = pt.repeat(pt.as_tensor(self.stacked.groups[specimens]), count)
+            of_points = pt.repeat(pt.as_tensor(self.stacked.groups), count)
             dists = vectorize_graph(dists, {group: of_points})
             del values[group]
         flat = [x.reshape((n * count, *x.shape[2:]), ndim=x.ndim - 1) for x in points]
@@ -382,37 +377,33 @@ class SpecimenLikelihood:
         terms = log_p.reshape((n, count)) + log_a
         error = self._errors(params)
         if not self.error_is_known:
-            terms = terms + self._readings_log_density(specimens, error)
+            terms = terms + self._readings_log_density(error)
         likelihood = logsumexp_finite(terms)
         if self.stacked.repeats is not None:
-            likelihood = likelihood + self.stacked.repeats.log_density(error, pt)[specimens]
+            likelihood = likelihood + self.stacked.repeats.log_density(error, pt)
         share = self.measurements[0].gross_errors
         if share is not False:
             share = params.get(share, share)
-            gross = pt.log(share) + self.stacked.log_gross[specimens]
+            gross = pt.log(share) + self.stacked.log_gross
             likelihood = pt.logaddexp(pt.log1p(-share) + likelihood, gross)
-        return likelihood
+        weights = self.measurements[0].weights  # of one simulator without repeated readings
+        return likelihood if weights is None else likelihood * weights
 
     def _errors(self, params: Mapping[Any, Any]) -> Any:
-        """Return the unknown error of each output, (M,): one where it is known, or not in params.
-
-        An output whose error is not in params was not measured.
-        """
+        """Return the unknown error of each output, (M,): one where it is known."""
         errors = []
         for each in self.measurements:
-            error = params.get(each.extras.get("error"), 1.0)
+            error = params[each.extras["error"]] if "error" in each.extras else 1.0
             errors.append(error + pt.zeros(each.rows.shape[1]))
         return pt.concatenate(errors)
 
-    def _readings_log_density(self, specimens: NDArray[np.intp], error: Any) -> Any:
-        """Return the log-density of the readings at the points, (n, K), for an unknown error."""
-        outputs = self.points.outputs[specimens]
-        sd = error * self.stacked.scale[specimens]
-        variance = self.emulation.error**2 + sd[:, None] ** 2
+    def _readings_log_density(self, error: Any) -> Any:
+        """Return the log-density of the readings at the points, (S, K), for an unknown error."""
+        outputs = self.points.outputs
+        variance = self.emulation.error**2 + (error * self.stacked.scale[:, None]) ** 2
         # Points that fill up the array have any output.
         outputs = np.where(np.isfinite(outputs), outputs, 1e30)
-        readings = self.readings.rows(specimens)
-        return readings.symbolic_log_density(outputs, variance, pt)
+        return self.readings.symbolic_log_density(outputs, variance, pt)
 
     def draws(
         self,
@@ -732,25 +723,24 @@ class SpecimenDistribution(pm.Distribution):  # type: ignore[misc]
 def _log_density(
     op: SpecimenRV, values: Any, rng: Any, size: Any, *params: Any, **kwargs: Any
 ) -> TensorVariable:
-    """Return the log-likelihoods of the specimens, (N,)."""
+    """Return the log-likelihoods of the specimens, (S,); none where a later simulator has them."""
     (value,) = values
-    if builds_priors_alone():
-        return pt.zeros(len(op.measurement.observed))
+    if builds_priors_alone() or op.measurement is not op.likelihood.measurements[-1]:
+        return pt.zeros(0)
     variables = op.variables
     roots = {
         v: p if is_group(v) else p[(0,) * (p.ndim - v.type.ndim)]
         for v, p in zip(variables, params, strict=False)
     }
-    measurements = op.measurements
+    measurements: Sequence[Measurement] = op.measurements
     others = zip(params[len(variables) :], measurements[:-1], strict=True)
     data = [_value_of(p[(0,) * (p.ndim - m.observed.ndim)]) for p, m in others] + [value]
     numbers = {m.name: known_value(v) for m, v in zip(measurements, data, strict=True)}
     likelihood = op.likelihood.observing(numbers)
-    measurements = [m for m in likelihood.measurements if m.name in op.simulators]
-    result = likelihood.log_likelihood(measurements[-1], roots)
+    result = likelihood.log_likelihood(roots)
     same = [
         _equal(v, m.observed)
-        for m, v in zip(measurements, data, strict=True)
+        for m, v in zip(likelihood.measurements, data, strict=True)
         if not all(isinstance(leaf, Constant) for leaf in ancestors([v]) if leaf.owner is None)
     ]
     if not same:
