@@ -135,7 +135,7 @@ class SpecimenLikelihood:
     @cached_property
     def coordinates(self) -> Coordinates:
         """Coordinates of the inputs."""
-        return Coordinates.of_prior(self.inputs)
+        return Coordinates.of_prior(self.inputs, len(self.observed))
 
     def run(self, z: Floats) -> Floats:
         """Return the outputs of runs at coordinates, (n, d) -> (n, m); NaN where there is none.
