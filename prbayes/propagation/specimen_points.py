@@ -259,11 +259,14 @@ def emulate(
     rng = np.random.default_rng([seed, 1])
     for batch in range(6):
         roots = specimen_roots(emulation, readings, options)
-        enough = batch >= 2 if known is None else emulation.covers(roots.z)
+        enough = (batch >= 2 or known is not None) and emulation.covers(roots.z)
         # Twice at most: a reading that no inputs reproduce is reported.
         wider = _widened(emulation.box, roots) if batch < 2 else emulation.box
         if enough and emulation.bias <= options.bias and np.array_equal(wider, emulation.box):
-            break
+            # Zero for the response itself, which no run improves.
+            narrowing = 0.0 if emulation.bias == 0 else _narrowing(emulation, readings, roots)
+            if narrowing <= options.bias:
+                break
         emulation = replace(emulation, box=wider)
         count = max(n // 2, options.fresh)
         fresh = spread_out(roots.z, wider, count, options.fresh, rng)
@@ -287,6 +290,37 @@ def emulate(
             f"{len(emulation.z)} runs, expected at most {options.bias}; {rough}"
         )
     return emulation, roots
+
+
+def _narrowing(emulation: Emulation, readings: Readings, roots: Roots) -> float:
+    """Return by how much the error of the emulator could narrow the population of an input.
+
+    In posterior standard deviations of its standard deviation sigma. The comparison allows an error
+    covariance C of a root; the part of it that the runs have overestimated is missing in sigma^2:
+
+        sqrt(2 N) / 2 max_j mean_i sum_r w_ir C_jj / (C_jj + sigma_j^2)
+
+    with weights w_ir of the roots under a normal population that is fitted to them.
+    """
+    width = emulation.box[1] - emulation.box[0]
+    sd = np.where(readings.is_measured, readings.comparison_sd(emulation.error), 1.0)
+    factor = (sd / emulation.error)[roots.specimen][:, :, None]
+    precision, of_error = (
+        np.einsum("rmd,rme->rde", j, j) + np.diag(4.0 / width**2)
+        for j in (roots.jacobian, roots.jacobian * factor)
+    )
+    _, specimen = np.unique(roots.specimen, return_inverse=True)
+    table = _Components(specimen, roots.z, precision, roots.misfit).table
+    log_mass = -np.linalg.slogdet(precision)[1] / 2 - roots.misfit
+    log_a = np.where(table >= 0, log_mass[table], -np.inf)
+    ((mean, root),) = normal_populations(roots.z[table], log_a, 1, 0, bootstrap=False)
+    log_w = normal_log_density(roots.z[table], mean, root) + log_a
+    w = np.exp(log_w - logsumexp(log_w, axis=1, keepdims=True))
+    whole, part = (
+        np.einsum("rdd->rd", np.linalg.inv(each))[table] for each in (precision, of_error)
+    )
+    share = np.einsum("nr,nrd->nd", w, part / (whole + (root**2).sum(axis=1)))
+    return float(np.sqrt(len(share) / 2) * share.mean(axis=0).max())
 
 
 def extended(
