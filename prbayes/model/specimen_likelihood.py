@@ -150,7 +150,7 @@ class SpecimenLikelihood:
     @cached_property
     def coordinates(self) -> Coordinates:
         """Coordinates of the inputs."""
-        return Coordinates.of_prior(self.inputs)
+        return Coordinates.of_prior(self.inputs, len(self.observed))
 
     def columns(self, measurement: Measurement) -> slice:
         """Return which of all outputs are those of a simulator."""

@@ -22,7 +22,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln, logsumexp, ndtri
+from scipy.special import chdtri, gammaln, logsumexp, ndtri
 
 from prbayes._checks import AT_ONCE, Floats
 from prbayes.emulators.interpolant import Interpolant, fit_interpolant
@@ -30,7 +30,13 @@ from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.guards import half_difference, missing_share, predicted_bias
 from prbayes.propagation.points import sobol
-from prbayes.propagation.roots import Response, Roots, find_roots, nearest_starts
+from prbayes.propagation.roots import (
+    Response,
+    Roots,
+    find_roots,
+    gabriel_neighbours,
+    nearest_starts,
+)
 
 
 @dataclass(frozen=True)
@@ -253,11 +259,14 @@ def emulate(
     rng = np.random.default_rng([seed, 1])
     for batch in range(6):
         roots = specimen_roots(emulation, readings, options)
-        enough = batch >= 2 if known is None else emulation.covers(roots.z)
+        enough = (batch >= 2 or known is not None) and emulation.covers(roots.z)
         # Twice at most: a reading that no inputs reproduce is reported.
         wider = _widened(emulation.box, roots) if batch < 2 else emulation.box
         if enough and emulation.bias <= options.bias and np.array_equal(wider, emulation.box):
-            break
+            # Zero for the response itself, which no run improves.
+            narrowing = 0.0 if emulation.bias == 0 else _narrowing(emulation, readings, roots)
+            if narrowing <= options.bias:
+                break
         emulation = replace(emulation, box=wider)
         count = max(n // 2, options.fresh)
         fresh = spread_out(roots.z, wider, count, options.fresh, rng)
@@ -281,6 +290,37 @@ def emulate(
             f"{len(emulation.z)} runs, expected at most {options.bias}; {rough}"
         )
     return emulation, roots
+
+
+def _narrowing(emulation: Emulation, readings: Readings, roots: Roots) -> float:
+    """Return by how much the error of the emulator could narrow the population of an input.
+
+    In posterior standard deviations of its standard deviation sigma. The comparison allows an error
+    covariance C of a root; the part of it that the runs have overestimated is missing in sigma^2:
+
+        sqrt(2 N) / 2 max_j mean_i sum_r w_ir C_jj / (C_jj + sigma_j^2)
+
+    with weights w_ir of the roots under a normal population that is fitted to them.
+    """
+    width = emulation.box[1] - emulation.box[0]
+    sd = np.where(readings.is_measured, readings.comparison_sd(emulation.error), 1.0)
+    factor = (sd / emulation.error)[roots.specimen][:, :, None]
+    precision, of_error = (
+        np.einsum("rmd,rme->rde", j, j) + np.diag(4.0 / width**2)
+        for j in (roots.jacobian, roots.jacobian * factor)
+    )
+    _, specimen = np.unique(roots.specimen, return_inverse=True)
+    table = _Components(specimen, roots.z, precision, roots.misfit).table
+    log_mass = -np.linalg.slogdet(precision)[1] / 2 - roots.misfit
+    log_a = np.where(table >= 0, log_mass[table], -np.inf)
+    ((mean, root),) = normal_populations(roots.z[table], log_a, 1, 0, bootstrap=False)
+    log_w = normal_log_density(roots.z[table], mean, root) + log_a
+    w = np.exp(log_w - logsumexp(log_w, axis=1, keepdims=True))
+    whole, part = (
+        np.einsum("rdd->rd", np.linalg.inv(each))[table] for each in (precision, of_error)
+    )
+    share = np.einsum("nr,nrd->nd", w, part / (whole + (root**2).sum(axis=1)))
+    return float(np.sqrt(len(share) / 2) * share.mean(axis=0).max())
 
 
 def extended(
@@ -392,12 +432,16 @@ def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptio
     solvable = np.flatnonzero(measured.sum(axis=1) >= emulation.z.shape[1])
     # Runs are not chosen by an output that a reading error dominates.
     unit = np.hypot(readings.spread(), 10 * np.median(readings.error, axis=0))
+    unit = np.where(measured, unit, np.inf)
+    neighbours = gabriel_neighbours(run_z)
     parts = []
     # Specimens in blocks, so that memory stays constant.
     block = max(1, AT_ONCE // (options.starts * len(run_z) * 4))
     for first in range(0, len(solvable), block):
         rows = solvable[first : first + block]
-        starts = _starts(run_z, run_y, target[rows], measured[rows], unit, options.starts)
+        starts = nearest_starts(
+            run_z, run_y, target[rows], unit[rows], options.starts, neighbours
+        )
         roots = find_roots(
             emulation, target[rows], np.where(measured[rows], sd[rows], 1e150), starts,
             emulation.box, gap=options.gap,
@@ -407,27 +451,6 @@ def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptio
     joined = [np.concatenate([getattr(r, name) for r, _ in parts]) for name in names]
     specimen = np.concatenate([rows[r.specimen] for r, rows in parts])
     return Roots(specimen, *joined)
-
-
-def _starts(
-    run_z: Floats,
-    run_y: Floats,
-    y: Floats,
-    measured: NDArray[np.bool_],
-    spread: Floats,
-    count: int,
-) -> Floats:
-    """Return starts by specimen, compared in the outputs that were measured, (N, count, d)."""
-    count = min(count, len(run_z))
-    starts = np.empty((len(y), count, run_z.shape[1]))
-    patterns, which = np.unique(measured, axis=0, return_inverse=True)
-    for k, pattern in enumerate(patterns):
-        rows = np.flatnonzero(which.ravel() == k)
-        columns = np.flatnonzero(pattern)
-        starts[rows] = nearest_starts(
-            run_z, run_y[:, columns], y[np.ix_(rows, columns)], spread[columns], count
-        )
-    return starts
 
 
 def spread_out(
@@ -618,8 +641,16 @@ def _fit_components(
             combined = np.linalg.inv(narrow + wide)
             pull = np.einsum("rde,re->rd", narrow, rank.center) + wide @ mean
             center = np.einsum("rde,re->rd", combined, pull)
-            rank = _Components(
-                rank.specimen, center, np.linalg.cholesky(1.5 * combined), rank.log_mass
+            # Roots of another population, such as a mirror one, keep their components.
+            away = rank.center - mean
+            spread = np.linalg.inv(narrow) + 4 * covariance
+            square = np.einsum("rd,rd->r", away, np.linalg.solve(spread, away[..., None])[..., 0])
+            is_near = (square < chdtri(d, 0.001))[:, None]
+            combined_root = np.linalg.cholesky(1.5 * combined)
+            rank = replace(
+                rank,
+                center=np.where(is_near, center, rank.center),
+                root=np.where(is_near[..., None], combined_root, rank.root),
             )
         components = _Components(some[rank.specimen], *_fields(rank)[1:])
     without = np.setdiff1d(np.arange(len(readings)), some)
@@ -742,8 +773,6 @@ def _scrambled(components: int, count: int, dimensions: int, seed: tuple[int, in
 
 def _t_radius(u: Floats, degrees: float) -> Floats:
     """Return the factors that turn normal vectors into vectors of a t distribution."""
-    from scipy.special import chdtri
-
     return np.asarray(np.sqrt(degrees / chdtri(degrees, u)))
 
 
