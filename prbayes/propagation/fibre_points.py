@@ -27,6 +27,7 @@ from prbayes.propagation.specimen_points import (
     SpecimenPoints,
     extended,
     first_runs,
+    root_points,
     spread_out,
     typical_sd,
 )
@@ -96,7 +97,7 @@ def fibre_points(
     population = ReferencePopulation.from_sample(prior_specimens)
     rng = np.random.default_rng([seed, 1])
     for attempt in range(6):
-        points = _draw(emulation, readings, population, 256, seed + attempt)
+        points = _draw(emulation, readings, population, 256, options, seed + attempt)
         draws = posterior(points.z, points.log_a)
         population = ReferencePopulation.from_sample(draws.specimens())
         if attempt >= 2 and emulation.bias <= options.bias:
@@ -115,7 +116,9 @@ def fibre_points(
     largest = 3 * options.half_difference
     count = 128
     while True:
-        halves = [_draw(emulation, readings, population, count, 100 + seed + h) for h in (0, 1)]
+        halves = [
+            _draw(emulation, readings, population, count, options, 100 + seed + h) for h in (0, 1)
+        ]
         logs = [draws.log_likelihoods(half.z, half.log_a) for half in halves]
         finite = np.isfinite(logs[0]).all(axis=1) & np.isfinite(logs[1]).all(axis=1)
         difference = half_difference(logs[0][finite], logs[1][finite]) if finite.any() else np.inf
@@ -151,7 +154,12 @@ def _joined(first: _Points, second: _Points) -> _Points:
 
 
 def _draw(
-    emulation: Emulation, readings: Readings, population: ReferencePopulation, count: int, seed: int
+    emulation: Emulation,
+    readings: Readings,
+    population: ReferencePopulation,
+    count: int,
+    options: PointOptions,
+    seed: int,
 ) -> _Points:
     """Draw points of all specimens, by the pattern of outputs that were measured."""
     n, m = readings.values.shape
@@ -175,6 +183,9 @@ def _draw(
             continue
         response = _columns(emulation, columns)
         y = part.values[:, columns]
+        if not noisy.any() and len(columns) >= d:
+            z[rows], log_proposal[rows] = root_points(emulation, part, count, options, seed)
+            continue
         if not noisy.any():
             points = fit_fibres(response, y, population, seed=seed, numbers=numbers[rows]).draw(
                 count, seed

@@ -591,6 +591,29 @@ def draw_points(
     )
 
 
+def root_points(
+    emulation: Emulation, readings: Readings, count: int, options: PointOptions, seed: int = 0
+) -> tuple[Floats, Floats]:
+    """Return points around the roots of specimens among others with fewer readings than inputs.
+
+    Returns
+    -------
+    z : ndarray, shape (N, count, d)
+    log_proposal : ndarray, shape (N, count)
+        Log of the number of points times the proposal density; +inf for points that fill up.
+    """
+    roots = specimen_roots(emulation, readings, options)
+    box = emulation.box
+    components = _fit_components(emulation, emulation.error, readings, roots, box, options, seed)
+    each = max(1, count // components.table.shape[1])
+    sample = _draw(emulation, emulation.error, readings, components, each, options, (seed, 5))
+    z = np.repeat(sample.z[:, :1], count, axis=1)
+    log_proposal = np.full(z.shape[:2], np.inf)
+    drawn = min(count, sample.z.shape[1])
+    z[:, :drawn], log_proposal[:, :drawn] = sample.z[:, :drawn], sample.log_proposal[:, :drawn]
+    return z, log_proposal
+
+
 def _of_error(
     halves: list[_Sample], readings: Readings, error: Floats, factor: float
 ) -> list[_Sample]:

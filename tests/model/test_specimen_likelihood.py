@@ -641,16 +641,6 @@ def test_predictive_draws_are_those_of_the_population() -> None:
     assert len(np.unique(drawn.round(12))) == drawn.size
 
 
-def test_specimens_with_several_readings_are_refused() -> None:
-    with pm.Model():
-        x = pm.Normal.dist(pm.Normal("mu"), 1.0)
-        with pytest.raises(ValueError, match="got the label 'a' several times"):
-            prb.Simulator("y", np.positive, x, observed=[1.0, 2.0], specimens=["a", "a"])
-        prb.Simulator("y", np.positive, x, observed=[1.0, 2.0], specimens=["a", "b"])
-        with pytest.raises(ValueError, match="'b', which y has too"):
-            prb.Simulator("z", np.square, x, observed=[1.0, 2.0], specimens=["b", "c"])
-
-
 def test_the_first_use_logs_the_number_of_runs(caplog: pytest.LogCaptureFixture) -> None:
     with pm.Model() as model:
         x = pm.Normal.dist(pm.Normal("mu"), 1.0)
