@@ -46,7 +46,8 @@ class PointOptions:
     Attributes
     ----------
     starts : int
-        Starts of the search for roots, by specimen; doubled while roots are missing.
+        Fewest starts of the search for roots, by specimen; doubled while simulated specimens do not
+        get their inputs back.
     gap : float
         Largest misfit of a root above the specimen's best, in nats.
     points : int
@@ -60,8 +61,7 @@ class PointOptions:
         Runs at roots that measure the emulator's bias; they stay in the emulator.
     bias : float
         Largest bias of a mean or standard deviation of an input, in posterior standard deviations.
-    missing : float
-        Largest share of simulated specimens that do not get their own inputs back.
+        More runs are added where the emulator's error could cause as much.
     floor : float
         Smallest standard deviation of a comparison, as a share of the data's.
     """
@@ -73,7 +73,6 @@ class PointOptions:
     half_difference: float = 0.05
     fresh: int = 16
     bias: float = 0.15
-    missing: float = 0.03
     floor: float = 1e-6
     degrees: float = 5.0
 
@@ -408,7 +407,7 @@ def _all_roots(
     box = np.stack([emulation.z[good].min(axis=0), emulation.z[good].max(axis=0)])
     while options.starts < len(emulation.z):
         share = missing_share(find, lambda z: emulation(z)[0], box, values, seed=seed)
-        if not share > options.missing:
+        if not share > 0:
             break
         options = replace(options, starts=2 * options.starts)
         roots = specimen_roots(emulation, readings, options)

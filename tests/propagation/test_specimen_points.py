@@ -19,11 +19,12 @@ from prbayes.propagation.specimen_points import (
     Emulation,
     PointOptions,
     SpecimenPoints,
-    _starts,
+    _narrowing,
     draw_points,
     emulate,
     first_runs,
     normal_log_density,
+    specimen_roots,
 )
 
 Density = Callable[[Floats], Floats]
@@ -324,12 +325,53 @@ def test_runs_far_from_the_data_do_not_count_as_errors() -> None:
     assert np.sort(misfits)[-2] < 0.1
 
 
-def test_starts_are_nearest_in_the_outputs_that_were_measured() -> None:
-    run_z = np.arange(4.0)[:, None]
-    run_y = np.array([[1.0, 9.0], [2.0, 5.0], [3.0, 0.0], [4.0, 7.0]])
-    y, measured = np.array([[4.0, 0.0], [0.0, 9.0]]), np.array([[True, False], [False, True]])
-    starts = _starts(run_z, run_y, y, measured, np.ones(2), 2)
-    assert starts[..., 0].tolist() == [[3.0, 2.0], [0.0, 3.0]]
+def test_roots_on_a_steep_branch_are_not_missing() -> None:
+    """The outputs of at least 12 runs on the flat branch are nearer than any on the steep one."""
+
+    def cubic(z: Floats) -> Floats:
+        x = 2.2 * z
+        return x**3 - 3 * x
+
+    y = np.linspace(1.9, 1.99, 12)[:, None]
+    emulation, points = points_of(cubic, y, 1)
+    assert points.n_roots.tolist() == [3] * 12
+    roots = specimen_roots(emulation, readings(y), PointOptions(starts=1))
+    assert np.bincount(roots.specimen).tolist() == [3] * 12
+
+
+def test_points_of_a_mirror_population_stay_at_its_roots() -> None:
+    """One of two populations is as narrow as the error of the emulator; the other is wide."""
+
+    def symmetric(z: Floats) -> Floats:
+        a, b = np.exp(z[:, 0]), np.exp(z[:, 1])
+        return np.stack([a * b, a + b], axis=1)
+
+    rng = np.random.default_rng(5)
+    x = np.stack([rng.normal(0.5, 0.3, 20), rng.normal(-0.5, 1e-4, 20)], axis=1)
+    y = symmetric(x)
+    data, box = readings(y), cube(2, 1.5)
+    emulation, roots = emulate(symmetric, data, cube(2), box, PointOptions())
+    error = np.array([3e-4, 3e-4])
+    points = draw_points(emulation, error, data, roots, box, PointOptions())
+    for side in (x, x[:, ::-1]):
+        away = np.abs(points.z - side[:, None]).max(axis=2).min(axis=1)
+        assert away.max() < 0.01
+
+
+def test_runs_are_added_while_the_error_could_narrow_a_population() -> None:
+    """A population that is narrow beside the emulator's error at a distant mirror population."""
+
+    def cosh(z: Floats) -> Floats:
+        return np.stack([z[:, 0] + 0.2 * z[:, 1], np.cosh(3 * z[:, 1] - 0.9)], axis=1)
+
+    rng = np.random.default_rng(1)
+    x = np.stack([rng.normal(0.2, 0.02, 15), rng.normal(0.35, 0.6, 15)], axis=1)
+    data, box = readings(cosh(x)), cube(2, 2.0)
+    emulation, _ = emulate(cosh, data, cube(2), box, PointOptions())
+    rough, roots = emulate(cosh, data, cube(2), box, PointOptions(bias=1e9))
+    assert rough.bias < PointOptions().bias < _narrowing(rough, data, roots)
+    assert len(emulation.z) > len(rough.z) == 128
+    assert emulation.error[1] < 0.01 < rough.error[1]
 
 
 def test_batches_of_runs_are_at_the_roots() -> None:
