@@ -299,19 +299,17 @@ def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats
     if evaluator is None or thetas is None:
         return checked + Checked(
             untested=(
-                "The conflict of prior and data was not tested: that needs the model; pass model=.",
-                _ELSEWHERE,
+                "The family of the population and the conflict of prior and data were not tested: "
+                "that needs the model; pass model=.",
             )
         )
     center = thetas.reshape(-1, evaluator.size).mean(axis=0)
     checked += Checked(failing_region_findings(evaluator, center), emulator_notes(evaluator))
-    return checked + _conflict(evaluator, thetas) + Checked(untested=(_ELSEWHERE,))
-
-
-_ELSEWHERE = (
-    "The family of the population was not tested: prb.diagnose of the optimum of prb.minimize "
-    "tests it."
-)
+    obstacle = simulation_obstacle(evaluator)
+    if obstacle is not None:
+        return checked + _not_tested(obstacle) + _conflict_not_tested(obstacle)
+    optimum = find_optimum(evaluator, Minimisation())
+    return checked + _population(optimum) + _conflict(optimum, thetas)
 
 
 def separate_modes(thetas: Floats, names: Sequence[str]) -> tuple[Finding, ...]:
@@ -373,17 +371,17 @@ def influence(result: xr.DataTree) -> tuple[Finding, ...]:
     return tuple(findings)
 
 
-def _conflict(evaluator: Evaluator, thetas: Floats) -> Checked:
+def _conflict_not_tested(reason: str) -> Checked:
+    return Checked(untested=(f"The conflict of prior and data was not tested: {reason}.",))
+
+
+def _conflict(optimum: Optimum, thetas: Floats) -> Checked:
     """Report hyperparameters whose prior pulls the posterior away from the data."""
-    obstacle = simulation_obstacle(evaluator)
-    if obstacle is None:
-        optimum = find_optimum(evaluator, Minimisation())
-        if not (optimum.converged and np.isfinite(optimum.covariance).all()):
-            obstacle = "nothing is known of the sampling distribution of the optimum"
-        elif any(rival["comparable"] for rival in optimum.rivals):
-            obstacle = "the likelihood has several modes"
-    if obstacle is not None:
-        return Checked(untested=(f"The conflict of prior and data was not tested: {obstacle}.",))
+    evaluator = optimum.evaluator
+    if not (optimum.converged and np.isfinite(optimum.covariance).all()):
+        return _conflict_not_tested("nothing is known of the sampling distribution of the optimum")
+    if any(rival["comparable"] for rival in optimum.rivals):
+        return _conflict_not_tested("the likelihood has several modes")
     draws = thetas.reshape(-1, evaluator.size)
     errors = np.sqrt(np.diag(optimum.covariance))
     pulls = np.abs(draws.mean(axis=0) - optimum.theta) / errors
@@ -398,8 +396,9 @@ def _conflict(evaluator: Evaluator, thetas: Floats) -> Checked:
     prior = evaluator.prior_thetas(_OPTIONS.prior_draws, 0)
     predictive = _predictive_estimates(optimum, prior)
     if np.isfinite(predictive).all(axis=1).mean() < 0.5:
-        reason = "the information of most populations of the prior is not finite"
-        return Checked(untested=(f"The conflict of prior and data was not tested: {reason}.",))
+        return _conflict_not_tested(
+            "the information of most populations of the prior is not finite"
+        )
     findings = conflict_findings(
         names,
         prior,

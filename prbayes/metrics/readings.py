@@ -73,6 +73,17 @@ class Readings:
         sd = np.sqrt((away**2).sum(axis=0) / count)
         return np.where(sd > 0, sd, 1.0)
 
+    def robust_spread(self) -> Floats:
+        """Return the standard deviation of each output by its quartiles, (m,).
+
+        Specimens near a pole of the response decide the ordinary one. Where the quartiles are
+        equal, it is the ordinary one.
+        """
+        columns = [v[k] for v, k in zip(self.values.T, self.is_measured.T, strict=True)]
+        widths = [np.subtract(*np.quantile(v, [0.75, 0.25])) if v.size else 0.0 for v in columns]
+        scatter = np.array(widths) / 1.349
+        return np.where(scatter > 0, scatter, self.spread())
+
     def comparison_sd(self, emulator_error: Floats) -> Floats:
         """Return the standard deviation of the comparison with an emulator, (N, m).
 

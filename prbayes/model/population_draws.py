@@ -21,6 +21,7 @@ from prbayes._checks import AT_ONCE, Floats
 from prbayes.model.hyperparameters import Hyperparameters
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.points import sobol
+from prbayes.propagation.response_share import ResponseShare
 from prbayes.response.distributions import PopulationSampler, compiled_log_density
 from prbayes.response.grouping import is_group
 from prbayes.response.inputs import Inputs
@@ -87,7 +88,24 @@ class Populations:
                 result[some, rows] = logsumexp(logs + weights[rows], axis=2)
         return result
 
-    def posterior(self, z: Floats, log_a: Floats, seed: int = 0) -> PopulationDraws:
+    def log_share(self, thetas: Floats, share: ResponseShare, size: int) -> Floats:
+        """Return log S of the population of each of N specimens, summed over them, (S,)."""
+        groups = np.zeros(size, dtype=np.intp) if self.groups is None else self.groups
+        x = self.coordinates.inputs(share.z)
+        result = np.zeros(len(thetas))
+        step = max(1, AT_ONCE // len(share.z))
+        for group, count in zip(*np.unique(groups, return_counts=True), strict=True):
+            for first in range(0, len(thetas), step):
+                some = slice(first, first + step)
+                with np.errstate(all="ignore"):
+                    (log_p,) = self._log_density(*self._roots(thetas[some], int(group)), *x)
+                log_p = np.nan_to_num(log_p, nan=-np.inf) + self.coordinates.log_jacobian(share.z)
+                result[some] += count * share.log_share(log_p)
+        return result
+
+    def posterior(
+        self, z: Floats, log_a: Floats, share: ResponseShare | None = None, seed: int = 0
+    ) -> PopulationDraws:
         """Return draws of the posterior of the hyperparameters given points of the specimens.
 
         Weights are tempered until their effective sample size is ten times the number of
@@ -103,6 +121,8 @@ class Populations:
             if inside.any():
                 likelihood = self.log_likelihoods(thetas[inside], z, log_a).sum(axis=1)
                 total[inside] = prior[inside] + likelihood
+                if share is not None:
+                    total[inside] -= self.log_share(thetas[inside], share, len(z))
             return total
 
         thetas = names.prior_points(2048, seed)
@@ -122,7 +142,7 @@ class Populations:
                 break
         rng = np.random.default_rng([seed, 5])
         chosen = thetas[rng.choice(len(thetas), 256, p=weights)]
-        return PopulationDraws(self, chosen)
+        return PopulationDraws(self, chosen, len(z))
 
 
 def _tempered(log_weights: Floats, least: int) -> tuple[Floats, float]:
@@ -150,14 +170,21 @@ class PopulationDraws:
     ----------
     populations : Populations
     thetas : ndarray, shape (S, d)
+    size : int
+        Number of measured specimens.
     """
 
     populations: Populations
     thetas: Floats
+    size: int
 
     def log_likelihoods(self, z: Floats, log_a: Floats, draws: int = 32) -> Floats:
         """Return log p(y_i | theta) at some of the draws, (draws, N)."""
         return self.populations.log_likelihoods(self.thetas[:draws], z, log_a)
+
+    def log_share(self, share: ResponseShare) -> Floats:
+        """Return the sum over the specimens of log S, the log share with a response, (S,)."""
+        return self.populations.log_share(self.thetas, share, self.size)
 
     def specimens(self, each: int = 16, seed: int = 0) -> Floats:
         """Return coordinates of specimens of all groups and draws, (n, d)."""

@@ -219,10 +219,7 @@ def emulator_findings(
         In robust standard deviations of the readings. Jumps, poles and crossing modes with less
         have posterior means within .1 standard deviations (33 data sets, one of them .15).
     """
-    low, high = np.nanquantile(readings.values, [0.25, 0.75], axis=0)
-    scatter = (high - low) / 1.349
-    scatter = np.where(scatter > 0, scatter, readings.spread())
-    share = error / scatter
+    share = error / readings.robust_spread()
     if not (share > largest).any():
         return ()
     return (

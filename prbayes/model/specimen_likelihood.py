@@ -59,6 +59,7 @@ from prbayes.model.run_checks import (
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.fibre_points import fibre_points
+from prbayes.propagation.response_share import ResponseShare, response_share
 from prbayes.propagation.roots import Roots
 from prbayes.propagation.specimen_points import (
     Emulation,
@@ -150,7 +151,7 @@ class SpecimenLikelihood:
     @cached_property
     def coordinates(self) -> Coordinates:
         """Coordinates of the inputs."""
-        return Coordinates.of_prior(self.inputs, len(self.observed))
+        return Coordinates.of_prior(self.inputs, len(self.readings))
 
     def columns(self, measurement: Measurement) -> slice:
         """Return which of all outputs are those of a simulator."""
@@ -184,16 +185,17 @@ class SpecimenLikelihood:
         return [(place, np.flatnonzero(groups == place)) for place in np.unique(groups).tolist()]
 
     def run(self, z: Floats) -> Floats:
-        """Return the outputs of runs at coordinates, (n, d) -> (n, M); NaN where there is none.
+        """Return the outputs of runs at coordinates, (n, d) -> (n, M).
 
-        The first runs are checked for scatter and for the range of the readings.
+        NaN where there is no response, +inf where a specimen failed. The first runs are checked for
+        scatter and for the range of the readings.
         """
         responses = [each.responses for each in self.measurements]
         before = sum(each.computed for each in responses)
         inputs = self.coordinates.inputs(z)
         parts = [each(inputs, []).reshape(len(z), -1) for each in responses]
         values = np.concatenate(parts, axis=1)
-        values = np.where(np.isfinite(values), values, np.nan)
+        values = np.where(np.isneginf(values), np.nan, values)
         if self.known is None and self._first_outputs is None:
             if sum(each.computed for each in responses) > before:
 
@@ -220,13 +222,24 @@ class SpecimenLikelihood:
         return [name for name, size in zip(names, sizes, strict=True) for _ in range(size)]
 
     @cached_property
-    def _prepared(self) -> tuple[Emulation, SpecimenPoints, tuple[Finding, ...]]:
-        """The emulator, the points and what is to be reported of them."""
+    def _prepared(
+        self,
+    ) -> tuple[Emulation, SpecimenPoints, tuple[Finding, ...], ResponseShare | None]:
+        """The emulator, the points, what is to be reported of them, and the share of responses."""
         responses = [each.responses for each in self.measurements]
         for each in responses:
             each.on_start = partial(self._log_first_runs, each)
         try:
-            return self._prepare()
+            emulation, points, findings = self._prepare(self.known)
+            refined, share = response_share(
+                self.run, emulation, lambda: self._prior_specimens,
+                partial(self._populations.posterior, points.z, points.log_a),
+                self.options, name=self.name,
+            )  # fmt: skip
+            if refined is not emulation and not self._is_partial:
+                # Specimens beside the failing region have points on its right side now.
+                refined, points, findings = self._prepare(refined)
+            return refined, points, report(findings), share
         finally:
             for each in responses:
                 each.on_start = None
@@ -247,7 +260,16 @@ class SpecimenLikelihood:
             runs,
         )
 
-    def _prepare(self) -> tuple[Emulation, SpecimenPoints, tuple[Finding, ...]]:
+    def _prepare(
+        self, known: Emulation | None
+    ) -> tuple[Emulation, SpecimenPoints, Sequence[Finding]]:
+        """Return the emulator, the points and what is to be reported of them.
+
+        Parameters
+        ----------
+        known : Emulation, optional
+            Of the same response.
+        """
         name, n = self.name, self.first_runs
         bounds, d = self.coordinates.bounds, self.coordinates.size
         if self._is_partial:
@@ -256,17 +278,12 @@ class SpecimenLikelihood:
                     f"{name}: propagation: got prb.Resimulated, expected stored responses where "
                     "specimens have fewer readings than inputs; leave propagation= out"
                 )
-            populations = Populations(
-                self.model, self.inputs, self.coordinates, self.stacked.groups
-            )
-            prior = specimens_of(populations, populations.hyperparameters.prior_thetas(2048, 0), 1)
             emulation, points = fibre_points(
-                self.run, self.readings, bounds, prior, populations.posterior, self.options, n=n,
-                name=name,
+                self.run, self.readings, bounds, self._prior_specimens,
+                self._populations.posterior, self.options, n=n, name=name,
             )  # fmt: skip
-            return emulation, points, report(self._data_findings(several_roots=True))
+            return emulation, points, self._data_findings(several_roots=True)
         box = np.stack([-np.ones(d), np.ones(d)])
-        known = self.known
         if self.calls_response:
             known = Emulation.of_function(self.run, box, bounds, self.readings, self.options)
         try:
@@ -276,7 +293,8 @@ class SpecimenLikelihood:
         except DesignError as error:
             first = self._first_outputs
             cause = "" if first is None else unreached(first, self.readings)
-            raise DesignError(f"{error}{cause}") from None
+            data = "".join(f". {finding}" for finding in self._data_findings(several_roots=False))
+            raise DesignError(f"{error}{cause}{data}") from None
         if not self.calls_response:
             refuse_undetermined(name, emulation, roots, self._coordinate_names)
         points = draw_points(
@@ -293,7 +311,17 @@ class SpecimenLikelihood:
             *misfit_findings(self.name, self.readings, roots, emulation.error),
             *emulator_findings(self.name, self.readings, emulation.error),
         ]
-        return emulation, points, report(findings)
+        return emulation, points, findings
+
+    @cached_property
+    def _populations(self) -> Populations:
+        return Populations(self.model, self.inputs, self.coordinates, self.stacked.groups)
+
+    @cached_property
+    def _prior_specimens(self) -> Floats:
+        """Coordinates of specimens of the prior predictive population, (n, d)."""
+        populations = self._populations
+        return specimens_of(populations, populations.hyperparameters.prior_thetas(2048, 0), 1)
 
     @property
     def _is_partial(self) -> bool:
@@ -338,6 +366,11 @@ class SpecimenLikelihood:
         """What the data and the runs show before the fit."""
         return self._prepared[2]
 
+    @property
+    def share(self) -> ResponseShare | None:
+        """Points from which the share of a population with a response follows, if it matters."""
+        return self._prepared[3]
+
     @cached_property
     def arrays(self) -> tuple[list[Any], Any]:
         """Shared variables of the points, (N, K, *event) by input, and of the numbers A, (N, K)."""
@@ -362,30 +395,25 @@ class SpecimenLikelihood:
         points, log_a = self.arrays
         n, count = len(self.readings), log_a.shape[1]
         symbols = self.inputs.placeholders()
-        dists, _ = self.inputs.rebuilt(symbols)
         values = {s: params[r] for s, r in zip(symbols, self.inputs.roots, strict=True)}
-        if self.stacked.groups is not None:
-            # A vector of groups in place of one makes vectors of the distributions' parameters.
-            (group,) = (s for s, r in zip(symbols, self.inputs.roots, strict=True) if is_group(r))
-            of_points = pt.repeat(pt.as_tensor(self.stacked.groups), count)
-            dists = vectorize_graph(dists, {group: of_points})
-            del values[group]
+        groups = self.stacked.groups
+        groups = np.zeros(n, dtype=np.intp) if groups is None else groups
         flat = [x.reshape((n * count, *x.shape[2:]), ndim=x.ndim - 1) for x in points]
-        log_p = log_density(self.inputs, dists, flat)
-        # After the densities are built: PyMC may clone parameters that are random.
-        (log_p,) = graph_replace([log_p], values, strict=False)
+        log_p = self._log_density(values, flat, pt.repeat(pt.as_tensor(groups), count))
         terms = log_p.reshape((n, count)) + log_a
         error = self._errors(params)
         if not self.error_is_known:
             terms = terms + self._readings_log_density(error)
         likelihood = logsumexp_finite(terms)
+        if self.share is not None:
+            likelihood = likelihood - self._log_share(values, self.share)[groups]
         if self.stacked.repeats is not None:
             likelihood = likelihood + self.stacked.repeats.log_density(error, pt)
-        share = self.measurements[0].gross_errors
-        if share is not False:
-            share = params.get(share, share)
-            gross = pt.log(share) + self.stacked.log_gross
-            likelihood = pt.logaddexp(pt.log1p(-share) + likelihood, gross)
+        gross_share = self.measurements[0].gross_errors
+        if gross_share is not False:
+            gross_share = params.get(gross_share, gross_share)
+            gross = pt.log(gross_share) + self.stacked.log_gross
+            likelihood = pt.logaddexp(pt.log1p(-gross_share) + likelihood, gross)
         weights = self.measurements[0].weights  # of one simulator without repeated readings
         return likelihood if weights is None else likelihood * weights
 
@@ -396,6 +424,42 @@ class SpecimenLikelihood:
             error = params[each.extras["error"]] if "error" in each.extras else 1.0
             errors.append(error + pt.zeros(each.rows.shape[1]))
         return pt.concatenate(errors)
+
+    def _log_density(self, values: dict[Any, Any], points: Sequence[Any], groups: Any) -> Any:
+        """Return the log-density of points, (n, *event) by input, in populations of groups (n,).
+
+        Parameters
+        ----------
+        values : dict
+            Placeholders of the inputs' roots -> values.
+        points : sequence
+        groups : tensor of int, shape (n,)
+        """
+        symbols = list(values)
+        dists, _ = self.inputs.rebuilt(symbols)
+        if self.stacked.groups is not None:
+            # A vector of groups in place of one makes vectors of the distributions' parameters.
+            (group,) = (s for s, r in zip(symbols, self.inputs.roots, strict=True) if is_group(r))
+            dists = vectorize_graph(dists, {group: groups})
+            values = {symbol: value for symbol, value in values.items() if symbol is not group}
+        log_p = log_density(self.inputs, dists, points)
+        # After the densities are built: PyMC may clone parameters that are random.
+        (log_p,) = graph_replace([log_p], values, strict=False)
+        return log_p
+
+    def _log_share(self, values: dict[Any, Any], share: ResponseShare) -> Any:
+        """Return the graph of log S, the log share with a response, of the groups, (G,)."""
+        size = 1 if self.stacked.groups is None else int(self.stacked.groups.max()) + 1
+        points = [np.concatenate([x] * size) for x in self.coordinates.inputs(share.z)]
+        groups = np.repeat(np.arange(size), len(share.z))
+        log_b = share.log_b + self.coordinates.log_jacobian(share.z)
+        log_p = self._log_density(values, list(map(pytensor.shared, points)), pt.as_tensor(groups))
+        terms = log_p.reshape((size, len(share.z))) + pytensor.shared(log_b)
+        inside = logsumexp_finite(terms[:, : share.with_response])
+        outside = logsumexp_finite(terms[:, share.with_response :])
+        is_unknown = pt.isinf(inside)
+        log_ratio = outside - pt.switch(is_unknown, 0.0, inside)
+        return pt.switch(is_unknown, 0.0, -pt.softplus(log_ratio))
 
     def _readings_log_density(self, error: Any) -> Any:
         """Return the log-density of the readings at the points, (S, K), for an unknown error."""
@@ -429,19 +493,31 @@ class SpecimenLikelihood:
         ndarray, shape (P, n), (P, n, m) or (P, n, M)
             With the error of the readings, and gross errors where the metric has them. As many as
             the simulator's rows are of its specimens, so that repeated readings have common inputs.
+            NaN in a population of which next to nothing has a response.
         """
         roots = [params[root] for root in self.inputs.roots if not is_group(root)]
         groups = self.stacked.groups if measurement is None else measurement.groups
-        if groups is None:
-            specimens, _ = self._sampler(roots, n, rng)
-        else:
-            specimens = self._of_groups(rng, roots, np.resize(groups, n))
+        same: Any = slice(None)
         if measurement is not None and n == len(measurement.observed):
             numbers = self.numbers(measurement)
-            _, first, same = np.unique(numbers, return_index=True, return_inverse=True)
-            specimens = [x[:, first[same]] for x in specimens]
-        flat = [x.reshape(-1, *x.shape[2:]) for x in specimens]
-        outputs = self.emulated(flat).reshape(len(roots[0]), n, -1)
+            _, first, inverse = np.unique(numbers, return_index=True, return_inverse=True)
+            same = first[inverse]
+
+        def drawn() -> Floats:
+            if groups is None:
+                specimens, _ = self._sampler(roots, n, rng)
+            else:
+                specimens = self._of_groups(rng, roots, np.resize(groups, n))
+            flat = [x[:, same].reshape(-1, *x.shape[2:]) for x in specimens]
+            return self.emulated(flat).reshape(len(roots[0]), n, -1)
+
+        outputs = drawn()
+        # Specimens without a response are not measured.
+        for _ in range(32):
+            is_missing = np.isnan(outputs).any(axis=-1)
+            if not is_missing.any():
+                break
+            outputs[is_missing] = drawn()[is_missing]
         if measurement is None:
             return self._measured(rng, outputs, self.readings, self.measurements, params)
         outputs = outputs[..., self.columns(measurement)]

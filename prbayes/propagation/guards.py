@@ -91,9 +91,13 @@ def half_difference(log_likelihoods_a: Floats, log_likelihoods_b: Floats) -> flo
     Parameters
     ----------
     log_likelihoods_a, log_likelihoods_b : ndarray, shape (S, N)
-        By posterior draw and specimen; 32 draws suffice.
+        By posterior draw and specimen; 32 draws suffice. A specimen without a point in one of the
+        halves, as beside a region without response, is left out.
     """
-    difference = (log_likelihoods_a - log_likelihoods_b).sum(axis=1)
+    is_finite = np.isfinite(log_likelihoods_a) & np.isfinite(log_likelihoods_b)
+    with np.errstate(invalid="ignore"):
+        by_specimen = np.where(is_finite, log_likelihoods_a - log_likelihoods_b, 0.0)
+    difference = by_specimen.sum(axis=1)
     return float(difference.std() / 2)
 
 

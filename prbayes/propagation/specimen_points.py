@@ -201,15 +201,22 @@ class Emulation:
         return values
 
     def fails(self, z: Floats) -> NDArray[np.bool_]:
-        """Return where the nearest run has no response."""
-        good = np.isfinite(self.y).all(axis=1)
-        if good.all():
+        """Return where the nearest run has no finite response."""
+        return self._of_nearest(~np.isfinite(self.y).all(axis=1), z)
+
+    def is_missing(self, z: Floats) -> NDArray[np.bool_]:
+        """Return where the nearest run has no response: NaN, while +inf is a failed specimen."""
+        return self._of_nearest(np.isnan(self.y).any(axis=1), z)
+
+    def _of_nearest(self, of_runs: NDArray[np.bool_], z: Floats) -> NDArray[np.bool_]:
+        """Return a property of the nearest run of each point."""
+        if not of_runs.any():
             return np.zeros(len(z), dtype=bool)
         from scipy.spatial import cKDTree
 
         width = self.box[1] - self.box[0]
         _, nearest = cKDTree(self.z / width).query(z / width)
-        return np.asarray(~good[nearest])
+        return np.asarray(of_runs[nearest])
 
 
 def emulate(
@@ -277,10 +284,11 @@ def emulate(
         "the response is not smooth enough for prb.LogLikelihood(): use "
         "metric=prb.ProbabilityResidual(), or more first runs with propagation=prb.Reweighted(n)"
     )
-    if (emulation.error > spread).any():
+    scatter = readings.robust_spread()
+    if (emulation.error > scatter).any():
         raise DesignError(
             f"{name}: got an emulator with errors of {emulation.error} at the specimens, expected "
-            f"less than the data's standard deviations {spread}; {rough}"
+            f"less than the data's standard deviations {scatter}; {rough}"
         )
     if emulation.bias > options.bias:
         raise DesignError(
