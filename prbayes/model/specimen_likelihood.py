@@ -233,7 +233,7 @@ class SpecimenLikelihood:
             emulation, points, findings = self._prepare(self.known)
             refined, share = response_share(
                 self.run, emulation, lambda: self._prior_specimens,
-                partial(self._populations.posterior, points.z, points.log_a),
+                lambda share: self._populations.posterior(points.z, points.log_a, share),
                 self.options, name=self.name,
             )  # fmt: skip
             if refined is not emulation and not self._is_partial:
@@ -313,7 +313,7 @@ class SpecimenLikelihood:
         ]
         return emulation, points, findings
 
-    @cached_property
+    @property
     def _populations(self) -> Populations:
         return Populations(self.model, self.inputs, self.coordinates, self.stacked.groups)
 
