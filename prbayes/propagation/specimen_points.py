@@ -582,8 +582,8 @@ def root_points(
     roots = specimen_roots(emulation, readings, options)
     box = emulation.box
     components = _fit_components(emulation, emulation.error, readings, roots, box, options, seed)
-    each = max(1, count // components.table.shape[1])
-    sample = _draw(emulation, emulation.error, readings, components, each, options, (seed, 5))
+    of_root = max(1, count // components.table.shape[1])
+    sample = _draw(emulation, emulation.error, readings, components, of_root, options, (seed, 5))
     z = np.repeat(sample.z[:, :1], count, axis=1)
     log_proposal = np.full(z.shape[:2], np.inf)
     drawn = min(count, sample.z.shape[1])
