@@ -294,9 +294,9 @@ class SpecimenRefits:
                     np.add.at(factors.T, specimens, part.T * len(specimens))
                     np.add.at(count, specimens, 1)
             factors /= count
-            own = likelihood.measurements[0].weights
-            if own is not None:  # which are in the likelihood, and in the weights
-                factors = factors / np.where(own > 0, own, 1.0)
+            stated = likelihood.measurements[0].weights
+            if stated is not None:  # which are in the likelihood, and in the weights
+                factors = factors / np.where(stated > 0, stated, 1.0)
             by_likelihood.append(factors)
         estimates = [self.fit(list(rows)) for rows in zip(*by_likelihood, strict=True)]
         thetas, converged = zip(*estimates, strict=True)

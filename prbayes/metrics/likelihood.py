@@ -34,9 +34,9 @@ class LogLikelihood(Metric):
 
     .. math:: \log L(\theta) = \sum_i \log \int p(y_i \mid f(x))\, p(x \mid \theta)\, dx,
 
-    with the readings :math:`y_i` of specimen i and the response f. It needs a deterministic
-    response and continuous inputs, has no epsilon, and serves every sampler of PyMC. It compares no
-    two samples, so that it has no direct call.
+    with all readings :math:`y_i` of specimen i, also of several simulators, and the response f. It
+    needs a deterministic response and continuous inputs, has no epsilon, and serves every sampler
+    of PyMC. It compares no two samples, so that it has no direct call.
 
     With ``density`` it is the negative mean log-likelihood
     :math:`-\frac{1}{N} \sum_i \log p(z_i)` of the observed values under a density estimate of the

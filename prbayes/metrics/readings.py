@@ -213,15 +213,15 @@ def averaged(
         return result
 
     names = ("values", "lower", "upper")
-    given = {name: by_specimen(getattr(readings, name), np.nan) for name in names}
+    arrays = {name: by_specimen(getattr(readings, name), np.nan) for name in names}
     for name in ("error", "step"):
         values = getattr(readings, name)
-        given[name] = by_specimen(values, np.median(values, axis=0))
+        arrays[name] = by_specimen(values, np.median(values, axis=0))
     combined = by_specimen(scale, np.median(scale, axis=0))
     repeated = count > 1
     zero = np.zeros(count.shape)
     if not repeated.any():
-        return Readings(**given), combined, Repeats(zero, zero, zero)
+        return Readings(**arrays), combined, Repeats(zero, zero, zero)
 
     def total(values: Floats) -> Floats:
         result = np.zeros(count.shape)
@@ -234,13 +234,14 @@ def averaged(
         mean = total(y / c**2) / precision
         within = total(((y - mean[places]) / c) ** 2)
         new = precision**-0.5
-        given["error"] = np.where(repeated, given["error"] / combined * new, given["error"])
+        error = arrays["error"]
+        arrays["error"] = np.where(repeated, error / combined * new, error)
         constant = np.log(new) - total(np.log(c)) - (count - 1) / 2 * np.log(2 * np.pi)
-    given["values"] = np.where(repeated, mean, given["values"])
+    arrays["values"] = np.where(repeated, mean, arrays["values"])
     repeats = Repeats(
         np.where(repeated, count - 1.0, 0.0), within, np.where(repeated, constant, 0.0)
     )
-    return Readings(**given), np.where(repeated, new, combined), repeats
+    return Readings(**arrays), np.where(repeated, new, combined), repeats
 
 
 def log_interval_probability(low: Any, high: Any, xp: Any = np) -> Any:

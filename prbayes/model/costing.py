@@ -186,7 +186,7 @@ def _of_model(model: pm.Model) -> list[Countable]:
         shared = alike[0].responses.name if alike and not computed else ""
         asked.append(Asked(responses, simulator.propagation, simulator.target, shared, computed))
     likelihoods = specimen_likelihoods(model)
-    specimens = [SpecimenRuns(likelihoods[rv], own) for rv, own in measurements_of(model).items()]
+    specimens = [SpecimenRuns(likelihoods[rv], m) for rv, m in measurements_of(model).items()]
     return [*asked, *specimens]
 
 

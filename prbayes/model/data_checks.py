@@ -370,7 +370,7 @@ def _identical(groups: tuple[tuple[int, ...], ...]) -> Finding:
     return Finding(
         "identical-specimens",
         f"got specimens {shown}{more} (counted from 0) with identical values of all outputs, "
-        "expected different ones; leave out copies, pass specimens= for repeated readings, or "
-        "rounded= for coarse ones",
+        "expected different ones; leave out copies, pass specimens= and error= for repeated "
+        "readings, or rounded= for coarse ones",
         "likelihood.md#identical-specimens",
     )

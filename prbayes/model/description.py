@@ -55,9 +55,7 @@ def describe(model: pm.Model) -> dict[str, Any]:
         if rv not in simulators and rv not in likelihoods:
             variables.append(_variable(rv, "observed", _distribution(rv, known)))
     described = [_simulator(node, known) for node in simulators.values()]
-    described += [
-        _specimen_simulator(each, likelihoods[rv], known) for rv, each in measurements.items()
-    ]
+    described += [_specimen_simulator(m, likelihoods[rv], known) for rv, m in measurements.items()]
     return {"variables": variables, "simulators": described}
 
 

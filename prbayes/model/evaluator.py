@@ -162,7 +162,7 @@ class Evaluator:
     def n_responses(self) -> int:
         """Scalar responses computed so far; those that several simulators share count once."""
         by_metric = self._once([node.bound.responses.count for node in self.nodes])
-        return by_metric + sum(each.responses.count for each in self.measurements)
+        return by_metric + sum(m.responses.count for m in self.measurements)
 
     @property
     def n_runs(self) -> int:
@@ -171,7 +171,7 @@ class Evaluator:
 
     def likelihood_of(self, measurement: Measurement) -> SpecimenLikelihood:
         """Return the log-likelihood of a simulator's specimens."""
-        return next(each for each in self.likelihoods if measurement in each.measurements)
+        return next(joint for joint in self.likelihoods if measurement in joint.measurements)
 
     @property
     def simulators(self) -> list[PopulationSimulator]:
@@ -254,7 +254,7 @@ class Evaluator:
             self._evaluate_specimens(np.ascontiguousarray(thetas[first : first + rows]))
             for first in range(0, len(thetas), rows)
         ]
-        result = {each.name: np.empty((len(thetas), 0)) for each in self.measurements}
+        result = {m.name: np.empty((len(thetas), 0)) for m in self.measurements}
         for likelihood, columns in zip(self.likelihoods, zip(*parts, strict=True), strict=True):
             result[likelihood.measurements[-1].name] = np.concatenate(columns)
         return result
@@ -271,7 +271,7 @@ class Evaluator:
 
     def specimen_graphs(self) -> list[Any]:
         """Return the graphs of the log-likelihoods of the specimens, by likelihood, (S,)."""
-        last = {each.measurements[-1]: k for k, each in enumerate(self.likelihoods)}
+        last = {joint.measurements[-1]: k for k, joint in enumerate(self.likelihoods)}
         variables = {v: last[m] for v, m in measurements_of(self.model).items() if m in last}
         graphs = self.model.logp(vars=sorted(variables, key=variables.__getitem__), sum=False)
         return list(graphs)

@@ -94,7 +94,7 @@ def failures_dataset(evaluator: Evaluator) -> xr.Dataset:
 def observed_dataset(evaluator: Evaluator) -> xr.Dataset:
     """Return the observed responses of all simulators, labelled; several outputs by their names."""
     observed = {node.name: node.target.observed for node in evaluator.nodes}
-    observed |= {each.name: each.observed for each in evaluator.measurements}
+    observed |= {m.name: m.observed for m in evaluator.measurements}
     return labelled_responses(evaluator, observed)
 
 

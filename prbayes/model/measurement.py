@@ -155,14 +155,14 @@ class StackedReadings:
             If readings of one specimen contradict each other, or cannot be combined.
         """
         numbers, size = _specimen_numbers(measurements)
-        parts = [_averaged(m, own, size) for m, own in zip(measurements, numbers, strict=True)]
+        parts = [_averaged(m, index, size) for m, index in zip(measurements, numbers, strict=True)]
         readings, scales, repeats = zip(*parts, strict=True)
         log_gross = np.zeros(size)
-        for measurement, own in zip(measurements, numbers, strict=True):
+        for measurement, index in zip(measurements, numbers, strict=True):
             width = 2 * np.ptp(measurement.range, axis=0)
             logs = np.log(np.where(width > 0, width, 1.0))
             logs = np.where(np.isnan(measurement.rows), 0.0, logs).sum(axis=1)
-            np.subtract.at(log_gross, own, logs)
+            np.subtract.at(log_gross, index, logs)
         return cls(
             Readings.beside(readings),
             np.concatenate(scales, axis=1),
@@ -177,14 +177,14 @@ def _specimen_numbers(
     measurements: Sequence[Measurement],
 ) -> tuple[list[NDArray[np.intp]], int]:
     """Return the specimen of each row, by simulator, and the number of specimens."""
-    known: dict[object, int] = {}
+    first: dict[object, int] = {}
     numbers = []
     for k, measurement in enumerate(measurements):
         labels: list[object] = [(k, i) for i in range(len(measurement.observed))]
         if measurement.specimens is not None:
             labels = measurement.specimens.tolist()
-        numbers.append(np.array([known.setdefault(x, len(known)) for x in labels], dtype=np.intp))
-    return numbers, len(known)
+        numbers.append(np.array([first.setdefault(x, len(first)) for x in labels], dtype=np.intp))
+    return numbers, len(first)
 
 
 def _averaged(
@@ -224,14 +224,14 @@ def _groups(
 ) -> NDArray[np.intp] | None:
     """Return the group of each specimen, None without groups."""
     result = np.full(size, -1, dtype=np.intp)
-    for measurement, own in zip(measurements, numbers, strict=True):
+    for measurement, index in zip(measurements, numbers, strict=True):
         if measurement.groups is None:
             return None
-        other = (result[own] >= 0) & (result[own] != measurement.groups)
-        result[own] = measurement.groups
-        other |= result[own] != measurement.groups
-        if other.any():
-            label = np.asarray(measurement.specimens).tolist()[int(np.argmax(other))]
+        conflicts = (result[index] >= 0) & (result[index] != measurement.groups)
+        result[index] = measurement.groups
+        conflicts |= result[index] != measurement.groups
+        if conflicts.any():
+            label = np.asarray(measurement.specimens).tolist()[int(np.argmax(conflicts))]
             raise ValueError(
                 f"{measurement.name}: specimens: got the label {label!r} in two groups, expected "
                 "each specimen in one group; write labels that are different"

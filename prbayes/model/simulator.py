@@ -115,9 +115,11 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         Weights of the observed responses.
     specimens : array_like, shape (N,), optional
         Labels of the specimens. Observations with the same label, also of several simulators,
-        belong together: data sets are drawn specimen by specimen. Each simulator's default epsilon
-        counts its specimens, so that those that several share count several times under
-        `pymc.sample`, until `calibrate_epsilon` corrects for it; a warning says so.
+        belong together: data sets are drawn specimen by specimen. With a metric of distributions
+        each simulator's default epsilon counts its specimens, so that those that several share
+        count several times under `pymc.sample`, until `calibrate_epsilon` corrects for it; a
+        warning says so. With `LogLikelihood` observations of a specimen share its inputs, and the
+        last simulator has the log-likelihoods of all specimens.
     dims : str or sequence of str, optional
         Names of the observed dimensions.
     propagation : Propagation, optional
@@ -266,8 +268,8 @@ def _by_specimen(
     elif np.isnan(values).any():
         # As a constant, in which PyMC does not look for missing values to impute.
         data = pt.constant(values)
-    joined = [rv for rv, each in specimen_likelihoods(model).items() if each in partners]
-    simulators = tuple(each.name for each in likelihood.measurements)
+    joined = [rv for rv, joint in specimen_likelihoods(model).items() if joint in partners]
+    simulators = tuple(m.name for m in likelihood.measurements)
     named = [rv.name for rv in joined if model.named_vars_to_dims.get(rv.name)]
     if likelihood.labels is not None and (named or dims is not None):
         raise ValueError(
@@ -284,8 +286,8 @@ def _by_specimen(
         observed=data,
         dims=_checked_dims(name, dims, values.shape, model),
     )
-    for other in joined:
-        set_likelihood(other, likelihood)
+    for partner in joined:
+        set_likelihood(partner, likelihood)
     return rv
 
 
@@ -298,21 +300,22 @@ def _with_common_specimens(
     by_metric = list(simulators(model).values())
     measurements = list(measurements_of(model).values())
     _refuse_alike_labels(name, labels, [*by_metric, *measurements])
-    own = set(labels.tolist())
-    for other in by_metric:
-        if other.specimens is not None and own & set(other.specimens.tolist()):
-            shared = sorted(map(_read, own & set(other.specimens.tolist())))
+
+    def common(simulator: AnySimulator | Measurement) -> list[str]:
+        if simulator.specimens is None:
+            return []
+        return sorted(map(_read, set(labels.tolist()) & set(simulator.specimens.tolist())))
+
+    for simulator in by_metric:
+        if common(simulator):
             raise ValueError(
-                f"{name}: specimens: got {shared[0]!r}, which {other.name} has too with "
-                f"{called(other.target.metric)}, expected each specimen by one kind of metric: "
-                f"pass metric=prb.LogLikelihood() to {other.name}, or the same metric to {name}"
+                f"{name}: specimens: got {common(simulator)[0]!r}, which {simulator.name} has too "
+                f"with {called(simulator.target.metric)}, expected each specimen by one kind of "
+                f"metric: pass metric=prb.LogLikelihood() to {simulator.name}, or the same metric "
+                f"to {name}"
             )
-    return [
-        likelihood
-        for likelihood in dict.fromkeys(specimen_likelihoods(model).values())
-        if any(m.specimens is not None and own & set(m.specimens.tolist())
-               for m in likelihood.measurements)
-    ]  # fmt: skip
+    likelihoods = dict.fromkeys(specimen_likelihoods(model).values())
+    return [joint for joint in likelihoods if any(map(common, joint.measurements))]
 
 
 def _inputs_of_partners(
@@ -320,14 +323,13 @@ def _inputs_of_partners(
 ) -> Inputs:
     """Return the inputs in the order of those of simulators with the same specimens."""
     for partner in partners:
-        other = partner.inputs
-        if set(inputs.aleatory) != set(other.aleatory):
+        if set(inputs.aleatory) != set(partner.inputs.aleatory):
             raise ValueError(
                 f"{name}: got other inputs than {partner.name}, which has the same specimens, "
                 "expected the same .dist() objects in both: a specimen has one value of each "
                 "input; pass all of them to both responses, also those that one does not use"
             )
-        if other.aleatory != partners[0].inputs.aleatory:
+        if partner.inputs.aleatory != partners[0].inputs.aleatory:
             raise ValueError(
                 f"{name}: got specimens of {partners[0].name} and of {partner.name}, expected "
                 "these to have their inputs in the same order; reorder the arguments of one"
@@ -350,29 +352,29 @@ def _likelihood(
         _ = measurement.readings
     except ValueError as error:
         raise ValueError(f"{name}: metric: {error}") from None
-    joined = [each for partner in partners for each in partner.measurements]
-    others = [each for each in measurements_of(model).values() if each in joined]
-    likelihood = SpecimenLikelihood((*others, measurement), weakref.ref(model))
+    joined = {m for partner in partners for m in partner.measurements}
+    earlier = [m for m in measurements_of(model).values() if m in joined]
+    likelihood = SpecimenLikelihood((*earlier, measurement), weakref.ref(model))
     size = len(likelihood.readings)
     if size < 2:
         raise ValueError(f"{name}: specimens: got {size} specimen, expected at least 2")
-    weighted = [each.name for each in likelihood.measurements if each.weights is not None]
-    if weighted and size < sum(len(each.observed) for each in likelihood.measurements):
+    weighted = [m.name for m in likelihood.measurements if m.weights is not None]
+    if weighted and size < sum(len(m.observed) for m in likelihood.measurements):
         raise ValueError(
             f"{name}: weights: got weights of {weighted[0]}, which has specimens with several "
             "readings, expected none: a specimen has one weight; leave weights= out"
         )
-    for other in others:
-        if other.propagation.calls_response != measurement.propagation.calls_response:
+    for m in earlier:
+        if m.propagation.calls_response != measurement.propagation.calls_response:
             raise ValueError(
                 f"{name}: propagation: got {called(measurement.propagation)}, and "
-                f"{called(other.propagation)} in {other.name}, which has the same specimens, "
+                f"{called(m.propagation)} in {m.name}, which has the same specimens, "
                 "expected the same kind in both"
             )
-        if other.gross_errors != measurement.gross_errors:
+        if m.gross_errors != measurement.gross_errors:
             raise ValueError(
                 f"{name}: metric: gross_errors: got {measurement.gross_errors}, and "
-                f"{other.gross_errors} in {other.name}, which has the same specimens, expected "
+                f"{m.gross_errors} in {m.name}, which has the same specimens, expected "
                 "the same in both: a specimen has a gross error in all of its readings or in none"
             )
     return likelihood

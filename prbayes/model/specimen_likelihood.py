@@ -108,7 +108,7 @@ class SpecimenLikelihood:
     @property
     def name(self) -> str:
         """Names of the simulators."""
-        return " and ".join(each.name for each in self.measurements)
+        return " and ".join(m.name for m in self.measurements)
 
     @property
     def inputs(self) -> Inputs:
@@ -132,16 +132,16 @@ class SpecimenLikelihood:
         """
         extras = [
             v
-            for each in self.measurements
-            if names is None or each.name in names
-            for v in each.extras.values()
+            for m in self.measurements
+            if names is None or m.name in names
+            for v in m.extras.values()
         ]
         return tuple(dict.fromkeys([*self.inputs.roots, *extras]))
 
     @property
     def error_is_known(self) -> bool:
         """Whether no error of a reading is a variable of the model."""
-        return not any("error" in each.extras for each in self.measurements)
+        return not any("error" in m.extras for m in self.measurements)
 
     @property
     def calls_response(self) -> bool:
@@ -156,9 +156,9 @@ class SpecimenLikelihood:
     def columns(self, measurement: Measurement) -> slice:
         """Return which of all outputs are those of a simulator."""
         first = 0
-        for each in self.measurements:
-            last = first + each.rows.shape[1]
-            if each is measurement:
+        for m in self.measurements:
+            last = first + m.rows.shape[1]
+            if m is measurement:
                 break
             first = last
         return slice(first, last)
@@ -172,7 +172,7 @@ class SpecimenLikelihood:
         """Labels of the specimens, (S,); None if these are the rows of a single simulator."""
         if len(self.measurements) == 1 and len(self.readings) == len(self.measurements[0].observed):
             return None
-        labels = np.concatenate([np.asarray(each.specimens) for each in self.measurements])
+        labels = np.concatenate([np.asarray(m.specimens) for m in self.measurements])
         _, first = np.unique(np.concatenate(self.stacked.numbers), return_index=True)
         return labels[first]
 
@@ -190,18 +190,20 @@ class SpecimenLikelihood:
         NaN where there is no response, +inf where a specimen failed. The first runs are checked for
         scatter and for the range of the readings.
         """
-        responses = [each.responses for each in self.measurements]
-        before = sum(each.computed for each in responses)
+        responses = [m.responses for m in self.measurements]
+        before = sum(response.computed for response in responses)
         inputs = self.coordinates.inputs(z)
-        parts = [each(inputs, []).reshape(len(z), -1) for each in responses]
+        parts = [response(inputs, []).reshape(len(z), -1) for response in responses]
         values = np.concatenate(parts, axis=1)
         values = np.where(np.isneginf(values), np.nan, values)
         if self.known is None and self._first_outputs is None:
-            if sum(each.computed for each in responses) > before:
+            if sum(response.computed for response in responses) > before:
 
                 def alone(row: int) -> Floats:
                     inputs = self.coordinates.inputs(z[row : row + 1])
-                    return np.concatenate([each.alone(inputs).ravel() for each in responses])
+                    return np.concatenate(
+                        [response.alone(inputs).ravel() for response in responses]
+                    )
 
                 refuse_scatter(self.name, values, alone)
             refuse_unreachable(self.name, values, self.readings)
@@ -226,9 +228,9 @@ class SpecimenLikelihood:
         self,
     ) -> tuple[Emulation, SpecimenPoints, tuple[Finding, ...], ResponseShare | None]:
         """The emulator, the points, what is to be reported of them, and the share of responses."""
-        responses = [each.responses for each in self.measurements]
-        for each in responses:
-            each.on_start = partial(self._log_first_runs, each)
+        responses = [m.responses for m in self.measurements]
+        for response in responses:
+            response.on_start = partial(self._log_first_runs, response)
         try:
             emulation, points, findings = self._prepare(self.known)
             refined, share = response_share(
@@ -241,8 +243,8 @@ class SpecimenLikelihood:
                 refined, points, findings = self._prepare(refined)
             return refined, points, report(findings), share
         finally:
-            for each in responses:
-                each.on_start = None
+            for response in responses:
+                response.on_start = None
 
     def _log_first_runs(self, responses: Responses, runs: int, seconds: float) -> None:
         """Log how many runs there are, how long they take, and which number changes them."""
@@ -332,20 +334,20 @@ class SpecimenLikelihood:
     @property
     def first_runs(self) -> int | None:
         """The largest number of first runs that a simulator asks for, None for the default."""
-        numbers = [each.propagation.emulator_runs for each in self.measurements]
+        numbers = [m.propagation.emulator_runs for m in self.measurements]
         return max((n for n in numbers if n is not None), default=None)
 
     def _data_findings(self, *, several_roots: bool) -> tuple[Finding, ...]:
         """Return findings of rounded, censored and repeated readings that are taken as exact."""
         findings: list[Finding] = []
-        for each in self.measurements:
-            steps = each.readings.step.max(axis=0)
+        for m in self.measurements:
+            steps = m.readings.step.max(axis=0)
             # A reading error that the user gives covers rounding.
-            is_stated = (steps > 0) | (each.metric.error is not None)
+            is_stated = (steps > 0) | (m.metric.error is not None)
             steps = np.where(is_stated, np.maximum(steps, 1e-300), np.nan)
             findings += data_findings(
-                each.readings.values,
-                labels=[f"{each.name}[{label}]" for label in each.outputs.names] or [each.name],
+                m.readings.values,
+                labels=[f"{m.name}[{label}]" for label in m.outputs.names] or [m.name],
                 several_roots=several_roots,
                 rounded=steps,
             )
@@ -420,9 +422,9 @@ class SpecimenLikelihood:
     def _errors(self, params: Mapping[Any, Any]) -> Any:
         """Return the unknown error of each output, (M,): one where it is known."""
         errors = []
-        for each in self.measurements:
-            error = params[each.extras["error"]] if "error" in each.extras else 1.0
-            errors.append(error + pt.zeros(each.rows.shape[1]))
+        for m in self.measurements:
+            error = params[m.extras["error"]] if "error" in m.extras else 1.0
+            errors.append(error + pt.zeros(m.rows.shape[1]))
         return pt.concatenate(errors)
 
     def _log_density(self, values: dict[Any, Any], points: Sequence[Any], groups: Any) -> Any:
@@ -533,19 +535,19 @@ class SpecimenLikelihood:
         params: Mapping[Any, Floats],
     ) -> Floats:
         """Return readings of outputs, (P, n, m): with error, rounding and gross errors."""
-        size, n, m = outputs.shape
-        sd: Any = np.resize(readings.error, (n, m))
-        for each in measurements:
-            if "error" in each.extras and len(measurements) == 1:
-                sd = params[each.extras["error"]].reshape(size, 1, -1)
-                sd = sd * np.abs(outputs) if each.metric.relative else sd
+        size, n, count = outputs.shape
+        sd: Any = np.resize(readings.error, (n, count))
+        for m in measurements:
+            if "error" in m.extras and len(measurements) == 1:
+                sd = params[m.extras["error"]].reshape(size, 1, -1)
+                sd = sd * np.abs(outputs) if m.metric.relative else sd
         values = outputs + sd * rng.standard_normal(outputs.shape)
-        step = np.resize(readings.step, (n, m))
+        step = np.resize(readings.step, (n, count))
         whole = np.where(step > 0, step, 1.0)
         values = np.where(step > 0, np.round(values / whole) * whole, values)
         share = measurements[0].gross_errors
         if share is not False:
-            low, high = np.concatenate([each.range for each in measurements], axis=1)
+            low, high = np.concatenate([m.range for m in measurements], axis=1)
             anywhere = (low + high) / 2 + (high - low) * (2 * rng.random(outputs.shape) - 1)
             is_gross = rng.random((size, n)) < np.reshape(params.get(share, share), (-1, 1))
             values = np.where(is_gross[..., None], anywhere, values)
@@ -589,10 +591,8 @@ class SpecimenLikelihood:
         It is the same object where the values are the same.
         """
         changed = tuple(
-            each.observing(data[each.name])
-            if _differs(data.get(each.name), each.observed)
-            else each
-            for each in self.measurements
+            m.observing(data[m.name]) if _differs(data.get(m.name), m.observed) else m
+            for m in self.measurements
         )
         if all(a is b for a, b in zip(changed, self.measurements, strict=True)):
             return self
@@ -695,7 +695,7 @@ class SpecimenRV(RandomVariable):  # type: ignore[misc]
     @property
     def measurements(self) -> list[Measurement]:
         """The measurements of `simulators`."""
-        by_name = {each.name: each for each in self.likelihood.measurements}
+        by_name = {m.name: m for m in self.likelihood.measurements}
         return [by_name[name] for name in self.simulators]
 
     @property
@@ -775,9 +775,9 @@ class SpecimenDistribution(pm.Distribution):  # type: ignore[misc]
         rng: Any = None,
     ) -> TensorVariable:
         """Return a random variable that carries a likelihood."""
-        *others, last = (m for m in likelihood.measurements if m.name in simulators)
+        *earlier, last = (m for m in likelihood.measurements if m.name in simulators)
         ndims = [v.type.ndim for v in likelihood.variables(simulators)]
-        ndims += [other.observed.ndim for other in others]
+        ndims += [m.observed.ndim for m in earlier]
         signature = rv_signature(ndims, len(last.event))
         op = SpecimenRV(signature=signature, likelihood=likelihood, simulators=simulators)
         generator = pt.random.shared_rng(seed=None) if rng is None else rng
@@ -809,23 +809,23 @@ def _log_density(
         for v, p in zip(variables, params, strict=False)
     }
     measurements: Sequence[Measurement] = op.measurements
-    others = zip(params[len(variables) :], measurements[:-1], strict=True)
-    data = [_value_of(p[(0,) * (p.ndim - m.observed.ndim)]) for p, m in others] + [value]
+    earlier = zip(params[len(variables) :], measurements[:-1], strict=True)
+    data = [_value_of(p[(0,) * (p.ndim - m.observed.ndim)]) for p, m in earlier] + [value]
     numbers = {m.name: known_value(v) for m, v in zip(measurements, data, strict=True)}
     likelihood = op.likelihood.observing(numbers)
     result = likelihood.log_likelihood(roots)
-    same = [
+    conditions = [
         _equal(v, m.observed)
         for m, v in zip(likelihood.measurements, data, strict=True)
         if not all(isinstance(leaf, Constant) for leaf in ancestors([v]) if leaf.owner is None)
     ]
-    if not same:
+    if not conditions:
         return result
     return CheckParameterValue(
         f"{op.measurement.name}: got other observed values than when this was compiled, expected "
         "the same ones, whose points are part of it; compile it again, as pm.sample, prb.minimize "
         "and prb.sample_smc do"
-    )(result, *same)
+    )(result, pt.all(pt.stack(conditions)))
 
 
 def _value_of(variable: Any) -> Any:

@@ -132,9 +132,9 @@ def _emulated(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) ->
     drawn = {}
     for k, likelihood in enumerate(evaluator.likelihoods):
         params = evaluator.specimen_params(thetas.reshape(-1, d), k)
-        for each in likelihood.measurements:
-            values = likelihood.draws(rng, params, len(each.observed), each)
-            drawn[each.name] = values.reshape(chains, draws, *values.shape[1:])
+        for measurement in likelihood.measurements:
+            values = likelihood.draws(rng, params, len(measurement.observed), measurement)
+            drawn[measurement.name] = values.reshape(chains, draws, *values.shape[1:])
     return labelled_responses(evaluator, drawn, (chains, draws))
 
 

@@ -184,7 +184,9 @@ def _draw(
         response = _columns(emulation, columns)
         y = part.values[:, columns]
         if not noisy.any() and len(columns) >= d:
-            z[rows], log_proposal[rows] = root_points(emulation, part, count, options, seed)
+            z[rows], log_proposal[rows] = root_points(
+                emulation, part, readings.spread(), count, options, seed
+            )
             continue
         if not noisy.any():
             points = fit_fibres(response, y, population, seed=seed, numbers=numbers[rows]).draw(

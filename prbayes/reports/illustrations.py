@@ -410,7 +410,7 @@ def _observed_formatter(model: pm.Model) -> Callable[[Any], dict[str, Any]]:
     graphs: Any = import_module("pymc.model_graph")
     plain = graphs.DEFAULT_NODE_FORMATTERS[graphs.NodeType.OBSERVED_RV]
     simulators = {each.name for each in nodes(model).values()}
-    simulators |= {each.name for each in measurements_of(model).values()}
+    simulators |= {m.name for m in measurements_of(model).values()}
 
     def formatted(rv: Any) -> dict[str, Any]:
         style: dict[str, Any] = plain(rv)

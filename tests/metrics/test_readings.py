@@ -8,7 +8,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from prbayes._checks import Floats
-from prbayes.metrics.readings import Readings, log_interval_probability
+from prbayes.metrics.readings import Readings, averaged, log_interval_probability
 
 NAN = np.nan
 
@@ -196,3 +196,20 @@ def test_the_spread_is_that_of_measured_values_and_never_zero() -> None:
     y = readings([[1.0, 5.0, NAN], [3.0, 5.0, NAN], [NAN, 5.0, NAN]])
     assert y.spread().tolist() == [1.0, 1.0, 1.0]
     assert readings([[1.0], [5.0]]).spread().tolist() == [2.0]
+
+
+@pytest.mark.parametrize("error", [0.5, 2.0])
+def test_repeated_readings_have_the_density_of_their_mean_and_their_scatter(error: float) -> None:
+    rng = np.random.default_rng(0)
+    numbers = np.array([0, 1, 0, 2, 0, 1])
+    y, scale = rng.normal(size=(6, 1)), rng.uniform(0.5, 2.0, (6, 1))
+    count = np.bincount(numbers)[:, None]
+    mean, combined, repeats = averaged(
+        readings(y.tolist(), error=(error * scale).tolist()), scale, numbers, count
+    )
+    assert np.allclose(mean.error, error * combined, rtol=1e-12)
+    outputs_of = np.array([0.3, -0.2, 1.0])
+    density = mean.log_density(outputs_of[:, None, None], np.zeros(1))[:, 0]
+    density += repeats.log_density(np.array([error]), np)
+    each = norm.logpdf(y[:, 0], outputs_of[numbers], error * scale[:, 0])
+    assert np.allclose(density, np.bincount(numbers, each), rtol=1e-12)

@@ -18,9 +18,11 @@ from scipy import stats
 
 import prbayes as prb
 from prbayes._checks import Floats
+from prbayes.model.evaluator import Evaluator
 from prbayes.model.specimen_likelihood import specimen_likelihoods
 from prbayes.propagation.specimen_points import PointOptions
 from prbayes.response.compilation import PLAIN
+from prbayes.validation.cross_validation import _mean_log_losses
 
 N = 20
 RNG = np.random.default_rng(3)
@@ -326,6 +328,16 @@ def test_different_outputs_of_a_specimen_in_different_rows_are_no_repeats() -> N
             )  # fmt: skip
         models.append(model)
     assert np.allclose(values(models[0], "y"), values(models[1], "y"), atol=1e-12)
+
+
+def test_a_specimen_with_repeated_readings_counts_once_in_a_held_out_loss() -> None:
+    evaluator = Evaluator(repeated())
+    thetas = evaluator.thetas_of([np.array([0.8]), np.exp([-0.5])])
+    (logs,) = evaluator.specimen_log_likelihoods(thetas)["y"]
+    # Three readings of specimen 0, one of specimen 19
+    held_out = np.isin(LABELS, [0, 19]).astype(float)[None]
+    loss = _mean_log_losses(evaluator, thetas, [held_out])
+    assert loss.item() == pytest.approx(-(logs[0] + logs[19]) / 2, rel=1e-12)
 
 
 # -- use of results ----------------------------------------------------------------------------------

@@ -368,7 +368,9 @@ def test_copies_have_the_same_points(make: str, used: bool) -> None:
     if make != "cloudpickle":
         assert response.runs == 128
     elif used:
-        assert specimen_likelihoods(other)[other["y"]].measurements[0].responses.function.runs == 128
+        assert (
+            specimen_likelihoods(other)[other["y"]].measurements[0].responses.function.runs == 128
+        )
 
 
 def test_a_hyperparameter_that_is_set_needs_no_run() -> None:
