@@ -38,6 +38,7 @@ from benchmarks.scoreboard.problem import (
 )
 from benchmarks.scoreboard.problem import Problem as Population
 from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
+from prbayes.propagation.base import DesignError
 
 OUT = record.RESULTS / "likelihood_coverage.json"
 PROB = 0.89
@@ -323,7 +324,7 @@ def data_set(problem: Problem, likelihood: SpecimenLikelihood, number: int) -> d
     other.__dict__["coordinates"] = likelihood.coordinates
     try:
         points = other.points
-    except prb.DesignError as error:
+    except DesignError as error:
         return row | {"error": str(error)}
     row["runs"] = len(other.emulation.z)
     x = np.concatenate(

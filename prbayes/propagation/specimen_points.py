@@ -265,17 +265,18 @@ def emulate(
     rng = np.random.default_rng([seed, 1])
     for batch in range(6):
         roots = specimen_roots(emulation, readings, options)
+        if batch < 2 and len(roots.z):
+            # Twice at most: a reading that no inputs reproduce is reported.
+            emulation = replace(emulation, box=_widened(emulation.box, roots))
+            roots = specimen_roots(emulation, readings, options)
         enough = (batch >= 2 or known is not None) and emulation.covers(roots.z)
-        # Twice at most: a reading that no inputs reproduce is reported.
-        wider = _widened(emulation.box, roots) if batch < 2 else emulation.box
-        if enough and emulation.bias <= options.bias and np.array_equal(wider, emulation.box):
+        if enough and emulation.bias <= options.bias:
             # Zero for the response itself, which no run improves.
             narrowing = 0.0 if emulation.bias == 0 else _narrowing(emulation, readings, roots)
             if narrowing <= options.bias:
                 break
-        emulation = replace(emulation, box=wider)
         count = max(n // 2, options.fresh)
-        fresh = spread_out(roots.z, wider, count, options.fresh, rng)
+        fresh = spread_out(roots.z, emulation.box, count, options.fresh, rng)
         emulation = extended(emulation, run, fresh, readings, options, spread, name)
     else:
         roots = specimen_roots(emulation, readings, options)
@@ -309,25 +310,34 @@ def _narrowing(emulation: Emulation, readings: Readings, roots: Roots) -> float:
 
     with weights w_ir of the roots under a normal population that is fitted to them.
     """
-    width = emulation.box[1] - emulation.box[0]
     sd = np.where(readings.is_measured, readings.comparison_sd(emulation.error), 1.0)
     factor = (sd / emulation.error)[roots.specimen][:, :, None]
-    precision, of_error = (
-        np.einsum("rmd,rme->rde", j, j) + np.diag(4.0 / width**2)
-        for j in (roots.jacobian, roots.jacobian * factor)
-    )
+    table, log_mass, covariance = _laplace(roots, emulation.box)
+    _, _, of_error = _laplace(replace(roots, jacobian=roots.jacobian * factor), emulation.box)
+    ((mean, root),) = normal_populations(roots.z[table], log_mass, 1, 0, bootstrap=False)
+    log_w = normal_log_density(roots.z[table], mean, root) + log_mass
+    w = np.exp(log_w - logsumexp(log_w, axis=1, keepdims=True))
+    whole, part = (np.einsum("rdd->rd", each)[table] for each in (covariance, of_error))
+    share = np.einsum("nr,nrd->nd", w, part / (whole + (root**2).sum(axis=1)))
+    return float(np.sqrt(len(share) / 2) * share.mean(axis=0).max())
+
+
+def _laplace(roots: Roots, box: Floats) -> tuple[NDArray[np.intp], Floats, Floats]:
+    """Return the roots of each specimen that has some, their log masses, and covariances.
+
+    Returns
+    -------
+    table : ndarray of int, shape (N, most)
+        Rows of the roots, filled up with -1.
+    log_mass : ndarray, shape (N, most)
+    covariance : ndarray, shape (R, d, d)
+    """
+    precision = np.einsum("rmd,rme->rde", roots.jacobian, roots.jacobian)
+    precision = precision + np.diag(4.0 / (box[1] - box[0]) ** 2)
     _, specimen = np.unique(roots.specimen, return_inverse=True)
     table = _Components(specimen, roots.z, precision, roots.misfit).table
     log_mass = -np.linalg.slogdet(precision)[1] / 2 - roots.misfit
-    log_a = np.where(table >= 0, log_mass[table], -np.inf)
-    ((mean, root),) = normal_populations(roots.z[table], log_a, 1, 0, bootstrap=False)
-    log_w = normal_log_density(roots.z[table], mean, root) + log_a
-    w = np.exp(log_w - logsumexp(log_w, axis=1, keepdims=True))
-    whole, part = (
-        np.einsum("rdd->rd", np.linalg.inv(each))[table] for each in (precision, of_error)
-    )
-    share = np.einsum("nr,nrd->nd", w, part / (whole + (root**2).sum(axis=1)))
-    return float(np.sqrt(len(share) / 2) * share.mean(axis=0).max())
+    return table, np.where(table >= 0, log_mass[table], -np.inf), np.linalg.inv(precision)
 
 
 def extended(
@@ -388,14 +398,21 @@ def surface_near(
     return surface, np.sqrt((surface.left_out[inside] ** 2).mean(axis=0))
 
 
-def _widened(box: Floats, roots: Roots, misfit: float = 50.0) -> Floats:
-    """Return the box with more room where the search for a root ends at its side with a misfit."""
+def _widened(box: Floats, roots: Roots, misfit: float = 50.0, outside: float = 1 / 4097) -> Floats:
+    """Return the box with more room where roots or their population reach beyond its sides.
+
+    A quarter where the search for a root ends at the side with a misfit. And room for a normal
+    population that is fitted to the roots: all specimens of a data set are within the box, with a
+    probability as of `Coordinates.bounds`.
+    """
     poor = roots.z[roots.misfit > misfit]
-    if not len(poor):
-        return box
     width = box[1] - box[0]
     ends = np.stack([poor <= box[0] + 1e-6 * width, poor >= box[1] - 1e-6 * width])
-    return np.asarray(box + 0.25 * width * np.array([[-1.0], [1.0]]) * ends.any(axis=1))
+    wider = box + 0.25 * width * np.array([[-1.0], [1.0]]) * ends.any(axis=1)
+    table, log_mass, _ = _laplace(roots, box)
+    ((mean, root),) = normal_populations(roots.z[table], log_mass, 1, 0, bootstrap=False)
+    reach = -ndtri(outside / len(table)) * np.sqrt((root**2).sum(axis=1))
+    return np.stack([np.minimum(wider[0], mean - reach), np.maximum(wider[1], mean + reach)])
 
 
 def _all_roots(
@@ -452,9 +469,7 @@ def specimen_roots(
     block = max(1, AT_ONCE // (options.starts * len(run_z) * 4))
     for first in range(0, len(solvable), block):
         rows = solvable[first : first + block]
-        starts = nearest_starts(
-            run_z, run_y, target[rows], unit[rows], options.starts, neighbours
-        )
+        starts = nearest_starts(run_z, run_y, target[rows], unit[rows], options.starts, neighbours)
         roots = find_roots(
             emulation, target[rows], np.where(measured[rows], sd[rows], 1e150), starts,
             emulation.box, gap=options.gap,
