@@ -68,11 +68,18 @@ class Populations:
             for root in self.inputs.roots
         ]
 
-    def log_likelihoods(self, thetas: Floats, z: Floats, log_a: Floats) -> Floats:
-        """Return log p(y_i | theta), (S, N), from points (N, K, d) and their numbers (N, K)."""
-        n, count, _ = z.shape
-        weights = log_a + self.coordinates.log_jacobian(z)
+    def log_likelihoods(
+        self, thetas: Floats, z: Floats, log_a: Floats, smoothing: Floats | None = None
+    ) -> Floats:
+        """Return log p(y_i | theta), (S, N), from points (N, K, d) and their numbers (N, K).
+
+        With `smoothing`, a covariance (d, d), populations are normal with the moments of the
+        coordinates z, and wider by it: points that lie farther apart than a population is wide
+        have a smooth log-likelihood.
+        """
+        n, count, d = z.shape
         x = self.coordinates.inputs(z)
+        weights = log_a if smoothing is not None else log_a + self.coordinates.log_jacobian(z)
         result = np.empty((len(thetas), n))
         groups = np.zeros(n, dtype=np.intp) if self.groups is None else self.groups
         for group in np.unique(groups):
@@ -82,9 +89,12 @@ class Populations:
             for first in range(0, len(thetas), step):
                 some = slice(first, first + step)
                 roots = self._roots(thetas[some], int(group))
-                with np.errstate(all="ignore"):
-                    (logs,) = self._log_density(*roots, *flat)
-                logs = np.nan_to_num(logs, nan=-np.inf).reshape(-1, len(rows), count)
+                if smoothing is not None:
+                    logs = self._normal_log_density(roots, z[rows].reshape(-1, d), smoothing)
+                else:
+                    with np.errstate(all="ignore"):
+                        (logs,) = self._log_density(*roots, *flat)
+                logs = np.where(np.isnan(logs), -np.inf, logs).reshape(-1, len(rows), count)
                 result[some, rows] = logsumexp(logs + weights[rows], axis=2)
         return result
 
@@ -103,13 +113,41 @@ class Populations:
                 result[some] += count * share.log_share(log_p)
         return result
 
+    def _normal_log_density(
+        self, roots: Sequence[Floats], z: Floats, smoothing: Floats, specimens: int = 256
+    ) -> Floats:
+        """Return the log-density of points (n, d) in smoothed normal populations, (S, n)."""
+        drawn, _ = self._sampler(roots, specimens, np.random.default_rng(0))
+        sample = self.coordinates.of(drawn, 2)
+        mean = sample.mean(axis=1, keepdims=True)
+        centred = sample - mean
+        root = np.linalg.cholesky(centred.swapaxes(1, 2) @ centred / specimens + smoothing)
+        standard = (z - mean) @ np.linalg.inv(root).swapaxes(1, 2)
+        log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1, keepdims=True)
+        constant = z.shape[1] / 2 * np.log(2 * np.pi)
+        return np.asarray(-0.5 * (standard**2).sum(axis=2) - log_det - constant)
+
     def posterior(
-        self, z: Floats, log_a: Floats, share: ResponseShare | None = None, seed: int = 0
+        self,
+        z: Floats,
+        log_a: Floats,
+        smoothing: Floats | None = None,
+        share: ResponseShare | None = None,
+        seed: int = 0,
     ) -> PopulationDraws:
         """Return draws of the posterior of the hyperparameters given points of the specimens.
 
         Weights are tempered until their effective sample size is ten times the number of
         hyperparameters, so that a few draws do not decide the next proposal.
+
+        Parameters
+        ----------
+        z, log_a : ndarray, shapes (N, K, d) and (N, K)
+        smoothing : ndarray, shape (d, d), optional
+            As in `log_likelihoods`.
+        share : ResponseShare, optional
+            Points of the share of a population that has a response.
+        seed : int
         """
         names = self.hyperparameters
         d = names.size
@@ -119,8 +157,8 @@ class Populations:
             inside = np.isfinite(prior)
             total = np.full(len(thetas), -np.inf)
             if inside.any():
-                likelihood = self.log_likelihoods(thetas[inside], z, log_a).sum(axis=1)
-                total[inside] = prior[inside] + likelihood
+                logs = self.log_likelihoods(thetas[inside], z, log_a, smoothing)
+                total[inside] = prior[inside] + logs.sum(axis=1)
                 if share is not None:
                     total[inside] -= self.log_share(thetas[inside], share, len(z))
             return total

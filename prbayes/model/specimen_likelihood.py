@@ -235,7 +235,7 @@ class SpecimenLikelihood:
             emulation, points, findings = self._prepare(self.known)
             refined, share = response_share(
                 self.run, emulation, lambda: self._prior_specimens,
-                lambda share: self._populations.posterior(points.z, points.log_a, share),
+                lambda share: self._populations.posterior(points.z, points.log_a, share=share),
                 self.options, name=self.name,
             )  # fmt: skip
             if refined is not emulation and not self._is_partial:

@@ -74,6 +74,11 @@ class ReferencePopulation:
         """Return the inputs (..., d) at whitened inputs (..., d)."""
         return self.mean + z @ self.root.T
 
+    def wider(self, covariance: Floats) -> ReferencePopulation:
+        """Return the population whose covariance is larger by a matrix (d, d)."""
+        total = self.root @ self.root.T + covariance
+        return ReferencePopulation(self.mean, np.linalg.cholesky(total))
+
     def with_errors(self, outputs: int) -> ReferencePopulation:
         """Return the population of inputs and standard normal reading errors, of d + m inputs.
 

@@ -48,7 +48,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv, logsumexp, ndtri
+from scipy.special import gammaincinv, logsumexp, ndtri, stdtrit
 
 from prbayes._checks import Floats
 from prbayes.propagation.charts import (
@@ -363,8 +363,12 @@ def _draw(
     cumulative = np.cumsum(charts.share, axis=1)[:, :-1]
     slot = (uniform[..., :1] > cumulative[:, None, :]).sum(axis=2).ravel()
     specimen = np.repeat(np.arange(n), points)
-    chi_square = 2 * gammaincinv(Charts.degrees / 2, uniform[..., 1].reshape(-1, 1))
-    t = ndtri(uniform[..., 2:].reshape(-1, k)) / np.sqrt(chi_square / Charts.degrees)
+    if k == 1:
+        # Even points on a line have a far smaller error than points from two coordinates.
+        t = stdtrit(Charts.degrees, uniform[..., 2].reshape(-1, 1))
+    else:
+        chi_square = 2 * gammaincinv(Charts.degrees / 2, uniform[..., 1].reshape(-1, 1))
+        t = ndtri(uniform[..., 2:].reshape(-1, k)) / np.sqrt(chi_square / Charts.degrees)
     u = charts.location[specimen, slot] + (charts.scale[specimen, slot] @ t[..., None])[..., 0]
     # Specimens without charts have arrays of zeros, so that all their solves fail.
     z, jacobian, converged = charts.points(fibres, specimen, slot, u)

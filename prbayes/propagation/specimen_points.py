@@ -446,13 +446,8 @@ def _is_near(y: Floats, readings: Readings, spread: Floats) -> NDArray[np.bool_]
     return np.asarray(((y >= low - margin) & (y <= high + margin)).all(axis=1))
 
 
-def specimen_roots(
-    emulation: Emulation, readings: Readings, options: PointOptions, spread: Floats | None = None
-) -> Roots:
-    """Return the roots of the specimens with at least as many measured outputs as inputs.
-
-    The spread of outputs, (m,), is by default that of the readings.
-    """
+def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptions) -> Roots:
+    """Return the roots of the specimens with at least as many measured outputs as inputs."""
     good = np.isfinite(emulation.y).all(axis=1)
     run_z, run_y = emulation.z[good], emulation.y[good]
     measured = readings.is_measured
@@ -460,8 +455,7 @@ def specimen_roots(
     sd = readings.comparison_sd(emulation.error)
     solvable = np.flatnonzero(measured.sum(axis=1) >= emulation.z.shape[1])
     # Runs are not chosen by an output that a reading error dominates.
-    spread = readings.spread() if spread is None else spread
-    unit = np.hypot(spread, 10 * np.median(readings.error, axis=0))
+    unit = np.hypot(readings.spread(), 10 * np.median(readings.error, axis=0))
     unit = np.where(measured, unit, np.inf)
     neighbours = gabriel_neighbours(run_z)
     parts = []
@@ -617,46 +611,6 @@ def draw_points(
     return SpecimenPoints(
         points.z, points.outputs, points.log_a, points.log_proposal, n_roots, difference
     )
-
-
-def root_points(
-    emulation: Emulation,
-    readings: Readings,
-    spread: Floats,
-    count: int,
-    options: PointOptions,
-    seed: int = 0,
-) -> tuple[Floats, Floats]:
-    """Return points around the roots of specimens among others with fewer readings than inputs.
-
-    Parameters
-    ----------
-    emulation : Emulation
-    readings : Readings
-        Of N specimens.
-    spread : ndarray, shape (m,)
-        Of the outputs of all specimens.
-    count : int
-        Points of a specimen.
-    options : PointOptions
-    seed : int
-
-    Returns
-    -------
-    z : ndarray, shape (N, count, d)
-    log_proposal : ndarray, shape (N, count)
-        Log of the number of points times the proposal density; +inf for points that fill up.
-    """
-    roots = specimen_roots(emulation, readings, options, spread)
-    box = emulation.box
-    components = _fit_components(emulation, emulation.error, readings, roots, box, options, seed)
-    of_root = max(1, count // components.table.shape[1])
-    sample = _draw(emulation, emulation.error, readings, components, of_root, options, (seed, 5))
-    z = np.repeat(sample.z[:, :1], count, axis=1)
-    log_proposal = np.full(z.shape[:2], np.inf)
-    drawn = min(count, sample.z.shape[1])
-    z[:, :drawn], log_proposal[:, :drawn] = sample.z[:, :drawn], sample.log_proposal[:, :drawn]
-    return z, log_proposal
 
 
 def _of_error(
