@@ -23,7 +23,7 @@ X = np.random.default_rng(4).normal(1.0, SD, N)
 def populations_of(model: pm.Model) -> Populations:
     (likelihood,) = specimen_likelihoods(model).values()
     return Populations(
-        weakref.ref(model), likelihood.inputs, likelihood.coordinates, likelihood.groups
+        weakref.ref(model), likelihood.inputs, likelihood.coordinates, likelihood.stacked.groups
     )
 
 
