@@ -197,6 +197,15 @@ def likelihood_ranks() -> Iterator[Row]:
             yield [problem, name, sets, short(within, 3), short(exact, 3), p, *distance]
 
 
+def guard_sizes() -> Iterator[Row]:
+    """Yield how often right models are flagged by the guards of the log-likelihood by specimen."""
+    for problem, checks in found("likelihood_guards")["summary"].items():
+        for check, cell in checks.items():
+            if cell["data sets"]:
+                share = f"{short(cell['share'], 3)} ± {short(cell['standard error'], 3)}"
+                yield [problem, check, str(cell["data sets"]), share]
+
+
 def _mean_ratio(ratios: Any) -> str:
     return short(float(np.exp(np.log(ratios).mean())))
 
@@ -886,6 +895,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "given the estimate, by problem": given_estimate_by_problem,
     "ranks": ranks,
     "likelihood, ranks": likelihood_ranks,
+    "likelihood, sizes of guards": guard_sizes,
     "hard posteriors": hard_posteriors,
     "samplers": samplers,
     "size": sizes,

@@ -628,6 +628,25 @@ def test_a_true_value_at_the_end_of_its_prior_has_the_exact_posterior() -> None:
     assert bounded_shift(0) <= 0.1
 
 
+def truncated_shift(seed: int) -> float:
+    """Return the shift of a population without response above a limit: a truncated normal."""
+    x = sample(np.random.default_rng([seed, 17]), 100)
+    x = x[x < 1.2]
+    model = failing(np.random.default_rng([seed, 17]), 1.2)
+
+    def exact(at: dict[str, Floats]) -> Floats:
+        share = norm.logcdf(1.2, at["mu"], at["sigma"])
+        return normal_log(x, at["mu"], at["sigma"]) - len(x) * share
+
+    bounds = np.array([[-1.0, np.log(0.15)], [4.0, np.log(2.5)]])
+    return shift(model, *over_box(bounds, 4000), exact)
+
+
+@pytest.mark.long
+def test_a_failing_region_has_the_exact_posterior() -> None:
+    assert truncated_shift(0) <= 0.1
+
+
 def sum_shift(seed: int) -> float:
     """Return the shift of two inputs that enter only through their sum."""
     rng = np.random.default_rng([seed, 8])
@@ -650,7 +669,7 @@ def test_a_ridge_has_the_exact_posterior() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "of_seed", [ends_shift, bounded_shift, sum_shift], ids=lambda f: f.__name__
+    "of_seed", [ends_shift, bounded_shift, sum_shift, truncated_shift], ids=lambda f: f.__name__
 )
 def test_other_problems_have_the_exact_posterior_in_twenty_data_sets(of_seed: Any) -> None:
     shifts = [of_seed(seed) for seed in SEEDS]

@@ -18,7 +18,7 @@ from prbayes._finding import Finding, report
 from prbayes.estimate.differences import cross, slopes
 from prbayes.estimate.failing_region import failing_region_findings
 from prbayes.estimate.optimum import Optimum, plain
-from prbayes.estimate.prior_ends import PriorEnd, end_of_range, of_prior_ends
+from prbayes.estimate.prior_ends import PriorEnd, end_of_range, prior_end_findings
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
 from prbayes.model.identity import identity_of
@@ -364,7 +364,7 @@ def _findings(
     """Report a failing region, ends of priors, several modes and what is not identified."""
     best = modes[0]
     findings = list(failing_region_findings(evaluator, best.theta))
-    findings += [Finding("prior-end", text) for text in of_prior_ends(ends)]
+    findings += prior_end_findings(ends)
     if np.isnan(best.covariance).any():
         findings.append(
             Finding(

@@ -230,5 +230,6 @@ def emulator_findings(
             "in the range of the priors, or more detail than the runs; posterior means may be off "
             "by more than .1 standard deviations. Narrow the priors, give more first runs with "
             "propagation=prb.Reweighted(n), or use metric=prb.ProbabilityResidual()",
+            "likelihood.md#emulator-error",
         ),
     )

@@ -272,6 +272,58 @@ def test_groups_have_populations_of_their_own_and_share_runs() -> None:
     assert drawn[index == 0].mean() < drawn[index == 1].mean()
 
 
+# -- inputs without a response -----------------------------------------------------------------------
+
+
+LIMIT = 1.2
+
+
+def limited(x: Any) -> Any:
+    return np.where(np.asarray(x) > LIMIT, np.nan, 1 + 2 * np.asarray(x))
+
+
+def test_inputs_without_a_response_truncate_the_population() -> None:
+    observed = Y[Y < 1 + 2 * LIMIT]
+    model = build(limited, observed)
+    other = {"mu": 1.0, "sigma_log__": -0.8}
+
+    def truncated(point: dict[str, Any]) -> Floats:
+        share = stats.norm.logcdf(LIMIT, point["mu"], np.exp(point["sigma_log__"]))
+        return exact(point, observed) - share
+
+    difference = values(model, other) - values(model)
+    assert np.allclose(difference, truncated(other) - truncated(POINT), atol=2e-3)
+    # The exact gradient of the term: differences of the closed form.
+    gradient = model.compile_fn(model.dlogp(), mode=PLAIN)(POINT)
+    prior = model.compile_fn(model.logp(vars=model.free_RVs), mode=PLAIN)
+    for name, slope in zip(("mu", "sigma_log__"), np.ravel(gradient), strict=True):
+        ahead, behind = ({**POINT, name: POINT[name] + step} for step in (1e-4, -1e-4))
+        total = [truncated(at).sum() + prior(at) for at in (ahead, behind)]
+        assert slope == pytest.approx((total[0] - total[1]) / 2e-4, abs=0.1)
+    (likelihood,) = specimen_likelihoods(model).values()
+    drawn = likelihood.draws(np.random.default_rng(0), [np.array([1.0]), np.array([0.5])], 500)
+    assert (drawn < 1 + 2 * LIMIT + 0.05).all()
+
+
+def test_each_group_is_truncated_by_itself() -> None:
+    names = ["Adler", "Busch"]
+    data = labelled(names)
+    keep = data.values < LIMIT
+    with pm.Model(coords={"supplier": names}) as model:
+        mu, sigma = pm.Normal("mu", 0, 2, dims="supplier"), pm.HalfNormal("sigma", 1)
+        x = pm.Normal.dist(mu[prb.response.group("supplier")], sigma)
+        prb.Simulator("y", limited, x, observed=1 + 2 * data[keep])
+    index = (data["supplier"].values[keep] == "Busch").astype(int)
+    points = [{"mu": np.array(mu), "sigma_log__": -1.0} for mu in ((0.1, 0.9), (0.0, 1.2))]
+    ours = values(model, points[1]) - values(model, points[0])
+    expected = []
+    for point in points:
+        means, sd = point["mu"][index], np.exp(-1.0)
+        log_p = stats.norm.logpdf(data.values[keep], means, sd)
+        expected.append(log_p - stats.norm.logcdf(LIMIT, means, sd))
+    assert np.allclose(ours, expected[1] - expected[0], atol=2e-3)
+
+
 # -- several simulators ------------------------------------------------------------------------------
 
 
