@@ -112,6 +112,7 @@ def specimen_pool(
         np.resize(measurement.step, shape),
         missing,
         missing,
+        measurement.relative,
     )
     options = likelihood.options
     # The tolerance is that of the log-likelihood of a data set, not of the pool.

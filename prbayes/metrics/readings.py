@@ -22,6 +22,8 @@ class Readings:
         NaN where an output was not measured, or is censored.
     error : ndarray, shape (N, m)
         Standard deviation of the reading's normal error; zero if it is exact.
+    relative : bool
+        Whether the error is a share of the output.
     step : ndarray, shape (N, m)
         Width to which the reading was rounded; zero if it was not.
     lower, upper : ndarray, shape (N, m)
@@ -33,6 +35,7 @@ class Readings:
     step: Floats
     lower: Floats
     upper: Floats
+    relative: bool = False
 
     @classmethod
     def exact(cls, values: Floats) -> Readings:
@@ -58,6 +61,10 @@ class Readings:
         """Which readings are known to an interval alone, (N, m)."""
         return ~np.isnan(self.lower)
 
+    def error_sd(self, outputs: Any) -> Any:
+        """Return the standard deviation of the errors of outputs that broadcast against (N, m)."""
+        return self.error * np.abs(outputs) if self.relative else self.error
+
     def spread(self) -> Floats:
         """Return the standard deviation of each output over specimens, (m,); one if it is zero."""
         measured = self.is_measured
@@ -73,7 +80,8 @@ class Readings:
 
         Emulator error, reading error and rounding add; infinite where nothing was measured.
         """
-        sd = np.sqrt(emulator_error**2 + self.error**2 + self.step**2 / 12)
+        error = self.error_sd(np.nan_to_num(self.values))
+        sd = np.sqrt(emulator_error**2 + error**2 + self.step**2 / 12)
         return np.where(self.is_measured, sd, np.inf)
 
     def scaled(self, factor: float) -> Readings:
@@ -85,9 +93,11 @@ class Readings:
 
         -inf where an output is NaN.
         """
-        variance = emulator_error**2 + self.error**2
+        by_point = np.moveaxis(outputs, 1, 0)  # (K, N, m)
+        variance = emulator_error**2 + self.error_sd(by_point) ** 2
+        variance = np.moveaxis(np.broadcast_to(variance, by_point.shape), 0, 1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            result = self.symbolic_log_density(outputs, variance[:, None], np)
+            result = self.symbolic_log_density(outputs, variance, np)
         return np.where(np.isnan(result), -np.inf, result)
 
     def symbolic_log_density(self, outputs: Floats, variance: Any, xp: Any) -> Any:

@@ -328,14 +328,10 @@ class SpecimenLikelihood:
     def _readings_log_density(self, error: Any) -> Any:
         """Return the log-density of the readings at the points, (N, K), for an unknown error."""
         outputs = self.points.outputs
-        sd = (
-            error * np.abs(np.nan_to_num(self.readings.values))[:, None]
-            if (self.metric.relative)
-            else error
-        )
-        variance = self.emulation.error**2 + sd**2
         # Points that fill up the array have any output.
         outputs = np.where(np.isfinite(outputs), outputs, 1e30)
+        sd = error * np.abs(outputs) if self.metric.relative else error
+        variance = self.emulation.error**2 + sd**2
         return self.readings.symbolic_log_density(outputs, variance + pt.zeros((1, 1, 1)), pt)
 
     @cached_property
@@ -381,7 +377,7 @@ class SpecimenLikelihood:
         sd: Any = np.resize(self.readings.error, (n, m))
         if "error" in extras:
             sd = extras["error"].reshape(size, 1, -1)
-            sd = sd * np.abs(outputs) if self.metric.relative else sd
+        sd = sd * np.abs(outputs) if self.metric.relative else sd
         values = outputs + sd * rng.standard_normal(outputs.shape)
         step = np.resize(self.readings.step, (n, m))
         whole = np.where(step > 0, step, 1.0)
