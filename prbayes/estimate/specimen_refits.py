@@ -112,6 +112,7 @@ def specimen_pool(
         np.resize(measurement.step, shape),
         missing,
         missing,
+        np.resize(measurement.is_relative, shape),
     )
     options = likelihood.options
     # The tolerance is that of the log-likelihood of a data set, not of the pool.

@@ -51,7 +51,7 @@ class LogLikelihood(Metric):
         for each output, (m,), or one for each reading, (N,) or (N, m). A variable of the model is
         estimated. Readings are exact by default.
     relative : bool
-        Whether ``error`` is a share of the reading.
+        Whether ``error`` is a share of the output.
     gross_errors : bool, float or model variable
         Share of specimens with a gross error, whose readings are uniform over twice the range of
         each output. True adds the variable ``{name}_gross_errors`` with a Beta(1, 9) prior.
@@ -172,8 +172,6 @@ class LogLikelihood(Metric):
                 ) from None
 
         sd = np.zeros(values.shape) if error is None else full(error, "error")
-        if self.relative:
-            sd = sd * np.abs(values)
         step = np.zeros(values.shape) if self.rounded is None else full(self.rounded, "rounded")
         lower, upper = np.full(values.shape, np.nan), np.full(values.shape, np.nan)
         if self.censored is not None:
@@ -186,7 +184,7 @@ class LogLikelihood(Metric):
                 lower[is_high], upper[is_high] = full(high, "censored")[is_high], np.inf
             values = np.where(is_low | is_high, np.nan, values)
         sd = np.where(np.isfinite(sd), sd, 0.0)
-        return Readings(values, sd, step, lower, upper)
+        return Readings(values, sd, step, lower, upper, np.full(values.shape, self.relative))
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         if self.density is None:

@@ -27,6 +27,8 @@ class Readings:
         Width to which the reading was rounded; zero if it was not.
     lower, upper : ndarray, shape (N, m)
         Bounds of a censored reading, perhaps infinite; NaN where the reading is not censored.
+    is_relative : ndarray of bool, shape (N, m)
+        Where the error is a share of the output.
     """
 
     values: Floats
@@ -34,12 +36,13 @@ class Readings:
     step: Floats
     lower: Floats
     upper: Floats
+    is_relative: NDArray[np.bool_]
 
     @classmethod
     def exact(cls, values: Floats) -> Readings:
         """Return readings without error, (N, m)."""
         zero, missing = np.zeros_like(values), np.full_like(values, np.nan)
-        return cls(values, zero, zero, missing, missing)
+        return cls(values, zero, zero, missing, missing, np.zeros(values.shape, dtype=bool))
 
     def __len__(self) -> int:
         return len(self.values)
@@ -62,6 +65,10 @@ class Readings:
     def is_censored(self) -> NDArray[np.bool_]:
         """Which readings are known to an interval alone, (N, m)."""
         return ~np.isnan(self.lower)
+
+    def error_sd(self, outputs: Any) -> Any:
+        """Return the standard deviation of the errors of outputs that broadcast against (N, m)."""
+        return self.error * np.where(self.is_relative, np.abs(outputs), 1.0)
 
     def spread(self) -> Floats:
         """Return the standard deviation of each output over specimens, (m,); one if it is zero."""
@@ -89,7 +96,8 @@ class Readings:
 
         Emulator error, reading error and rounding add; infinite where nothing was measured.
         """
-        sd = np.sqrt(emulator_error**2 + self.error**2 + self.step**2 / 12)
+        error = self.error_sd(np.nan_to_num(self.values))
+        sd = np.sqrt(emulator_error**2 + error**2 + self.step**2 / 12)
         return np.where(self.is_measured, sd, np.inf)
 
     def scaled(self, factor: float) -> Readings:
@@ -101,9 +109,11 @@ class Readings:
 
         -inf where an output is NaN.
         """
-        variance = emulator_error**2 + self.error**2
+        by_point = np.moveaxis(outputs, 1, 0)  # (K, N, m)
+        variance = emulator_error**2 + self.error_sd(by_point) ** 2
+        variance = np.moveaxis(np.broadcast_to(variance, by_point.shape), 0, 1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            result = self.symbolic_log_density(outputs, variance[:, None], np)
+            result = self.symbolic_log_density(outputs, variance, np)
         return np.where(np.isnan(result), -np.inf, result)
 
     def symbolic_log_density(self, outputs: Floats, variance: Any, xp: Any) -> Any:
@@ -213,10 +223,11 @@ def averaged(
         return result
 
     names = ("values", "lower", "upper")
-    arrays = {name: by_specimen(getattr(readings, name), np.nan) for name in names}
+    arrays: dict[str, Any] = {name: by_specimen(getattr(readings, name), np.nan) for name in names}
     for name in ("error", "step"):
         values = getattr(readings, name)
         arrays[name] = by_specimen(values, np.median(values, axis=0))
+    arrays["is_relative"] = np.broadcast_to(readings.is_relative[:1], count.shape)
     combined = by_specimen(scale, np.median(scale, axis=0))
     repeated = count > 1
     zero = np.zeros(count.shape)

@@ -83,9 +83,7 @@ class Measurement:
     @property
     def scale(self) -> Floats:
         """Standard deviation of the error of a reading, (N, m), in units of an unknown error."""
-        if "error" not in self.extras:
-            return self.readings.error
-        return np.abs(np.nan_to_num(self.rows)) if self.metric.relative else np.ones_like(self.rows)
+        return np.ones_like(self.rows) if "error" in self.extras else self.readings.error
 
     @cached_property
     def range(self) -> Floats:
@@ -196,19 +194,21 @@ def _averaged(
         labels = measurement.specimens
         return repr(int(numbers[row]) if labels is None else labels.tolist()[row])
 
-    readings, repeated = measurement.readings, np.zeros(measurement.rows.shape, dtype=bool)
+    readings = measurement.readings
     present = readings.is_measured | readings.is_censored
     count = np.zeros((size, present.shape[1]), dtype=np.intp)
     np.add.at(count, numbers, present)
     repeated = present & (count > 1)[numbers]
     exact = repeated & (measurement.scale == 0)
-    coarse = repeated & ((readings.step > 0) | readings.is_censored)
+    is_normal = (readings.step == 0) & ~readings.is_censored & ~readings.is_relative
+    coarse = repeated & ~is_normal
     name = measurement.name
     if coarse.any():
         raise ValueError(
             f"{name}: specimens: got the label {text(int(np.argmax(coarse.any(axis=1))))} several "
-            "times with rounded or censored readings, expected repeated readings with a normal "
-            "error; leave rounded= and censored= out, and pass an error= that covers the rounding"
+            "times with rounded or censored readings or a relative error, expected repeated "
+            "readings with a normal error; leave rounded=, censored= and relative= out, and pass "
+            "an error= that covers them"
         )
     if exact.any():
         raise ValueError(

@@ -92,6 +92,11 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
                 "response that depends on its inputs; check the response, or leave the output out"
             )
         values = readings.values[np.isfinite(readings.values[:, j]), j]
+        if not values.size and readings.is_censored[:, j].any():
+            raise DesignError(
+                f"{name}: got no reading of {output} within the limits of censored=, expected at "
+                "least one; leave the output out, or check the limits"
+            )
         beyond = np.maximum(values - high[j], low[j] - values)
         if values.size and (beyond > width).all():
             raise DesignError(

@@ -466,9 +466,10 @@ class SpecimenLikelihood:
     def _readings_log_density(self, error: Any) -> Any:
         """Return the log-density of the readings at the points, (S, K), for an unknown error."""
         outputs = self.points.outputs
-        variance = self.emulation.error**2 + (error * self.stacked.scale[:, None]) ** 2
         # Points that fill up the array have any output.
         outputs = np.where(np.isfinite(outputs), outputs, 1e30)
+        unit = np.where(self.readings.is_relative[:, None], np.abs(outputs), 1.0)
+        variance = self.emulation.error**2 + (error * self.stacked.scale[:, None] * unit) ** 2
         return self.readings.symbolic_log_density(outputs, variance, pt)
 
     def draws(
@@ -540,7 +541,7 @@ class SpecimenLikelihood:
         for m in measurements:
             if "error" in m.extras and len(measurements) == 1:
                 sd = params[m.extras["error"]].reshape(size, 1, -1)
-                sd = sd * np.abs(outputs) if m.metric.relative else sd
+        sd = sd * np.where(np.resize(readings.is_relative, (n, count)), np.abs(outputs), 1.0)
         values = outputs + sd * rng.standard_normal(outputs.shape)
         step = np.resize(readings.step, (n, count))
         whole = np.where(step > 0, step, 1.0)

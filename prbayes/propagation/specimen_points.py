@@ -425,7 +425,9 @@ def _all_roots(
 
     def find(y: Floats) -> list[Floats]:
         error = np.broadcast_to(np.median(readings.error, axis=0), y.shape)
-        simulated = specimen_roots(emulation, replace(Readings.exact(y), error=error), options)
+        relative = np.broadcast_to(readings.is_relative[:1], y.shape)
+        measured = replace(Readings.exact(y), error=error, is_relative=relative)
+        simulated = specimen_roots(emulation, measured, options)
         return [simulated.z[simulated.specimen == i] for i in range(len(y))]
 
     good = np.isfinite(emulation.y).all(axis=1)
@@ -455,7 +457,8 @@ def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptio
     sd = readings.comparison_sd(emulation.error)
     solvable = np.flatnonzero(measured.sum(axis=1) >= emulation.z.shape[1])
     # Runs are not chosen by an output that a reading error dominates.
-    unit = np.hypot(readings.spread(), 10 * np.median(readings.error, axis=0))
+    error = readings.error_sd(target)
+    unit = np.hypot(readings.spread(), 10 * np.median(error, axis=0))
     unit = np.where(measured, unit, np.inf)
     neighbours = gabriel_neighbours(run_z)
     parts = []
@@ -535,7 +538,7 @@ class _Components:
     specimen: NDArray[np.intp]  # (R,)
     center: Floats  # (R, d)
     root: Floats  # (R, d, d): lower Cholesky factors of the scale matrices
-    log_mass: Floats  # (R,): log of the integral of the readings' density around the root
+    log_mass: Floats  # (R,): log of the integral of the readings' density; NaN of uncertain ones
 
     @property
     def table(self) -> NDArray[np.intp]:
@@ -572,7 +575,8 @@ def draw_points(
     options : PointOptions
     error_is_known : bool
         Whether the error of the readings is the one given; else it is about so large. With a known
-        error the weights around a root are scaled to the root's mass, which 256 points measure.
+        error the weights around the root of certain readings are scaled to its mass, which 256
+        points measure.
     seed : int
 
     Raises
@@ -581,9 +585,13 @@ def draw_points(
         If `most_points` are not enough.
     """
     components = _fit_components(emulation, error, readings, roots, box, options, seed)
-    count = options.points if error_is_known else 4 * options.points
-    scales = (1.0,) if error_is_known else (0.5, 1.0, 1.3)
-    populations: list[tuple[Floats, Floats]] = []
+    is_certain = np.isfinite(components.log_mass).all()
+    count = options.points * (1 if is_certain and error_is_known else 16)
+    scales = (1.0,) if error_is_known else (0.125, 0.25, 0.5, 1.0, 1.3)
+    fits: dict[float, list[tuple[Floats, Floats]]] = {}
+    # Where the error of the readings is as large as the scatter, populations may be much narrower
+    # than their fit. They are added step by step: too few points exclude them wrongly.
+    narrowing = [1.0, 0.5]
     while True:
         halves = [
             _draw(emulation, error, readings, components, max(1, count // 2), options, (seed, h))
@@ -592,16 +600,22 @@ def draw_points(
         if error_is_known:
             halves = [_normalised(half, components) for half in halves]
         points = _joined(halves)
-        populations = populations or normal_populations(points.z, points.log_a, 32, seed)
-        difference = max(
-            _difference(halves if k == 1.0 else _of_error(halves, readings, error, k), populations)
-            for k in scales
-        )
+        of_error = {
+            k: halves if k == 1.0 else _of_error(halves, readings, error, k) for k in scales
+        }
+        samples = {k: _joined(pair) for k, pair in of_error.items()}
+        fits = fits or {k: normal_populations(x.z, x.log_a, 32, seed) for k, x in samples.items()}
+        difference = 0.0
+        while narrowing and difference <= options.half_difference:
+            plausible = _plausible(samples, fits, narrowing[0])
+            values = [_difference(of_error[k], few) for k, few in plausible.items() if few]
+            difference = max(values, default=0.0)
+            narrowing = narrowing[1:] if difference <= options.half_difference else narrowing
         largest = components.table.shape[1] * count
         if difference <= options.half_difference or 2 * largest > options.most_points:
             break
         count *= 2
-    if difference > options.half_difference:
+    if difference > options.half_difference and narrowing[0] == 1.0:
         raise DesignError(
             f"log-likelihood: got two halves of {largest} points a specimen that differ by "
             f"{difference:.2g} nats, expected at most {options.half_difference}; use another "
@@ -611,6 +625,36 @@ def draw_points(
     return SpecimenPoints(
         points.z, points.outputs, points.log_a, points.log_proposal, n_roots, difference
     )
+
+
+def _plausible(
+    samples: dict[float, _Sample],
+    fits: dict[float, list[tuple[Floats, Floats]]],
+    narrowing: float,
+    largest: float = 4.0,
+) -> dict[float, list[tuple[Floats, Floats]]]:
+    """Return narrowed normal populations that the data do not exclude, by scale of the error.
+
+    Parameters
+    ----------
+    samples, fits : dict
+        Points and bootstrap fits, by scale of the reading error.
+    narrowing : float
+        Factor of the fits' standard deviations.
+    largest : float
+        Difference from the largest log-likelihood of the fits, in nats.
+    """
+
+    def log_likelihood(sample: _Sample, mean: Floats, root: Floats) -> float:
+        terms = normal_log_density(sample.z, mean, root) + sample.log_a
+        return float(logsumexp(terms, axis=1).sum())
+
+    best = max(log_likelihood(samples[k], *fit) for k, few in fits.items() for fit in few)
+    narrowed = {k: [(mean, narrowing * root) for mean, root in few] for k, few in fits.items()}
+    return {
+        k: [fit for fit in few if log_likelihood(samples[k], *fit) > best - largest]
+        for k, few in narrowed.items()
+    }
 
 
 def _of_error(
@@ -633,13 +677,16 @@ def _fit_components(
     options: PointOptions,
     seed: int,
     fine: int = 256,
+    share: float = 0.1,
 ) -> _Components:
     """Return a t component for each root, fitted to the readings' density around it.
 
     The first scale matrix is that of the Gauss-Newton approximation, within the box. Where the
     weights of 256 points are uneven, as at a turning point of the response, location and scale
     become their weighted moments, twice. Where the readings leave an input about as uncertain as
-    the population does, the component is that of the specimen given a population twice as wide.
+    the population does, the component is that of the specimen given a population twice as wide. A
+    component or a reading that is uncertain by this share of the scatter has no mass: see
+    `_normalised`.
     """
     d = roots.z.shape[1] if len(roots.z) else box.shape[1]
     precision = np.einsum("rmd,rme->rde", roots.jacobian, roots.jacobian)
@@ -677,16 +724,26 @@ def _fit_components(
         components = _Components(some[rank.specimen], *_fields(rank)[1:])
     without = np.setdiff1d(np.arange(len(readings)), some)
     if without.size:
-        # Sixteen components of the population stand for as many times the points of a root.
-        specimen = np.repeat(without, 16)
-        center = np.tile(mean, (len(specimen), 1))
-        root = np.tile(2.5 * np.linalg.cholesky(covariance), (len(specimen), 1, 1))
+        # Eight components of the population, and sixteen over the box: the specimens with a root
+        # may be few, and far from the others.
+        width = box[1] - box[0]
+        centers = np.concatenate([np.tile(mean, (8, 1)), box[0] + width * sobol(16, d, seed)])
+        roots_of_population = np.tile(2.5 * np.linalg.cholesky(covariance), (8, 1, 1))
+        roots_of_box = np.tile(np.diag(width / 16 ** (1 / d)), (16, 1, 1))
+        specimen = np.repeat(without, len(centers))
+        center = np.tile(centers, (len(without), 1))
+        root = np.tile(np.concatenate([roots_of_population, roots_of_box]), (len(without), 1, 1))
         added = (specimen, center, root, np.zeros(len(specimen)))
         joined = [np.concatenate(pair) for pair in zip(_fields(components), added, strict=True)]
         order = np.argsort(joined[0], kind="stable")
         components = _Components(*(field[order] for field in joined))
     sample = _draw(emulation, error, readings, components, fine, options, (seed, 9))
     _, log_mass = _component_weights(sample, components)
+    sd = np.sqrt(np.einsum("rde,rde->rd", components.root, components.root))
+    is_wide = (sd > share * np.sqrt(np.diag(covariance))).any(axis=1)
+    is_noisy = (readings.comparison_sd(error) > share * readings.spread()) & readings.is_measured
+    is_uncertain = (is_noisy | readings.is_censored).any(axis=1)
+    log_mass = np.where(is_wide | is_uncertain[components.specimen], np.nan, log_mass)
     return replace(components, log_mass=log_mass)
 
 
@@ -819,13 +876,18 @@ def _component_weights(sample: _Sample, components: _Components) -> tuple[Floats
 
 
 def _normalised(sample: _Sample, components: _Components) -> _Sample:
-    """Scale the weights of the points around each root to the root's mass."""
+    """Scale the weights of the points around each root to the root's mass, if there is one.
+
+    Few points with scaled weights have too small a variance: a negligible bias if the readings are
+    certain. Both halves have that bias, so that their difference does not show it.
+    """
     table = components.table
     n, slots = table.shape
     log_a = sample.log_a.reshape(n, slots, -1)
     total = logsumexp(log_a, axis=2)
     mass = np.where(table >= 0, components.log_mass[np.maximum(table, 0)], -np.inf)
-    shift = np.where(np.isfinite(total), mass - np.where(np.isfinite(total), total, 0.0), 0.0)
+    scales = np.isfinite(total) & np.isfinite(mass)
+    shift = np.where(scales, mass - np.where(scales, total, 0.0), 0.0)
     scaled = (log_a + shift[..., None]).reshape(n, -1)
     return replace(sample, log_a=scaled)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -15,13 +17,9 @@ NAN = np.nan
 
 def readings(values: list[list[float]], **fields: list[list[float]]) -> Readings:
     """Return readings; what is not given is as of exact ones."""
-    parts = {"values": np.array(values)}
-    exact = Readings.exact(parts["values"])
+    exact = Readings.exact(np.array(values))
     given = {name: np.array(field, dtype=float) for name, field in fields.items()}
-    rest = {
-        name: given.get(name, getattr(exact, name)) for name in ("error", "step", "lower", "upper")
-    }
-    return Readings(parts["values"], **rest)
+    return replace(exact, **given)
 
 
 def outputs(points: list[list[list[float]]]) -> Floats:
@@ -42,6 +40,17 @@ def test_variances_of_reading_and_emulator_add() -> None:
     density = y.log_density(points, np.array([0.4]))
     assert np.allclose(density[:, 0], norm.logpdf([1.0, 2.0], [1.2, 1.5], [0.5, 0.4]))
     assert np.allclose(y.comparison_sd(np.array([0.4])), [[0.5], [0.4]])
+
+
+def test_a_relative_error_is_a_share_of_the_output() -> None:
+    absolute = readings([[1.0], [-2.0]], error=[[0.3], [0.1]])
+    y = replace(absolute, is_relative=np.full((2, 1), True))
+    points = outputs([[[1.2], [-0.5]], [[-1.5], [0.0]]])
+    density = y.log_density(points, np.array([0.4]))
+    sd = np.hypot(0.4, np.array([[0.3], [0.1]]) * np.abs(points[..., 0]))
+    assert np.allclose(density, norm.logpdf(y.values, points[..., 0], sd), rtol=1e-12)
+    # Roots are searched with the error at the reading.
+    assert np.allclose(y.comparison_sd(np.array([0.4]))[:, 0], np.hypot(0.4, [0.3, 0.2]))
 
 
 @pytest.mark.parametrize("output", [0.0, 0.7, 3.0])

@@ -20,6 +20,7 @@ import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.propagation.base import DesignError
 from prbayes.response.compilation import PLAIN
 
 N = 20
@@ -539,6 +540,12 @@ def test_epistemic_inputs_are_refused() -> None:
 def test_data_that_are_no_readings_are_refused(observed: Floats, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         build(observed=observed)
+
+
+def test_censored_readings_alone_are_refused() -> None:
+    model = build(metric=prb.LogLikelihood(censored=(None, Y.min())))
+    with pytest.raises(DesignError, match="got no reading of the output within the limits"):
+        model.compile_logp()
 
 
 def test_there_is_no_epsilon_to_set_or_to_calibrate() -> None:

@@ -35,8 +35,7 @@ def cube(d: int, half_width: float = 1.0) -> Floats:
 
 
 def readings(y: Floats, error: float = 0.0) -> Readings:
-    exact = Readings.exact(y)
-    return Readings(y, np.full_like(y, error), exact.step, exact.lower, exact.upper)
+    return replace(Readings.exact(y), error=np.full_like(y, error))
 
 
 def points_of(
@@ -281,6 +280,44 @@ def test_the_number_of_points_grows_with_the_error_of_the_readings() -> None:
         assert points.difference <= PointOptions().half_difference
     assert counts[0] == 4
     assert counts[1] >= 8
+
+
+@pytest.mark.parametrize("scatter", [0.05, 0.3, 1.0])
+def test_populations_of_readings_with_a_large_error(scatter: float) -> None:
+    """y = z + error: the population is narrower than the error, as wide, or wider."""
+    ranges = []
+    for seed in range(6):
+        rng = np.random.default_rng([5, seed])
+        y = 0.2 + scatter * rng.normal(size=(20, 1)) + 0.3 * rng.normal(size=(20, 1))
+        _, points = points_of(lambda z: z, y, 1, error=0.3, unit=3.0)
+        differences = []
+        for sd in (0.8 * scatter, scatter, 1.25 * scatter):
+            exact = norm.logpdf(y[:, 0], 0.2, np.hypot(sd, 0.3)).sum()
+            differences.append(log_likelihoods(points, normal(0.2, sd**2)).sum() - exact)
+        ranges.append(np.ptp(differences))
+    # A difference of .1 nats over one posterior standard deviation shifts the posterior by .1 of
+    # it; these populations are about two apart.
+    assert np.sqrt(np.mean(np.square(ranges))) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("measured", "mean", "sd"), [(1, 0.4, 0.5), (3, 0.1, 0.4), (15, -0.45, 0.07)]
+)
+def test_censored_specimens_far_from_the_measured_ones(
+    measured: int, mean: float, sd: float
+) -> None:
+    y = np.full((20, 1), np.nan)
+    y[:measured, 0] = -0.5 + 0.1 * np.arange(measured) / measured
+    lower = np.where(np.isnan(y), -0.4, np.nan)
+    upper = np.where(np.isnan(y), np.inf, np.nan)
+    data = replace(Readings.exact(y), lower=lower, upper=upper)
+    options = PointOptions(half_difference=0.5)
+    emulation, roots = emulate(lambda z: z, data, cube(1), cube(1, 1.5), options)
+    points = draw_points(emulation, emulation.error, data, roots, cube(1, 1.5), options)
+    exact = norm.logpdf(y[:measured, 0], mean, sd).sum()
+    exact += (20 - measured) * norm.logsf(-0.4, mean, sd)
+    ours = log_likelihoods(points, normal(mean, sd**2)).sum()
+    assert abs(ours - exact) < 0.1
 
 
 def test_too_few_points_are_refused() -> None:
