@@ -49,12 +49,12 @@ class Readings:
 
     def rows(self, index: NDArray[np.intp]) -> Readings:
         """Return the readings of some specimens."""
-        return Readings(*(getattr(self, f.name)[index] for f in fields(self)))
+        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     @classmethod
     def beside(cls, parts: Sequence[Readings]) -> Readings:
         """Return the readings of different outputs of the same specimens as one."""
-        return cls(*_beside(cls, parts))
+        return cls(**_beside(cls, parts))
 
     @property
     def is_measured(self) -> NDArray[np.bool_]:
@@ -176,7 +176,7 @@ class Repeats:
     @classmethod
     def beside(cls, parts: Sequence[Repeats]) -> Repeats:
         """Return the repeats of different outputs of the same specimens as one."""
-        return cls(*_beside(cls, parts))
+        return cls(**_beside(cls, parts))
 
     def log_density(self, error: Any, xp: Any) -> Any:
         """Return the sum over outputs, (N,), as an array or a graph of the error e, (m,)."""
@@ -184,9 +184,10 @@ class Repeats:
         return terms.sum(axis=-1)
 
 
-def _beside(kind: Any, parts: Sequence[Any]) -> list[Floats]:
-    """Return the arrays of records, joined along the axis of the outputs."""
-    return [np.concatenate([getattr(p, f.name) for p in parts], axis=1) for f in fields(kind)]
+def _beside(kind: Any, parts: Sequence[Any]) -> dict[str, Any]:
+    """Return the arrays of records by name, joined along the axis of the outputs."""
+    names = [f.name for f in fields(kind)]
+    return {name: np.concatenate([getattr(p, name) for p in parts], axis=1) for name in names}
 
 
 def averaged(

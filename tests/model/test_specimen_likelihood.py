@@ -302,7 +302,8 @@ def test_inputs_without_a_response_truncate_the_population() -> None:
         total = [truncated(at).sum() + prior(at) for at in (ahead, behind)]
         assert slope == pytest.approx((total[0] - total[1]) / 2e-4, abs=0.1)
     (likelihood,) = specimen_likelihoods(model).values()
-    drawn = likelihood.draws(np.random.default_rng(0), [np.array([1.0]), np.array([0.5])], 500)
+    params = dict(zip(likelihood.variables(), [np.array([1.0]), np.array([0.5])], strict=True))
+    drawn = likelihood.draws(np.random.default_rng(0), params, 500)
     assert (drawn < 1 + 2 * LIMIT + 0.05).all()
 
 
