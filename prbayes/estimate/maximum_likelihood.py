@@ -66,7 +66,9 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
         optima.append(_descend(objective, start, options))
         if objective.count > options.max_evaluations:
             break
-    modes = _distinct(optima, evaluator.prior_sd)
+    # Points of specimens have a Monte Carlo error, with which a ridge has ripples.
+    errors = [max(x.points.difference, x.options.half_difference) for x in evaluator.likelihoods]
+    modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))
     best = modes[0]
     point, stderr = _in_units(evaluator, best.theta, best.covariance)
     ends = _prior_ends(evaluator, best, lambda theta: objective(theta)[0])
@@ -283,24 +285,70 @@ def _inverse_hessian(objective: _Objective, theta: Floats) -> tuple[Floats, floa
     return covariance, slope
 
 
-def _distinct(optima: list[LocalOptimum], unit: Floats) -> list[LocalOptimum]:
-    """Return different optima within 30 nats of the best, best first."""
+def _distinct(
+    optima: list[LocalOptimum], objective: _Objective, error: float
+) -> list[LocalOptimum]:
+    """Return the modes within 30 nats of the best optimum, best first.
+
+    Optima closer than a hundredth of the prior's width are the same.
+    """
     ordered = sorted((o for o in optima if np.isfinite(o.value)), key=lambda o: o.value)
     if not ordered:
         return optima[:1]
-    kept: list[LocalOptimum] = []
-    for optimum in ordered:
-        if optimum.value > ordered[0].value + 30 or (kept and not optimum.converged):
+    modes = ordered[:1]
+    for optimum in ordered[1:]:
+        if optimum.value > ordered[0].value + 30 or not optimum.converged:
             continue
-        new = True
-        for other in kept:
-            sd = np.sqrt(np.abs(np.diag(other.covariance)))
-            # Infinite where nothing is identified: a ridge is one optimum.
-            scale = np.where(np.isnan(sd) | (sd == 0), 0.1 * unit, sd)
-            new = new and bool((np.abs(optimum.theta - other.theta) > 0.5 * scale).any())
-        if new:
-            kept.append(optimum)
-    return kept
+        away = [np.abs((optimum.theta - mode.theta) / objective.unit).max() for mode in modes]
+        if min(away) > 0.01 and not any(
+            share_mode(objective, objective.unit, mode, optimum, error) for mode in modes
+        ):
+            modes.append(optimum)
+    return modes
+
+
+def share_mode(
+    objective: Callable[[Floats], tuple[float, Floats]],
+    unit: Floats,
+    first: LocalOptimum,
+    second: LocalOptimum,
+    largest: float,
+) -> bool:
+    """Return whether two optima are of one mode: no barrier lies between them.
+
+    The barrier is that of the profile along the straight line between the optima: the smallest
+    value across the line, in units of the prior. So a ridge, straight or curved, is one mode.
+
+    Parameters
+    ----------
+    objective : callable
+        Theta (d,) -> value and gradient.
+    unit : ndarray, shape (d,)
+        Unit of each parameter.
+    first, second : LocalOptimum
+    largest : float
+        Height above the higher optimum, in nats, from which on it is a barrier.
+    """
+    from scipy.linalg import null_space
+    from scipy.optimize import minimize
+
+    start, step = first.theta / unit, (second.theta - first.theta) / unit
+    across = null_space(step[None])
+    height = max(first.value, second.value) + largest
+
+    def profile(u: Floats, at: Floats) -> tuple[float, Floats]:
+        value, gradient = objective((at + across @ u) * unit)
+        return value, across.T @ (gradient * unit)
+
+    for share in (0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875):  # a barrier is likely in the middle
+        at, offset = start + share * step, np.zeros(across.shape[1])
+        value, _ = profile(offset, at)
+        if value > height and offset.size:
+            # Off the line, on which a symmetric objective has no slope.
+            value = minimize(profile, offset + 0.01, args=(at,), jac=True, method="BFGS").fun
+        if value > height:
+            return False
+    return True
 
 
 def _in_units(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -229,6 +229,52 @@ def test_points_are_doubled_until_both_halves_agree() -> None:
     assert error.std() < 0.15
     with pytest.raises(DesignError, match=r"got two halves of 256 points .*ProbabilityResidual"):
         points_of(lambda z: z @ a.T, readings, draws, most_points=256)
+
+
+@dataclass(frozen=True)
+class PriorSample(NormalDraws):
+    """Populations of the prior, from which the posterior is resampled."""
+
+    is_smoothed: list[bool] = field(default_factory=list)
+
+    def posterior(self, z: Floats, log_a: Floats, smoothing: Floats | None) -> NormalDraws:
+        self.is_smoothed.append(smoothing is not None)
+        d = z.shape[-1]
+        total = np.empty(len(self.means))
+        for s, (mean, sd) in enumerate(zip(self.means, self.sds, strict=True)):
+            covariance = np.diag(sd**2) + (0 if smoothing is None else smoothing)
+            root = np.linalg.cholesky(covariance)
+            standard = (z - mean) @ np.linalg.inv(root).T
+            log_p = -0.5 * (standard**2).sum(axis=-1) - np.log(np.diag(root)).sum()
+            total[s] = logsumexp(log_p - d / 2 * np.log(2 * np.pi) + log_a, axis=1).sum()
+        weights = np.exp(total - logsumexp(total))
+        chosen = np.random.default_rng(0).choice(len(weights), 32, p=weights)
+        return NormalDraws(self.means[chosen], self.sds[chosen])
+
+
+def test_populations_that_happen_to_lie_near_points_do_not_decide() -> None:
+    # The difference of the means is not identified, over eighty widths of a population.
+    rng = np.random.default_rng(5)
+    prior = PriorSample(0.4 * rng.standard_normal((400, 2)), np.full((400, 2), 0.01))
+    prior.means[:, 0] = 0.2 - prior.means[:, 1] + 0.005 * rng.standard_normal(400)
+    a = np.ones((1, 2))
+    readings = Readings.exact(0.2 + 0.01 * np.sqrt(2) * rng.standard_normal((N, 1)))
+    _, points = points_of(lambda z: z @ a.T, readings, prior)
+    assert prior.is_smoothed[:2] == [False, True]
+    assert prior.is_smoothed[-3:] == [False] * 3
+    exact = linear_log_likelihoods(a, readings, prior).sum(axis=1)
+    estimate = prior.log_likelihoods(points.z, points.log_a).sum(axis=1)
+    mean, sd = moments_of(prior.means[:, 0], exact)
+    mean_of_points, sd_of_points = moments_of(prior.means[:, 0], estimate)
+    assert sd > 20 * 0.01
+    assert mean_of_points == pytest.approx(mean, abs=0.15 * sd)
+    assert sd_of_points == pytest.approx(sd, rel=0.15)
+
+
+def moments_of(values: Floats, log_weights: Floats) -> tuple[float, float]:
+    weights = np.exp(log_weights - logsumexp(log_weights))
+    mean = weights @ values
+    return float(mean), float(np.sqrt(weights @ (values - mean) ** 2))
 
 
 def test_a_response_with_a_jump_is_refused() -> None:
