@@ -99,8 +99,11 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         flagged[name] = [code in row["codes"] for row in tested]
     result: dict[str, Any] = {}
     for name, values in flagged.items():
-        n, share = len(values), float(np.mean(values)) if values else np.nan
-        error = float(np.sqrt(max(share, 1 / n) * (1 - share) / n)) if n else np.nan
+        if not values:
+            continue
+        n, share = len(values), float(np.mean(values))
+        # Of no flag, as if there were one.
+        error = float(np.sqrt(max(share, 1 / n) * (1 - share) / n))
         result[name] = {"data sets": n, "share": round(share, 4), "standard error": round(error, 4)}
     return result
 

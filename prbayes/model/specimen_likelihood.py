@@ -191,8 +191,17 @@ class SpecimenLikelihood:
                 # Specimens beside the failing region have points on its right side now.
                 refined, points, findings = self._prepare(refined)
             return refined, points, report(findings), share
+        except DesignError as error:
+            raise DesignError(f"{error}{self._causes()}") from None
         finally:
             self.responses.on_start = None
+
+    def _causes(self) -> str:
+        """Return what the data show of the causes of a refusal, as sentences."""
+        first = self._first_outputs
+        outside = "" if first is None else unreached(first, self.readings)
+        findings = self._data_findings(several_roots=False)
+        return outside + "".join(f". {finding}" for finding in findings)
 
     def _log_first_runs(self, runs: int, seconds: float) -> None:
         """Log how many runs there are, how long they take, and which number changes them."""
@@ -236,15 +245,9 @@ class SpecimenLikelihood:
         box = np.stack([-np.ones(d), np.ones(d)])
         if self.propagation.calls_response:
             known = Emulation.of_function(self.run, box, bounds, self.readings, self.options)
-        try:
-            emulation, roots = emulate(
-                self.run, self.readings, box, bounds, self.options, n=n, known=known, name=name
-            )
-        except DesignError as error:
-            first = self._first_outputs
-            cause = "" if first is None else unreached(first, self.readings)
-            data = "".join(f". {finding}" for finding in self._data_findings(several_roots=False))
-            raise DesignError(f"{error}{cause}{data}") from None
+        emulation, roots = emulate(
+            self.run, self.readings, box, bounds, self.options, n=n, known=known, name=name
+        )
         if not self.propagation.calls_response:
             refuse_undetermined(name, emulation, roots, self._coordinate_names)
         points = draw_points(
