@@ -42,7 +42,7 @@ from prbayes.model.node import (
     response_name,
     rv_signature,
 )
-from prbayes.model.population_draws import Populations, specimens_of
+from prbayes.model.population_draws import Populations
 from prbayes.model.run_checks import (
     emulator_findings,
     refuse_scatter,
@@ -180,16 +180,17 @@ class SpecimenLikelihood:
     ) -> tuple[Emulation, SpecimenPoints, tuple[Finding, ...], ResponseShare | None]:
         """The emulator, the points, what is to be reported of them, and the share of responses."""
         self.responses.on_start = self._log_first_runs
+        populations = self.populations
         try:
-            emulation, points, findings = self._prepare(self.known)
+            emulation, points, findings = self._prepare(populations, self.known)
             refined, share = response_share(
-                self.run, emulation, lambda: self._prior_specimens,
-                partial(self._populations.posterior, points.z, points.log_a),
-                self.options, name=self.name,
+                self.run, emulation, populations.prior_specimens,
+                partial(populations.posterior, points.z, points.log_a), self.options,
+                name=self.name,
             )  # fmt: skip
             if refined is not emulation and not self._is_partial:
                 # Specimens beside the failing region have points on its right side now.
-                refined, points, findings = self._prepare(refined)
+                refined, points, findings = self._prepare(populations, refined)
             return refined, points, report(findings), share
         except DesignError as error:
             raise DesignError(f"{error}{self._causes()}") from None
@@ -220,12 +221,13 @@ class SpecimenLikelihood:
         )
 
     def _prepare(
-        self, known: Emulation | None
+        self, populations: Populations, known: Emulation | None
     ) -> tuple[Emulation, SpecimenPoints, Sequence[Finding]]:
         """Return the emulator, the points and what is to be reported of them.
 
         Parameters
         ----------
+        populations : Populations
         known : Emulation, optional
             Of the same response.
         """
@@ -238,8 +240,8 @@ class SpecimenLikelihood:
                     "specimens have fewer readings than inputs; leave propagation= out"
                 )
             emulation, points = fibre_points(
-                self.run, self.readings, bounds, self._prior_specimens,
-                self._populations.posterior, self.options, n=n, name=name,
+                self.run, self.readings, bounds, populations.prior_specimens(),
+                populations.posterior, self.options, n=n, name=name,
             )  # fmt: skip
             return emulation, points, self._data_findings(several_roots=True)
         box = np.stack([-np.ones(d), np.ones(d)])
@@ -266,15 +268,10 @@ class SpecimenLikelihood:
         ]
         return emulation, points, findings
 
-    @cached_property
-    def _populations(self) -> Populations:
+    @property
+    def populations(self) -> Populations:
+        """Populations of the model's hyperparameters, which compile what they are asked for."""
         return Populations(self.model, self.inputs, self.coordinates, self.groups)
-
-    @cached_property
-    def _prior_specimens(self) -> Floats:
-        """Coordinates of specimens of the prior predictive population, (n, d)."""
-        populations = self._populations
-        return specimens_of(populations, populations.hyperparameters.prior_thetas(2048, 0), 1)
 
     @property
     def _is_partial(self) -> bool:
