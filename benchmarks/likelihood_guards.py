@@ -24,6 +24,7 @@ from benchmarks.likelihood_coverage import PROBLEMS, Problem, likelihood_of, the
 from benchmarks.scoreboard.problem import Input, normal, truncated
 from prbayes._specimen_checks import check_draws
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.population_draws import Populations
 from prbayes.model.specimen_likelihood import SpecimenLikelihood
 
 OUT = record.RESULTS / "likelihood_guards.json"
@@ -40,6 +41,7 @@ TESTS = {
     "family of the population": "population-misfit",
     "conflict of prior and data": "prior-conflict",
 }
+CHECKS = ("loops and checks before the fit", *TESTS)
 _BLOCK = 10  # data sets between two writes of the results
 
 
@@ -78,11 +80,11 @@ def before_the_fit(
         return {"before the fit": ["refused"], "error": str(error)}
 
 
-def of_draws(evaluator: Evaluator) -> dict[str, Any]:
+def of_draws(evaluator: Evaluator, populations: Populations) -> dict[str, Any]:
     """Return the codes of the findings of posterior draws, and the tests that were not run."""
     (likelihood,) = evaluator.likelihoods
     points = likelihood.points
-    draws = likelihood._populations.posterior(points.z, points.log_a).thetas
+    draws = populations.posterior(points.z, points.log_a).thetas
     result = xr.DataTree.from_dict({"posterior": xr.Dataset()})
     checked = check_draws(evaluator, result, draws.reshape(2, -1, evaluator.size))
     return {
@@ -93,14 +95,17 @@ def of_draws(evaluator: Evaluator) -> dict[str, Any]:
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the share of data sets that each check flags, with its standard error."""
-    flagged = {"loops and checks before the fit": [bool(row["before the fit"]) for row in rows]}
+    flagged = {CHECKS[0]: [bool(row["before the fit"]) for row in rows]}
     for name, code in TESTS.items():
         tested = [row for row in rows if "codes" in row and name not in row["untested"]]
         flagged[name] = [code in row["codes"] for row in tested]
     result: dict[str, Any] = {}
     for name, values in flagged.items():
-        n, share = len(values), float(np.mean(values)) if values else np.nan
-        error = float(np.sqrt(max(share, 1 / n) * (1 - share) / n)) if n else np.nan
+        if not values:
+            continue
+        n, share = len(values), float(np.mean(values))
+        # Of no flag, as if there were one.
+        error = float(np.sqrt(max(share, 1 / n) * (1 - share) / n))
         result[name] = {"data sets": n, "share": round(share, 4), "standard error": round(error, 4)}
     return result
 
@@ -120,13 +125,14 @@ def main() -> None:
         model, _ = likelihood_of(problem)
         evaluator = Evaluator(model)
         (likelihood,) = evaluator.likelihoods
+        populations = likelihood.populations
         rows = found["rows"].setdefault(name, [])
         for number in range(arguments.data_sets):
             if number < len(rows) and (number >= arguments.tested or "codes" in rows[number]):
                 continue
             row = before_the_fit(likelihood, base, readings(problem, number))
             if number < arguments.tested and "error" not in row:
-                row |= of_draws(evaluator)
+                row |= of_draws(evaluator, populations)
             rows[number : number + 1] = [row]
             if number % _BLOCK == _BLOCK - 1 or number == arguments.data_sets - 1:
                 found["summary"][name] = summary(rows)

@@ -201,9 +201,8 @@ def guard_sizes() -> Iterator[Row]:
     """Yield how often right models are flagged by the guards of the log-likelihood by specimen."""
     for problem, checks in found("likelihood_guards")["summary"].items():
         for check, cell in checks.items():
-            if cell["data sets"]:
-                share = f"{short(cell['share'], 3)} ± {short(cell['standard error'], 3)}"
-                yield [problem, check, str(cell["data sets"]), share]
+            share = f"{short(cell['share'], 3)} ± {short(cell['standard error'], 3)}"
+            yield [problem, check, str(cell["data sets"]), share]
 
 
 def _mean_ratio(ratios: Any) -> str:

@@ -98,6 +98,10 @@ class Populations:
                 result[some, rows] = logsumexp(logs + weights[rows], axis=2)
         return result
 
+    def prior_specimens(self) -> Floats:
+        """Return coordinates of specimens of the prior predictive population, (n, d)."""
+        return specimens_of(self, self.hyperparameters.prior_thetas(2048, 0), 1)
+
     def log_share(self, thetas: Floats, share: ResponseShare, size: int) -> Floats:
         """Return log S of the population of each of N specimens, summed over them, (S,)."""
         groups = np.zeros(size, dtype=np.intp) if self.groups is None else self.groups

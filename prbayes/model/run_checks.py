@@ -110,10 +110,12 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
 def unreached(outputs: Floats, readings: Readings) -> str:
     """Return a sentence about readings outside the range of the runs; empty if most are inside."""
     finite = outputs[np.isfinite(outputs).all(axis=1)]
+    if not len(finite):
+        return ""
     with np.errstate(invalid="ignore"):
         outside = (readings.values < finite.min(axis=0)) | (readings.values > finite.max(axis=0))
     count = int(outside.any(axis=1).sum())
-    if not len(finite) or 2 * count <= len(readings):
+    if 2 * count <= len(readings):
         return ""
     return (
         f". The readings of {count} of {len(readings)} specimens are outside the range of all "

@@ -47,7 +47,7 @@ from prbayes.model.node import (
     response_name,
     rv_signature,
 )
-from prbayes.model.population_draws import Populations, specimens_of
+from prbayes.model.population_draws import Populations
 from prbayes.model.run_checks import (
     emulator_findings,
     refuse_scatter,
@@ -231,20 +231,30 @@ class SpecimenLikelihood:
         responses = [m.responses for m in self.measurements]
         for response in responses:
             response.on_start = partial(self._log_first_runs, response)
+        populations = self.populations
         try:
-            emulation, points, findings = self._prepare(self.known)
+            emulation, points, findings = self._prepare(populations, self.known)
             refined, share = response_share(
-                self.run, emulation, lambda: self._prior_specimens,
-                lambda share: self._populations.posterior(points.z, points.log_a, share=share),
+                self.run, emulation, populations.prior_specimens,
+                lambda share: populations.posterior(points.z, points.log_a, share=share),
                 self.options, name=self.name,
             )  # fmt: skip
             if refined is not emulation and not self._is_partial:
                 # Specimens beside the failing region have points on its right side now.
-                refined, points, findings = self._prepare(refined)
+                refined, points, findings = self._prepare(populations, refined)
             return refined, points, report(findings), share
+        except DesignError as error:
+            raise DesignError(f"{error}{self._causes()}") from None
         finally:
             for response in responses:
                 response.on_start = None
+
+    def _causes(self) -> str:
+        """Return what the data show of the causes of a refusal, as sentences."""
+        first = self._first_outputs
+        outside = "" if first is None else unreached(first, self.readings)
+        findings = self._data_findings(several_roots=False)
+        return outside + "".join(f". {finding}" for finding in findings)
 
     def _log_first_runs(self, responses: Responses, runs: int, seconds: float) -> None:
         """Log how many runs there are, how long they take, and which number changes them."""
@@ -263,12 +273,13 @@ class SpecimenLikelihood:
         )
 
     def _prepare(
-        self, known: Emulation | None
+        self, populations: Populations, known: Emulation | None
     ) -> tuple[Emulation, SpecimenPoints, Sequence[Finding]]:
         """Return the emulator, the points and what is to be reported of them.
 
         Parameters
         ----------
+        populations : Populations
         known : Emulation, optional
             Of the same response.
         """
@@ -281,22 +292,16 @@ class SpecimenLikelihood:
                     "specimens have fewer readings than inputs; leave propagation= out"
                 )
             emulation, points = fibre_points(
-                self.run, self.readings, bounds, self._prior_specimens,
-                self._populations.posterior, self.options, n=n, name=name,
+                self.run, self.readings, bounds, populations.prior_specimens(),
+                populations.posterior, self.options, n=n, name=name,
             )  # fmt: skip
             return emulation, points, self._data_findings(several_roots=True)
         box = np.stack([-np.ones(d), np.ones(d)])
         if self.calls_response:
             known = Emulation.of_function(self.run, box, bounds, self.readings, self.options)
-        try:
-            emulation, roots = emulate(
-                self.run, self.readings, box, bounds, self.options, n=n, known=known, name=name
-            )
-        except DesignError as error:
-            first = self._first_outputs
-            cause = "" if first is None else unreached(first, self.readings)
-            data = "".join(f". {finding}" for finding in self._data_findings(several_roots=False))
-            raise DesignError(f"{error}{cause}{data}") from None
+        emulation, roots = emulate(
+            self.run, self.readings, box, bounds, self.options, n=n, known=known, name=name
+        )
         if not self.calls_response:
             refuse_undetermined(name, emulation, roots, self._coordinate_names)
         points = draw_points(
@@ -316,14 +321,9 @@ class SpecimenLikelihood:
         return emulation, points, findings
 
     @property
-    def _populations(self) -> Populations:
+    def populations(self) -> Populations:
+        """Populations of the model's hyperparameters, which compile what they are asked for."""
         return Populations(self.model, self.inputs, self.coordinates, self.stacked.groups)
-
-    @cached_property
-    def _prior_specimens(self) -> Floats:
-        """Coordinates of specimens of the prior predictive population, (n, d)."""
-        populations = self._populations
-        return specimens_of(populations, populations.hyperparameters.prior_thetas(2048, 0), 1)
 
     @property
     def _is_partial(self) -> bool:
