@@ -374,6 +374,17 @@ def test_runs_are_added_while_the_error_could_narrow_a_population() -> None:
     assert emulation.error[1] < rough.error[1] / 10
 
 
+def test_the_search_covers_the_population_of_the_roots() -> None:
+    x = np.random.default_rng(0).normal(0.6, 0.2, 20)
+    emulation, _ = emulate(
+        lambda z: 2 * z, readings(2 * x[:, None]), cube(1), cube(1, 1.2), PointOptions()
+    )
+    assert emulation.box[0, 0] == -1.2
+    # All of 20 specimens are below with a probability of 1 - 1 / 4097.
+    end = x.mean() + norm.isf(1 / 4097 / 20) * x.std()
+    assert emulation.box[1, 0] == pytest.approx(end, rel=1e-3)
+
+
 def test_batches_of_runs_are_at_the_roots() -> None:
     sizes: list[int] = []
 
