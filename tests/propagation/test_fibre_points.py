@@ -252,6 +252,7 @@ class PriorSample(NormalDraws):
         return NormalDraws(self.means[chosen], self.sds[chosen])
 
 
+@pytest.mark.long
 def test_populations_that_happen_to_lie_near_points_do_not_decide() -> None:
     # The difference of the means is not identified, over eighty widths of a population.
     rng = np.random.default_rng(5)
