@@ -297,6 +297,25 @@ def gross_errors() -> Iterator[Row]:
         ]
 
 
+def readings_coverage() -> Iterator[Row]:
+    """Yield bias, width and coverage of measurement arguments beside the exact posterior."""
+    for case, table in found("readings_coverage")["summary"].items():
+        for j, (name, within) in enumerate(table["prbayes"]["coverage"].items()):
+            exact = table["exact"]["coverage"][name]
+            error = np.sqrt(0.89 * 0.11 / (table["data sets"] - table["refused"]))
+            refused = f", {table['refused']} refused" if table["refused"] else ""
+            yield [
+                case,
+                name,
+                f"{table['data sets']}{refused}",
+                f"{table['bias'][j]:+.2f} ± {table['error of bias'][j]:.2f}",
+                f"{table['largest distance'][j]:.2f}",
+                f"{table['width'][j]:.2f}",
+                f"{within:.2f} ± {error:.2f}",
+                f"{exact:.2f}",
+            ]
+
+
 # By rival of the scoreboard: the metric, what it estimates, failures, gross errors.
 _PRICES = {
     "prbayes likelihood": (
@@ -909,6 +928,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "small groups": small_groups,
     "measurement error": measurement_error,
     "gross errors": gross_errors,
+    "readings, coverage": readings_coverage,
     "metric prices": metric_prices,
     "landscapes": landscapes,
     "wrong families, many data": lambda: families((100_000,)),
