@@ -221,17 +221,22 @@ def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum
 
     left = max(10, options.max_evaluations - objective.count)
     result = minimize(
-        standardised, start / unit, jac=True, method="BFGS",
+        standardised,
+        start / unit,
+        jac=True,
+        method="BFGS",
         options={"gtol": options.tolerance * 100, "maxiter": left},
-    )  # fmt: skip
+    )
     theta = np.asarray(result.x) * unit
     value, _ = objective(theta)
     if not result.success and np.isfinite(value):
         # A support whose end moves has its optimum at a jump: without gradients from there.
         simplex = minimize(
-            lambda u: objective(u * unit)[0], theta / unit, method="Nelder-Mead",
+            lambda u: objective(u * unit)[0],
+            theta / unit,
+            method="Nelder-Mead",
             options={"maxfev": min(left, 200 * theta.size), "xatol": 1e-8, "fatol": 1e-8},
-        )  # fmt: skip
+        )
         if simplex.fun < value - 1e-6:
             theta = np.asarray(simplex.x) * unit
             value, _ = objective(theta)

@@ -245,9 +245,12 @@ class SpecimenRefits:
             return float(value), root.T @ np.where(np.isfinite(gradient), gradient, 0.0)
 
         result = minimize(
-            objective, np.zeros(self.theta.size), jac=True, method="BFGS",
+            objective,
+            np.zeros(self.theta.size),
+            jac=True,
+            method="BFGS",
             options={"gtol": 1e-3, "maxiter": 200},
-        )  # fmt: skip
+        )
         slope = np.abs(objective(result.x)[1]).max()
         return self.theta + root @ result.x, bool(np.isfinite(result.fun) and slope < 0.05)
 

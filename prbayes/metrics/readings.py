@@ -248,7 +248,8 @@ def averaged(
         new = precision**-0.5
         error = arrays["error"]
         arrays["error"] = np.where(repeated, error / combined * new, error)
-        constant = np.log(new) - total(np.log(c)) - (count - 1) / 2 * np.log(2 * np.pi)
+        normal = (count - 1) / 2 * np.log(2 * np.pi)
+        constant = np.log(new) - total(np.log(c)) - normal
     arrays["values"] = np.where(repeated, mean, arrays["values"])
     repeats = Repeats(
         np.where(repeated, count - 1.0, 0.0), within, np.where(repeated, constant, 0.0)
@@ -260,7 +261,8 @@ def log_interval_probability(low: Any, high: Any, xp: Any = np) -> Any:
     """Return log(Phi(high) - Phi(low)) of a standard normal variable, in the tails too."""
     # In the upper tail both ends are mirrored, so that no digits are lost.
     is_upper = low > 0
-    a, b = xp.where(is_upper, -high, low), xp.where(is_upper, -low, high)
+    a = xp.where(is_upper, -high, low)
+    b = xp.where(is_upper, -low, high)
     log_a, log_b = _log_distribution(a, xp), _log_distribution(b, xp)
     return log_b + xp.log1p(-xp.exp(log_a - log_b))
 

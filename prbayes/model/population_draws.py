@@ -84,7 +84,8 @@ class Populations:
         groups = np.zeros(n, dtype=np.intp) if self.groups is None else self.groups
         for group in np.unique(groups):
             rows = np.flatnonzero(groups == group)
-            flat = [np.ascontiguousarray(v[rows].reshape(-1, *v.shape[2:])) for v in x]
+            of_rows = [v[rows] for v in x]
+            flat = [np.ascontiguousarray(v.reshape(-1, *v.shape[2:])) for v in of_rows]
             step = max(1, AT_ONCE // (len(rows) * count))
             for first in range(0, len(thetas), step):
                 some = slice(first, first + step)
@@ -94,7 +95,8 @@ class Populations:
                 else:
                     with np.errstate(all="ignore"):
                         (logs,) = self._log_density(*roots, *flat)
-                logs = np.where(np.isnan(logs), -np.inf, logs).reshape(-1, len(rows), count)
+                logs = np.where(np.isnan(logs), -np.inf, logs)
+                logs = logs.reshape(-1, len(rows), count)
                 result[some, rows] = logsumexp(logs + weights[rows], axis=2)
         return result
 
@@ -176,7 +178,8 @@ class Populations:
             covariance = (away.T * weights) @ away + 1e-12 * np.diag(names.prior_sd**2)
             root = np.linalg.cholesky(1.2 * covariance)
             u = sobol(1024, d + 1, seed + 1 + attempt)
-            standard = ndtri(u[:, :d]) * np.sqrt(5 / chdtri(5, u[:, d]))[:, None]
+            radius = np.sqrt(5 / chdtri(5, u[:, d]))
+            standard = ndtri(u[:, :d]) * radius[:, None]
             thetas = mean + standard @ root.T
             log_proposal = -(5 + d) / 2 * np.log1p((standard**2).sum(axis=1) / 5)
             weights, temper = _tempered(log_posterior(thetas) - log_proposal, 10 * d)

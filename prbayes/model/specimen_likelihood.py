@@ -235,10 +235,13 @@ class SpecimenLikelihood:
         try:
             emulation, points, findings = self._prepare(populations, self.known)
             refined, share = response_share(
-                self.run, emulation, populations.prior_specimens,
+                self.run,
+                emulation,
+                populations.prior_specimens,
                 lambda share: populations.posterior(points.z, points.log_a, share=share),
-                self.options, name=self.name,
-            )  # fmt: skip
+                self.options,
+                name=self.name,
+            )
             if refined is not emulation and not self._is_partial:
                 # Specimens beside the failing region have points on its right side now.
                 refined, points, findings = self._prepare(populations, refined)
@@ -292,9 +295,15 @@ class SpecimenLikelihood:
                     "specimens have fewer readings than inputs; leave propagation= out"
                 )
             emulation, points = fibre_points(
-                self.run, self.readings, bounds, populations.prior_specimens(),
-                populations.posterior, self.options, n=n, name=name,
-            )  # fmt: skip
+                self.run,
+                self.readings,
+                bounds,
+                populations.prior_specimens(),
+                populations.posterior,
+                self.options,
+                n=n,
+                name=name,
+            )
             return emulation, points, self._data_findings(several_roots=True)
         box = np.stack([-np.ones(d), np.ones(d)])
         if self.calls_response:
@@ -469,7 +478,8 @@ class SpecimenLikelihood:
         # Points that fill up the array have any output.
         outputs = np.where(np.isfinite(outputs), outputs, 1e30)
         unit = np.where(self.readings.is_relative[:, None], np.abs(outputs), 1.0)
-        variance = self.emulation.error**2 + (error * self.stacked.scale[:, None] * unit) ** 2
+        sd = error * self.stacked.scale[:, None] * unit
+        variance = self.emulation.error**2 + sd**2
         return self.readings.symbolic_log_density(outputs, variance, pt)
 
     def draws(
@@ -541,7 +551,8 @@ class SpecimenLikelihood:
         for m in measurements:
             if "error" in m.extras and len(measurements) == 1:
                 sd = params[m.extras["error"]].reshape(size, 1, -1)
-        sd = sd * np.where(np.resize(readings.is_relative, (n, count)), np.abs(outputs), 1.0)
+        is_relative = np.resize(readings.is_relative, (n, count))
+        sd = sd * np.where(is_relative, np.abs(outputs), 1.0)
         values = outputs + sd * rng.standard_normal(outputs.shape)
         step = np.resize(readings.step, (n, count))
         whole = np.where(step > 0, step, 1.0)
@@ -549,8 +560,10 @@ class SpecimenLikelihood:
         share = measurements[0].gross_errors
         if share is not False:
             low, high = np.concatenate([m.range for m in measurements], axis=1)
-            anywhere = (low + high) / 2 + (high - low) * (2 * rng.random(outputs.shape) - 1)
-            is_gross = rng.random((size, n)) < np.reshape(params.get(share, share), (-1, 1))
+            middle, width = (low + high) / 2, high - low
+            anywhere = middle + width * (2 * rng.random(outputs.shape) - 1)
+            probability = np.reshape(params.get(share, share), (-1, 1))
+            is_gross = rng.random((size, n)) < probability
             values = np.where(is_gross[..., None], anywhere, values)
         return np.asarray(values)
 
@@ -622,8 +635,10 @@ def misfit_findings(
     poor = np.flatnonzero(has_root & (best > largest))
     if not poor.size:
         return []
-    rows = [int(np.flatnonzero(roots.specimen == i)[np.argmin(roots.misfit[roots.specimen == i])])
-            for i in poor]  # fmt: skip
+    rows = [
+        int(np.flatnonzero(roots.specimen == i)[np.argmin(roots.misfit[roots.specimen == i])])
+        for i in poor
+    ]
     sd = np.where(readings.is_measured, readings.comparison_sd(error), 0.0)[poor]
     off = np.sqrt(np.mean((roots.residual[rows] * sd) ** 2, axis=0))
     outputs = ", ".join(f"{value:.2g}" for value in off)

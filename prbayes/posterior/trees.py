@@ -229,9 +229,13 @@ def _calibration(
         return by_metric
     by_specimen = _by_specimen(evaluator, thetas, by_metric)
     return xr.concat(
-        [by_metric, by_specimen], "simulator", data_vars="minimal", coords="minimal",
-        compat="override", join="outer",
-    )  # fmt: skip
+        [by_metric, by_specimen],
+        "simulator",
+        data_vars="minimal",
+        coords="minimal",
+        compat="override",
+        join="outer",
+    )
 
 
 def _by_specimen(evaluator: Evaluator, thetas: Floats, beside: xr.Dataset) -> xr.Dataset:

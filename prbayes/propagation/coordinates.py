@@ -81,7 +81,8 @@ class Coordinates:
         arrays, first = [], 0
         for shape in self.shapes:
             last = first + int(np.prod(shape, dtype=int))
-            arrays.append(flat[..., first:last].reshape(*z.shape[:-1], *shape))
+            part = flat[..., first:last]
+            arrays.append(part.reshape(*z.shape[:-1], *shape))
             first = last
         return arrays
 

@@ -170,9 +170,13 @@ def _reliable_draws(
         if not narrows:
             draws = posterior(points.z, points.log_a, None)
             half = count // 2
-            parts = (points.z[:, :half], points.log_a[:, :half]), (
-                points.z[:, half:], points.log_a[:, half:],
-            )  # fmt: skip
+            parts = (
+                (points.z[:, :half], points.log_a[:, :half]),
+                (
+                    points.z[:, half:],
+                    points.log_a[:, half:],
+                ),
+            )
             difference = _difference(*(draws.log_likelihoods(*part) for part in parts))
             if difference <= largest:
                 return points, draws
@@ -246,9 +250,12 @@ def _draw(
         # A reading error per pattern; the density of each reading replaces it below.
         error = typical_sd(sd[np.ix_(rows, columns)])
         proposal = fit_fibres(
-            with_error(response, error), y, population.with_errors(len(columns)), seed=seed,
+            with_error(response, error),
+            y,
+            population.with_errors(len(columns)),
+            seed=seed,
             numbers=numbers[rows],
-        )  # fmt: skip
+        )
         points = proposal.draw(count, seed).without_errors(len(columns))
         z[rows] = points.x
         values, _ = response(points.x.reshape(-1, d))
@@ -271,7 +278,9 @@ def _columns(emulation: Emulation, columns: NDArray[np.intp]) -> Response:
 
     def response(z: Floats) -> tuple[Floats, Floats]:
         values, jacobian = emulation(z)
-        outside = ((z < emulation.box[0] - 0.5) | (z > emulation.box[1] + 0.5)).any(axis=1)
+        low, high = emulation.box
+        is_beyond = (z < low - 0.5) | (z > high + 0.5)
+        outside = is_beyond.any(axis=1)
         values, jacobian = values[:, columns], jacobian[:, columns]
         # The emulator has no runs there.
         values[outside], jacobian[outside] = np.nan, np.nan
@@ -288,7 +297,9 @@ def _population_points(
 
     d = len(population.mean)
     base = sobol(count, d, seed)
-    shift = np.random.default_rng([seed, 2]).random((int(rows.max()) + 1, 1, d))[rows]
+    rng = np.random.default_rng([seed, 2])
+    size = int(rows.max()) + 1
+    shift = rng.random((size, 1, d))[rows]
     u = np.clip((base + shift) % 1.0, 1e-12, 1 - 1e-12)
     standard = ndtri(u)
     wide = 1.5

@@ -63,7 +63,8 @@ def _logsumexp(terms: Floats) -> Floats:
     largest = terms.max(axis=-1, keepdims=True, initial=-np.inf)
     largest = np.where(np.isfinite(largest), largest, 0.0)
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log(np.exp(terms - largest).sum(axis=-1)) + largest[..., 0])
+        total = np.exp(terms - largest).sum(axis=-1)
+        return np.asarray(np.log(total) + largest[..., 0])
 
 
 class SharedDraws(Protocol):
@@ -134,7 +135,8 @@ def response_share(
         fresh = boundary_points(emulation, draws.specimens(), batch, seed)
         before = draws.log_share(share)
         if len(fresh):
-            z, y = np.concatenate([emulation.z, fresh]), np.concatenate([emulation.y, run(fresh)])
+            z = np.concatenate([emulation.z, fresh])
+            y = np.concatenate([emulation.y, run(fresh)])
             emulation = replace(emulation, z=z, y=y)
         share = drawn(count, 0)
         change = float(np.std(draws.log_share(share) - before))
@@ -175,7 +177,8 @@ def _points(
     each = count // len(samples)
     d = samples[0].shape[1]
     means = [sample.mean(axis=0) for sample in samples]
-    roots = [np.linalg.cholesky(1.5 * np.cov(sample.T).reshape(d, d)) for sample in samples]
+    covariances = [np.cov(sample.T).reshape(d, d) for sample in samples]
+    roots = [np.linalg.cholesky(1.5 * covariance) for covariance in covariances]
     z = np.concatenate(
         [
             mean + stdtrit(degrees, sobol(each, d, 1009 * seed + k)) @ root.T

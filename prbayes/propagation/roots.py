@@ -122,7 +122,8 @@ def find_roots(
         active = active[unfinished]
     kept = _distinct(specimen, z, misfit, jacobian, gap, width)
     # By place: misfits of nearly zero are in an order of rounding.
-    kept = kept[np.lexsort((*z[kept].T[::-1], specimen[kept]))]
+    order = np.lexsort((*z[kept].T[::-1], specimen[kept]))
+    kept = kept[order]
     return Roots(specimen[kept], z[kept], misfit[kept], residual[kept], jacobian[kept])
 
 
@@ -209,7 +210,8 @@ def nearest_starts(
     distance = np.zeros((len(y), len(run_y)))
     for column, other, of_column in zip(y.T, run_y.T, unit.T, strict=True):
         distance += ((column[:, None] - other) / of_column[:, None]) ** 2
-    least = np.array([distance[:, row].min(axis=1, initial=np.inf) for row in neighbours]).T
+    nearest = [distance[:, row].min(axis=1, initial=np.inf) for row in neighbours]
+    least = np.array(nearest).T
     is_minimum = distance <= least
     order = np.lexsort((distance, ~is_minimum), axis=1)
     return run_z[order[:, : max(count, int(is_minimum.sum(axis=1).max()))]]

@@ -111,7 +111,8 @@ class DifferencedResponse:
         """Return values and Jacobian."""
         k, d = z.shape
         shifts = self.step * np.concatenate([np.zeros((1, d)), np.eye(d), -np.eye(d)])
-        values = self.values((z + shifts[:, None]).reshape(-1, d)).reshape(2 * d + 1, k, -1)
+        points = (z + shifts[:, None]).reshape(-1, d)
+        values = self.values(points).reshape(2 * d + 1, k, -1)
         slopes = (values[1 : d + 1] - values[d + 1 :]) / (2 * self.step)
         return values[0], np.moveaxis(slopes, 0, -1)
 
@@ -175,9 +176,10 @@ class Emulation:
         options: PointOptions,
     ) -> Emulation:
         """Return the response itself in place of an emulator, with runs as starts of a search."""
-        z = box[0] + (box[1] - box[0]) * sobol(first_runs(box.shape[1]), box.shape[1], 0)
+        d = box.shape[1]
+        z = box[0] + (box[1] - box[0]) * sobol(first_runs(d), d, 0)
         error = options.floor * readings.spread()
-        whole = np.stack([np.full(box.shape[1], -np.inf), np.full(box.shape[1], np.inf)])
+        whole = np.stack([np.full(d, -np.inf), np.full(d, np.inf)])
         return cls(z, run(z), search_box, DifferencedResponse(run), error, 0.0, whole)
 
     def covers(self, z: Floats) -> bool:
@@ -407,12 +409,15 @@ def _widened(box: Floats, roots: Roots, misfit: float = 50.0, outside: float = 1
     """
     poor = roots.z[roots.misfit > misfit]
     width = box[1] - box[0]
-    ends = np.stack([poor <= box[0] + 1e-6 * width, poor >= box[1] - 1e-6 * width])
+    at_low, at_high = poor <= box[0] + 1e-6 * width, poor >= box[1] - 1e-6 * width
+    ends = np.stack([at_low, at_high])
     wider = box + 0.25 * width * np.array([[-1.0], [1.0]]) * ends.any(axis=1)
     table, log_mass, _ = _laplace(roots, box)
     ((mean, root),) = normal_populations(roots.z[table], log_mass, 1, 0, bootstrap=False)
     reach = -ndtri(outside / len(table)) * np.sqrt((root**2).sum(axis=1))
-    return np.stack([np.minimum(wider[0], mean - reach), np.maximum(wider[1], mean + reach)])
+    low = np.minimum(wider[0], mean - reach)
+    high = np.maximum(wider[1], mean + reach)
+    return np.stack([low, high])
 
 
 def _all_roots(
@@ -431,7 +436,8 @@ def _all_roots(
         return [simulated.z[simulated.specimen == i] for i in range(len(y))]
 
     good = np.isfinite(emulation.y).all(axis=1)
-    box = np.stack([emulation.z[good].min(axis=0), emulation.z[good].max(axis=0)])
+    run_z = emulation.z[good]
+    box = np.stack([run_z.min(axis=0), run_z.max(axis=0)])
     while options.starts < len(emulation.z):
         share = missing_share(find, lambda z: emulation(z)[0], box, values, seed=seed)
         if not share > 0:
@@ -468,9 +474,13 @@ def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptio
         rows = solvable[first : first + block]
         starts = nearest_starts(run_z, run_y, target[rows], unit[rows], options.starts, neighbours)
         roots = find_roots(
-            emulation, target[rows], np.where(measured[rows], sd[rows], 1e150), starts,
-            emulation.box, gap=options.gap,
-        )  # fmt: skip
+            emulation,
+            target[rows],
+            np.where(measured[rows], sd[rows], 1e150),
+            starts,
+            emulation.box,
+            gap=options.gap,
+        )
         parts.append((roots, rows))
     names = ("z", "misfit", "residual", "jacobian")
     joined = [np.concatenate([getattr(r, name) for r, _ in parts]) for name in names]
@@ -649,7 +659,8 @@ def _plausible(
         terms = normal_log_density(sample.z, mean, root) + sample.log_a
         return float(logsumexp(terms, axis=1).sum())
 
-    best = max(log_likelihood(samples[k], *fit) for k, few in fits.items() for fit in few)
+    heights = [log_likelihood(samples[k], *fit) for k, few in fits.items() for fit in few]
+    best = max(heights)
     narrowed = {k: [(mean, narrowing * root) for mean, root in few] for k, few in fits.items()}
     return {
         k: [fit for fit in few if log_likelihood(samples[k], *fit) > best - largest]
@@ -819,7 +830,8 @@ def _draw(
     # By specimen.
     filled = np.maximum(table, 0)
     z_all = z[filled].reshape(n, slots * count, d)
-    outputs = values.reshape(len(z), count, -1)[filled].reshape(n, slots * count, -1)
+    by_root = values.reshape(len(z), count, -1)
+    outputs = by_root[filled].reshape(n, slots * count, -1)
     log_q = np.full((n, slots, slots * count), -np.inf)
     for s in range(slots):
         c = filled[:, s]
@@ -828,7 +840,8 @@ def _draw(
         square = (np.einsum("nde,nke->nkd", inverse, away) ** 2).sum(axis=-1)
         log_det = np.log(np.einsum("ndd->nd", components.root[c])).sum(axis=1)
         constant = gammaln((nu + d) / 2) - gammaln(nu / 2) - d / 2 * np.log(nu * np.pi)
-        density = constant - log_det[:, None] - (nu + d) / 2 * np.log1p(square / nu)
+        tail = (nu + d) / 2 * np.log1p(square / nu)
+        density = constant - log_det[:, None] - tail
         log_q[:, s] = np.where(table[:, s, None] >= 0, density, -np.inf)
     log_proposal = logsumexp(log_q, axis=1) + np.log(count)
     exists = np.repeat(table >= 0, count, axis=1)
