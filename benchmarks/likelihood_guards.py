@@ -57,7 +57,8 @@ def observe(likelihood: SpecimenLikelihood, base: SpecimenLikelihood, y: Any) ->
     new_points, new_log_a = other.arrays
     for old, new in zip((*points, log_a), (*new_points, new_log_a), strict=True):
         old.set_value(new.get_value())
-    vars(likelihood).update(observed=other.observed, readings=other.readings, _prepared=prepared)
+    # The observed values stay, as the model has them: others would be other points.
+    vars(likelihood).update(readings=other.readings, _prepared=prepared)
     return [finding.code for finding in other.findings]
 
 
