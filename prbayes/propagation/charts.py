@@ -55,7 +55,8 @@ class ReferencePopulation:
         ValueError
             If the covariance is singular.
         """
-        weights = np.full(len(x), 1 / len(x)) if weights is None else weights / weights.sum()
+        weights = np.ones(len(x)) if weights is None else weights
+        weights = weights / weights.sum()
         mean = weights @ x
         centred = x - mean
         covariance = (centred.T * weights) @ centred

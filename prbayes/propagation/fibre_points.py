@@ -260,7 +260,8 @@ def _draw(
         z[rows] = points.x
         values, _ = response(points.x.reshape(-1, d))
         away = (y[:, None] - values.reshape(len(rows), count, -1)) / error
-        normal = (-0.5 * away**2 - np.log(error) - 0.5 * np.log(2 * np.pi)).sum(axis=-1)
+        log_normal = -0.5 * away**2 - np.log(error) - 0.5 * np.log(2 * np.pi)
+        normal = log_normal.sum(axis=-1)
         log_proposal[rows] = normal - points.log_a
     outputs = emulation(z.reshape(-1, d))[0].reshape(n, count, m)
     is_exact = np.isfinite(log_proposal) & (log_proposal == 0.0)
@@ -305,7 +306,8 @@ def _population_points(
     wide = 1.5
     z = population.mean + wide * standard @ population.root.T
     log_det = np.log(np.diag(population.root)).sum() + d * np.log(wide)
-    density = -0.5 * (standard**2).sum(axis=-1) - d / 2 * np.log(2 * np.pi) - log_det
+    square = (standard**2).sum(axis=-1)
+    density = -0.5 * square - d / 2 * np.log(2 * np.pi) - log_det
     return z, density + np.log(count)
 
 
