@@ -12,7 +12,14 @@ from scipy.stats import norm
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks import contamination, coverage, families, likelihood_coverage, record
+from benchmarks import (
+    contamination,
+    coverage,
+    families,
+    likelihood_coverage,
+    readings_coverage,
+    record,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -150,3 +157,14 @@ def test_the_likelihood_by_specimen_covers_over_a_whole_prior() -> None:
         # As if the hyperparameters of a data set were one: the error is at most this one.
         error = (0.89 * 0.11 / found["data sets"]) ** 0.5
         assert abs(found["prbayes"]["pooled coverage"] - 0.89) < 4 * error
+
+
+def test_measurement_arguments_have_the_exact_posterior() -> None:
+    results = record.load(readings_coverage.OUT, None)
+    for name, rows in results["rows"].items():
+        found = readings_coverage.table(rows)
+        assert found == results["summary"][name]
+        assert np.abs(found["bias"]).max() < 0.1
+        error = (0.89 * 0.11 / (found["data sets"] - found["refused"])) ** 0.5
+        for within in found["prbayes"]["coverage"].values():
+            assert abs(within - 0.89) < 3 * error
