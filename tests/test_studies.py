@@ -18,6 +18,7 @@ from benchmarks import (
     families,
     likelihood_coverage,
     likelihood_guards,
+    readings_coverage,
     record,
 )
 
@@ -167,3 +168,14 @@ def test_guards_rarely_flag_right_models() -> None:
         assert found == results["summary"][name]
         for check, cell in found.items():
             assert cell["share"] <= largest[check] + 4 * cell["standard error"], (name, check)
+
+
+def test_measurement_arguments_have_the_exact_posterior() -> None:
+    results = record.load(readings_coverage.OUT, None)
+    for name, rows in results["rows"].items():
+        found = readings_coverage.table(rows)
+        assert found == results["summary"][name]
+        assert np.abs(found["bias"]).max() < 0.1
+        error = (0.89 * 0.11 / (found["data sets"] - found["refused"])) ** 0.5
+        for within in found["prbayes"]["coverage"].values():
+            assert abs(within - 0.89) < 3 * error
