@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 from scipy import optimize, stats
-from scipy.special import i0e, lambertw, logsumexp, ndtr, ndtri
+from scipy.special import betaincinv, i0e, lambertw, logsumexp, ndtr, ndtri
 
 import prbayes as prb
 from benchmarks import record
@@ -38,6 +38,7 @@ from benchmarks.scoreboard.problem import (
 )
 from benchmarks.scoreboard.problem import Problem as Population
 from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
+from prbayes.propagation.base import DesignError
 
 OUT = record.RESULTS / "likelihood_coverage.json"
 PROB = 0.89
@@ -140,8 +141,13 @@ PROBLEMS = {
 }
 
 
-def likelihood_of(problem: Problem) -> tuple[pm.Model, SpecimenLikelihood]:
-    """Return a model with this problem's inputs, and its likelihood; its data are arbitrary."""
+def likelihood_of(
+    problem: Problem, measurement: Callable[[Any], dict[str, Any]] = lambda values: {}
+) -> tuple[pm.Model, SpecimenLikelihood]:
+    """Return a model with this problem's inputs, and its likelihood; its data are arbitrary.
+
+    ``measurement`` returns arguments of `prb.LogLikelihood` from the model variables by name.
+    """
     population = problem.population
     middle = {name: p.distribution().median() for name, p in problem.priors.items()}
     z = stats.norm.ppf((np.arange(problem.size) + 0.5) / problem.size)
@@ -150,7 +156,8 @@ def likelihood_of(problem: Problem) -> tuple[pm.Model, SpecimenLikelihood]:
         values = in_pymc.hyperparameters(population)
         inputs = in_pymc.inputs(population, values)
         observed = problem.response(*[np.ravel(column) for column in x])
-        prb.Simulator("y", problem.response, *inputs, observed=observed)
+        metric = prb.LogLikelihood(**measurement(values))
+        prb.Simulator("y", problem.response, *inputs, metric=metric, observed=observed)
     (likelihood,) = specimen_likelihoods(model).values()
     return model, likelihood
 
@@ -171,6 +178,8 @@ def _quantile(prior: Prior, p: Any) -> Any:
         return mean + sd * ndtri(p)
     if prior.family == "halfnorm":
         return prior.arguments[0] + prior.arguments[1] * ndtri((1 + p) / 2)
+    if prior.family == "beta":
+        return betaincinv(*prior.arguments, p)
     low, _, mean, sd = prior.arguments  # truncated below
     return mean + sd * ndtri(ndtr(low) + p * ndtr(-low))
 
@@ -206,7 +215,9 @@ def exact_log_likelihood(problem: Problem, y: Any) -> Functions:
     return log_likelihood(problem, *problem.roots(y))
 
 
-def posterior(problem: Problem, function: Functions, start: Any) -> tuple[Any, Any, float]:
+def posterior(
+    problem: Problem, function: Functions, start: Any, count: int = _POINTS
+) -> tuple[Any, Any, float]:
     """Return coordinates (S, q) with normalised weights (S,), and Pareto k."""
     from arviz_stats.base.array import array_stats
 
@@ -218,14 +229,14 @@ def posterior(problem: Problem, function: Functions, start: Any) -> tuple[Any, A
         return np.where(np.isnan(logs), -np.inf, logs)
 
     components = _modes(log_density, start, d)
-    sobol = np.clip(stats.qmc.Sobol(d + 2, seed=0).random(_POINTS), 1e-12, 1 - 1e-12)
+    sobol = np.clip(stats.qmc.Sobol(d + 2, seed=0).random(count), 1e-12, 1 - 1e-12)
     k = np.inf
     for round_number in range(4):
         u, log_q = _drawn(components, sobol)
         logs = log_density(u) - log_q
         smoothed, k = array_stats.psislw(-logs)  # of minus the log of the ratios
         weights = np.exp(smoothed - logsumexp(smoothed))
-        if (float(k) <= 0.5 and 1 / (weights**2).sum() > 0.2 * _POINTS) or round_number == 3:
+        if (float(k) <= 0.5 and 1 / (weights**2).sum() > 0.2 * count) or round_number == 3:
             break
         components = _refitted(components, u, weights)
     return u, weights, float(k)
@@ -318,12 +329,12 @@ def data_set(problem: Problem, likelihood: SpecimenLikelihood, number: int) -> d
     values = dict(zip(problem.priors, truth, strict=True))
     y = problem.response(*[np.ravel(x) for x in problem.population.population(values, z)])
     row: dict[str, Any] = {"number": number}
-    other = likelihood.observing(y)
+    other = likelihood.observing({likelihood.name: y})
     # Coordinates are those of the prior, whatever the data.
     other.__dict__["coordinates"] = likelihood.coordinates
     try:
         points = other.points
-    except prb.DesignError as error:
+    except DesignError as error:
         return row | {"error": str(error)}
     row["runs"] = len(other.emulation.z)
     x = np.concatenate(

@@ -197,6 +197,14 @@ def likelihood_ranks() -> Iterator[Row]:
             yield [problem, name, sets, short(within, 3), short(exact, 3), p, *distance]
 
 
+def guard_sizes() -> Iterator[Row]:
+    """Yield how often right models are flagged by the guards of the log-likelihood by specimen."""
+    for problem, checks in found("likelihood_guards")["summary"].items():
+        for check, cell in checks.items():
+            share = f"{short(cell['share'], 3)} ± {short(cell['standard error'], 3)}"
+            yield [problem, check, str(cell["data sets"]), share]
+
+
 def _mean_ratio(ratios: Any) -> str:
     return short(float(np.exp(np.log(ratios).mean())))
 
@@ -287,6 +295,25 @@ def gross_errors() -> Iterator[Row]:
             " / ".join(f"{bias + 0.0:+.2f} ± {error:.2f}" for bias, error in biases),
             " / ".join(f"{width:.2f}" for width in row["width"]),
         ]
+
+
+def readings_coverage() -> Iterator[Row]:
+    """Yield bias, width and coverage of measurement arguments beside the exact posterior."""
+    for case, table in found("readings_coverage")["summary"].items():
+        for j, (name, within) in enumerate(table["prbayes"]["coverage"].items()):
+            exact = table["exact"]["coverage"][name]
+            error = np.sqrt(0.89 * 0.11 / (table["data sets"] - table["refused"]))
+            refused = f", {table['refused']} refused" if table["refused"] else ""
+            yield [
+                case,
+                name,
+                f"{table['data sets']}{refused}",
+                f"{table['bias'][j]:+.2f} ± {table['error of bias'][j]:.2f}",
+                f"{table['largest distance'][j]:.2f}",
+                f"{table['width'][j]:.2f}",
+                f"{within:.2f} ± {error:.2f}",
+                f"{exact:.2f}",
+            ]
 
 
 # By rival of the scoreboard: the metric, what it estimates, failures, gross errors.
@@ -886,6 +913,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "given the estimate, by problem": given_estimate_by_problem,
     "ranks": ranks,
     "likelihood, ranks": likelihood_ranks,
+    "likelihood, sizes of guards": guard_sizes,
     "hard posteriors": hard_posteriors,
     "samplers": samplers,
     "size": sizes,
@@ -900,6 +928,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "small groups": small_groups,
     "measurement error": measurement_error,
     "gross errors": gross_errors,
+    "readings, coverage": readings_coverage,
     "metric prices": metric_prices,
     "landscapes": landscapes,
     "wrong families, many data": lambda: families((100_000,)),

@@ -341,7 +341,8 @@ def _scored(
             found[key] = np.where(supported, scores, np.nan)
     for name, values in evaluator.specimen_log_likelihoods(thetas).items():
         before = f"{name} " if several else ""
-        found[f"{before}{_BY_SPECIMEN}"] = -values.mean(axis=1)
+        if values.size:
+            found[f"{before}{_BY_SPECIMEN}"] = -values.mean(axis=1)
     return found
 
 

@@ -117,10 +117,11 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     best population, by refits (p < .01). If they cannot, notes tell which of several outputs, and
     which correlations of two, disagree. No response is computed; what was not looked at is said.
 
-    With the log-likelihood by specimen: whether chains are in different modes; of optima, a test of
-    the family of the population of the inputs, with its power at this number of specimens; of
-    draws, the conflict of prior and data, and specimens on which the posterior depends (Pareto k,
-    where the result has a log-likelihood by specimen).
+    With the log-likelihood by specimen: a test of the family of the population of the inputs, with
+    its power at this number of specimens; of draws, whether chains are in different modes, the
+    conflict of prior and data, and specimens on which the posterior depends (Pareto k, where the
+    result has a log-likelihood by specimen). Both tests of draws take the optimum of the
+    likelihood, which is computed for them.
 
     Parameters
     ----------

@@ -157,7 +157,7 @@ def _population(optimum: Optimum) -> Checked:
     for likelihood, (z, weights), statistics in zip(
         evaluator.likelihoods, samples, null, strict=True
     ):
-        labels = _labels(likelihood.inputs, likelihood.responses.function)
+        labels = _labels(likelihood.inputs, likelihood.measurements[0].responses.function)
         misfit = population_findings(
             population_test(z, weights, statistics), labels, threshold=threshold
         )
@@ -273,11 +273,8 @@ def _points(
     for likelihood, own, (points, log_a) in zip(evaluator.likelihoods, scores, data, strict=True):
         z = np.empty((*log_a.shape, likelihood.coordinates.size))
         weights = np.empty(log_a.shape)
-        for k, simulator in enumerate(evaluator.emulated, start=len(evaluator.nodes)):
-            if simulator.likelihood is not likelihood:
-                continue
-            rows = simulator.rows
-            roots = evaluator.roots(theta[None], k)
+        for place, rows in likelihood.by_group:
+            roots = evaluator.roots_of(theta[None], likelihood.inputs, place)
             some = [x[rows] for x in points]
             z[rows], weights[rows] = own.at(likelihood.inputs, roots, some, log_a[rows])
         result.append((z, weights))
@@ -302,19 +299,17 @@ def check_draws(evaluator: Evaluator | None, result: xr.DataTree, thetas: Floats
     if evaluator is None or thetas is None:
         return checked + Checked(
             untested=(
-                "The conflict of prior and data was not tested: that needs the model; pass model=.",
-                _ELSEWHERE,
+                "The family of the population and the conflict of prior and data were not tested: "
+                "that needs the model; pass model=.",
             )
         )
     center = thetas.reshape(-1, evaluator.size).mean(axis=0)
     checked += Checked(failing_region_findings(evaluator, center), emulator_notes(evaluator))
-    return checked + _conflict(evaluator, thetas) + Checked(untested=(_ELSEWHERE,))
-
-
-_ELSEWHERE = (
-    "The family of the population was not tested: prb.diagnose of the optimum of prb.minimize "
-    "tests it."
-)
+    obstacle = simulation_obstacle(evaluator)
+    if obstacle is not None:
+        return checked + _not_tested(obstacle) + _conflict_not_tested(obstacle)
+    optimum = find_optimum(evaluator, Minimisation())
+    return checked + _population(optimum) + _conflict(optimum, thetas)
 
 
 def separate_modes(thetas: Floats, names: Sequence[str]) -> tuple[Finding, ...]:
@@ -376,17 +371,17 @@ def influence(result: xr.DataTree) -> tuple[Finding, ...]:
     return tuple(findings)
 
 
-def _conflict(evaluator: Evaluator, thetas: Floats) -> Checked:
+def _conflict_not_tested(reason: str) -> Checked:
+    return Checked(untested=(f"The conflict of prior and data was not tested: {reason}.",))
+
+
+def _conflict(optimum: Optimum, thetas: Floats) -> Checked:
     """Report hyperparameters whose prior pulls the posterior away from the data."""
-    obstacle = simulation_obstacle(evaluator)
-    if obstacle is None:
-        optimum = find_optimum(evaluator, Minimisation())
-        if not (optimum.converged and np.isfinite(optimum.covariance).all()):
-            obstacle = "nothing is known of the sampling distribution of the optimum"
-        elif any(rival["comparable"] for rival in optimum.rivals):
-            obstacle = "the likelihood has several modes"
-    if obstacle is not None:
-        return Checked(untested=(f"The conflict of prior and data was not tested: {obstacle}.",))
+    evaluator = optimum.evaluator
+    if not (optimum.converged and np.isfinite(optimum.covariance).all()):
+        return _conflict_not_tested("nothing is known of the sampling distribution of the optimum")
+    if any(rival["comparable"] for rival in optimum.rivals):
+        return _conflict_not_tested("the likelihood has several modes")
     draws = thetas.reshape(-1, evaluator.size)
     errors = np.sqrt(np.diag(optimum.covariance))
     pulls = np.abs(draws.mean(axis=0) - optimum.theta) / errors
@@ -401,8 +396,9 @@ def _conflict(evaluator: Evaluator, thetas: Floats) -> Checked:
     prior = evaluator.prior_thetas(_OPTIONS.prior_draws, 0)
     predictive = _predictive_estimates(optimum, prior)
     if np.isfinite(predictive).all(axis=1).mean() < 0.5:
-        reason = "the information of most populations of the prior is not finite"
-        return Checked(untested=(f"The conflict of prior and data was not tested: {reason}.",))
+        return _conflict_not_tested(
+            "the information of most populations of the prior is not finite"
+        )
     findings = conflict_findings(
         names,
         prior,
@@ -413,7 +409,7 @@ def _conflict(evaluator: Evaluator, thetas: Floats) -> Checked:
     )
     if findings:
         return Checked(findings=findings)
-    n = sum(len(each.observed) for each in evaluator.likelihoods)
+    n = sum(len(each.readings) for each in evaluator.likelihoods)
     power = np.interp(np.log(n), np.log([10, 20, 50]), [0.86, 0.98, 1.0])
     return Checked(
         notes=(
@@ -434,7 +430,7 @@ def _predictive_estimates(optimum: Optimum, prior: Floats) -> Floats:
     evaluator = optimum.evaluator
     compiled = [
         (PopulationSampler(each.inputs), compiled_log_density(each.inputs))
-        for each in evaluator.emulated
+        for each in evaluator.likelihoods
     ]
     complete = _covariance(evaluator, compiled, optimum.theta, rng)
     ratio = np.sqrt(np.diag(optimum.covariance) / np.diag(complete))
@@ -458,15 +454,15 @@ def _covariance(
     step = 1e-3 * evaluator.prior_sd
     around = cross(theta, step)
     information = np.zeros((theta.size, theta.size))
-    for k, simulator in enumerate(evaluator.emulated, start=len(evaluator.nodes)):
-        roots = evaluator.roots(around, k)
-        sampler, log_density = compiled[k - len(evaluator.nodes)]
-        specimens, _ = sampler([root[:1] for root in roots], _OPTIONS.specimens, rng)
-        (log_p,) = log_density(*roots, *[x[0] for x in specimens])
-        log_p = np.broadcast_to(log_p, (len(around), _OPTIONS.specimens))
-        with np.errstate(invalid="ignore"):
-            scores = slopes(log_p, step)
-        information += len(simulator.observed) / _OPTIONS.specimens * scores.T @ scores
+    for likelihood, (sampler, log_density) in zip(evaluator.likelihoods, compiled, strict=True):
+        for place, rows in likelihood.by_group:
+            roots = evaluator.roots_of(around, likelihood.inputs, place)
+            specimens, _ = sampler([root[:1] for root in roots], _OPTIONS.specimens, rng)
+            (log_p,) = log_density(*roots, *[x[0] for x in specimens])
+            log_p = np.broadcast_to(log_p, (len(around), _OPTIONS.specimens))
+            with np.errstate(invalid="ignore"):
+                scores = slopes(log_p, step)
+            information += len(rows) / _OPTIONS.specimens * scores.T @ scores
     nothing = np.full_like(information, np.nan)
     if not np.isfinite(information).all():
         return nothing

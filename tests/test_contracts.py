@@ -25,7 +25,7 @@ from pymc.distributions.censored import CensoredRV
 from pymc.distributions.distribution import SymbolicRandomVariable
 from pymc.distributions.multivariate import MvNormal, MvStudentT
 from pymc.distributions.shape_utils import change_dist_size
-from pymc.logprob.abstract import _logprob
+from pymc.logprob.abstract import ValuedRV, _logprob
 from pymc.logprob.utils import CheckParameterValue
 from pymc.model.fgraph import clone_model
 from pymc.printing import str_for_dist
@@ -234,6 +234,27 @@ def test_densities_are_dispatched_on_the_class_of_the_operation() -> None:
     generator = pt.random.shared_rng(seed=None)
     _, variable = Flat()(2.0, rng=generator, return_next_rng=True)
     assert pm.logp(variable, 5.0).eval() == 7.0
+
+
+def test_parameters_with_a_value_are_marked_in_densities() -> None:
+    class Sum(RandomVariable):
+        name, signature, dtype = "sum", "(n)->()", "float64"
+
+    marks = []
+
+    @_logprob.register(Sum)
+    def density(op: Any, values: Any, rng: Any, size: Any, *params: Any, **kwargs: Any) -> Any:
+        marks.extend(v for v in ancestors(params) if v.owner and isinstance(v.owner.op, ValuedRV))
+        return params[0].sum() + values[0]
+
+    with pm.Model() as model:
+        parent = pm.Normal("parent", observed=[1.0, 2.0])
+        generator = pt.random.shared_rng(seed=None)
+        _, child = Sum()(parent, rng=generator, return_next_rng=True)
+        model.register_rv(child, "child", observed=4.0)
+    assert model.compile_logp(vars=[child], mode=PLAIN)({}) == 7.0
+    (mark,) = set(marks)
+    assert mark.owner.inputs[0].eval().tolist() == [1.0, 2.0]
 
 
 def test_parameter_checks_hold_the_value_and_then_the_conditions() -> None:

@@ -471,6 +471,7 @@ INNER = {
         "pytensor.graph.traversal.ancestors",
     },
     "model.identity": {"pymc.printing.str_for_dist"},
+    "model.measurement": {"pytensor.tensor.variable.TensorVariable"},
     "model.node": {
         "pymc.logprob.abstract._logprob",
         "pymc.logprob.utils.CheckParameterValue",
@@ -487,12 +488,14 @@ INNER = {
     },
     "model.simulator": {"pytensor.graph.basic.Variable", "pytensor.tensor.variable.TensorVariable"},
     "model.specimen_likelihood": {
+        "pymc.logprob.abstract.ValuedRV",
         "pymc.logprob.abstract._logprob",
         "pymc.logprob.utils.CheckParameterValue",
         "pytensor.graph.basic.Apply",
         "pytensor.graph.basic.Constant",
         "pytensor.graph.replace.graph_replace",
         "pytensor.graph.replace.vectorize_graph",
+        "pytensor.graph.traversal.ancestors",
         "pytensor.tensor.random.op.RandomVariable",
         "pytensor.tensor.variable.TensorVariable",
     },

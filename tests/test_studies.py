@@ -12,7 +12,15 @@ from scipy.stats import norm
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks import contamination, coverage, families, likelihood_coverage, record
+from benchmarks import (
+    contamination,
+    coverage,
+    families,
+    likelihood_coverage,
+    likelihood_guards,
+    readings_coverage,
+    record,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -150,3 +158,24 @@ def test_the_likelihood_by_specimen_covers_over_a_whole_prior() -> None:
         # As if the hyperparameters of a data set were one: the error is at most this one.
         error = (0.89 * 0.11 / found["data sets"]) ** 0.5
         assert abs(found["prbayes"]["pooled coverage"] - 0.89) < 4 * error
+
+
+def test_guards_rarely_flag_right_models() -> None:
+    results = record.load(likelihood_guards.OUT, None)
+    largest = dict(zip(likelihood_guards.CHECKS, (0.07, 0.06, 0.06), strict=True))
+    for name, rows in results["rows"].items():
+        found = likelihood_guards.summary(rows)
+        assert found == results["summary"][name]
+        for check, cell in found.items():
+            assert cell["share"] <= largest[check] + 4 * cell["standard error"], (name, check)
+
+
+def test_measurement_arguments_have_the_exact_posterior() -> None:
+    results = record.load(readings_coverage.OUT, None)
+    for name, rows in results["rows"].items():
+        found = readings_coverage.table(rows)
+        assert found == results["summary"][name]
+        assert np.abs(found["bias"]).max() < 0.1
+        error = (0.89 * 0.11 / (found["data sets"] - found["refused"])) ** 0.5
+        for within in found["prbayes"]["coverage"].values():
+            assert abs(within - 0.89) < 3 * error

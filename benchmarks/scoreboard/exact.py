@@ -19,6 +19,7 @@ def posterior(
     priors: dict[str, Prior],
     log_likelihood: Callable[[Any, Any], Any],
     told: Callable[[Draws], Draws] = dict,
+    points: int = _POINTS,
 ) -> Reference:
     """Return means and standard deviations of two hyperparameters, or of what is told of them.
 
@@ -27,7 +28,7 @@ def posterior(
     names, frozen = list(priors), [p.distribution() for p in priors.values()]
     low, high = np.transpose([p.ppf([_TAIL, 1 - _TAIL]) for p in frozen])
     for _ in range(_PASSES):
-        axes = [np.linspace(a, b, _POINTS) for a, b in zip(low, high, strict=True)]
+        axes = [np.linspace(a, b, points) for a, b in zip(low, high, strict=True)]
         first, second = (x.ravel() for x in np.meshgrid(*axes, indexing="ij"))
         values = {names[0]: first, names[1]: second}
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -35,12 +36,12 @@ def posterior(
             logs = log_likelihood(first, second) + prior
         logs = np.where(np.isnan(logs), -np.inf, logs)
         weights = np.exp(logs - logs.max())
-        square = weights.reshape(_POINTS, _POINTS)
+        square = weights.reshape(points, points)
         for k, axis in enumerate(axes):
             marginal = square.sum(axis=1 - k)
             kept = np.flatnonzero(marginal > _NEGLIGIBLE * marginal.max())
             low[k] = axis[max(kept[0] - 1, 0)]
-            high[k] = axis[min(kept[-1] + 1, _POINTS - 1)]
+            high[k] = axis[min(kept[-1] + 1, points - 1)]
     return moments("exact posterior", told(values), weights)
 
 

@@ -11,6 +11,7 @@ from benchmarks.scoreboard.problem import Draws, Problem
 _PRIORS: dict[str, Any] = {
     "norm": lambda name, mean, sd: pm.Normal(name, mean, sd),
     "halfnorm": lambda name, _, scale: pm.HalfNormal(name, scale),
+    "beta": lambda name, a, b: pm.Beta(name, a, b),
     "uniform": lambda name, low, width: pm.Uniform(name, low, low + width),
     "truncnorm": lambda name, low, _, mean, sd: pm.TruncatedNormal(
         name, mean, sd, lower=mean + low * sd

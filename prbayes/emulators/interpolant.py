@@ -54,7 +54,8 @@ class Interpolant:
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
         """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d)."""
         m, d = self.weights.shape[1], self.z.shape[1]
-        values, jacobian = np.empty((len(z), m)), np.empty((len(z), m, d))
+        values = np.empty((len(z), m))
+        jacobian = np.empty((len(z), m, d))
         step = max(1, AT_ONCE // (4 * len(self.z)))
         for first in range(0, len(z), step):
             rows = slice(first, first + step)
@@ -70,7 +71,8 @@ class Interpolant:
             square = _squared_distances(z[rows], self.z)
             scaled = (z[rows] - self.center) / self.half_width
             terms = _terms(_legendre(scaled, self.powers), self.powers)
-            values[rows] = terms @ self.coefficients - (square**2 * np.sqrt(square)) @ self.weights
+            quintic = square**2 * np.sqrt(square)
+            values[rows] = terms @ self.coefficients - quintic @ self.weights
         return values
 
     def _evaluate(self, z: Floats) -> tuple[Floats, Floats]:

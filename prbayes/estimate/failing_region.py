@@ -15,9 +15,10 @@ def failing_region_findings(
 ) -> tuple[Finding, ...]:
     """Report populations of which a part has no response; no run is made.
 
-    The likelihood of a specimen integrates over inputs with a response. The density elsewhere is
-    probability where no specimen can be measured, so that a population moves away from there.
-    The finding ``failing-region`` has the share.
+    Where the response is NaN no specimen can be measured: the likelihood is that of the population
+    truncated to the other inputs (`prbayes.propagation.response_share`). Where it is +inf specimens
+    fail: as none is among the data, a population moves away from there. The finding
+    ``failing-region`` has the share of both.
 
     Parameters
     ----------
@@ -44,14 +45,23 @@ def failing_region_findings(
         n = len(simulator.rows)
         if share * n < lost:
             continue
+        if likelihood.share is None:
+            meaning = (
+                "as no specimen with these inputs is among the data, the population moves away "
+                "from there. If such specimens cannot be measured, return NaN"
+            )
+        else:
+            meaning = (
+                "the specimens are taken for a sample of the rest, the population truncated to "
+                "inputs with a response. If specimens with these inputs were measured, repair the "
+                "response; if none would fail unseen, return inf"
+            )
         findings.append(
             Finding(
                 "failing-region",
-                f"{simulator.name}: got no response (NaN) for {share:.1%} of the population, "
-                f"expected less than {lost / n:.1%}: the likelihood takes it for inputs with "
-                "which no specimen is measured, and the population moves away from there. If "
-                "specimens with these inputs were measured, repair the response; if they were "
-                "discarded, give the inputs a truncated distribution (pm.Truncated)",
+                f"{simulator.name}: got no finite response for {share:.1%} of the population, "
+                f"expected less than {lost / n:.1%}: {meaning}",
+                "likelihood.md#failing-region",
             )
         )
     return tuple(findings)

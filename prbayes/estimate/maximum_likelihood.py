@@ -18,7 +18,7 @@ from prbayes._finding import Finding, report
 from prbayes.estimate.differences import cross, slopes
 from prbayes.estimate.failing_region import failing_region_findings
 from prbayes.estimate.optimum import Optimum, plain
-from prbayes.estimate.prior_ends import PriorEnd, end_of_range, of_prior_ends
+from prbayes.estimate.prior_ends import PriorEnd, end_of_range, prior_end_findings
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
 from prbayes.model.identity import identity_of
@@ -66,7 +66,9 @@ def maximize_likelihood(evaluator: Evaluator, options: Any) -> Optimum:
         optima.append(_descend(objective, start, options))
         if objective.count > options.max_evaluations:
             break
-    modes = _distinct(optima, evaluator.prior_sd)
+    # Points of specimens have a Monte Carlo error, with which a ridge has ripples.
+    errors = [max(x.points.difference, x.options.half_difference) for x in evaluator.likelihoods]
+    modes = _distinct(optima, objective, 3 * float(np.linalg.norm(errors)))
     best = modes[0]
     point, stderr = _in_units(evaluator, best.theta, best.covariance)
     ends = _prior_ends(evaluator, best, lambda theta: objective(theta)[0])
@@ -219,17 +221,22 @@ def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum
 
     left = max(10, options.max_evaluations - objective.count)
     result = minimize(
-        standardised, start / unit, jac=True, method="BFGS",
+        standardised,
+        start / unit,
+        jac=True,
+        method="BFGS",
         options={"gtol": options.tolerance * 100, "maxiter": left},
-    )  # fmt: skip
+    )
     theta = np.asarray(result.x) * unit
     value, _ = objective(theta)
     if not result.success and np.isfinite(value):
         # A support whose end moves has its optimum at a jump: without gradients from there.
         simplex = minimize(
-            lambda u: objective(u * unit)[0], theta / unit, method="Nelder-Mead",
+            lambda u: objective(u * unit)[0],
+            theta / unit,
+            method="Nelder-Mead",
             options={"maxfev": min(left, 200 * theta.size), "xatol": 1e-8, "fatol": 1e-8},
-        )  # fmt: skip
+        )
         if simplex.fun < value - 1e-6:
             theta = np.asarray(simplex.x) * unit
             value, _ = objective(theta)
@@ -283,24 +290,70 @@ def _inverse_hessian(objective: _Objective, theta: Floats) -> tuple[Floats, floa
     return covariance, slope
 
 
-def _distinct(optima: list[LocalOptimum], unit: Floats) -> list[LocalOptimum]:
-    """Return different optima within 30 nats of the best, best first."""
+def _distinct(
+    optima: list[LocalOptimum], objective: _Objective, error: float
+) -> list[LocalOptimum]:
+    """Return the modes within 30 nats of the best optimum, best first.
+
+    Optima closer than a hundredth of the prior's width are the same.
+    """
     ordered = sorted((o for o in optima if np.isfinite(o.value)), key=lambda o: o.value)
     if not ordered:
         return optima[:1]
-    kept: list[LocalOptimum] = []
-    for optimum in ordered:
-        if optimum.value > ordered[0].value + 30 or (kept and not optimum.converged):
+    modes = ordered[:1]
+    for optimum in ordered[1:]:
+        if optimum.value > ordered[0].value + 30 or not optimum.converged:
             continue
-        new = True
-        for other in kept:
-            sd = np.sqrt(np.abs(np.diag(other.covariance)))
-            # Infinite where nothing is identified: a ridge is one optimum.
-            scale = np.where(np.isnan(sd) | (sd == 0), 0.1 * unit, sd)
-            new = new and bool((np.abs(optimum.theta - other.theta) > 0.5 * scale).any())
-        if new:
-            kept.append(optimum)
-    return kept
+        away = [np.abs((optimum.theta - mode.theta) / objective.unit).max() for mode in modes]
+        if min(away) > 0.01 and not any(
+            share_mode(objective, objective.unit, mode, optimum, error) for mode in modes
+        ):
+            modes.append(optimum)
+    return modes
+
+
+def share_mode(
+    objective: Callable[[Floats], tuple[float, Floats]],
+    unit: Floats,
+    first: LocalOptimum,
+    second: LocalOptimum,
+    largest: float,
+) -> bool:
+    """Return whether two optima are of one mode: no barrier lies between them.
+
+    The barrier is that of the profile along the straight line between the optima: the smallest
+    value across the line, in units of the prior. So a ridge, straight or curved, is one mode.
+
+    Parameters
+    ----------
+    objective : callable
+        Theta (d,) -> value and gradient.
+    unit : ndarray, shape (d,)
+        Unit of each parameter.
+    first, second : LocalOptimum
+    largest : float
+        Height above the higher optimum, in nats, from which on it is a barrier.
+    """
+    from scipy.linalg import null_space
+    from scipy.optimize import minimize
+
+    start, step = first.theta / unit, (second.theta - first.theta) / unit
+    across = null_space(step[None])
+    height = max(first.value, second.value) + largest
+
+    def profile(u: Floats, at: Floats) -> tuple[float, Floats]:
+        value, gradient = objective((at + across @ u) * unit)
+        return value, across.T @ (gradient * unit)
+
+    for share in (0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875):  # a barrier is likely in the middle
+        at, offset = start + share * step, np.zeros(across.shape[1])
+        value, _ = profile(offset, at)
+        if value > height and offset.size:
+            # Off the line, on which a symmetric objective has no slope.
+            value = minimize(profile, offset + 0.01, args=(at,), jac=True, method="BFGS").fun
+        if value > height:
+            return False
+    return True
 
 
 def _in_units(
@@ -364,7 +417,7 @@ def _findings(
     """Report a failing region, ends of priors, several modes and what is not identified."""
     best = modes[0]
     findings = list(failing_region_findings(evaluator, best.theta))
-    findings += [Finding("prior-end", text) for text in of_prior_ends(ends)]
+    findings += prior_end_findings(ends)
     if np.isnan(best.covariance).any():
         findings.append(
             Finding(

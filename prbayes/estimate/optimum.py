@@ -205,7 +205,7 @@ class Optimum:
         """
         evaluator = self.evaluator
         by_metric = sum(node.bound.responses.computed for node in evaluator.nodes)
-        return by_metric + sum(each.responses.computed for each in evaluator.likelihoods)
+        return by_metric + sum(m.responses.computed for m in evaluator.measurements)
 
     @property
     def failures(self) -> xr.Dataset:
@@ -377,10 +377,10 @@ def _trace_dataset(optimum: Optimum) -> xr.Dataset:
 
 def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
     evaluator = optimum.evaluator
-    nodes, likelihoods = evaluator.nodes, evaluator.likelihoods
+    nodes, measurements = evaluator.nodes, evaluator.measurements
     discrepancies = {name: -float(v.sum()) for name, v in _log_likelihoods(optimum).items()}
     discrepancies |= optimum.discrepancies
-    names = [node.name for node in nodes] + [each.name for each in likelihoods]
+    names = [node.name for node in nodes] + [m.name for m in measurements]
     variables: dict[str, Any] = {
         "discrepancy": ("simulator", [discrepancies[name] for name in names]),
         "scale": ("simulator", [optimum.scales.get(name, 1.0) for name in names]),
@@ -390,13 +390,14 @@ def _calibration_dataset(optimum: Optimum) -> xr.Dataset:
         variables[key] = ("simulator", values)
     variables["theta"] = ("element", optimum.theta)
     variables["covariance"] = (["element", "other_element"], optimum.covariance)
-    metrics = [node.metric for node in nodes] + [each.metric for each in likelihoods]
+    metrics = [node.metric for node in nodes] + [m.metric for m in measurements]
     variables["metric"] = ("simulator", [without_addresses(metric) for metric in metrics])
-    compared = [node.target.told for node in nodes] + [""] * len(likelihoods)
+    compared = [node.target.told for node in nodes] + [""] * len(measurements)
     variables["compared"] = ("simulator", compared)
-    is_likelihood = [0] * len(nodes) + [1] * len(likelihoods)
+    is_likelihood = [0] * len(nodes) + [1] * len(measurements)
     variables["is_likelihood"] = ("simulator", is_likelihood)
-    runs = [node.bound.n_runs for node in nodes] + [len(each.emulation.z) for each in likelihoods]
+    runs = [node.bound.n_runs for node in nodes]
+    runs += [len(evaluator.likelihood_of(m).emulation.z) for m in measurements]
     variables["n_runs"] = ("simulator", runs)
     elements = {"element": optimum.names, "other_element": optimum.names}
     return xr.Dataset(variables, coords={"simulator": names, **elements})

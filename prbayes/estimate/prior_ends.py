@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from prbayes._checks import Floats
+from prbayes._finding import Finding
 from prbayes._pages import more_in
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.model.evaluator import Evaluator
@@ -126,9 +127,18 @@ def _pushed(sampling: SamplingDistribution, i: int, middle: float) -> bool:
 
 def of_prior_ends(ends: list[PriorEnd]) -> list[str]:
     """Say so."""
+    page = more_in("optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something")
+    return [f"{finding.text}{page}" for finding in prior_end_findings(ends)]
+
+
+def prior_end_findings(ends: list[PriorEnd]) -> list[Finding]:
+    """Report ends of priors."""
     return [
-        f"the data push {end}, and ask for more than it allows: widen the prior, or look at units, "
-        "at the response and at the family of the inputs"
-        f"{more_in('optimum_or_abc.md#few-specimens-and-a-prior-that-knows-something')}"
+        Finding(
+            "prior-end",
+            f"the data push {end}, and ask for more than it allows: widen the prior, or look at "
+            "units, at the response and at the family of the inputs",
+            "likelihood.md#end-of-a-prior",
+        )
         for end in ends
     ]

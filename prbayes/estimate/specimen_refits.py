@@ -6,7 +6,7 @@ specimens whose points are computed once. Both cost no run.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,7 +21,7 @@ from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum, require_minimiser, require_sampling
 from prbayes.metrics.readings import Readings
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
+from prbayes.model.specimen_likelihood import SpecimenLikelihood
 from prbayes.propagation.specimen_points import draw_points, specimen_roots
 from prbayes.response.compilation import compiled, ninf_for_invalid, untraced
 
@@ -30,7 +30,7 @@ _COMPILED = "weighted log-likelihood"
 
 def specimen_refit_obstacle(evaluator: Evaluator) -> str | None:
     """Return why a model of log-likelihoods by specimen cannot be fitted to other data, or None."""
-    others = len(evaluator.model.observed_RVs) > len(evaluator.likelihoods)
+    others = len(evaluator.model.observed_RVs) > len(evaluator.measurements)
     if evaluator.nodes or others or evaluator.model.potentials:
         return (
             "the model has likelihood terms or potentials besides its log-likelihoods by specimen"
@@ -49,7 +49,7 @@ def simulation_obstacle(evaluator: Evaluator) -> str | None:
         is_measured = likelihood.readings.is_measured
         if (is_measured.sum(axis=1) < likelihood.coordinates.size).any():
             return f"{likelihood.name} has specimens with fewer readings than inputs"
-        if "error" in likelihood.extras:
+        if not likelihood.error_is_known:
             return f"{likelihood.name} has an unknown reading error"
     return None
 
@@ -84,7 +84,7 @@ class SpecimenPool:
 
 def specimen_pool(
     likelihood: SpecimenLikelihood,
-    params: Sequence[Floats],
+    params: Mapping[Any, Floats],
     rng: np.random.Generator,
     size: int = 2000,
 ) -> SpecimenPool:
@@ -93,13 +93,13 @@ def specimen_pool(
     Parameters
     ----------
     likelihood : SpecimenLikelihood
-    params : sequence of ndarray, shapes (1, *shape)
-        Values of its variables without the group.
+    params : mapping
+        Values by its variables without the group, shapes (1, *shape).
     rng : Generator
     size : int
         Number of specimens, rounded up to a multiple of the observed ones.
     """
-    n = len(likelihood.observed)
+    n = len(likelihood.readings)
     copies = max(1, -(-size // n))
     values = likelihood.draws(rng, params, copies * n)[0].reshape(copies * n, -1)
     measurement = likelihood.readings
@@ -112,6 +112,7 @@ def specimen_pool(
         np.resize(measurement.step, shape),
         missing,
         missing,
+        np.resize(measurement.is_relative, shape),
     )
     options = likelihood.options
     # The tolerance is that of the log-likelihood of a data set, not of the pool.
@@ -205,9 +206,8 @@ class SpecimenRefits:
 
     def _compile(self) -> Any:
         evaluator = self.evaluator
-        model = evaluator.model
         with untraced():
-            graphs = model.logp(vars=list(specimen_likelihoods(model)), sum=False)
+            graphs = evaluator.specimen_graphs()
             weights = [pt.dvector(f"weights_{k}") for k in range(len(graphs))]
             terms = [
                 pt.switch(pt.gt(w, 0), w * g, 0.0).sum()
@@ -234,9 +234,8 @@ class SpecimenRefits:
         weights : sequence of ndarray, shapes (N,), optional
             Of the specimens, by likelihood, with sum N; all one by default.
         """
-        likelihoods = self.evaluator.likelihoods
         if weights is None:
-            weights = [np.ones(len(each.observed)) for each in likelihoods]
+            weights = [np.ones(len(each.readings)) for each in self.evaluator.likelihoods]
         root = self._root
 
         def objective(u: Floats) -> tuple[float, Floats]:
@@ -246,9 +245,12 @@ class SpecimenRefits:
             return float(value), root.T @ np.where(np.isfinite(gradient), gradient, 0.0)
 
         result = minimize(
-            objective, np.zeros(self.theta.size), jac=True, method="BFGS",
+            objective,
+            np.zeros(self.theta.size),
+            jac=True,
+            method="BFGS",
             options={"gtol": 1e-3, "maxiter": 200},
-        )  # fmt: skip
+        )
         slope = np.abs(objective(result.x)[1]).max()
         return self.theta + root @ result.x, bool(np.isfinite(result.fun) and slope < 0.05)
 
@@ -288,13 +290,17 @@ class SpecimenRefits:
         by_likelihood = []
         emulated = self.evaluator.emulated
         for likelihood in self.evaluator.likelihoods:
-            n = len(likelihood.observed)
-            factors = np.zeros((len(weights[0]), n))
+            factors = np.zeros((len(weights[0]), len(likelihood.readings)))
+            count = np.zeros(len(likelihood.readings))
             for simulator, part in zip(emulated, weights, strict=True):
                 if simulator.likelihood is likelihood:
-                    factors[:, simulator.rows] = part * len(simulator.rows)
-            if likelihood.weights is not None:  # which are in the likelihood, and in the weights
-                factors = factors / np.where(likelihood.weights > 0, likelihood.weights, 1.0)
+                    specimens = likelihood.numbers(simulator.measurement)[simulator.rows]
+                    np.add.at(factors.T, specimens, part.T * len(specimens))
+                    np.add.at(count, specimens, 1)
+            factors /= count
+            stated = likelihood.measurements[0].weights
+            if stated is not None:  # which are in the likelihood, and in the weights
+                factors = factors / np.where(stated > 0, stated, 1.0)
             by_likelihood.append(factors)
         estimates = [self.fit(list(rows)) for rows in zip(*by_likelihood, strict=True)]
         thetas, converged = zip(*estimates, strict=True)

@@ -34,9 +34,9 @@ class LogLikelihood(Metric):
 
     .. math:: \log L(\theta) = \sum_i \log \int p(y_i \mid f(x))\, p(x \mid \theta)\, dx,
 
-    with the readings :math:`y_i` of specimen i and the response f. It needs a deterministic
-    response and continuous inputs, has no epsilon, and serves every sampler of PyMC. It compares no
-    two samples, so that it has no direct call.
+    with all readings :math:`y_i` of specimen i, also of several simulators, and the response f. It
+    needs a deterministic response and continuous inputs, has no epsilon, and serves every sampler
+    of PyMC. It compares no two samples, so that it has no direct call.
 
     With ``density`` it is the negative mean log-likelihood
     :math:`-\frac{1}{N} \sum_i \log p(z_i)` of the observed values under a density estimate of the
@@ -51,7 +51,7 @@ class LogLikelihood(Metric):
         for each output, (m,), or one for each reading, (N,) or (N, m). A variable of the model is
         estimated. Readings are exact by default.
     relative : bool
-        Whether ``error`` is a share of the reading.
+        Whether ``error`` is a share of the output.
     gross_errors : bool, float or model variable
         Share of specimens with a gross error, whose readings are uniform over twice the range of
         each output. True adds the variable ``{name}_gross_errors`` with a Beta(1, 9) prior.
@@ -172,8 +172,6 @@ class LogLikelihood(Metric):
                 ) from None
 
         sd = np.zeros(values.shape) if error is None else full(error, "error")
-        if self.relative:
-            sd = sd * np.abs(values)
         step = np.zeros(values.shape) if self.rounded is None else full(self.rounded, "rounded")
         lower, upper = np.full(values.shape, np.nan), np.full(values.shape, np.nan)
         if self.censored is not None:
@@ -186,7 +184,7 @@ class LogLikelihood(Metric):
                 lower[is_high], upper[is_high] = full(high, "censored")[is_high], np.inf
             values = np.where(is_low | is_high, np.nan, values)
         sd = np.where(np.isfinite(sd), sd, 0.0)
-        return Readings(values, sd, step, lower, upper)
+        return Readings(values, sd, step, lower, upper, np.full(values.shape, self.relative))
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         if self.density is None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ class Readings:
         Width to which the reading was rounded; zero if it was not.
     lower, upper : ndarray, shape (N, m)
         Bounds of a censored reading, perhaps infinite; NaN where the reading is not censored.
+    is_relative : ndarray of bool, shape (N, m)
+        Where the error is a share of the output.
     """
 
     values: Floats
@@ -33,20 +36,25 @@ class Readings:
     step: Floats
     lower: Floats
     upper: Floats
+    is_relative: NDArray[np.bool_]
 
     @classmethod
     def exact(cls, values: Floats) -> Readings:
         """Return readings without error, (N, m)."""
         zero, missing = np.zeros_like(values), np.full_like(values, np.nan)
-        return cls(values, zero, zero, missing, missing)
+        return cls(values, zero, zero, missing, missing, np.zeros(values.shape, dtype=bool))
 
     def __len__(self) -> int:
         return len(self.values)
 
     def rows(self, index: NDArray[np.intp]) -> Readings:
         """Return the readings of some specimens."""
-        fields = ("values", "error", "step", "lower", "upper")
-        return replace(self, **{name: getattr(self, name)[index] for name in fields})
+        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    @classmethod
+    def beside(cls, parts: Sequence[Readings]) -> Readings:
+        """Return the readings of different outputs of the same specimens as one."""
+        return cls(**_beside(cls, parts))
 
     @property
     def is_measured(self) -> NDArray[np.bool_]:
@@ -58,6 +66,10 @@ class Readings:
         """Which readings are known to an interval alone, (N, m)."""
         return ~np.isnan(self.lower)
 
+    def error_sd(self, outputs: Any) -> Any:
+        """Return the standard deviation of the errors of outputs that broadcast against (N, m)."""
+        return self.error * np.where(self.is_relative, np.abs(outputs), 1.0)
+
     def spread(self) -> Floats:
         """Return the standard deviation of each output over specimens, (m,); one if it is zero."""
         measured = self.is_measured
@@ -68,12 +80,24 @@ class Readings:
         sd = np.sqrt((away**2).sum(axis=0) / count)
         return np.where(sd > 0, sd, 1.0)
 
+    def robust_spread(self) -> Floats:
+        """Return the standard deviation of each output by its quartiles, (m,).
+
+        Specimens near a pole of the response decide the ordinary one. Where the quartiles are
+        equal, it is the ordinary one.
+        """
+        columns = [v[k] for v, k in zip(self.values.T, self.is_measured.T, strict=True)]
+        widths = [np.subtract(*np.quantile(v, [0.75, 0.25])) if v.size else 0.0 for v in columns]
+        scatter = np.array(widths) / 1.349
+        return np.where(scatter > 0, scatter, self.spread())
+
     def comparison_sd(self, emulator_error: Floats) -> Floats:
         """Return the standard deviation of the comparison with an emulator, (N, m).
 
         Emulator error, reading error and rounding add; infinite where nothing was measured.
         """
-        sd = np.sqrt(emulator_error**2 + self.error**2 + self.step**2 / 12)
+        error = self.error_sd(np.nan_to_num(self.values))
+        sd = np.sqrt(emulator_error**2 + error**2 + self.step**2 / 12)
         return np.where(self.is_measured, sd, np.inf)
 
     def scaled(self, factor: float) -> Readings:
@@ -85,9 +109,11 @@ class Readings:
 
         -inf where an output is NaN.
         """
-        variance = emulator_error**2 + self.error**2
+        by_point = np.moveaxis(outputs, 1, 0)  # (K, N, m)
+        variance = emulator_error**2 + self.error_sd(by_point) ** 2
+        variance = np.moveaxis(np.broadcast_to(variance, by_point.shape), 0, 1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            result = self.symbolic_log_density(outputs, variance[:, None], np)
+            result = self.symbolic_log_density(outputs, variance, np)
         return np.where(np.isnan(result), -np.inf, result)
 
     def symbolic_log_density(self, outputs: Floats, variance: Any, xp: Any) -> Any:
@@ -123,11 +149,120 @@ class Readings:
         return terms.sum(axis=-1)
 
 
+@dataclass(frozen=True, eq=False)
+class Repeats:
+    r"""What repeated readings add to the log-density of their weighted mean.
+
+    Readings :math:`y_r` with standard deviations :math:`e c_r` have the mean :math:`\bar y` with
+    :math:`e c`, :math:`c^{-2} = \sum c_r^{-2}`, and
+
+    .. math:: \prod_r N(y_r;\, f,\, e^2 c_r^2) = N(\bar y;\, f,\, e^2 c^2)\,
+        \frac{c}{(2 \pi e^2)^{(R-1)/2} \prod_r c_r}
+        \exp\Bigl(-\frac{1}{2 e^2} \sum_r \frac{(y_r - \bar y)^2}{c_r^2}\Bigr).
+
+    Attributes
+    ----------
+    count : ndarray, shape (N, m)
+        Number of readings less one.
+    within : ndarray, shape (N, m)
+        Sum of squares around the mean.
+    constant : ndarray, shape (N, m)
+    """
+
+    count: Floats
+    within: Floats
+    constant: Floats
+
+    @classmethod
+    def beside(cls, parts: Sequence[Repeats]) -> Repeats:
+        """Return the repeats of different outputs of the same specimens as one."""
+        return cls(**_beside(cls, parts))
+
+    def log_density(self, error: Any, xp: Any) -> Any:
+        """Return the sum over outputs, (N,), as an array or a graph of the error e, (m,)."""
+        terms = self.constant - self.count * xp.log(error) - self.within / (2 * error**2)
+        return terms.sum(axis=-1)
+
+
+def _beside(kind: Any, parts: Sequence[Any]) -> dict[str, Any]:
+    """Return the arrays of records by name, joined along the axis of the outputs."""
+    names = [f.name for f in fields(kind)]
+    return {name: np.concatenate([getattr(p, name) for p in parts], axis=1) for name in names}
+
+
+def averaged(
+    readings: Readings, scale: Floats, numbers: NDArray[np.intp], count: NDArray[np.intp]
+) -> tuple[Readings, Floats, Repeats]:
+    """Return the readings of S specimens, repeated ones by their weighted mean.
+
+    Parameters
+    ----------
+    readings : Readings
+        N rows.
+    scale : ndarray, shape (N, m)
+        Standard deviation of each reading's error, in any unit e; positive for repeated readings.
+    numbers : ndarray of int, shape (N,)
+        Specimen of each row.
+    count : ndarray of int, shape (S, m)
+        Number of readings of each output.
+
+    Returns
+    -------
+    readings : Readings
+        S rows.
+    scale : ndarray, shape (S, m)
+    repeats : Repeats
+    """
+    present = np.nonzero(readings.is_measured | readings.is_censored)
+    places = numbers[present[0]], present[1]
+
+    def by_specimen(values: Floats, missing: Any) -> Floats:
+        result = np.empty(count.shape)
+        result[:] = missing
+        result[numbers] = values  # outputs that were not measured keep what was given
+        result[places] = values[present]
+        return result
+
+    names = ("values", "lower", "upper")
+    arrays: dict[str, Any] = {name: by_specimen(getattr(readings, name), np.nan) for name in names}
+    for name in ("error", "step"):
+        values = getattr(readings, name)
+        arrays[name] = by_specimen(values, np.median(values, axis=0))
+    arrays["is_relative"] = np.broadcast_to(readings.is_relative[:1], count.shape)
+    combined = by_specimen(scale, np.median(scale, axis=0))
+    repeated = count > 1
+    zero = np.zeros(count.shape)
+    if not repeated.any():
+        return Readings(**arrays), combined, Repeats(zero, zero, zero)
+
+    def total(values: Floats) -> Floats:
+        result = np.zeros(count.shape)
+        np.add.at(result, places, np.where(repeated[places], values, 0.0))
+        return np.where(repeated, result, 0.0)
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        c, y = scale[present], readings.values[present]
+        precision = total(c**-2.0)
+        mean = total(y / c**2) / precision
+        within = total(((y - mean[places]) / c) ** 2)
+        new = precision**-0.5
+        error = arrays["error"]
+        arrays["error"] = np.where(repeated, error / combined * new, error)
+        normal = (count - 1) / 2 * np.log(2 * np.pi)
+        constant = np.log(new) - total(np.log(c)) - normal
+    arrays["values"] = np.where(repeated, mean, arrays["values"])
+    repeats = Repeats(
+        np.where(repeated, count - 1.0, 0.0), within, np.where(repeated, constant, 0.0)
+    )
+    return Readings(**arrays), np.where(repeated, new, combined), repeats
+
+
 def log_interval_probability(low: Any, high: Any, xp: Any = np) -> Any:
     """Return log(Phi(high) - Phi(low)) of a standard normal variable, in the tails too."""
     # In the upper tail both ends are mirrored, so that no digits are lost.
     is_upper = low > 0
-    a, b = xp.where(is_upper, -high, low), xp.where(is_upper, -low, high)
+    a = xp.where(is_upper, -high, low)
+    b = xp.where(is_upper, -low, high)
     log_a, log_b = _log_distribution(a, xp), _log_distribution(b, xp)
     return log_b + xp.log1p(-xp.exp(log_a - log_b))
 

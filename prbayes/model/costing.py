@@ -14,9 +14,11 @@ import pymc as pm
 from prbayes._checks import called, flag
 from prbayes.metrics.base import Discrepancy
 from prbayes.model.description import without_addresses
+from prbayes.model.measurement import Measurement
 from prbayes.model.node import model_on_context, simulators
 from prbayes.model.specimen_likelihood import (
     SpecimenLikelihood,
+    measurements_of,
     require_simulator,
     specimen_likelihoods,
 )
@@ -183,21 +185,24 @@ def _of_model(model: pm.Model) -> list[Countable]:
         alike = [earlier for earlier in asked if earlier.responses.runs is responses.runs]
         shared = alike[0].responses.name if alike and not computed else ""
         asked.append(Asked(responses, simulator.propagation, simulator.target, shared, computed))
-    return [*asked, *map(SpecimenRuns, specimen_likelihoods(model).values())]
+    likelihoods = specimen_likelihoods(model)
+    specimens = [SpecimenRuns(likelihoods[rv], m) for rv, m in measurements_of(model).items()]
+    return [*asked, *specimens]
 
 
 @dataclass(frozen=True, eq=False)
 class SpecimenRuns:
-    """What the emulator of a log-likelihood by specimen asks for."""
+    """What the emulator of a log-likelihood by specimen asks of a simulator."""
 
     likelihood: SpecimenLikelihood
+    measurement: Measurement
 
     def counted(self, dry_run: bool) -> SimulatorCost:
         """Return the runs that are needed, after one was made where asked for."""
         likelihood = self.likelihood
-        responses = likelihood.responses
+        responses = self.measurement.responses
         d = likelihood.coordinates.size
-        first = likelihood.propagation.emulator_runs or first_runs(d)
+        first = likelihood.first_runs or first_runs(d)
         batch = max(first // 2, likelihood.options.fresh)
         is_emulated = "_prepared" in vars(likelihood)
         known = len(likelihood.emulation.z) if is_emulated else 0
@@ -210,7 +215,7 @@ class SpecimenRuns:
         least = first + 2 * batch
         return SimulatorCost(
             responses.name,
-            f"{likelihood.metric!r} by an emulator",
+            f"{self.measurement.metric!r} by an emulator",
             max(least, known),
             known,
             Demand(

@@ -139,7 +139,9 @@ def count_at_ends(y: Floats, step: float = 0.0, draws: int = 399, seed: int = 0)
     seed : int
     """
     n, high, low = len(y), y.max(), y.min()
-    at_end = np.array([np.sum(y > high - step / 2), np.sum(y < low + step / 2)])
+    at_high = np.sum(y > high - step / 2)
+    at_low = np.sum(y < low + step / 2)
+    at_end = np.array([at_high, at_low])
     if not step:
         at_end = np.array([np.sum(y == high), np.sum(y == low)])
         # Copies of specimens repeat values between the ends, too.
@@ -150,11 +152,14 @@ def count_at_ends(y: Floats, step: float = 0.0, draws: int = 399, seed: int = 0)
         null = np.empty((draws, 2))
         for draw in null:
             values = np.round((rng.normal(y.mean(), y.std(), n) - low) / step)
-            draw[:] = np.sum(values == values.max()), np.sum(values == values.min())
+            draw[0] = np.sum(values == values.max())
+            draw[1] = np.sum(values == values.min())
         bootstrap = adjusted_p_values(at_end.astype(np.float64), null)
         cells = max(1, int(0.5 * y.std() / step))
         width = (cells + 0.5) * step
-        near = np.array([np.sum(y > high - width), np.sum(y < low + width)])
+        near_high = np.sum(y > high - width)
+        near_low = np.sum(y < low + width)
+        near = np.array([near_high, near_low])
         p_values = np.maximum(bootstrap, bdtrc(at_end - 1, near, 1 / (1 + cells)))
     top, bottom = at_end.tolist()
     p_top, p_bottom = p_values.tolist()
@@ -325,7 +330,8 @@ def data_findings(
                     limits.append(sample.max() if side == "largest" else sample.min())
                     findings.append(_censored(label, side, count, len(sample), limits[-1]))
         for limit in limits:
-            exact[np.abs(y[:, j] - limit) <= steps[j] / 2, j] = np.nan
+            at_limit = np.abs(y[:, j] - limit) <= steps[j] / 2
+            exact[at_limit, j] = np.nan
     if chance_of_repeats(exact, steps, options.draws, options.seed) <= options.repeated:
         findings.append(_identical(identical_specimens(exact)))
     return tuple(findings)
@@ -370,7 +376,7 @@ def _identical(groups: tuple[tuple[int, ...], ...]) -> Finding:
     return Finding(
         "identical-specimens",
         f"got specimens {shown}{more} (counted from 0) with identical values of all outputs, "
-        "expected different ones; leave out copies, pass specimens= for repeated readings, or "
-        "rounded= for coarse ones",
+        "expected different ones; leave out copies, pass specimens= and error= for repeated "
+        "readings, or rounded= for coarse ones",
         "likelihood.md#identical-specimens",
     )

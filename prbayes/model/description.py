@@ -14,8 +14,13 @@ from pymc.printing import str_for_dist
 from pytensor.graph.basic import Variable
 from pytensor.graph.traversal import walk
 
+from prbayes.model.measurement import Measurement
 from prbayes.model.node import Node, nodes, response_name
-from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
+from prbayes.model.specimen_likelihood import (
+    SpecimenLikelihood,
+    measurements_of,
+    specimen_likelihoods,
+)
 from prbayes.response.inputs import Inputs, is_random
 
 # What is told of a variable and of a simulator.
@@ -38,6 +43,7 @@ def describe(model: pm.Model) -> dict[str, Any]:
     """
     known = known_variables(model)
     simulators = nodes(model)
+    measurements = measurements_of(model)
     likelihoods = specimen_likelihoods(model)
     variables = []
     for rv in model.free_RVs:
@@ -49,7 +55,7 @@ def describe(model: pm.Model) -> dict[str, Any]:
         if rv not in simulators and rv not in likelihoods:
             variables.append(_variable(rv, "observed", _distribution(rv, known)))
     described = [_simulator(node, known) for node in simulators.values()]
-    described += [_specimen_simulator(each, known) for each in likelihoods.values()]
+    described += [_specimen_simulator(m, likelihoods[rv], known) for rv, m in measurements.items()]
     return {"variables": variables, "simulators": described}
 
 
@@ -108,15 +114,17 @@ def _simulator(node: Node, known: Set[Any]) -> dict[str, str]:
     }
 
 
-def _specimen_simulator(likelihood: SpecimenLikelihood, known: Set[Any]) -> dict[str, str]:
+def _specimen_simulator(
+    measurement: Measurement, likelihood: SpecimenLikelihood, known: Set[Any]
+) -> dict[str, str]:
     return {
-        "name": likelihood.name,
-        "response": response_name(likelihood.responses.function),
-        "inputs": _arguments(likelihood.inputs, known),
-        "metric": without_addresses(likelihood.metric),
+        "name": measurement.name,
+        "response": response_name(measurement.responses.function),
+        "inputs": _arguments(measurement.inputs, known),
+        "metric": without_addresses(measurement.metric),
         "propagation": f"emulator of {len(likelihood.emulation.z)} runs",
         "n_points": str(len(likelihood.emulation.z)),
-        "specimens": _specimens(likelihood.specimens),
+        "specimens": _specimens(measurement.specimens),
     }
 
 

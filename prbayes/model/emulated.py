@@ -20,8 +20,13 @@ from scipy.special import logsumexp
 from prbayes._checks import AT_ONCE, Floats
 from prbayes.emulators.interpolant import fit_interpolant
 from prbayes.metrics.base import Metric
+from prbayes.model.measurement import Measurement
 from prbayes.model.node import Node, nodes
-from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
+from prbayes.model.specimen_likelihood import (
+    SpecimenLikelihood,
+    measurements_of,
+    specimen_likelihoods,
+)
 from prbayes.propagation.base import MAX_LOST, DesignError
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.new_specimens import new_specimens
@@ -58,6 +63,23 @@ _SIZES = EmulatedSizes()
 
 
 @dataclass(frozen=True, eq=False)
+class SomeOutputs:
+    """Some outputs of a surface."""
+
+    surface: Surface
+    columns: slice
+
+    def __call__(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian."""
+        values, jacobian = self.surface(z)
+        return values[:, self.columns], jacobian[:, self.columns]
+
+    def values(self, z: Floats) -> Floats:
+        """Return the values alone."""
+        return self.surface.values(z)[:, self.columns]
+
+
+@dataclass(frozen=True, eq=False)
 class EmulatedResponse:
     """A response between its runs, as a function of the inputs.
 
@@ -84,16 +106,19 @@ class EmulatedResponse:
     error: Floats
 
     @classmethod
-    def of_likelihood(cls, likelihood: SpecimenLikelihood) -> EmulatedResponse:
-        """Return the emulator of a likelihood; its first use computes the runs."""
+    def of_measurement(
+        cls, likelihood: SpecimenLikelihood, measurement: Measurement
+    ) -> EmulatedResponse:
+        """Return the emulator of a simulator's outputs; its first use computes the runs."""
         emulation = likelihood.emulation
+        columns = likelihood.columns(measurement)
         return cls(
             likelihood.coordinates,
             emulation.z,
-            emulation.y,
-            emulation.surface,
-            likelihood.event,
-            emulation.error,
+            emulation.y[:, columns],
+            SomeOutputs(emulation.surface, columns),
+            measurement.event,
+            emulation.error[columns],
         )
 
     @classmethod
@@ -177,11 +202,14 @@ class EmulatedSimulator:
     Attributes
     ----------
     likelihood : SpecimenLikelihood
+    measurement : Measurement
+        What the simulator was given.
     place : int or None
         Index of the group; None without groups.
     """
 
     likelihood: SpecimenLikelihood
+    measurement: Measurement
     place: int | None = None
 
     is_emulated: ClassVar[Literal[True]] = True
@@ -192,7 +220,7 @@ class EmulatedSimulator:
     @property
     def has_specimens(self) -> bool:
         """Whether specimens of all populations are there without a run."""
-        return not self.likelihood.propagation.calls_response
+        return not self.likelihood.calls_response
 
     @property
     def runs_per_theta(self) -> int:
@@ -204,8 +232,8 @@ class EmulatedSimulator:
         """Name of the simulator, such as 'y', or 'y[Adler]' of a group."""
         groups = self.inputs.groups
         if groups is None or self.place is None:
-            return self.likelihood.name
-        return groups.name(self.likelihood.name, self.place)
+            return self.measurement.name
+        return groups.name(self.measurement.name, self.place)
 
     @property
     def group(self) -> str:
@@ -215,49 +243,49 @@ class EmulatedSimulator:
 
     @cached_property
     def rows(self) -> NDArray[np.intp]:
-        """Which of the likelihood's specimens these are, (N,)."""
-        groups = self.likelihood.groups
+        """Which of the simulator's rows these are, (N,)."""
+        groups = self.measurement.groups
         if groups is None:
-            return np.arange(len(self.likelihood.observed))
+            return np.arange(len(self.measurement.observed))
         return np.flatnonzero(groups == self.place)
 
     @property
     def observed(self) -> Floats:
         """Measured responses, (N,) or (N, m)."""
-        return self.likelihood.observed[self.rows]
+        return self.measurement.observed[self.rows]
 
     @property
     def weights(self) -> Floats:
         """Weights of the specimens, (N,), which sum to one."""
-        weights = self.likelihood.weights
+        weights = self.measurement.weights
         factors = np.ones(len(self.rows)) if weights is None else weights[self.rows]
         return np.asarray(factors / factors.sum())
 
     @property
     def specimens(self) -> NDArray[Any] | None:
         """Labels, (N,), or None."""
-        labels = self.likelihood.specimens
+        labels = self.measurement.specimens
         return None if labels is None else labels[self.rows]
 
     @property
     def metric(self) -> Metric:
         """The log-likelihood by specimen."""
-        return self.likelihood.metric
+        return self.measurement.metric
 
     @property
     def inputs(self) -> Inputs:
         """The inputs of the response."""
-        return self.likelihood.inputs
+        return self.measurement.inputs
 
     @property
     def responses(self) -> Responses:
         """The response, and how it is called."""
-        return self.likelihood.responses
+        return self.measurement.responses
 
     @property
     def outputs(self) -> Outputs:
         """The outputs of a run."""
-        return self.likelihood.outputs
+        return self.measurement.outputs
 
     @property
     def n_specimens(self) -> float:
@@ -271,7 +299,7 @@ class EmulatedSimulator:
 
     @cached_property
     def _emulated(self) -> EmulatedResponse:
-        return EmulatedResponse.of_likelihood(self.likelihood)
+        return EmulatedResponse.of_measurement(self.likelihood, self.measurement)
 
     def emulator(self, responses: Responses) -> EmulatedResponse:
         """Return a response of the same inputs as a function of them.
@@ -292,7 +320,7 @@ class EmulatedSimulator:
         specimens, _ = new_specimens(self.name, self.inputs, list(roots), _SIZES.specimens, rng)
         count = len(roots[0])
         flat = [x.reshape(count * _SIZES.specimens, *x.shape[2:]) for x in specimens]
-        values = self._emulated(flat).reshape(count, _SIZES.specimens, *self.likelihood.event)
+        values = self._emulated(flat).reshape(count, _SIZES.specimens, *self.measurement.event)
         return values, np.full((count, _SIZES.specimens), 1 / _SIZES.specimens)
 
 
@@ -302,12 +330,12 @@ type PopulationSimulator = Node | EmulatedSimulator
 def emulated_simulators(model: pm.Model) -> list[EmulatedSimulator]:
     """Return the simulators with a likelihood by specimen, one by one for groups with specimens."""
     result = []
-    for likelihood in specimen_likelihoods(model).values():
-        if likelihood.groups is None:
-            result.append(EmulatedSimulator(likelihood))
-        else:
-            places = np.unique(likelihood.groups).tolist()
-            result += [EmulatedSimulator(likelihood, place) for place in places]
+    likelihoods = specimen_likelihoods(model)
+    for rv, measurement in measurements_of(model).items():
+        places: list[int | None] = [None]
+        if measurement.groups is not None:
+            places = np.unique(measurement.groups).tolist()
+        result += [EmulatedSimulator(likelihoods[rv], measurement, place) for place in places]
     return result
 
 

@@ -20,6 +20,7 @@ from prbayes._checks import AT_ONCE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import PopulationSimulator, emulated_simulators
 from prbayes.model.hyperparameters import Hyperparameters
+from prbayes.model.measurement import Measurement
 from prbayes.model.node import (
     Node,
     log_kernel,
@@ -27,13 +28,19 @@ from prbayes.model.node import (
     priors_alone,
     without_epsilon_warning,
 )
-from prbayes.model.specimen_likelihood import require_simulator, specimen_likelihoods
+from prbayes.model.specimen_likelihood import (
+    SpecimenLikelihood,
+    measurements_of,
+    require_simulator,
+    specimen_likelihoods,
+)
 from prbayes.propagation.base import Bound
 from prbayes.propagation.cloud import CLOUD
 from prbayes.propagation.reweighted import Design
 from prbayes.response.budget import budget
 from prbayes.response.compilation import compile_batched, compiled, ninf_for_invalid, untraced
 from prbayes.response.grouping import is_group
+from prbayes.response.inputs import Inputs
 
 # Points of a design from which on an eighth of them serve on the way to an answer: those of the
 # smallest cloud.
@@ -75,6 +82,8 @@ class Evaluator:
     nodes : list of Node
         The simulators with a metric of distributions.
     likelihoods : list of SpecimenLikelihood
+        The log-likelihoods by specimen, one for simulators with common specimens.
+    measurements : list of Measurement
         The simulators with a log-likelihood by specimen.
     emulated : list of EmulatedSimulator
         The populations of these, by group.
@@ -89,7 +98,8 @@ class Evaluator:
         self.nodes: list[Node] = list(by_variable.values())
         self._variables = list(by_variable)
         # Simulators with a likelihood by specimen: ordinary observed variables.
-        self.likelihoods = list(specimen_likelihoods(model).values())
+        self.likelihoods = list(dict.fromkeys(specimen_likelihoods(model).values()))
+        self.measurements = list(measurements_of(model).values())
         self.emulated = emulated_simulators(model)
         # Compiled, by what they were asked for; they live as long as this evaluator.
         self._objectives: dict[tuple[bool, bool], Any] = {}
@@ -152,12 +162,16 @@ class Evaluator:
     def n_responses(self) -> int:
         """Scalar responses computed so far; those that several simulators share count once."""
         by_metric = self._once([node.bound.responses.count for node in self.nodes])
-        return by_metric + sum(each.responses.count for each in self.likelihoods)
+        return by_metric + sum(m.responses.count for m in self.measurements)
 
     @property
     def n_runs(self) -> int:
         """Runs of all designs; those that several simulators share count once."""
         return self._once([0 if n.design is None else n.design.n_runs for n in self.nodes])
+
+    def likelihood_of(self, measurement: Measurement) -> SpecimenLikelihood:
+        """Return the log-likelihood of a simulator's specimens."""
+        return next(joint for joint in self.likelihoods if measurement in joint.measurements)
 
     @property
     def simulators(self) -> list[PopulationSimulator]:
@@ -229,7 +243,10 @@ class Evaluator:
         return np.array(np.broadcast_to(found, len(thetas)))
 
     def specimen_log_likelihoods(self, thetas: Floats) -> dict[str, Floats]:
-        """Return log p(y_i | theta) by simulator, shapes (P, N), of those with a likelihood."""
+        """Return log p(y_i | theta) by simulator, shapes (P, S), of those with a likelihood.
+
+        Of simulators with common specimens the last has those of all, and the others have none.
+        """
         if not self.likelihoods:
             return {}
         rows = max(1, AT_ONCE // max(each.points.log_a.size for each in self.likelihoods))
@@ -237,20 +254,27 @@ class Evaluator:
             self._evaluate_specimens(np.ascontiguousarray(thetas[first : first + rows]))
             for first in range(0, len(thetas), rows)
         ]
-        names = [each.name for each in self.likelihoods]
-        joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
-        return dict(zip(names, joined, strict=True))
+        result = {m.name: np.empty((len(thetas), 0)) for m in self.measurements}
+        for likelihood, columns in zip(self.likelihoods, zip(*parts, strict=True), strict=True):
+            result[likelihood.measurements[-1].name] = np.concatenate(columns)
+        return result
 
-    def specimen_params(self, thetas: Floats, k: int) -> list[Floats]:
+    def specimen_params(self, thetas: Floats, k: int) -> dict[Any, Floats]:
         """Return the variables of the k-th likelihood by specimen at thetas, shapes (P, *shape)."""
         values = self.constrained(thetas)
-        return [values[str(v.name)] for v in self.likelihoods[k].variables if not is_group(v)]
+        variables = self.likelihoods[k].variables()
+        return {v: values[str(v.name)] for v in variables if not is_group(v)}
 
     @cached_property
     def _evaluate_specimens(self) -> Any:
-        variables = list(specimen_likelihoods(self.model))
-        graphs = self.model.logp(vars=variables, sum=False)
-        return self.hyperparameters.compile(graphs)
+        return self.hyperparameters.compile(self.specimen_graphs())
+
+    def specimen_graphs(self) -> list[Any]:
+        """Return the graphs of the log-likelihoods of the specimens, by likelihood, (S,)."""
+        last = {joint.measurements[-1]: k for k, joint in enumerate(self.likelihoods)}
+        variables = {v: last[m] for v, m in measurements_of(self.model).items() if m in last}
+        graphs = self.model.logp(vars=sorted(variables, key=variables.__getitem__), sum=False)
+        return list(graphs)
 
     def discrepancies(self, thetas: Floats, k: int, target: Discrepancy | None = None) -> Floats:
         """Return the k-th simulator's discrepancies, shape (P,), or those from another target."""
@@ -429,10 +453,14 @@ class Evaluator:
     def _emulated_roots(self, thetas: Floats, k: int) -> list[Floats]:
         """Return the roots of a simulator whose responses are emulated, its group among them."""
         simulator = self.emulated[k - len(self.nodes)]
+        return self.roots_of(thetas, simulator.inputs, simulator.place)
+
+    def roots_of(self, thetas: Floats, inputs: Inputs, place: int | None) -> list[Floats]:
+        """Return the roots of inputs in the group with this index, shapes (P, *shape)."""
         values = self.constrained(thetas)
         return [
-            np.full(len(thetas), simulator.place) if is_group(root) else values[str(root.name)]
-            for root in simulator.inputs.roots
+            np.full(len(thetas), place) if is_group(root) else values[str(root.name)]
+            for root in inputs.roots
         ]
 
     @cached_property

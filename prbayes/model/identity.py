@@ -29,8 +29,9 @@ from prbayes.model.description import (
     without_addresses,
 )
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.measurement import Measurement
 from prbayes.model.node import Node, nodes
-from prbayes.model.specimen_likelihood import SpecimenLikelihood, specimen_likelihoods
+from prbayes.model.specimen_likelihood import measurements_of, specimen_likelihoods
 from prbayes.response.compilation import interpreted
 from prbayes.response.inputs import Inputs
 
@@ -160,7 +161,7 @@ def identity_of(evaluator: Evaluator, *, prior_minimised: bool | None = None) ->
         free = node.bound.stored
         discrepancies = evaluator.discrepancies(thetas, k) if free else np.empty(0)
         simulators.append(_simulator(node, discrepancies))
-    simulators += map(_specimen_simulator, evaluator.likelihoods)
+    simulators += map(_specimen_simulator, evaluator.measurements)
     return _identity(
         evaluator.model,
         simulators,
@@ -179,7 +180,7 @@ def identity_of_model(model: pm.Model) -> Identity:
     """
     found = nodes(model).values()
     simulators = [_simulator(node, np.empty(0)) for node in found]
-    simulators += map(_specimen_simulator, specimen_likelihoods(model).values())
+    simulators += map(_specimen_simulator, measurements_of(model).values())
     shapes = {}
     for rv in model.free_RVs:
         value = model.rvs_to_values[rv]
@@ -228,20 +229,20 @@ def _simulator(node: Node, discrepancies: Floats) -> SimulatorIdentity:
     )
 
 
-def _specimen_simulator(likelihood: SpecimenLikelihood) -> SimulatorIdentity:
+def _specimen_simulator(measurement: Measurement) -> SimulatorIdentity:
     """Return the identity of a simulator with a likelihood by specimen."""
-    observed = likelihood.observed
-    labels = [] if likelihood.specimens is None else likelihood.specimens.tolist()
-    weights = b"" if likelihood.weights is None else likelihood.weights.tobytes()
-    groups = b"" if likelihood.groups is None else likelihood.groups.tobytes()
+    observed = measurement.observed
+    labels = [] if measurement.specimens is None else measurement.specimens.tolist()
+    weights = b"" if measurement.weights is None else measurement.weights.tobytes()
+    groups = b"" if measurement.groups is None else measurement.groups.tobytes()
     return SimulatorIdentity(
-        name=likelihood.name,
+        name=measurement.name,
         data=_digest(observed.tobytes() + groups),
         weights=_digest(weights),
         specimens=_digest(repr(labels).encode()),
-        inputs=_inputs(likelihood.inputs),
-        metric=without_addresses(likelihood.metric),
-        propagation=without_addresses(likelihood.propagation),
+        inputs=_inputs(measurement.inputs),
+        metric=without_addresses(measurement.metric),
+        propagation=without_addresses(measurement.propagation),
         n_points=0,
         batches=1,
         epsilon=1.0,

@@ -13,8 +13,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.measurement import Measurement
 from prbayes.model.node import Node
-from prbayes.model.specimen_likelihood import SpecimenLikelihood
 from prbayes.response.outputs import Outputs
 
 
@@ -71,7 +71,7 @@ def failures_dataset(evaluator: Evaluator) -> xr.Dataset:
     each = []
     instead = []
     responses = [(node.name, node.bound.responses) for node in evaluator.nodes]
-    responses += [(simulator.name, simulator.responses) for simulator in evaluator.likelihoods]
+    responses += [(simulator.name, simulator.responses) for simulator in evaluator.measurements]
     for name, response in responses:
         each += [(name, failure) for failure in response.failed]
         instead += [response.replacement] * len(response.failed)
@@ -94,7 +94,7 @@ def failures_dataset(evaluator: Evaluator) -> xr.Dataset:
 def observed_dataset(evaluator: Evaluator) -> xr.Dataset:
     """Return the observed responses of all simulators, labelled; several outputs by their names."""
     observed = {node.name: node.target.observed for node in evaluator.nodes}
-    observed |= {each.name: each.observed for each in evaluator.likelihoods}
+    observed |= {m.name: m.observed for m in evaluator.measurements}
     return labelled_responses(evaluator, observed)
 
 
@@ -107,7 +107,7 @@ def labelled_responses(
     """
     sizes = dict(zip(("chain", "draw"), leading, strict=False))
     data = labelled(evaluator, values, sizes)
-    simulators: list[Node | SpecimenLikelihood] = [*evaluator.nodes, *evaluator.likelihoods]
+    simulators: list[Node | Measurement] = [*evaluator.nodes, *evaluator.measurements]
     for simulator in simulators:
         if simulator.name not in values:
             continue

@@ -21,6 +21,7 @@ from prbayes._checks import AT_ONCE, Floats
 from prbayes.model.hyperparameters import Hyperparameters
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.points import sobol
+from prbayes.propagation.response_share import ResponseShare
 from prbayes.response.distributions import PopulationSampler, compiled_log_density
 from prbayes.response.grouping import is_group
 from prbayes.response.inputs import Inputs
@@ -67,31 +68,92 @@ class Populations:
             for root in self.inputs.roots
         ]
 
-    def log_likelihoods(self, thetas: Floats, z: Floats, log_a: Floats) -> Floats:
-        """Return log p(y_i | theta), (S, N), from points (N, K, d) and their numbers (N, K)."""
-        n, count, _ = z.shape
-        weights = log_a + self.coordinates.log_jacobian(z)
+    def log_likelihoods(
+        self, thetas: Floats, z: Floats, log_a: Floats, smoothing: Floats | None = None
+    ) -> Floats:
+        """Return log p(y_i | theta), (S, N), from points (N, K, d) and their numbers (N, K).
+
+        With `smoothing`, a covariance (d, d), populations are normal with the moments of the
+        coordinates z, and wider by it: points that lie farther apart than a population is wide
+        have a smooth log-likelihood.
+        """
+        n, count, d = z.shape
         x = self.coordinates.inputs(z)
+        weights = log_a if smoothing is not None else log_a + self.coordinates.log_jacobian(z)
         result = np.empty((len(thetas), n))
         groups = np.zeros(n, dtype=np.intp) if self.groups is None else self.groups
         for group in np.unique(groups):
             rows = np.flatnonzero(groups == group)
-            flat = [np.ascontiguousarray(v[rows].reshape(-1, *v.shape[2:])) for v in x]
+            of_rows = [v[rows] for v in x]
+            flat = [np.ascontiguousarray(v.reshape(-1, *v.shape[2:])) for v in of_rows]
             step = max(1, AT_ONCE // (len(rows) * count))
             for first in range(0, len(thetas), step):
                 some = slice(first, first + step)
                 roots = self._roots(thetas[some], int(group))
-                with np.errstate(all="ignore"):
-                    (logs,) = self._log_density(*roots, *flat)
-                logs = np.nan_to_num(logs, nan=-np.inf).reshape(-1, len(rows), count)
+                if smoothing is not None:
+                    logs = self._normal_log_density(roots, z[rows].reshape(-1, d), smoothing)
+                else:
+                    with np.errstate(all="ignore"):
+                        (logs,) = self._log_density(*roots, *flat)
+                logs = np.where(np.isnan(logs), -np.inf, logs)
+                logs = logs.reshape(-1, len(rows), count)
                 result[some, rows] = logsumexp(logs + weights[rows], axis=2)
         return result
 
-    def posterior(self, z: Floats, log_a: Floats, seed: int = 0) -> PopulationDraws:
+    def prior_specimens(self) -> Floats:
+        """Return coordinates of specimens of the prior predictive population, (n, d)."""
+        return specimens_of(self, self.hyperparameters.prior_thetas(2048, 0), 1)
+
+    def log_share(self, thetas: Floats, share: ResponseShare, size: int) -> Floats:
+        """Return log S of the population of each of N specimens, summed over them, (S,)."""
+        groups = np.zeros(size, dtype=np.intp) if self.groups is None else self.groups
+        x = self.coordinates.inputs(share.z)
+        result = np.zeros(len(thetas))
+        step = max(1, AT_ONCE // len(share.z))
+        for group, count in zip(*np.unique(groups, return_counts=True), strict=True):
+            for first in range(0, len(thetas), step):
+                some = slice(first, first + step)
+                with np.errstate(all="ignore"):
+                    (log_p,) = self._log_density(*self._roots(thetas[some], int(group)), *x)
+                log_p = np.nan_to_num(log_p, nan=-np.inf) + self.coordinates.log_jacobian(share.z)
+                result[some] += count * share.log_share(log_p)
+        return result
+
+    def _normal_log_density(
+        self, roots: Sequence[Floats], z: Floats, smoothing: Floats, specimens: int = 256
+    ) -> Floats:
+        """Return the log-density of points (n, d) in smoothed normal populations, (S, n)."""
+        drawn, _ = self._sampler(roots, specimens, np.random.default_rng(0))
+        sample = self.coordinates.of(drawn, 2)
+        mean = sample.mean(axis=1, keepdims=True)
+        centred = sample - mean
+        root = np.linalg.cholesky(centred.swapaxes(1, 2) @ centred / specimens + smoothing)
+        standard = (z - mean) @ np.linalg.inv(root).swapaxes(1, 2)
+        log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1, keepdims=True)
+        constant = z.shape[1] / 2 * np.log(2 * np.pi)
+        return np.asarray(-0.5 * (standard**2).sum(axis=2) - log_det - constant)
+
+    def posterior(
+        self,
+        z: Floats,
+        log_a: Floats,
+        smoothing: Floats | None = None,
+        share: ResponseShare | None = None,
+        seed: int = 0,
+    ) -> PopulationDraws:
         """Return draws of the posterior of the hyperparameters given points of the specimens.
 
         Weights are tempered until their effective sample size is ten times the number of
         hyperparameters, so that a few draws do not decide the next proposal.
+
+        Parameters
+        ----------
+        z, log_a : ndarray, shapes (N, K, d) and (N, K)
+        smoothing : ndarray, shape (d, d), optional
+            As in `log_likelihoods`.
+        share : ResponseShare, optional
+            Points of the share of a population that has a response.
+        seed : int
         """
         names = self.hyperparameters
         d = names.size
@@ -101,8 +163,10 @@ class Populations:
             inside = np.isfinite(prior)
             total = np.full(len(thetas), -np.inf)
             if inside.any():
-                likelihood = self.log_likelihoods(thetas[inside], z, log_a).sum(axis=1)
-                total[inside] = prior[inside] + likelihood
+                logs = self.log_likelihoods(thetas[inside], z, log_a, smoothing)
+                total[inside] = prior[inside] + logs.sum(axis=1)
+                if share is not None:
+                    total[inside] -= self.log_share(thetas[inside], share, len(z))
             return total
 
         thetas = names.prior_points(2048, seed)
@@ -114,7 +178,8 @@ class Populations:
             covariance = (away.T * weights) @ away + 1e-12 * np.diag(names.prior_sd**2)
             root = np.linalg.cholesky(1.2 * covariance)
             u = sobol(1024, d + 1, seed + 1 + attempt)
-            standard = ndtri(u[:, :d]) * np.sqrt(5 / chdtri(5, u[:, d]))[:, None]
+            radius = np.sqrt(5 / chdtri(5, u[:, d]))
+            standard = ndtri(u[:, :d]) * radius[:, None]
             thetas = mean + standard @ root.T
             log_proposal = -(5 + d) / 2 * np.log1p((standard**2).sum(axis=1) / 5)
             weights, temper = _tempered(log_posterior(thetas) - log_proposal, 10 * d)
@@ -122,7 +187,7 @@ class Populations:
                 break
         rng = np.random.default_rng([seed, 5])
         chosen = thetas[rng.choice(len(thetas), 256, p=weights)]
-        return PopulationDraws(self, chosen)
+        return PopulationDraws(self, chosen, len(z))
 
 
 def _tempered(log_weights: Floats, least: int) -> tuple[Floats, float]:
@@ -150,14 +215,21 @@ class PopulationDraws:
     ----------
     populations : Populations
     thetas : ndarray, shape (S, d)
+    size : int
+        Number of measured specimens.
     """
 
     populations: Populations
     thetas: Floats
+    size: int
 
     def log_likelihoods(self, z: Floats, log_a: Floats, draws: int = 32) -> Floats:
         """Return log p(y_i | theta) at some of the draws, (draws, N)."""
         return self.populations.log_likelihoods(self.thetas[:draws], z, log_a)
+
+    def log_share(self, share: ResponseShare) -> Floats:
+        """Return the sum over the specimens of log S, the log share with a response, (S,)."""
+        return self.populations.log_share(self.thetas, share, self.size)
 
     def specimens(self, each: int = 16, seed: int = 0) -> Floats:
         """Return coordinates of specimens of all groups and draws, (n, d)."""

@@ -92,6 +92,11 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
                 "response that depends on its inputs; check the response, or leave the output out"
             )
         values = readings.values[np.isfinite(readings.values[:, j]), j]
+        if not values.size and readings.is_censored[:, j].any():
+            raise DesignError(
+                f"{name}: got no reading of {output} within the limits of censored=, expected at "
+                "least one; leave the output out, or check the limits"
+            )
         beyond = np.maximum(values - high[j], low[j] - values)
         if values.size and (beyond > width).all():
             raise DesignError(
@@ -105,10 +110,12 @@ def refuse_unreachable(name: str, outputs: Floats, readings: Readings) -> None:
 def unreached(outputs: Floats, readings: Readings) -> str:
     """Return a sentence about readings outside the range of the runs; empty if most are inside."""
     finite = outputs[np.isfinite(outputs).all(axis=1)]
+    if not len(finite):
+        return ""
     with np.errstate(invalid="ignore"):
         outside = (readings.values < finite.min(axis=0)) | (readings.values > finite.max(axis=0))
     count = int(outside.any(axis=1).sum())
-    if not len(finite) or 2 * count <= len(readings):
+    if 2 * count <= len(readings):
         return ""
     return (
         f". The readings of {count} of {len(readings)} specimens are outside the range of all "
@@ -219,10 +226,7 @@ def emulator_findings(
         In robust standard deviations of the readings. Jumps, poles and crossing modes with less
         have posterior means within .1 standard deviations (33 data sets, one of them .15).
     """
-    low, high = np.nanquantile(readings.values, [0.25, 0.75], axis=0)
-    scatter = (high - low) / 1.349
-    scatter = np.where(scatter > 0, scatter, readings.spread())
-    share = error / scatter
+    share = error / readings.robust_spread()
     if not (share > largest).any():
         return ()
     return (
@@ -233,5 +237,6 @@ def emulator_findings(
             "in the range of the priors, or more detail than the runs; posterior means may be off "
             "by more than .1 standard deviations. Narrow the priors, give more first runs with "
             "propagation=prb.Reweighted(n), or use metric=prb.ProbabilityResidual()",
+            "likelihood.md#emulator-error",
         ),
     )

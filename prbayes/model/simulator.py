@@ -31,6 +31,7 @@ from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.metrics.likelihood import LogLikelihood
 from prbayes.model.costing import Asked, SpecimenRuns, listening, with_points
 from prbayes.model.first_look import tell_copies
+from prbayes.model.measurement import Measurement
 from prbayes.model.node import (
     AnySimulator,
     SimulatorDistribution,
@@ -45,7 +46,8 @@ from prbayes.model.node import (
 from prbayes.model.specimen_likelihood import (
     SpecimenDistribution,
     SpecimenLikelihood,
-    reference_error,
+    measurements_of,
+    set_likelihood,
     specimen_likelihoods,
 )
 from prbayes.propagation.base import Propagation, refuse_nested
@@ -113,9 +115,11 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         Weights of the observed responses.
     specimens : array_like, shape (N,), optional
         Labels of the specimens. Observations with the same label, also of several simulators,
-        belong together: data sets are drawn specimen by specimen. Each simulator's default epsilon
-        counts its specimens, so that those that several share count several times under
-        `pymc.sample`, until `calibrate_epsilon` corrects for it; a warning says so.
+        belong together: data sets are drawn specimen by specimen. With a metric of distributions
+        each simulator's default epsilon counts its specimens, so that those that several share
+        count several times under `pymc.sample`, until `calibrate_epsilon` corrects for it; a
+        warning says so. With `LogLikelihood` observations of a specimen share its inputs, and the
+        last simulator has the log-likelihoods of all specimens.
     dims : str or sequence of str, optional
         Names of the observed dimensions.
     propagation : Propagation, optional
@@ -235,21 +239,15 @@ def _by_specimen(
     labels = (
         None if specimens is None else sample_labels(specimens, len(values), f"{name}: specimens")
     )
-    _refuse_shared_specimens(name, labels, model)
+    partners = _with_common_specimens(name, labels, model)
+    inputs = _inputs_of_partners(name, inputs, partners)
     factors = None
     if weights is not None:
         factors = sample_weights(weights, len(values), f"{name}: weights") * len(values)
-    extras = _measurement_variables(name, model, metric)
-    try:
-        rows = values.reshape(len(values), -1)
-        readings = metric.readings(rows, reference_error(extras), values.shape[1:])
-    except ValueError as error:
-        raise ValueError(f"{name}: metric: {error}") from None
-    likelihood = SpecimenLikelihood(
+    measurement = Measurement(
         name,
         metric,
         values,
-        readings,
         factors,
         labels,
         inputs,
@@ -257,12 +255,12 @@ def _by_specimen(
         settings,
         outputs,
         groups,
-        extras,
-        weakref.ref(model),
+        _measurement_variables(name, model, metric, partners),
     )
+    likelihood = _likelihood(measurement, partners, model)
     asked = listening()
     if asked is not None:
-        asked.append(SpecimenRuns(likelihood))
+        asked.append(SpecimenRuns(likelihood, measurement))
         return pt.as_tensor(values, name=name)
     data: Any = values
     if isinstance(observed, Variable):
@@ -270,48 +268,132 @@ def _by_specimen(
     elif np.isnan(values).any():
         # As a constant, in which PyMC does not look for missing values to impute.
         data = pt.constant(values)
-    params = [pt.constant(groups) if is_group(v) else v for v in likelihood.variables]
-    return SpecimenDistribution(
+    joined = [rv for rv, joint in specimen_likelihoods(model).items() if joint in partners]
+    simulators = tuple(m.name for m in likelihood.measurements)
+    named = [rv.name for rv in joined if model.named_vars_to_dims.get(rv.name)]
+    if likelihood.labels is not None and (named or dims is not None):
+        raise ValueError(
+            f"{name}: dims: got dimensions of {(named or [name])[0]}, whose specimens have several "
+            "readings, expected none: log-likelihoods are by specimen; leave dims= out"
+        )
+    params = [pt.constant(groups) if is_group(v) else v for v in likelihood.variables(simulators)]
+    rv = SpecimenDistribution(
         name,
         *params,
+        *joined,
         likelihood=likelihood,
+        simulators=simulators,
         observed=data,
         dims=_checked_dims(name, dims, values.shape, model),
     )
+    for partner in joined:
+        set_likelihood(partner, likelihood)
+    return rv
 
 
-def _refuse_shared_specimens(name: str, labels: NDArray[Any] | None, model: pm.Model) -> None:
-    """Raise if a specimen has several readings of an output, or is in another simulator too."""
+def _with_common_specimens(
+    name: str, labels: NDArray[Any] | None, model: pm.Model
+) -> list[SpecimenLikelihood]:
+    """Return the likelihoods of a model with specimens of these labels."""
     if labels is None:
-        return
-    texts = [_read(label) for label in labels.tolist()]
-    repeated = sorted({text for text in texts if texts.count(text) > 1})
-    if repeated:
-        raise ValueError(
-            f"{name}: specimens: got the label {repeated[0]!r} several times, expected each once: "
-            "readings of one specimen share its inputs; pass observed= as (N, R), a row for each "
-            "specimen, with a response that returns the output R times, and error="
-        )
-    for other in (*simulators(model).values(), *specimen_likelihoods(model).values()):
-        own = [] if other.specimens is None else [_read(x) for x in other.specimens.tolist()]
-        shared = sorted(set(texts) & set(own))
-        if shared:
+        return []
+    by_metric = list(simulators(model).values())
+    measurements = list(measurements_of(model).values())
+    _refuse_alike_labels(name, labels, [*by_metric, *measurements])
+
+    def common(simulator: AnySimulator | Measurement) -> list[str]:
+        if simulator.specimens is None:
+            return []
+        return sorted(map(_read, set(labels.tolist()) & set(simulator.specimens.tolist())))
+
+    for simulator in by_metric:
+        if common(simulator):
             raise ValueError(
-                f"{name}: specimens: got {shared[0]!r}, which {other.name} has too, expected each "
-                "specimen in one simulator with prb.LogLikelihood(): return all outputs from one "
-                "response, and pass observed= as (N, m), with NaN where an output is missing"
+                f"{name}: specimens: got {common(simulator)[0]!r}, which {simulator.name} has too "
+                f"with {called(simulator.target.metric)}, expected each specimen by one kind of "
+                f"metric: pass metric=prb.LogLikelihood() to {simulator.name}, or the same metric "
+                f"to {name}"
             )
+    likelihoods = dict.fromkeys(specimen_likelihoods(model).values())
+    return [joint for joint in likelihoods if any(map(common, joint.measurements))]
+
+
+def _inputs_of_partners(
+    name: str, inputs: Inputs, partners: Sequence[SpecimenLikelihood]
+) -> Inputs:
+    """Return the inputs in the order of those of simulators with the same specimens."""
+    for partner in partners:
+        if set(inputs.aleatory) != set(partner.inputs.aleatory):
+            raise ValueError(
+                f"{name}: got other inputs than {partner.name}, which has the same specimens, "
+                "expected the same .dist() objects in both: a specimen has one value of each "
+                "input; pass all of them to both responses, also those that one does not use"
+            )
+        if partner.inputs.aleatory != partners[0].inputs.aleatory:
+            raise ValueError(
+                f"{name}: got specimens of {partners[0].name} and of {partner.name}, expected "
+                "these to have their inputs in the same order; reorder the arguments of one"
+            )
+    return inputs.ordered_as(partners[0].inputs) if partners else inputs
+
+
+def _likelihood(
+    measurement: Measurement, partners: Sequence[SpecimenLikelihood], model: pm.Model
+) -> SpecimenLikelihood:
+    """Return the likelihood of a simulator and of those with the same specimens.
+
+    Raises
+    ------
+    ValueError
+        If their measurements cannot be combined.
+    """
+    name = measurement.name
+    try:
+        _ = measurement.readings
+    except ValueError as error:
+        raise ValueError(f"{name}: metric: {error}") from None
+    joined = {m for partner in partners for m in partner.measurements}
+    earlier = [m for m in measurements_of(model).values() if m in joined]
+    likelihood = SpecimenLikelihood((*earlier, measurement), weakref.ref(model))
+    size = len(likelihood.readings)
+    if size < 2:
+        raise ValueError(f"{name}: specimens: got {size} specimen, expected at least 2")
+    weighted = [m.name for m in likelihood.measurements if m.weights is not None]
+    if weighted and size < sum(len(m.observed) for m in likelihood.measurements):
+        raise ValueError(
+            f"{name}: weights: got weights of {weighted[0]}, which has specimens with several "
+            "readings, expected none: a specimen has one weight; leave weights= out"
+        )
+    for m in earlier:
+        if m.propagation.calls_response != measurement.propagation.calls_response:
+            raise ValueError(
+                f"{name}: propagation: got {called(measurement.propagation)}, and "
+                f"{called(m.propagation)} in {m.name}, which has the same specimens, "
+                "expected the same kind in both"
+            )
+        if m.gross_errors != measurement.gross_errors:
+            raise ValueError(
+                f"{name}: metric: gross_errors: got {measurement.gross_errors}, and "
+                f"{m.gross_errors} in {m.name}, which has the same specimens, expected "
+                "the same in both: a specimen has a gross error in all of its readings or in none"
+            )
+    return likelihood
 
 
 def _measurement_variables(
-    name: str, model: pm.Model, metric: LogLikelihood
+    name: str, model: pm.Model, metric: LogLikelihood, partners: Sequence[SpecimenLikelihood]
 ) -> dict[str, TensorVariable]:
-    """Return the model variables of the measurement by their role; adds the one of gross errors."""
+    """Return the model variables of the measurement by their role; adds the one of gross errors.
+
+    Simulators with the same specimens have the same one.
+    """
     extras: dict[str, TensorVariable] = {}
     for role in ("error", "gross_errors"):
         value = getattr(metric, role)
         if role == "gross_errors" and value is True:
-            value = pm.Beta(f"{name}_gross_errors", 1, 9)
+            earlier = [p.measurements[0].extras.get(role) for p in partners]
+            value = next(iter(earlier), None)
+            value = pm.Beta(f"{name}_gross_errors", 1, 9) if value is None else value
         if not isinstance(value, Variable):
             continue
         if value not in (*model.free_RVs, *model.deterministics):
@@ -626,7 +708,9 @@ def _refuse_simulators(name: str, inputs: Inputs, model: pm.Model) -> None:
             )
 
 
-def _refuse_alike_labels(name: str, labels: NDArray[Any], others: list[AnySimulator]) -> None:
+def _refuse_alike_labels(
+    name: str, labels: NDArray[Any], others: Sequence[AnySimulator | Measurement]
+) -> None:
     """Raise where labels look the same and are not, as 1 and "1": they would be two specimens."""
     seen: dict[str, tuple[str, object]] = {}
     labelled = [(other.name, other.specimens) for other in others]

@@ -139,7 +139,7 @@ def _evaluator_of(optimum: Optimum, model: pm.Model | None) -> Evaluator:
         return optimum.evaluator
     require_of_model(optimum, model, "plot_landscape", Level.POPULATIONS)
     evaluator = Evaluator(model)
-    simulators = [node.name for node in evaluator.nodes or evaluator.likelihoods]
+    simulators = [node.name for node in evaluator.nodes or evaluator.measurements]
     expected = list(optimum.scales)
     if evaluator.names != optimum.names or simulators != expected:
         raise ValueError(

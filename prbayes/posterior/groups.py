@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -105,11 +106,16 @@ def specimen_groups(
     prior = evaluator.prior_thetas(draws, int(rng.integers(2**31)))
     values = evaluator.specimen_log_likelihoods(thetas.reshape(-1, d))
     observed = observed_dataset(evaluator)
-    log_likelihood = {
-        name: (["chain", "draw", observed[name].dims[0]], value.reshape(chains, draws, -1))
-        for name, value in values.items()
-    }
-    coords = {"chain": np.arange(chains), "draw": np.arange(draws)}
+    coords: dict[str, Any] = {"chain": np.arange(chains), "draw": np.arange(draws)}
+    log_likelihood = {}
+    for likelihood in evaluator.likelihoods:
+        name = likelihood.measurements[-1].name
+        dim = str(observed[name].dims[0])
+        if likelihood.labels is not None:  # by specimen, not by reading
+            dim = f"{name}_specimen"
+            coords[dim] = likelihood.labels
+        value = values[name].reshape(chains, draws, -1)
+        log_likelihood[name] = (["chain", "draw", dim], value)
     groups = {
         "prior": _variables(evaluator, prior[None]),
         "log_prior": _log_prior(evaluator, thetas),
@@ -126,8 +132,9 @@ def _emulated(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) ->
     drawn = {}
     for k, likelihood in enumerate(evaluator.likelihoods):
         params = evaluator.specimen_params(thetas.reshape(-1, d), k)
-        values = likelihood.draws(rng, params, len(likelihood.observed))
-        drawn[likelihood.name] = values.reshape(chains, draws, *values.shape[1:])
+        for measurement in likelihood.measurements:
+            values = likelihood.draws(rng, params, len(measurement.observed), measurement)
+            drawn[measurement.name] = values.reshape(chains, draws, *values.shape[1:])
     return labelled_responses(evaluator, drawn, (chains, draws))
 
 

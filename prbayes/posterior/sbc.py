@@ -220,7 +220,7 @@ def _one(evaluator: Evaluator, job: _Job, rng: np.random.Generator) -> dict[str,
         data = fresh_data(evaluator, theta, rng)
     for k, likelihood in enumerate(evaluator.likelihoods):
         params = evaluator.specimen_params(theta[None], k)
-        pools.append(specimen_pool(likelihood, params, rng, size=len(likelihood.observed)))
+        pools.append(specimen_pool(likelihood, params, rng, size=len(likelihood.readings)))
     draws_seed = int(rng.integers(2**31))
     adjust = job.adjust
     if isinstance(adjust, Affine):  # the same refits for all data sets would err alike

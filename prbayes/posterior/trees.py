@@ -236,9 +236,13 @@ def _calibration(
         return by_metric
     by_specimen = _by_specimen(evaluator, thetas, by_metric)
     return xr.concat(
-        [by_metric, by_specimen], "simulator", data_vars="minimal", coords="minimal",
-        compat="override", join="outer",
-    )  # fmt: skip
+        [by_metric, by_specimen],
+        "simulator",
+        data_vars="minimal",
+        coords="minimal",
+        compat="override",
+        join="outer",
+    )
 
 
 def _by_specimen(evaluator: Evaluator, thetas: Floats, beside: xr.Dataset) -> xr.Dataset:
@@ -247,16 +251,17 @@ def _by_specimen(evaluator: Evaluator, thetas: Floats, beside: xr.Dataset) -> xr
     Minus the log-likelihood is the discrepancy, with an epsilon of one.
     """
     chains, draws, d = thetas.shape
-    likelihoods = evaluator.likelihoods
+    measurements = evaluator.measurements
+    likelihoods = [evaluator.likelihood_of(m) for m in measurements]
     values = evaluator.specimen_log_likelihoods(thetas.reshape(-1, d))
-    names = [likelihood.name for likelihood in likelihoods]
+    names = [m.name for m in measurements]
     discrepancies = np.stack([-values[name].sum(axis=1) for name in names], axis=-1)
     runs = [len(likelihood.emulation.z) for likelihood in likelihoods]
     known: dict[str, Any] = {
         "discrepancy": (_EACH_DRAW, discrepancies.reshape(chains, draws, -1)),
         "epsilon": ("simulator", np.ones(len(names))),
         "max_lost": ("simulator", np.full(len(names), MAX_LOST)),
-        "metric": ("simulator", [without_addresses(each.metric) for each in likelihoods]),
+        "metric": ("simulator", [without_addresses(m.metric) for m in measurements]),
         "compared": ("simulator", [""] * len(names)),
         "propagation": ("simulator", [f"emulator of {count} runs" for count in runs]),
         "n_points": ("simulator", [each.points.log_a.size for each in likelihoods]),

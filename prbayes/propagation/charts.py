@@ -55,7 +55,8 @@ class ReferencePopulation:
         ValueError
             If the covariance is singular.
         """
-        weights = np.full(len(x), 1 / len(x)) if weights is None else weights / weights.sum()
+        weights = np.ones(len(x)) if weights is None else weights
+        weights = weights / weights.sum()
         mean = weights @ x
         centred = x - mean
         covariance = (centred.T * weights) @ centred
@@ -73,6 +74,11 @@ class ReferencePopulation:
     def inputs(self, z: Floats) -> Floats:
         """Return the inputs (..., d) at whitened inputs (..., d)."""
         return self.mean + z @ self.root.T
+
+    def wider(self, covariance: Floats) -> ReferencePopulation:
+        """Return the population whose covariance is larger by a matrix (d, d)."""
+        total = self.root @ self.root.T + covariance
+        return ReferencePopulation(self.mean, np.linalg.cholesky(total))
 
     def with_errors(self, outputs: int) -> ReferencePopulation:
         """Return the population of inputs and standard normal reading errors, of d + m inputs.
@@ -252,7 +258,8 @@ class Charts:
         self, fibres: Fibres, specimen: Indices, slot: Indices, u: Floats
     ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         """Return the points at free coordinates u, (n, d - m), as `Fibres.solve` does."""
-        start = self.centre[specimen, slot] + (self.free[specimen, slot] @ u[..., None])[..., 0]
+        along = self.free[specimen, slot] @ u[..., None]
+        start = self.centre[specimen, slot] + along[..., 0]
         return fibres.solve(specimen, start, self.solved[specimen, slot])
 
     def coordinates(self, specimen: Indices, slot: Indices, z: Floats) -> Floats:
@@ -303,14 +310,18 @@ class Charts:
             rows = np.flatnonzero(self.share[specimen, c] > 0)
             i, j = specimen[rows], np.full(len(rows), c)
             u[rows, c] = self.coordinates(i, j, z[rows])
-            scaled = inverse[i, c] @ (u[rows, c] - self.location[i, c])[..., None]
+            away = u[rows, c] - self.location[i, c]
+            scaled = inverse[i, c] @ away[..., None]
             distance = (scaled[..., 0] ** 2).sum(axis=1)
             with np.errstate(divide="ignore"):
-                log_det = np.log(np.abs(np.linalg.det(jacobian[rows] @ self.solved[i, c])))
-            log_t = constant[i, c] - (Charts.degrees + k) / 2 * np.log1p(distance / Charts.degrees)
+                projected = jacobian[rows] @ self.solved[i, c]
+                log_det = np.log(np.abs(np.linalg.det(projected)))
+            exponent = (Charts.degrees + k) / 2
+            log_t = constant[i, c] - exponent * np.log1p(distance / Charts.degrees)
             terms[rows, c] = log_t + log_det
         # Only charts whose term matters need the check that they reach the point.
-        terms[terms < terms[np.arange(n), slot][:, None] - 10] = -np.inf
+        nearest = terms[np.arange(n), slot]
+        terms[terms < nearest[:, None] - 10] = -np.inf
         for c in range(charts):
             rows = np.flatnonzero((terms[:, c] > -np.inf) & (slot != c))
             j = np.full(len(rows), c)
@@ -354,7 +365,8 @@ def charts_at_modes(fibres: Fibres, starts: int, charts: int) -> Charts:
     specimen = np.repeat(np.arange(n), starts)
     z = _levenberg_marquardt(fibres, specimen, np.tile(first, (n, 1)))
     z, jacobian, converged = fibres.solve(specimen, z)
-    log_density = np.where(converged, -(z**2).sum(axis=1) / 2, -np.inf).reshape(n, starts)
+    log_normal = -(z**2).sum(axis=1) / 2
+    log_density = np.where(converged, log_normal, -np.inf).reshape(n, starts)
     best = log_density.max(axis=1)
 
     order = np.argsort(-log_density, axis=1, kind="stable")
@@ -367,7 +379,8 @@ def charts_at_modes(fibres: Fibres, starts: int, charts: int) -> Charts:
         distance = np.sqrt(((z[row, None] - modes) ** 2).sum(axis=2)).min(axis=1)
         accepted = np.isfinite(value) & (value > best - 8) & (distance > 0.7)
         i = np.flatnonzero(accepted & (count < modes.shape[1]))
-        modes[i, count[i]], source[i, count[i]] = z[row[i]], row[i]
+        modes[i, count[i]] = z[row[i]]
+        source[i, count[i]] = row[i]
         count[i] += 1
 
     i, slot = np.nonzero(source >= 0)
@@ -427,7 +440,8 @@ def cover(fibres: Fibres, charts: Charts, normal: Floats) -> Charts:
     specimen = np.repeat(np.arange(n), tries)
     nearby = charts.centre[:, :1] + 0.5 * normal
     # The first half, as even points of a Sobol sequence lie in one half of the space.
-    start = np.where(np.arange(tries)[:, None] < tries / 2, normal, nearby).reshape(-1, d)
+    is_first_half = np.arange(tries)[:, None] < tries / 2
+    start = np.where(is_first_half, normal, nearby).reshape(-1, d)
     z, jacobian, converged = fibres.solve(specimen, start)
     log_density = -(z**2).sum(axis=1) / 2
     present = charts.share > 0
@@ -435,13 +449,15 @@ def cover(fibres: Fibres, charts: Charts, normal: Floats) -> Charts:
     rows = np.flatnonzero(converged & (log_density > modes.max(axis=1)[specimen] - 8))
     rows = rows[np.argsort(-log_density[rows], kind="stable")]  # most probable first
     volume = np.zeros(len(z))
-    volume[rows] = np.sqrt(np.linalg.det(jacobian[rows] @ jacobian[rows].transpose(0, 2, 1)))
+    gram = jacobian[rows] @ jacobian[rows].transpose(0, 2, 1)
+    volume[rows] = np.sqrt(np.linalg.det(gram))
     rows = rows[volume[rows] > 0]
 
     def uncovered(rows: Indices, slot: Indices) -> Indices:
         """Return the points that chart `slot` of their specimen does not cover."""
         i = specimen[rows]
-        cosine = np.abs(np.linalg.det(jacobian[rows] @ charts.solved[i, slot])) / volume[rows]
+        projected = jacobian[rows] @ charts.solved[i, slot]
+        cosine = np.abs(np.linalg.det(projected)) / volume[rows]
         covered = cosine >= 0.3
         near, near_slot = rows[covered], slot[covered]
         u = charts.coordinates(specimen[near], near_slot, z[near])

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import Floats
+from prbayes._checks import AT_ONCE, Floats
 from prbayes.response.distributions import PopulationSampler, prior_draws
 from prbayes.response.inputs import Inputs
 
@@ -26,7 +26,8 @@ class Coordinates:
     center, half_width : ndarray, shape (d,)
         Of the prior range: all but 1 % of the specimens of the prior predictive population.
     bounds : ndarray, shape (2, d)
-        Smallest and largest z of these specimens.
+        Smallest and largest z in data sets of the prior, one for each of 4096 populations. A new
+        data set of the prior exceeds an end with a probability of 1 in 4097.
     """
 
     shapes: tuple[tuple[int, ...], ...]
@@ -36,20 +37,37 @@ class Coordinates:
     bounds: Floats
 
     @classmethod
-    def of_prior(cls, inputs: Inputs, specimens: int = 4096, seed: int = 0) -> Coordinates:
-        """Return the coordinates for specimens of the prior predictive population."""
-        roots = prior_draws(inputs.roots, specimens, seed)
-        drawn, _ = PopulationSampler(inputs)(roots, 1, np.random.default_rng([seed, 11]))
-        flat = np.concatenate([x.reshape(specimens, -1) for x in drawn], axis=1)
-        flat = flat[np.isfinite(flat).all(axis=1)]
+    def of_prior(cls, inputs: Inputs, n: int = 1, populations: int = 4096) -> Coordinates:
+        """Return the coordinates of populations of the prior, and bounds of n specimens of each."""
+        roots = prior_draws(inputs.roots, populations, 0)
+        sampler = PopulationSampler(inputs)
+        rng = np.random.default_rng([0, 11])
+
+        def draw(count: int) -> Floats:
+            drawn, _ = sampler(roots, count, rng)
+            flat = np.concatenate([x.reshape(populations * count, -1) for x in drawn], axis=1)
+            return flat[np.isfinite(flat).all(axis=1)]
+
+        flat = draw(1)
         low, high = np.quantile(flat, [0.005, 0.995], axis=0)
         is_log = (flat > 0).all(axis=0) & (high > 10 * low)
         flat = np.where(is_log, np.log(np.where(is_log, flat, 1.0)), flat)
         low, high = np.quantile(flat, [0.005, 0.995], axis=0)
         half_width = np.where(high > low, (high - low) / 2, 1.0)
-        z = (flat - (low + high) / 2) / half_width
-        bounds = np.stack([z.min(axis=0), z.max(axis=0)])
-        return cls(inputs.event_shapes, is_log, (low + high) / 2, half_width, bounds)
+        center = (low + high) / 2
+        z = (flat - center) / half_width
+        ends = [z.min(axis=0), z.max(axis=0)]
+        # Specimens in blocks, so that memory stays constant.
+        block = max(1, 16 * AT_ONCE // (populations * len(center)))
+        for first in range(1, n, block):
+            flat = draw(min(block, n - first))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                flat = np.where(is_log, np.log(flat), flat)
+            z = (flat - center) / half_width
+            z = z[np.isfinite(z).all(axis=1)]
+            ends += [z.min(axis=0), z.max(axis=0)]
+        bounds = np.stack([np.min(ends, axis=0), np.max(ends, axis=0)])
+        return cls(inputs.event_shapes, is_log, center, half_width, bounds)
 
     @property
     def size(self) -> int:
@@ -63,7 +81,8 @@ class Coordinates:
         arrays, first = [], 0
         for shape in self.shapes:
             last = first + int(np.prod(shape, dtype=int))
-            arrays.append(flat[..., first:last].reshape(*z.shape[:-1], *shape))
+            part = flat[..., first:last]
+            arrays.append(part.reshape(*z.shape[:-1], *shape))
             first = last
         return arrays
 

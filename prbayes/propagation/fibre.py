@@ -48,7 +48,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv, logsumexp, ndtri
+from scipy.special import gammaincinv, logsumexp, ndtri, stdtrit
 
 from prbayes._checks import Floats
 from prbayes.propagation.charts import (
@@ -363,16 +363,23 @@ def _draw(
     cumulative = np.cumsum(charts.share, axis=1)[:, :-1]
     slot = (uniform[..., :1] > cumulative[:, None, :]).sum(axis=2).ravel()
     specimen = np.repeat(np.arange(n), points)
-    chi_square = 2 * gammaincinv(Charts.degrees / 2, uniform[..., 1].reshape(-1, 1))
-    t = ndtri(uniform[..., 2:].reshape(-1, k)) / np.sqrt(chi_square / Charts.degrees)
-    u = charts.location[specimen, slot] + (charts.scale[specimen, slot] @ t[..., None])[..., 0]
+    if k == 1:
+        # Even points on a line have a far smaller error than points from two coordinates.
+        t = stdtrit(Charts.degrees, uniform[..., 2].reshape(-1, 1))
+    else:
+        chi_square = 2 * gammaincinv(Charts.degrees / 2, uniform[..., 1].reshape(-1, 1))
+        normal = ndtri(uniform[..., 2:].reshape(-1, k))
+        t = normal / np.sqrt(chi_square / Charts.degrees)
+    scaled = charts.scale[specimen, slot] @ t[..., None]
+    u = charts.location[specimen, slot] + scaled[..., 0]
     # Specimens without charts have arrays of zeros, so that all their solves fail.
     z, jacobian, converged = charts.points(fibres, specimen, slot, u)
 
     rows = np.flatnonzero(converged)
     log_density = charts.log_mixture(fibres, specimen[rows], slot[rows], z[rows], jacobian[rows])
     log_a = np.full(len(z), -np.inf)
-    log_units = np.log(np.diagonal(fibres.population.root)).sum() - np.log(fibres.unit).sum()
+    log_units = np.log(np.diagonal(fibres.population.root)).sum()
+    log_units = log_units - np.log(fibres.unit).sum()
     log_a[rows] = log_units - np.log(points) - log_density
     z = np.where(converged[:, None], z, 0.0)
     return _Sample(
@@ -408,12 +415,14 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
         share[:, c] = w.sum(axis=1)
         i = np.flatnonzero(share[:, c] > 1e-6)
         w = w[i] / share[i, c][:, None]
-        size = share[i, c] ** 2 / (weight[i] ** 2 * (sample.chart[i] == c)).sum(axis=1)
+        squares = weight[i] ** 2 * (sample.chart[i] == c)
+        size = share[i, c] ** 2 / squares.sum(axis=1)
 
         turned = i[(size > d) & turn]
         mean_jacobian = np.einsum("nk,nkmd->nmd", w[(size > d) & turn], sample.jacobian[turned])
         right = np.linalg.svd(mean_jacobian)[2].transpose(0, 2, 1)
-        solved[turned, c], free[turned, c] = right[..., :m], right[..., m:]
+        solved[turned, c] = right[..., :m]
+        free[turned, c] = right[..., m:]
 
         # Present location and scale in the new directions
         rotation = free[i, c].transpose(0, 2, 1) @ charts.free[i, c]
@@ -424,13 +433,17 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
             root @ root.transpose(0, 2, 1) / Charts.inflation + np.eye(k) - rotation @ transposed
         )
 
-        u = (sample.z[i] - charts.centre[i, None, c]) @ free[i, c]
-        old, new = 4.0 * k / (size + 4 * k), size / (size + 4 * k)
-        mean = new[:, None] * (w[:, None, :] @ u)[:, 0] + old[:, None] * present_location
+        away = sample.z[i] - charts.centre[i, None, c]
+        u = away @ free[i, c]
+        old = 4.0 * k / (size + 4 * k)
+        new = size / (size + 4 * k)
+        weighted_mean = (w[:, None, :] @ u)[:, 0]
+        mean = new[:, None] * weighted_mean + old[:, None] * present_location
         centred = u - mean[:, None]
         covariance = (centred * w[..., None]).transpose(0, 2, 1) @ centred
         covariance = new[:, None, None] * covariance + old[:, None, None] * present
-        location[i, c], scale[i, c] = mean, np.linalg.cholesky(Charts.inflation * covariance)
+        location[i, c] = mean
+        scale[i, c] = np.linalg.cholesky(Charts.inflation * covariance)
     has_chart = charts.share > 0
     share = 0.9 * share + 0.1 * has_chart / np.maximum(has_chart.sum(axis=1, keepdims=True), 1)
     share = np.where(has_chart, share, 0)

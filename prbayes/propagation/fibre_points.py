@@ -2,7 +2,8 @@
 
 The inputs of such a specimen are not determined by its readings, so that its points have to cover
 every plausible population. The reference population in which they are drawn is the prior
-predictive one at first, then that of draws of the posterior, twice.
+predictive one at first, then that of draws of the posterior, twice. Posteriors of smoothed
+populations come before these where points lie farther apart than populations are wide.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def fibre_points(
     readings: Readings,
     bounds: Floats,
     prior_specimens: Floats,
-    posterior: Callable[[Floats, Floats], Draws],
+    posterior: Callable[[Floats, Floats, Floats | None], Draws],
     options: PointOptions,
     *,
     n: int | None = None,
@@ -76,7 +77,8 @@ def fibre_points(
     prior_specimens : ndarray, shape (n, d)
         Specimens of the prior predictive population.
     posterior : callable
-        Points (N, K, d) and their numbers (N, K) -> draws of the hyperparameters.
+        Points (N, K, d), their numbers (N, K), and a covariance (d, d) by which populations are
+        smoothed, or None -> draws of the hyperparameters.
     options : PointOptions
     n : int, optional
         First runs.
@@ -95,11 +97,14 @@ def fibre_points(
     emulation = Emulation.first(run, 2 * sobol(n, d, seed) - 1, bounds, readings, options, name)
     population = ReferencePopulation.from_sample(prior_specimens)
     rng = np.random.default_rng([seed, 1])
-    for attempt in range(6):
-        points = _draw(emulation, readings, population, 256, seed + attempt)
-        draws = posterior(points.z, points.log_a)
+    count = 256
+    for batch in range(6):
+        points, draws = _reliable_draws(
+            emulation, readings, population, posterior, count, options, seed + batch, name
+        )
+        count = points.z.shape[1]
         population = ReferencePopulation.from_sample(draws.specimens())
-        if attempt >= 2 and emulation.bias <= options.bias:
+        if batch >= 2 and emulation.bias <= options.bias:
             break
         fresh = _fresh(points, draws, max(n // 2, options.fresh), options.fresh, bounds, rng)
         emulation = extended(emulation, run, fresh, readings, options, spread, name)
@@ -116,19 +121,12 @@ def fibre_points(
     count = 128
     while True:
         halves = [_draw(emulation, readings, population, count, 100 + seed + h) for h in (0, 1)]
-        logs = [draws.log_likelihoods(half.z, half.log_a) for half in halves]
-        finite = np.isfinite(logs[0]).all(axis=1) & np.isfinite(logs[1]).all(axis=1)
-        difference = half_difference(logs[0][finite], logs[1][finite]) if finite.any() else np.inf
-        if difference <= largest or 4 * count > options.most_points:
+        difference = _difference(*(draws.log_likelihoods(p.z, p.log_a) for p in halves))
+        if difference <= largest:
             break
+        if 4 * count > options.most_points:
+            raise _monte_carlo_error(name, 2 * count, difference, largest)
         count *= 2
-    if difference > largest:
-        raise DesignError(
-            f"{name}: got two halves of {2 * count} points a specimen whose log-likelihoods differ "
-            f"by {difference:.2g} nats, expected at most {largest:.2g}; "
-            "measure more outputs of each specimen, narrow the priors, or use "
-            "metric=prb.ProbabilityResidual()"
-        )
     joint = _joined(*halves)
     return emulation, SpecimenPoints(
         joint.z,
@@ -138,6 +136,73 @@ def fibre_points(
         np.zeros(len(readings), dtype=np.intp),
         difference,
     )
+
+
+def _reliable_draws(
+    emulation: Emulation,
+    readings: Readings,
+    population: ReferencePopulation,
+    posterior: Callable[[Floats, Floats, Floats | None], Draws],
+    count: int,
+    options: PointOptions,
+    seed: int,
+    name: str,
+    largest: float = 1.0,
+) -> tuple[_Points, Draws]:
+    """Return points and draws at which both halves of the points agree.
+
+    Where points lie farther apart than populations are wide, the likely populations are those
+    where points happen to lie close. Populations that are wider by the bandwidth of Scott's rule
+    have a smooth log-likelihood. They narrow the reference population, in which points are drawn
+    anew, until it narrows no more; then points are doubled.
+
+    Parameters
+    ----------
+    count : int
+        Points at first.
+    largest : float
+        Half difference in nats that shifts a posterior by about its standard deviation.
+    """
+    free = population.root.shape[0] - int(readings.is_measured.sum(axis=1).min())
+    narrows = False
+    while True:
+        points = _draw(emulation, readings, population, count, seed)
+        if not narrows:
+            draws = posterior(points.z, points.log_a, None)
+            half = count // 2
+            parts = (
+                (points.z[:, :half], points.log_a[:, :half]),
+                (
+                    points.z[:, half:],
+                    points.log_a[:, half:],
+                ),
+            )
+            difference = _difference(*(draws.log_likelihoods(*part) for part in parts))
+            if difference <= largest:
+                return points, draws
+            if 2 * count > options.most_points:
+                raise _monte_carlo_error(name, count, difference, largest)
+        smoothing = count ** (-2 / (free + 4)) * population.root @ population.root.T
+        specimens = posterior(points.z, points.log_a, smoothing).specimens()
+        smoothed = ReferencePopulation.from_sample(specimens).wider(smoothing)
+        volumes = [np.diag(p.root).prod() for p in (smoothed, population)]
+        narrows = bool(volumes[0] < volumes[1] / 2)
+        population = smoothed
+        count = count if narrows else 2 * count
+
+
+def _monte_carlo_error(name: str, count: int, difference: float, largest: float) -> DesignError:
+    return DesignError(
+        f"{name}: got two halves of {count} points a specimen whose log-likelihoods differ by "
+        f"{difference:.2g} nats, expected at most {largest:.2g}; measure more outputs of each "
+        "specimen, narrow the priors, or use metric=prb.ProbabilityResidual()"
+    )
+
+
+def _difference(first: Floats, second: Floats) -> float:
+    """Return the half difference of log-likelihoods (S, N) over the draws where both are finite."""
+    finite = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
+    return half_difference(first[finite], second[finite]) if finite.any() else np.inf
 
 
 def _joined(first: _Points, second: _Points) -> _Points:
@@ -159,8 +224,8 @@ def _draw(
     z = np.empty((n, count, d))
     log_proposal = np.full((n, count), np.inf)
     exact = np.zeros((n, count))
-    sd = readings.comparison_sd(np.zeros(m))
-    has_error = np.isfinite(sd) & (sd > 0)
+    sd = readings.comparison_sd(emulation.error)
+    has_error = readings.is_measured & ((readings.error > 0) | (readings.step > 0))
     patterns, which = np.unique(
         np.concatenate([readings.is_measured, has_error], axis=1), axis=0, return_inverse=True
     )
@@ -175,7 +240,7 @@ def _draw(
             continue
         response = _columns(emulation, columns)
         y = part.values[:, columns]
-        if not noisy.any():
+        if not noisy.any() and len(columns) < d:
             points = fit_fibres(response, y, population, seed=seed, numbers=numbers[rows]).draw(
                 count, seed
             )
@@ -184,16 +249,19 @@ def _draw(
             continue
         # A reading error per pattern; the density of each reading replaces it below.
         error = typical_sd(sd[np.ix_(rows, columns)])
-        error = np.where(noisy, error, 1e-6 * readings.spread()[columns])
         proposal = fit_fibres(
-            with_error(response, error), y, population.with_errors(len(columns)), seed=seed,
+            with_error(response, error),
+            y,
+            population.with_errors(len(columns)),
+            seed=seed,
             numbers=numbers[rows],
-        )  # fmt: skip
+        )
         points = proposal.draw(count, seed).without_errors(len(columns))
         z[rows] = points.x
         values, _ = response(points.x.reshape(-1, d))
         away = (y[:, None] - values.reshape(len(rows), count, -1)) / error
-        normal = (-0.5 * away**2 - np.log(error) - 0.5 * np.log(2 * np.pi)).sum(axis=-1)
+        log_normal = -0.5 * away**2 - np.log(error) - 0.5 * np.log(2 * np.pi)
+        normal = log_normal.sum(axis=-1)
         log_proposal[rows] = normal - points.log_a
     outputs = emulation(z.reshape(-1, d))[0].reshape(n, count, m)
     is_exact = np.isfinite(log_proposal) & (log_proposal == 0.0)
@@ -211,7 +279,9 @@ def _columns(emulation: Emulation, columns: NDArray[np.intp]) -> Response:
 
     def response(z: Floats) -> tuple[Floats, Floats]:
         values, jacobian = emulation(z)
-        outside = ((z < emulation.box[0] - 0.5) | (z > emulation.box[1] + 0.5)).any(axis=1)
+        low, high = emulation.box
+        is_beyond = (z < low - 0.5) | (z > high + 0.5)
+        outside = is_beyond.any(axis=1)
         values, jacobian = values[:, columns], jacobian[:, columns]
         # The emulator has no runs there.
         values[outside], jacobian[outside] = np.nan, np.nan
@@ -228,13 +298,16 @@ def _population_points(
 
     d = len(population.mean)
     base = sobol(count, d, seed)
-    shift = np.random.default_rng([seed, 2]).random((int(rows.max()) + 1, 1, d))[rows]
+    rng = np.random.default_rng([seed, 2])
+    size = int(rows.max()) + 1
+    shift = rng.random((size, 1, d))[rows]
     u = np.clip((base + shift) % 1.0, 1e-12, 1 - 1e-12)
     standard = ndtri(u)
     wide = 1.5
     z = population.mean + wide * standard @ population.root.T
     log_det = np.log(np.diag(population.root)).sum() + d * np.log(wide)
-    density = -0.5 * (standard**2).sum(axis=-1) - d / 2 * np.log(2 * np.pi) - log_det
+    square = (standard**2).sum(axis=-1)
+    density = -0.5 * square - d / 2 * np.log(2 * np.pi) - log_det
     return z, density + np.log(count)
 
 

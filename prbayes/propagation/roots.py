@@ -122,7 +122,8 @@ def find_roots(
         active = active[unfinished]
     kept = _distinct(specimen, z, misfit, jacobian, gap, width)
     # By place: misfits of nearly zero are in an order of rounding.
-    kept = kept[np.lexsort((*z[kept].T[::-1], specimen[kept]))]
+    order = np.lexsort((*z[kept].T[::-1], specimen[kept]))
+    kept = kept[order]
     return Roots(specimen[kept], z[kept], misfit[kept], residual[kept], jacobian[kept])
 
 
@@ -168,10 +169,49 @@ def _distinct(
     return np.array(kept, dtype=np.intp)
 
 
-def nearest_starts(run_z: Floats, run_y: Floats, y: Floats, spread: Floats, count: int) -> Floats:
-    """Return the runs whose outputs are nearest to each specimen's, (N, count, d)."""
+def gabriel_neighbours(z: Floats, most: int = 32) -> NDArray[np.bool_]:
+    """Return which pairs of points have no third point in the sphere between them, (n, n).
+
+    Among the `most` nearest points of each. In one dimension these are the left and the right
+    neighbour.
+
+    References
+    ----------
+    .. [1] Gabriel, K. R. and R. R. Sokal (1969), A new statistical approach to geographic variation
+       analysis, Systematic Zoology 18(3), 259-278, doi:10.2307/2412323.
+    """
+    squares = ((z[:, None] - z) ** 2).sum(axis=2)
+    near = np.argsort(squares, axis=1, kind="stable")[:, 1 : most + 1]
+    result = np.zeros(squares.shape, dtype=bool)
+    for i, others in enumerate(near):
+        length = squares[i, others]
+        by_third = length[:, None] + squares[np.ix_(others, others)]
+        np.fill_diagonal(by_third, np.inf)
+        result[i, others] = by_third.min(axis=0, initial=np.inf) >= length
+    return result | result.T
+
+
+def nearest_starts(
+    run_z: Floats,
+    run_y: Floats,
+    y: Floats,
+    spread: Floats,
+    count: int,
+    neighbours: NDArray[np.bool_],
+) -> Floats:
+    """Return starts of the search among the runs, by specimen, (N, S, d).
+
+    First the runs whose outputs are nearer to the specimen's than those of all their neighbours:
+    each root lies in the basin of such a run, unless it lies between runs. Then the runs with the
+    nearest outputs. S is `count`, or the largest number of the former if that is larger. The
+    spread, (m,) or (N, m), is infinite for outputs that were not measured.
+    """
+    unit = np.broadcast_to(spread, y.shape)
     distance = np.zeros((len(y), len(run_y)))
-    for column, other, unit in zip(y.T, run_y.T, spread, strict=True):
-        distance += ((column[:, None] - other) / unit) ** 2
-    order = np.argsort(distance, axis=1, kind="stable")[:, :count]
-    return run_z[order]
+    for column, other, of_column in zip(y.T, run_y.T, unit.T, strict=True):
+        distance += ((column[:, None] - other) / of_column[:, None]) ** 2
+    nearest = [distance[:, row].min(axis=1, initial=np.inf) for row in neighbours]
+    least = np.array(nearest).T
+    is_minimum = distance <= least
+    order = np.lexsort((distance, ~is_minimum), axis=1)
+    return run_z[order[:, : max(count, int(is_minimum.sum(axis=1).max()))]]

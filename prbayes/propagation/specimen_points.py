@@ -22,7 +22,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln, logsumexp, ndtri
+from scipy.special import chdtri, gammaln, logsumexp, ndtri
 
 from prbayes._checks import AT_ONCE, Floats
 from prbayes.emulators.interpolant import Interpolant, fit_interpolant
@@ -30,7 +30,13 @@ from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.guards import half_difference, missing_share, predicted_bias
 from prbayes.propagation.points import sobol
-from prbayes.propagation.roots import Response, Roots, find_roots, nearest_starts
+from prbayes.propagation.roots import (
+    Response,
+    Roots,
+    find_roots,
+    gabriel_neighbours,
+    nearest_starts,
+)
 
 
 @dataclass(frozen=True)
@@ -40,7 +46,8 @@ class PointOptions:
     Attributes
     ----------
     starts : int
-        Starts of the search for roots, by specimen; doubled while roots are missing.
+        Fewest starts of the search for roots, by specimen; doubled while simulated specimens do not
+        get their inputs back.
     gap : float
         Largest misfit of a root above the specimen's best, in nats.
     points : int
@@ -54,8 +61,7 @@ class PointOptions:
         Runs at roots that measure the emulator's bias; they stay in the emulator.
     bias : float
         Largest bias of a mean or standard deviation of an input, in posterior standard deviations.
-    missing : float
-        Largest share of simulated specimens that do not get their own inputs back.
+        More runs are added where the emulator's error could cause as much.
     floor : float
         Smallest standard deviation of a comparison, as a share of the data's.
     """
@@ -67,7 +73,6 @@ class PointOptions:
     half_difference: float = 0.05
     fresh: int = 16
     bias: float = 0.15
-    missing: float = 0.03
     floor: float = 1e-6
     degrees: float = 5.0
 
@@ -106,7 +111,8 @@ class DifferencedResponse:
         """Return values and Jacobian."""
         k, d = z.shape
         shifts = self.step * np.concatenate([np.zeros((1, d)), np.eye(d), -np.eye(d)])
-        values = self.values((z + shifts[:, None]).reshape(-1, d)).reshape(2 * d + 1, k, -1)
+        points = (z + shifts[:, None]).reshape(-1, d)
+        values = self.values(points).reshape(2 * d + 1, k, -1)
         slopes = (values[1 : d + 1] - values[d + 1 :]) / (2 * self.step)
         return values[0], np.moveaxis(slopes, 0, -1)
 
@@ -170,9 +176,10 @@ class Emulation:
         options: PointOptions,
     ) -> Emulation:
         """Return the response itself in place of an emulator, with runs as starts of a search."""
-        z = box[0] + (box[1] - box[0]) * sobol(first_runs(box.shape[1]), box.shape[1], 0)
+        d = box.shape[1]
+        z = box[0] + (box[1] - box[0]) * sobol(first_runs(d), d, 0)
         error = options.floor * readings.spread()
-        whole = np.stack([np.full(box.shape[1], -np.inf), np.full(box.shape[1], np.inf)])
+        whole = np.stack([np.full(d, -np.inf), np.full(d, np.inf)])
         return cls(z, run(z), search_box, DifferencedResponse(run), error, 0.0, whole)
 
     def covers(self, z: Floats) -> bool:
@@ -196,15 +203,22 @@ class Emulation:
         return values
 
     def fails(self, z: Floats) -> NDArray[np.bool_]:
-        """Return where the nearest run has no response."""
-        good = np.isfinite(self.y).all(axis=1)
-        if good.all():
+        """Return where the nearest run has no finite response."""
+        return self._of_nearest(~np.isfinite(self.y).all(axis=1), z)
+
+    def is_missing(self, z: Floats) -> NDArray[np.bool_]:
+        """Return where the nearest run has no response: NaN, while +inf is a failed specimen."""
+        return self._of_nearest(np.isnan(self.y).any(axis=1), z)
+
+    def _of_nearest(self, of_runs: NDArray[np.bool_], z: Floats) -> NDArray[np.bool_]:
+        """Return a property of the nearest run of each point."""
+        if not of_runs.any():
             return np.zeros(len(z), dtype=bool)
         from scipy.spatial import cKDTree
 
         width = self.box[1] - self.box[0]
         _, nearest = cKDTree(self.z / width).query(z / width)
-        return np.asarray(~good[nearest])
+        return np.asarray(of_runs[nearest])
 
 
 def emulate(
@@ -253,14 +267,18 @@ def emulate(
     rng = np.random.default_rng([seed, 1])
     for batch in range(6):
         roots = specimen_roots(emulation, readings, options)
-        enough = batch >= 2 if known is None else emulation.covers(roots.z)
-        # Twice at most: a reading that no inputs reproduce is reported.
-        wider = _widened(emulation.box, roots) if batch < 2 else emulation.box
-        if enough and emulation.bias <= options.bias and np.array_equal(wider, emulation.box):
-            break
-        emulation = replace(emulation, box=wider)
+        if batch < 2 and len(roots.z):
+            # Twice at most: a reading that no inputs reproduce is reported.
+            emulation = replace(emulation, box=_widened(emulation.box, roots))
+            roots = specimen_roots(emulation, readings, options)
+        enough = (batch >= 2 or known is not None) and emulation.covers(roots.z)
+        if enough and emulation.bias <= options.bias:
+            # Zero for the response itself, which no run improves.
+            narrowing = 0.0 if emulation.bias == 0 else _narrowing(emulation, readings, roots)
+            if narrowing <= options.bias:
+                break
         count = max(n // 2, options.fresh)
-        fresh = spread_out(roots.z, wider, count, options.fresh, rng)
+        fresh = spread_out(roots.z, emulation.box, count, options.fresh, rng)
         emulation = extended(emulation, run, fresh, readings, options, spread, name)
     else:
         roots = specimen_roots(emulation, readings, options)
@@ -269,10 +287,11 @@ def emulate(
         "the response is not smooth enough for prb.LogLikelihood(): use "
         "metric=prb.ProbabilityResidual(), or more first runs with propagation=prb.Reweighted(n)"
     )
-    if (emulation.error > spread).any():
+    scatter = readings.robust_spread()
+    if (emulation.error > scatter).any():
         raise DesignError(
             f"{name}: got an emulator with errors of {emulation.error} at the specimens, expected "
-            f"less than the data's standard deviations {spread}; {rough}"
+            f"less than the data's standard deviations {scatter}; {rough}"
         )
     if emulation.bias > options.bias:
         raise DesignError(
@@ -281,6 +300,46 @@ def emulate(
             f"{len(emulation.z)} runs, expected at most {options.bias}; {rough}"
         )
     return emulation, roots
+
+
+def _narrowing(emulation: Emulation, readings: Readings, roots: Roots) -> float:
+    """Return by how much the error of the emulator could narrow the population of an input.
+
+    In posterior standard deviations of its standard deviation sigma. The comparison allows an error
+    covariance C of a root; the part of it that the runs have overestimated is missing in sigma^2:
+
+        sqrt(2 N) / 2 max_j mean_i sum_r w_ir C_jj / (C_jj + sigma_j^2)
+
+    with weights w_ir of the roots under a normal population that is fitted to them.
+    """
+    sd = np.where(readings.is_measured, readings.comparison_sd(emulation.error), 1.0)
+    factor = (sd / emulation.error)[roots.specimen][:, :, None]
+    table, log_mass, covariance = _laplace(roots, emulation.box)
+    _, _, of_error = _laplace(replace(roots, jacobian=roots.jacobian * factor), emulation.box)
+    ((mean, root),) = normal_populations(roots.z[table], log_mass, 1, 0, bootstrap=False)
+    log_w = normal_log_density(roots.z[table], mean, root) + log_mass
+    w = np.exp(log_w - logsumexp(log_w, axis=1, keepdims=True))
+    whole, part = (np.einsum("rdd->rd", each)[table] for each in (covariance, of_error))
+    share = np.einsum("nr,nrd->nd", w, part / (whole + (root**2).sum(axis=1)))
+    return float(np.sqrt(len(share) / 2) * share.mean(axis=0).max())
+
+
+def _laplace(roots: Roots, box: Floats) -> tuple[NDArray[np.intp], Floats, Floats]:
+    """Return the roots of each specimen that has some, their log masses, and covariances.
+
+    Returns
+    -------
+    table : ndarray of int, shape (N, most)
+        Rows of the roots, filled up with -1.
+    log_mass : ndarray, shape (N, most)
+    covariance : ndarray, shape (R, d, d)
+    """
+    precision = np.einsum("rmd,rme->rde", roots.jacobian, roots.jacobian)
+    precision = precision + np.diag(4.0 / (box[1] - box[0]) ** 2)
+    _, specimen = np.unique(roots.specimen, return_inverse=True)
+    table = _Components(specimen, roots.z, precision, roots.misfit).table
+    log_mass = -np.linalg.slogdet(precision)[1] / 2 - roots.misfit
+    return table, np.where(table >= 0, log_mass[table], -np.inf), np.linalg.inv(precision)
 
 
 def extended(
@@ -341,14 +400,24 @@ def surface_near(
     return surface, np.sqrt((surface.left_out[inside] ** 2).mean(axis=0))
 
 
-def _widened(box: Floats, roots: Roots, misfit: float = 50.0) -> Floats:
-    """Return the box with more room where the search for a root ends at its side with a misfit."""
+def _widened(box: Floats, roots: Roots, misfit: float = 50.0, outside: float = 1 / 4097) -> Floats:
+    """Return the box with more room where roots or their population reach beyond its sides.
+
+    A quarter where the search for a root ends at the side with a misfit. And room for a normal
+    population that is fitted to the roots: all specimens of a data set are within the box, with a
+    probability as of `Coordinates.bounds`.
+    """
     poor = roots.z[roots.misfit > misfit]
-    if not len(poor):
-        return box
     width = box[1] - box[0]
-    ends = np.stack([poor <= box[0] + 1e-6 * width, poor >= box[1] - 1e-6 * width])
-    return np.asarray(box + 0.25 * width * np.array([[-1.0], [1.0]]) * ends.any(axis=1))
+    at_low, at_high = poor <= box[0] + 1e-6 * width, poor >= box[1] - 1e-6 * width
+    ends = np.stack([at_low, at_high])
+    wider = box + 0.25 * width * np.array([[-1.0], [1.0]]) * ends.any(axis=1)
+    table, log_mass, _ = _laplace(roots, box)
+    ((mean, root),) = normal_populations(roots.z[table], log_mass, 1, 0, bootstrap=False)
+    reach = -ndtri(outside / len(table)) * np.sqrt((root**2).sum(axis=1))
+    low = np.minimum(wider[0], mean - reach)
+    high = np.maximum(wider[1], mean + reach)
+    return np.stack([low, high])
 
 
 def _all_roots(
@@ -361,14 +430,17 @@ def _all_roots(
 
     def find(y: Floats) -> list[Floats]:
         error = np.broadcast_to(np.median(readings.error, axis=0), y.shape)
-        simulated = specimen_roots(emulation, replace(Readings.exact(y), error=error), options)
+        relative = np.broadcast_to(readings.is_relative[:1], y.shape)
+        measured = replace(Readings.exact(y), error=error, is_relative=relative)
+        simulated = specimen_roots(emulation, measured, options)
         return [simulated.z[simulated.specimen == i] for i in range(len(y))]
 
     good = np.isfinite(emulation.y).all(axis=1)
-    box = np.stack([emulation.z[good].min(axis=0), emulation.z[good].max(axis=0)])
+    run_z = emulation.z[good]
+    box = np.stack([run_z.min(axis=0), run_z.max(axis=0)])
     while options.starts < len(emulation.z):
         share = missing_share(find, lambda z: emulation(z)[0], box, values, seed=seed)
-        if not share > options.missing:
+        if not share > 0:
             break
         options = replace(options, starts=2 * options.starts)
         roots = specimen_roots(emulation, readings, options)
@@ -391,43 +463,29 @@ def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptio
     sd = readings.comparison_sd(emulation.error)
     solvable = np.flatnonzero(measured.sum(axis=1) >= emulation.z.shape[1])
     # Runs are not chosen by an output that a reading error dominates.
-    unit = np.hypot(readings.spread(), 10 * np.median(readings.error, axis=0))
+    error = readings.error_sd(target)
+    unit = np.hypot(readings.spread(), 10 * np.median(error, axis=0))
+    unit = np.where(measured, unit, np.inf)
+    neighbours = gabriel_neighbours(run_z)
     parts = []
     # Specimens in blocks, so that memory stays constant.
     block = max(1, AT_ONCE // (options.starts * len(run_z) * 4))
     for first in range(0, len(solvable), block):
         rows = solvable[first : first + block]
-        starts = _starts(run_z, run_y, target[rows], measured[rows], unit, options.starts)
+        starts = nearest_starts(run_z, run_y, target[rows], unit[rows], options.starts, neighbours)
         roots = find_roots(
-            emulation, target[rows], np.where(measured[rows], sd[rows], 1e150), starts,
-            emulation.box, gap=options.gap,
-        )  # fmt: skip
+            emulation,
+            target[rows],
+            np.where(measured[rows], sd[rows], 1e150),
+            starts,
+            emulation.box,
+            gap=options.gap,
+        )
         parts.append((roots, rows))
     names = ("z", "misfit", "residual", "jacobian")
     joined = [np.concatenate([getattr(r, name) for r, _ in parts]) for name in names]
     specimen = np.concatenate([rows[r.specimen] for r, rows in parts])
     return Roots(specimen, *joined)
-
-
-def _starts(
-    run_z: Floats,
-    run_y: Floats,
-    y: Floats,
-    measured: NDArray[np.bool_],
-    spread: Floats,
-    count: int,
-) -> Floats:
-    """Return starts by specimen, compared in the outputs that were measured, (N, count, d)."""
-    count = min(count, len(run_z))
-    starts = np.empty((len(y), count, run_z.shape[1]))
-    patterns, which = np.unique(measured, axis=0, return_inverse=True)
-    for k, pattern in enumerate(patterns):
-        rows = np.flatnonzero(which.ravel() == k)
-        columns = np.flatnonzero(pattern)
-        starts[rows] = nearest_starts(
-            run_z, run_y[:, columns], y[np.ix_(rows, columns)], spread[columns], count
-        )
-    return starts
 
 
 def spread_out(
@@ -490,7 +548,7 @@ class _Components:
     specimen: NDArray[np.intp]  # (R,)
     center: Floats  # (R, d)
     root: Floats  # (R, d, d): lower Cholesky factors of the scale matrices
-    log_mass: Floats  # (R,): log of the integral of the readings' density around the root
+    log_mass: Floats  # (R,): log of the integral of the readings' density; NaN of uncertain ones
 
     @property
     def table(self) -> NDArray[np.intp]:
@@ -527,7 +585,8 @@ def draw_points(
     options : PointOptions
     error_is_known : bool
         Whether the error of the readings is the one given; else it is about so large. With a known
-        error the weights around a root are scaled to the root's mass, which 256 points measure.
+        error the weights around the root of certain readings are scaled to its mass, which 256
+        points measure.
     seed : int
 
     Raises
@@ -536,9 +595,13 @@ def draw_points(
         If `most_points` are not enough.
     """
     components = _fit_components(emulation, error, readings, roots, box, options, seed)
-    count = options.points if error_is_known else 4 * options.points
-    scales = (1.0,) if error_is_known else (0.5, 1.0, 1.3)
-    populations: list[tuple[Floats, Floats]] = []
+    is_certain = np.isfinite(components.log_mass).all()
+    count = options.points * (1 if is_certain and error_is_known else 16)
+    scales = (1.0,) if error_is_known else (0.125, 0.25, 0.5, 1.0, 1.3)
+    fits: dict[float, list[tuple[Floats, Floats]]] = {}
+    # Where the error of the readings is as large as the scatter, populations may be much narrower
+    # than their fit. They are added step by step: too few points exclude them wrongly.
+    narrowing = [1.0, 0.5]
     while True:
         halves = [
             _draw(emulation, error, readings, components, max(1, count // 2), options, (seed, h))
@@ -547,16 +610,22 @@ def draw_points(
         if error_is_known:
             halves = [_normalised(half, components) for half in halves]
         points = _joined(halves)
-        populations = populations or normal_populations(points.z, points.log_a, 32, seed)
-        difference = max(
-            _difference(halves if k == 1.0 else _of_error(halves, readings, error, k), populations)
-            for k in scales
-        )
+        of_error = {
+            k: halves if k == 1.0 else _of_error(halves, readings, error, k) for k in scales
+        }
+        samples = {k: _joined(pair) for k, pair in of_error.items()}
+        fits = fits or {k: normal_populations(x.z, x.log_a, 32, seed) for k, x in samples.items()}
+        difference = 0.0
+        while narrowing and difference <= options.half_difference:
+            plausible = _plausible(samples, fits, narrowing[0])
+            values = [_difference(of_error[k], few) for k, few in plausible.items() if few]
+            difference = max(values, default=0.0)
+            narrowing = narrowing[1:] if difference <= options.half_difference else narrowing
         largest = components.table.shape[1] * count
         if difference <= options.half_difference or 2 * largest > options.most_points:
             break
         count *= 2
-    if difference > options.half_difference:
+    if difference > options.half_difference and narrowing[0] == 1.0:
         raise DesignError(
             f"log-likelihood: got two halves of {largest} points a specimen that differ by "
             f"{difference:.2g} nats, expected at most {options.half_difference}; use another "
@@ -566,6 +635,37 @@ def draw_points(
     return SpecimenPoints(
         points.z, points.outputs, points.log_a, points.log_proposal, n_roots, difference
     )
+
+
+def _plausible(
+    samples: dict[float, _Sample],
+    fits: dict[float, list[tuple[Floats, Floats]]],
+    narrowing: float,
+    largest: float = 4.0,
+) -> dict[float, list[tuple[Floats, Floats]]]:
+    """Return narrowed normal populations that the data do not exclude, by scale of the error.
+
+    Parameters
+    ----------
+    samples, fits : dict
+        Points and bootstrap fits, by scale of the reading error.
+    narrowing : float
+        Factor of the fits' standard deviations.
+    largest : float
+        Difference from the largest log-likelihood of the fits, in nats.
+    """
+
+    def log_likelihood(sample: _Sample, mean: Floats, root: Floats) -> float:
+        terms = normal_log_density(sample.z, mean, root) + sample.log_a
+        return float(logsumexp(terms, axis=1).sum())
+
+    heights = [log_likelihood(samples[k], *fit) for k, few in fits.items() for fit in few]
+    best = max(heights)
+    narrowed = {k: [(mean, narrowing * root) for mean, root in few] for k, few in fits.items()}
+    return {
+        k: [fit for fit in few if log_likelihood(samples[k], *fit) > best - largest]
+        for k, few in narrowed.items()
+    }
 
 
 def _of_error(
@@ -588,13 +688,16 @@ def _fit_components(
     options: PointOptions,
     seed: int,
     fine: int = 256,
+    share: float = 0.1,
 ) -> _Components:
     """Return a t component for each root, fitted to the readings' density around it.
 
     The first scale matrix is that of the Gauss-Newton approximation, within the box. Where the
     weights of 256 points are uneven, as at a turning point of the response, location and scale
     become their weighted moments, twice. Where the readings leave an input about as uncertain as
-    the population does, the component is that of the specimen given a population twice as wide.
+    the population does, the component is that of the specimen given a population twice as wide. A
+    component or a reading that is uncertain by this share of the scatter has no mass: see
+    `_normalised`.
     """
     d = roots.z.shape[1] if len(roots.z) else box.shape[1]
     precision = np.einsum("rmd,rme->rde", roots.jacobian, roots.jacobian)
@@ -618,22 +721,40 @@ def _fit_components(
             combined = np.linalg.inv(narrow + wide)
             pull = np.einsum("rde,re->rd", narrow, rank.center) + wide @ mean
             center = np.einsum("rde,re->rd", combined, pull)
-            rank = _Components(
-                rank.specimen, center, np.linalg.cholesky(1.5 * combined), rank.log_mass
+            # Roots of another population, such as a mirror one, keep their components.
+            away = rank.center - mean
+            spread = np.linalg.inv(narrow) + 4 * covariance
+            square = np.einsum("rd,rd->r", away, np.linalg.solve(spread, away[..., None])[..., 0])
+            is_near = (square < chdtri(d, 0.001))[:, None]
+            combined_root = np.linalg.cholesky(1.5 * combined)
+            rank = replace(
+                rank,
+                center=np.where(is_near, center, rank.center),
+                root=np.where(is_near[..., None], combined_root, rank.root),
             )
         components = _Components(some[rank.specimen], *_fields(rank)[1:])
     without = np.setdiff1d(np.arange(len(readings)), some)
     if without.size:
-        # Sixteen components of the population stand for as many times the points of a root.
-        specimen = np.repeat(without, 16)
-        center = np.tile(mean, (len(specimen), 1))
-        root = np.tile(2.5 * np.linalg.cholesky(covariance), (len(specimen), 1, 1))
+        # Eight components of the population, and sixteen over the box: the specimens with a root
+        # may be few, and far from the others.
+        width = box[1] - box[0]
+        centers = np.concatenate([np.tile(mean, (8, 1)), box[0] + width * sobol(16, d, seed)])
+        roots_of_population = np.tile(2.5 * np.linalg.cholesky(covariance), (8, 1, 1))
+        roots_of_box = np.tile(np.diag(width / 16 ** (1 / d)), (16, 1, 1))
+        specimen = np.repeat(without, len(centers))
+        center = np.tile(centers, (len(without), 1))
+        root = np.tile(np.concatenate([roots_of_population, roots_of_box]), (len(without), 1, 1))
         added = (specimen, center, root, np.zeros(len(specimen)))
         joined = [np.concatenate(pair) for pair in zip(_fields(components), added, strict=True)]
         order = np.argsort(joined[0], kind="stable")
         components = _Components(*(field[order] for field in joined))
     sample = _draw(emulation, error, readings, components, fine, options, (seed, 9))
     _, log_mass = _component_weights(sample, components)
+    sd = np.sqrt(np.einsum("rde,rde->rd", components.root, components.root))
+    is_wide = (sd > share * np.sqrt(np.diag(covariance))).any(axis=1)
+    is_noisy = (readings.comparison_sd(error) > share * readings.spread()) & readings.is_measured
+    is_uncertain = (is_noisy | readings.is_censored).any(axis=1)
+    log_mass = np.where(is_wide | is_uncertain[components.specimen], np.nan, log_mass)
     return replace(components, log_mass=log_mass)
 
 
@@ -709,7 +830,8 @@ def _draw(
     # By specimen.
     filled = np.maximum(table, 0)
     z_all = z[filled].reshape(n, slots * count, d)
-    outputs = values.reshape(len(z), count, -1)[filled].reshape(n, slots * count, -1)
+    by_root = values.reshape(len(z), count, -1)
+    outputs = by_root[filled].reshape(n, slots * count, -1)
     log_q = np.full((n, slots, slots * count), -np.inf)
     for s in range(slots):
         c = filled[:, s]
@@ -718,7 +840,8 @@ def _draw(
         square = (np.einsum("nde,nke->nkd", inverse, away) ** 2).sum(axis=-1)
         log_det = np.log(np.einsum("ndd->nd", components.root[c])).sum(axis=1)
         constant = gammaln((nu + d) / 2) - gammaln(nu / 2) - d / 2 * np.log(nu * np.pi)
-        density = constant - log_det[:, None] - (nu + d) / 2 * np.log1p(square / nu)
+        tail = (nu + d) / 2 * np.log1p(square / nu)
+        density = constant - log_det[:, None] - tail
         log_q[:, s] = np.where(table[:, s, None] >= 0, density, -np.inf)
     log_proposal = logsumexp(log_q, axis=1) + np.log(count)
     exists = np.repeat(table >= 0, count, axis=1)
@@ -742,8 +865,6 @@ def _scrambled(components: int, count: int, dimensions: int, seed: tuple[int, in
 
 def _t_radius(u: Floats, degrees: float) -> Floats:
     """Return the factors that turn normal vectors into vectors of a t distribution."""
-    from scipy.special import chdtri
-
     return np.asarray(np.sqrt(degrees / chdtri(degrees, u)))
 
 
@@ -768,13 +889,18 @@ def _component_weights(sample: _Sample, components: _Components) -> tuple[Floats
 
 
 def _normalised(sample: _Sample, components: _Components) -> _Sample:
-    """Scale the weights of the points around each root to the root's mass."""
+    """Scale the weights of the points around each root to the root's mass, if there is one.
+
+    Few points with scaled weights have too small a variance: a negligible bias if the readings are
+    certain. Both halves have that bias, so that their difference does not show it.
+    """
     table = components.table
     n, slots = table.shape
     log_a = sample.log_a.reshape(n, slots, -1)
     total = logsumexp(log_a, axis=2)
     mass = np.where(table >= 0, components.log_mass[np.maximum(table, 0)], -np.inf)
-    shift = np.where(np.isfinite(total), mass - np.where(np.isfinite(total), total, 0.0), 0.0)
+    scales = np.isfinite(total) & np.isfinite(mass)
+    shift = np.where(scales, mass - np.where(scales, total, 0.0), 0.0)
     scaled = (log_a + shift[..., None]).reshape(n, -1)
     return replace(sample, log_a=scaled)
 

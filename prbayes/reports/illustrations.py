@@ -14,7 +14,7 @@ import pymc as pm
 from prbayes.model.elements import variable_of
 from prbayes.model.emulated import population_simulators
 from prbayes.model.node import nodes
-from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.model.specimen_likelihood import measurements_of
 from prbayes.plots.comparison import plot_comparison
 from prbayes.plots.influences import plot_sensitivity
 from prbayes.plots.landscape import plot_landscape
@@ -410,7 +410,7 @@ def _observed_formatter(model: pm.Model) -> Callable[[Any], dict[str, Any]]:
     graphs: Any = import_module("pymc.model_graph")
     plain = graphs.DEFAULT_NODE_FORMATTERS[graphs.NodeType.OBSERVED_RV]
     simulators = {each.name for each in nodes(model).values()}
-    simulators |= {each.name for each in specimen_likelihoods(model).values()}
+    simulators |= {m.name for m in measurements_of(model).values()}
 
     def formatted(rv: Any) -> dict[str, Any]:
         style: dict[str, Any] = plain(rv)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -65,6 +65,12 @@ class Inputs:
             if isinstance(x, Variable):
                 found.update((v, None) for v in _ancestry(x, known) if v in known)
         return tuple(found)
+
+    def ordered_as(self, other: Inputs) -> Inputs:
+        """Return the same arguments with the aleatory inputs in the order of equal ones."""
+        places = [other.aleatory.index(x) for x in self.aleatory]
+        arguments = tuple(places[a] if isinstance(a, int) else a for a in self.arguments)
+        return replace(self, arguments=arguments, aleatory=other.aleatory, roots=other.roots)
 
     def rebuilt(self, params: Sequence[Any]) -> tuple[list[TensorVariable], list[TensorVariable]]:
         """Return the aleatory and epistemic inputs with the roots replaced by ``params``."""

@@ -229,8 +229,12 @@ def _mean_log_losses(evaluator: Evaluator, thetas: Floats, data: list[Floats]) -
     by_name = evaluator.specimen_log_likelihoods(thetas)
     columns = []
     for simulator, weights in zip(evaluator.emulated, data, strict=True):
-        logs = by_name[simulator.likelihood.name][:, simulator.rows]
-        own = simulator.likelihood.weights
+        likelihood, measurement = simulator.likelihood, simulator.measurement
+        numbers = likelihood.numbers(measurement)
+        specimens = numbers[simulator.rows]
+        weights = weights / np.bincount(numbers)[specimens]  # a specimen counts once
+        logs = by_name[likelihood.measurements[-1].name][:, specimens]
+        own = measurement.weights
         if own is not None:
             logs = logs / np.where(own > 0, own, 1.0)[simulator.rows]
         total = weights.sum(axis=1)

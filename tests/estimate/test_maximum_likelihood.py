@@ -10,8 +10,9 @@ import pymc as pm
 import pytest
 
 import prbayes as prb
+from prbayes._checks import Floats
 from prbayes._finding import Finding, report
-from prbayes.estimate.maximum_likelihood import LocalOptimum, mode_weights
+from prbayes.estimate.maximum_likelihood import LocalOptimum, mode_weights, share_mode
 
 N = 25
 X = np.random.default_rng(3).normal(0.8, 0.5, N)
@@ -135,6 +136,62 @@ def test_a_start_selects_the_mode(codes: list[str]) -> None:
         assert np.sign(optimum.point["mu"]) == sign
         assert optimum.rivals == ()
     assert codes == []
+
+
+def quartic(theta: Floats) -> tuple[float, Floats]:
+    """Return (|theta|^2 - 1)^2: a circle of minima, in one dimension two minima at distance 2."""
+    away = float(theta @ theta) - 1
+    return 20 * away**2, 80 * away * theta
+
+
+@pytest.mark.parametrize("angle", [0.5, 2.0, np.pi])
+def test_optima_on_a_curved_ridge_are_one_mode(angle: float) -> None:
+    unit = np.array([1.0, 1.0])
+    first, second = (
+        LocalOptimum(np.array([np.cos(a), np.sin(a)]), 0.0, np.eye(2), True) for a in (0.0, angle)
+    )
+    assert share_mode(quartic, unit, first, second, 0.01)
+    assert share_mode(quartic, unit, second, first, 0.01)
+
+
+@pytest.mark.parametrize(("height", "expected"), [(0.9, True), (1.1, False)])
+def test_a_barrier_divides_modes(height: float, expected: bool) -> None:
+    def double_well(theta: Floats) -> tuple[float, Floats]:
+        # The barrier at theta[0] = 0; another direction in other units.
+        value, slope = quartic(theta[:1])
+        scaled = theta[1] / 1e6 - 3 * theta[0]
+        gradient = [slope[0] * height / 20 - 6 * scaled, 2 * scaled / 1e6]
+        return height / 20 * value + scaled**2, np.array(gradient)
+
+    first, second = (
+        LocalOptimum(np.array([s, 3e6 * s]), 0.0, np.eye(2), True) for s in (-1.0, 1.0)
+    )
+    assert share_mode(double_well, np.array([1.0, 1e6]), first, second, 1.0) == expected
+
+
+@pytest.mark.parametrize(("error", "expected"), [(0.15, True), (0.05, False)])
+def test_ripples_within_the_error_of_the_likelihood_are_no_barrier(
+    error: float, expected: bool
+) -> None:
+    def ridge(theta: Floats) -> tuple[float, Floats]:
+        phase = 6 * np.pi * theta[1]
+        value = 20 * theta[0] ** 2 + 0.05 * (1 - np.cos(phase))
+        return value, np.array([40 * theta[0], 0.3 * np.pi * np.sin(phase)])
+
+    first, second = (LocalOptimum(np.array([0.0, at]), 0.0, np.eye(2), True) for at in (0.0, 1.0))
+    assert share_mode(ridge, np.ones(2), first, second, error) == expected
+
+
+def test_a_ridge_of_four_hyperparameters_is_one_mode(codes: list[str]) -> None:
+    # As of y = a + b with two normal inputs.
+    with pm.Model() as model:
+        first, second = pm.Normal("first", 0, 1), pm.Normal("second", 0, 1)
+        sd = pm.HalfNormal("sd", 1, shape=2)
+        x = pm.Normal.dist(first + second, pm.math.sqrt((sd**2).sum()))
+        prb.Simulator("y", line, x, observed=line(X))
+    optimum = fit(model)
+    assert codes == ["not-identified"]
+    assert optimum.rivals == ()
 
 
 def mode(value: float, variance: Any) -> LocalOptimum:

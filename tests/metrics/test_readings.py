@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
 from prbayes._checks import Floats
-from prbayes.metrics.readings import Readings, log_interval_probability
+from prbayes.metrics.readings import Readings, averaged, log_interval_probability
 
 NAN = np.nan
 
 
 def readings(values: list[list[float]], **fields: list[list[float]]) -> Readings:
     """Return readings; what is not given is as of exact ones."""
-    parts = {"values": np.array(values)}
-    exact = Readings.exact(parts["values"])
+    exact = Readings.exact(np.array(values))
     given = {name: np.array(field, dtype=float) for name, field in fields.items()}
-    rest = {
-        name: given.get(name, getattr(exact, name)) for name in ("error", "step", "lower", "upper")
-    }
-    return Readings(parts["values"], **rest)
+    return replace(exact, **given)
 
 
 def outputs(points: list[list[list[float]]]) -> Floats:
@@ -42,6 +40,17 @@ def test_variances_of_reading_and_emulator_add() -> None:
     density = y.log_density(points, np.array([0.4]))
     assert np.allclose(density[:, 0], norm.logpdf([1.0, 2.0], [1.2, 1.5], [0.5, 0.4]))
     assert np.allclose(y.comparison_sd(np.array([0.4])), [[0.5], [0.4]])
+
+
+def test_a_relative_error_is_a_share_of_the_output() -> None:
+    absolute = readings([[1.0], [-2.0]], error=[[0.3], [0.1]])
+    y = replace(absolute, is_relative=np.full((2, 1), True))
+    points = outputs([[[1.2], [-0.5]], [[-1.5], [0.0]]])
+    density = y.log_density(points, np.array([0.4]))
+    sd = np.hypot(0.4, np.array([[0.3], [0.1]]) * np.abs(points[..., 0]))
+    assert np.allclose(density, norm.logpdf(y.values, points[..., 0], sd), rtol=1e-12)
+    # Roots are searched with the error at the reading.
+    assert np.allclose(y.comparison_sd(np.array([0.4]))[:, 0], np.hypot(0.4, [0.3, 0.2]))
 
 
 @pytest.mark.parametrize("output", [0.0, 0.7, 3.0])
@@ -196,3 +205,20 @@ def test_the_spread_is_that_of_measured_values_and_never_zero() -> None:
     y = readings([[1.0, 5.0, NAN], [3.0, 5.0, NAN], [NAN, 5.0, NAN]])
     assert y.spread().tolist() == [1.0, 1.0, 1.0]
     assert readings([[1.0], [5.0]]).spread().tolist() == [2.0]
+
+
+@pytest.mark.parametrize("error", [0.5, 2.0])
+def test_repeated_readings_have_the_density_of_their_mean_and_their_scatter(error: float) -> None:
+    rng = np.random.default_rng(0)
+    numbers = np.array([0, 1, 0, 2, 0, 1])
+    y, scale = rng.normal(size=(6, 1)), rng.uniform(0.5, 2.0, (6, 1))
+    count = np.bincount(numbers)[:, None]
+    mean, combined, repeats = averaged(
+        readings(y.tolist(), error=(error * scale).tolist()), scale, numbers, count
+    )
+    assert np.allclose(mean.error, error * combined, rtol=1e-12)
+    outputs_of = np.array([0.3, -0.2, 1.0])
+    density = mean.log_density(outputs_of[:, None, None], np.zeros(1))[:, 0]
+    density += repeats.log_density(np.array([error]), np)
+    each = norm.logpdf(y[:, 0], outputs_of[numbers], error * scale[:, 0])
+    assert np.allclose(density, np.bincount(numbers, each), rtol=1e-12)

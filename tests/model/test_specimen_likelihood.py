@@ -20,6 +20,7 @@ import prbayes as prb
 from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.specimen_likelihood import specimen_likelihoods
+from prbayes.propagation.base import DesignError
 from prbayes.response.compilation import PLAIN
 
 N = 20
@@ -272,6 +273,59 @@ def test_groups_have_populations_of_their_own_and_share_runs() -> None:
     assert drawn[index == 0].mean() < drawn[index == 1].mean()
 
 
+# -- inputs without a response -----------------------------------------------------------------------
+
+
+LIMIT = 1.2
+
+
+def limited(x: Any) -> Any:
+    return np.where(np.asarray(x) > LIMIT, np.nan, 1 + 2 * np.asarray(x))
+
+
+def test_inputs_without_a_response_truncate_the_population() -> None:
+    observed = Y[Y < 1 + 2 * LIMIT]
+    model = build(limited, observed)
+    other = {"mu": 1.0, "sigma_log__": -0.8}
+
+    def truncated(point: dict[str, Any]) -> Floats:
+        share = stats.norm.logcdf(LIMIT, point["mu"], np.exp(point["sigma_log__"]))
+        return exact(point, observed) - share
+
+    difference = values(model, other) - values(model)
+    assert np.allclose(difference, truncated(other) - truncated(POINT), atol=2e-3)
+    # The exact gradient of the term: differences of the closed form.
+    gradient = model.compile_fn(model.dlogp(), mode=PLAIN)(POINT)
+    prior = model.compile_fn(model.logp(vars=model.free_RVs), mode=PLAIN)
+    for name, slope in zip(("mu", "sigma_log__"), np.ravel(gradient), strict=True):
+        ahead, behind = ({**POINT, name: POINT[name] + step} for step in (1e-4, -1e-4))
+        total = [truncated(at).sum() + prior(at) for at in (ahead, behind)]
+        assert slope == pytest.approx((total[0] - total[1]) / 2e-4, abs=0.1)
+    (likelihood,) = specimen_likelihoods(model).values()
+    params = dict(zip(likelihood.variables(), [np.array([1.0]), np.array([0.5])], strict=True))
+    drawn = likelihood.draws(np.random.default_rng(0), params, 500)
+    assert (drawn < 1 + 2 * LIMIT + 0.05).all()
+
+
+def test_each_group_is_truncated_by_itself() -> None:
+    names = ["Adler", "Busch"]
+    data = labelled(names)
+    keep = data.values < LIMIT
+    with pm.Model(coords={"supplier": names}) as model:
+        mu, sigma = pm.Normal("mu", 0, 2, dims="supplier"), pm.HalfNormal("sigma", 1)
+        x = pm.Normal.dist(mu[prb.response.group("supplier")], sigma)
+        prb.Simulator("y", limited, x, observed=1 + 2 * data[keep])
+    index = (data["supplier"].values[keep] == "Busch").astype(int)
+    points = [{"mu": np.array(mu), "sigma_log__": -1.0} for mu in ((0.1, 0.9), (0.0, 1.2))]
+    ours = values(model, points[1]) - values(model, points[0])
+    expected = []
+    for point in points:
+        means, sd = point["mu"][index], np.exp(-1.0)
+        log_p = stats.norm.logpdf(data.values[keep], means, sd)
+        expected.append(log_p - stats.norm.logcdf(LIMIT, means, sd))
+    assert np.allclose(ours, expected[1] - expected[0], atol=2e-3)
+
+
 # -- several simulators ------------------------------------------------------------------------------
 
 
@@ -368,7 +422,9 @@ def test_copies_have_the_same_points(make: str, used: bool) -> None:
     if make != "cloudpickle":
         assert response.runs == 128
     elif used:
-        assert specimen_likelihoods(other)[other["y"]].responses.function.runs == 128
+        assert (
+            specimen_likelihoods(other)[other["y"]].measurements[0].responses.function.runs == 128
+        )
 
 
 def test_a_hyperparameter_that_is_set_needs_no_run() -> None:
@@ -409,7 +465,7 @@ def test_data_of_another_length() -> None:
 def test_data_of_another_shape_are_refused() -> None:
     (likelihood,) = specimen_likelihoods(shared()).values()
     with pytest.raises(ValueError, match=r"y: observed: got shape \(20, 1\), expected \('N',\)"):
-        likelihood.observing(Y[:, None])
+        likelihood.observing({"y": Y[:, None]})
 
 
 def test_what_was_compiled_for_other_data_refuses_them() -> None:
@@ -485,6 +541,12 @@ def test_epistemic_inputs_are_refused() -> None:
 def test_data_that_are_no_readings_are_refused(observed: Floats, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         build(observed=observed)
+
+
+def test_censored_readings_alone_are_refused() -> None:
+    model = build(metric=prb.LogLikelihood(censored=(None, Y.min())))
+    with pytest.raises(DesignError, match="got no reading of the output within the limits"):
+        model.compile_logp()
 
 
 def test_there_is_no_epsilon_to_set_or_to_calibrate() -> None:
@@ -639,16 +701,6 @@ def test_predictive_draws_are_those_of_the_population() -> None:
     assert drawn.std() == pytest.approx(1.0, abs=0.06)
     # Different specimens, and different data sets
     assert len(np.unique(drawn.round(12))) == drawn.size
-
-
-def test_specimens_with_several_readings_are_refused() -> None:
-    with pm.Model():
-        x = pm.Normal.dist(pm.Normal("mu"), 1.0)
-        with pytest.raises(ValueError, match="got the label 'a' several times"):
-            prb.Simulator("y", np.positive, x, observed=[1.0, 2.0], specimens=["a", "a"])
-        prb.Simulator("y", np.positive, x, observed=[1.0, 2.0], specimens=["a", "b"])
-        with pytest.raises(ValueError, match="'b', which y has too"):
-            prb.Simulator("z", np.square, x, observed=[1.0, 2.0], specimens=["b", "c"])
 
 
 def test_the_first_use_logs_the_number_of_runs(caplog: pytest.LogCaptureFixture) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
+from scipy.stats import norm
 
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.response.inputs import read_inputs
@@ -73,6 +74,22 @@ def test_the_prior_range_is_from_minus_one_to_one() -> None:
     )
     assert one.bounds[0, 0] < -1
     assert one.bounds[1, 0] > 1
+
+
+def test_the_bounds_are_those_of_data_sets_of_the_prior() -> None:
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0.0, 1.0)
+        inputs = read_inputs("y", [pm.Normal.dist(mu, 1.0)], model)
+    few, many = (Coordinates.of_prior(inputs, n) for n in (1, 2000))
+    assert np.array_equal(few.center, many.center)
+    assert np.array_equal(few.half_width, many.half_width)
+    # The probability that a new data set of 2000 specimens exceeds the upper end: 1 in 4097 on
+    # average over the draws, exponentially distributed.
+    population = np.random.default_rng(0).normal(size=(1 << 16, 1))
+    ends = np.array([few.inputs(few.bounds)[0][1], many.inputs(many.bounds)[0][1]])
+    exceeded = -np.expm1(2000 * norm.logcdf(ends, population, 1)).mean(axis=0)
+    assert exceeded[0] > 50 / 4097
+    assert exceeded[1] < 5 / 4097
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 
 from prbayes._checks import Floats
 from prbayes.propagation.points import sobol
-from prbayes.propagation.roots import Roots, find_roots, nearest_starts
+from prbayes.propagation.roots import Roots, find_roots, gabriel_neighbours, nearest_starts
 
 BOX = np.array([[-3.0], [3.0]])
 SQUARE = np.array([[-2.0, -2.0], [2.0, 2.0]])
@@ -236,12 +236,50 @@ def test_a_coordinate_without_influence_stays_where_it_starts() -> None:
 def test_nearest_starts_are_the_runs_with_the_nearest_outputs() -> None:
     z = np.arange(6.0)[:, None]
     run_y = np.array([[0, 0], [1, 0], [2, 0], [0, 100], [1, 100], [2, 100]], dtype=float)
-    starts = nearest_starts(
-        z, run_y, np.array([[0.9, 0.0], [1.9, 100.0]]), np.array([1.0, 100.0]), 2
-    )
+    everyone = ~np.eye(6, dtype=bool)
+    y = np.array([[0.9, 0.0], [1.9, 100.0]])
+    starts = nearest_starts(z, run_y, y, np.array([1.0, 100.0]), 2, everyone)
     assert starts[:, 0].ravel().tolist() == [1, 5]
     assert starts[:, 1].ravel().tolist() == [0, 4]
     # In units of the spread: a distance of 100 in the second output is as one of 1 in the first.
     y = np.array([[2.0, 60.0]])
-    starts = nearest_starts(z, run_y, y, np.array([1.0, 100.0]), 2)
+    starts = nearest_starts(z, run_y, y, np.array([1.0, 100.0]), 2, everyone)
     assert starts.ravel().tolist() == [5, 2]
+
+
+def test_starts_are_nearest_in_the_outputs_that_were_measured() -> None:
+    run_z = np.arange(4.0)[:, None]
+    run_y = np.array([[1.0, 9.0], [2.0, 5.0], [3.0, 0.0], [4.0, 7.0]])
+    spread = np.array([[1.0, np.inf], [np.inf, 1.0]])
+    y, everyone = np.array([[4.0, 0.0], [0.0, 9.0]]), ~np.eye(4, dtype=bool)
+    starts = nearest_starts(run_z, run_y, y, spread, 2, everyone)
+    assert starts[..., 0].tolist() == [[3.0, 2.0], [0.0, 3.0]]
+
+
+def test_the_nearest_run_of_every_basin_comes_first() -> None:
+    # One flat branch with many runs near the output, and one steep branch with none.
+    z = np.concatenate([np.linspace(-1, -0.5, 20), [-0.25], np.linspace(0, 1, 6)])
+    run_y = np.where(z < -0.25, 1 + 0.1 * z, np.abs(20 * z))
+    order = np.random.default_rng(0).permutation(len(z))
+    z, run_y = z[order, None], run_y[order, None]
+    neighbours = gabriel_neighbours(z)
+    starts = nearest_starts(z, run_y, np.array([[0.93]]), np.ones(1), 2, neighbours)
+    assert np.abs(starts.ravel() - [-0.7, 0.0]).max() < 0.03
+    # All of them, even if one start is asked for.
+    again = nearest_starts(z, run_y, np.array([[0.93]]), np.ones(1), 1, neighbours)
+    assert np.array_equal(again, starts)
+
+
+def test_neighbours_on_a_line_are_left_and_right() -> None:
+    z = np.random.default_rng(0).normal(size=(50, 1))
+    rank = z[:, 0].argsort().argsort()
+    assert np.array_equal(gabriel_neighbours(z), np.abs(rank[:, None] - rank) == 1)
+
+
+def test_neighbours_in_a_plane_have_an_empty_circle_between_them() -> None:
+    z = np.random.default_rng(1).normal(size=(30, 2))
+    middle = (z[:, None] + z) / 2
+    radius = np.linalg.norm(z[:, None] - z, axis=2) / 2
+    inside = np.linalg.norm(middle[:, :, None] - z, axis=3) < radius[..., None] - 1e-9
+    expected = ~inside.any(axis=2) & ~np.eye(30, dtype=bool)
+    assert np.array_equal(gabriel_neighbours(z), expected)

@@ -19,11 +19,12 @@ from prbayes.propagation.specimen_points import (
     Emulation,
     PointOptions,
     SpecimenPoints,
-    _starts,
+    _narrowing,
     draw_points,
     emulate,
     first_runs,
     normal_log_density,
+    specimen_roots,
 )
 
 Density = Callable[[Floats], Floats]
@@ -34,8 +35,7 @@ def cube(d: int, half_width: float = 1.0) -> Floats:
 
 
 def readings(y: Floats, error: float = 0.0) -> Readings:
-    exact = Readings.exact(y)
-    return Readings(y, np.full_like(y, error), exact.step, exact.lower, exact.upper)
+    return replace(Readings.exact(y), error=np.full_like(y, error))
 
 
 def points_of(
@@ -282,6 +282,44 @@ def test_the_number_of_points_grows_with_the_error_of_the_readings() -> None:
     assert counts[1] >= 8
 
 
+@pytest.mark.parametrize("scatter", [0.05, 0.3, 1.0])
+def test_populations_of_readings_with_a_large_error(scatter: float) -> None:
+    """y = z + error: the population is narrower than the error, as wide, or wider."""
+    ranges = []
+    for seed in range(6):
+        rng = np.random.default_rng([5, seed])
+        y = 0.2 + scatter * rng.normal(size=(20, 1)) + 0.3 * rng.normal(size=(20, 1))
+        _, points = points_of(lambda z: z, y, 1, error=0.3, unit=3.0)
+        differences = []
+        for sd in (0.8 * scatter, scatter, 1.25 * scatter):
+            exact = norm.logpdf(y[:, 0], 0.2, np.hypot(sd, 0.3)).sum()
+            differences.append(log_likelihoods(points, normal(0.2, sd**2)).sum() - exact)
+        ranges.append(np.ptp(differences))
+    # A difference of .1 nats over one posterior standard deviation shifts the posterior by .1 of
+    # it; these populations are about two apart.
+    assert np.sqrt(np.mean(np.square(ranges))) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("measured", "mean", "sd"), [(1, 0.4, 0.5), (3, 0.1, 0.4), (15, -0.45, 0.07)]
+)
+def test_censored_specimens_far_from_the_measured_ones(
+    measured: int, mean: float, sd: float
+) -> None:
+    y = np.full((20, 1), np.nan)
+    y[:measured, 0] = -0.5 + 0.1 * np.arange(measured) / measured
+    lower = np.where(np.isnan(y), -0.4, np.nan)
+    upper = np.where(np.isnan(y), np.inf, np.nan)
+    data = replace(Readings.exact(y), lower=lower, upper=upper)
+    options = PointOptions(half_difference=0.5)
+    emulation, roots = emulate(lambda z: z, data, cube(1), cube(1, 1.5), options)
+    points = draw_points(emulation, emulation.error, data, roots, cube(1, 1.5), options)
+    exact = norm.logpdf(y[:measured, 0], mean, sd).sum()
+    exact += (20 - measured) * norm.logsf(-0.4, mean, sd)
+    ours = log_likelihoods(points, normal(mean, sd**2)).sum()
+    assert abs(ours - exact) < 0.1
+
+
 def test_too_few_points_are_refused() -> None:
     problem = Linear(1, 1, n=30)
     options = PointOptions(half_difference=1e-9, most_points=8)
@@ -324,12 +362,64 @@ def test_runs_far_from_the_data_do_not_count_as_errors() -> None:
     assert np.sort(misfits)[-2] < 0.1
 
 
-def test_starts_are_nearest_in_the_outputs_that_were_measured() -> None:
-    run_z = np.arange(4.0)[:, None]
-    run_y = np.array([[1.0, 9.0], [2.0, 5.0], [3.0, 0.0], [4.0, 7.0]])
-    y, measured = np.array([[4.0, 0.0], [0.0, 9.0]]), np.array([[True, False], [False, True]])
-    starts = _starts(run_z, run_y, y, measured, np.ones(2), 2)
-    assert starts[..., 0].tolist() == [[3.0, 2.0], [0.0, 3.0]]
+def test_roots_on_a_steep_branch_are_not_missing() -> None:
+    """The outputs of at least 12 runs on the flat branch are nearer than any on the steep one."""
+
+    def cubic(z: Floats) -> Floats:
+        x = 2.2 * z
+        return x**3 - 3 * x
+
+    y = np.linspace(1.9, 1.99, 12)[:, None]
+    emulation, points = points_of(cubic, y, 1)
+    assert points.n_roots.tolist() == [3] * 12
+    roots = specimen_roots(emulation, readings(y), PointOptions(starts=1))
+    assert np.bincount(roots.specimen).tolist() == [3] * 12
+
+
+def test_points_of_a_mirror_population_stay_at_its_roots() -> None:
+    """One of two populations is as narrow as the error of the emulator; the other is wide."""
+
+    def symmetric(z: Floats) -> Floats:
+        a, b = np.exp(z[:, 0]), np.exp(z[:, 1])
+        return np.stack([a * b, a + b], axis=1)
+
+    rng = np.random.default_rng(5)
+    x = np.stack([rng.normal(0.5, 0.3, 20), rng.normal(-0.5, 1e-4, 20)], axis=1)
+    y = symmetric(x)
+    data, box = readings(y), cube(2, 1.5)
+    emulation, roots = emulate(symmetric, data, cube(2), box, PointOptions())
+    error = np.array([3e-4, 3e-4])
+    points = draw_points(emulation, error, data, roots, box, PointOptions())
+    for side in (x, x[:, ::-1]):
+        away = np.abs(points.z - side[:, None]).max(axis=2).min(axis=1)
+        assert away.max() < 0.01
+
+
+def test_runs_are_added_while_the_error_could_narrow_a_population() -> None:
+    """A population that is narrow beside the emulator's error at a distant mirror population."""
+
+    def cosh(z: Floats) -> Floats:
+        return np.stack([z[:, 0] + 0.2 * z[:, 1], np.cosh(3 * z[:, 1] - 0.9)], axis=1)
+
+    rng = np.random.default_rng(2)
+    x = np.stack([rng.normal(0.2, 0.02, 15), rng.normal(0.35, 0.9, 15)], axis=1)
+    data, box = readings(cosh(x)), cube(2, 2.0)
+    emulation, _ = emulate(cosh, data, cube(2), box, PointOptions())
+    rough, roots = emulate(cosh, data, cube(2), box, PointOptions(bias=1e9))
+    assert rough.bias < PointOptions().bias < _narrowing(rough, data, roots)
+    assert len(emulation.z) > len(rough.z) == 128
+    assert emulation.error[1] < rough.error[1] / 10
+
+
+def test_the_search_covers_the_population_of_the_roots() -> None:
+    x = np.random.default_rng(0).normal(0.6, 0.2, 20)
+    emulation, _ = emulate(
+        lambda z: 2 * z, readings(2 * x[:, None]), cube(1), cube(1, 1.2), PointOptions()
+    )
+    assert emulation.box[0, 0] == -1.2
+    # All of 20 specimens are below with a probability of 1 - 1 / 4097.
+    end = x.mean() + norm.isf(1 / 4097 / 20) * x.std()
+    assert emulation.box[1, 0] == pytest.approx(end, rel=1e-3)
 
 
 def test_batches_of_runs_are_at_the_roots() -> None:

@@ -1,0 +1,145 @@
+"""Sizes of the guards of the log-likelihood by specimen: how often right models are flagged.
+
+Hyperparameters are drawn from the prior, inputs of specimens from their population, and readings are
+their responses without error: every finding is a false one. All data sets of a problem share the first
+runs and the compiled log-likelihood. Each data set goes through what a user calls: roots, points and
+the checks before the fit, and 256 draws of the posterior, by importance sampling, of which `prb.diagnose`
+tests the family of the population and the conflict of prior and data.
+
+    uv run python -m benchmarks.likelihood_guards [--data-sets 200] [--tested 60]
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+import prbayes as prb
+from benchmarks import record
+from benchmarks.likelihood_coverage import PROBLEMS, Problem, likelihood_of, thetas_of
+from benchmarks.scoreboard.problem import Input, normal, truncated
+from prbayes._specimen_checks import check_draws
+from prbayes.model.evaluator import Evaluator
+from prbayes.model.population_draws import Populations
+from prbayes.model.specimen_likelihood import SpecimenLikelihood
+
+OUT = record.RESULTS / "likelihood_guards.json"
+# With priors that matter beside the data: conflicts are reported where the prior pulls.
+LINEAR = Problem(
+    name="linear",
+    size=20,
+    priors={"mu": normal(1.0, 0.2), "sigma": truncated(0.5, 0.15, low=0.1)},
+    inputs=(Input("normal", "mu", "sigma"),),
+    formula=lambda xp, x: 2 * x + 1,
+)
+CASES = {"linear": LINEAR, "folded": PROBLEMS["folded"], "mirror root": PROBLEMS["mirror root"]}
+TESTS = {
+    "family of the population": "population-misfit",
+    "conflict of prior and data": "prior-conflict",
+}
+CHECKS = ("loops and checks before the fit", *TESTS)
+_BLOCK = 10  # data sets between two writes of the results
+
+
+def observe(likelihood: SpecimenLikelihood, base: SpecimenLikelihood, y: Any) -> list[str]:
+    """Give a likelihood other data, with the runs of a base, and return its findings.
+
+    Its compiled graphs stay.
+    """
+    points, log_a = likelihood.arrays
+    other = base.observing(y)
+    vars(other)["coordinates"] = base.coordinates  # those of the prior, whatever the data
+    prepared = other._prepared
+    new_points, new_log_a = other.arrays
+    for old, new in zip((*points, log_a), (*new_points, new_log_a), strict=True):
+        old.set_value(new.get_value())
+    # The observed values stay, as the model has them: others would be other points.
+    vars(likelihood).update(readings=other.readings, _prepared=prepared)
+    return [finding.code for finding in other.findings]
+
+
+def readings(problem: Problem, number: int) -> Any:
+    """Return the responses of one data set, with hyperparameters from the prior."""
+    rng = np.random.default_rng([17, problem.size, number])
+    truth = thetas_of(problem, rng.standard_normal((1, len(problem.priors))))[0]
+    z = rng.standard_normal((problem.size, len(problem.inputs)))
+    values = dict(zip(problem.priors, truth, strict=True))
+    return problem.response(*[np.ravel(x) for x in problem.population.population(values, z)])
+
+
+def before_the_fit(
+    likelihood: SpecimenLikelihood, base: SpecimenLikelihood, y: Any
+) -> dict[str, Any]:
+    """Return the codes of the findings of loops and checks before the fit."""
+    try:
+        return {"before the fit": observe(likelihood, base, y)}
+    except prb.DesignError as error:
+        return {"before the fit": ["refused"], "error": str(error)}
+
+
+def of_draws(evaluator: Evaluator, populations: Populations) -> dict[str, Any]:
+    """Return the codes of the findings of posterior draws, and the tests that were not run."""
+    (likelihood,) = evaluator.likelihoods
+    points = likelihood.points
+    draws = populations.posterior(points.z, points.log_a).thetas
+    result = xr.DataTree.from_dict({"posterior": xr.Dataset()})
+    checked = check_draws(evaluator, result, draws.reshape(2, -1, evaluator.size))
+    return {
+        "codes": [finding.code for finding in checked.findings],
+        "untested": [name for name in TESTS if any(name in text for text in checked.untested)],
+    }
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the share of data sets that each check flags, with its standard error."""
+    flagged = {CHECKS[0]: [bool(row["before the fit"]) for row in rows]}
+    for name, code in TESTS.items():
+        tested = [row for row in rows if "codes" in row and name not in row["untested"]]
+        flagged[name] = [code in row["codes"] for row in tested]
+    result: dict[str, Any] = {}
+    for name, values in flagged.items():
+        if not values:
+            continue
+        n, share = len(values), float(np.mean(values))
+        # Of no flag, as if there were one.
+        error = float(np.sqrt(max(share, 1 / n) * (1 - share) / n))
+        result[name] = {"data sets": n, "share": round(share, 4), "standard error": round(error, 4)}
+    return result
+
+
+def main() -> None:
+    """Run what is missing."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--data-sets", type=int, default=200)
+    parser.add_argument("--problems", nargs="+", default=list(CASES), choices=list(CASES))
+    parser.add_argument("--tested", type=int, default=60, help="data sets with tests of draws")
+    arguments = parser.parse_args()
+    logging.disable(logging.WARNING)
+    found = record.load(OUT, {"rows": {}, "summary": {}})
+    for name in arguments.problems:
+        problem = CASES[name]
+        _base_model, base = likelihood_of(problem)
+        model, _ = likelihood_of(problem)
+        evaluator = Evaluator(model)
+        (likelihood,) = evaluator.likelihoods
+        populations = likelihood.populations
+        rows = found["rows"].setdefault(name, [])
+        for number in range(arguments.data_sets):
+            if number < len(rows) and (number >= arguments.tested or "codes" in rows[number]):
+                continue
+            row = before_the_fit(likelihood, base, readings(problem, number))
+            if number < arguments.tested and "error" not in row:
+                row |= of_draws(evaluator, populations)
+            rows[number : number + 1] = [row]
+            if number % _BLOCK == _BLOCK - 1 or number == arguments.data_sets - 1:
+                found["summary"][name] = summary(rows)
+                record.save(OUT, found)
+                print(name, number + 1, found["summary"][name], flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,235 @@
+"""Share of a population that has a response, under the log-likelihood by specimen.
+
+Where a response is NaN, no specimen can be measured. The measured specimens are then from the
+population that is truncated to inputs with a response,
+
+    log p(y_i | theta) = log L_i(theta) - log S(theta),
+
+    S(theta) = integral over inputs with a response of p(x | theta) dx
+             ~= sum_{k with a response} exp(B_k) p(x_k | theta) / sum_k exp(B_k) p(x_k | theta),
+
+B_k = -log q(x_k). Neither the points x_k nor the proposal density q contain theta.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from scipy.special import logsumexp, stdtrit
+
+from prbayes._checks import Floats
+from prbayes.propagation.base import DesignError
+from prbayes.propagation.points import sobol
+from prbayes.propagation.specimen_points import Emulation, PointOptions, first_runs
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseShare:
+    """Points from which the share of a population that has a response follows.
+
+    Attributes
+    ----------
+    z : ndarray, shape (M, d)
+        Coordinates; the points with a response first.
+    log_b : ndarray, shape (M,)
+        Minus the log of the proposal density of z, up to a constant.
+    with_response : int
+        Number of points with a response.
+    """
+
+    z: Floats
+    log_b: Floats
+    with_response: int
+
+    def log_share(self, log_p: Floats) -> Floats:
+        """Return log S of log-densities of the points, (..., M) -> (...).
+
+        Zero where no point with a response is in the population.
+        """
+        terms = log_p + self.log_b
+        inside, outside = (
+            _logsumexp(terms[..., : self.with_response]),
+            _logsumexp(terms[..., self.with_response :]),
+        )
+        is_known = np.isfinite(inside)
+        return np.where(is_known, -np.logaddexp(0.0, outside - np.where(is_known, inside, 0)), 0.0)
+
+
+def _logsumexp(terms: Floats) -> Floats:
+    """Return the log of the sum of exponentials over the last axis; SciPy's takes twice as long."""
+    largest = terms.max(axis=-1, keepdims=True, initial=-np.inf)
+    largest = np.where(np.isfinite(largest), largest, 0.0)
+    with np.errstate(divide="ignore"):
+        total = np.exp(terms - largest).sum(axis=-1)
+        return np.asarray(np.log(total) + largest[..., 0])
+
+
+class SharedDraws(Protocol):
+    """Draws of the hyperparameters given the specimens, without or with a share."""
+
+    def log_share(self, share: ResponseShare) -> Floats:
+        """Return the sum of log S over the specimens, (S,)."""
+
+    def specimens(self) -> Floats:
+        """Return coordinates of specimens, (n, d)."""
+
+
+def response_share(
+    run: Callable[[Floats], Floats],
+    emulation: Emulation,
+    prior_specimens: Callable[[], Floats],
+    posterior: Callable[[ResponseShare | None], SharedDraws],
+    options: PointOptions,
+    *,
+    count: int = 1024,
+    most: int = 2**16,
+    batches: int = 6,
+    seed: int = 0,
+    name: str = "response",
+) -> tuple[Emulation, ResponseShare | None]:
+    """Return the points of the share, and the emulation with runs at the failing region's boundary.
+
+    None where the share changes the log-likelihood of no plausible population by more than the
+    error of the points of the specimens.
+
+    Parameters
+    ----------
+    run : callable
+        Coordinates (n, d) -> outputs (n, m); NaN where there is no response.
+    emulation : Emulation
+    prior_specimens : callable
+        Returns specimens of the prior predictive population, (n, d).
+    posterior : callable
+        Share -> draws of the hyperparameters.
+    options : PointOptions
+    count, most : int
+        Points of each half at first, and at last.
+    batches : int
+        Largest number of batches of runs at the boundary.
+    seed : int
+    name : str
+        For messages.
+
+    Raises
+    ------
+    DesignError
+        If boundary or points do not determine the share.
+    """
+    if not np.isnan(emulation.y).any():
+        return emulation, None
+    largest = options.half_difference
+    draws = posterior(None)
+
+    def drawn(number: int, half: int) -> ResponseShare:
+        return _points(emulation, (prior_specimens(), draws.specimens()), number, 2 * seed + half)
+
+    share = drawn(count, 0)
+    if np.sqrt((draws.log_share(share) ** 2).mean()) <= largest:
+        return emulation, None
+    draws = posterior(share)
+    batch = max(first_runs(emulation.z.shape[1]) // 2, options.fresh)
+    for _ in range(batches):
+        fresh = boundary_points(emulation, draws.specimens(), batch, seed)
+        before = draws.log_share(share)
+        if len(fresh):
+            z = np.concatenate([emulation.z, fresh])
+            y = np.concatenate([emulation.y, run(fresh)])
+            emulation = replace(emulation, z=z, y=y)
+        share = drawn(count, 0)
+        change = float(np.std(draws.log_share(share) - before))
+        if change <= largest:
+            break
+    else:
+        raise DesignError(
+            f"{name}: got a failing region (NaN) whose boundary still changes the log-likelihood "
+            f"by {change:.2g} nats after {batches} batches of {batch} runs there, expected at most "
+            f"{largest}; repair the response, narrow the priors, or use "
+            "metric=prb.ProbabilityResidual()"
+        )
+    draws = posterior(share)
+    while True:
+        halves = [drawn(count, half) for half in (0, 1)]
+        logs = [draws.log_share(half) for half in halves]
+        difference = float(np.std(logs[0] - logs[1]) / 2)
+        if difference <= largest or 2 * count > most:
+            break
+        count *= 2
+    if difference > largest:
+        raise DesignError(
+            f"{name}: got two halves of {count} points whose shares without response change the "
+            f"log-likelihood by {difference:.2g} nats, expected at most {largest}; narrow the "
+            "priors, or use metric=prb.ProbabilityResidual()"
+        )
+    return emulation, _sorted(
+        np.concatenate([half.z for half in halves]),
+        np.concatenate([half.log_b for half in halves]),
+        emulation,
+    )
+
+
+def _points(
+    emulation: Emulation, samples: tuple[Floats, ...], count: int, seed: int, degrees: float = 5.0
+) -> ResponseShare:
+    """Draw Sobol points from a mixture around samples: whitened, t distributed elements."""
+    each = count // len(samples)
+    d = samples[0].shape[1]
+    means = [sample.mean(axis=0) for sample in samples]
+    covariances = [np.cov(sample.T).reshape(d, d) for sample in samples]
+    roots = [np.linalg.cholesky(1.5 * covariance) for covariance in covariances]
+    z = np.concatenate(
+        [
+            mean + stdtrit(degrees, sobol(each, d, 1009 * seed + k)) @ root.T
+            for k, (mean, root) in enumerate(zip(means, roots, strict=True))
+        ]
+    )
+    log_q = []
+    for mean, root in zip(means, roots, strict=True):
+        standard = np.linalg.solve(root, (z - mean).T)
+        log_t = -(degrees + 1) / 2 * np.log1p(standard**2 / degrees)
+        log_q.append(log_t.sum(axis=0) - np.log(np.diag(root)).sum())
+    return _sorted(z, -logsumexp(log_q, axis=0), emulation)
+
+
+def _sorted(z: Floats, log_b: Floats, emulation: Emulation) -> ResponseShare:
+    """Return the share with the points that have a response first."""
+    is_missing = emulation.is_missing(z)
+    order = np.argsort(is_missing, kind="stable")
+    return ResponseShare(z[order], log_b[order], int((~is_missing).sum()))
+
+
+def boundary_points(emulation: Emulation, z: Floats, count: int, seed: int = 0) -> Floats:
+    """Return points for runs between runs with and without response, at most (count, d).
+
+    A point is near the boundary if its distances to the nearest run with and to the nearest run
+    without a response differ by less than a factor of two. They are chosen one by one among
+    specimens, each farthest from all runs.
+
+    Parameters
+    ----------
+    emulation : Emulation
+    z : ndarray, shape (n, d)
+        Specimens of plausible populations.
+    count : int
+    seed : int
+    """
+    from scipy.spatial import cKDTree
+
+    width = emulation.box[1] - emulation.box[0]
+    is_missing = np.isnan(emulation.y).any(axis=1)
+    with_response, without = (
+        cKDTree(emulation.z[rows] / width).query(z / width)[0] for rows in (~is_missing, is_missing)
+    )
+    distance = np.minimum(with_response, without)
+    near = np.flatnonzero(np.maximum(with_response, without) < 2 * distance)
+    # Some of them, so that the population decides where on the boundary the runs are.
+    near = np.random.default_rng(seed).permutation(near)[: 4 * count]
+    candidates, distance = z[near] / width, distance[near]
+    chosen: list[int] = []
+    while len(chosen) < min(count, len(near)):
+        chosen.append(int(np.argmax(distance)))
+        away = np.sqrt(((candidates - candidates[chosen[-1]]) ** 2).sum(axis=1))
+        distance = np.minimum(distance, away)
+    return z[near[chosen]]

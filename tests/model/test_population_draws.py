@@ -1,0 +1,151 @@
+"""Draws of the hyperparameters given points of the specimens, against closed forms."""
+
+from __future__ import annotations
+
+import weakref
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+import xarray as xr
+from scipy.stats import norm
+
+import prbayes as prb
+from prbayes._checks import Floats
+from prbayes.model.population_draws import Populations, specimens_of
+from prbayes.model.specimen_likelihood import specimen_likelihoods
+
+N, SD, PRIOR_SD = 12, 0.5, 2.0
+X = np.random.default_rng(4).normal(1.0, SD, N)
+
+
+def populations_of(model: pm.Model) -> Populations:
+    (likelihood,) = specimen_likelihoods(model).values()
+    return Populations(
+        weakref.ref(model), likelihood.inputs, likelihood.coordinates, likelihood.stacked.groups
+    )
+
+
+def normal_model(scale: float = 1.0) -> pm.Model:
+    """Return a model of one normal input with a known standard deviation."""
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 0, PRIOR_SD * scale)
+        x = pm.Normal.dist(mu, SD * scale)
+        prb.Simulator("y", lambda x: x / scale, x, observed=X)
+    return model
+
+
+def points_at(populations: Populations, x: Floats) -> tuple[Floats, Floats]:
+    """Return one point for each specimen, at its inputs, with the number of the density of x."""
+    z = populations.coordinates.of([x], 1)[:, None]
+    return z, -populations.coordinates.log_jacobian(z)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e6])
+def test_moments_are_those_of_the_posterior(scale: float) -> None:
+    model = normal_model(scale)
+    populations = populations_of(model)
+    z, log_a = points_at(populations, scale * X)
+    draws = populations.posterior(z, log_a)
+    precision = N / SD**2 + 1 / PRIOR_SD**2
+    mean, sd = X.sum() / SD**2 / precision, precision**-0.5
+    thetas = draws.thetas[:, 0] / scale
+    assert len(thetas) == 256
+    assert thetas.mean() == pytest.approx(mean, abs=5 * sd / np.sqrt(256))
+    assert thetas.std() == pytest.approx(sd, abs=5 * sd / np.sqrt(512))
+
+
+def test_log_likelihoods_are_those_of_the_population() -> None:
+    model = normal_model()
+    populations = populations_of(model)
+    z, log_a = points_at(populations, X)
+    thetas = np.array([[0.0], [1.5]])
+    expected = norm.logpdf(X, thetas, SD)
+    np.testing.assert_allclose(populations.log_likelihoods(thetas, z, log_a), expected)
+    # The same point with half the number each
+    twice = np.repeat(z, 2, axis=1), np.repeat(log_a, 2, axis=1) - np.log(2)
+    np.testing.assert_allclose(populations.log_likelihoods(thetas, *twice), expected)
+
+
+def test_smoothing_widens_populations() -> None:
+    model = normal_model()
+    populations = populations_of(model)
+    z, log_a = points_at(populations, X)
+    unit = populations.coordinates.half_width[0]
+    smoothing = np.array([[(0.7 / unit) ** 2]])
+    thetas = np.array([[0.0], [1.5]])
+    smoothed = populations.log_likelihoods(thetas, z, log_a, smoothing)
+    # Moments of 256 specimens: their standard errors shift log L by about .1.
+    jacobian = populations.coordinates.log_jacobian(z)[:, 0]
+    expected = norm.logpdf(X, thetas, np.hypot(SD, 0.7)) - jacobian
+    spread = np.abs(X - thetas) / (SD**2 + 0.7**2) * SD / np.sqrt(256) + 0.05
+    assert (np.abs(smoothed - expected - jacobian) < 5 * spread).all()
+    draws = populations.posterior(z, log_a, smoothing)
+    precision = N / (SD**2 + 0.7**2) + 1 / PRIOR_SD**2
+    assert draws.thetas.std() == pytest.approx(precision**-0.5, rel=0.25)
+
+
+def test_specimens_are_those_of_the_predictive_population() -> None:
+    model = normal_model()
+    populations = populations_of(model)
+    draws = populations.posterior(*points_at(populations, X))
+    (x,) = populations.coordinates.inputs(draws.specimens())
+    precision = N / SD**2 + 1 / PRIOR_SD**2
+    assert x.shape == (256 * 16,)
+    assert x.mean() == pytest.approx(X.sum() / SD**2 / precision, abs=5 * precision**-0.5 / 16)
+    assert x.std() == pytest.approx(np.hypot(SD, precision**-0.5), rel=5 / np.sqrt(2 * 256))
+
+
+def test_groups_have_populations_of_their_own() -> None:
+    groups = np.arange(N) % 2
+    data = xr.DataArray(
+        X + 3 * groups, {"kind": ("specimen", np.array(["a", "b"])[groups])}, "specimen"
+    )
+    with pm.Model(coords={"kind": ["a", "b"]}) as model:
+        mu = pm.Normal("mu", 0, PRIOR_SD, dims="kind")
+        x = pm.Normal.dist(mu[prb.response.group("kind")], SD)
+        prb.Simulator("y", lambda x: x, x, observed=data)
+    populations = populations_of(model)
+    z, log_a = points_at(populations, X + 3 * groups)
+    thetas = np.array([[0.0, 2.0], [1.0, 4.0]])
+    expected = norm.logpdf(X + 3 * groups, thetas[:, groups], SD)
+    np.testing.assert_allclose(populations.log_likelihoods(thetas, z, log_a), expected)
+    draws = populations.posterior(z, log_a)
+    precision = N / 2 / SD**2 + 1 / PRIOR_SD**2
+    for group in (0, 1):
+        mean = (X + 3 * groups)[groups == group].sum() / SD**2 / precision
+        error = 5 * precision**-0.5 / 16
+        assert draws.thetas[:, group].mean() == pytest.approx(mean, abs=error)
+    specimens = specimens_of(populations, draws.thetas, each=4)
+    assert len(specimens) == 2 * 256 * 4
+    (x,) = populations.coordinates.inputs(specimens)
+    assert x[: len(x) // 2].mean() == pytest.approx(draws.thetas[:, 0].mean(), abs=0.1)
+    assert x[len(x) // 2 :].mean() == pytest.approx(draws.thetas[:, 1].mean(), abs=0.1)
+
+
+def test_seeds() -> None:
+    populations = populations_of(normal_model())
+    points = points_at(populations, X)
+    first, same, second = (populations.posterior(*points, seed=seed) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first.thetas, same.thetas)
+    np.testing.assert_array_equal(first.specimens(), same.specimens())
+    assert not np.array_equal(first.thetas, second.thetas)
+    assert not np.array_equal(first.specimens(), first.specimens(seed=1))
+
+
+def test_specimens_that_no_population_reaches() -> None:
+    with pm.Model() as model:
+        end = pm.Uniform("end", 1, 2)
+        prb.Simulator("y", lambda x: x, pm.Uniform.dist(0, end), observed=X)
+    populations = populations_of(model)
+    with pytest.raises(ValueError, match="no population of the prior that reaches the specimens"):
+        populations.posterior(*points_at(populations, X + 10))
+
+
+def test_a_model_that_is_gone() -> None:
+    model: Any = normal_model()
+    populations = populations_of(model)
+    gone = Populations(lambda: None, populations.inputs, populations.coordinates, None)  # type: ignore[arg-type]
+    with pytest.raises(RuntimeError, match="build the model again"):
+        _ = gone.hyperparameters
