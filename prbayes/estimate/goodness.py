@@ -206,14 +206,6 @@ def _distances_of(expected: Floats, w: Floats) -> list[Floats]:
     return [in_the_middle, in_the_tails]
 
 
-def probability_there(sampling: SamplingDistribution, n_sets: int, seed: int) -> float:
-    """Return how probable a distance as the data's from the population at theta itself is.
-
-    Without refits: for an optimum that is no minimiser, as a prior holds it.
-    """
-    return Refitted.there(sampling, n_sets, seed).probability
-
-
 def of_held_away(probability: float) -> list[str]:
     """Say so where the data cannot have come from the population that the prior holds."""
     if not probability < UNLIKELY:

@@ -676,12 +676,6 @@ def nodes(model: pm.Model) -> dict[Any, Node]:
     return computed
 
 
-def required_nodes(model: pm.Model) -> dict[Any, Node]:
-    """Return the simulators of a model, or raise if it has none."""
-    required_simulators(model)
-    return nodes(model)
-
-
 def required_simulators(model: pm.Model) -> dict[Any, AnySimulator]:
     """Return the simulators of a model as far as they are computed, or raise if it has none."""
     by_variable = simulators(model)

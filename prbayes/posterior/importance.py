@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri, gammaln, logsumexp, ndtri
+from scipy.special import chdtri, logsumexp, ndtri
 
 from prbayes._checks import Floats
 from prbayes.propagation.points import sobol
@@ -124,8 +124,10 @@ def laplace(
         direction = np.einsum("mde,me->md", covariance, gradient)
         decrement = np.einsum("md,md->m", gradient, direction)
         new_sd = np.sqrt(np.einsum("mdd->md", covariance))
-        same_step = ((new_sd < 2 * sd) & (sd < 2 * new_sd)).all(axis=1)
-        settled = same_step & (decrement < 1e-3) & (values.min(axis=1) > -0.01)
+        ratio = new_sd / sd
+        same_step = ((ratio < 2) & (ratio > 0.5)).all(axis=1)
+        is_maximum = values.min(axis=1) > -0.01
+        settled = same_step & (decrement < 1e-3) & is_maximum
         if settled.all():
             break
         sd = np.minimum(new_sd, 10 * sd)
@@ -135,7 +137,8 @@ def laplace(
         best = heights.argmax(axis=1)
         rises = ~settled & (heights[np.arange(count), best] > value)
         modes[rises] = trials[rises, best[rises]]
-    log_mass = value + np.linalg.slogdet(covariance)[1] / 2 + d / 2 * np.log(2 * np.pi)
+    _, log_det = np.linalg.slogdet(covariance)
+    log_mass = value + log_det / 2 + d / 2 * np.log(2 * np.pi)
     parts = zip(modes, covariance, log_mass.tolist(), settled.tolist(), strict=True)
     return [Laplace(*part) for part in parts]
 
@@ -147,18 +150,28 @@ def _derivatives(
     count, d = thetas.shape
     axes = steps[:, None] * np.eye(d)
     first, second = np.triu_indices(d, 1)
-    pairs = [s * axes[:, first] + t * axes[:, second] for s in (1, -1) for t in (1, -1)]
-    shifts = np.concatenate([np.zeros((count, 1, d)), axes, -axes, *pairs], axis=1)
-    values = log_density((thetas[:, None] + shifts).reshape(-1, d)).reshape(count, -1)
+    along, across = axes[:, first], axes[:, second]
+    pairs = along + across, along - across, across - along, -along - across
+    center = np.zeros((count, 1, d))
+    shifts = np.concatenate([center, axes, -axes, *pairs], axis=1)
+    points = thetas[:, None] + shifts
+    values = log_density(points.reshape(-1, d)).reshape(count, -1)
     if not np.isfinite(values).all():
         raise ValueError("got a log-density that is not finite around a mode")
-    center, up, down = values[:, :1], values[:, 1 : d + 1], values[:, d + 1 : 2 * d + 1]
+    middle, up, down, *mixed = np.split(values, _ends(d, len(first)), axis=1)
     gradient = (up - down) / (2 * steps)
-    hessian = ((up + down - 2 * center) / steps**2)[..., None] * np.eye(d)
-    mixed = np.moveaxis(values[:, 2 * d + 1 :].reshape(count, 4, -1), 1, 0)
-    cross = (mixed[0] - mixed[1] - mixed[2] + mixed[3]) / (4 * steps[:, first] * steps[:, second])
-    hessian[:, first, second] = hessian[:, second, first] = cross
-    return center[:, 0], gradient, hessian
+    second_derivatives = (up + down - 2 * middle) / steps**2
+    hessian = second_derivatives[..., None] * np.eye(d)
+    area = steps[:, first] * steps[:, second]
+    cross = (mixed[0] - mixed[1] - mixed[2] + mixed[3]) / (4 * area)
+    hessian[:, first, second] = cross
+    hessian[:, second, first] = cross
+    return middle[:, 0], gradient, hessian
+
+
+def _ends(d: int, pairs: int) -> list[int]:
+    """Return where the values of the middle, up, down and three of the mixed points end."""
+    return np.cumsum([1, d, d, pairs, pairs, pairs]).tolist()
 
 
 def importance_sample(
@@ -194,7 +207,8 @@ def importance_sample(
         weights, sample = _weighted(points, log_p, log_p - log_q, size, seed + round_)
         if sample.is_reliable(options):
             break
-        responsibilities = np.exp(by_component - log_q[:, None]) * weights[:, None]
+        responsibilities = np.exp(by_component - log_q[:, None])
+        responsibilities = responsibilities * weights[:, None]
         shares = responsibilities.sum(axis=0)
         for m, share in enumerate(shares):
             if share * len(points) * sample.efficiency < 10 * points.shape[1]:
@@ -202,7 +216,8 @@ def importance_sample(
             rows = responsibilities[:, m] / share
             centers[m] = rows @ points
             away = points - centers[m]
-            roots[m] = np.linalg.cholesky((away * rows[:, None]).T @ away)
+            covariance = (away * rows[:, None]).T @ away
+            roots[m] = np.linalg.cholesky(covariance)
     return sample
 
 
@@ -220,7 +235,13 @@ def _weighted(
     positions = (np.arange(size) + rng.random()) / size
     rows = np.searchsorted(np.cumsum(weights), positions).clip(max=len(weights) - 1)
     rows = rng.permutation(rows)
-    sample = ImportanceSample(points[rows], log_p[rows], float(pareto_k), efficiency, log_evidence)
+    sample = ImportanceSample(
+        points[rows],
+        log_p[rows],
+        float(pareto_k),
+        efficiency,
+        log_evidence,
+    )
     return weights, sample
 
 
@@ -241,17 +262,16 @@ class _Mixture:
             max=len(self.shares) - 1
         )
         radius = np.sqrt(self.degrees / chdtri(self.degrees, u[:, d]))
-        away = np.einsum("sde,se->sd", self.roots[component], ndtri(u[:, :d]) * radius[:, None])
+        standard = ndtri(u[:, :d]) * radius[:, None]
+        away = np.einsum("sde,se->sd", self.roots[component], standard)
         return np.asarray(self.centers[component] + away)
 
     def log_densities(self, points: Floats) -> Floats:
         """Return log(share times density) of each component, (S, M)."""
-        d, nu = self.centers.shape[1], self.degrees
-        constant = gammaln((nu + d) / 2) - gammaln(nu / 2) - d / 2 * np.log(nu * np.pi)
+        from scipy.stats import multivariate_t
+
         columns = []
         for center, root, share in zip(self.centers, self.roots, self.shares, strict=True):
-            standard = np.linalg.solve(root, (points - center).T)
-            log_det = np.log(np.diag(root)).sum()
-            tail = (nu + d) / 2 * np.log1p((standard**2).sum(axis=0) / nu)
-            columns.append(np.log(share) + constant - log_det - tail)
+            log_t = multivariate_t(center, root @ root.T, self.degrees).logpdf(points)
+            columns.append(np.log(share) + np.atleast_1d(log_t))
         return np.stack(columns, axis=1)

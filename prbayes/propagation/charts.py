@@ -376,7 +376,8 @@ def charts_at_modes(fibres: Fibres, starts: int, charts: int) -> Charts:
     for rank in range(starts):
         row = np.arange(n) * starts + order[:, rank]
         value = log_density.ravel()[row]
-        distance = np.sqrt(((z[row, None] - modes) ** 2).sum(axis=2)).min(axis=1)
+        squares = ((z[row, None] - modes) ** 2).sum(axis=2)
+        distance = np.sqrt(squares).min(axis=1)
         accepted = np.isfinite(value) & (value > best - 8) & (distance > 0.7)
         i = np.flatnonzero(accepted & (count < modes.shape[1]))
         modes[i, count[i]] = z[row[i]]
@@ -507,7 +508,8 @@ def _charts_at(fibres: Fibres, z: Floats, jacobian: Floats) -> Charts:
             column = solve_each(square, (change @ solved)[..., o])
             slope[:, a] -= column[:, o]
     # NaN beside the range of the response, or at a singular Jacobian
-    bad = ~(np.isfinite(curvature).all(axis=(1, 2)) & np.isfinite(slope).all(axis=1))
+    is_curved = np.isfinite(curvature).all(axis=(1, 2))
+    bad = ~(is_curved & np.isfinite(slope).all(axis=1))
     curvature[bad], slope[bad] = 0, 0
     hessian = np.eye(d - m) - (curvature + curvature.transpose(0, 2, 1)) / 2
     precision, axes = np.linalg.eigh(hessian)

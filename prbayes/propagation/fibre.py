@@ -163,7 +163,9 @@ class FibreProposal:
             sample = _draw(
                 self.fibres.subset(block), self.charts.subset(block), points, (1, seed), numbers
             )
-            x[block], log_a[block], chart[block] = sample.x, sample.log_a, sample.chart
+            x[block] = sample.x
+            log_a[block] = sample.log_a
+            chart[block] = sample.chart
         failed = ~np.isfinite(log_a[self.charts_per_specimen > 0])
         return FibrePoints(x, log_a, float(failed.mean()) if failed.size else 0.0, chart)
 
@@ -338,7 +340,8 @@ def with_error(response: Response, error: Floats) -> Response:
     def response_with_error(x: Floats) -> tuple[Floats, Floats]:
         values, jacobian = response(x[:, :-m])
         by_error = np.broadcast_to(np.diag(error), (len(x), m, m))
-        return values + x[:, -m:] * error, np.concatenate([jacobian, by_error], axis=2)
+        values = values + x[:, -m:] * error
+        return values, np.concatenate([jacobian, by_error], axis=2)
 
     return response_with_error
 

@@ -110,7 +110,8 @@ class DifferencedResponse:
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
         """Return values and Jacobian."""
         k, d = z.shape
-        shifts = self.step * np.concatenate([np.zeros((1, d)), np.eye(d), -np.eye(d)])
+        axes = np.eye(d)
+        shifts = self.step * np.concatenate([np.zeros((1, d)), axes, -axes])
         points = (z + shifts[:, None]).reshape(-1, d)
         values = self.values(points).reshape(2 * d + 1, k, -1)
         slopes = (values[1 : d + 1] - values[d + 1 :]) / (2 * self.step)
@@ -163,7 +164,8 @@ class Emulation:
         spread = readings.spread()
         surface, left_out = surface_near(z, y, readings, spread, name)
         error = np.maximum(2 * left_out, options.floor * spread)
-        empty = np.stack([np.full(z.shape[1], np.inf), np.full(z.shape[1], -np.inf)])
+        nothing = np.full(z.shape[1], np.inf)
+        empty = np.stack([nothing, -nothing])
         return cls(z, y, box, surface, error, np.inf, empty)
 
     @classmethod
@@ -179,14 +181,17 @@ class Emulation:
         d = box.shape[1]
         z = box[0] + (box[1] - box[0]) * sobol(first_runs(d), d, 0)
         error = options.floor * readings.spread()
-        whole = np.stack([np.full(d, -np.inf), np.full(d, np.inf)])
+        infinite = np.full(d, np.inf)
+        whole = np.stack([-infinite, infinite])
         return cls(z, run(z), search_box, DifferencedResponse(run), error, 0.0, whole)
 
     def covers(self, z: Floats) -> bool:
         """Return whether points lie in the range of the roots at which runs were made."""
         with np.errstate(invalid="ignore"):
             margin = np.nan_to_num(0.1 * np.maximum(self.range[1] - self.range[0], 0.0))
-        return bool(((z >= self.range[0] - margin) & (z <= self.range[1] + margin)).all())
+        low, high = self.range
+        is_covered = (z >= low - margin) & (z <= high + margin)
+        return bool(is_covered.all())
 
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
         """Return values and Jacobian, NaN where the nearest run has no response."""
@@ -339,7 +344,8 @@ def _laplace(roots: Roots, box: Floats) -> tuple[NDArray[np.intp], Floats, Float
     _, specimen = np.unique(roots.specimen, return_inverse=True)
     table = _Components(specimen, roots.z, precision, roots.misfit).table
     log_mass = -np.linalg.slogdet(precision)[1] / 2 - roots.misfit
-    return table, np.where(table >= 0, log_mass[table], -np.inf), np.linalg.inv(precision)
+    masses = np.where(table >= 0, log_mass[table], -np.inf)
+    return table, masses, np.linalg.inv(precision)
 
 
 def extended(
@@ -409,12 +415,14 @@ def _widened(box: Floats, roots: Roots, misfit: float = 50.0, outside: float = 1
     """
     poor = roots.z[roots.misfit > misfit]
     width = box[1] - box[0]
-    at_low, at_high = poor <= box[0] + 1e-6 * width, poor >= box[1] - 1e-6 * width
+    at_low = poor <= box[0] + 1e-6 * width
+    at_high = poor >= box[1] - 1e-6 * width
     ends = np.stack([at_low, at_high])
     wider = box + 0.25 * width * np.array([[-1.0], [1.0]]) * ends.any(axis=1)
     table, log_mass, _ = _laplace(roots, box)
     ((mean, root),) = normal_populations(roots.z[table], log_mass, 1, 0, bootstrap=False)
-    reach = -ndtri(outside / len(table)) * np.sqrt((root**2).sum(axis=1))
+    sd = np.sqrt((root**2).sum(axis=1))
+    reach = -ndtri(outside / len(table)) * sd
     low = np.minimum(wider[0], mean - reach)
     high = np.maximum(wider[1], mean + reach)
     return np.stack([low, high])
@@ -451,7 +459,8 @@ def _is_near(y: Floats, readings: Readings, spread: Floats) -> NDArray[np.bool_]
     """Return which outputs, (n, m), are within the range of the readings or half of it away."""
     low, high = np.nanmin(readings.values, axis=0), np.nanmax(readings.values, axis=0)
     margin = np.maximum((high - low) / 2, spread)
-    return np.asarray(((y >= low - margin) & (y <= high + margin)).all(axis=1))
+    is_near = (y >= low - margin) & (y <= high + margin)
+    return np.asarray(is_near.all(axis=1))
 
 
 def specimen_roots(emulation: Emulation, readings: Readings, options: PointOptions) -> Roots:
@@ -500,7 +509,8 @@ def spread_out(
     chosen = z[rng.permutation(len(z))[: min(sampled, len(z))]]
     around = z[rng.integers(0, len(z), 8 * count)]
     jittered = around + 0.4 * scale * rng.standard_normal(around.shape)
-    candidates = np.clip(np.concatenate([z, jittered]), box[0], box[1]) / scale
+    both = np.concatenate([z, jittered])
+    candidates = np.clip(both, box[0], box[1]) / scale
     picked = list(chosen / scale)
     distance = np.min([((candidates - p) ** 2).sum(axis=1) for p in picked], axis=0)
     while len(picked) < count:
@@ -554,7 +564,8 @@ class _Components:
     def table(self) -> NDArray[np.intp]:
         """The components of each specimen, (N, most), filled up with -1."""
         count = np.bincount(self.specimen)
-        slot = np.arange(len(self.specimen)) - np.repeat(np.cumsum(count) - count, count)
+        first = np.cumsum(count) - count
+        slot = np.arange(len(self.specimen)) - np.repeat(first, count)
         table = np.full((len(count), count.max()), -1)
         table[self.specimen, slot] = np.arange(len(self.specimen))
         return table
@@ -898,7 +909,8 @@ def _normalised(sample: _Sample, components: _Components) -> _Sample:
     n, slots = table.shape
     log_a = sample.log_a.reshape(n, slots, -1)
     total = logsumexp(log_a, axis=2)
-    mass = np.where(table >= 0, components.log_mass[np.maximum(table, 0)], -np.inf)
+    by_slot = components.log_mass[np.maximum(table, 0)]
+    mass = np.where(table >= 0, by_slot, -np.inf)
     scales = np.isfinite(total) & np.isfinite(mass)
     shift = np.where(scales, mass - np.where(scales, total, 0.0), 0.0)
     scaled = (log_a + shift[..., None]).reshape(n, -1)
