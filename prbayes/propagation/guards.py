@@ -108,7 +108,8 @@ def predicted_bias(misfit: Floats, jacobian: Floats, x: Floats, size: int) -> Fl
     biases of mean (first row) and standard deviation (second row) of each input's population. At
     .15 for the largest absolute value, 16 fresh runs: flagged .91 of the data sets with a true bias
     > .25 and .055 of the others (kinks, poles, crossing modes, jump, frame; 7000 data sets). At a
-    jump the prediction has .10 to .45 of the true size. Missing roots are not seen.
+    jump the prediction has .10 to .45 of the true size. Missing roots are not seen. Infinite if all
+    runs have the same value of an input.
 
     Parameters
     ----------
@@ -123,6 +124,9 @@ def predicted_bias(misfit: Floats, jacobian: Floats, x: Floats, size: int) -> Fl
     """
     shift = -np.einsum("ndm,nm->nd", np.linalg.pinv(jacobian), misfit)
     sd = x.std(axis=0)
+    if (sd == 0).any():
+        # Roots at one place, such as the maximum of a response, show no spread.
+        return np.full((2, len(sd)), np.inf)
     mean_bias = -shift.mean(axis=0) / sd * np.sqrt(size)
     covariance = ((x - x.mean(axis=0)) * shift).mean(axis=0)
     # var(x) = var(x + shift) - 2 cov(x, shift) - var(shift)

@@ -205,3 +205,8 @@ def test_a_kink_is_flagged_where_runs_are_few(runs: int, flagged: float) -> None
     assert share == pytest.approx(flagged, abs=0.12)
     # Signed medians; their standard error is .02
     assert np.median(bias, axis=0)[0] == pytest.approx(np.median(true_bias), abs=0.12)
+
+
+def test_roots_at_one_place_have_an_unknown_bias() -> None:
+    x, jacobian = np.ones((4, 1)), np.ones((4, 1, 1))
+    assert np.isinf(predicted_bias(np.full((4, 1), 0.1), jacobian, x, 20)).all()
