@@ -270,13 +270,13 @@ def _points(
 ) -> list[tuple[Floats, Floats]]:
     """Return scores and weights of the specimens of each likelihood in the population at theta."""
     result = []
-    for likelihood, own, (points, log_a) in zip(evaluator.likelihoods, scores, data, strict=True):
+    for likelihood, score, (points, log_a) in zip(evaluator.likelihoods, scores, data, strict=True):
         z = np.empty((*log_a.shape, likelihood.coordinates.size))
         weights = np.empty(log_a.shape)
         for place, rows in likelihood.by_group:
             roots = evaluator.roots_of(theta[None], likelihood.inputs, place)
-            some = [x[rows] for x in points]
-            z[rows], weights[rows] = own.at(likelihood.inputs, roots, some, log_a[rows])
+            of_group = [x[rows] for x in points]
+            z[rows], weights[rows] = score.at(likelihood.inputs, roots, of_group, log_a[rows])
         result.append((z, weights))
     return result
 

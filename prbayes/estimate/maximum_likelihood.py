@@ -454,7 +454,7 @@ def _findings(
             Finding(
                 "second-mode",
                 f"A second optimum at {where} has {weight:.0%} of the posterior's mass; NUTS "
-                "chains stay in the mode where they start, prb.sample_smc samples both",
+                "chains may stay in the mode where they start; prb.sample_smc samples both",
                 "likelihood.md#several-modes",
             )
         )
