@@ -62,6 +62,7 @@ __all__ = [  # noqa: F405
     "refine",
     "reports",
     "response",
+    "sample",
     "sample_smc",
     "scalar",
     "sensitivity",

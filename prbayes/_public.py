@@ -46,6 +46,7 @@ from prbayes.plots.validity import plot_validity as plot_validity
 from prbayes.posterior.adjusting import adjust as adjust
 from prbayes.posterior.bootstrapping import bootstrap as bootstrap
 from prbayes.posterior.epsilon import calibrate_epsilon as calibrate_epsilon
+from prbayes.posterior.sample import sample as sample
 from prbayes.posterior.sbc import simulation_based_calibration as simulation_based_calibration
 from prbayes.posterior.smc import sample_smc as sample_smc
 from prbayes.propagation.fresh import Fresh as Fresh

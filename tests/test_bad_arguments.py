@@ -637,6 +637,22 @@ TABLE: dict[str, Row] = {
         },
         {"refine": False},
     ),
+    "sample": Row(
+        lambda **given: prb.sample(
+            **{"model": model(), "optimum": optimum(), "draws": 20, "chains": 1} | QUIET | given
+        ),
+        {
+            "draws": (*COUNT, 5),
+            "chains": COUNT,
+            "model": NO_MODEL,
+            "optimum": [value for value in NO_OPTIMUM if value is not None],
+            "idata_kwargs": (3, "dims", {"model": 1}, {"dims": 1}, {"log_prior": 1}),
+            "var_names": (3, "nu", [], [1], ["nu"]),
+            **BUDGETS,
+            "random_seed": SEED,
+            "progressbar": FLAG,
+        },
+    ),
     "adjust": Row(
         lambda **given: prb.adjust(
             **{"idata": posterior(), "model": model(), "optimum": optimum()}

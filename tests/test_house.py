@@ -251,6 +251,7 @@ SLOW = (
     "minimize",
     "predict",
     "refine",
+    "sample",
     "sample_smc",
     "simulation_based_calibration",
     "validation.compare_candidates",

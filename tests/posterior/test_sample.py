@@ -11,7 +11,6 @@ from scipy.stats import norm
 
 import prbayes as prb
 from prbayes._checks import Floats
-from prbayes.posterior.sample import sample
 
 X = np.random.default_rng(0).normal(10, 1, 20)
 
@@ -40,7 +39,7 @@ def exact_moments(x: Floats) -> dict[str, tuple[float, float]]:
 
 
 def test_the_posterior_is_exact() -> None:
-    result = sample(2000, chains=2, model=linear_model(), random_seed=1, progressbar=False)
+    result = prb.sample(2000, chains=2, model=linear_model(), random_seed=1, progressbar=False)
     attrs = result.posterior.attrs
     assert attrs["sampler"] == "importance sampling"
     assert attrs["pareto_k"] < 0.7
@@ -55,7 +54,7 @@ def test_the_posterior_is_exact() -> None:
 
 def test_the_groups_are_those_of_other_samplers() -> None:
     model = linear_model()
-    result = sample(100, chains=3, model=model, random_seed=1, progressbar=False)
+    result = prb.sample(100, chains=3, model=model, random_seed=1, progressbar=False)
     assert result.posterior["mu"].shape == (3, 100)
     assert result.log_likelihood["y"].shape == (3, 100, len(X))
     assert result.posterior_predictive["y"].shape == (3, 100, len(X))
@@ -74,7 +73,7 @@ def test_the_groups_are_those_of_other_samplers() -> None:
 def test_draws_depend_on_the_seed_alone() -> None:
     model = linear_model()
     first, again, other = (
-        sample(50, model=model, random_seed=seed, progressbar=False).posterior["mu"].values
+        prb.sample(50, model=model, random_seed=seed, progressbar=False).posterior["mu"].values
         for seed in (3, 3, 4)
     )
     np.testing.assert_array_equal(first, again)
@@ -87,7 +86,7 @@ def test_moving_ends_are_sampled_by_smc() -> None:
         low, width = pm.Normal("low", 2, 2), pm.HalfNormal("width", 4)
         inputs = pm.Uniform.dist(low, low + width)
         prb.Simulator("y", lambda x: 2 * x + 1, inputs, observed=2 * x + 1)
-    result = sample(200, chains=2, model=model, progressbar=False)
+    result = prb.sample(200, chains=2, model=model, progressbar=False)
     assert result.posterior.attrs["sampler"] == "SMC"
     assert float((result.posterior["low"]).max()) <= x.min()
 
@@ -98,7 +97,7 @@ def test_few_specimens_are_sampled_by_nuts(monkeypatch: pytest.MonkeyPatch) -> N
     from prbayes.posterior import sample as module
 
     monkeypatch.setattr(module, "_OPTIONS", replace(module._OPTIONS, efficiency=1.0))
-    result = sample(500, chains=2, model=linear_model(), progressbar=False)
+    result = prb.sample(500, chains=2, model=linear_model(), progressbar=False)
     assert result.posterior.attrs["sampler"] == "NUTS"
     for name, (mean, sd) in exact_moments(X).items():
         assert abs(float(result.posterior[name].mean()) - mean) < 0.3 * sd
@@ -108,7 +107,7 @@ def test_a_metric_of_distributions_is_sampled_by_smc() -> None:
     with pm.Model() as model:
         inputs = pm.Normal.dist(pm.Normal("mu", 0, 2), 1.0)
         prb.Simulator("y", np.negative, inputs, metric=prb.AreaMetric(), observed=[0.0, 2.0, 4.0])
-    result = sample(50, chains=1, model=model, progressbar=False)
+    result = prb.sample(50, chains=1, model=model, progressbar=False)
     assert result.posterior.attrs["sampler"] == "SMC-ABC"
 
 
@@ -123,4 +122,4 @@ def test_a_metric_of_distributions_is_sampled_by_smc() -> None:
 )
 def test_bad_arguments(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
-        sample(model=linear_model(), **arguments)
+        prb.sample(model=linear_model(), **arguments)
