@@ -144,10 +144,11 @@ def readings(case: Case, x: Any, values: dict[str, float], rng: np.random.Genera
     if case.rounded is not None:
         y = np.round(y / case.rounded) * case.rounded
     if case.censored is not None:
-        y = np.clip(y, *(-np.inf if c is None else np.reshape(c, (-1, 1)) for c in _limits(case)))
+        low, high = (np.reshape(limit, (-1, 1)) for limit in _limits(case))
+        y = np.clip(y, low, high)
     if case.gross_errors is not None:
-        low, high = y.min(axis=0), y.max(axis=0)
-        anywhere = (low + high) / 2 + (high - low) * (2 * rng.random(y.shape) - 1)
+        least, most = y.min(axis=0), y.max(axis=0)
+        anywhere = (least + most) / 2 + (most - least) * (2 * rng.random(y.shape) - 1)
         y = np.where(rng.random((len(y), 1)) < values[case.gross_errors], anywhere, y)
     return y
 
@@ -295,11 +296,12 @@ def log_likelihood(likelihood: SpecimenLikelihood) -> Functions:
     """Return the log-likelihood (S,) of populations (S, q) from the points, in NumPy."""
     points = likelihood.points
     x = likelihood.coordinates.inputs(points.z)[0]
-    estimated = "error" in likelihood.extras
+    (measurement,) = likelihood.measurements
+    estimated = not likelihood.error_is_known
     log_a = -points.log_proposal if estimated else points.log_a
     log_a = log_a + likelihood.coordinates.log_jacobian(points.z)
     outputs = np.where(np.isfinite(points.outputs), points.outputs, 1e30)
-    size = np.abs(outputs) if likelihood.metric.relative else 1.0
+    size = np.abs(outputs) if measurement.metric.relative else 1.0
 
     def function(theta: Any) -> Any:
         mu, sigma = theta[:, 0, None, None], theta[:, 1, None, None]
@@ -309,9 +311,9 @@ def log_likelihood(likelihood: SpecimenLikelihood) -> Functions:
             variance = likelihood.emulation.error**2 + sd**2
             terms = terms + likelihood.readings.symbolic_log_density(outputs, variance, np)
         values = logsumexp(terms, axis=2)
-        if "gross_errors" in likelihood.extras:
+        if "gross_errors" in measurement.extras:
             share = theta[:, -1:]
-            gross = np.log(share) + likelihood.log_gross_density
+            gross = np.log(share) + likelihood.stacked.log_gross
             values = np.logaddexp(np.log1p(-share) + values, gross)
         return values.sum(axis=1)
 
@@ -325,7 +327,7 @@ def log_likelihood(likelihood: SpecimenLikelihood) -> Functions:
 def check(case: Case, likelihood: SpecimenLikelihood, function: Functions, theta: Any) -> None:
     """Raise if the log-likelihood in NumPy differs from the graph of the package."""
     values = dict(zip(case.problem.priors, theta, strict=True))
-    params = [pt.as_tensor(values[variable.name]) for variable in likelihood.variables]
+    params = {v: pt.as_tensor(values[str(v.name)]) for v in likelihood.variables()}
     expected = likelihood.log_likelihood(params).sum().eval()
     np.testing.assert_allclose(function(theta[None]), expected, rtol=1e-8)
 
@@ -343,7 +345,8 @@ def data_set(case: Case, likelihood: SpecimenLikelihood, number: int) -> dict[st
     x = values["mu"] + values["sigma"] * rng.standard_normal(SIZE)
     y = readings(case, x, values, rng)
     row: dict[str, Any] = {"number": number, "truth": values}
-    other = likelihood.observing(y if case.repeats > 1 else y[:, 0])
+    (measurement,) = likelihood.measurements
+    other = likelihood.observing({measurement.name: y if case.repeats > 1 else y[:, 0]})
     # Coordinates are those of the prior, whatever the data.
     other.__dict__["coordinates"] = likelihood.coordinates
     try:

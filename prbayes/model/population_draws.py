@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
-from scipy.special import chdtri, logsumexp, ndtri
+from scipy.special import chdtri, ndtri
 
 from prbayes._checks import AT_ONCE, Floats
 from prbayes.model.hyperparameters import Hyperparameters
+from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.points import sobol
 from prbayes.propagation.response_share import ResponseShare
@@ -86,7 +87,7 @@ class Populations:
             rows = np.flatnonzero(groups == group)
             of_rows = [v[rows] for v in x]
             flat = [np.ascontiguousarray(v.reshape(-1, *v.shape[2:])) for v in of_rows]
-            step = max(1, AT_ONCE // (len(rows) * count))
+            step = max(1, AT_ONCE // 16 // (len(rows) * count))  # in the cache
             for first in range(0, len(thetas), step):
                 some = slice(first, first + step)
                 roots = self._roots(thetas[some], int(group))
@@ -97,7 +98,7 @@ class Populations:
                         (logs,) = self._log_density(*roots, *flat)
                 logs = np.where(np.isnan(logs), -np.inf, logs)
                 logs = logs.reshape(-1, len(rows), count)
-                result[some, rows] = logsumexp(logs + weights[rows], axis=2)
+                result[some, rows] = log_sum_exp(logs + weights[rows])
         return result
 
     def prior_specimens(self) -> Floats:
@@ -128,10 +129,17 @@ class Populations:
         mean = sample.mean(axis=1, keepdims=True)
         centred = sample - mean
         root = np.linalg.cholesky(centred.swapaxes(1, 2) @ centred / specimens + smoothing)
-        standard = (z - mean) @ np.linalg.inv(root).swapaxes(1, 2)
+        inverse = np.linalg.inv(root)
         log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1, keepdims=True)
         constant = z.shape[1] / 2 * np.log(2 * np.pi)
-        return np.asarray(-0.5 * (standard**2).sum(axis=2) - log_det - constant)
+        result = np.zeros((len(mean), len(z)))
+        for axis in inverse.swapaxes(0, 1):
+            standard = axis @ z.T
+            standard -= (axis * mean[:, 0]).sum(axis=1, keepdims=True)
+            result += np.square(standard, out=standard)
+        result *= -0.5
+        result -= log_det + constant
+        return result
 
     def posterior(
         self,

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.special import logsumexp, stdtrit
 
 from prbayes._checks import Floats
+from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.points import sobol
 from prbayes.propagation.specimen_points import Emulation, PointOptions, first_runs
@@ -50,21 +51,10 @@ class ResponseShare:
         Zero where no point with a response is in the population.
         """
         terms = log_p + self.log_b
-        inside, outside = (
-            _logsumexp(terms[..., : self.with_response]),
-            _logsumexp(terms[..., self.with_response :]),
-        )
+        inside = log_sum_exp(terms[..., : self.with_response])
+        outside = log_sum_exp(terms[..., self.with_response :])
         is_known = np.isfinite(inside)
         return np.where(is_known, -np.logaddexp(0.0, outside - np.where(is_known, inside, 0)), 0.0)
-
-
-def _logsumexp(terms: Floats) -> Floats:
-    """Return the log of the sum of exponentials over the last axis; SciPy's takes twice as long."""
-    largest = terms.max(axis=-1, keepdims=True, initial=-np.inf)
-    largest = np.where(np.isfinite(largest), largest, 0.0)
-    with np.errstate(divide="ignore"):
-        total = np.exp(terms - largest).sum(axis=-1)
-        return np.asarray(np.log(total) + largest[..., 0])
 
 
 class SharedDraws(Protocol):
