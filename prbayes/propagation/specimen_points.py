@@ -387,16 +387,18 @@ def typical_sd(sd: Floats) -> Floats:
 def surface_near(
     z: Floats, y: Floats, readings: Readings, spread: Floats, name: str
 ) -> tuple[Interpolant, Floats]:
-    """Return the interpolant, and its root mean square left-out error near the data, (m,)."""
+    """Return the interpolant, and its root mean square left-out error near the data, (m,).
+
+    Of runs that are equal to nine digits one is taken: others add nothing but rounding errors.
+    """
     good = np.isfinite(y).all(axis=1)
     if good.sum() < 8:
         raise DesignError(
             f"{name}: got {int(good.sum())} runs with a response of {len(y)}, expected at least 8; "
             "check the response, or give the hyperparameters priors where it exists"
         )
-    zg, yg = z[good], y[good]
-    zg, first = np.unique(zg, axis=0, return_index=True)
-    yg = yg[first]
+    _, first = np.unique(np.round(z[good], 9), axis=0, return_index=True)
+    zg, yg = z[good][first], _limited(y[good][first], readings, spread)
     inside = _is_near(yg, readings, spread)
     if inside.sum() < len(yg) // 4:
         distance = (((yg - np.nanmean(readings.values, axis=0)) / spread) ** 2).sum(axis=1)
@@ -404,6 +406,19 @@ def surface_near(
         inside[np.argsort(distance, kind="stable")[: max(8, len(yg) // 4)]] = True
     surface = fit_interpolant(zg, yg, inside)
     return surface, np.sqrt((surface.left_out[inside] ** 2).mean(axis=0))
+
+
+def _limited(y: Floats, readings: Readings, spread: Floats, most: float = 1e4) -> Floats:
+    """Return outputs (n, m) within a distance of the data, beyond which they are not resolved.
+
+    A response that is steep outside the data would take the digits that outputs near them need.
+    The distance is `most` standard deviations of the data, and at least ten times that of 90 % of
+    the runs, so that outputs over a wide prior keep their values.
+    """
+    center = np.nanmean(readings.values, axis=0)
+    away = np.abs(y - center)
+    largest = np.maximum(most * spread, 10 * np.quantile(away, 0.9, axis=0))
+    return center + np.clip(y - center, -largest, largest) if (away > largest).any() else y
 
 
 def _widened(box: Floats, roots: Roots, misfit: float = 50.0, outside: float = 1 / 4097) -> Floats:

@@ -25,6 +25,7 @@ from prbayes.propagation.specimen_points import (
     first_runs,
     normal_log_density,
     specimen_roots,
+    surface_near,
 )
 
 Density = Callable[[Floats], Floats]
@@ -356,10 +357,9 @@ def test_runs_far_from_the_data_do_not_count_as_errors() -> None:
         counts = points.log_a > points.log_a.max(axis=1, keepdims=True) - 10
         errors.append(emulation.error[0] / y.std())
         misfits.append(np.abs(points.outputs[..., 0] - y)[counts].max() / y.std())
-    # Twice the error at 16 roots; at the steepest fresh run it is a thousand times the spread. The
-    # worst of six data sets depends on the last digits.
-    assert np.sort(errors)[-2] < 0.02
-    assert np.sort(misfits)[-2] < 0.1
+    # Twice the error at 16 roots; at the steepest fresh run it is a thousand times the spread.
+    assert max(errors) < 0.02
+    assert max(misfits) < 0.1
 
 
 def test_roots_on_a_steep_branch_are_not_missing() -> None:
@@ -522,3 +522,22 @@ def test_a_response_that_hardly_exists_is_refused() -> None:
 def test_two_specimens_are_enough() -> None:
     _, points = points_of(square, FOLDED[:2], 1)
     assert np.isfinite(of_folded(points)).all()
+
+
+def test_a_run_with_a_huge_response_and_equal_runs_cost_no_digits() -> None:
+    z = np.linspace(-1, 1, 41)[:, None]
+    data = readings(np.linspace(-0.5, 0.5, 9)[:, None])
+    spread = data.spread()
+    y = z + z**3
+    y[-1] = 1e30
+    # Twenty runs at one place, to the last digit but one.
+    rng = np.random.default_rng(0)
+    copies = 0.1 + 1e-16 * rng.standard_normal((20, 1))
+    z, y = np.concatenate([z, copies]), np.concatenate([y, copies + copies**3])
+    surface, _ = surface_near(z, y, data, spread, "y")
+    near = np.linspace(-0.5, 0.5, 11)[:, None]
+    np.testing.assert_allclose(surface.values(near), near + near**3, atol=0.02)
+    # Of a straight response over a wide prior all runs keep their values.
+    z = np.linspace(-1, 1, 41)[:, None]
+    surface, _ = surface_near(z, 1e9 * z, data, spread, "y")
+    np.testing.assert_allclose(surface.values(z), 1e9 * z, atol=1)
