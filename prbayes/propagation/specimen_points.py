@@ -397,8 +397,10 @@ def surface_near(
             f"{name}: got {int(good.sum())} runs with a response of {len(y)}, expected at least 8; "
             "check the response, or give the hyperparameters priors where it exists"
         )
-    _, first = np.unique(np.round(z[good], 9), axis=0, return_index=True)
-    zg, yg = z[good][first], _limited(y[good][first], readings, spread)
+    z, y = z[good], y[good]
+    _, first = np.unique(np.round(z, 9), axis=0, return_index=True)
+    zg = z[first]
+    yg = _limited(y[first], readings, spread)
     inside = _is_near(yg, readings, spread)
     if inside.sum() < len(yg) // 4:
         distance = (((yg - np.nanmean(readings.values, axis=0)) / spread) ** 2).sum(axis=1)
@@ -418,7 +420,7 @@ def _limited(y: Floats, readings: Readings, spread: Floats, most: float = 1e4) -
     center = np.nanmean(readings.values, axis=0)
     away = np.abs(y - center)
     largest = np.maximum(most * spread, 10 * np.quantile(away, 0.9, axis=0))
-    return center + np.clip(y - center, -largest, largest) if (away > largest).any() else y
+    return np.clip(y, center - largest, center + largest)
 
 
 def _widened(box: Floats, roots: Roots, misfit: float = 50.0, outside: float = 1 / 4097) -> Floats:
