@@ -51,14 +51,14 @@ def observe(likelihood: SpecimenLikelihood, base: SpecimenLikelihood, y: Any) ->
     Its compiled graphs stay.
     """
     points, log_a = likelihood.arrays
-    other = base.observing(y)
+    other = base.observing({base.name: y})
     vars(other)["coordinates"] = base.coordinates  # those of the prior, whatever the data
     prepared = other._prepared
     new_points, new_log_a = other.arrays
     for old, new in zip((*points, log_a), (*new_points, new_log_a), strict=True):
         old.set_value(new.get_value())
     # The observed values stay, as the model has them: others would be other points.
-    vars(likelihood).update(readings=other.readings, _prepared=prepared)
+    vars(likelihood).update(stacked=other.stacked, _prepared=prepared)
     return [finding.code for finding in other.findings]
 
 

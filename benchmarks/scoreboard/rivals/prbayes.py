@@ -2,22 +2,22 @@
 
     uv run python -m benchmarks.scoreboard.rivals.prbayes
 
-With the log-likelihood by specimen (``prbayes likelihood``) the posterior is sampled by PyMC's NUTS
-from the optimum, and by `prb.sample_smc` where a support moves or the optimum reports several
-modes. With a metric: the optimum, then `prb.sample_smc`.
+With the log-likelihood by specimen (``prbayes likelihood``) the posterior is sampled by
+`prb.sample`. With a metric: the optimum, then `prb.sample_smc`.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pymc as pm
 
 import prbayes as prb
 from benchmarks.metrics import BY_NAME
 from benchmarks.scoreboard import in_pymc
 from benchmarks.scoreboard.problem import Draws
-from benchmarks.scoreboard.study import CannotError, Rival, Task, main
+from benchmarks.scoreboard.study import Rival, Task, main
 
 
 def _of_vector(task: Task) -> Any:
@@ -26,19 +26,26 @@ def _of_vector(task: Task) -> Any:
 
 def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
     """Return draws of the hyperparameters by a metric."""
-    if task.problem.separate:
-        raise CannotError("this script compares joint outputs, and these are of other specimens")
     metric = BY_NAME[settings["metric"]]
     with pm.Model() as model:
         values = in_pymc.hyperparameters(task.problem)
         inputs = in_pymc.inputs(task.problem, values)
-        if task.observed.ndim == 2:
-            metric = prb.Joint(metric, components=task.problem.degrees)
-        response = _of_vector(task) if task.problem.correlation else task.response
-        prb.Simulator("y", response, *inputs, metric=metric, observed=task.observed)
+        if task.problem.separate:
+            for k, column in enumerate(task.observed.T):
+                prb.Simulator(f"y{k}", _output(task, k), *inputs, metric=metric, observed=column)
+        else:
+            if task.observed.ndim == 2:
+                metric = prb.Joint(metric, components=task.problem.degrees)
+            response = _of_vector(task) if task.problem.correlation else task.response
+            prb.Simulator("y", response, *inputs, metric=metric, observed=task.observed)
     optimum = prb.minimize(model, progressbar=False)
     tree = prb.sample_smc(optimum=optimum, model=model, random_seed=task.seed, progressbar=False)
     return in_pymc.draws(tree.posterior, task.problem)
+
+
+def _output(task: Task, k: int) -> Any:
+    """Return the response of one output."""
+    return lambda *x: task.response(*x)[..., k]
 
 
 def likelihood_model(task: Task) -> pm.Model:
@@ -48,9 +55,9 @@ def likelihood_model(task: Task) -> pm.Model:
         values = in_pymc.hyperparameters(problem)
         inputs = in_pymc.inputs(problem, values)
         if problem.separate:
-            for k, column in enumerate(observed.T):
-                prb.Simulator(f"y{k}", _output(task, k), *inputs, observed=column)
-            return model
+            # One row for each specimen, which was measured in one output.
+            observed = np.where(np.eye(observed.shape[1])[:, None] > 0, observed, np.nan)
+            observed = observed.reshape(-1, observed.shape[-1])
         error = None
         if problem.degrees is not None:
             # Readings of a curve, whose error is not known.
@@ -61,27 +68,10 @@ def likelihood_model(task: Task) -> pm.Model:
     return model
 
 
-def _output(task: Task, k: int) -> Any:
-    """Return the response of one output."""
-    return lambda *x: task.response(*x)[..., k]
-
-
 def calibrate_likelihood(task: Task, settings: dict[str, Any]) -> Draws:
     """Return draws of the hyperparameters by the log-likelihood by specimen."""
     model = likelihood_model(task)
-    optimum = prb.minimize(model, progressbar=False)
-    has_edges = any(x.family == "uniform" for x in task.problem.inputs)
-    if has_edges or any(mode["weight"] > settings["second mode"] for mode in optimum.rivals):
-        tree = prb.sample_smc(
-            optimum=optimum, model=model, random_seed=task.seed, progressbar=False
-        )
-    else:
-        with model:
-            tree = pm.sample(
-                settings["draws"], tune=settings["tune"], chains=4, cores=1, nuts_sampler="pymc",
-                initvals=optimum.initvals, init="adapt_diag", random_seed=task.seed,
-                progressbar=False, compute_convergence_checks=False,
-            )  # fmt: skip
+    tree = prb.sample(settings["draws"], model=model, random_seed=task.seed, progressbar=False)
     return in_pymc.draws(tree.posterior, task.problem)
 
 
@@ -95,7 +85,7 @@ METRICS = {
 # What the defaults were, so that results of other defaults are not gone on with.
 _DEFAULTS = {"adjust": "given the estimate; a log-likelihood as it is"}
 _GROSS = ("contaminated",)  # problems whose data may have gross errors
-_LIKELIHOOD = {"draws": 1000, "tune": 1000, "second mode": 0.01}
+_LIKELIHOOD = {"sampler": "prb.sample", "draws": 1000}
 RIVALS = (
     Rival("prbayes likelihood", PACKAGES, _LIKELIHOOD, calibrate_likelihood),
     *(
