@@ -552,9 +552,13 @@ def crossing_shift(seed: int) -> float:
 def is_repaired_or_reported(
     outcome: Any, model: pm.Model, shift_of: Callable[[int], float], seed: int
 ) -> bool:
-    """Return whether a posterior is right, or a finding or an error reports the emulator."""
+    """Return whether a posterior is right, or a finding or an error reports what is wrong.
+
+    A specimen beyond a pole may have no root of the emulator, and is reported for that.
+    """
     got = outcome(model, optimum=False)
-    if any(is_seen(code, got) for code in ("emulator-error", "not smooth", "two halves")):
+    reports = ("emulator-error", "not smooth", "two halves", "readings-misfit")
+    if any(is_seen(code, got) for code in reports):
         return True
     return shift_of(seed) <= 0.1
 
@@ -826,7 +830,7 @@ def test_the_joint_size_of_checks_before_the_fit(outcome: Any) -> None:
     # One model, whose runs serve all data sets.
     base = likelihood_of(model_of(line, normal_input, data[0]))
     _ = base.points
-    flagged = [bool(base.observing(y).findings) for y in data]
+    flagged = [bool(base.observing({base.name: y}).findings) for y in data]
     assert np.mean(flagged) <= 0.07
 
 

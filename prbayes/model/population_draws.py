@@ -231,9 +231,9 @@ class PopulationDraws:
     thetas: Floats
     size: int
 
-    def log_likelihoods(self, z: Floats, log_a: Floats, draws: int = 32) -> Floats:
-        """Return log p(y_i | theta) at some of the draws, (draws, N)."""
-        return self.populations.log_likelihoods(self.thetas[:draws], z, log_a)
+    def log_likelihoods(self, z: Floats, log_a: Floats) -> Floats:
+        """Return log p(y_i | theta) at the draws, (S, N)."""
+        return self.populations.log_likelihoods(self.thetas, z, log_a)
 
     def log_share(self, share: ResponseShare) -> Floats:
         """Return the sum over the specimens of log S, the log share with a response, (S,)."""
