@@ -388,6 +388,31 @@ def test_routes_from_the_fit_to_a_prediction(make: Callable[[], pm.Model]) -> No
 
 
 @pytest.mark.long
+@pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning"
+)
+@pytest.mark.parametrize("make", [two_simulators, repeated])
+@pytest.mark.parametrize("sampler", ["pymc", "nutpie", "numpyro"])
+def test_nuts_has_the_posterior_of_importance_sampling(
+    sampler: str, make: Callable[[], pm.Model]
+) -> None:
+    pytest.importorskip(sampler)
+    model = make()
+    expected = prb.sample(1000, model=model, random_seed=1, progressbar=False).posterior
+    assert expected.attrs["sampler"] == "importance sampling"
+    with model:
+        draws = pm.sample(
+            1000, tune=500, chains=2, cores=1, nuts_sampler=sampler, random_seed=1,
+            progressbar=False,
+        ).posterior  # fmt: skip
+    for name in ("mu", "sigma"):
+        mean, sd = float(expected[name].mean()), float(expected[name].std())
+        # Several hundred effective draws have standard errors of .04 standard deviations.
+        assert abs(float(draws[name].mean()) - mean) < 0.2 * sd
+        assert abs(float(draws[name].std()) / sd - 1) < 0.15
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("make", [two_simulators, repeated])
 def test_other_data_sets_are_of_specimens(make: Callable[[], pm.Model]) -> None:
     optimum = prb.minimize(make(), progressbar=False)
