@@ -1,0 +1,296 @@
+"""Likelihood of the hyperparameters given a metric's estimate, from stored responses.
+
+The statistic is the metric's gradient at the estimate, the mean of the specimens' scores. Its
+density for any theta is a saddlepoint approximation over the weights of the stored responses: no
+refit and no synthetic data set.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from prbayes._checks import AT_ONCE, Floats
+from prbayes._threads import one_thread
+from prbayes.estimate.data_sets import aligned, groups, observable, specimens
+from prbayes.estimate.optimum import Optimum
+from prbayes.metrics.score import ScoreOptions, WeightSlopes, specimen_scores
+from prbayes.model.evaluator import Evaluator
+from prbayes.posterior.saddlepoint import (
+    SaddlepointOptions,
+    Scores,
+    cumulants,
+    log_density,
+    varying_combinations,
+)
+
+
+@dataclass(frozen=True)
+class EstimateLikelihoodOptions:
+    """Options of the likelihood given an estimate.
+
+    Attributes
+    ----------
+    score : ScoreOptions
+    saddlepoint : SaddlepointOptions
+    step : float
+        Step of differences of log weights, in standard deviations of the prior.
+    wide_step : float
+        The same if the support of an input moves.
+    effective_responses : float
+        Smallest effective number of stored responses at the point of the score. An estimate at an
+        edge is moved inside until it is reached.
+    distance : float
+        Distance from the middle of the prior, in its standard deviations, beyond which an element
+        may be at an edge.
+    smallest_spread : float
+        Smallest standard deviation of an element's likelihood score there, relative to the largest
+        of all elements: less where a bounded prior ends.
+    """
+
+    score: ScoreOptions = field(default_factory=ScoreOptions)
+    saddlepoint: SaddlepointOptions = field(default_factory=SaddlepointOptions)
+    step: float = 1e-5
+    wide_step: float = 0.05
+    effective_responses: float = 50.0
+    distance: float = 3.0
+    smallest_spread: float = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class EstimateLikelihood:
+    """The likelihood given the estimate, for `importance_sample` and `laplace`.
+
+    Attributes
+    ----------
+    evaluator : Evaluator
+    point : ndarray, shape (d,)
+        Where the score is taken: the estimate, or a point inside if it is at an edge.
+    simulators : tuple of int
+        The first simulator of each set of simulators that share specimens.
+    observable : tuple of ndarray of bool, shapes (M_j,)
+        Stored responses that could be observed.
+    scores : tuple of Scores
+        Of these.
+    combinations : ndarray, shape (d, r)
+        Combinations of the scores that vary.
+    options : SaddlepointOptions
+    """
+
+    evaluator: Evaluator
+    point: Floats
+    simulators: tuple[int, ...]
+    observable: tuple[NDArray[np.bool_], ...]
+    scores: tuple[Scores, ...]
+    combinations: Floats
+    options: SaddlepointOptions
+
+    @one_thread()
+    def log_likelihood(self, thetas: Floats) -> Floats:
+        """Return the log-density of the score at the estimate, (S, d) -> (S,)."""
+        if self.combinations.shape[1] == 0:
+            return np.zeros(len(thetas))
+        largest = max(len(score.values) for score in self.scores)
+        # Weights of a block of populations stay in the cache of the processor.
+        rows = max(16, AT_ONCE // (16 * largest))
+        blocks = [thetas[i : i + rows] for i in range(0, len(thetas), rows)]
+        return np.concatenate([self._block(block) for block in blocks])
+
+    def _block(self, thetas: Floats) -> Floats:
+        log_weights = []
+        for k, known in zip(self.simulators, self.observable, strict=True):
+            _, weights = self.evaluator.populations(thetas, k)
+            log_weights.append(_log_normalised(weights[:, known]))
+        return log_density(log_weights, self.scores, self.options)
+
+    def log_posterior(self, thetas: Floats) -> Floats:
+        """Return the unnormalised log-posterior density in unconstrained space, (S, d) -> (S,)."""
+        thetas = np.ascontiguousarray(thetas)
+        logs = self.evaluator.hyperparameters.log_prior(thetas) + self.evaluator.log_other(thetas)
+        possible = np.flatnonzero(np.isfinite(logs))
+        result = np.full(len(thetas), -np.inf)
+        if possible.size:
+            result[possible] = logs[possible] + self.log_likelihood(thetas[possible])
+        return result
+
+
+def _log_normalised(weights: Floats) -> Floats:
+    """Return logarithms of weights (S, M) that sum to one; NaN where a population has none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.log(weights / weights.sum(axis=1, keepdims=True)))
+
+
+def estimate_likelihood(
+    evaluator: Evaluator,
+    optimum: Optimum,
+    options: EstimateLikelihoodOptions = EstimateLikelihoodOptions(),
+) -> EstimateLikelihood:
+    """Return the likelihood of the hyperparameters given the minimiser of their metrics.
+
+    Simulators that share specimens add the scores of a specimen. Independent simulators add their
+    cumulant functions.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+        Of a model whose simulators have stored responses and metrics with ``additive``.
+    optimum : Optimum
+    options : EstimateLikelihoodOptions
+
+    Raises
+    ------
+    TypeError
+        If responses are not stored, or a metric's gradient is no mean over specimens.
+    ValueError
+        If observed specimens have unequal weights, or are shared in part.
+    """
+    _require_stored(evaluator)
+    point = score_point(evaluator, optimum, options)
+    parts = [
+        _group_scores(evaluator, members, point, optimum, options)
+        for members in groups(evaluator.nodes)
+    ]
+    raw = [Scores(part.stored - part.observed.mean(axis=0), len(part.observed)) for part in parts]
+    log_weights = [part.log_weights for part in parts]
+    hessian = cumulants(log_weights, raw, np.zeros((1, len(point)))).hessians[0]
+    size = sum(score.size for score in raw)
+    combinations = varying_combinations(hessian / size, options.saddlepoint)
+    return EstimateLikelihood(
+        evaluator=evaluator,
+        point=point,
+        simulators=tuple(part.simulator for part in parts),
+        observable=tuple(part.observable for part in parts),
+        scores=tuple(Scores(score.values @ combinations, score.size) for score in raw),
+        combinations=combinations,
+        options=options.saddlepoint,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _GroupScores:
+    """Scores of simulators that share specimens."""
+
+    simulator: int  # the first of them
+    observable: NDArray[np.bool_]  # (M,): stored responses that could be observed by all
+    log_weights: Floats  # (1, M'): of these, at the point of the score
+    stored: Floats  # (M', d)
+    observed: Floats  # (N, d)
+
+
+def _group_scores(
+    evaluator: Evaluator,
+    members: Sequence[int],
+    point: Floats,
+    optimum: Optimum,
+    options: EstimateLikelihoodOptions,
+) -> _GroupScores:
+    """Return the scores of specimens in the sum of their simulators' discrepancies."""
+    nodes = [evaluator.nodes[k] for k in members]
+    _require_same_specimens(evaluator, members)
+    populations = [_weight_slopes(evaluator, k, point, options) for k in members]
+    known = [observable(p.responses, n.target) for p, n in zip(populations, nodes, strict=True)]
+    mask = np.all(known, axis=0)
+    stored = np.zeros((mask.sum(), len(point)))
+    observed = np.zeros((len(nodes[0].observed), len(point)))
+    numbers, _ = specimens(evaluator.nodes)
+    for k, node, population in zip(members, nodes, populations, strict=True):
+        # The gradient of the objective is a sum over specimens of these, by units of the prior.
+        factor = evaluator.prior_sd / (len(observed) * optimum.scales[node.name])
+        responses = population.responses[mask]
+        stored += factor * specimen_scores(node.target, population, responses, options.score)
+        order = np.argsort(numbers[k])
+        measured = node.observed[order]
+        observed += factor * specimen_scores(node.target, population, measured, options.score)
+    log_weights = _log_normalised(populations[0].weights[None, mask])
+    return _GroupScores(members[0], mask, log_weights, stored, observed)
+
+
+def _weight_slopes(
+    evaluator: Evaluator, k: int, theta: Floats, options: EstimateLikelihoodOptions
+) -> WeightSlopes:
+    """Return the k-th simulator's stored responses with weights, and their derivatives."""
+    moves = evaluator.nodes[k].bound.support_moves
+    steps = (options.wide_step if moves else options.step) * evaluator.prior_sd
+    axes = np.diag(steps)
+    thetas = np.concatenate([theta[None], theta + axes, theta - axes])
+    responses, weights = evaluator.populations(thetas, k)
+    center, up, down = np.split(weights, [1, 1 + len(theta)])
+    # Log weights are nearly parabolas, whose differences are right at any step. A weight that
+    # vanishes within the step has none.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_logs = center * (np.log(up) - np.log(down))
+    slopes = np.where(np.isfinite(by_logs), by_logs, up - down) / (2 * steps[:, None])
+    return WeightSlopes(responses[0], center[0], slopes)
+
+
+def score_point(
+    evaluator: Evaluator, optimum: Optimum, options: EstimateLikelihoodOptions
+) -> Floats:
+    """Return the estimate, (d,), or a point inside if it is at an edge.
+
+    At an edge the scores of an element vanish, or stored responses are too few for them. The score
+    at a point inside is as good a statistic. Elements at an edge are moved towards the middle of
+    their prior.
+    """
+    order = [optimum.names.index(name) for name in evaluator.names]
+    theta = optimum.theta[order]
+    middle = np.median(evaluator.prior_points(256, 0), axis=0)
+    is_far = np.abs(theta - middle) > options.distance * evaluator.prior_sd
+    for share in np.linspace(0, 1, 33):
+        point = np.where(is_far, theta + share * (middle - theta), theta)
+        spread = _likelihood_spread(evaluator, point, options)
+        is_still = is_far & (spread < options.smallest_spread * spread.max())
+        sizes = [support["weight_ess"][0] for support in evaluator.support(point[None]).values()]
+        if not is_still.any() and min(sizes) >= options.effective_responses:
+            return point
+    return theta
+
+
+def _likelihood_spread(
+    evaluator: Evaluator, theta: Floats, options: EstimateLikelihoodOptions
+) -> Floats:
+    """Return standard deviations of the derivatives of log weights, in units of the prior, (d,)."""
+    total = np.zeros(len(theta))
+    for k in range(len(evaluator.nodes)):
+        population = _weight_slopes(evaluator, k, theta, options)
+        positive = np.maximum(population.weights, np.finfo(float).tiny)
+        total += (population.slopes**2 / positive).sum(axis=1)
+    return np.asarray(np.sqrt(total) * evaluator.prior_sd)
+
+
+def _require_stored(evaluator: Evaluator) -> None:
+    """Raise if responses are not stored, or observed specimens have unequal weights."""
+    if not evaluator.nodes:
+        raise TypeError("model: got no simulator with a metric, expected one")
+    for node in evaluator.nodes:
+        if not node.bound.stored:
+            raise TypeError(
+                f"{node.name}: propagation: got {type(node.propagation).__name__}, expected "
+                "prb.Reweighted(), whose stored responses serve all hyperparameters"
+            )
+        if np.ptp(node.target.weights) > 1e-12:
+            raise ValueError(
+                f"{node.name}: got observed responses of unequal weights, expected equal ones"
+            )
+
+
+def _require_same_specimens(evaluator: Evaluator, members: Sequence[int]) -> None:
+    """Raise unless simulators have the same specimens, each measured once in each."""
+    numbers, _ = specimens(evaluator.nodes)
+    first, *others = [np.sort(numbers[k]) for k in members]
+    is_repeated = len(np.unique(first)) < len(first)
+    if is_repeated or not all(np.array_equal(first, other) for other in others):
+        names = ", ".join(evaluator.nodes[k].name for k in members)
+        raise ValueError(
+            f"specimens: got some that {names} share in part or measure twice, expected each "
+            "specimen once in every simulator that shares it"
+        )
+    if not aligned([evaluator.nodes[k] for k in members]):
+        names = ", ".join(evaluator.nodes[k].name for k in members)
+        raise ValueError(
+            f"specimens: got the same labels in {names} with different inputs or designs, expected "
+            "the same .dist() objects, n and seed in all"
+        )
