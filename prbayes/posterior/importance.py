@@ -232,9 +232,11 @@ def _weighted(
     weights = np.exp(smoothed - logsumexp(smoothed))
     efficiency = float(1 / (weights**2).sum() / len(weights))
     rng = np.random.default_rng(seed)
+    # In random order: equal steps through a Sobol sequence stay in one part of the space.
+    order = rng.permutation(len(weights))
     positions = (np.arange(size) + rng.random()) / size
-    rows = np.searchsorted(np.cumsum(weights), positions).clip(max=len(weights) - 1)
-    rows = rng.permutation(rows)
+    rows = np.searchsorted(np.cumsum(weights[order]), positions).clip(max=len(weights) - 1)
+    rows = rng.permutation(order[rows])
     sample = ImportanceSample(
         points[rows],
         log_p[rows],
