@@ -51,6 +51,13 @@ class WeightSlopes:
     weights: Floats
     slopes: Floats
 
+    @property
+    def spread(self) -> Floats:
+        """Standard deviations of the derivatives of the log weights, (d,)."""
+        positive = np.maximum(self.weights, np.finfo(float).tiny)
+        squares = self.slopes**2 / positive
+        return np.asarray(np.sqrt(squares.sum(axis=1)))
+
 
 def specimen_scores(
     target: Discrepancy,
@@ -91,31 +98,35 @@ def _part_scores(
     basis = target.stored(part.of(population.responses))
     features = target.from_basis(population.weights[None], basis, np)
     slopes = target.from_basis(population.slopes, basis, np)
-    # The steps are relative to the root mean square of d log(weights) / d theta.
-    positive = np.maximum(population.weights, np.finfo(float).tiny)
-    sizes = np.sqrt((population.slopes**2 / positive).sum(axis=1))
-    steps = options.step / np.where(sizes > 0, sizes, 1.0)
+    steps = options.step / np.maximum(population.spread, np.finfo(float).tiny)
     shifts = np.concatenate([steps, -steps])[:, None]
-    pairs = zip(features, slopes, strict=True)
-    ends = [feature + shifts * np.tile(slope, (2, 1)) for feature, slope in pairs]
+    ends = [
+        feature + shifts * np.tile(slope, (2, 1))
+        for feature, slope in zip(features, slopes, strict=True)
+    ]
     values = _within_reach(part, specimens, options)
     scores = np.empty((len(values), d))
     for first in range(0, len(values), options.block):
         rows = slice(first, first + options.block)
         block = values[rows]
-        single = target.with_observed(block, np.eye(len(block))[:, None])
+        one_each = np.eye(len(block))[:, None]
+        single = target.with_observed(block, one_each)
         discrepancies = single.outer(*ends, xp=np)
-        scores[rows] = (discrepancies[:, :d] - discrepancies[:, d:]) / (2 * steps)
+        up, down = np.split(discrepancies, 2, axis=1)
+        scores[rows] = (up - down) / (2 * steps)
     return scores
 
 
 def _within_reach(part: Part, specimens: Floats, options: ScoreOptions) -> Floats:
     """Return what a part compares of specimens, held within reach of the data, (n,)."""
     values = np.asarray(part.of(specimens))
-    cells = part.target.density_cells
-    if not (part.target.metric.likelihood and isinstance(cells, KernelCells)):
+    target = part.target
+    cells = target.density_cells
+    if not (target.metric.likelihood and isinstance(cells, KernelCells)):
         return values
-    finite = part.target.observed[np.isfinite(part.target.observed)]
+    finite = target.observed[np.isfinite(target.observed)]
     margin = options.reach * cells.bandwidth
-    clipped = np.clip(values, finite.min() - margin, finite.max() + margin)
+    lower = finite.min() - margin
+    upper = finite.max() + margin
+    clipped = np.clip(values, lower, upper)
     return np.where(np.isfinite(values), clipped, values)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,6 +150,7 @@ def estimate_likelihood(
     """
     _require_stored(evaluator)
     point = score_point(evaluator, optimum, options)
+    evaluator = _coarse_where_sufficient(evaluator, point)
     parts = [
         _group_scores(evaluator, members, point, optimum, options)
         for members in groups(evaluator.nodes)
@@ -188,23 +190,27 @@ def _group_scores(
     options: EstimateLikelihoodOptions,
 ) -> _GroupScores:
     """Return the scores of specimens in the sum of their simulators' discrepancies."""
-    nodes = [evaluator.nodes[k] for k in members]
     _require_same_specimens(evaluator, members)
+    numbers, _ = specimens(evaluator.nodes)
+    nodes = [evaluator.nodes[k] for k in members]
     populations = [_weight_slopes(evaluator, k, point, options) for k in members]
-    known = [observable(p.responses, n.target) for p, n in zip(populations, nodes, strict=True)]
-    mask = np.all(known, axis=0)
+    masks = [
+        observable(population.responses, node.target)
+        for population, node in zip(populations, nodes, strict=True)
+    ]
+    mask = np.all(masks, axis=0)
     stored = np.zeros((mask.sum(), len(point)))
     observed = np.zeros((len(nodes[0].observed), len(point)))
-    numbers, _ = specimens(evaluator.nodes)
     for k, node, population in zip(members, nodes, populations, strict=True):
         # The gradient of the objective is a sum over specimens of these, by units of the prior.
-        factor = evaluator.prior_sd / (len(observed) * optimum.scales[node.name])
-        responses = population.responses[mask]
-        stored += factor * specimen_scores(node.target, population, responses, options.score)
-        order = np.argsort(numbers[k])
-        measured = node.observed[order]
-        observed += factor * specimen_scores(node.target, population, measured, options.score)
-    log_weights = _log_normalised(populations[0].weights[None, mask])
+        scale = len(observed) * optimum.scales[node.name]
+        factor = evaluator.prior_sd / scale
+        score = partial(specimen_scores, node.target, population, options=options.score)
+        stored += factor * score(population.responses[mask])
+        measured = node.observed[np.argsort(numbers[k])]
+        observed += factor * score(measured)
+    weights = populations[0].weights[None, mask]
+    log_weights = _log_normalised(weights)
     return _GroupScores(members[0], mask, log_weights, stored, observed)
 
 
@@ -213,7 +219,8 @@ def _weight_slopes(
 ) -> WeightSlopes:
     """Return the k-th simulator's stored responses with weights, and their derivatives."""
     moves = evaluator.nodes[k].bound.support_moves
-    steps = (options.wide_step if moves else options.step) * evaluator.prior_sd
+    share = options.wide_step if moves else options.step
+    steps = share * evaluator.prior_sd
     axes = np.diag(steps)
     thetas = np.concatenate([theta[None], theta + axes, theta - axes])
     responses, weights = evaluator.populations(thetas, k)
@@ -221,8 +228,9 @@ def _weight_slopes(
     # Log weights are nearly parabolas, whose differences are right at any step. A weight that
     # vanishes within the step has none.
     with np.errstate(divide="ignore", invalid="ignore"):
-        by_logs = center * (np.log(up) - np.log(down))
-    slopes = np.where(np.isfinite(by_logs), by_logs, up - down) / (2 * steps[:, None])
+        differences = center * (np.log(up) - np.log(down))
+    differences = np.where(np.isfinite(differences), differences, up - down)
+    slopes = differences / (2 * steps[:, None])
     return WeightSlopes(responses[0], center[0], slopes)
 
 
@@ -238,13 +246,16 @@ def score_point(
     order = [optimum.names.index(name) for name in evaluator.names]
     theta = optimum.theta[order]
     middle = np.median(evaluator.prior_points(256, 0), axis=0)
-    is_far = np.abs(theta - middle) > options.distance * evaluator.prior_sd
+    way = middle - theta
+    is_far = np.abs(way) > options.distance * evaluator.prior_sd
     for share in np.linspace(0, 1, 33):
-        point = np.where(is_far, theta + share * (middle - theta), theta)
+        point = theta + share * np.where(is_far, way, 0.0)
         spread = _likelihood_spread(evaluator, point, options)
-        is_still = is_far & (spread < options.smallest_spread * spread.max())
-        sizes = [support["weight_ess"][0] for support in evaluator.support(point[None]).values()]
-        if not is_still.any() and min(sizes) >= options.effective_responses:
+        is_still = spread < options.smallest_spread * spread.max()
+        support = evaluator.support(point[None])
+        effective = min(each["weight_ess"][0] for each in support.values())
+        is_inside = not (is_far & is_still).any()
+        if is_inside and effective >= options.effective_responses:
             return point
     return theta
 
@@ -253,12 +264,24 @@ def _likelihood_spread(
     evaluator: Evaluator, theta: Floats, options: EstimateLikelihoodOptions
 ) -> Floats:
     """Return standard deviations of the derivatives of log weights, in units of the prior, (d,)."""
-    total = np.zeros(len(theta))
+    variance = np.zeros(len(theta))
     for k in range(len(evaluator.nodes)):
         population = _weight_slopes(evaluator, k, theta, options)
-        positive = np.maximum(population.weights, np.finfo(float).tiny)
-        total += (population.slopes**2 / positive).sum(axis=1)
-    return np.asarray(np.sqrt(total) * evaluator.prior_sd)
+        variance += population.spread**2
+    return np.asarray(np.sqrt(variance) * evaluator.prior_sd)
+
+
+def _coarse_where_sufficient(evaluator: Evaluator, point: Floats) -> Evaluator:
+    """Return an evaluator with an eighth of the points of large designs, if they are sufficient."""
+    coarse = evaluator.coarser()
+    if coarse is None:
+        return evaluator
+    support = coarse.support(point[None])
+    is_sufficient = [
+        support[name]["weight_ess"][0] >= design.required_ess
+        for name, design in coarse.designs.items()
+    ]
+    return coarse if all(is_sufficient) else evaluator
 
 
 def _require_stored(evaluator: Evaluator) -> None:
@@ -280,16 +303,16 @@ def _require_stored(evaluator: Evaluator) -> None:
 def _require_same_specimens(evaluator: Evaluator, members: Sequence[int]) -> None:
     """Raise unless simulators have the same specimens, each measured once in each."""
     numbers, _ = specimens(evaluator.nodes)
+    nodes = [evaluator.nodes[k] for k in members]
+    names = ", ".join(node.name for node in nodes)
     first, *others = [np.sort(numbers[k]) for k in members]
     is_repeated = len(np.unique(first)) < len(first)
     if is_repeated or not all(np.array_equal(first, other) for other in others):
-        names = ", ".join(evaluator.nodes[k].name for k in members)
         raise ValueError(
             f"specimens: got some that {names} share in part or measure twice, expected each "
             "specimen once in every simulator that shares it"
         )
-    if not aligned([evaluator.nodes[k] for k in members]):
-        names = ", ".join(evaluator.nodes[k].name for k in members)
+    if not aligned(nodes):
         raise ValueError(
             f"specimens: got the same labels in {names} with different inputs or designs, expected "
             "the same .dist() objects, n and seed in all"

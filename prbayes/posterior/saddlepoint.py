@@ -114,9 +114,11 @@ def cumulants(log_weights: Sequence[Floats], scores: Sequence[Scores], tilts: Fl
         weights = np.exp(exponents - largest)
         totals = weights.sum(axis=1, keepdims=True)
         means = weights @ psi / totals
-        products = weights @ (psi[:, first] * psi[:, second]) / totals
+        pairs = psi[:, first] * psi[:, second]
+        products = weights @ pairs / totals
         covariances = products - means[:, first] * means[:, second]
-        values += score.size * (np.log(totals) + largest)[:, 0]
+        cumulant = np.log(totals) + largest
+        values += score.size * cumulant[:, 0]
         gradients += score.size * means
         hessians[:, first, second] += score.size * covariances
     hessians[:, second, first] = hessians[:, first, second]
@@ -137,7 +139,8 @@ def saddlepoints(
     scores : sequence of Scores
     options : SaddlepointOptions
     """
-    count, r = len(log_weights[0]), scores[0].values.shape[1]
+    count = len(log_weights[0])
+    r = scores[0].values.shape[1]
     size = sum(score.size for score in scores)
     ridge = 1e-8 * size * np.eye(r)
     tilts = np.zeros((count, r))
@@ -147,12 +150,15 @@ def saddlepoints(
         rows = np.flatnonzero(~converged)
         if rows.size == 0:
             break
-        gradients = state.gradients[rows, :, None]
-        steps = -np.linalg.solve(state.hessians[rows] + ridge, gradients)[:, :, 0]
+        hessians = state.hessians[rows] + ridge
+        gradients = state.gradients[rows]
+        steps = -np.linalg.solve(hessians, gradients[..., None])[..., 0]
         lengths = np.linalg.norm(steps, axis=1)
         limits = 1 + np.linalg.norm(tilts[rows], axis=1)
-        tilts[rows] += steps * np.minimum(1, limits / np.maximum(lengths, 1e-300))[:, None]
-        step = cumulants([logs[rows] for logs in log_weights], scores, tilts[rows])
+        factors = limits / np.maximum(lengths, limits)
+        tilts[rows] += steps * factors[:, None]
+        some = [logs[rows] for logs in log_weights]
+        step = cumulants(some, scores, tilts[rows])
         state.values[rows] = step.values
         state.gradients[rows] = step.gradients
         state.hessians[rows] = step.hessians
@@ -189,8 +195,10 @@ def log_density(
     rows = np.flatnonzero(np.all(supported, axis=0))
     if rows.size == 0:
         return result
-    points = saddlepoints([logs[rows] for logs in log_weights], scores, options)
-    signs, log_dets = np.linalg.slogdet(points.cumulants.hessians / size)
+    some = [logs[rows] for logs in log_weights]
+    points = saddlepoints(some, scores, options)
+    covariances = points.cumulants.hessians / size
+    signs, log_dets = np.linalg.slogdet(covariances)
     usable = points.converged & (signs > 0)
     usable &= log_dets > r * np.log(options.smallest_variance)
     logs = points.cumulants.values - log_dets / 2
@@ -216,7 +224,10 @@ def varying_combinations(covariance: Floats, options: SaddlepointOptions) -> Flo
     varies = spread > tolerance * spread.max()
     if not spread.max() > 0:
         return np.zeros((len(spread), 0))
-    scaling = np.diag(1 / np.where(varies, spread, 1.0))[:, varies]
-    eigenvalues, vectors = np.linalg.eigh(scaling.T @ covariance @ scaling)
-    kept = eigenvalues > tolerance
-    return np.asarray(scaling @ vectors[:, kept] / np.sqrt(eigenvalues[kept]))
+    units = np.where(varies, spread, 1.0)
+    scaling = np.diag(1 / units)[:, varies]
+    correlation = scaling.T @ covariance @ scaling
+    eigenvalues, vectors = np.linalg.eigh(correlation)
+    is_large = eigenvalues > tolerance
+    standardised = vectors[:, is_large] / np.sqrt(eigenvalues[is_large])
+    return np.asarray(scaling @ standardised)
