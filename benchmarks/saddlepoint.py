@@ -25,7 +25,7 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,7 @@ from prbayes.posterior.importance import importance_sample, laplace
 OUT = record.RESULTS / "saddlepoint.json"
 METRICS = {"KLD": prb.KullbackLeibler(), "PR": prb.ProbabilityResidual()}
 DRAWS = 1000
+SIZES = {"one": [10, 20, 50, 200], "several": [20, 50], "far": [20]}
 
 
 @dataclass(frozen=True)
@@ -344,22 +345,18 @@ def cells(arguments: argparse.Namespace) -> dict[str, Callable[[int], dict[str, 
     """Return the cells of a study by name."""
     result: dict[str, Callable[[int], dict[str, Any]]] = {}
     for name in arguments.metrics:
-        if arguments.study == "one":
-            for size in arguments.sizes or [10, 20, 50, 200]:
+        for size in arguments.sizes or SIZES[arguments.study]:
+            if arguments.study == "one":
                 # In conflict the pivots' density is not known where it is needed.
                 for prior in PRIORS if name == "KLD" else list(PRIORS)[:3]:
-                    result[f"one, {name}, N = {size}, {prior}"] = lambda i, a=(name, size, prior): (
-                        one(*a, i)
-                    )
-        if arguments.study == "several":
-            for size in arguments.sizes or [20, 50]:
+                    result[f"one, {name}, N = {size}, {prior}"] = partial(one, name, size, prior)
+            if arguments.study == "several":
                 for outputs in arguments.outputs:
-                    result[f"several, {name}, N = {size}, {outputs} outputs"] = (
-                        lambda i, a=(name, size, outputs): several(*a, i)
-                    )
+                    cell = f"several, {name}, N = {size}, {outputs} outputs"
+                    result[cell] = partial(several, name, size, outputs)
         if arguments.study == "far":
-            result[f"far, {name}"] = lambda i, a=name: far(a, i)
-            result[f"starts, {name}"] = lambda i, a=name: starts(a, i)
+            result[f"far, {name}"] = partial(far, name)
+            result[f"starts, {name}"] = partial(starts, name)
     return result
 
 

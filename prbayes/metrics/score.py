@@ -54,9 +54,11 @@ class WeightSlopes:
     @property
     def spread(self) -> Floats:
         """Standard deviations of the derivatives of the log weights, (d,)."""
-        positive = np.maximum(self.weights, np.finfo(float).tiny)
+        smallest = np.finfo(float).tiny
+        positive = np.maximum(self.weights, smallest)
         squares = self.slopes**2 / positive
-        return np.asarray(np.sqrt(squares.sum(axis=1)))
+        variances = squares.sum(axis=1)
+        return np.asarray(np.sqrt(variances))
 
 
 def specimen_scores(
@@ -83,9 +85,12 @@ def specimen_scores(
             f"metric: got {type(target.metric).__name__}, whose gradient is no mean over specimens "
             "of complete records, expected prb.ProbabilityResidual() or prb.KullbackLeibler()"
         )
-    scores = np.zeros((len(specimens), len(population.slopes)))
+    n = len(specimens)
+    d = len(population.slopes)
+    scores = np.zeros((n, d))
     for part in target.parts:
-        scores += part.share * _part_scores(part, population, specimens, options)
+        terms = _part_scores(part, population, specimens, options)
+        scores += part.share * terms
     return scores
 
 
@@ -94,27 +99,31 @@ def _part_scores(
 ) -> Floats:
     """Return the scores of specimens in one part of a metric, (n, d)."""
     target = part.target
-    d = len(population.slopes)
-    basis = target.stored(part.of(population.responses))
-    features = target.from_basis(population.weights[None], basis, np)
+    responses = part.of(population.responses)
+    basis = target.stored(responses)
+    weights = population.weights[None]
+    features = target.from_basis(weights, basis, np)
     slopes = target.from_basis(population.slopes, basis, np)
-    steps = options.step / np.maximum(population.spread, np.finfo(float).tiny)
-    shifts = np.concatenate([steps, -steps])[:, None]
-    ends = [
-        feature + shifts * np.tile(slope, (2, 1))
-        for feature, slope in zip(features, slopes, strict=True)
-    ]
+    smallest = np.finfo(float).tiny
+    spread = np.maximum(population.spread, smallest)
+    steps = options.step / spread
+    column = steps[:, None]
+    upper, lower = [], []
+    for feature, slope in zip(features, slopes, strict=True):
+        shift = column * slope
+        upper.append(feature + shift)
+        lower.append(feature - shift)
     values = _within_reach(part, specimens, options)
-    scores = np.empty((len(values), d))
+    blocks = []
     for first in range(0, len(values), options.block):
-        rows = slice(first, first + options.block)
-        block = values[rows]
-        one_each = np.eye(len(block))[:, None]
-        single = target.with_observed(block, one_each)
-        discrepancies = single.outer(*ends, xp=np)
-        up, down = np.split(discrepancies, 2, axis=1)
-        scores[rows] = (up - down) / (2 * steps)
-    return scores
+        block = values[first : first + options.block]
+        one_each = np.eye(len(block))
+        single = target.with_observed(block, one_each[:, None])
+        up = single.outer(*upper, xp=np)
+        down = single.outer(*lower, xp=np)
+        blocks.append(up - down)
+    differences = np.concatenate(blocks)
+    return np.asarray(differences / (2 * steps))
 
 
 def _within_reach(part: Part, specimens: Floats, options: ScoreOptions) -> Floats:
@@ -124,9 +133,11 @@ def _within_reach(part: Part, specimens: Floats, options: ScoreOptions) -> Float
     cells = target.density_cells
     if not (target.metric.likelihood and isinstance(cells, KernelCells)):
         return values
-    finite = target.observed[np.isfinite(target.observed)]
+    observed = target.observed
+    finite = observed[np.isfinite(observed)]
     margin = options.reach * cells.bandwidth
     lower = finite.min() - margin
     upper = finite.max() + margin
     clipped = np.clip(values, lower, upper)
-    return np.where(np.isfinite(values), clipped, values)
+    is_finite = np.isfinite(values)
+    return np.where(is_finite, clipped, values)

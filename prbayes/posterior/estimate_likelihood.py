@@ -97,31 +97,41 @@ class EstimateLikelihood:
         largest = max(len(score.values) for score in self.scores)
         # Weights of a block of populations stay in the cache of the processor.
         rows = max(16, AT_ONCE // (16 * largest))
-        blocks = [thetas[i : i + rows] for i in range(0, len(thetas), rows)]
-        return np.concatenate([self._block(block) for block in blocks])
+        blocks = []
+        for first in range(0, len(thetas), rows):
+            block = self._block(thetas[first : first + rows])
+            blocks.append(block)
+        return np.concatenate(blocks)
 
     def _block(self, thetas: Floats) -> Floats:
         log_weights = []
         for k, known in zip(self.simulators, self.observable, strict=True):
             _, weights = self.evaluator.populations(thetas, k)
-            log_weights.append(_log_normalised(weights[:, known]))
+            logs = _log_normalised(weights[:, known])
+            log_weights.append(logs)
         return log_density(log_weights, self.scores, self.options)
 
     def log_posterior(self, thetas: Floats) -> Floats:
         """Return the unnormalised log-posterior density in unconstrained space, (S, d) -> (S,)."""
         thetas = np.ascontiguousarray(thetas)
-        logs = self.evaluator.hyperparameters.log_prior(thetas) + self.evaluator.log_other(thetas)
-        possible = np.flatnonzero(np.isfinite(logs))
+        evaluator = self.evaluator
+        logs = evaluator.hyperparameters.log_prior(thetas)
+        logs = logs + evaluator.log_other(thetas)
+        is_possible = np.isfinite(logs)
+        if not is_possible.any():
+            return np.full(len(thetas), -np.inf)
+        log_likelihood = self.log_likelihood(thetas[is_possible])
         result = np.full(len(thetas), -np.inf)
-        if possible.size:
-            result[possible] = logs[possible] + self.log_likelihood(thetas[possible])
+        result[is_possible] = logs[is_possible] + log_likelihood
         return result
 
 
 def _log_normalised(weights: Floats) -> Floats:
     """Return logarithms of weights (S, M) that sum to one; NaN where a population has none."""
+    totals = weights.sum(axis=1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.log(weights / weights.sum(axis=1, keepdims=True)))
+        shares = weights / totals
+        return np.asarray(np.log(shares))
 
 
 def estimate_likelihood(
@@ -155,17 +165,19 @@ def estimate_likelihood(
         _group_scores(evaluator, members, point, optimum, options)
         for members in groups(evaluator.nodes)
     ]
-    raw = [Scores(part.stored - part.observed.mean(axis=0), len(part.observed)) for part in parts]
     log_weights = [part.log_weights for part in parts]
-    hessian = cumulants(log_weights, raw, np.zeros((1, len(point)))).hessians[0]
-    size = sum(score.size for score in raw)
-    combinations = varying_combinations(hessian / size, options.saddlepoint)
+    centered = [part.centered for part in parts]
+    untilted = cumulants(log_weights, centered, np.zeros((1, len(point))))
+    size = sum(score.size for score in centered)
+    covariance = untilted.hessians[0] / size
+    combinations = varying_combinations(covariance, options.saddlepoint)
+    scores = [Scores(score.values @ combinations, score.size) for score in centered]
     return EstimateLikelihood(
         evaluator=evaluator,
         point=point,
         simulators=tuple(part.simulator for part in parts),
         observable=tuple(part.observable for part in parts),
-        scores=tuple(Scores(score.values @ combinations, score.size) for score in raw),
+        scores=tuple(scores),
         combinations=combinations,
         options=options.saddlepoint,
     )
@@ -181,6 +193,12 @@ class _GroupScores:
     stored: Floats  # (M', d)
     observed: Floats  # (N, d)
 
+    @property
+    def centered(self) -> Scores:
+        """The scores of stored responses, less the mean over the observed specimens."""
+        mean = self.observed.mean(axis=0)
+        return Scores(self.stored - mean, len(self.observed))
+
 
 def _group_scores(
     evaluator: Evaluator,
@@ -194,24 +212,34 @@ def _group_scores(
     numbers, _ = specimens(evaluator.nodes)
     nodes = [evaluator.nodes[k] for k in members]
     populations = [_weight_slopes(evaluator, k, point, options) for k in members]
-    masks = [
-        observable(population.responses, node.target)
-        for population, node in zip(populations, nodes, strict=True)
-    ]
-    mask = np.all(masks, axis=0)
-    stored = np.zeros((mask.sum(), len(point)))
-    observed = np.zeros((len(nodes[0].observed), len(point)))
+    mask = np.ones(len(populations[0].weights), dtype=bool)
+    for node, population in zip(nodes, populations, strict=True):
+        mask &= observable(population.responses, node.target)
+    n = len(nodes[0].observed)
+    d = len(point)
+    stored = np.zeros((mask.sum(), d))
+    observed = np.zeros((n, d))
     for k, node, population in zip(members, nodes, populations, strict=True):
         # The gradient of the objective is a sum over specimens of these, by units of the prior.
-        scale = len(observed) * optimum.scales[node.name]
+        scale = n * optimum.scales[node.name]
         factor = evaluator.prior_sd / scale
-        score = partial(specimen_scores, node.target, population, options=options.score)
+        score = partial(
+            specimen_scores,
+            node.target,
+            population,
+            options=options.score,
+        )
+        order = np.argsort(numbers[k])
         stored += factor * score(population.responses[mask])
-        measured = node.observed[np.argsort(numbers[k])]
-        observed += factor * score(measured)
-    weights = populations[0].weights[None, mask]
-    log_weights = _log_normalised(weights)
-    return _GroupScores(members[0], mask, log_weights, stored, observed)
+        observed += factor * score(node.observed[order])
+    weights = populations[0].weights[mask]
+    return _GroupScores(
+        simulator=members[0],
+        observable=mask,
+        log_weights=_log_normalised(weights[None]),
+        stored=stored,
+        observed=observed,
+    )
 
 
 def _weight_slopes(
@@ -222,15 +250,18 @@ def _weight_slopes(
     share = options.wide_step if moves else options.step
     steps = share * evaluator.prior_sd
     axes = np.diag(steps)
-    thetas = np.concatenate([theta[None], theta + axes, theta - axes])
+    thetas = np.vstack([theta, theta + axes, theta - axes])
     responses, weights = evaluator.populations(thetas, k)
     center, up, down = np.split(weights, [1, 1 + len(theta)])
     # Log weights are nearly parabolas, whose differences are right at any step. A weight that
     # vanishes within the step has none.
     with np.errstate(divide="ignore", invalid="ignore"):
-        differences = center * (np.log(up) - np.log(down))
-    differences = np.where(np.isfinite(differences), differences, up - down)
-    slopes = differences / (2 * steps[:, None])
+        ratios = np.log(up) - np.log(down)
+        relative = center * ratios
+    is_finite = np.isfinite(relative)
+    differences = np.where(is_finite, relative, up - down)
+    lengths = 2 * steps
+    slopes = differences / lengths[:, None]
     return WeightSlopes(responses[0], center[0], slopes)
 
 
@@ -248,13 +279,16 @@ def score_point(
     middle = np.median(evaluator.prior_points(256, 0), axis=0)
     way = middle - theta
     is_far = np.abs(way) > options.distance * evaluator.prior_sd
+    way[~is_far] = 0
     for share in np.linspace(0, 1, 33):
-        point = theta + share * np.where(is_far, way, 0.0)
+        point = theta + share * way
         spread = _likelihood_spread(evaluator, point, options)
-        is_still = spread < options.smallest_spread * spread.max()
+        smallest = options.smallest_spread * spread.max()
+        is_still = is_far & (spread < smallest)
         support = evaluator.support(point[None])
-        effective = min(each["weight_ess"][0] for each in support.values())
-        is_inside = not (is_far & is_still).any()
+        sizes = [design["weight_ess"] for design in support.values()]
+        effective = np.min(sizes)
+        is_inside = not is_still.any()
         if is_inside and effective >= options.effective_responses:
             return point
     return theta
@@ -305,9 +339,9 @@ def _require_same_specimens(evaluator: Evaluator, members: Sequence[int]) -> Non
     numbers, _ = specimens(evaluator.nodes)
     nodes = [evaluator.nodes[k] for k in members]
     names = ", ".join(node.name for node in nodes)
-    first, *others = [np.sort(numbers[k]) for k in members]
-    is_repeated = len(np.unique(first)) < len(first)
-    if is_repeated or not all(np.array_equal(first, other) for other in others):
+    expected = np.unique(numbers[members[0]])
+    is_same = [np.array_equal(np.sort(numbers[k]), expected) for k in members]
+    if not all(is_same):
         raise ValueError(
             f"specimens: got some that {names} share in part or measure twice, expected each "
             "specimen once in every simulator that shares it"

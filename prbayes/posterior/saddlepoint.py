@@ -59,6 +59,11 @@ class Scores:
     values: Floats
     size: int
 
+    @property
+    def rank(self) -> int:
+        """The number of combinations of scores, r."""
+        return int(self.values.shape[1])
+
 
 @dataclass(frozen=True, eq=False)
 class Cumulants:
@@ -109,16 +114,20 @@ def cumulants(log_weights: Sequence[Floats], scores: Sequence[Scores], tilts: Fl
     first, second = np.triu_indices(r)
     for logs, score in zip(log_weights, scores, strict=True):
         psi = score.values
-        exponents = logs + tilts @ psi.T
-        largest = exponents.max(axis=1, keepdims=True)
-        weights = np.exp(exponents - largest)
-        totals = weights.sum(axis=1, keepdims=True)
-        means = weights @ psi / totals
+        exponents = tilts @ psi.T
+        exponents += logs
+        largest = exponents.max(axis=1)
+        exponents -= largest[:, None]
+        weights = np.exp(exponents)
+        totals = weights.sum(axis=1)
+        column = totals[:, None]
+        means = weights @ psi / column
         pairs = psi[:, first] * psi[:, second]
-        products = weights @ pairs / totals
-        covariances = products - means[:, first] * means[:, second]
+        products = weights @ pairs / column
+        squares = means[:, first] * means[:, second]
         cumulant = np.log(totals) + largest
-        values += score.size * cumulant[:, 0]
+        covariances = products - squares
+        values += score.size * cumulant
         gradients += score.size * means
         hessians[:, first, second] += score.size * covariances
     hessians[:, second, first] = hessians[:, first, second]
@@ -140,35 +149,33 @@ def saddlepoints(
     options : SaddlepointOptions
     """
     count = len(log_weights[0])
-    r = scores[0].values.shape[1]
+    r = scores[0].rank
     size = sum(score.size for score in scores)
     ridge = 1e-8 * size * np.eye(r)
     tilts = np.zeros((count, r))
     state = cumulants(log_weights, scores, tilts)
-    converged = _is_small(state.gradients, size, options)
+    limit = options.tolerance * size
+    converged = np.linalg.norm(state.gradients, axis=1) < limit
     for _ in range(options.iterations):
         rows = np.flatnonzero(~converged)
         if rows.size == 0:
             break
         hessians = state.hessians[rows] + ridge
-        gradients = state.gradients[rows]
-        steps = -np.linalg.solve(hessians, gradients[..., None])[..., 0]
+        gradients = state.gradients[rows, :, None]
+        steps = np.linalg.solve(hessians, gradients)
+        steps = steps[:, :, 0]
         lengths = np.linalg.norm(steps, axis=1)
-        limits = 1 + np.linalg.norm(tilts[rows], axis=1)
-        factors = limits / np.maximum(lengths, limits)
-        tilts[rows] += steps * factors[:, None]
-        some = [logs[rows] for logs in log_weights]
-        step = cumulants(some, scores, tilts[rows])
+        longest = 1 + np.linalg.norm(tilts[rows], axis=1)
+        factors = longest / np.maximum(lengths, longest)
+        tilts[rows] -= steps * factors[:, None]
+        remaining = [logs[rows] for logs in log_weights]
+        step = cumulants(remaining, scores, tilts[rows])
         state.values[rows] = step.values
         state.gradients[rows] = step.gradients
         state.hessians[rows] = step.hessians
-        converged[rows] = _is_small(step.gradients, size, options)
+        sizes = np.linalg.norm(step.gradients, axis=1)
+        converged[rows] = sizes < limit
     return Saddlepoints(tilts, state, converged)
-
-
-def _is_small(gradients: Floats, size: int, options: SaddlepointOptions) -> NDArray[np.bool_]:
-    """Return where the gradient by specimen is below the tolerance, (S,)."""
-    return np.linalg.norm(gradients, axis=1) < options.tolerance * size
 
 
 def log_density(
@@ -188,21 +195,24 @@ def log_density(
         In units in which their covariance is about one.
     options : SaddlepointOptions
     """
-    r = scores[0].values.shape[1]
     size = sum(score.size for score in scores)
+    smallest = scores[0].rank * np.log(options.smallest_variance)
     result = np.full(len(log_weights[0]), -np.inf)
-    supported = [np.isfinite(logs.max(axis=1)) for logs in log_weights]
-    rows = np.flatnonzero(np.all(supported, axis=0))
-    if rows.size == 0:
+    is_supported = np.ones(len(result), dtype=bool)
+    for logs in log_weights:
+        largest = logs.max(axis=1)
+        is_supported &= np.isfinite(largest)
+    if not is_supported.any():
         return result
-    some = [logs[rows] for logs in log_weights]
-    points = saddlepoints(some, scores, options)
+    supported = [logs[is_supported] for logs in log_weights]
+    points = saddlepoints(supported, scores, options)
     covariances = points.cumulants.hessians / size
     signs, log_dets = np.linalg.slogdet(covariances)
-    usable = points.converged & (signs > 0)
-    usable &= log_dets > r * np.log(options.smallest_variance)
-    logs = points.cumulants.values - log_dets / 2
-    result[rows] = np.where(usable, logs, -np.inf)
+    is_usable = points.converged & (signs > 0)
+    is_usable &= log_dets > smallest
+    log_densities = points.cumulants.values - log_dets / 2
+    log_densities[~is_usable] = -np.inf
+    result[is_supported] = log_densities
     return result
 
 
@@ -220,14 +230,18 @@ def varying_combinations(covariance: Floats, options: SaddlepointOptions) -> Flo
     options : SaddlepointOptions
     """
     tolerance = options.smallest_eigenvalue
-    spread = np.sqrt(np.diag(covariance))
-    varies = spread > tolerance * spread.max()
-    if not spread.max() > 0:
+    variances = np.diag(covariance)
+    spread = np.sqrt(variances)
+    largest = spread.max()
+    if not largest > 0:
         return np.zeros((len(spread), 0))
+    varies = spread > tolerance * largest
     units = np.where(varies, spread, 1.0)
-    scaling = np.diag(1 / units)[:, varies]
+    scaling = np.diag(1 / units)
+    scaling = scaling[:, varies]
     correlation = scaling.T @ covariance @ scaling
     eigenvalues, vectors = np.linalg.eigh(correlation)
     is_large = eigenvalues > tolerance
-    standardised = vectors[:, is_large] / np.sqrt(eigenvalues[is_large])
+    sizes = np.sqrt(eigenvalues[is_large])
+    standardised = vectors[:, is_large] / sizes
     return np.asarray(scaling @ standardised)
