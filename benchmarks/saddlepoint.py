@@ -249,8 +249,9 @@ def one(name: str, size: int, prior_name: str, number: int) -> dict[str, Any]:
     """Return a row of the study of one output."""
     prior = PRIORS[prior_name](size)
     rng = np.random.default_rng([5, size, sorted(PRIORS).index(prior_name), number])
-    truth = [float(margin.rvs(random_state=rng)) for margin in (prior.mean, prior.sd)]
-    y = rng.normal(*(prior.truth or truth), size)
+    drawn = float(prior.mean.rvs(random_state=rng)), float(prior.sd.rvs(random_state=rng))
+    mean, sd = prior.truth or drawn
+    y = rng.normal(mean, sd, size)
     return pair_row(name, prior, y)
 
 
