@@ -6,13 +6,16 @@ A metric with ``additive`` has a gradient that is a mean over the observed speci
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from prbayes._checks import Floats
+from prbayes._weighted import finite_sample
 from prbayes.metrics.base import Discrepancy, Part
-from prbayes.metrics.cells import KernelCells
+from prbayes.metrics.density import BandwidthRule, GaussianKDE, twice_silverman
 
 
 @dataclass(frozen=True)
@@ -22,8 +25,9 @@ class ScoreOptions:
     Attributes
     ----------
     reach : float
-        Bandwidths beyond the data from which on the score of a log-density is constant. It would
-        grow without bound there, and the tail of the population would decide on the posterior.
+        Default bandwidths of the data beyond their ends from which on the score of a log-density is
+        constant. It would grow without bound there, and the tail of the population would decide on
+        the posterior.
     step : float
         Relative step of central differences.
     block : int
@@ -59,6 +63,45 @@ class WeightSlopes:
         squares = self.slopes**2 / positive
         variances = squares.sum(axis=1)
         return np.asarray(np.sqrt(variances))
+
+
+def prepared_on_population(target: Discrepancy, responses: Floats, weights: Floats) -> Discrepancy:
+    """Return the discrepancy from the same data with the whitening of a population.
+
+    The whitening by few data depends on them, and the minimiser with it. That of the population at
+    an estimate is about the same for all data sets with this estimate. The bandwidth is that of as
+    many specimens as are observed.
+
+    Parameters
+    ----------
+    target : Discrepancy
+        Of several outputs.
+    responses : ndarray, shape (M, m)
+        Rows that lack a number are left out.
+    weights : ndarray, shape (M,)
+    """
+    metric = target.metric
+    inner: Any = getattr(metric, "metric", metric)
+    density = getattr(inner, "density", None)
+    if isinstance(density, GaussianKDE) and callable(density.bandwidth):
+        rule = partial(
+            _bandwidth_of_fewer,
+            rule=density.bandwidth,
+            size=len(target.observed),
+        )
+        inner = replace(inner, density=GaussianKDE(rule))
+    is_finite = np.isfinite(responses).all(axis=1)
+    shares = weights[is_finite]
+    shares = shares / shares.sum()
+    prepared = metric.like(inner).against(responses[is_finite], shares)
+    return prepared.with_observed(target.observed)
+
+
+def _bandwidth_of_fewer(sample: Floats, weights: Floats, rule: BandwidthRule, size: int) -> float:
+    """Return the bandwidth of so many specimens, by a rule in proportion to n^(-1/5)."""
+    squares = (weights**2).sum()
+    factor = (squares * size) ** -0.2
+    return float(factor * rule(sample, weights))
 
 
 def specimen_scores(
@@ -130,14 +173,12 @@ def _within_reach(part: Part, specimens: Floats, options: ScoreOptions) -> Float
     """Return what a part compares of specimens, held within reach of the data, (n,)."""
     values = np.asarray(part.of(specimens))
     target = part.target
-    cells = target.density_cells
-    if not (target.metric.likelihood and isinstance(cells, KernelCells)):
+    if not target.metric.likelihood:
         return values
-    observed = target.observed
-    finite = observed[np.isfinite(observed)]
-    margin = options.reach * cells.bandwidth
-    lower = finite.min() - margin
-    upper = finite.max() + margin
+    observed, weights = finite_sample(target.observed, target.weights)
+    margin = options.reach * twice_silverman(observed, weights)
+    lower = observed.min() - margin
+    upper = observed.max() + margin
     clipped = np.clip(values, lower, upper)
     is_finite = np.isfinite(values)
     return np.where(is_finite, clipped, values)

@@ -13,12 +13,18 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 
 from prbayes._checks import AT_ONCE, Floats
 from prbayes._threads import one_thread
 from prbayes.estimate.data_sets import aligned, groups, observable, specimens
 from prbayes.estimate.optimum import Optimum
-from prbayes.metrics.score import ScoreOptions, WeightSlopes, specimen_scores
+from prbayes.metrics.score import (
+    ScoreOptions,
+    WeightSlopes,
+    prepared_on_population,
+    specimen_scores,
+)
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.saddlepoint import (
     SaddlepointOptions,
@@ -37,6 +43,9 @@ class EstimateLikelihoodOptions:
     ----------
     score : ScoreOptions
     saddlepoint : SaddlepointOptions
+    rounds : int
+        Times that metrics of several outputs are minimised again, with the whitening of the
+        population at the estimate before. With zero the whitening is that of the observed data.
     step : float
         Step of differences of log weights, in standard deviations of the prior.
     wide_step : float
@@ -54,6 +63,7 @@ class EstimateLikelihoodOptions:
 
     score: ScoreOptions = field(default_factory=ScoreOptions)
     saddlepoint: SaddlepointOptions = field(default_factory=SaddlepointOptions)
+    rounds: int = 2
     step: float = 1e-5
     wide_step: float = 0.05
     effective_responses: float = 50.0
@@ -160,6 +170,8 @@ def estimate_likelihood(
     """
     _require_stored(evaluator)
     point = score_point(evaluator, optimum, options)
+    for _ in range(options.rounds):
+        evaluator, point = _minimised_on_population(evaluator, point, optimum, options)
     evaluator = _coarse_where_sufficient(evaluator, point)
     parts = [
         _group_scores(evaluator, members, point, optimum, options)
@@ -181,6 +193,41 @@ def estimate_likelihood(
         combinations=combinations,
         options=options.saddlepoint,
     )
+
+
+def _minimised_on_population(
+    evaluator: Evaluator, point: Floats, optimum: Optimum, options: EstimateLikelihoodOptions
+) -> tuple[Evaluator, Floats]:
+    """Return metrics of several outputs with the whitening of the population, and their minimiser.
+
+    Metrics of one output are not whitened: without others all is as it was. A minimiser that stored
+    responses do not support is not taken.
+    """
+    targets = [node.target for node in evaluator.nodes]
+    if not any(target.event for target in targets):
+        return evaluator, point
+    for k, target in enumerate(targets):
+        responses, weights = evaluator.populations(point[None], k)
+        if target.event:
+            targets[k] = prepared_on_population(target, responses[0], weights[0])
+    prepared = evaluator.with_targets(targets)
+    scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
+    unit = evaluator.prior_sd
+
+    def objective(shift: Floats) -> tuple[float, Floats]:
+        step = 1e-4 * unit
+        axes = np.diag(step)
+        theta = point + shift * unit
+        thetas = np.vstack([theta, theta + axes, theta - axes])
+        totals = prepared.total(thetas, scales)
+        value, up, down = np.split(totals, [1, 1 + len(theta)])
+        return float(value[0]), (up - down) / 2e-4
+
+    minimum = minimize(objective, np.zeros(len(point)), jac=True, method="BFGS")
+    minimiser = point + minimum.x * unit
+    sizes = [design["weight_ess"] for design in prepared.support(minimiser[None]).values()]
+    is_supported = np.min(sizes) >= options.effective_responses
+    return prepared, minimiser if is_supported else point
 
 
 @dataclass(frozen=True, eq=False)
