@@ -90,7 +90,8 @@ def prepared_on_population(target: Discrepancy, responses: Floats, weights: Floa
             size=len(target.observed),
         )
         inner = replace(inner, density=GaussianKDE(rule))
-    is_finite = np.isfinite(responses).all(axis=1)
+    table = responses.reshape(len(responses), -1)
+    is_finite = np.isfinite(table).all(axis=1)
     shares = weights[is_finite]
     shares = shares / shares.sum()
     prepared = metric.like(inner).against(responses[is_finite], shares)

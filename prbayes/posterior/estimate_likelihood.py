@@ -44,8 +44,10 @@ class EstimateLikelihoodOptions:
     score : ScoreOptions
     saddlepoint : SaddlepointOptions
     rounds : int
-        Times that metrics of several outputs are minimised again, with the whitening of the
-        population at the estimate before. With zero the whitening is that of the observed data.
+        Times that metrics are minimised again, with whitening and bandwidth of the population at
+        the estimate before. With zero they are those of the observed data.
+    several_outputs : bool
+        Whether only metrics of several outputs are, or those of one as well.
     step : float
         Step of differences of log weights, in standard deviations of the prior.
     wide_step : float
@@ -64,6 +66,7 @@ class EstimateLikelihoodOptions:
     score: ScoreOptions = field(default_factory=ScoreOptions)
     saddlepoint: SaddlepointOptions = field(default_factory=SaddlepointOptions)
     rounds: int = 2
+    several_outputs: bool = True
     step: float = 1e-5
     wide_step: float = 0.05
     effective_responses: float = 50.0
@@ -169,7 +172,8 @@ def estimate_likelihood(
         If observed specimens have unequal weights, or are shared in part.
     """
     _require_stored(evaluator)
-    point = score_point(evaluator, optimum, options)
+    order = [optimum.names.index(name) for name in evaluator.names]
+    point = inside(evaluator, optimum.theta[order], options)
     for _ in range(options.rounds):
         evaluator, point = _minimised_on_population(evaluator, point, optimum, options)
     evaluator = _coarse_where_sufficient(evaluator, point)
@@ -204,11 +208,12 @@ def _minimised_on_population(
     responses do not support is not taken.
     """
     targets = [node.target for node in evaluator.nodes]
-    if not any(target.event for target in targets):
+    is_chosen = [bool(target.event) or not options.several_outputs for target in targets]
+    if not any(is_chosen):
         return evaluator, point
     for k, target in enumerate(targets):
         responses, weights = evaluator.populations(point[None], k)
-        if target.event:
+        if is_chosen[k]:
             targets[k] = prepared_on_population(target, responses[0], weights[0])
     prepared = evaluator.with_targets(targets)
     scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
@@ -224,7 +229,7 @@ def _minimised_on_population(
         return float(value[0]), (up - down) / 2e-4
 
     minimum = minimize(objective, np.zeros(len(point)), jac=True, method="BFGS")
-    minimiser = point + minimum.x * unit
+    minimiser = inside(prepared, point + minimum.x * unit, options)
     sizes = [design["weight_ess"] for design in prepared.support(minimiser[None]).values()]
     is_supported = np.min(sizes) >= options.effective_responses
     return prepared, minimiser if is_supported else point
@@ -312,17 +317,13 @@ def _weight_slopes(
     return WeightSlopes(responses[0], center[0], slopes)
 
 
-def score_point(
-    evaluator: Evaluator, optimum: Optimum, options: EstimateLikelihoodOptions
-) -> Floats:
+def inside(evaluator: Evaluator, theta: Floats, options: EstimateLikelihoodOptions) -> Floats:
     """Return the estimate, (d,), or a point inside if it is at an edge.
 
     At an edge the scores of an element vanish, or stored responses are too few for them. The score
     at a point inside is as good a statistic. Elements at an edge are moved towards the middle of
     their prior.
     """
-    order = [optimum.names.index(name) for name in evaluator.names]
-    theta = optimum.theta[order]
     middle = np.median(evaluator.prior_points(256, 0), axis=0)
     way = middle - theta
     is_far = np.abs(way) > options.distance * evaluator.prior_sd
