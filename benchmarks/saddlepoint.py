@@ -216,7 +216,7 @@ def given_estimate(model: pm.Model) -> tuple[EstimateLikelihood, dict[str, Any],
     clock = time.process_time()
     likelihood = estimate_likelihood(optimum.evaluator, optimum)
     setup = time.process_time() - clock
-    draws, figures = sampled(likelihood, likelihood.point[None], likelihood.evaluator.prior_sd)
+    draws, figures = sampled(likelihood, likelihood.point[None], likelihood.scale)
     support = likelihood.evaluator.support(likelihood.point[None])
     effective = min(float(of["weight_ess"][0]) for of in support.values())
     points = max(len(score.values) for score in likelihood.scores)
@@ -302,13 +302,13 @@ def starts(name: str, number: int, count: int = 32) -> dict[str, Any]:
     optimum = prb.minimize(model=normal_model(vague(20), METRICS[name], y), progressbar=False)
     likelihood = estimate_likelihood(optimum.evaluator, optimum)
     evaluator = likelihood.evaluator
-    (best,) = laplace(likelihood.log_posterior, likelihood.point[None], evaluator.prior_sd)
+    (best,) = laplace(likelihood.log_posterior, likelihood.point[None], likelihood.scale)
     points = evaluator.prior_points(count, number)
     possible = np.isfinite(likelihood.log_posterior(points))
     arrived = 0
     for start in points[possible]:
         try:
-            (mode,) = laplace(likelihood.log_posterior, start[None], evaluator.prior_sd)
+            (mode,) = laplace(likelihood.log_posterior, start[None], likelihood.scale)
         except ValueError:
             continue
         away = np.linalg.solve(np.linalg.cholesky(best.covariance), mode.mode - best.mode)

@@ -91,6 +91,9 @@ class EstimateLikelihood:
         Of these.
     combinations : ndarray, shape (d, r)
         Combinations of the scores that vary.
+    scale : ndarray, shape (d,)
+        Unit of each element for `laplace`: a standard deviation of the prior, or a hundred standard
+        errors of the element alone if these are less.
     options : SaddlepointOptions
     """
 
@@ -100,6 +103,7 @@ class EstimateLikelihood:
     observable: tuple[NDArray[np.bool_], ...]
     scores: tuple[Scores, ...]
     combinations: Floats
+    scale: Floats
     options: SaddlepointOptions
 
     @one_thread()
@@ -188,6 +192,9 @@ def estimate_likelihood(
     covariance = untilted.hessians[0] / size
     combinations = varying_combinations(covariance, options.saddlepoint)
     scores = [Scores(score.values @ combinations, score.size) for score in centered]
+    # With a prior far wider than the population a step in its unit would miss all data.
+    precision = _likelihood_spread(evaluator, point, options) * np.sqrt(size)
+    units = 100 / np.maximum(precision, 100)
     return EstimateLikelihood(
         evaluator=evaluator,
         point=point,
@@ -195,6 +202,7 @@ def estimate_likelihood(
         observable=tuple(part.observable for part in parts),
         scores=tuple(scores),
         combinations=combinations,
+        scale=units * evaluator.prior_sd,
         options=options.saddlepoint,
     )
 

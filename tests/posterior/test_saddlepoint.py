@@ -210,8 +210,7 @@ def likelihood_of(model: pm.Model) -> EstimateLikelihood:
 
 
 def sample_of(likelihood: EstimateLikelihood) -> ImportanceSample:
-    scale = likelihood.evaluator.prior_sd
-    modes = laplace(likelihood.log_posterior, likelihood.point[None], scale)
+    modes = laplace(likelihood.log_posterior, likelihood.point[None], likelihood.scale)
     return importance_sample(likelihood.log_posterior, modes, 1000, seed=0)
 
 
@@ -265,6 +264,21 @@ def test_the_score_elsewhere_is_as_good_a_statistic(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("prbayes.posterior.estimate_likelihood.specimen_scores", wrong)
     with pytest.raises(AssertionError, match=r"array"):
         require_close(moments_of(at_another_point(optimum)), exact)
+
+
+@pytest.mark.long
+def test_a_prior_far_wider_than_the_population() -> None:
+    y = 3.9 + 4e-4 * np.random.default_rng(7).standard_normal(50)
+    likelihood = likelihood_of(normal_model(vague, KLD, y))
+    require_close(moments_of(likelihood), exact_moments(vague, y))
+
+
+def test_an_estimate_at_the_end_of_a_prior_is_moved_inside() -> None:
+    """The data are beyond the end: scores of an element there would vanish."""
+    y = data() + 0.5
+    likelihood = likelihood_of(normal_model(bounded, KLD, y))
+    assert likelihood.combinations.shape == (2, 2)
+    require_close(moments_of(likelihood), exact_moments(bounded, y))
 
 
 def test_two_simulators_are_as_one_with_all_data() -> None:
@@ -340,11 +354,17 @@ def test_an_estimate_at_an_edge_is_moved_inside() -> None:
 
 
 @pytest.mark.long
-def test_two_outputs_by_a_joint_metric() -> None:
-    """Responses of two correlated outputs determine the inputs, so that the likelihood is exact."""
-    rng = np.random.default_rng(6)
-    x1, x2 = rng.normal(1, 0.5, 30), rng.normal(-1, 0.8, 30)
-    outputs = np.stack([x1 + x2, x1 - x2], axis=1)
+@pytest.mark.parametrize("metric", [KLD, PR])
+def test_two_outputs_by_a_joint_metric(metric: Metric) -> None:
+    """Two outputs determine the inputs, so that the likelihood is known.
+
+    Independent inputs are fewer hyperparameters than the whitening has numbers. The whitening of 20
+    specimens then makes the estimates of their spreads too small; that of the population does not.
+    """
+    rng = np.random.default_rng(21)
+    x = np.array([1.0, -1.0]) + np.array([0.5, 0.8]) * rng.standard_normal((20, 2))
+    # A correlation by chance is what the whitening removes.
+    x[:, 1] += 0.9 * (x[:, 0] - x[:, 0].mean())
     with pm.Model() as model:
         a = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
         b = pm.Normal.dist(pm.Normal("nu", 0, 2), pm.HalfNormal("tau", 1))
@@ -353,16 +373,21 @@ def test_two_outputs_by_a_joint_metric() -> None:
             lambda a, b: np.stack([a + b, a - b], axis=-1),
             a,
             b,
-            observed=outputs,
-            metric=prb.Joint(KLD),
+            observed=x @ np.array([[1.0, 1.0], [1.0, -1.0]]),
+            metric=prb.Joint(metric),
             propagation=prb.Reweighted(256),
         )
-    likelihood = likelihood_of(model)
+    optimum = prb.minimize(model=model, progressbar=False)
+    likelihood = estimate_likelihood(optimum.evaluator, optimum)
     draws = likelihood.evaluator.constrained(sample_of(likelihood).draws)
-    for mean_name, sd_name, x in (("mu", "sigma", x1), ("nu", "tau", x2)):
-        exact = exact_moments(vague, x)
+    for mean_name, sd_name, inputs in (("mu", "sigma", x[:, 0]), ("nu", "tau", x[:, 1])):
+        exact = exact_moments(vague, inputs)
         pair = np.stack([draws[mean_name], np.log(draws[sd_name])], axis=1)
         require_close(Moments(pair.mean(axis=0), pair.std(axis=0)), exact)
+    by_data = EstimateLikelihoodOptions(rounds=0)
+    narrow = estimate_likelihood(optimum.evaluator, optimum, by_data)
+    tau = narrow.evaluator.constrained(sample_of(narrow).draws)["tau"]
+    assert (np.log(tau).mean() - exact.mean[1]) / exact.sd[1] < -0.2
 
 
 def test_responses_that_are_not_stored_are_refused() -> None:
