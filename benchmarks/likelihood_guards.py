@@ -36,7 +36,7 @@ LINEAR = Problem(
     inputs=(Input("normal", "mu", "sigma"),),
     formula=lambda xp, x: 2 * x + 1,
 )
-CASES = {"linear": LINEAR, "folded": PROBLEMS["folded"], "mirror root": PROBLEMS["mirror root"]}
+CASES = {"linear": LINEAR} | {name: PROBLEMS[name] for name in ("folded", "mirror root", "circle")}
 TESTS = {
     "family of the population": "population-misfit",
     "conflict of prior and data": "prior-conflict",

@@ -18,6 +18,8 @@ Floats = NDArray[np.float64]
 # Numbers held at a time where work is done in parts: 32 MiB. It bounds memory; where the parts
 # leave a trace in an answer, that place says so.
 AT_ONCE = 1 << 22
+# Numbers of arrays that stay in the cache of a processor: 2 MiB.
+IN_CACHE = 1 << 18
 
 
 def real_array(values: ArrayLike, name: str) -> Floats:

@@ -19,7 +19,7 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from prbayes._checks import AT_ONCE, Floats
+from prbayes._checks import IN_CACHE, Floats
 from prbayes._threads import one_thread
 
 
@@ -56,7 +56,7 @@ class Interpolant:
         m, d = self.weights.shape[1], self.z.shape[1]
         values = np.empty((len(z), m))
         jacobian = np.empty((len(z), m, d))
-        step = max(1, AT_ONCE // (4 * len(self.z)))
+        step = max(1, IN_CACHE // len(self.z))
         for first in range(0, len(z), step):
             rows = slice(first, first + step)
             values[rows], jacobian[rows] = self._evaluate(z[rows])
@@ -65,7 +65,7 @@ class Interpolant:
     def values(self, z: Floats) -> Floats:
         """Return values at points, (k, d) -> (k, m), without the Jacobian."""
         values = np.empty((len(z), self.weights.shape[1]))
-        step = max(1, AT_ONCE // (4 * len(self.z)))
+        step = max(1, IN_CACHE // len(self.z))
         for first in range(0, len(z), step):
             rows = slice(first, first + step)
             square = _squared_distances(z[rows], self.z)

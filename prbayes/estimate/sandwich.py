@@ -44,11 +44,9 @@ _SHORTENED = 8
 # Knots on which distribution functions are linearised.
 _KNOTS = 400
 # Single observations over which the covariance of an additive gradient is taken: of one output, and
-# of several, whose gradients have tails in all directions. So many are computed at a time, as the
-# work grows with their square.
+# of several, whose gradients have tails in all directions.
 _SINGLE = 1000
 _SINGLE_TOGETHER = 2000
-_SINGLES_AT_ONCE = 64
 # Instead of a zero that something is divided by.
 _TINY = np.finfo(float).tiny
 
@@ -286,8 +284,9 @@ class Information:
             return np.atleast_2d(covariance)
         # A mean over observations: the covariance of single ones, by N.
         single, mass = self._single
-        starts = range(0, len(single), _SINGLES_AT_ONCE)
-        batches = [single[i : i + _SINGLES_AT_ONCE] for i in starts]
+        # 64 at a time, as the work grows with their square.
+        starts = range(0, len(single), 64)
+        batches = [single[i : i + 64] for i in starts]
         each = [self.gradients(batch, np.eye(len(batch))) for batch in batches]
         covariance = np.cov(np.concatenate(each), rowvar=False, aweights=mass)
         return np.atleast_2d(covariance) / self._target.n_effective

@@ -16,7 +16,7 @@ import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import NDArray
 
-from prbayes._checks import AT_ONCE, Floats
+from prbayes._checks import AT_ONCE, IN_CACHE, Floats
 from prbayes.metrics.base import Discrepancy, Metric
 from prbayes.model.emulated import PopulationSimulator, emulated_simulators
 from prbayes.model.hyperparameters import Hyperparameters
@@ -249,7 +249,7 @@ class Evaluator:
         """
         if not self.likelihoods:
             return {}
-        rows = max(1, AT_ONCE // max(each.points.log_a.size for each in self.likelihoods))
+        rows = max(1, IN_CACHE // max(each.points.log_a.size for each in self.likelihoods))
         parts = [
             self._evaluate_specimens(np.ascontiguousarray(thetas[first : first + rows]))
             for first in range(0, len(thetas), rows)
@@ -285,9 +285,9 @@ class Evaluator:
     def __call__(self, thetas: Floats) -> Evaluation:
         """Evaluate a batch, shape (P, d); invalid thetas leave the others alone."""
         size = len(thetas)
-        points = max((node.bound.n_points for node in self.nodes), default=1)
-        points = max(points, *(each.points.log_a.size for each in self.likelihoods), 1)
-        step = max(1, AT_ONCE // max(1, points))
+        rows_at_once = [AT_ONCE // max(1, node.bound.n_points) for node in self.nodes]
+        rows_at_once += [IN_CACHE // each.points.log_a.size for each in self.likelihoods]
+        step = max(1, min(rows_at_once, default=size))
         log_prior = np.empty(size)
         log_other = np.empty(size)
         discrepancies = np.empty((size, len(self.nodes)))

@@ -17,7 +17,7 @@ import pymc as pm
 from numpy.typing import NDArray
 from scipy.special import chdtri, ndtri
 
-from prbayes._checks import AT_ONCE, Floats
+from prbayes._checks import AT_ONCE, IN_CACHE, Floats
 from prbayes.model.hyperparameters import Hyperparameters
 from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.propagation.coordinates import Coordinates
@@ -87,7 +87,7 @@ class Populations:
             rows = np.flatnonzero(groups == group)
             of_rows = [v[rows] for v in x]
             flat = [np.ascontiguousarray(v.reshape(-1, *v.shape[2:])) for v in of_rows]
-            step = max(1, AT_ONCE // 16 // (len(rows) * count))  # in the cache
+            step = max(1, IN_CACHE // (len(rows) * count))
             for first in range(0, len(thetas), step):
                 some = slice(first, first + step)
                 roots = self._roots(thetas[some], int(group))

@@ -232,11 +232,11 @@ def _weighted(
     weights = np.exp(smoothed - logsumexp(smoothed))
     efficiency = float(1 / (weights**2).sum() / len(weights))
     rng = np.random.default_rng(seed)
-    # In random order: equal steps through a Sobol sequence stay in one part of the space.
+    # In random order: every fourth point of a Sobol sequence is in the same quarter.
     order = rng.permutation(len(weights))
     positions = (np.arange(size) + rng.random()) / size
-    rows = np.searchsorted(np.cumsum(weights[order]), positions).clip(max=len(weights) - 1)
-    rows = rng.permutation(order[rows])
+    chosen = np.searchsorted(np.cumsum(weights[order]), positions)
+    rows = order[chosen.clip(max=len(weights) - 1)]
     sample = ImportanceSample(
         points[rows],
         log_p[rows],

@@ -115,7 +115,7 @@ def sample(
         raise TypeError(f"optimum: got {got}, expected an Optimum; call prb.minimize() first")
     names = checked_names(var_names, model)
     keywords = checked_idata_kwargs(idata_kwargs)
-    seed = seed_number(np.random.default_rng() if random_seed is None else random_seed)
+    seed = seed_number(random_seed)
     asked = Sampling(
         draws=draws,
         chains=chains,
@@ -145,7 +145,7 @@ def _sample_likelihood(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     modes = _modes(evaluator, density, asked.optimum)
     if modes is None:
         return sample_likelihood(evaluator, asked)
-    seed = 0 if asked.random_seed is None else asked.random_seed
+    seed = seed_number(asked.random_seed)
     sample = importance_sample(density, modes, asked.chains * asked.draws, seed, _OPTIONS)
     if sample.is_reliable(_OPTIONS):
         attrs, thetas, stats = _of_importance_sample(sample, asked)

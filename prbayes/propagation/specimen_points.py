@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, gammaln, logsumexp, ndtri
 
-from prbayes._checks import AT_ONCE, Floats
+from prbayes._checks import AT_ONCE, IN_CACHE, Floats
 from prbayes.emulators.interpolant import Interpolant, fit_interpolant
 from prbayes.metrics.readings import Readings
 from prbayes.propagation.base import DesignError
@@ -879,7 +879,7 @@ def _draw(
 
 
 def _in_blocks(emulation: Response, z: Floats) -> Floats:
-    step = AT_ONCE // 16
+    step = IN_CACHE
     parts = [emulation(z[first : first + step])[0] for first in range(0, len(z), step)]
     return np.concatenate(parts)
 

@@ -181,7 +181,7 @@ def test_points_in_parts_have_the_same_values(monkeypatch: pytest.MonkeyPatch) -
     surface = fit_interpolant(z, smooth(z))
     elsewhere = design(64, 2, seed=5)
     whole = surface(elsewhere)
-    monkeypatch.setattr(interpolant, "AT_ONCE", 4 * 48 * 5)
+    monkeypatch.setattr(interpolant, "IN_CACHE", 48 * 5)
     parts = surface(elsewhere)
     assert np.allclose(whole[0], parts[0], rtol=1e-13)
     assert np.allclose(whole[1], parts[1], rtol=1e-10, atol=1e-12)
