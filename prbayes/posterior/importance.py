@@ -236,7 +236,8 @@ def _weighted(
     order = rng.permutation(len(weights))
     positions = (np.arange(size) + rng.random()) / size
     chosen = np.searchsorted(np.cumsum(weights[order]), positions)
-    rows = order[chosen.clip(max=len(weights) - 1)]
+    # Copies of a point are next to each other.
+    rows = rng.permutation(order[chosen.clip(max=len(weights) - 1)])
     sample = ImportanceSample(
         points[rows],
         log_p[rows],
