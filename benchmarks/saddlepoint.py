@@ -379,9 +379,9 @@ def main() -> None:
                 rows.append(function(number))
             except (ValueError, np.linalg.LinAlgError) as error:
                 rows.append({"error": str(error)})
-        found["summary"][cell] = summary(rows)
-        record.save(OUT, found)
-        print(cell, found["summary"][cell], flush=True)
+            found["summary"][cell] = summary(rows)
+            record.save(OUT, found)
+        print(cell, found["summary"].get(cell), flush=True)
 
 
 if __name__ == "__main__":
