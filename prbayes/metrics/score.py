@@ -58,7 +58,8 @@ class WeightSlopes:
     @property
     def spread(self) -> Floats:
         """Standard deviations of the derivatives of the log weights, (d,)."""
-        smallest = np.finfo(float).tiny
+        # Where an edge of the support passes, weights are zero and their derivatives are not.
+        smallest = 1e-3 * self.weights.mean()
         positive = np.maximum(self.weights, smallest)
         squares = self.slopes**2 / positive
         variances = squares.sum(axis=1)

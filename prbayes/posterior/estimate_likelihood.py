@@ -177,7 +177,7 @@ def estimate_likelihood(
     """
     _require_stored(evaluator)
     order = [optimum.names.index(name) for name in evaluator.names]
-    point = inside(evaluator, optimum.theta[order], options)
+    point = move_inside(evaluator, optimum.theta[order], options)
     for _ in range(options.rounds):
         evaluator, point = _minimised_on_population(evaluator, point, optimum, options)
     evaluator = _coarse_where_sufficient(evaluator, point)
@@ -237,7 +237,7 @@ def _minimised_on_population(
         return float(value[0]), (up - down) / 2e-4
 
     minimum = minimize(objective, np.zeros(len(point)), jac=True, method="BFGS")
-    minimiser = inside(prepared, point + minimum.x * unit, options)
+    minimiser = move_inside(prepared, point + minimum.x * unit, options)
     sizes = [design["weight_ess"] for design in prepared.support(minimiser[None]).values()]
     is_supported = np.min(sizes) >= options.effective_responses
     return prepared, minimiser if is_supported else point
@@ -325,7 +325,7 @@ def _weight_slopes(
     return WeightSlopes(responses[0], center[0], slopes)
 
 
-def inside(evaluator: Evaluator, theta: Floats, options: EstimateLikelihoodOptions) -> Floats:
+def move_inside(evaluator: Evaluator, theta: Floats, options: EstimateLikelihoodOptions) -> Floats:
     """Return the estimate, (d,), or a point inside if it is at an edge.
 
     At an edge the scores of an element vanish, or stored responses are too few for them. The score

@@ -3,7 +3,7 @@ r"""Saddlepoint density of a mean of independent scores.
 The density of an M-estimating equation at its root follows from the cumulant function of one
 specimen's score (Field and Hampel 1982, doi:10.1093/biomet/69.1.29):
 
-.. math:: \log L = N K(a) - \tfrac12 \log\det N K''(a), \quad
+.. math:: \log L = N K(a) - \tfrac{1}{2} \log\det N K''(a), \quad
           K(a) = \log \sum_m w_m e^{a' \psi_m}, \quad K'(a) = 0.
 
 Independent simulators add their cumulant functions :math:`N_j K_j(a)` with one tilt :math:`a`.

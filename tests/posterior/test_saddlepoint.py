@@ -266,6 +266,25 @@ def test_the_score_elsewhere_is_as_good_a_statistic(monkeypatch: pytest.MonkeyPa
         require_close(moments_of(at_another_point(optimum)), exact)
 
 
+def test_a_population_of_bounded_support() -> None:
+    """The scores include the points that the ends pass; widths are about the standard errors."""
+    rng = np.random.default_rng(3)
+    y = rng.uniform(0.2, 1.8, 20)
+    with pm.Model() as model:
+        mu, sigma = vague()
+        x = pm.Uniform.dist(mu - 1.73 * sigma, mu + 1.73 * sigma)
+        prb.Simulator("y", lambda x: x, x, observed=y, metric=KLD)
+    optimum = prb.minimize(model=model, progressbar=False)
+    likelihood = estimate_likelihood(optimum.evaluator, optimum)
+    assert likelihood.combinations.shape == (2, 2)
+    sample = sample_of(likelihood)
+    assert sample.pareto_k < 0.7
+    draws = likelihood.evaluator.constrained(sample.draws)
+    for name, values in draws.items():
+        # The prior is vague, and a posterior of 20 specimens is wider than the standard error.
+        assert 0.9 < values.std() / optimum.stderr[name] < 1.4, name
+
+
 @pytest.mark.long
 def test_a_prior_far_wider_than_the_population() -> None:
     y = 3.9 + 4e-4 * np.random.default_rng(7).standard_normal(50)
