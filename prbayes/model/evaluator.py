@@ -378,7 +378,7 @@ class Evaluator:
             target = chosen.against(observed, counted)
             bound = node.bound
             targets.append(target.beside(bound.first_responses, bound.dimensions))
-        return self._with_targets(targets)
+        return self.with_targets(targets)
 
     def of_one(self, node: Node, k: int) -> Evaluator:
         """Return an evaluator of one simulator alone, of the k-th's inputs; it is not compiled."""
@@ -405,7 +405,8 @@ class Evaluator:
         other.__dict__["objective"] = other._uncompiled
         return other
 
-    def _with_targets(self, targets: list[Discrepancy]) -> Evaluator:
+    def with_targets(self, targets: list[Discrepancy]) -> Evaluator:
+        """Return an evaluator of the same model with other prepared metrics, by simulator."""
         other = copy.copy(self)
         pairs = zip(self.nodes, targets, strict=True)
         other.nodes = [replace(node, target=target) for node, target in pairs]
@@ -524,4 +525,4 @@ def _unpacked(payload: bytes) -> Evaluator:
 
     model, targets = cloudpickle.loads(payload)
     evaluator = Evaluator(model)
-    return evaluator if targets is None else evaluator._with_targets(targets)
+    return evaluator if targets is None else evaluator.with_targets(targets)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,16 @@ import xarray as xr
 
 from prbayes._checks import Floats, Seed, positive_integer, seed_number
 from prbayes._progress import shown
+from prbayes.estimate.minimization import Minimisation, find_optimum, require_finished
 from prbayes.estimate.optimum import Optimum
+from prbayes.estimate.refinement import MAX_ROUNDS, refine_at
 from prbayes.model.evaluator import Evaluator
-from prbayes.model.interruption import explained
+from prbayes.model.hyperparameters import THETAS
+from prbayes.model.interruption import designs_as_before, explained
 from prbayes.model.node import model_on_context
 from prbayes.model.turns import in_turn
-from prbayes.posterior.groups import specimen_groups
+from prbayes.posterior.estimate_likelihood import estimate_likelihood
+from prbayes.posterior.groups import arviz_groups, specimen_groups
 from prbayes.posterior.importance import (
     ImportanceOptions,
     ImportanceSample,
@@ -54,7 +59,11 @@ def sample(
     With the log-likelihood by specimen: importance sampling from Laplace approximations of the
     modes. If Pareto k is above .7, or the effective sample size below a quarter of the points, NUTS
     from the optimum; of several modes, or where the likelihood jumps at the optimum, sequential
-    Monte Carlo from the prior. Models with another metric are sampled by `sample_smc`.
+    Monte Carlo from the prior.
+
+    With PR or the Kullback-Leibler divergence and stored responses (`Reweighted`), the posterior is
+    prior times density of the metric's own estimate: of its score there, by a saddlepoint
+    approximation [2]_. It is sampled in the same way. Other metrics are sampled by `sample_smc`.
 
     Parameters
     ----------
@@ -96,6 +105,8 @@ def sample(
     ----------
     .. [1] Vehtari, A., D. Simpson, A. Gelman, Y. Yao and J. Gabry (2024), Pareto smoothed
        importance sampling, J. Mach. Learn. Res. 25(72), 1-58.
+    .. [2] Field, C. A. and F. R. Hampel (1982), Small-sample asymptotic distributions of
+       M-estimators of location, Biometrika 69(1), 29-46, doi:10.1093/biomet/69.1.29.
 
     Examples
     --------
@@ -131,7 +142,7 @@ def sample(
     ):
         evaluator = evaluator_of(model, optimum, "sample")
         if evaluator.nodes:
-            tree = sample_by_smc(evaluator, asked)
+            tree = _sample_given_estimate(evaluator, asked)
         else:
             tree = _sample_likelihood(evaluator, asked)
         return as_asked(tree, names, keywords)
@@ -142,7 +153,11 @@ def _sample_likelihood(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     clock = time.perf_counter()
     before = evaluator.n_responses
     density = log_posterior(evaluator)
-    modes = _modes(evaluator, density, asked.optimum)
+    if asked.optimum is None:
+        starts = _starts(evaluator, density)
+    else:
+        starts = list(optima_of(asked.optimum, evaluator))
+    modes = _modes(evaluator, density, starts)
     if modes is None:
         return sample_likelihood(evaluator, asked)
     seed = seed_number(asked.random_seed)
@@ -171,6 +186,71 @@ def _sample_likelihood(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
         )
 
 
+def _sample_given_estimate(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
+    """Return the result for metrics: prior times density of the metric's score at the estimate.
+
+    By `sample_smc` where there is no such density, or where importance sampling is not reliable.
+    """
+    clock = time.perf_counter()
+    before = evaluator.n_responses - evaluator.n_runs
+    optimum = asked.optimum
+    if optimum is None:
+        optimum = require_finished(find_optimum(evaluator, Minimisation()))
+    asked = replace(asked, optimum=optimum)
+    with designs_as_before(evaluator):
+        sample = _importance_sample_given_estimate(evaluator, optimum, asked)
+    if sample is None:
+        return sample_by_smc(evaluator, asked)
+    attrs, thetas, stats = _of_importance_sample(sample, asked)
+    with unlimited():
+        evaluation = evaluator(sample.draws)
+        shape = (asked.chains, asked.draws, -1)
+        discrepancies = evaluation.discrepancies.reshape(shape)
+        log_likelihood = (sample.log_density - evaluation.log_prior).reshape(shape[:2])
+        return posterior_tree(
+            evaluator,
+            thetas,
+            discrepancies,
+            evaluation.lost.reshape(shape),
+            [],
+            sampler=attrs,
+            sample_stats=stats,
+            adjustment="none needed: the posterior is given the metric's own estimate",
+            warnings=optimum.warnings,
+            seed=asked.random_seed,
+            n_responses=evaluator.n_responses - before,
+            seconds=time.perf_counter() - clock,
+            groups=arviz_groups(
+                evaluator, thetas, discrepancies, thetas, log_likelihood, asked.random_seed
+            ),
+        )
+
+
+def _importance_sample_given_estimate(
+    evaluator: Evaluator, optimum: Optimum, asked: Sampling
+) -> ImportanceSample | None:
+    """Return draws given the estimate, or None where they cannot be had or are not reliable.
+
+    Stored responses are added where they do not support the draws.
+    """
+    seed = seed_number(asked.random_seed)
+    for _ in range(MAX_ROUNDS + 1):
+        try:
+            likelihood = estimate_likelihood(evaluator, optimum)
+        except (TypeError, ValueError):
+            return None
+        density = likelihood.log_posterior
+        modes = _modes(evaluator, density, list(optima_of(optimum, evaluator)))
+        if modes is None:
+            return None
+        sample = importance_sample(density, modes, asked.chains * asked.draws, seed, _OPTIONS)
+        if not sample.is_reliable(_OPTIONS):
+            return None
+        if not refine_at(evaluator, sample.draws[:THETAS]):
+            return sample
+    return None
+
+
 def log_posterior(evaluator: Evaluator) -> LogDensity:
     """Return the log-posterior density in unconstrained space, (S, d) -> (S,)."""
 
@@ -189,14 +269,8 @@ def _warnings(evaluator: Evaluator, optimum: Optimum | None) -> tuple[str, ...]:
     return tuple(str(finding) for finding in findings)
 
 
-def _modes(
-    evaluator: Evaluator, density: LogDensity, optimum: Optimum | None
-) -> list[Laplace] | None:
-    """Return Laplace approximations of the modes, or None where the density jumps at one.
-
-    The starts are the optimum with other local optima of its search, or points of the prior.
-    """
-    starts = _starts(evaluator, density) if optimum is None else optima_of(optimum, evaluator)
+def _modes(evaluator: Evaluator, density: LogDensity, starts: list[Floats]) -> list[Laplace] | None:
+    """Return Laplace approximations of the modes near starts, None if the density jumps there."""
     try:
         candidates = laplace(density, np.stack(starts), evaluator.prior_sd)
     except (ValueError, np.linalg.LinAlgError):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -92,8 +94,6 @@ def test_moving_ends_are_sampled_by_smc() -> None:
 
 
 def test_few_specimens_are_sampled_by_nuts(monkeypatch: pytest.MonkeyPatch) -> None:
-    from dataclasses import replace
-
     from prbayes.posterior import sample as module
 
     monkeypatch.setattr(module, "_OPTIONS", replace(module._OPTIONS, efficiency=1.0))
@@ -101,6 +101,81 @@ def test_few_specimens_are_sampled_by_nuts(monkeypatch: pytest.MonkeyPatch) -> N
     assert result.posterior.attrs["sampler"] == "NUTS"
     for name, (mean, sd) in exact_moments(X).items():
         assert abs(float(result.posterior[name].mean()) - mean) < 0.3 * sd
+
+
+def metric_model(metric: prb.Metric, x: Floats, mu: Callable[[], Any] | None = None) -> pm.Model:
+    with pm.Model() as model:
+        center = pm.Normal("mu", 9, 3) if mu is None else mu()
+        inputs = pm.Normal.dist(center, pm.HalfNormal("sigma", 2))
+        prb.Simulator("y", lambda x: 2 * x + 1, inputs, metric=metric, observed=2 * x + 1)
+    return model
+
+
+def test_the_posterior_given_the_estimate_of_the_divergence_is_nearly_the_exact_one() -> None:
+    model = metric_model(prb.KullbackLeibler(), X)
+    result = prb.sample(1000, model=model, progressbar=False)
+    assert result.posterior.attrs["sampler"] == "importance sampling"
+    assert result.posterior.attrs["adjustment"].startswith("none needed")
+    for name, (mean, sd) in exact_moments(X).items():
+        draws = result.posterior[name]
+        assert abs(float(draws.mean()) - mean) < 0.2 * sd
+        assert 0.9 < float(draws.std()) / sd < 1.15
+    # Of the draws' own density, up to a constant, for power-scaling.
+    log_density = result.sample_stats["lp"]
+    log_prior = sum(result.log_prior[name] for name in ("mu", "sigma"))
+    jacobian = np.log(result.posterior["sigma"])
+    parts = result.log_likelihood.to_dataset()
+    log_likelihood = sum(parts[name].squeeze("y_dim_0", drop=True) for name in parts.data_vars)
+    np.testing.assert_allclose(log_density, log_prior + jacobian + log_likelihood, atol=1e-8)
+    assert prb.diagnose(result, model=model).ok
+
+
+@pytest.mark.parametrize("metric", [prb.KullbackLeibler(), prb.ProbabilityResidual()])
+def test_the_end_of_a_prior_cuts_the_posterior_given_the_estimate(metric: prb.Metric) -> None:
+    """The estimate is near the end; its density does not depend on the prior."""
+    free = prb.sample(2000, model=metric_model(metric, X), progressbar=False).posterior
+    end = float(free["mu"].mean())
+    cut = prb.sample(
+        1000,
+        model=metric_model(metric, X, lambda: pm.Uniform("mu", 0.0, end)),
+        progressbar=False,
+    ).posterior
+    assert cut.attrs["sampler"] == "importance sampling"
+    below = free["mu"].to_numpy().ravel()
+    # The normal prior of the first is flat over its posterior: .01 standard deviations.
+    expected = below[below < end]
+    sd = expected.std()
+    assert abs(float(cut["mu"].mean()) - expected.mean()) < 0.15 * sd
+    assert 0.9 < float(cut["mu"].std()) / sd < 1.1
+
+
+def test_two_simulators_add_what_they_know() -> None:
+    with pm.Model() as model:
+        mu = pm.Normal("mu", 9, 3)
+        sigma = pm.HalfNormal("sigma", 2)
+        for name, part in (("first", X[:10]), ("second", X[10:])):
+            inputs = pm.Normal.dist(mu, sigma)
+            prb.Simulator(
+                name, lambda x: 2 * x + 1, inputs, metric=prb.KullbackLeibler(),
+                observed=2 * part + 1,
+            )  # fmt: skip
+    result = prb.sample(1000, model=model, progressbar=False)
+    assert result.posterior.attrs["sampler"] == "importance sampling"
+    for name, (mean, sd) in exact_moments(X).items():
+        draws = result.posterior[name]
+        assert abs(float(draws.mean()) - mean) < 0.3 * sd
+        assert 0.85 < float(draws.std()) / sd < 1.2
+
+
+def test_where_importance_sampling_is_not_reliable_a_metric_is_sampled_by_smc(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from prbayes.posterior import sample as module
+
+    monkeypatch.setattr(module, "_OPTIONS", replace(module._OPTIONS, efficiency=1.0))
+    model = metric_model(prb.ProbabilityResidual(), X)
+    result = prb.sample(50, chains=1, model=model, progressbar=False)
+    assert result.posterior.attrs["sampler"] == "SMC-ABC"
 
 
 def test_a_metric_of_distributions_is_sampled_by_smc() -> None:

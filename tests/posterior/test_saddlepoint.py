@@ -1,0 +1,430 @@
+"""The density of a metric's score at its estimate, against exact densities and posteriors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytest
+from scipy import stats
+
+import prbayes as prb
+from prbayes._checks import Floats
+from prbayes.metrics.base import Metric
+from prbayes.metrics.score import WeightSlopes, specimen_scores
+from prbayes.model.evaluator import Evaluator
+from prbayes.posterior.estimate_likelihood import (
+    EstimateLikelihood,
+    EstimateLikelihoodOptions,
+    estimate_likelihood,
+)
+from prbayes.posterior.importance import ImportanceSample, importance_sample, laplace
+from prbayes.posterior.saddlepoint import (
+    SaddlepointOptions,
+    Scores,
+    cumulants,
+    log_density,
+    saddlepoints,
+    varying_combinations,
+)
+
+KLD = prb.KullbackLeibler()
+PR = prb.ProbabilityResidual()
+Parameters = Callable[[], tuple[Any, Any]]  # within a model: mean and standard deviation
+
+
+# -- cumulant functions --
+
+
+def atoms(size: int = 400, d: int = 2) -> tuple[Floats, Floats]:
+    """Return log weights (3, M) of three populations, and scores (M, d)."""
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(size, d))
+    logs = -0.5 * ((values[:, 0] - np.array([[0.0], [0.3], [-0.8]])) ** 2)
+    return logs - np.log(np.exp(logs).sum(axis=1, keepdims=True)), values
+
+
+def test_derivatives_of_the_cumulant_function() -> None:
+    logs, values = atoms()
+    scores = [Scores(values, 7)]
+    tilts = np.array([[0.1, -0.4], [1.0, 0.2], [-0.5, 0.0]])
+    at = cumulants([logs], scores, tilts)
+    expected = 7 * np.log((np.exp(logs) * np.exp(tilts @ values.T)).sum(axis=1))
+    np.testing.assert_allclose(at.values, expected)
+    for j, step in enumerate(1e-5 * np.eye(2)):
+        up, down = (cumulants([logs], scores, tilts + sign * step) for sign in (1, -1))
+        np.testing.assert_allclose((up.values - down.values) / 2e-5, at.gradients[:, j], rtol=1e-7)
+        slope = (up.gradients - down.gradients) / 2e-5
+        np.testing.assert_allclose(slope, at.hessians[:, j], rtol=1e-7)
+
+
+def test_tilts_have_no_gradient_and_simulators_add() -> None:
+    logs, values = atoms()
+    points = saddlepoints([logs], [Scores(values, 7)])
+    assert points.converged.all()
+    np.testing.assert_allclose(points.cumulants.gradients, 0, atol=7e-5)
+    halves = [Scores(values, 3), Scores(values, 4)]
+    np.testing.assert_allclose(
+        log_density([logs, logs], halves), log_density([logs], [Scores(values, 7)])
+    )
+
+
+def test_zero_outside_of_the_hull_has_no_density() -> None:
+    logs, values = atoms()
+    shifted = Scores(values + np.array([10.0, 0.0]), 7)
+    assert np.isneginf(log_density([logs], [shifted])).all()
+    unsupported = np.full_like(logs, np.nan)
+    assert np.isneginf(log_density([unsupported], [Scores(values, 7)])).all()
+
+
+def test_the_density_of_a_mean_of_exponential_variables() -> None:
+    """The saddlepoint density of a gamma mean is exact up to a constant."""
+    nodes = stats.expon.ppf((np.arange(20000) + 0.5) / 20000)
+    rates = np.array([0.6, 1.0, 1.7])
+    logs = np.log(rates)[:, None] + (1 - rates[:, None]) * nodes
+    logs -= np.log(np.exp(logs).sum(axis=1, keepdims=True))
+    found = log_density([logs], [Scores(nodes[:, None] - 1.0, 5)])
+    expected = stats.gamma(5, scale=1 / (5 * rates)).logpdf(1.0)
+    np.testing.assert_allclose(found - found[1], expected - expected[1], atol=5e-3)
+
+
+def test_combinations_without_variation_are_dropped() -> None:
+    rng = np.random.default_rng(1)
+    independent = rng.normal(size=(200, 2)) * [1.0, 100.0]
+    scores = np.column_stack([independent, independent @ [2.0, 1.0], np.zeros(200)])
+    covariance = np.cov(scores.T)
+    combinations = varying_combinations(covariance, SaddlepointOptions())
+    assert combinations.shape == (4, 2)
+    np.testing.assert_allclose(
+        combinations.T @ covariance @ combinations, np.eye(2), rtol=1e-6, atol=1e-9
+    )
+    assert varying_combinations(np.zeros((2, 2)), SaddlepointOptions()).shape == (2, 0)
+
+
+# -- scores of specimens --
+
+
+def normal_population(m: int) -> WeightSlopes:
+    """Return standard normal responses (M, m), weights, and slopes for mean and log sd of the first."""
+    rng = np.random.default_rng(2)
+    values = rng.normal(size=(3000, m))
+    weights = np.full(3000, 1 / 3000)
+    scores = np.stack([values[:, 0], values[:, 0] ** 2])
+    slopes = weights * (scores - scores.mean(axis=1, keepdims=True))
+    return WeightSlopes(values if m > 1 else values[:, 0], weights, slopes)
+
+
+@pytest.mark.parametrize("metric", [PR, KLD, prb.Joint(PR), prb.Joint(KLD)])
+def test_the_mean_score_is_the_gradient(metric: Metric) -> None:
+    m = 2 if metric.takes_outputs else 1
+    rng = np.random.default_rng(3)
+    observed = np.squeeze(0.2 + rng.normal(size=(12, m)))
+    target = metric.against(observed)
+    population = normal_population(m)
+    found = specimen_scores(target, population, observed).mean(axis=0)
+    steps = 1e-5 * population.slopes
+    up, down = (target(population.responses, population.weights + s * steps) for s in (1, -1))
+    np.testing.assert_allclose(found, (up - down) / 2e-5, rtol=1e-4)
+
+
+def test_the_score_of_the_divergence_is_constant_beyond_the_data() -> None:
+    observed = np.linspace(-1, 1, 10)
+    target = KLD.against(observed)
+    far = specimen_scores(target, normal_population(1), np.array([6.0, 8.0, np.inf]))
+    np.testing.assert_allclose(far[0], far[1])
+    assert np.isfinite(far).all()
+
+
+def test_metrics_without_a_mean_score_are_refused() -> None:
+    observed = np.linspace(-1, 1, 10)
+    for metric in (prb.AreaMetric(), prb.KullbackLeibler(reverse=True)):
+        with pytest.raises(TypeError, match="gradient is no mean"):
+            specimen_scores(metric.against(observed), normal_population(1), observed)
+
+
+# -- posteriors --
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Means and standard deviations of mu and log sigma."""
+
+    mean: Floats
+    sd: Floats
+
+
+def vague() -> tuple[Any, Any]:
+    return pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1)
+
+
+def sharp() -> tuple[Any, Any]:
+    return pm.Normal("mu", 0.7, 0.1), pm.LogNormal("sigma", np.log(0.4), 0.1)
+
+
+def bounded() -> tuple[Any, Any]:
+    return pm.Uniform("mu", 0, 1.05), pm.Uniform("sigma", 0, 0.55)
+
+
+LOG_PRIORS: dict[Parameters, Callable[[Floats, Floats], Floats]] = {
+    vague: lambda mu, s: stats.norm(0, 2).logpdf(mu) + stats.halfnorm.logpdf(s),
+    sharp: lambda mu, s: stats.norm(0.7, 0.1).logpdf(mu) + stats.lognorm(0.1, scale=0.4).logpdf(s),
+    bounded: lambda mu, s: stats.uniform(0, 1.05).logpdf(mu) + stats.uniform(0, 0.55).logpdf(s),
+}
+
+
+def exact_moments(parameters: Parameters, y: Floats) -> Moments:
+    """Return those of the exact posterior of a normal population, on a grid."""
+    center, error = y.mean(), y.std() / np.sqrt(len(y))
+    mu = np.linspace(center - 12 * error, center + 12 * error, 1201)[:, None]
+    log_sd = np.linspace(np.log(y.std()) - 2, np.log(y.std()) + 2, 1200)[None]
+    sd = np.exp(log_sd)
+    squares = (len(y) * ((center - mu) ** 2 + y.var())) / (2 * sd**2)
+    with np.errstate(divide="ignore"):
+        logs = -len(y) * log_sd - squares + LOG_PRIORS[parameters](mu, sd) + log_sd
+    weights = np.exp(logs - logs.max())
+    weights /= weights.sum()
+    mean = np.array([(weights * mu).sum(), (weights * log_sd).sum()])
+    variance = [(weights * (mu - mean[0]) ** 2).sum(), (weights * (log_sd - mean[1]) ** 2).sum()]
+    return Moments(mean, np.sqrt(variance))
+
+
+def normal_model(parameters: Parameters, metric: Metric, *groups: Floats) -> pm.Model:
+    """Return a model of a normal population, with a simulator y = x for each group of data."""
+    with pm.Model() as model:
+        mu, sigma = parameters()
+        for k, observed in enumerate(groups):
+            x = pm.Normal.dist(mu, sigma)
+            propagation = prb.Reweighted(1024)
+            prb.Simulator(
+                f"y{k}", lambda x: x, x, observed=observed, metric=metric, propagation=propagation
+            )
+    return model
+
+
+def likelihood_of(model: pm.Model) -> EstimateLikelihood:
+    optimum = prb.minimize(model=model, progressbar=False)
+    return estimate_likelihood(optimum.evaluator, optimum)
+
+
+def sample_of(likelihood: EstimateLikelihood) -> ImportanceSample:
+    modes = laplace(likelihood.log_posterior, likelihood.point[None], likelihood.scale)
+    return importance_sample(likelihood.log_posterior, modes, 1000, seed=0)
+
+
+def moments_of(likelihood: EstimateLikelihood) -> Moments:
+    """Return those of the posterior given the estimate."""
+    sample = sample_of(likelihood)
+    assert sample.pareto_k < 0.7
+    values = likelihood.evaluator.constrained(sample.draws)
+    pair = np.stack([values["mu"], np.log(values["sigma"])], axis=1)
+    return Moments(pair.mean(axis=0), pair.std(axis=0))
+
+
+def require_close(found: Moments, exact: Moments) -> None:
+    offsets = (found.mean - exact.mean) / exact.sd
+    widths = found.sd / exact.sd
+    assert (np.abs(offsets) < 0.2).all(), offsets
+    assert ((widths > 0.9) & (widths < 1.15)).all(), widths
+
+
+def data(size: int = 20, seed: int = 4) -> Floats:
+    return np.random.default_rng(seed).normal(1, 0.5, size)
+
+
+@pytest.mark.parametrize("parameters", [vague, sharp, bounded])
+def test_the_posterior_of_a_normal_population(parameters: Parameters) -> None:
+    """Mean and standard deviation are sufficient, and the divergence's estimate is close to both."""
+    y = data()
+    likelihood = likelihood_of(normal_model(parameters, KLD, y))
+    require_close(moments_of(likelihood), exact_moments(parameters, y))
+
+
+def at_another_point(optimum: prb.Optimum) -> EstimateLikelihood:
+    """Return the likelihood by the score a standard deviation of the prior away."""
+    shifted = replace(optimum, theta=optimum.theta + optimum.evaluator.prior_sd)
+    likelihood = estimate_likelihood(optimum.evaluator, shifted)
+    np.testing.assert_allclose(likelihood.point, shifted.theta)
+    return likelihood
+
+
+def test_the_score_elsewhere_is_as_good_a_statistic(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its observed mean is subtracted there; with the wrong sign the posterior is elsewhere."""
+    y = data()
+    optimum = prb.minimize(model=normal_model(sharp, KLD, y), progressbar=False)
+    exact = exact_moments(sharp, y)
+    require_close(moments_of(at_another_point(optimum)), exact)
+
+    def wrong(target: Any, population: Any, specimens: Floats, options: Any) -> Floats:
+        sign = -1 if len(specimens) == len(y) else 1
+        return sign * specimen_scores(target, population, specimens, options)
+
+    monkeypatch.setattr("prbayes.posterior.estimate_likelihood.specimen_scores", wrong)
+    with pytest.raises(AssertionError, match=r"array"):
+        require_close(moments_of(at_another_point(optimum)), exact)
+
+
+def test_a_population_of_bounded_support() -> None:
+    """The scores include the points that the ends pass; widths are about the standard errors."""
+    rng = np.random.default_rng(3)
+    y = rng.uniform(0.2, 1.8, 20)
+    with pm.Model() as model:
+        mu, sigma = vague()
+        x = pm.Uniform.dist(mu - 1.73 * sigma, mu + 1.73 * sigma)
+        prb.Simulator("y", lambda x: x, x, observed=y, metric=KLD)
+    optimum = prb.minimize(model=model, progressbar=False)
+    likelihood = estimate_likelihood(optimum.evaluator, optimum)
+    assert likelihood.combinations.shape == (2, 2)
+    sample = sample_of(likelihood)
+    assert sample.pareto_k < 0.7
+    draws = likelihood.evaluator.constrained(sample.draws)
+    for name, values in draws.items():
+        # The prior is vague, and a posterior of 20 specimens is wider than the standard error.
+        assert 0.9 < values.std() / optimum.stderr[name] < 1.4, name
+
+
+@pytest.mark.long
+def test_a_prior_far_wider_than_the_population() -> None:
+    y = 3.9 + 4e-4 * np.random.default_rng(7).standard_normal(50)
+    likelihood = likelihood_of(normal_model(vague, KLD, y))
+    require_close(moments_of(likelihood), exact_moments(vague, y))
+
+
+def test_an_estimate_at_the_end_of_a_prior_is_moved_inside() -> None:
+    """The data are beyond the end: scores of an element there would vanish."""
+    y = data() + 0.5
+    likelihood = likelihood_of(normal_model(bounded, KLD, y))
+    assert likelihood.combinations.shape == (2, 2)
+    require_close(moments_of(likelihood), exact_moments(bounded, y))
+
+
+def test_two_simulators_are_as_one_with_all_data() -> None:
+    """They have one bandwidth, so that all specimens count alike."""
+    y = data(40)
+    metric = prb.KullbackLeibler(prb.GaussianKDE(0.3))
+    likelihood = likelihood_of(normal_model(vague, metric, y[:20], y[20:]))
+    assert len(likelihood.scores) == 2
+    require_close(moments_of(likelihood), exact_moments(vague, y))
+
+
+def test_specimens_in_two_simulators_add_their_scores() -> None:
+    y = data()
+    labels = np.arange(20)
+    with pm.Model() as model:
+        x = pm.Normal.dist(*vague())
+        for name, response in (("y", lambda x: x), ("z", lambda x: 3 * x)):
+            prb.Simulator(
+                name,
+                response,
+                x,
+                observed=y if name == "y" else 3 * y,
+                metric=KLD,
+                propagation=prb.Reweighted(1024),
+                specimens=labels,
+            )
+    likelihood = likelihood_of(model)
+    assert len(likelihood.scores) == 1
+    require_close(moments_of(likelihood), exact_moments(vague, y))
+
+
+def test_the_posterior_of_an_unidentified_hyperparameter_is_its_prior() -> None:
+    y = data()
+
+    def parameters() -> tuple[Any, Any]:
+        pm.Normal("unused", 3, 2)
+        return vague()
+
+    likelihood = likelihood_of(normal_model(parameters, KLD, y))
+    assert likelihood.combinations.shape == (3, 2)
+    sample = sample_of(likelihood)
+    place = likelihood.evaluator.names.index("unused")
+    draws = sample.draws[:, place]
+    # Four standard errors of 1000 independent draws.
+    assert abs(draws.mean() - 3) < 4 * 2 / np.sqrt(1000)
+    assert abs(draws.std() / 2 - 1) < 4 / np.sqrt(2000)
+
+
+def test_an_estimate_at_an_edge_is_moved_inside() -> None:
+    """Known scatter of .5 exceeds that of the data: the standard deviation of mu's inputs is zero."""
+    noise = np.random.default_rng(5).normal(0, 0.3, 20)
+    with pm.Model() as model:
+        mu, sigma = vague()
+        x = pm.Normal.dist(mu, pm.math.sqrt(sigma**2 + 0.25))
+        prb.Simulator("y", lambda x: x, x, observed=1 + noise, metric=KLD)
+    optimum = prb.minimize(model=model, progressbar=False)
+    likelihood = estimate_likelihood(optimum.evaluator, optimum)
+    assert likelihood.combinations.shape[1] == 2
+    draws = likelihood.evaluator.constrained(sample_of(likelihood).draws)
+    y = 1 + noise
+    mu_grid = np.linspace(0.2, 1.8, 401)[:, None]
+    sigma_grid = np.linspace(1e-3, 1.5, 600)[None]
+    variance = sigma_grid**2 + 0.25
+    logs = -10 * np.log(variance) - 10 * ((y.mean() - mu_grid) ** 2 + y.var()) / variance
+    logs = logs + LOG_PRIORS[vague](mu_grid, sigma_grid)
+    weights = np.exp(logs - logs.max())
+    weights /= weights.sum()
+    for name, grid in (("mu", mu_grid), ("sigma", sigma_grid)):
+        mean = (weights * grid).sum()
+        sd = np.sqrt((weights * (grid - mean) ** 2).sum())
+        assert abs(draws[name].mean() - mean) < 0.2 * sd
+        assert 0.9 < draws[name].std() / sd < 1.15
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("metric", [KLD, PR])
+def test_two_outputs_by_a_joint_metric(metric: Metric) -> None:
+    """Two outputs determine the inputs, so that the likelihood is known.
+
+    Independent inputs are fewer hyperparameters than the whitening has numbers. The whitening of 20
+    specimens then makes the estimates of their spreads too small; that of the population does not.
+    """
+    rng = np.random.default_rng(21)
+    x = np.array([1.0, -1.0]) + np.array([0.5, 0.8]) * rng.standard_normal((20, 2))
+    # A correlation by chance is what the whitening removes.
+    x[:, 1] += 0.9 * (x[:, 0] - x[:, 0].mean())
+    with pm.Model() as model:
+        a = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        b = pm.Normal.dist(pm.Normal("nu", 0, 2), pm.HalfNormal("tau", 1))
+        prb.Simulator(
+            "y",
+            lambda a, b: np.stack([a + b, a - b], axis=-1),
+            a,
+            b,
+            observed=x @ np.array([[1.0, 1.0], [1.0, -1.0]]),
+            metric=prb.Joint(metric),
+            propagation=prb.Reweighted(256),
+        )
+    optimum = prb.minimize(model=model, progressbar=False)
+    likelihood = estimate_likelihood(optimum.evaluator, optimum)
+    draws = likelihood.evaluator.constrained(sample_of(likelihood).draws)
+    for mean_name, sd_name, inputs in (("mu", "sigma", x[:, 0]), ("nu", "tau", x[:, 1])):
+        exact = exact_moments(vague, inputs)
+        pair = np.stack([draws[mean_name], np.log(draws[sd_name])], axis=1)
+        require_close(Moments(pair.mean(axis=0), pair.std(axis=0)), exact)
+    by_data = EstimateLikelihoodOptions(rounds=0)
+    narrow = estimate_likelihood(optimum.evaluator, optimum, by_data)
+    tau = narrow.evaluator.constrained(sample_of(narrow).draws)["tau"]
+    assert (np.log(tau).mean() - exact.mean[1]) / exact.sd[1] < -0.2
+
+
+def test_responses_that_are_not_stored_are_refused() -> None:
+    with pm.Model() as model:
+        x = pm.Normal.dist(*vague())
+        prb.Simulator(
+            "y", lambda x: x, x, observed=data(), metric=KLD, propagation=prb.Resimulated(256)
+        )
+    optimum = prb.minimize(model=model, progressbar=False)
+    with pytest.raises(TypeError, match="stored responses"):
+        estimate_likelihood(optimum.evaluator, optimum)
+
+
+def test_the_options_reach_the_density() -> None:
+    model = normal_model(vague, KLD, data())
+    optimum = prb.minimize(model=model, progressbar=False)
+    options = EstimateLikelihoodOptions(saddlepoint=SaddlepointOptions(iterations=0))
+    evaluator: Evaluator = optimum.evaluator
+    likelihood = estimate_likelihood(evaluator, optimum, options)
+    away = likelihood.point + 0.1
+    assert np.isneginf(likelihood.log_posterior(away[None])).all()
