@@ -197,6 +197,26 @@ def likelihood_ranks() -> Iterator[Row]:
             yield [problem, name, sets, short(within, 3), short(exact, 3), p, *distance]
 
 
+def saddlepoint() -> Iterator[Row]:
+    """Yield offsets and widths of posteriors given the estimate, by metric and prior."""
+    cells: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for name, cell in found("saddlepoint")["summary"].items():
+        study, *rest = name.split(", ")
+        if study == "one":
+            metric, _, prior = rest
+            cells.setdefault((metric, prior), []).append(cell)
+    for (metric, prior), those in cells.items():
+        rms, most = (max(max(c[f"{key} offset"]) for c in those) for key in ("rms", "largest"))
+        low = min(min(c["smallest width"]) for c in those)
+        high = max(max(c["largest width"]) for c in those)
+        seconds = float(np.median([c["seconds"] for c in those]))
+        sets = sum(c["data sets"] for c in those)
+        yield [
+            metric, prior, str(sets), short(rms), short(most), f"{short(low)} to {short(high)}",
+            short(seconds),
+        ]  # fmt: skip
+
+
 def guard_sizes() -> Iterator[Row]:
     """Yield how often right models are flagged by the guards of the log-likelihood by specimen."""
     for problem, checks in found("likelihood_guards")["summary"].items():
@@ -914,6 +934,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "ranks": ranks,
     "likelihood, ranks": likelihood_ranks,
     "likelihood, sizes of guards": guard_sizes,
+    "saddlepoint": saddlepoint,
     "hard posteriors": hard_posteriors,
     "samplers": samplers,
     "size": sizes,

@@ -231,8 +231,11 @@ def _importance_sample_given_estimate(
 ) -> ImportanceSample | None:
     """Return draws given the estimate, or None where they cannot be had or are not reliable.
 
-    Stored responses are added where they do not support the draws.
+    Stored responses are added where they do not support the draws. Fewer than ten specimens of a
+    simulator have bandwidths that bias the estimate, and were not studied.
     """
+    if min(len(node.observed) for node in evaluator.nodes) < 10:
+        return None
     seed = seed_number(asked.random_seed)
     for _ in range(MAX_ROUNDS + 1):
         try:
