@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -136,6 +138,11 @@ def test_families(truth: str, monkeypatch: pytest.MonkeyPatch) -> None:
         assert 0.8 - 4 * 0.09 < found["z_sd"] < 1.25 + 4 * 0.14
 
 
+def rounded(result: Any) -> Any:
+    """Return a result with nine digits: the last ones depend on the processor."""
+    return json.loads(json.dumps(result), parse_float=lambda text: float(f"{float(text):.9g}"))
+
+
 @pytest.mark.parametrize("name", list(likelihood_coverage.PROBLEMS))
 def test_the_posterior_of_the_likelihood_by_specimen_is_the_exact_one(name: str) -> None:
     problem = likelihood_coverage.PROBLEMS[name]
@@ -153,7 +160,7 @@ def test_the_likelihood_by_specimen_covers_over_a_whole_prior() -> None:
     results = record.load(likelihood_coverage.OUT, None)
     for name, rows in results["rows"].items():
         found = likelihood_coverage.summary(rows)
-        assert found == results["summary"][name]
+        assert rounded(found) == rounded(results["summary"][name])
         assert min(found["prbayes"]["p of uniformity"].values()) > 0.01
         # As if the hyperparameters of a data set were one: the error is at most this one.
         error = (0.89 * 0.11 / found["data sets"]) ** 0.5
@@ -165,7 +172,7 @@ def test_guards_rarely_flag_right_models() -> None:
     largest = dict(zip(likelihood_guards.CHECKS, (0.07, 0.06, 0.06), strict=True))
     for name, rows in results["rows"].items():
         found = likelihood_guards.summary(rows)
-        assert found == results["summary"][name]
+        assert rounded(found) == rounded(results["summary"][name])
         for check, cell in found.items():
             assert cell["share"] <= largest[check] + 4 * cell["standard error"], (name, check)
 
@@ -174,7 +181,7 @@ def test_measurement_arguments_have_the_exact_posterior() -> None:
     results = record.load(readings_coverage.OUT, None)
     for name, rows in results["rows"].items():
         found = readings_coverage.table(rows)
-        assert found == results["summary"][name]
+        assert rounded(found) == rounded(results["summary"][name])
         assert np.abs(found["bias"]).max() < 0.1
         error = (0.89 * 0.11 / (found["data sets"] - found["refused"])) ** 0.5
         for within in found["prbayes"]["coverage"].values():
