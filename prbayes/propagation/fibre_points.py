@@ -117,14 +117,15 @@ def fibre_points(
             "propagation=prb.Reweighted(n)"
         )
     # Points on fibres cost more than those around roots, and their error falls more slowly.
-    largest = 3 * options.half_difference
+    goal, largest = 2 * options.half_difference, 3 * options.half_difference
     count = 128
     while True:
         halves = [_draw(emulation, readings, population, count, 100 + seed + h) for h in (0, 1)]
         difference = _difference(*(draws.log_likelihoods(p.z, p.log_a) for p in halves))
-        if difference <= largest:
+        is_last = 4 * count > options.most_points
+        if difference <= (largest if is_last else goal):
             break
-        if 4 * count > options.most_points:
+        if is_last:
             raise _monte_carlo_error(name, 2 * count, difference, largest)
         count *= 2
     joint = _joined(*halves)
