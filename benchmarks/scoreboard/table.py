@@ -31,8 +31,8 @@ _ENOUGH = 20  # data sets of a coverage that is told: its standard error is .07
 _ACROSS = 4  # panels of a picture
 _TENSION = tension_304l.PROBLEM.name
 # Axes that are the same in all panels; what lies beyond stands at their edge.
-_LIMITS = {"rms": (0.02, 20.0), "width": (0.25, 8.0)}
-_RUNS, _WIDTHS = (300.0, 3e8), (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+_LIMITS = {"rms": (0.005, 20.0), "width": (0.25, 8.0)}
+_RUNS, _WIDTHS = (60.0, 3e8), (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 _COSTS = ("data sets", "failures", "runs", "cpu")
 # In the order of the page: by what a rival is, and prbayes first because the page is its own.
 RIVALS = (
