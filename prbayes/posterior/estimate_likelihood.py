@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from prbayes._checks import AT_ONCE, Floats
+from prbayes._checks import IN_CACHE, Floats
 from prbayes._threads import one_thread
 from prbayes.estimate.data_sets import aligned, groups, observable, specimens
 from prbayes.estimate.optimum import Optimum
@@ -113,7 +113,7 @@ class EstimateLikelihood:
             return np.zeros(len(thetas))
         largest = max(len(score.values) for score in self.scores)
         # Weights of a block of populations stay in the cache of the processor.
-        rows = max(16, AT_ONCE // (16 * largest))
+        rows = max(16, IN_CACHE // largest)
         blocks = []
         for first in range(0, len(thetas), rows):
             block = self._block(thetas[first : first + rows])

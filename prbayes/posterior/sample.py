@@ -157,7 +157,7 @@ def _sample_likelihood(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
         starts = _starts(evaluator, density)
     else:
         starts = list(optima_of(asked.optimum, evaluator))
-    modes = _modes(evaluator, density, starts)
+    modes = _modes(density, starts, evaluator.prior_sd)
     if modes is None:
         return sample_likelihood(evaluator, asked)
     seed = seed_number(asked.random_seed)
@@ -243,7 +243,9 @@ def _importance_sample_given_estimate(
         except (TypeError, ValueError):
             return None
         density = likelihood.log_posterior
-        modes = _modes(evaluator, density, list(optima_of(optimum, evaluator)))
+        # Of several outputs the estimate is minimised again, with other coordinates.
+        starts = [likelihood.point, *optima_of(optimum, evaluator)[1:]]
+        modes = _modes(density, starts, likelihood.scale)
         if modes is None:
             return None
         sample = importance_sample(density, modes, asked.chains * asked.draws, seed, _OPTIONS)
@@ -272,10 +274,10 @@ def _warnings(evaluator: Evaluator, optimum: Optimum | None) -> tuple[str, ...]:
     return tuple(str(finding) for finding in findings)
 
 
-def _modes(evaluator: Evaluator, density: LogDensity, starts: list[Floats]) -> list[Laplace] | None:
+def _modes(density: LogDensity, starts: list[Floats], scale: Floats) -> list[Laplace] | None:
     """Return Laplace approximations of the modes near starts, None if the density jumps there."""
     try:
-        candidates = laplace(density, np.stack(starts), evaluator.prior_sd)
+        candidates = laplace(density, np.stack(starts), scale)
     except (ValueError, np.linalg.LinAlgError):
         return None
     candidates.sort(key=lambda mode: (not mode.converged, -mode.log_mass))

@@ -149,6 +149,14 @@ def test_the_end_of_a_prior_cuts_the_posterior_given_the_estimate(metric: prb.Me
     assert 0.9 < float(cut["mu"].std()) / sd < 1.1
 
 
+@pytest.mark.long
+def test_a_prior_that_is_far_wider_than_the_population() -> None:
+    model = metric_model(prb.KullbackLeibler(), X, lambda: pm.Normal("mu", 0.0, 300.0))
+    result = prb.sample(500, model=model, progressbar=False)
+    mean, sd = exact_moments(X)["mu"]
+    assert abs(float(result.posterior["mu"].mean()) - mean) < 0.3 * sd
+
+
 def test_two_simulators_add_what_they_know() -> None:
     with pm.Model() as model:
         mu = pm.Normal("mu", 9, 3)
