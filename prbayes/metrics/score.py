@@ -15,7 +15,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from prbayes._checks import Floats
-from prbayes._weighted import finite_sample
+from prbayes._weighted import finite_sample, quantile
 from prbayes.metrics.base import Discrepancy, Part
 from prbayes.metrics.density import BandwidthRule, GaussianKDE, twice_silverman
 
@@ -29,7 +29,7 @@ class ScoreOptions:
     reach : float
         Default bandwidths of the data beyond their ends from which on the score of a log-density is
         constant. It would grow without bound there, and the tail of the population would decide on
-        the posterior.
+        the posterior. The extremes expected of all specimens of the model count as data.
     step : float
         Relative step of central differences.
     block : int
@@ -111,6 +111,11 @@ class ShiftedResponses:
     lower: Floats
     lengths: Floats
 
+    @property
+    def weights(self) -> Floats:
+        """Equal weights of the responses, (M,)."""
+        return np.full(len(self.responses), 1 / len(self.responses))
+
     def neighbours(self, part: Part, options: ScoreOptions) -> tuple[list[Floats], list[Floats]]:
         """Return features of a part at theta plus and minus a step, (d, ...) each."""
         weights = np.full(self.upper.shape[:2], 1 / self.upper.shape[1])
@@ -168,6 +173,7 @@ def specimen_scores(
     population: WeightSlopes | ShiftedResponses,
     specimens: Floats,
     options: ScoreOptions = ScoreOptions(),
+    total: int = 0,
 ) -> Floats:
     """Return the score of each specimen, (n, d).
 
@@ -181,6 +187,8 @@ def specimen_scores(
     population : WeightSlopes or ShiftedResponses
     specimens : ndarray, shape (n,) or (n, m)
     options : ScoreOptions
+    total : int
+        Number of observed specimens of all simulators.
     """
     if not target.additive:
         raise TypeError(
@@ -189,7 +197,7 @@ def specimen_scores(
         )
     scores: Any = 0.0
     for part in target.parts:
-        terms = _part_scores(part, population, part.of(specimens), options)
+        terms = _part_scores(part, population, part.of(specimens), options, total)
         scores = scores + part.share * terms
     return np.asarray(scores)
 
@@ -199,6 +207,7 @@ def tabulated_scores(
     population: ShiftedResponses,
     specimens: Floats,
     options: ScoreOptions = ScoreOptions(),
+    total: int = 0,
 ) -> Callable[[Floats], Floats]:
     """Return a function of responses, (..., n) or (..., n, m) -> (..., n, d), by interpolation.
 
@@ -212,6 +221,8 @@ def tabulated_scores(
     specimens : ndarray, shape (n,) or (n, m)
         Observed responses.
     options : ScoreOptions
+    total : int
+        Number of observed specimens of all simulators.
     """
     tables = []
     for part in target.parts:
@@ -222,8 +233,8 @@ def tabulated_scores(
         observed, weights = finite_sample(inner.observed, inner.weights)
         margin = options.margin * twice_silverman(observed, weights)
         nodes = np.linspace(values.min() - margin, values.max() + margin, options.nodes)
-        scores = part.share * _part_scores(part, population, nodes, options)
-        failed = part.share * _part_scores(part, population, np.array([np.inf]), options)
+        scores = part.share * _part_scores(part, population, nodes, options, total)
+        failed = part.share * _part_scores(part, population, np.array([np.inf]), options, total)
         tables.append((part, CubicSpline(nodes, scores), failed[0]))
 
     def function(responses: Floats) -> Floats:
@@ -245,11 +256,12 @@ def _part_scores(
     population: WeightSlopes | ShiftedResponses,
     compared: Floats,
     options: ScoreOptions,
+    total: int,
 ) -> Floats:
     """Return the scores, (n, d), of values that a part compares, (n,)."""
     target = part.target
     upper, lower = population.neighbours(part, options)
-    values = _within_reach(part, compared, options)
+    values = _within_reach(part, population, compared, options, total)
     blocks = []
     for first in range(0, len(values), options.block):
         block = values[first : first + options.block]
@@ -262,15 +274,26 @@ def _part_scores(
     return np.asarray(differences / (2 * population.steps(options)))
 
 
-def _within_reach(part: Part, values: Floats, options: ScoreOptions) -> Floats:
+def _within_reach(
+    part: Part,
+    population: WeightSlopes | ShiftedResponses,
+    values: Floats,
+    options: ScoreOptions,
+    total: int,
+) -> Floats:
     """Return values of a log-density's part limited to the reach of the data, (n,)."""
     target = part.target
     if not target.metric.likelihood:
         return values
     observed, weights = finite_sample(target.observed, target.weights)
+    lower, upper = observed.min(), observed.max()
+    if total > len(target.observed):
+        simulated = np.asarray(part.of(population.responses))
+        is_known = np.isfinite(simulated)
+        level = 1 / (total + 1)
+        low, high = quantile(simulated[is_known], population.weights[is_known], [level, 1 - level])
+        lower, upper = min(lower, low), max(upper, high)
     margin = options.reach * twice_silverman(observed, weights)
-    lower = observed.min() - margin
-    upper = observed.max() + margin
-    clipped = np.clip(values, lower, upper)
+    clipped = np.clip(values, lower - margin, upper + margin)
     is_finite = np.isfinite(values)
     return np.where(is_finite, clipped, values)

@@ -18,8 +18,9 @@ from scipy.optimize import minimize
 
 from prbayes._checks import IN_CACHE, Floats
 from prbayes._threads import one_thread
-from prbayes.estimate.data_sets import aligned, groups, observable, specimens
+from prbayes.estimate.data_sets import SETS, aligned, groups, observable, specimens
 from prbayes.estimate.optimum import Optimum
+from prbayes.estimate.refinement import noise_floors
 from prbayes.metrics.score import (
     ScoreOptions,
     ShiftedResponses,
@@ -49,8 +50,8 @@ class EstimateLikelihoodOptions:
     rounds : int
         Times that metrics are minimised again, with whitening and bandwidth of the population at
         the estimate before. With zero they are those of the observed data.
-    several_outputs : bool
-        Whether only metrics of several outputs are, or those of one as well.
+    few_specimens : int
+        Number of specimens below which metrics of one output are minimised again as well.
     step : float
         Step of differences of log weights, in standard deviations of the prior.
     wide_step : float
@@ -71,7 +72,7 @@ class EstimateLikelihoodOptions:
     score: ScoreOptions = field(default_factory=ScoreOptions)
     saddlepoint: SaddlepointOptions = field(default_factory=SaddlepointOptions)
     rounds: int = 2
-    several_outputs: bool = True
+    few_specimens: int = 10
     step: float = 1e-5
     wide_step: float = 0.05
     resimulated_step: float = 1e-3
@@ -235,11 +236,13 @@ def estimate_likelihood(
         raise ValueError(f"metric: {obstacle}; expected a refit_likelihood")
     order = [optimum.names.index(name) for name in evaluator.names]
     point = move_inside(evaluator, optimum.theta[order], options)
-    for _ in range(options.rounds):
-        evaluator, point = _minimised_on_population(evaluator, point, optimum, options)
+    scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
+    if _needs_population(evaluator, options):
+        for _ in range(options.rounds):
+            evaluator, scales, point = _minimised_on_population(evaluator, point, options)
     evaluator = _coarse_where_sufficient(evaluator, point)
     parts = [
-        _group_scores(evaluator, members, point, optimum, options)
+        _group_scores(evaluator, members, point, scales, options)
         for members in groups(evaluator.nodes)
     ]
     pairs = [part.population(evaluator, point[None]) for part in parts]
@@ -273,24 +276,35 @@ def _unit(
     return np.asarray(np.minimum(100 * errors, evaluator.prior_sd))
 
 
-def _minimised_on_population(
-    evaluator: Evaluator, point: Floats, optimum: Optimum, options: EstimateLikelihoodOptions
-) -> tuple[Evaluator, Floats]:
-    """Return metrics of several outputs with the whitening of the population, and their minimiser.
+def _needs_population(evaluator: Evaluator, options: EstimateLikelihoodOptions) -> bool:
+    """Return whether whitening or bandwidths by the observed data would bias the estimate.
 
-    Metrics of one output are not whitened: without others all is as it was. A minimiser that stored
-    responses do not support is not taken.
+    Simulators of few specimens that happen to scatter little would have a small bandwidth and a
+    large weight in the sum of all.
     """
-    targets = [node.target for node in evaluator.nodes]
-    is_chosen = [bool(target.event) or not options.several_outputs for target in targets]
-    if not any(is_chosen):
-        return evaluator, point
-    for k, target in enumerate(targets):
+    nodes = evaluator.nodes
+    has_several_outputs = any(node.target.event for node in nodes)
+    fewest = min(len(node.observed) for node in nodes)
+    return has_several_outputs or len(nodes) > 1 or fewest < options.few_specimens
+
+
+def _minimised_on_population(
+    evaluator: Evaluator, point: Floats, options: EstimateLikelihoodOptions
+) -> tuple[Evaluator, Floats, Floats]:
+    """Return metrics with the whitening and bandwidths of the population, and their minimiser.
+
+    With them come the scales of the simulators, (k,). A minimiser that stored responses do not
+    support is not taken.
+    """
+    targets = []
+    for k, node in enumerate(evaluator.nodes):
         responses, weights = evaluator.populations(point[None], k)
-        if is_chosen[k]:
-            targets[k] = prepared_on_population(target, responses[0], weights[0])
+        targets.append(prepared_on_population(node.target, responses[0], weights[0]))
     prepared = evaluator.with_targets(targets)
-    scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
+    scales = prepared.epsilon
+    unset = np.isnan(scales)
+    if unset.any():
+        scales = np.where(unset, noise_floors(prepared, point, SETS), scales)
     unit = evaluator.prior_sd
 
     def objective(shift: Floats) -> tuple[float, Floats]:
@@ -306,18 +320,18 @@ def _minimised_on_population(
     minimiser = move_inside(prepared, point + minimum.x * unit, options)
     sizes = [design["weight_ess"] for design in prepared.support(minimiser[None]).values()]
     is_supported = np.min(sizes, initial=np.inf) >= options.effective_responses
-    return prepared, minimiser if is_supported else point
+    return prepared, scales, minimiser if is_supported else point
 
 
 def _group_scores(
     evaluator: Evaluator,
     members: Sequence[int],
     point: Floats,
-    optimum: Optimum,
+    scales: Floats,
     options: EstimateLikelihoodOptions,
 ) -> StoredScores | ResimulatedScores:
     """Return the scores of specimens in the sum of their simulators' discrepancies."""
-    numbers, _ = specimens(evaluator.nodes)
+    numbers, total = specimens(evaluator.nodes)
     nodes = [evaluator.nodes[k] for k in members]
     n = len(nodes[0].observed)
     observed = np.zeros((n, len(point)))
@@ -325,14 +339,16 @@ def _group_scores(
     populations = []
     for k, node in zip(members, nodes, strict=True):
         # The gradient of the objective is a sum over specimens of these, by units of the prior.
-        factor = evaluator.prior_sd / (n * optimum.scales[node.name])
+        factor = evaluator.prior_sd / (n * scales[k])
         population: WeightSlopes | ShiftedResponses
         if node.bound.stored:
             population = _weight_slopes(evaluator, k, point, options)
         else:
             population = _shifted_responses(evaluator, k, point, options)
         populations.append(population)
-        score = partial(specimen_scores, node.target, population, options=options.score)
+        score = partial(
+            specimen_scores, node.target, population, options=options.score, total=total
+        )
         observed += factor * score(node.observed[np.argsort(numbers[k])])
         functions.append((factor, score))
     mean = observed.mean(axis=0)
@@ -341,7 +357,7 @@ def _group_scores(
         tables = []
         for (factor, _), node, population in zip(functions, nodes, populations, strict=True):
             assert isinstance(population, ShiftedResponses)
-            table = tabulated_scores(node.target, population, node.observed, options.score)
+            table = tabulated_scores(node.target, population, node.observed, options.score, total)
             tables.append(partial(_scaled, table, factor))
         return ResimulatedScores(tuple(members), tuple(tables), mean, n, identity)
     mask = np.ones(len(populations[0].responses), dtype=bool)
