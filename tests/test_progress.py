@@ -92,7 +92,7 @@ def test_a_sampler_without_a_terminal_says_where_it_is(
             "y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0],
             epsilon=0.1, propagation=prb.Reweighted(64),
         )  # fmt: skip
-    quiet = {"chains": 2, "model": model, "random_seed": 1, "adjust": False}
+    quiet = {"chains": 2, "model": model, "random_seed": 1, "adjustment": None}
     prb.sample_smc(50, progressbar=False, **quiet)
     assert log.getvalue() == ""
     prb.sample_smc(50, **quiet)

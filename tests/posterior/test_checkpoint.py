@@ -14,7 +14,6 @@ import xarray as xr
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import identity_of
-from prbayes.posterior.adjustment import Affine
 from prbayes.posterior.checkpoint import Checkpoint, _sealed, stored_settings
 from prbayes.response.store import StoreError
 
@@ -29,7 +28,7 @@ def run(path: Path, **changes: Any) -> Any:
     family: Any = changes.pop("family", pm.Normal)
     simulator = {"metric": prb.KullbackLeibler(), "observed": OBSERVED, "epsilon": 0.05}
     simulator |= {"propagation": prb.Reweighted(64, max_lost=0.9)} | changes.pop("simulator", {})
-    settings = {"draws": 20, "chains": 1, "random_seed": 1, "adjust": False, "refine": False}
+    settings = {"draws": 20, "chains": 1, "random_seed": 1, "adjustment": None, "refine": False}
     settings |= changes.pop("settings", {})
     assert not changes
     with pm.Model() as model:
@@ -61,7 +60,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "draws": {"settings": {"draws": 30}},
     "chains": {"settings": {"chains": 2}},
     "threshold": {"settings": {"threshold": 0.7}},
-    "adjustment": {"settings": {"adjust": Affine()}},
+    "adjustment": {"settings": {"adjustment": "estimate"}},
     "refinement": {"settings": {"refine": True}},
 }
 
