@@ -57,7 +57,12 @@ def sampled_by_epsilon() -> tuple[pm.Model, xr.DataTree]:
 def stuck() -> xr.DataTree:
     """Classic ABC with an epsilon that hardly any simulated sample meets."""
     return prb.sample_smc(
-        300, chains=2, model=build(prb.Fresh(40)), epsilon=0.002, adjustment=None, random_seed=1,
+        300,
+        chains=2,
+        model=build(prb.Fresh(40)),
+        epsilon=0.002,
+        adjustment=None,
+        random_seed=1,
         progressbar=False,
     )
 
@@ -432,7 +437,9 @@ def test_specimens_without_response_are_told_of(propagation: Any) -> None:
     said = f"y: {share:.1%} of specimens have no response (NaN) and are left out"
     assert said in repr(optimum)
     assert said in optimum._repr_html_()
-    tree = prb.sample_smc(50, chains=1, model=model, adjustment=None, random_seed=1, progressbar=False)
+    tree = prb.sample_smc(
+        50, chains=1, model=model, adjustment=None, random_seed=1, progressbar=False
+    )
     for result in (optimum, optimum.to_datatree()):
         assert [n for n in prb.diagnose(result).notes if n.startswith(said)]
     for result, own in ((tree, None), (tree, model)):
@@ -446,7 +453,9 @@ def test_specimens_without_response_are_told_of(propagation: Any) -> None:
 def test_draws_that_lose_too_much_are_counted_and_told() -> None:
     # The best draws lose next to nothing; those above 1, of which there are some, do.
     model = failing(prb.Resimulated(64, on_failure=REPLACED, max_lost=0.2), limit=1.6)
-    tree = prb.sample_smc(50, chains=1, model=model, epsilon=0.5, adjustment=None, progressbar=False)
+    tree = prb.sample_smc(
+        50, chains=1, model=model, epsilon=0.5, adjustment=None, progressbar=False
+    )
     calibration = tree["calibration"].to_dataset()
     lost = calibration["lost_mass"].values.ravel()
     exact = stats.norm.sf((1.6 - tree["posterior"]["mu"].values.ravel()) / 0.5)

@@ -30,7 +30,7 @@ from prbayes.posterior.importance import (
 )
 from prbayes.posterior.returned import as_asked, checked_idata_kwargs, checked_names
 from prbayes.posterior.smc import Sampling, evaluator_of, result_tree, sample_posterior
-from prbayes.posterior.target import Target, estimate_target, specimen_target
+from prbayes.posterior.target import Target, estimate_target, require_density, specimen_target
 from prbayes.response.budget import limited
 
 _OPTIONS = ImportanceOptions()
@@ -149,6 +149,7 @@ def draw_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     clock = time.perf_counter()
     before = evaluator.n_responses - evaluator.n_runs
     optimum = asked.optimum
+    require_density(evaluator)
     if optimum is None and evaluator.nodes:
         optimum = require_finished(find_optimum(evaluator, Minimisation()))
     asked = replace(asked, optimum=optimum)

@@ -41,7 +41,7 @@ from prbayes.posterior.returned import (
     checked_idata_kwargs,
     checked_names,
 )
-from prbayes.posterior.target import estimate_target, prior_conflicts
+from prbayes.posterior.target import estimate_target, prior_conflicts, require_density
 from prbayes.posterior.trees import posterior_tree, share_of_lossy
 from prbayes.response.budget import BudgetError, limited, unlimited
 
@@ -271,6 +271,7 @@ def sample_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     clock = time.perf_counter()
     before = evaluator.n_responses - evaluator.n_runs
     with designs_as_before(evaluator):
+        require_density(evaluator)
         optimum = asked.optimum
         if optimum is None and evaluator.nodes:
             optimum = require_finished(find_optimum(evaluator, Minimisation(refine=asked.refine)))

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
-import xarray as xr
 
 import prbayes as prb
 from prbayes.estimate.disagreement import disagreement

@@ -4,7 +4,6 @@ import logging
 import multiprocessing
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import nodes
 from prbayes.posterior import sbc
-from prbayes.posterior.smc import Sampling, sample
 from prbayes.response.compilation import PLAIN
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
