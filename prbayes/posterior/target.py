@@ -8,7 +8,7 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes._finding import Finding
-from prbayes.estimate.optimum import Optimum, require_sampling
+from prbayes.estimate.optimum import Optimum
 from prbayes.inference.checks.prior_conflict import conflict_findings
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.estimate_likelihood import estimate_likelihood, score_obstacle
@@ -81,11 +81,9 @@ def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
     Raises
     ------
     ValueError
-        If the density is not known (`require_density`), or the optimum is at the edge of a support
-        or at a jump.
+        If the density is not known (`require_density`).
     """
     require_density(evaluator)
-    require_sampling(optimum, "sample")
     by_scores = score_obstacle(evaluator) is None
     density = estimate_likelihood if by_scores else refit_likelihood
     likelihood = density(evaluator, optimum)

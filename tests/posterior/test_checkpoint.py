@@ -15,6 +15,7 @@ import prbayes as prb
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import identity_of
 from prbayes.posterior.checkpoint import Checkpoint, _sealed, stored_settings
+from prbayes.response.budget import BudgetError
 from prbayes.response.store import StoreError
 
 OBSERVED = np.random.default_rng(1).normal(2.0, 1.0, 40)
@@ -84,6 +85,19 @@ def test_the_same_run_gives_the_same_draws_at_once(done: tuple[Path, Any]) -> No
     path, first = done
     again = run(path)
     np.testing.assert_array_equal(again["posterior"]["mu"], first["posterior"]["mu"])
+
+
+@pytest.mark.parametrize("adjustment", [None, "estimate"])
+def test_an_interrupted_run_gives_the_draws_that_it_would_have_given(
+    adjustment: str | None, tmp_path: Path
+) -> None:
+    settings = {"adjustment": adjustment, "chains": 2, "threshold": 0.7}
+    at_once = run(tmp_path / "at_once.nc", settings=settings)
+    with pytest.raises(BudgetError, match="max_stages = 1"):
+        run(tmp_path / "run.nc", settings=settings | {"max_stages": 1})
+    resumed = run(tmp_path / "run.nc", settings=settings)
+    for group in ("posterior", "sample_stats"):
+        xr.testing.assert_equal(resumed[group].to_dataset(), at_once[group].to_dataset())
 
 
 def test_a_run_without_a_seed_takes_that_of_the_run_it_goes_on_with(tmp_path: Path) -> None:

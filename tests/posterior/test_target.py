@@ -151,12 +151,21 @@ def test_a_prior_that_is_sharper_than_the_data(spread: float) -> None:
 # -- several simulators --
 
 
-@pytest.mark.parametrize("metric", [KLD, PR])
+FEW = np.random.default_rng(701).normal(1, 0.5, (5, 4))
+
+
+@pytest.mark.parametrize("metric", [KLD, prb.ProbabilityResidual(prb.GaussianKDE(0.5))])
 def test_few_specimens_in_each_of_several_simulators_count_as_all_in_one(metric: Metric) -> None:
-    y = np.random.default_rng(701).normal(1, 0.5, (5, 4))
-    together = target_moments(normal_model(metric, y.ravel()), y.ravel())
-    apart = target_moments(normal_model(metric, *y), y.ravel())
+    """A bandwidth is given, as that of four specimens is another estimator of the residual."""
+    together = target_moments(normal_model(metric, FEW.ravel()), FEW.ravel())
+    apart = target_moments(normal_model(metric, *FEW), FEW.ravel())
     require_close(apart, together, offset=0.1, widths=(0.93, 1.07))
+
+
+def test_the_residual_of_few_specimens_in_each_of_several_simulators() -> None:
+    """With the wide bandwidth of four specimens mean and spread of all decide."""
+    apart = target_moments(normal_model(PR, *FEW), FEW.ravel())
+    require_close(apart, exact_moments(_vague, FEW.ravel()))
 
 
 # -- draws of exp(-discrepancy / epsilon) --
@@ -164,7 +173,9 @@ def test_few_specimens_in_each_of_several_simulators_count_as_all_in_one(metric:
 EPSILON = 0.08
 
 
-@pytest.mark.parametrize("sampler", ["prb.sample_smc", "pm.sample"])
+@pytest.mark.parametrize(
+    "sampler", ["prb.sample_smc", pytest.param("pm.sample", marks=pytest.mark.long)]
+)
 def test_epsilon_sets_the_width_without_an_adjustment(sampler: str) -> None:
     """The divergence is half a squared distance of means, in standard deviations, and a constant."""
     model = normal_model(
