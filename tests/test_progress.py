@@ -197,9 +197,8 @@ def test_everything_inside_the_sampler_follows_its_keyword(
 ) -> None:
     # At once, however quick the search is.
     monkeypatch.setattr(prbayes._progress, "_SHOWN_FROM", 0.0)
-    prb.sample_smc(
-        60, chains=1, model=build(prb.Resimulated(16)), random_seed=1, progressbar=visible
-    )
+    settings = {"model": build(prb.Resimulated(16)), "adjustment": None, "random_seed": 1}
+    prb.sample_smc(60, chains=1, progressbar=visible, **settings)
     assert ("SMC chain 0" in screen.getvalue()) == visible
     assert ("evaluations" in screen.getvalue()) == visible
     if not visible:
