@@ -673,7 +673,7 @@ def test_set_epsilon_is_all_or_nothing(epsilon: dict[str, Any], error: type[Exce
         prb.set_epsilon(model, epsilon)
     assert [n.epsilon_value for n in nodes(model).values()] == [0.1, 0.1]
     with pytest.raises(error):
-        prb.sample_smc(model=model, epsilon=epsilon, progressbar=False)
+        prb.sample_smc(model=model, epsilon=epsilon, adjustment=None, progressbar=False)
     assert [n.epsilon_value for n in nodes(model).values()] == [0.1, 0.1]
 
 
