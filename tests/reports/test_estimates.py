@@ -74,11 +74,12 @@ def test_elements_have_the_same_names_in_every_table(section: Any) -> None:
         ("none", "The draws are those of exp(-discrepancy / epsilon): their width is epsilon's."),
     ],
 )
-def test_what_sets_the_width_of_the_draws(adjustment: str, sentence: str, section: Any) -> None:
-    draws = xr.Dataset({"p": (["chain", "draw"], np.random.default_rng(1).normal(size=(2, 20)))})
-    calibration = xr.Dataset({"is_likelihood": ("simulator", [0])}, {"simulator": ["y"]})
-    groups = {"posterior": draws.assign_attrs(adjustment=adjustment), "calibration": calibration}
-    made = prb.Report("x", posterior=xr.DataTree.from_dict(groups), pictures=False)
+def test_what_sets_the_width_of_the_draws(
+    adjustment: str, sentence: str, calibrated: Any, section: Any
+) -> None:
+    tree = calibrated.posterior.copy(deep=True)
+    tree["posterior"].attrs["adjustment"] = adjustment
+    made = prb.Report("x", posterior=tree, pictures=False)
     assert section(made, "Posterior").text[1].startswith(sentence)
 
 
