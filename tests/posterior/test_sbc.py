@@ -160,7 +160,7 @@ def test_ranks_count_the_draws_below_the_truth(monkeypatch: pytest.MonkeyPatch) 
         draws = xr.Dataset({"mu": (["chain", "draw"], np.arange(10.0)[None] / 5 - 1)})
         return xr.DataTree.from_dict({"posterior": draws})
 
-    monkeypatch.setattr(sbc, "sample", fixed)
+    monkeypatch.setattr(sbc, "draw_posterior", fixed)
     result = prb.simulation_based_calibration(20, model=build(), draws=10, progressbar=False)
     truth, ranks = result.truth["mu"].values, result.prior_sbc["mu"].values
     below = np.clip(np.ceil((truth + 1) * 5), 0, 10)
