@@ -168,6 +168,32 @@ def test_the_residual_of_few_specimens_in_each_of_several_simulators() -> None:
     require_close(apart, exact_moments(_vague, FEW.ravel()))
 
 
+@pytest.mark.long
+def test_groups_with_a_common_prior_are_pooled() -> None:
+    """With a known standard deviation the exact posterior is normal; estimates are the means."""
+    names = ["a", "b", "c"]
+    centers = np.array([0.6, 1.0, 1.5])
+    y = np.random.default_rng(8).normal(centers[:, None], 0.5, (3, 6))
+    labels = ("specimen", np.repeat(names, 6))
+    observed = xr.DataArray(y.ravel(), {"supplier": labels}, "specimen")
+    with pm.Model(coords={"supplier": names}) as model:
+        mu = pm.Normal("mu", pm.Normal("common", 1, 2), 0.3, dims="supplier")
+        x = pm.Normal.dist(mu[prb.response.group("supplier")], 0.5)
+        propagation = prb.Reweighted(256)
+        prb.Simulator(
+            "y", lambda x: 1.0 * x, x, metric=KLD, observed=observed, propagation=propagation
+        )
+    optimum = prb.minimize(model, starts=0, progressbar=False)
+    tree = prb.sample(500, chains=2, model=model, optimum=optimum, **QUIET)
+    prior = 0.3**2 * np.eye(3) + 2.0**2
+    gain = prior @ np.linalg.inv(prior + np.eye(3) * 0.5**2 / 6)
+    mean = 1 + gain @ (y.mean(axis=1) - 1)
+    sd = np.sqrt(np.diag(prior - gain @ prior))
+    draws = tree.posterior["mu"].values.reshape(-1, 3)
+    assert (np.abs(draws.mean(axis=0) - mean) < 0.2 * sd).all()
+    assert (np.abs(draws.std(axis=0) / sd - 1) < 0.15).all()
+
+
 # -- draws of exp(-discrepancy / epsilon) --
 
 EPSILON = 0.08

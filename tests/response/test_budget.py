@@ -177,7 +177,13 @@ def sampled(
 ) -> xr.DataTree:
     made = model or build(PROPAGATIONS[name], black_box)[0]
     return prb.sample_smc(
-        30, chains=2, model=made, adjustment=None, checkpoint=checkpoint, random_seed=1, **limits,
+        30,
+        chains=2,
+        model=made,
+        adjustment=None,
+        checkpoint=checkpoint,
+        random_seed=1,
+        **limits,
         **QUIET,
     )
 
