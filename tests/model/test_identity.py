@@ -398,7 +398,7 @@ def test_an_epsilon_calibrated_for_another_problem_is_refused() -> None:
         with pytest.raises(
             ValueError, match="sample_smc: epsilon: got a result of another problem"
         ):
-            prb.sample_smc(20, model=other, epsilon=calibrated, **QUIET)
+            prb.sample_smc(20, model=other, epsilon=calibrated, adjustment=None, **QUIET)
     clone = clone_model(base())
     prb.set_epsilon(clone, calibrated)
     (node,) = nodes(clone).values()
