@@ -2,10 +2,13 @@
 
 import numpy as np
 import pymc as pm
+import pytensor.tensor as pt
 import pytest
 
 from prbayes.propagation.exponential_families import ExponentialForm
+from prbayes.response.compilation import PLAIN, compile_batched
 
+COVARIANCE = np.array([[1.0, 0.3], [0.3, 0.5]])
 # Constructor with two parameters, and ranges of these.
 FAMILIES = {
     "normal": (pm.Normal.dist, (-1, 1), (0.5, 2)),
@@ -16,13 +19,13 @@ FAMILIES = {
     "inverse gamma": (lambda a, b: pm.InverseGamma.dist(alpha=a, beta=b), (3, 5), (0.5, 2)),
     "beta": (lambda a, b: pm.Beta.dist(a, b), (1, 4), (1, 4)),
     "exponential": (lambda _, b: pm.Exponential.dist(b), (0, 1), (0.5, 2)),
-    "vector": (lambda m, s: pm.Normal.dist([m, -m], s), (-1, 1), (0.5, 2)),
-    "correlated": (lambda m, s: pm.MvNormal.dist([m, 0], [[1, 0.3], [0.3, s]]), (-1, 1), (0.5, 2)),
+    "vector": (lambda m, s: pm.Normal.dist(pt.stack([m, -m]), s), (-1, 1), (0.5, 2)),
+    "correlated": (
+        lambda m, s: pm.MvNormal.dist(pt.stack([m, 0.0]), s * COVARIANCE),
+        (-1, 1),
+        (0.5, 2),
+    ),
 }
-
-
-def log_densities(dist, parameters, points):
-    return np.stack([pm.logp(dist(*p), points, warn_rvs=False).eval() for p in parameters])
 
 
 @pytest.mark.parametrize("name", FAMILIES)
@@ -30,15 +33,20 @@ def test_the_matrix_form_equals_the_density(name):
     dist, *ranges = FAMILIES[name]
     rng = np.random.default_rng(0)
     parameters = rng.uniform(*np.transpose(ranges), size=(5, 2))
-    points = pm.draw(dist(*np.mean(ranges, axis=1)), 200, random_seed=1)
+    middle = dist(*np.mean(ranges, axis=1))
+    points = pm.draw(middle, 200, random_seed=1, mode=PLAIN)
+    symbols = pt.dscalars("first", "second")
+    given = pt.tensor(dtype="float64", shape=(None,) * points.ndim)
+    logp = pm.logp(dist(*symbols), given, warn_rvs=False)
+    log_density = compile_batched(
+        symbols, [logp.reshape((given.shape[0], -1)).sum(axis=1)], [given]
+    )
 
-    form = ExponentialForm.of([dist(*parameters[0])], [points])
+    form = ExponentialForm.of([middle], [points])
 
     assert form is not None
-    at_anchors = log_densities(dist, parameters, form.anchors[0])
-    expected = log_densities(dist, parameters, points)
-    if expected.ndim == 3:
-        at_anchors, expected = at_anchors.sum(axis=2), expected.sum(axis=2)
+    (at_anchors,) = log_density(*parameters.T, *form.anchors)
+    (expected,) = log_density(*parameters.T, points)
     natural = form.natural_parameters(at_anchors)
     np.testing.assert_allclose(natural @ form.statistics, expected, atol=1e-11)
 
