@@ -163,17 +163,25 @@ class ExponentialForm:
     def natural_parameters(self, at_anchors: Floats) -> Floats:
         """Return H from log-densities at the anchors, (S, q + 1) -> (S, q + 1).
 
-        Its last column is minus the log-normaliser. Rows of invalid populations are NaN.
+        Its last column is minus the log-normaliser.
         """
         with np.errstate(invalid="ignore"):
             return np.asarray(at_anchors @ self.inverse)
+
+    def is_rounded(self, at_anchors: Floats) -> NDArray[np.bool_]:
+        """Return which log-densities at points would be off by more than 1e-12, (S, q + 1) -> (S,).
+
+        Those of populations far narrower than the points, or far from them, and of invalid ones:
+        they are small differences of large numbers.
+        """
+        return ~(np.abs(at_anchors).max(axis=1) < 1000.0)
 
     def pulled_back(self, by_logs: Floats) -> Floats:
         """Return derivatives for log-densities at anchors from those at all points.
 
         (S, n) -> (S, q + 1)
         """
-        by_parameters = by_logs @ self.statistics.T
+        by_parameters = (self.statistics @ by_logs.T).T
         return np.asarray(by_parameters @ self.inverse.T)
 
 
@@ -187,3 +195,18 @@ def _anchors(statistics: Floats) -> NDArray[np.intp]:
     near = np.argsort(distance, kind="stable")[: n // 2]
     _, _, pivots = qr(statistics[:, near], mode="economic", pivoting=True)
     return np.asarray(near[pivots[:size]])
+
+
+def normalise(logs: Floats) -> Floats:
+    """Turn log weights, (S, n), into weights of sum one in place; return their log totals, (S,).
+
+    Rows without weight become NaN.
+    """
+    largest = logs.max(axis=1, keepdims=True)
+    largest = np.where(np.isfinite(largest), largest, 0.0)
+    logs -= largest
+    np.exp(logs, out=logs)
+    totals = logs.sum(axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs /= totals
+        return np.asarray((np.log(totals) + largest)[:, 0])

@@ -23,6 +23,7 @@ from prbayes.response.compilation import (
     PLAIN,
     compile_batched,
     interpreted,
+    untraced,
     with_leading_axis,
 )
 from prbayes.response.inputs import Inputs, event_shape, is_random, quiet_logp
@@ -69,14 +70,32 @@ def _is_walk(dist: TensorVariable) -> bool:
 
 def compiled_log_density(inputs: Inputs) -> Any:
     """Return log p(x) as a function of roots (k, *shape), then points (n, *event): (k, n)."""
+    symbols, points, density = _log_density(inputs)
+    return compile_batched(symbols, [density], points)
+
+
+def compiled_log_density_slopes(inputs: Inputs) -> Any:
+    """Return the derivatives for the roots of a sum over log p(x), shapes (k, *shape).
+
+    A function of roots (k, *shape), the factors of the sum (k, n), then points (n, *event).
+    """
+    symbols, points, density = _log_density(inputs)
+    factors = pt.dvector("factors")
+    with untraced():
+        known: Any = {density: factors}
+        slopes = pt.grad(None, symbols, known_grads=known, disconnected_inputs="ignore")
+    return compile_batched([*symbols, factors], slopes, points)
+
+
+def _log_density(inputs: Inputs) -> tuple[list[Any], list[Any], TensorVariable]:
+    """Return symbols of roots, (*shape), and points, (n, *event), and their log-density, (n,)."""
     symbols = inputs.placeholders()
     points = []
     for x in inputs.aleatory:
         shape = (None,) * (x.type.ndim + 1)
         points.append(pt.tensor(dtype=x.dtype, shape=shape))
     dists, _ = inputs.rebuilt(symbols)
-    density = log_density(inputs, dists, points)
-    return compile_batched(symbols, [density], points)
+    return symbols, points, log_density(inputs, dists, points)
 
 
 def is_mvnormal(dist: TensorVariable) -> bool:
