@@ -114,13 +114,13 @@ def _elliptical_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
     PyMC's own density solves once for each theta and point of a batch.
     """
     *freedom, mean, covariance = dist.owner.op.dist_params(dist.owner)
-    root = pt.linalg.cholesky(covariance, on_error="nan")
-    diagonal = [root[..., i, i] for i in range(size)]
+    root = _cholesky(covariance, size)
+    diagonal = [root[i][i] for i in range(size)]
     # Solve root z = x - mean.
     z: list[Any] = []
     for i in range(size):
         away = x[..., i] - mean[..., i]
-        above = sum(root[..., i, j] * z[j] for j in range(i))
+        above = sum(root[i][j] * z[j] for j in range(i))
         z.append((away - above) / diagonal[i])
     logp: Any = 0
     if freedom:
@@ -133,6 +133,26 @@ def _elliptical_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
             normal = -0.5 * z_i**2 - pt.log(scale) - constant
             logp = logp + normal
     return pt.switch(pt.isnan(logp), -np.inf, logp)
+
+
+def _cholesky(matrix: Any, size: int) -> list[list[Any]]:
+    """Return the rows of a lower Cholesky factor, not numbers if the matrix is not positive.
+
+    Elementwise if it is small: PyTensor's loops over the matrices of a batch.
+    """
+    if size > 4:
+        root = pt.linalg.cholesky(matrix, on_error="nan")
+        return [[root[..., i, j] for j in range(i + 1)] for i in range(size)]
+    rows: list[list[Any]] = []
+    for i in range(size):
+        row: list[Any] = []
+        for j in range(i):
+            known = sum(row[k] * rows[j][k] for k in range(j))
+            row.append((matrix[..., i, j] - known) / rows[j][j])
+        squares = sum(element**2 for element in row)
+        row.append(pt.sqrt(matrix[..., i, i] - squares))
+        rows.append(row)
+    return rows
 
 
 def _studentt_logp(nu: Any, z: Sequence[Any]) -> Any:
