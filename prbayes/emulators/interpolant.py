@@ -14,10 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from math import comb
 
 import numpy as np
+from numpy.polynomial.legendre import legder, legval
 from numpy.typing import NDArray
 
 from prbayes._checks import IN_CACHE, Floats
@@ -55,6 +57,8 @@ class Interpolant:
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
         """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d)."""
         m, d = self.weights.shape[1], self.z.shape[1]
+        if d == 1:
+            return self._on_line(z)
         values = np.empty((len(z), m))
         jacobian = np.empty((len(z), m, d))
         moments = [self.weights, *(column[:, None] * self.weights for column in self.z.T)]
@@ -75,6 +79,8 @@ class Interpolant:
 
     def values(self, z: Floats) -> Floats:
         """Return values at points, (k, d) -> (k, m), without the Jacobian."""
+        if self.z.shape[1] == 1:
+            return self._on_line(z)[0]
         values = np.empty((len(z), self.weights.shape[1]))
         for rows, square, length in self._distances(z):
             np.sqrt(square, out=length)
@@ -83,6 +89,49 @@ class Interpolant:
             terms = _terms(_legendre(self._scaled(z[rows]), self.powers), self.powers)
             values[rows] = (self.coefficients.T @ terms - self.weights.T @ square).T
         return values
+
+    @cached_property
+    def _pieces(self) -> tuple[Floats, Floats, Floats]:
+        """Of one input: sorted runs, middles of the pieces between them, and their polynomials.
+
+        Between two runs the radial functions are a polynomial of degree five. Its coefficients,
+        (6, pieces, m), are those of powers of the distance from the middle of the piece.
+        """
+        order = np.argsort(self.z[:, 0])
+        runs, weights = self.z[order, 0], self.weights[order]
+        middles = np.concatenate([runs[:1], (runs[1:] + runs[:-1]) / 2, runs[-1:]])
+        away = middles[:, None] - runs
+        side = np.where(np.arange(len(middles))[:, None] > np.arange(len(runs)), 1.0, -1.0)
+        powers = [-comb(5, p) * (side * away ** (5 - p)) @ weights for p in range(6)]
+        return runs, middles, np.stack(powers)
+
+    def _on_line(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return values and Jacobian at points of one input, (k, 1) -> (k, m), (k, m, 1)."""
+        runs, middles, coefficients = self._pieces
+        polynomial = self._legendre_series
+        values = np.empty((len(z), self.weights.shape[1]))
+        jacobian = np.empty_like(values)
+        step = max(1, IN_CACHE // 64)
+        for first in range(0, len(z), step):
+            rows = slice(first, first + step)
+            column = z[rows, 0]
+            piece = np.searchsorted(runs, column)
+            t = (column - middles[piece])[:, None]
+            value, slope = coefficients[5][piece], np.zeros((len(t), values.shape[1]))
+            for coefficient in coefficients[4::-1]:
+                slope = slope * t + value
+                value = value * t + coefficient[piece]
+            u = (column - self.center) / self.half_width
+            values[rows] = value + legval(u, polynomial[0]).T
+            jacobian[rows] = slope + legval(u, polynomial[1]).T
+        return values, jacobian[..., None]
+
+    @cached_property
+    def _legendre_series(self) -> tuple[Floats, Floats]:
+        """Of one input: coefficients of the polynomial and of its derivative, (terms, m)."""
+        series = np.zeros_like(self.coefficients)
+        series[self.powers[:, 0]] = self.coefficients
+        return series, legder(series) / self.half_width
 
     def _scaled(self, z: Floats) -> Floats:
         """Return the polynomial's variables, (k, d) -> (d, k)."""

@@ -182,12 +182,12 @@ def gabriel_neighbours(z: Floats, most: int = 32) -> NDArray[np.bool_]:
     """
     squares = ((z[:, None] - z) ** 2).sum(axis=2)
     near = np.argsort(squares, axis=1, kind="stable")[:, 1 : most + 1]
+    length = np.take_along_axis(squares, near, axis=1)
+    by_third = length[:, :, None] + squares[near[:, :, None], near[:, None, :]]
+    by_third += np.diag(np.full(near.shape[1], np.inf))
+    is_neighbour = by_third.min(axis=1, initial=np.inf) >= length
     result = np.zeros(squares.shape, dtype=bool)
-    for i, others in enumerate(near):
-        length = squares[i, others]
-        by_third = length[:, None] + squares[np.ix_(others, others)]
-        np.fill_diagonal(by_third, np.inf)
-        result[i, others] = by_third.min(axis=0, initial=np.inf) >= length
+    np.put_along_axis(result, near, is_neighbour, axis=1)
     return result | result.T
 
 
