@@ -183,7 +183,9 @@ def by_metric(metric: str) -> Callable[[int], Any]:
         with pm.Model() as model:
             inputs = in_pymc.inputs(task.problem, in_pymc.hyperparameters(task.problem))
             of_distributions = getattr(prb, metric)()
-            prb.Simulator("y", task.response, *inputs, metric=of_distributions, observed=task.observed)
+            prb.Simulator(
+                "y", task.response, *inputs, metric=of_distributions, observed=task.observed
+            )
         optimum = prb.minimize(model, progressbar=False)
         tree = prb.sample(model=model, optimum=optimum, random_seed=replicate, progressbar=False)
         return in_pymc.draws(tree.posterior, task.problem)
@@ -215,7 +217,11 @@ def by_outputs(sizes: str) -> Callable[[int], Any]:
         specimens = rng.normal([1.0, 2.0], [0.3, 0.2], (50, 2)).T[:count]
         with pm.Model() as model:
             a = pm.Normal.dist(pm.Normal("mu", 1, 0.3), pm.HalfNormal("sigma", 0.5))
-            b = pm.Normal.dist(pm.Normal("nu", 2, 0.3), pm.HalfNormal("tau", 0.5)) if count > 1 else 0
+            b = (
+                pm.Normal.dist(pm.Normal("nu", 2, 0.3), pm.HalfNormal("tau", 0.5))
+                if count > 1
+                else 0
+            )
             inputs = [a, b][:count]
             prb.Simulator("y", response, *inputs, metric=joint, observed=response(*specimens))
         optimum = prb.minimize(model, progressbar=False)
@@ -264,7 +270,9 @@ def memory(problem: str) -> dict[str, Any]:
     _ = prb.sample, prb.Simulator
     imported = peak()
     # One cached loop: what Numba itself takes.
-    _loops.sum_below(np.ones((1, 1)), np.zeros(1, dtype=np.intp), np.ones(1, dtype=np.intp), np.ones((1, 1)))
+    _loops.sum_below(
+        np.ones((1, 1)), np.zeros(1, dtype=np.intp), np.ones(1, dtype=np.intp), np.ones((1, 1))
+    )
     with_numba = peak()
     job(0)
     return {"imported": imported, "with Numba": with_numba, "added": peak() - with_numba}
@@ -286,7 +294,7 @@ def readme() -> dict[str, Any]:
     """Return CPU seconds of the first example of the README, imports included."""
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
     begun = time.process_time()
-    exec(compile(blocks[0], str(README), "exec"), {"__name__": "readme"})  # noqa: S102
+    exec(compile(blocks[0], str(README), "exec"), {"__name__": "readme"})
     return {"cold": time.process_time() - begun}
 
 
@@ -389,7 +397,9 @@ def main() -> None:
         print(f"{name:32s}", jobs[name], flush=True)
         record.save(arguments.out, {"jobs": jobs, "rows": rows(jobs)})
     for row in rows(jobs):
-        print(f"{row['what']:64s} {row['value']:8.3f} {row['ratio']:8.3f} {row['aim']:6.2f} {row['met']}")
+        print(
+            f"{row['what']:64s} {row['value']:8.3f} {row['ratio']:8.3f} {row['aim']:6.2f} {row['met']}"
+        )
 
 
 if __name__ == "__main__":

@@ -133,9 +133,10 @@ class Evaluator:
     @property
     def is_current(self) -> bool:
         """Whether the model has the data that this was made with: `pymc.set_data` changes them."""
-        now = list(nodes(self.model).values())
-        same = zip(now, self.nodes, strict=False)
-        return len(now) == len(self.nodes) and all(a is b for a, b in same)
+        now = [*nodes(self.model).values(), *specimen_likelihoods(self.model).values()]
+        before = [*self.nodes, *(self.likelihood_of(m) for m in self.measurements)]
+        same = zip(now, before, strict=False)
+        return len(now) == len(before) and all(a is b for a, b in same)
 
     @property
     def names(self) -> list[str]:

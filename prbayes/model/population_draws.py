@@ -10,7 +10,6 @@ import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import pymc as pm
@@ -24,7 +23,6 @@ from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.points import sobol
 from prbayes.propagation.population_density import PopulationDensity
 from prbayes.propagation.response_share import ResponseShare
-from prbayes.response.distributions import PopulationSampler
 from prbayes.response.grouping import is_group
 from prbayes.response.inputs import Inputs
 
@@ -39,8 +37,8 @@ class Populations:
     inputs : Inputs
     coordinates : Coordinates
     groups : ndarray of int, shape (N,), or None
-    density : PopulationDensity
-    sampler : PopulationSampler
+    density : PopulationDensity, optional
+        Of the same inputs, as far as it is compiled.
     evaluated : weak reference to Hyperparameters, optional
         Those of the model, where an evaluator has compiled them.
     """
@@ -49,9 +47,12 @@ class Populations:
     inputs: Inputs
     coordinates: Coordinates
     groups: NDArray[np.intp] | None
-    density: PopulationDensity
-    sampler: PopulationSampler
+    density: PopulationDensity | None = None
     evaluated: weakref.ref[Hyperparameters] | None = None
+
+    @cached_property
+    def _density(self) -> PopulationDensity:
+        return PopulationDensity(self.inputs) if self.density is None else self.density
 
     @cached_property
     def hyperparameters(self) -> Hyperparameters:
@@ -91,7 +92,7 @@ class Populations:
             of_rows = [v[rows] for v in x]
             if smoothing is None:
                 roots = self._roots(thetas, int(group))
-                result[:, rows] = self.density.log_likelihoods(roots, of_rows, weights[rows])
+                result[:, rows] = self._density.log_likelihoods(roots, of_rows, weights[rows])
                 continue
             step = max(1, IN_CACHE // (len(rows) * count))
             for first in range(0, len(thetas), step):
@@ -113,14 +114,14 @@ class Populations:
         result = np.zeros(len(thetas))
         for group, count in zip(*np.unique(groups, return_counts=True), strict=True):
             roots = self._roots(thetas, int(group))
-            result += count * share.of_populations(self.density, roots, self.coordinates)
+            result += count * share.of_populations(self._density, roots, self.coordinates)
         return result
 
     def _normal_log_density(
         self, roots: Sequence[Floats], z: Floats, smoothing: Floats, specimens: int = 256
     ) -> Floats:
         """Return the log-density of points (n, d) in smoothed normal populations, (S, n)."""
-        drawn, _ = self.sampler(roots, specimens, np.random.default_rng(0))
+        drawn, _ = self._density.sampler(roots, specimens, np.random.default_rng(0))
         sample = self.coordinates.of(drawn, 2)
         mean = sample.mean(axis=1, keepdims=True)
         centred = sample - mean
@@ -248,7 +249,7 @@ def specimens_of(populations: Populations, thetas: Floats, each: int, seed: int 
         groups = np.unique(populations.groups).tolist()
     parts = []
     for group in groups:
-        drawn, _ = populations.sampler(populations._roots(thetas, group), each, rng)
+        drawn, _ = populations._density.sampler(populations._roots(thetas, group), each, rng)
         z = populations.coordinates.of(drawn, 2)
         parts.append(z.reshape(-1, z.shape[-1]))
     z = np.concatenate(parts)

@@ -71,7 +71,7 @@ from prbayes.propagation.specimen_points import (
     emulate,
 )
 from prbayes.response.costs import in_words
-from prbayes.response.distributions import PopulationSampler, log_density
+from prbayes.response.distributions import log_density
 from prbayes.response.grouping import is_group
 from prbayes.response.inputs import Inputs, aleatory_names
 from prbayes.response.response import Responses
@@ -154,7 +154,7 @@ class SpecimenLikelihood:
     @cached_property
     def coordinates(self) -> Coordinates:
         """Coordinates of the inputs."""
-        return Coordinates.of_prior(self.inputs, self._sampler, len(self.readings))
+        return Coordinates.of_prior(self.inputs, len(self.readings), sampler=self._density.sampler)
 
     def columns(self, measurement: Measurement) -> slice:
         """Return which of all outputs are those of a simulator."""
@@ -336,15 +336,8 @@ class SpecimenLikelihood:
     def populations(self) -> Populations:
         """Populations of the model's hyperparameters, which compile what they are asked for."""
         groups = self.stacked.groups
-        return Populations(
-            self.model,
-            self.inputs,
-            self.coordinates,
-            groups,
-            self._density,
-            self._sampler,
-            self._evaluated,
-        )
+        shared = self._density, self._evaluated
+        return Populations(self.model, self.inputs, self.coordinates, groups, *shared)
 
     @cached_property
     def _density(self) -> PopulationDensity:
@@ -584,7 +577,7 @@ class SpecimenLikelihood:
 
         def drawn() -> Floats:
             if groups is None:
-                specimens, _ = self._sampler(roots, n, rng)
+                specimens, _ = self._density.sampler(roots, n, rng)
             else:
                 specimens = self._of_groups(rng, roots, np.resize(groups, n))
             flat = [x[:, same].reshape(-1, *x.shape[2:]) for x in specimens]
@@ -645,7 +638,7 @@ class SpecimenLikelihood:
                 for root in self.inputs.roots
             ]
             columns = np.flatnonzero(groups == group)
-            specimens, _ = self._sampler(completed, len(columns), rng)
+            specimens, _ = self._density.sampler(completed, len(columns), rng)
             drawn = drawn or [np.empty((x.shape[0], len(groups), *x.shape[2:])) for x in specimens]
             for whole, part in zip(drawn, specimens, strict=True):
                 whole[:, columns] = part
@@ -659,10 +652,6 @@ class SpecimenLikelihood:
         z = self.coordinates.of(inputs, 1)
         z = np.clip(z, self.emulation.box[0], self.emulation.box[1])
         return self.emulation.values(z)
-
-    @cached_property
-    def _sampler(self) -> PopulationSampler:
-        return PopulationSampler(self.inputs)
 
     def observing(self, data: Mapping[str, Any]) -> SpecimenLikelihood:
         """Return the likelihood of other observed values by simulator, with the same runs.

@@ -13,7 +13,6 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from prbayes._checks import IN_CACHE, Floats
 from prbayes._threads import one_thread
@@ -215,6 +214,8 @@ def _minimised_on_population(
     Metrics of one output are not whitened: without others all is as it was. A minimiser that stored
     responses do not support is not taken.
     """
+    from scipy.optimize import minimize
+
     targets = [node.target for node in evaluator.nodes]
     is_chosen = [bool(target.event) or not options.several_outputs for target in targets]
     if not any(is_chosen):

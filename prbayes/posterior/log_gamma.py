@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 from scipy.special import digamma, gammainc, gammaincc, gammaln, polygamma
 
 from prbayes._checks import Floats
@@ -36,6 +35,7 @@ class LogGamma:
     @classmethod
     def fit(cls, z: Floats, side: Floats, weights: Floats) -> LogGamma:
         """Return the most likely one for standardised numbers, (n,), or sides of them."""
+        from scipy.optimize import minimize_scalar
 
         def unlikelihood(shape: float) -> float:
             return -float(weights @ cls(shape).log_likelihood(z, side))

@@ -40,9 +40,9 @@ class Coordinates:
     def of_prior(
         cls,
         inputs: Inputs,
-        sampler: PopulationSampler | None = None,
         n: int = 1,
         populations: int = 4096,
+        sampler: PopulationSampler | None = None,
     ) -> Coordinates:
         """Return the coordinates of populations of the prior, and bounds of n specimens of each."""
         roots = prior_draws(inputs.roots, populations, 0)

@@ -23,7 +23,7 @@ from scipy.special import betaln, gammaln
 from prbayes._checks import IN_CACHE, Floats
 from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.response.compilation import compile_batched
-from prbayes.response.distributions import compiled_log_density
+from prbayes.response.distributions import PopulationSampler, compiled_log_density
 from prbayes.response.inputs import Inputs
 
 # Natural parameters, (q, S), and the normaliser B, (S,): NaN or infinite where one is invalid.
@@ -156,7 +156,7 @@ FAMILIES: dict[type, Callable[[Floats], FamilyTerms]] = {
 
 @dataclass(frozen=True, eq=False)
 class PopulationDensity:
-    """Log-densities of the populations of some inputs.
+    """Populations of some inputs, as far as they are compiled: log-densities and draws.
 
     Attributes
     ----------
@@ -195,6 +195,11 @@ class PopulationDensity:
     @cached_property
     def _log_density(self) -> Any:
         return compiled_log_density(self.inputs)
+
+    @cached_property
+    def sampler(self) -> PopulationSampler:
+        """Draws of specimens."""
+        return PopulationSampler(self.inputs)
 
     def log_likelihoods(
         self, roots: Sequence[Floats], x: Sequence[Floats], log_a: Floats

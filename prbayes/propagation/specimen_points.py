@@ -684,7 +684,6 @@ def _plausible(
         Difference from the largest log-likelihood of the fits, in nats.
     """
 
-
     def likely(sample: _Sample, few: list[tuple[Floats, Floats]]) -> Floats:
         return _log_likelihoods(sample, few).sum(axis=1)
 
