@@ -231,6 +231,7 @@ class Hyperparameters:
         return theta
 
     @cached_property
+    @untraced()
     def _transform(self) -> Any:
         free = self.model.free_RVs
         symbols = [rv.type() for rv in free]

@@ -22,7 +22,7 @@ from scipy.special import betaln, gammaln
 
 from prbayes._checks import IN_CACHE, Floats
 from prbayes.numerics.log_sum_exp import log_sum_exp
-from prbayes.response.compilation import compile_batched
+from prbayes.response.compilation import compile_batched, untraced
 from prbayes.response.distributions import PopulationSampler, compiled_log_density
 from prbayes.response.inputs import Inputs
 
@@ -174,6 +174,7 @@ class PopulationDensity:
         return [family for family in families if family is not None]
 
     @cached_property
+    @untraced()
     def _parameters(self) -> Callable[..., list[Floats]]:
         """Function of roots, (S, *shape), that returns all parameters of all inputs."""
         symbols = self.inputs.placeholders()

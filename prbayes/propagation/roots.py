@@ -153,20 +153,23 @@ def _distinct(
     np.minimum.at(least, specimen, misfit)
     candidates = np.flatnonzero(np.isfinite(misfit) & (misfit <= least[specimen] + gap))
     candidates = candidates[np.lexsort((misfit[candidates], specimen[candidates]))]
-    kept: list[int] = []
-    for row in candidates.tolist():
-        same = False
-        for other in reversed(kept):
-            if specimen[other] != specimen[row]:
-                break
-            away = z[row] - z[other]
-            # In units of the box, and in standard deviations of the Gauss-Newton approximation.
-            distance = np.abs(away / width).max()
-            is_within_error = ((jacobian[other] @ away) ** 2).sum() < 1.0
-            same = same or bool(distance < 1e-6 or (is_within_error and distance < 1e-2))
-        if not same:
-            kept.append(row)
-    return np.array(kept, dtype=np.intp)
+    count = np.bincount(specimen[candidates], minlength=len(least))
+    if not count.any():
+        return candidates
+    slot = np.arange(len(candidates)) - np.repeat(np.cumsum(count) - count, count)
+    table = np.full((len(least), count.max()), -1)
+    table[specimen[candidates], slot] = candidates
+    kept = table >= 0
+    for k in range(1, table.shape[1]):
+        # Each specimen's k-th candidate, beside the better ones.
+        better = table[:, :k]
+        away = z[table[:, k], None] - z[better]
+        # In units of the box, and in standard deviations of the Gauss-Newton approximation.
+        distance = np.abs(away / width).max(axis=2)
+        square = (np.einsum("nkmd,nkd->nkm", jacobian[better], away) ** 2).sum(axis=2)
+        is_same = (distance < 1e-6) | ((square < 1.0) & (distance < 1e-2))
+        kept[:, k] &= ~(is_same & kept[:, :k]).any(axis=1)
+    return table[kept]
 
 
 def gabriel_neighbours(z: Floats, most: int = 32) -> NDArray[np.bool_]:
