@@ -888,9 +888,10 @@ def _draw(
 
 
 def _in_blocks(emulation: Response, z: Floats) -> Floats:
+    """Return values at points, without the Jacobian where the emulation has them alone."""
+    values = getattr(emulation, "values", lambda z: emulation(z)[0])
     step = IN_CACHE
-    parts = [emulation(z[first : first + step])[0] for first in range(0, len(z), step)]
-    return np.concatenate(parts)
+    return np.concatenate([values(z[first : first + step]) for first in range(0, len(z), step)])
 
 
 def _scrambled(components: int, count: int, dimensions: int, seed: tuple[int, int]) -> Floats:
