@@ -208,7 +208,12 @@ def by_outputs(sizes: str) -> Callable[[int], Any]:
     import prbayes as prb
 
     outputs, count = map(int, sizes.split(" of "))
-    response = {"1 of 1": lambda a: a + 4, "1 of 2": lambda a, b: a + b**2, "2 of 2": _two}[sizes]
+    responses: dict[str, Callable[..., Any]] = {
+        "1 of 1": lambda a: a + 4,
+        "1 of 2": lambda a, b: a + b**2,
+        "2 of 2": _two,
+    }
+    response = responses[sizes]
     metric = prb.ProbabilityResidual()
     joint = prb.Joint(metric) if outputs > 1 else metric
 

@@ -297,7 +297,7 @@ def _legendre(u: Floats, powers: NDArray[np.intp]) -> Floats:
 
 def _terms(single: Floats, powers: NDArray[np.intp]) -> Floats:
     """Return products of Legendre polynomials, (terms, k)."""
-    terms = single[powers[:, 0], 0]
+    terms: Floats = single[powers[:, 0], 0]
     for a in range(1, powers.shape[1]):
         terms *= single[powers[:, a], a]
     return terms

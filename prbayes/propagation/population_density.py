@@ -9,15 +9,13 @@ and the natural parameters eta. Inputs of other families have their log-density 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from pymc.distributions.multivariate import MvNormal
-from pytensor.graph.basic import Constant
-from pytensor.tensor.random import basic as random_variables
+import pymc as pm
 from scipy.special import betaln, gammaln
 
 from prbayes._checks import IN_CACHE, Floats
@@ -51,13 +49,16 @@ class FamilyTerms:
 
 def normal_terms(x: Floats) -> FamilyTerms:
     """Return the normal family at points (n,), which are centred so that squares keep digits."""
-    center, unit = x.mean(), max(float(x.std()), 1e-300)
+    center = x.mean()
+    unit = max(float(x.std()), 1e-300)
     u = (x - center) / unit
 
     def natural(mu: Floats, sigma: Floats) -> Natural:
-        m, precision = (mu - center) / unit, np.where(sigma > 0, unit / sigma, np.nan) ** 2
-        normaliser = -0.5 * m**2 * precision - np.log(sigma) - 0.5 * np.log(2 * np.pi)
-        return [m * precision, -0.5 * precision], normaliser
+        m = (mu - center) / unit
+        precision = np.where(sigma > 0, unit / sigma, np.nan) ** 2
+        slope = m * precision
+        normaliser = -0.5 * m * slope - np.log(sigma) - 0.5 * np.log(2 * np.pi)
+        return [slope, -0.5 * precision], normaliser
 
     return FamilyTerms([u, u**2], np.zeros(len(x)), natural)
 
@@ -109,24 +110,29 @@ def beta_terms(x: Floats) -> FamilyTerms:
 def multivariate_normal_terms(x: Floats) -> FamilyTerms:
     """Return the multivariate normal family at points (n, d)."""
     d = x.shape[1]
-    center, unit = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-300)
+    center = x.mean(axis=0)
+    unit = np.maximum(x.std(axis=0), 1e-300)
     u = (x - center) / unit
     first, second = np.triu_indices(d)
+    products = u[:, first] * u[:, second]
+    factors = np.where(first == second, -0.5, -1.0)
 
     def natural(mu: Floats, covariance: Floats) -> Natural:
-        m, scaled = (mu - center) / unit, covariance / np.outer(unit, unit)
+        m = (mu - center) / unit
+        scaled = covariance / np.outer(unit, unit)
         is_finite = np.isfinite(scaled).all(axis=(1, 2))
         values, vectors = np.linalg.eigh(np.where(is_finite[:, None, None], scaled, np.eye(d)))
         is_valid = is_finite & (values[:, 0] > 0)
         values = np.where(is_valid[:, None], values, np.nan)
         precision = (vectors / values[:, None]) @ vectors.swapaxes(1, 2)
         slope = np.einsum("sde,se->sd", precision, m)
-        normaliser = -0.5 * np.einsum("sd,sd->s", m, slope) - 0.5 * np.log(values).sum(axis=1)
-        normaliser -= np.log(unit).sum() + d / 2 * np.log(2 * np.pi)
-        quadratic = precision * np.where(np.eye(d) > 0, -0.5, -1.0)
-        return [*slope.T, *quadratic[:, first, second].T], normaliser
+        square = np.einsum("sd,sd->s", m, slope)
+        log_det = np.log(values).sum(axis=1)
+        constant = np.log(unit).sum() + d / 2 * np.log(2 * np.pi)
+        quadratic = factors * precision[:, first, second]
+        return [*slope.T, *quadratic.T], -0.5 * (square + log_det) - constant
 
-    return FamilyTerms([*u.T, *(u[:, first] * u[:, second]).T], np.zeros(len(x)), natural)
+    return FamilyTerms([*u.T, *products.T], np.zeros(len(x)), natural)
 
 
 def _log(x: Floats) -> tuple[Floats, Floats]:
@@ -144,13 +150,13 @@ def _fields(terms: FamilyTerms, base: Floats) -> tuple[Any, ...]:
 
 
 FAMILIES: dict[type, Callable[[Floats], FamilyTerms]] = {
-    random_variables.NormalRV: normal_terms,
-    random_variables.LogNormalRV: lognormal_terms,
-    random_variables.GammaRV: gamma_terms,
-    random_variables.InvGammaRV: inverse_gamma_terms,
-    random_variables.ExponentialRV: exponential_terms,
-    random_variables.BetaRV: beta_terms,
-    type(MvNormal.rv_op): multivariate_normal_terms,
+    type(pm.Normal.rv_op): normal_terms,
+    type(pm.LogNormal.rv_op): lognormal_terms,
+    type(pm.Gamma.rv_op): gamma_terms,
+    type(pm.InverseGamma.rv_op): inverse_gamma_terms,
+    type(pm.Exponential.rv_op): exponential_terms,
+    type(pm.Beta.rv_op): beta_terms,
+    type(pm.MvNormal.rv_op): multivariate_normal_terms,
 }
 
 
@@ -168,10 +174,10 @@ class PopulationDensity:
     @cached_property
     def _families(self) -> list[Callable[[Floats], FamilyTerms]] | None:
         """The families of the aleatory inputs, None if one is not an exponential family."""
-        families = [FAMILIES.get(type(x.owner.op)) for x in self.inputs.aleatory]
-        if self.inputs.nested or any(family is None for family in families):
+        ops = [type(x.owner.op) for x in self.inputs.aleatory]
+        if self.inputs.nested or not FAMILIES.keys() >= set(ops):
             return None
-        return [family for family in families if family is not None]
+        return [FAMILIES[op] for op in ops]
 
     @cached_property
     @untraced()
@@ -179,17 +185,23 @@ class PopulationDensity:
         """Function of roots, (S, *shape), that returns all parameters of all inputs."""
         symbols = self.inputs.placeholders()
         dists, _ = self.inputs.rebuilt(symbols)
-        graphs = [p for dist in dists for p in dist.owner.op.dist_params(dist.owner)]
-        if all(p in symbols or isinstance(p, Constant) for p in graphs):
-            # Nothing to compute.
-            return lambda *roots: [
-                roots[symbols.index(p)] if p in symbols else p.data[None] for p in graphs
-            ]
-        function = compile_batched(symbols, graphs)
+        graphs: list[Any] = []
+        for dist in dists:
+            graphs += dist.owner.op.dist_params(dist.owner)
+        computed = [graph for graph in graphs if graph not in symbols]
+        # Without a computation the parameters are the roots.
+        function = compile_batched(symbols, computed) if computed else None
 
         def evaluate(*roots: Floats) -> list[Floats]:
-            values = zip(function(*roots), graphs, strict=True)
-            return [v if v.ndim > graph.type.ndim else v[None] for v, graph in values]
+            results = iter(function(*roots)) if function else iter(())
+            given = dict(zip(symbols, roots, strict=True))
+            values = []
+            for graph in graphs:
+                value = given[graph] if graph in given else next(results)
+                # What does not depend on a root comes without a leading axis.
+                value = value if value.ndim > graph.type.ndim else value[None]
+                values.append(np.asarray(value, dtype=float))
+            return values
 
         return evaluate
 
@@ -222,13 +234,15 @@ class PopulationDensity:
         # The points of a specimen as the first axis: reductions are then sums of long rows.
         flat = [v.swapaxes(0, 1).reshape(n * count, *v.shape[2:]) for v in x]
         with np.errstate(all="ignore"):
-            terms, eta = self._terms(roots, flat, log_a.T.ravel())
-            is_valid = np.isfinite(eta).all(axis=0)
-            result = np.empty((n, len(is_valid)))
-            step = max(16, IN_CACHE // 4 // len(terms))
-            for first in range(0, len(is_valid), step):
+            statistics, natural = self._terms(roots, flat, log_a.T.ravel())
+            is_valid = np.isfinite(natural).all(axis=0)
+            natural = np.where(is_valid, natural, 0.0)
+            size = len(is_valid)
+            result = np.empty((n, size))
+            step = max(16, IN_CACHE // 4 // log_a.size)
+            for first in range(0, size, step):
                 some = slice(first, first + step)
-                exponents = terms @ np.where(is_valid[some], eta[:, some], 0.0)
+                exponents = statistics @ natural[:, some]
                 _log_sum_exp_first(exponents.reshape(count, n, -1), result[:, some])
         result[:, ~is_valid] = -np.inf
         return result.T
@@ -256,37 +270,35 @@ class PopulationDensity:
         normaliser.
         """
         size = len(roots[0])
-        parameters = iter(np.asarray(p, dtype=float) for p in self._parameters(*roots))
+        parameters = iter(self._parameters(*roots))
         statistics: list[Floats] = []
         natural: list[Floats] = []
         base, normaliser = log_a, np.zeros(size)
-        assert self._families is not None
-        for dist, family, x in zip(self.inputs.aleatory, self._families, flat, strict=True):
+        for dist, family, x in zip(self.inputs.aleatory, self._families or (), flat, strict=True):
             params = [next(parameters) for _ in dist.owner.op.dist_params(dist.owner)]
-            elements: list[tuple[Floats, list[Floats]]] = [(x, params)]
-            if family is not multivariate_normal_terms and x.ndim > 1:
-                # A vector of independent inputs.
-                params = [np.broadcast_to(p, (len(p), *x.shape[1:])) for p in params]
-                columns = [p.reshape(len(p), -1).T for p in params]
-                by_element = zip(x.reshape(len(x), -1).T, *columns, strict=True)
-                elements = [(element, of_element) for element, *of_element in by_element]
-            for element, of_element in elements:
+            is_joint = family is multivariate_normal_terms
+            for element, of_element in [(x, params)] if is_joint else _elements(x, params):
                 terms = family(element)
                 eta, of_normaliser = terms.natural(*of_element)
                 statistics += terms.statistics
                 natural += [np.broadcast_to(parameter, size) for parameter in eta]
                 base = base + terms.base
                 normaliser = normaliser + of_normaliser
-        base = np.maximum(base, _NOTHING)
-        ones = np.ones(len(base)), np.ones(size)
-        return (
-            np.stack([*statistics, base, ones[0]], axis=1),
-            np.stack([*natural, ones[1], normaliser]),
-        )
+        # -inf times zero is NaN.
+        statistics += [np.maximum(base, -1e300), np.ones(len(base))]
+        natural += [np.ones(size), normaliser]
+        return np.stack(statistics, axis=1), np.stack(natural)
 
 
-# Logarithm of no density in a product, where -inf times zero is NaN.
-_NOTHING = -1e300
+def _elements(x: Floats, params: Sequence[Floats]) -> Iterator[tuple[Floats, list[Floats]]]:
+    """Return points, (n,), and parameters, (S,), of the elements of independent inputs."""
+    if x.ndim == 1:
+        yield x, list(params)
+        return
+    event = x.shape[1:]
+    for place in np.ndindex(*event):
+        values = [np.broadcast_to(p, (len(p), *event))[:, *place] for p in params]
+        yield x[:, *place], values
 
 
 def _log_sum_exp_first(exponents: Floats, out: Floats) -> None:
@@ -296,4 +308,4 @@ def _log_sum_exp_first(exponents: Floats, out: Floats) -> None:
     np.exp(exponents, out=exponents)
     np.log(exponents.sum(axis=0), out=out)
     out += largest
-    out[largest < _NOTHING / 2] = -np.inf
+    out[largest < -1e299] = -np.inf

@@ -166,9 +166,11 @@ def _distinct(
         away = z[table[:, k], None] - z[better]
         # In units of the box, and in standard deviations of the Gauss-Newton approximation.
         distance = np.abs(away / width).max(axis=2)
-        square = (np.einsum("nkmd,nkd->nkm", jacobian[better], away) ** 2).sum(axis=2)
-        is_same = (distance < 1e-6) | ((square < 1.0) & (distance < 1e-2))
-        kept[:, k] &= ~(is_same & kept[:, :k]).any(axis=1)
+        standard = np.einsum("nkmd,nkd->nkm", jacobian[better], away)
+        is_within_error = (standard**2).sum(axis=2) < 1.0
+        is_same = (distance < 1e-6) | (is_within_error & (distance < 1e-2))
+        is_distinct = ~(is_same & kept[:, :k]).any(axis=1)
+        kept[:, k] &= is_distinct
     return table[kept]
 
 
