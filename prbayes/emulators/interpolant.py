@@ -21,7 +21,7 @@ from math import comb
 import numpy as np
 from numpy.polynomial.legendre import legder, legval
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dsytrf, dsytri
+from scipy.linalg.lapack import dsytrf, dsytri, dsytrs
 
 from prbayes._checks import IN_CACHE, Floats
 from prbayes._threads import one_thread
@@ -207,16 +207,17 @@ def fit_interpolant(z: Floats, y: Floats, near: NDArray[np.bool_] | None = None)
         powers = _powers(d, degree)
         terms = _terms(_legendre(scaled, powers), powers).T
         target = np.concatenate([y, np.zeros((len(powers), y.shape[1]))])
+        matrix = np.block([[radial, terms], [terms.T, np.zeros((len(powers),) * 2)]])
         for nugget in (1e-16, 1e-14, 1e-12, 1e-10, 1e-8):
-            kernel = radial + nugget * largest * np.eye(n)
-            matrix = np.block([[kernel, terms], [terms.T, np.zeros((len(powers),) * 2)]])
-            try:
-                inverse = _symmetric_inverse(matrix)
-            except np.linalg.LinAlgError:
+            np.fill_diagonal(matrix[:n, :n], nugget * largest)
+            # Symmetric and indefinite: half the time of a general inverse.
+            factors, pivots, singular = dsytrf(matrix, lower=True)
+            if singular:
                 continue
+            inverse, _ = dsytri(factors, pivots, lower=True)
             # One step of iterative refinement: close runs make the matrix badly conditioned.
-            solution = inverse @ target
-            solution += inverse @ (target - matrix @ solution)
+            solution, _ = dsytrs(factors, pivots, target, lower=True)
+            solution += dsytrs(factors, pivots, target - matrix @ solution, lower=True)[0]
             unsolved = np.abs((target - matrix @ solution)[:n] / spread).max()
             left_out = solution[:n] / np.diag(inverse)[:n, None]
             # Left-out errors look small where the matrix is singular to rounding, so that a
@@ -232,16 +233,6 @@ def fit_interpolant(z: Floats, y: Floats, near: NDArray[np.bool_] | None = None)
             f"interpolation: got {n} points that determine no surface of {d} inputs"
         )
     return best
-
-
-def _symmetric_inverse(matrix: Floats) -> Floats:
-    """Return the inverse of a symmetric indefinite matrix, in half the time of a general one."""
-    factors, pivots, singular = dsytrf(matrix, lower=True)
-    if singular:
-        raise np.linalg.LinAlgError("singular matrix")
-    inverse, _ = dsytri(factors, pivots, lower=True)
-    lower = np.tril(inverse)
-    return np.asarray(lower + np.tril(inverse, -1).T)
 
 
 def _degrees(n: int, d: int) -> list[int]:
