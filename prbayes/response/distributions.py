@@ -279,6 +279,7 @@ def _seed(generators: Sequence[Any], rng: np.random.Generator) -> None:
 class PriorSampler:
     """Draws of variables from the prior, all in one call of a function that is compiled once."""
 
+    @untraced()
     def __init__(self, roots: Sequence[TensorVariable]) -> None:
         self._names = ", ".join(str(r.name) for r in roots)
         self._shapes = [event_shape(r) for r in roots]
@@ -340,6 +341,7 @@ class PriorPoints:
         If a variable has no inverse distribution function.
     """
 
+    @untraced()
     def __init__(self, variables: Sequence[TensorVariable]) -> None:
         self._shapes = [event_shape(v) for v in variables]
         self._sizes = [int(np.prod(s, dtype=int)) for s in self._shapes]
@@ -367,6 +369,7 @@ class PriorPoints:
 class PopulationSampler:
     """Random draws of n specimens from the populations at given roots."""
 
+    @untraced()
     def __init__(self, inputs: Inputs) -> None:
         self._names = ", ".join(str(x.owner.op) for x in inputs.aleatory)
         symbols = inputs.placeholders()
