@@ -88,7 +88,7 @@ class RefitLikelihoodOptions:
     radius: float = 4.0
     inflation: float = 1.5
     weakest: float = 10.0
-    tail: float = 10.0
+    tail: float = 40.0
     prior_sets: float = 1.0
     reach: float = 10.0
     converged: float = 0.9
@@ -330,7 +330,7 @@ def _draw(
     rng = np.random.default_rng([options.seed, seed])
     points = points_along(evaluator, thetas, rng)
     sets = sets_at(evaluator, stored_populations(evaluator, thetas), points)
-    estimates, converged = sampling.refit(sets, roughly=True)
+    estimates, converged = sampling.refit(sets, x, roughly=True)
     if converged.mean() < options.converged:
         raise ValueError(
             f"got {int(converged.sum())} of {converged.size} refits that converged, expected at "
