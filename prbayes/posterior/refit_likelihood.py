@@ -218,8 +218,8 @@ def extended_log_density(
     """Return the log-density of an estimate of zero, (S,).
 
     The cumulant function is that of the weighted estimates, mixed with that of a normal
-    distribution with their moments. Few effective data sets are joined by the normal distribution
-    around ``away`` with one standard error.
+    distribution with their moments. A few data sets with one standard error join the moments, which
+    matters where few of the synthetic ones have weights.
 
     Parameters
     ----------
@@ -233,9 +233,12 @@ def extended_log_density(
     scores = [Scores(estimates, 1)]
     untilted = cumulants([log_weights], scores, np.zeros_like(away))
     effective = 1 / np.exp(2 * log_weights).sum(axis=1)
-    prior = options.prior_sets * (r + 1)
-    part = effective / (effective + prior)
-    mean = part[:, None] * untilted.gradients + (1 - part)[:, None] * away
+    part = effective / (effective + options.prior_sets * (r + 1))
+    # Beyond all data sets the mean is as far away as the population.
+    lengths = np.linalg.norm(untilted.gradients, axis=1)
+    ratios = np.linalg.norm(away, axis=1) / np.maximum(lengths, 1e-300)
+    factors = np.maximum(ratios, 1) ** (1 - part)
+    mean = factors[:, None] * untilted.gradients
     covariance = part[:, None, None] * untilted.hessians
     covariance += (1 - part)[:, None, None] * np.eye(r)
     standardised = np.linalg.solve(covariance, mean[:, :, None])[:, :, 0]
@@ -255,7 +258,9 @@ def extended_log_density(
         )
 
     points = minimum(function, away.shape, 1, options.saddlepoint)
-    return density_at(points, 1, options.saddlepoint)
+    mixed = density_at(points, 1, options.saddlepoint)
+    normal = -(distance + np.linalg.slogdet(covariance)[1]) / 2
+    return np.where(np.isfinite(mixed), mixed, normal)
 
 
 def refit_likelihood(
@@ -343,7 +348,7 @@ class _Drawn:
 
     def joined(self, other: _Drawn) -> _Drawn:
         """Return these and others."""
-        counts = [vstack(pair, format="csr") for pair in zip(self.counts, other.counts)]
+        counts = [vstack(pair, format="csr") for pair in zip(self.counts, other.counts, strict=True)]
         return _Drawn(
             np.concatenate([self.x, other.x]),
             tuple(counts),
