@@ -39,6 +39,7 @@ from prbayes.estimate.optimum import Optimum
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.metrics.score import prepared_on_population
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.hyperparameters import THETAS
 from prbayes.model.support import TOLERABLE, supports_each
 from prbayes.posterior.importance import importance_sample, laplace
 from prbayes.posterior.saddlepoint import (
@@ -79,6 +80,8 @@ class RefitLikelihoodOptions:
         element of the estimate and one more.
     reach : float
         Largest distance of an estimate from the observed one, in standard errors.
+    far : float
+        Largest share of estimates beyond.
     converged : float
         Smallest share of refits that have to converge.
     whitenings : int
@@ -97,6 +100,7 @@ class RefitLikelihoodOptions:
     tail: float = 40.0
     prior_sets: float = 1.0
     reach: float = 10.0
+    far: float = 0.1
     converged: float = 0.9
     whitenings: int = 2
     seed: int = 0
@@ -286,16 +290,20 @@ def refit_likelihood(
         refits do not converge.
     """
     _require_stored(evaluator)
+    if optimum.at_edge:
+        raise ValueError(_at_edge(", ".join(optimum.at_edge)))
     order = [optimum.names.index(name) for name in evaluator.names]
     rivals = [rival["theta"] for rival in optimum.rivals if rival["comparable"]]
     thetas = np.array([optimum.theta, *rivals])[:, order]
     scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
     continuation = continuation_of(evaluator, thetas[:1])
+    evaluator = _coarse_where_sufficient(evaluator, continuation.within(thetas[:1])[0])
     start, *others = continuation.coordinates(thetas)
     for _ in range(options.whitenings):
         evaluator, start = _whitened(evaluator, continuation, start, scales, options)
     continued = _continued(evaluator, continuation)
     sampling = _at_minimiser(continued, start, scales, options)
+    _require_inside(sampling, options)
     centers = [sampling]
     for other in others:
         center = SamplingDistribution.of(continued, other, scales, options.weakest)
@@ -307,7 +315,7 @@ def refit_likelihood(
         centers=tuple(centers),
         continuation=continuation,
         starts=continuation.within(places, margin=0.05),
-        scale=evaluator.prior_sd,
+        scale=_scale(evaluator, sampling, continuation),
         sets=SyntheticSets((), np.empty(0), np.empty((0, sampling.stderr.size))),
         options=options,
     )
@@ -348,7 +356,8 @@ class _Drawn:
 
     def joined(self, other: _Drawn) -> _Drawn:
         """Return these and others."""
-        counts = [vstack(pair, format="csr") for pair in zip(self.counts, other.counts, strict=True)]
+        pairs = zip(self.counts, other.counts, strict=True)
+        counts = [vstack(pair, format="csr") for pair in pairs]
         return _Drawn(
             np.concatenate([self.x, other.x]),
             tuple(counts),
@@ -388,6 +397,9 @@ def _draw(
             f"got {int(converged.sum())} of {converged.size} refits that converged, expected at "
             f"least {options.converged:.0%}; use another metric, or prb.sample_smc"
         )
+    is_far = np.abs(estimates).max(axis=1) > options.reach
+    if is_far.mean() > options.far:
+        raise ValueError(_at_edge(f"{is_far.mean():.0%} of the estimates of synthetic data sets"))
     estimates = np.clip(estimates, -options.reach, options.reach)
     numbers, _ = specimens(evaluator.nodes)
     counts = []
@@ -490,7 +502,7 @@ def _continued(evaluator: Evaluator, continuation: Continuation) -> Evaluator:
 def _at_minimiser(
     evaluator: Evaluator, start: Floats, scales: Floats, options: RefitLikelihoodOptions
 ) -> SamplingDistribution:
-    """Return the sampling distribution at the minimiser that observed responses reach from a start."""
+    """Return the sampling distribution at the minimiser for the observed responses near a start."""
     for _ in range(5):
         sampling = SamplingDistribution.of(evaluator, start, scales, options.weakest)
         (x,), (converged,) = sampling.refit(observed_set(evaluator))
@@ -498,7 +510,10 @@ def _at_minimiser(
         if converged and np.abs(x).max(initial=0.0) < 0.5:
             break
     else:
-        raise ValueError("got an estimate that does not converge")
+        raise ValueError(
+            "got an estimate that still moves by half a standard error when it is minimised again, "
+            "expected a minimum; use another metric, or prb.sample_smc"
+        )
     return replace(sampling, theta=start)
 
 
@@ -509,7 +524,7 @@ def _whitened(
     scales: Floats,
     options: RefitLikelihoodOptions,
 ) -> tuple[Evaluator, Floats]:
-    """Return metrics of several outputs with the whitening of the population, and their minimiser."""
+    """Return metrics of several outputs, whitened by the population, and their minimiser."""
     targets = [node.target for node in evaluator.nodes]
     if not any(target.event for target in targets):
         return evaluator, start
@@ -521,6 +536,52 @@ def _whitened(
     prepared = evaluator.with_targets(targets)
     sampling = _at_minimiser(_continued(prepared, continuation), start, scales, options)
     return prepared, sampling.theta
+
+
+def _require_inside(sampling: SamplingDistribution, options: RefitLikelihoodOptions) -> None:
+    """Raise if the data identify more at the middle of the prior than at the estimate."""
+    local = sampling.local
+    if not local.unidentified.size:
+        return
+    evaluator = sampling.evaluator
+    middle = np.median(evaluator.prior_points(THETAS, 0), axis=0)
+    shift = (middle - sampling.theta) / local.prior_sd
+    along = local.identified @ (local.identified.T @ shift)
+    inside = sampling.theta + (shift - along) * local.prior_sd
+    there = SamplingDistribution.of(evaluator, inside, sampling.scales, options.weakest)
+    if there.stderr.size > sampling.stderr.size:
+        names = np.array(evaluator.readable_names)
+        is_flat = (local.unidentified**2).sum(axis=1) > 0.5
+        raise ValueError(_at_edge(", ".join(names[is_flat])))
+
+
+def _at_edge(what: str) -> str:
+    return (
+        f"got {what} at an edge, as where a standard deviation is about zero, where estimates pile "
+        "up and have no density; use prb.LogLikelihood(), or prb.sample_smc"
+    )
+
+
+def _scale(
+    evaluator: Evaluator, sampling: SamplingDistribution, continuation: Continuation
+) -> Floats:
+    """Return prior standard deviations, or a hundred standard errors if these are less, (d,)."""
+    axes = sampling.axes * sampling.stderr
+    errors = np.sqrt((axes**2).sum(axis=1))
+    is_known = ~continuation.is_continued & (errors > 0)
+    units = np.where(is_known, np.minimum(100 * errors, 1), 1.0)
+    return np.asarray(units * evaluator.prior_sd)
+
+
+def _coarse_where_sufficient(evaluator: Evaluator, theta: Floats) -> Evaluator:
+    """Return an evaluator with an eighth of the points of large designs, if they are sufficient."""
+    coarse = evaluator.coarser()
+    if coarse is None:
+        return evaluator
+    support = coarse.support(theta[None])
+    sizes = [support[name]["weight_ess"][0] for name in coarse.designs]
+    required = [design.required_ess for design in coarse.designs.values()]
+    return coarse if (np.array(sizes) >= required).all() else evaluator
 
 
 def _require_stored(evaluator: Evaluator) -> None:
