@@ -44,10 +44,15 @@ from scipy.interpolate import RectBivariateSpline
 import prbayes as prb
 from benchmarks import record, refit_pivots
 from prbayes.metrics.density import twice_silverman
-from prbayes.posterior.estimate_likelihood import EstimateLikelihood, estimate_likelihood
+from prbayes.posterior.estimate_likelihood import (
+    EstimateLikelihood,
+    StoredScores,
+    estimate_likelihood,
+)
 from prbayes.posterior.importance import importance_sample, laplace
 from prbayes.posterior.refit_likelihood import RefitLikelihood, refit_likelihood
 from prbayes.posterior.sample import _modes
+from prbayes.posterior.target import Target
 
 OUT = record.RESULTS / "saddlepoint.json"
 METRICS = {"KLD": prb.KullbackLeibler(), "PR": prb.ProbabilityResidual()}
@@ -229,11 +234,18 @@ def estimate_log_likelihood(y: Any) -> Callable[[Any, Any], Any]:
 # -- studies --
 
 
+def posterior(likelihood: Likelihood, starts: Any = None) -> Target:
+    """Return the posterior of a likelihood, which begins at its point by default."""
+    places = (likelihood.point,) if starts is None else tuple(starts)
+    return Target(likelihood.evaluator, likelihood.log_likelihood, places, likelihood.scale)
+
+
 def sampled(likelihood: Likelihood, starts: Any, scale: Any) -> tuple[Any, dict[str, Any]]:
     """Return draws in unconstrained space, and diagnostics."""
     clock = time.process_time()
-    modes = laplace(likelihood.log_posterior, starts, scale)
-    sample = importance_sample(likelihood.log_posterior, modes, DRAWS, seed=0)
+    density = posterior(likelihood).log_posterior
+    modes = laplace(density, starts, scale)
+    sample = importance_sample(density, modes, DRAWS, seed=0)
     figures = {"k": sample.pareto_k, "efficiency": sample.efficiency}
     return sample.draws, figures | {"seconds": time.process_time() - clock}
 
@@ -252,7 +264,9 @@ def given_estimate(
     if isinstance(likelihood, RefitLikelihood):
         points = len(likelihood.sets.estimates)
     else:
-        points = max(len(score.values) for score in likelihood.scores)
+        points = max(
+            len(each.scores.values) for each in likelihood.groups if isinstance(each, StoredScores)
+        )
     figures |= {
         "setup": setup,
         "effective": effective,
@@ -321,9 +335,8 @@ def modes_row(name: str, size: int, number: int) -> dict[str, Any]:
         )  # fmt: skip
     optimum = prb.minimize(model=model, progressbar=False)
     likelihood = refit_likelihood(optimum.evaluator, optimum)
-    density = likelihood.log_posterior
-    modes = _modes(density, list(likelihood.starts), likelihood.scale)
-    sample = importance_sample(density, modes or [], DRAWS, seed=0)
+    target = posterior(likelihood, likelihood.starts)
+    sample = importance_sample(target.log_posterior, _modes(target) or [], DRAWS, seed=0)
     mu = likelihood.evaluator.constrained(sample.draws)["mu"]
     means, log_sds = np.linspace(-3, 5, 401)[:, None, None], np.linspace(-2, 1, 150)[None, :, None]
     root, sds = np.sqrt(y), np.exp(log_sds)
@@ -413,13 +426,14 @@ def starts(name: str, number: int, count: int = 32) -> dict[str, Any]:
     optimum = prb.minimize(model=normal_model(vague(20), METRICS[name], y), progressbar=False)
     likelihood = estimate_likelihood(optimum.evaluator, optimum)
     evaluator = likelihood.evaluator
-    (best,) = laplace(likelihood.log_posterior, likelihood.point[None], likelihood.scale)
+    density = posterior(likelihood).log_posterior
+    (best,) = laplace(density, likelihood.point[None], likelihood.scale)
     points = evaluator.prior_points(count, number)
-    possible = np.isfinite(likelihood.log_posterior(points))
+    possible = np.isfinite(density(points))
     arrived = 0
     for start in points[possible]:
         try:
-            (mode,) = laplace(likelihood.log_posterior, start[None], likelihood.scale)
+            (mode,) = laplace(density, start[None], likelihood.scale)
         except ValueError:
             continue
         away = np.linalg.solve(np.linalg.cholesky(best.covariance), mode.mode - best.mode)
