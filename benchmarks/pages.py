@@ -628,6 +628,26 @@ def joint_memory() -> Iterator[Row]:
         ]
 
 
+def speed() -> Iterator[Row]:
+    """Return the rows of CPU seconds, memory and import beside their aims."""
+    for row in found("speed")["rows"]:
+        ratio = short(row["ratio"], 3) if row["against"] else ""
+        value = f"{row['value']:.0f}" if row["value"] >= 20 else short(row["value"])
+        aim = short(row["aim"]) if row["aim"] < 1 else f"{row['aim']:g}"
+        yield [row["what"], row["against"], value, ratio, aim, "yes" if row["met"] else "no"]
+
+
+def speed_jobs() -> Iterator[Row]:
+    """Return the rows of CPU seconds by job."""
+    for name, job in found("speed")["jobs"].items():
+        if "error" in job or "bias" in job:
+            cells = [short(job[key]) if key in job else "" for key in _OF_JOBS]
+            yield [name, *cells, job.get("error", "")]
+
+
+_OF_JOBS = ("cold", "warm", "bias", "width")
+
+
 def scale() -> Iterator[Row]:
     """Return the rows of time and memory of large problems."""
     from benchmarks.scale import THETAS
@@ -960,6 +980,8 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     **{f"joint, {name}": partial(joint, problem) for name, problem in JOINT.items()},
     "joint, time": joint_time,
     "joint, memory": joint_memory,
+    "speed": speed,
+    "speed, jobs": speed_jobs,
     "scale": scale,
     "busy workers": busy_workers,
     "between runs": between_runs,
