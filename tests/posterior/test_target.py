@@ -154,14 +154,18 @@ def test_a_prior_that_is_sharper_than_the_data(spread: float) -> None:
 FEW = np.random.default_rng(701).normal(1, 0.5, (5, 4))
 
 
-@pytest.mark.parametrize("metric", [KLD, prb.ProbabilityResidual(prb.GaussianKDE(0.5))])
+WIDE = pytest.param(prb.ProbabilityResidual(prb.GaussianKDE(0.5)), marks=pytest.mark.long)
+
+
+@pytest.mark.parametrize("metric", [KLD, WIDE])
 def test_few_specimens_in_each_of_several_simulators_count_as_all_in_one(metric: Metric) -> None:
-    """A bandwidth is given, as that of four specimens is another estimator of the residual."""
+    """With the bandwidth of four specimens the residual would have another estimator."""
     together = target_moments(normal_model(metric, FEW.ravel()), FEW.ravel())
     apart = target_moments(normal_model(metric, *FEW), FEW.ravel())
     require_close(apart, together, offset=0.1, widths=(0.93, 1.07))
 
 
+@pytest.mark.long
 def test_the_residual_of_few_specimens_in_each_of_several_simulators() -> None:
     """With the wide bandwidth of four specimens mean and spread of all decide."""
     apart = target_moments(normal_model(PR, *FEW), FEW.ravel())
