@@ -37,8 +37,13 @@ from scipy.interpolate import RectBivariateSpline
 import prbayes as prb
 from benchmarks import record
 from prbayes.metrics.density import twice_silverman
-from prbayes.posterior.estimate_likelihood import EstimateLikelihood, estimate_likelihood
+from prbayes.posterior.estimate_likelihood import (
+    EstimateLikelihood,
+    StoredScores,
+    estimate_likelihood,
+)
 from prbayes.posterior.importance import importance_sample, laplace
+from prbayes.posterior.target import Target
 
 OUT = record.RESULTS / "saddlepoint.json"
 METRICS = {"KLD": prb.KullbackLeibler(), "PR": prb.ProbabilityResidual()}
@@ -202,11 +207,18 @@ def estimate_log_likelihood(y: Any) -> Callable[[Any, Any], Any]:
 # -- studies --
 
 
+def target(likelihood: EstimateLikelihood) -> Target:
+    """Return the posterior of a likelihood."""
+    evaluator = likelihood.evaluator
+    return Target(evaluator, likelihood.log_likelihood, (likelihood.point,), likelihood.scale)
+
+
 def sampled(likelihood: EstimateLikelihood, starts: Any, scale: Any) -> tuple[Any, dict[str, Any]]:
     """Return draws in unconstrained space, and diagnostics."""
     clock = time.process_time()
-    modes = laplace(likelihood.log_posterior, starts, scale)
-    sample = importance_sample(likelihood.log_posterior, modes, DRAWS, seed=0)
+    log_posterior = target(likelihood).log_posterior
+    modes = laplace(log_posterior, starts, scale)
+    sample = importance_sample(log_posterior, modes, DRAWS, seed=0)
     figures = {"k": sample.pareto_k, "efficiency": sample.efficiency}
     return sample.draws, figures | {"seconds": time.process_time() - clock}
 
@@ -220,7 +232,8 @@ def given_estimate(model: pm.Model) -> tuple[EstimateLikelihood, dict[str, Any],
     draws, figures = sampled(likelihood, likelihood.point[None], likelihood.scale)
     support = likelihood.evaluator.support(likelihood.point[None])
     effective = min(float(of["weight_ess"][0]) for of in support.values())
-    points = max(len(score.values) for score in likelihood.scores)
+    stored = [group for group in likelihood.groups if isinstance(group, StoredScores)]
+    points = max(len(group.scores.values) for group in stored)
     figures |= {
         "setup": setup,
         "effective": effective,
@@ -323,13 +336,14 @@ def starts(name: str, number: int, count: int = 32) -> dict[str, Any]:
     optimum = prb.minimize(model=normal_model(vague(20), METRICS[name], y), progressbar=False)
     likelihood = estimate_likelihood(optimum.evaluator, optimum)
     evaluator = likelihood.evaluator
-    (best,) = laplace(likelihood.log_posterior, likelihood.point[None], likelihood.scale)
+    log_posterior = target(likelihood).log_posterior
+    (best,) = laplace(log_posterior, likelihood.point[None], likelihood.scale)
     points = evaluator.prior_points(count, number)
-    possible = np.isfinite(likelihood.log_posterior(points))
+    possible = np.isfinite(log_posterior(points))
     arrived = 0
     for start in points[possible]:
         try:
-            (mode,) = laplace(likelihood.log_posterior, start[None], likelihood.scale)
+            (mode,) = laplace(log_posterior, start[None], likelihood.scale)
         except ValueError:
             continue
         away = np.linalg.solve(np.linalg.cholesky(best.covariance), mode.mode - best.mode)
