@@ -51,7 +51,7 @@ def outliers() -> Iterator[Row]:
 def posterior_coverage() -> Iterator[Row]:
     """Yield coverage of posteriors given the estimate, pooled over groups of cells."""
     for name, group in found("posterior")["pooled"].items():
-        if "lowest" not in group:
+        if "intervals" not in group:  # of an earlier study
             continue
         yield [
             name,
@@ -76,23 +76,29 @@ def likelihood_ranks() -> Iterator[Row]:
 
 
 def saddlepoint() -> Iterator[Row]:
-    """Yield offsets and widths of posteriors given the estimate, by metric and prior."""
+    """Yield offsets and widths of posteriors given the estimate, by case and metric."""
     cells: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for name, cell in found("saddlepoint")["summary"].items():
-        study, *rest = name.split(", ")
-        if study == "one":
-            metric, _, prior = rest
-            cells.setdefault((metric, prior), []).append(cell)
-    for (metric, prior), those in cells.items():
+        study, metric, *rest = name.split(", ")
+        if study in ("one", "several", "refits"):
+            cells.setdefault((rest[-1], metric), []).append(cell)
+    for (case, metric), those in sorted(cells.items(), key=lambda item: _CASES.index(item[0][0])):
         rms, most = (max(max(c[f"{key} offset"]) for c in those) for key in ("rms", "largest"))
         low = min(min(c["smallest width"]) for c in those)
         high = max(max(c["largest width"]) for c in those)
         seconds = float(np.median([c["seconds"] for c in those]))
         sets = sum(c["data sets"] for c in those)
         yield [
-            metric, prior, str(sets), short(rms), short(most), f"{short(low)} to {short(high)}",
+            case, metric, str(sets), short(rms), short(most), f"{short(low)} to {short(high)}",
             short(seconds),
         ]  # fmt: skip
+
+
+# Priors of one simulator of one output, and problems of several.
+_CASES = (
+    "vague", "bounded", "sharp", "conflict", "two simulators", "4 simulators", "8 simulators",
+    "3 outputs", "4 outputs", "8 outputs",
+)  # fmt: skip
 
 
 def guard_sizes() -> Iterator[Row]:
