@@ -275,7 +275,6 @@ def sizes_through() -> Iterator[Row]:
     """Return the rows of the area test's size, through the whole package."""
     table = found("validity")["size_through_prbayes"]
     nulls = {
-        "default, fresh data": "default",
         "optimum taken as exact, fresh data": "optimum, ExactModel",
         "`JointNull`, the calibration's own data": "own data, JointNull",
         "`ExactModel`, the calibration's own data": "own data, ExactModel",
