@@ -57,9 +57,10 @@ def sample(
     from the optimum; of several modes, or where the likelihood jumps at the optimum, sequential
     Monte Carlo from the prior.
 
-    With PR or the Kullback-Leibler divergence and stored responses (`Reweighted`), the posterior is
-    prior times density of the metric's own estimate: of its score there, by a saddlepoint
-    approximation [2]_. It is sampled in the same way. Other metrics are sampled by `sample_smc`.
+    With a metric, the posterior is prior times density of the metric's own estimate, by a
+    saddlepoint approximation [2]_: of its score, if the gradient is a mean over specimens (PR, the
+    Kullback-Leibler divergence), else of refits of synthetic data sets on stored responses. It is
+    sampled in the same way, without NUTS.
 
     Parameters
     ----------
