@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -26,16 +25,6 @@ METRICS = {
     "area": "AreaMetric",
     "log-likelihood": "LogLikelihood",
 }
-POSTERIORS = {
-    "Gibbs, calibrated epsilon": "plain",
-    "sandwich": "sandwich",
-    "straight map": "affine",
-    "bootstrap": "bootstrap",
-    "exact": "exact",
-}
-# Metrics whose draws are given the estimate by default.
-SEEN = ("PR", "KLD", "area")
-WAYS = {"affine": "straight map", "given": "given the estimate", "exact": "exact posterior"}
 Row = Iterable[str]
 
 
@@ -49,140 +38,29 @@ def short(value: float, digits: int = 2) -> str:
     return f"{value:.{digits}f}".replace("0.", ".", 1) if abs(value) < 1 else f"{value:.{digits}f}"
 
 
-def pooled() -> Iterator[Row]:
-    """Return the rows of coverage over all cells."""
-    table = found("coverage")["pooled"]
-    for label, name in POSTERIORS.items():
-        for sizes, at in (("50, 200", ">= 50"), ("20", "= 20")):
-            row = table[f"all, {name}, N {at}"]
-            mean, *others = (row[key] for key in list(row))
-            yield [label, sizes, short(mean, 3), *(short(value) for value in others)]
-
-
-def coverage() -> Iterator[Row]:
-    """Return the rows of coverage by problem."""
-    table = found("coverage")["cells"]
-    problems = {
-        "linear": "linear",
-        "quadratic": "x^2 - 2x + 1",
-        "bell": "exp(-1/(1 + 100 x^2)) (held out)",
-        "lognormal": "lognormal input",
-        "correlated": "correlated inputs (held out)",
-    }
-    for (problem, label), size in product(problems.items(), (20, 50, 200)):
-        cells = [table[f"{problem}/{size}/{m}/affine"]["coverage_89%"] for m in METRICS.values()]
-        yield [label, str(size), *(" / ".join(map(short, cell)) for cell in cells)]
-
-
 def outliers() -> Iterator[Row]:
-    """Return the rows of shifts by gross outliers."""
+    """Yield shifts of posteriors by gross outliers."""
     table = found("contamination")
     for label, name in METRICS.items():
-        adjusted, plain = table[f"{name}/adjusted"], table[f"{name}/plain"]
-        shifts = zip(adjusted["shift"], adjusted["standard_error"], strict=True)
+        cell = table[name]
+        shifts = zip(cell["shift"], cell["standard_error"], strict=True)
+        ratios = (f"{ratio:.2f}" for ratio in cell["sd_ratio"])
+        yield [label, *(f"{shift:.2f} ± {error:.2f}" for shift, error in shifts), *ratios]
+
+
+def posterior_coverage() -> Iterator[Row]:
+    """Yield coverage of posteriors given the estimate, pooled over groups of cells."""
+    for name, group in found("posterior")["pooled"].items():
+        if "intervals" not in group:  # of an earlier study
+            continue
         yield [
-            label,
-            *(f"{shift:.2f} ± {error:.2f}" for shift, error in shifts),
-            *(f"{value:.2f}" for value in (*adjusted["sd_ratio"], *plain["shift"])),
+            name,
+            f"{short(group['coverage'], 3)} ± {short(group['error'], 3)}",
+            f"{group['intervals']:,}",
+            short(group["lowest"]),
+            short(group["highest"]),
+            str(group["failed"]),
         ]
-
-
-def folded() -> Iterator[Row]:
-    """Return the rows of widths and centres where a response is folded."""
-    for metric, row in found("folded").items():
-        for name, given in row["given"].items():
-            affine = row["affine"]
-            yield [
-                metric,
-                name,
-                f"{affine['width'][name]:.2f}",
-                f"{given['width']:.2f} ± {given['width, sd over seeds']:.2f}",
-                f"{affine['off'][name]:+.2f}",
-                f"{given['off']:+.2f}",
-            ]
-
-
-@dataclass(frozen=True)
-class _Estimates:
-    """What posteriors of several cells are worth, by cell and hyperparameter, (n,) each."""
-
-    coverage: Any
-    width: Any  # over the exact one
-    scatter: Any  # width over the scatter of the estimates
-    off: Any  # distance of centres from the exact ones
-    sets: list[int]  # data sets, by cell
-
-
-def _in_estimates(
-    posterior: str, *, problem: str = "", size: int = 0, least: int = 0
-) -> _Estimates:
-    """Return those of the cells with enough data sets."""
-    chosen = []
-    for key, cell in found("posterior")["cells"].items():
-        of_problem, of_size, metric, of = key.split("/")
-        asked = problem in ("", of_problem) and size in (0, int(of_size))
-        if asked and of == posterior and metric in SEEN and cell["data sets"] >= least:
-            chosen.append(cell)
-    names = ("coverage", "sd over exact sd", "sd over own sampling sd", "off")
-    coverage, width, scatter, off = (
-        np.concatenate([cell[name] for cell in chosen]) for name in names
-    )
-    sets = [cell["data sets"] for cell in chosen]
-    return _Estimates(coverage, width, scatter, np.abs(off), sets)
-
-
-def given_estimate() -> Iterator[Row]:
-    """Return the rows of the posterior given the estimate, over problems that set no constant."""
-    from benchmarks.posterior import POOLED
-
-    for size, (name, label) in product((10, 20, 50, 200), WAYS.items()):
-        of = _in_estimates(name, size=size, least=POOLED)
-        coverage, width, off = of.coverage, of.width, of.off
-        yield [
-            str(size),
-            label,
-            f"{short(coverage.mean(), 3)} ({_range(coverage)})",
-            f"{_mean_ratio(width)} ({_range(width)})",
-            f"{short(off.mean())} ({short(off.max())})",
-            _range(of.scatter),
-        ]
-
-
-def _range(values: Any) -> str:
-    return f"{short(values.min())} to {short(values.max())}"
-
-
-def given_estimate_by_problem() -> Iterator[Row]:
-    """Return the same rows by problem."""
-    problems = {
-        "gamma": "gamma",
-        "weibull": "Weibull",
-        "folded": "absolute value",
-        "threshold": "threshold",
-        "product": "product",
-    }
-    for (problem, label), size in product(problems.items(), (10, 20, 50, 200)):
-        row = [label, str(size)]
-        for name in ("affine", "given"):
-            of = _in_estimates(name, problem=problem, size=size)
-            row += [short(of.coverage.mean()), _mean_ratio(of.width), short(of.off.mean())]
-        row.insert(2, str(min(of.sets)))
-        yield row
-
-
-def ranks() -> Iterator[Row]:
-    """Return what ranks of simulated truths tell, by model and hyperparameter."""
-    labels = {"gamma": "PR", "weibull": "KLD", "threshold": "area"}
-    for model, summary in found("sbc")["summary"].items():
-        for name, told in summary.items():
-            if name == "failed":
-                continue
-            mean = f"{short(told['mean rank'], 3)} ± {short(told['error of mean rank'], 3)}"
-            within = short(told["share within 89%"], 3)
-            p = short(told["p of Kolmogorov and Smirnov"])
-            error = short(told["error of it"], 3)
-            off = f"{short(told["off the exact posterior's"], 3)} ± {error}"
-            yield [model, labels[model], name, str(told["data sets"]), mean, off, within, p]
 
 
 def likelihood_ranks() -> Iterator[Row]:
@@ -198,23 +76,29 @@ def likelihood_ranks() -> Iterator[Row]:
 
 
 def saddlepoint() -> Iterator[Row]:
-    """Yield offsets and widths of posteriors given the estimate, by metric and prior."""
+    """Yield offsets and widths of posteriors given the estimate, by case and metric."""
     cells: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for name, cell in found("saddlepoint")["summary"].items():
-        study, *rest = name.split(", ")
-        if study == "one":
-            metric, _, prior = rest
-            cells.setdefault((metric, prior), []).append(cell)
-    for (metric, prior), those in cells.items():
+        study, metric, *rest = name.split(", ")
+        if study in ("one", "several", "refits"):
+            cells.setdefault((rest[-1], metric), []).append(cell)
+    for (case, metric), those in sorted(cells.items(), key=lambda item: _CASES.index(item[0][0])):
         rms, most = (max(max(c[f"{key} offset"]) for c in those) for key in ("rms", "largest"))
         low = min(min(c["smallest width"]) for c in those)
         high = max(max(c["largest width"]) for c in those)
         seconds = float(np.median([c["seconds"] for c in those]))
         sets = sum(c["data sets"] for c in those)
         yield [
-            metric, prior, str(sets), short(rms), short(most), f"{short(low)} to {short(high)}",
+            case, metric, str(sets), short(rms), short(most), f"{short(low)} to {short(high)}",
             short(seconds),
         ]  # fmt: skip
+
+
+# Priors of one simulator of one output, and problems of several.
+_CASES = (
+    "vague", "bounded", "sharp", "conflict", "two simulators", "4 simulators", "8 simulators",
+    "3 outputs", "4 outputs", "8 outputs",
+)  # fmt: skip
 
 
 def guard_sizes() -> Iterator[Row]:
@@ -225,41 +109,11 @@ def guard_sizes() -> Iterator[Row]:
             yield [problem, check, str(cell["data sets"]), share]
 
 
-def _mean_ratio(ratios: Any) -> str:
-    return short(float(np.exp(np.log(ratios).mean())))
-
-
-def hard_posteriors() -> Iterator[Row]:
-    """Return the rows of posteriors where a straight line is not enough."""
-    from benchmarks.hard_posteriors import CASES, METRICS, summary
-
-    rows = found("hard_posteriors")
-    for case, metric in product(CASES, METRICS):
-        of_cell = [row for key, row in rows.items() if key.startswith(f"{case}/{metric}/")]
-        done = [row for row in of_cell if "refused" not in row]
-        if not done:
-            yield [case, metric, "refused", "", "", "refused", "", ""]
-            continue
-        row = [case, metric]
-        for posterior in ("Affine", "GivenEstimate"):
-            one = summary(done, posterior)
-            row += [
-                " / ".join(f"{value:+.2f}" for value in one["off"]),
-                " / ".join(f"{value:.2f}" for value in one["width"]),
-                f"{one['said']} of {len(done)}",
-            ]
-        if len(done) < len(of_cell):
-            row[-1] += f", {len(of_cell) - len(done)} refused"
-        yield row
-
-
 def samplers() -> Iterator[Row]:
     """Return the rows of sampling beside other packages."""
     table = found("smc")
     systems = {
         "prbayes, `Reweighted(256)`": "reweighted",
-        "the same, straight map": "straight",
-        "prbayes, `Resimulated(256)`": "resimulated",
         "stock PyMC": "pymc",
         "pyABC": "pyabc",
     }
@@ -421,7 +275,6 @@ def sizes_through() -> Iterator[Row]:
     """Return the rows of the area test's size, through the whole package."""
     table = found("validity")["size_through_prbayes"]
     nulls = {
-        "default, fresh data": "default",
         "optimum taken as exact, fresh data": "optimum, ExactModel",
         "`JointNull`, the calibration's own data": "own data, JointNull",
         "`ExactModel`, the calibration's own data": "own data, ExactModel",
@@ -551,56 +404,32 @@ def surrogates() -> Iterator[Row]:
         ]
 
 
-# Problems of joint calibration, by the name of their table.
-JOINT = {
-    "correlation 0": "normal 0",
-    "correlation .6": "normal .6",
-    "correlation .95": "normal .95",
-    "frame": "frame",
-    "four outputs": "four .9",
-}
+# Problems of joint calibration with enough data sets.
+JOINT = ("normal 0", "normal .6", "normal .95", "frame")
 
 
-def _joint_label(method: str) -> str:
-    """Return what a way of joint calibration is called."""
+def joint() -> Iterator[Row]:
+    """Yield errors of joint calibration over those of maximum likelihood, by problem."""
+    from benchmarks.joint import ENOUGH, METHODS, grouped
+
     schools = {
-        "joint": "`Joint`, straight map",
-        "given": "`Joint`",
+        "joint": "`Joint`",
         "correlation": "`MarginalCorrelation`",
         "separate": "separate marginals",
     }
-    if method == "exact":
-        return "exact posterior"
-    school, metric = method.split()
-    return f"{schools[school]}, {metric}"
-
-
-def joint_pooled() -> Iterator[Row]:
-    """Return the rows of joint calibration over all problems."""
-    from benchmarks.joint import METHODS
-
-    table = found("joint")["pooled"]
-    for size, method in product((20, 50, 200), METHODS):
-        cell = table.get(f"{method}/{size}")
-        if cell is not None:
-            figures = ("worst rmse over likelihood", "coverage", "worst off", "mean sd over exact")
-            columns = [short(cell[figure]) for figure in figures]
-            yield [str(size), _joint_label(method), str(cell["data sets"]), *columns]
-
-
-def joint(problem: str) -> Iterator[Row]:
-    """Return the rows of joint calibration of one problem."""
-    from benchmarks.joint import ENOUGH, grouped
-
-    for key, cell in found("joint")["cells"].items():
-        name, size, method = key.split("/")
-        if name != problem or cell["data sets"] < ENOUGH:
-            continue
-        columns = [
-            " / ".join(short(round(value, 2) + 0.0) for value in grouped(name, cell[figure]))
-            for figure in ("rmse over likelihood", "coverage", "off", "sd over exact")
-        ]
-        yield [size, _joint_label(method), str(cell["data sets"]), *columns]
+    cells = found("joint")["cells"]
+    for size, method in product((20, 50, 200), METHODS[1:]):
+        row, sets = [], []
+        for problem in JOINT:
+            cell = cells.get(f"{problem}/{size}/{method}")
+            if cell is None or cell["data sets"] < ENOUGH:
+                break
+            errors = grouped(problem, cell["rmse over likelihood"])
+            row.append(" / ".join(short(error) for error in errors))
+            sets.append(cell["data sets"])
+        else:
+            school, metric = method.split()
+            yield [str(size), f"{schools[school]}, {metric}", str(min(sets)), *row]
 
 
 def joint_time() -> Iterator[Row]:
@@ -749,15 +578,6 @@ def at_a_fold() -> Iterator[Row]:
             )
             cells.append(f"{short(row['mu'])} / {short(row['sigma'])}")
         yield [metric, *cells]
-
-
-def mode_weights() -> Iterator[Row]:
-    """Return the rows of what shares of modes are worth."""
-    ways = ("epsilon", "dealt out", "exact")
-    for kind in ("cubic", "bent"):
-        for row in found(f"mode_weights_{kind}"):
-            cells = [row[way][what] for way in ways for what in row[way]]
-            yield [kind, str(row["N"]), row["metric"], str(row["data sets"]), *map(short, cells)]
 
 
 def random_problems() -> Iterator[Row]:
@@ -945,17 +765,11 @@ def _scoreboard(problem: str) -> Iterator[Row]:
 
 # Where the rows of each table are from; the first two lines of it are the page's.
 TABLES: dict[str, Callable[[], Iterator[Row]]] = {
-    "coverage, pooled": pooled,
-    "coverage, by problem": coverage,
+    "posterior coverage": posterior_coverage,
     "outliers": outliers,
-    "given the estimate, folded": folded,
-    "given the estimate, pooled": given_estimate,
-    "given the estimate, by problem": given_estimate_by_problem,
-    "ranks": ranks,
     "likelihood, ranks": likelihood_ranks,
     "likelihood, sizes of guards": guard_sizes,
     "saddlepoint": saddlepoint,
-    "hard posteriors": hard_posteriors,
     "samplers": samplers,
     "size": sizes,
     "size, through prbayes": sizes_through,
@@ -976,8 +790,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "wrong families, few data": lambda: families((20, 50)),
     "ties": ties,
     "surrogates": surrogates,
-    "joint, pooled": joint_pooled,
-    **{f"joint, {name}": partial(joint, problem) for name, problem in JOINT.items()},
+    "joint, errors": joint,
     "joint, time": joint_time,
     "joint, memory": joint_memory,
     "speed": speed,
@@ -990,7 +803,6 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "few runs": few_runs,
     "many inputs": many_inputs,
     "at a fold": at_a_fold,
-    "mode weights": mode_weights,
     "random problems": random_problems,
     "three masses": three_masses,
     "two fidelities": two_fidelities,

@@ -29,7 +29,7 @@ from benchmarks.processes import child
 N = 50
 LEVELS = (np.arange(N) + 0.5) / N
 PROBLEMS = ("linear", "quadratic")
-OWN = ("reweighted", "resimulated")  # settings of this package
+OWN = ("reweighted",)  # settings of this package
 SYSTEMS = (*OWN, "pymc", "pyabc")
 DRAWS, CHAINS = 1000, 4
 # Before the clock starts; the package loads its names when the first is asked for, and the last
@@ -181,10 +181,10 @@ class Clock:
         return time.perf_counter() - self.wall, time.process_time() - self.cpu
 
 
-def with_prbayes(problem: str, system: str) -> dict[str, Any]:
+def with_prbayes(problem: str) -> dict[str, Any]:
     """Sample with this package, by default settings.
 
-    The model, the optimum and epsilon are set-up.
+    The model and the optimum are set-up.
     """
     import pymc as pm
 
@@ -194,9 +194,13 @@ def with_prbayes(problem: str, system: str) -> dict[str, Any]:
     clock = Clock()
     with pm.Model() as model:
         x = pm.Normal.dist(*_priors(problem))
-        kind = prb.Resimulated(256) if system == "resimulated" else prb.Reweighted(256)
         prb.Simulator(
-            "y", response, x, metric=prb.AreaMetric(), observed=observed, propagation=kind
+            "y",
+            response,
+            x,
+            metric=prb.AreaMetric(),
+            observed=observed,
+            propagation=prb.Reweighted(256),
         )
     optimum = prb.minimize(model, starts=0)
     setup = clock()
@@ -346,7 +350,7 @@ def one(system: str, problem: str) -> dict[str, Any]:
     """Run one system on one problem in this process."""
     _import()
     if system in OWN:
-        return with_prbayes(problem, system)
+        return with_prbayes(problem)
     return with_pymc(problem) if system == "pymc" else with_pyabc(problem)
 
 
@@ -392,7 +396,9 @@ def slow(system: str) -> dict[str, float]:
         if system == "resimulated":
             prb.set_epsilon(model, {"y": 0.02})
             clock, inside[0] = time.perf_counter(), 0.0
-            prb.sample_smc(20, chains=1, model=model, random_seed=1, progressbar=False)
+            prb.sample_smc(
+                20, chains=1, model=model, adjustment=None, random_seed=1, progressbar=False
+            )
             share = inside[0] / (2 * (time.perf_counter() - clock))
     return {"share of the time inside the response": share}
 

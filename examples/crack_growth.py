@@ -1,7 +1,7 @@
 """How does the crack growth rate vary from specimen to specimen? Calibration on 21 measured cracks.
 
 The crack length of 21 specimens after 50 000 load cycles calibrates the population of the
-coefficient C of Paris' law, lognormal, with its exponent held at 2.6: by the optimiser and by ABC,
+coefficient C of Paris' law, lognormal, with its exponent held at 2.6: by the optimiser and the posterior,
 with each metric. An independent reference fits C to every specimen's whole record by least squares.
 
 Run: uv run python examples/crack_growth.py [--out FOLDER]
@@ -56,7 +56,7 @@ def calibrate(metric, observed):
         C = pm.LogNormal.dist(mu, sigma)
         prb.Simulator("crack", growth, C, EXPONENT, metric=metric, observed=observed)
     optimum = prb.minimize(model)
-    posterior = prb.sample_smc(
+    posterior = prb.sample(
         1000, chains=4, model=model, optimum=optimum, random_seed=1, progressbar=False
     )
     return model, optimum, posterior
@@ -146,7 +146,7 @@ def main():
     for label, metric in METRICS.items():
         model, optimum, posterior = calibrate(metric, observed)
         results[label] = optimum, posterior
-        table = prb.compare({"optimum": optimum, "ABC": posterior}, model=model)
+        table = prb.compare({"optimum": optimum, "posterior": posterior}, model=model)
         print(
             f"{label}: {optimum.n_responses} responses computed, "
             f"epsilon {float(posterior.calibration.epsilon[0]):.3g}"

@@ -56,10 +56,10 @@ def main():
             metric=prb.AreaMetric(), observed=measured, propagation=propagation,
         )  # fmt: skip
         optimum = prb.minimize()
-        posterior = prb.sample_smc(500, chains=2, optimum=optimum, random_seed=1, progressbar=False)
+        posterior = prb.sample(500, chains=2, optimum=optimum, random_seed=1, progressbar=False)
     print(f"{optimum.n_responses} runs of the program in all; "
           f"sample mean {modulus.mean():.1f} GPa, sd {modulus.std(ddof=1):.1f} GPa")  # fmt: skip
-    table = prb.compare({"optimum": optimum, "ABC": posterior}, model=model)
+    table = prb.compare({"optimum": optimum, "posterior": posterior}, model=model)
     print(table[["estimate", "sd", "lower", "upper"]].to_dataframe().round(3))
 
 

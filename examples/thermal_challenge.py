@@ -274,14 +274,8 @@ def study():
 
     model, inputs = population()
     optimum = prb.minimize(model, progressbar=False)
-    posterior = prb.sample_smc(
-        500,
-        chains=2,
-        model=model,
-        optimum=optimum,
-        random_seed=1,
-        progressbar=False,
-        adjust=prb.posterior.Affine(),
+    posterior = prb.sample(
+        500, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False
     )
     found["runs"] = optimum.n_responses
     found["warnings"] = list(optimum.warnings)

@@ -127,19 +127,16 @@ def rub(metric, observed, surrogate, first, knowledge):
 
 
 def sampled(model, metric, epsilon):
-    """Return the posterior, around an optimum that the prior holds where the data see nothing."""
+    """Return the posterior; the optimum includes the prior, which identifies the damping.
+
+    The posterior given the area metric's estimate needs stored responses: draws are those of ABC.
+    """
     prb.set_epsilon(model, epsilon)
+    settings = {"chains": 2, "model": model, "random_seed": 1, "progressbar": False}
+    if isinstance(metric, prb.AreaMetric):
+        return prb.sample_smc(500, adjustment=None, **settings)
     center = prb.minimize(model, prior=True, progressbar=False)
-    draws = 300 if isinstance(metric, prb.LogLikelihood) else 500
-    return prb.sample_smc(
-        draws,
-        chains=2,
-        model=model,
-        optimum=center,
-        adjust=prb.posterior.Affine(),
-        random_seed=1,
-        progressbar=False,
-    )
+    return prb.sample(500, optimum=center, **settings)
 
 
 def carried_through(metric, observed, surrogate, first):
@@ -351,7 +348,7 @@ def main():
         steps[label], first_inputs[label] = [(optimum, posterior)], inputs
         frequency_moments[label] = moments(optimum, frequency, inputs)
         print(f"\n{label}")
-        shown = prb.compare({"optimum": optimum, "ABC": posterior}, model=model)
+        shown = prb.compare({"optimum": optimum, "posterior": posterior}, model=model)
         print(shown[["estimate", "sd", "lower", "upper"]].to_dataframe().round(2).to_string())
         for line in optimum.warnings:
             print(f"  said by prb.minimize: {line}")
@@ -380,7 +377,7 @@ def main():
         tables = []
         for name, result, of in (
             ("optimum", optimum, model),
-            ("ABC, step 1 carried", posterior, whole_model),
+            ("posterior, step 1 carried", posterior, whole_model),
         ):
             shown = prb.compare({name: result}, model=of)[["estimate", "sd", "lower", "upper"]]
             tables.append(shown.sel(hyperparameter=["mu_r", "sd_r"]).to_dataframe())

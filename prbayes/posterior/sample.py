@@ -56,10 +56,10 @@ def sample(
     from the optimum; of several modes, or where the likelihood jumps at the optimum, sequential
     Monte Carlo from the prior.
 
-    With a metric the posterior is prior times density of its own estimate, by a saddlepoint
-    approximation [2]_: of the score there, for PR and the Kullback-Leibler divergence, or of refits
-    of synthetic data sets. It is sampled in the same way, and by sequential Monte Carlo where
-    importance sampling is not reliable.
+    With a metric, the posterior is prior times density of the metric's own estimate, by a
+    saddlepoint approximation [2]_: of its score, if the gradient is a mean over specimens (PR, the
+    Kullback-Leibler divergence), else of refits of synthetic data sets on stored responses. It is
+    sampled in the same way, without NUTS.
 
     Parameters
     ----------
