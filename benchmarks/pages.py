@@ -217,6 +217,21 @@ def saddlepoint() -> Iterator[Row]:
         ]  # fmt: skip
 
 
+def saddlepoint_refits() -> Iterator[Row]:
+    """Yield offsets and widths of posteriors given estimates by refits, by metric, prior and size."""
+    for name, cell in found("saddlepoint")["summary"].items():
+        study, metric, *rest = name.split(", ")
+        if study != "refits" or "rms offset" not in cell:
+            continue
+        size, prior = rest
+        offset, largest = (max(cell[f"{key} offset"]) for key in ("rms", "largest"))
+        widths = f"{short(min(cell['mean width']))} to {short(max(cell['mean width']))}"
+        yield [
+            metric, size.removeprefix("N = "), prior, str(cell["data sets"] - cell["failed"]),
+            short(offset), short(largest), widths, short(cell["seconds"]),
+        ]  # fmt: skip
+
+
 def guard_sizes() -> Iterator[Row]:
     """Yield how often right models are flagged by the guards of the log-likelihood by specimen."""
     for problem, checks in found("likelihood_guards")["summary"].items():
@@ -935,6 +950,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "likelihood, ranks": likelihood_ranks,
     "likelihood, sizes of guards": guard_sizes,
     "saddlepoint": saddlepoint,
+    "saddlepoint_refits": saddlepoint_refits,
     "hard posteriors": hard_posteriors,
     "samplers": samplers,
     "size": sizes,
