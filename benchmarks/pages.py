@@ -94,6 +94,21 @@ def saddlepoint() -> Iterator[Row]:
         ]  # fmt: skip
 
 
+def saddlepoint_refits() -> Iterator[Row]:
+    """Yield offsets and widths of posteriors given estimates by refits, by metric, prior and size."""
+    for name, cell in found("saddlepoint")["summary"].items():
+        study, metric, *rest = name.split(", ")
+        if study != "refits" or "rms offset" not in cell:
+            continue
+        size, prior = rest
+        offset, largest = (max(cell[f"{key} offset"]) for key in ("rms", "largest"))
+        widths = f"{short(min(cell['mean width']))} to {short(max(cell['mean width']))}"
+        yield [
+            metric, size.removeprefix("N = "), prior, str(cell["data sets"] - cell["failed"]),
+            short(offset), short(largest), widths, short(cell["seconds"]),
+        ]  # fmt: skip
+
+
 # Priors of one simulator of one output, and problems of several.
 _CASES = (
     "vague", "bounded", "sharp", "conflict", "two simulators", "4 simulators", "8 simulators",
@@ -770,6 +785,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "likelihood, ranks": likelihood_ranks,
     "likelihood, sizes of guards": guard_sizes,
     "saddlepoint": saddlepoint,
+    "saddlepoint_refits": saddlepoint_refits,
     "samplers": samplers,
     "size": sizes,
     "size, through prbayes": sizes_through,

@@ -86,7 +86,8 @@ class Continuation:
     def roots(self, evaluator: Evaluator, coordinates: Floats, k: int) -> list[Floats]:
         """Return the roots of the k-th simulator, continued linearly in values beyond the ends."""
         shares = self._shares(coordinates, self.margin)
-        roots = evaluator.roots(self._thetas(shares, coordinates), k)
+        base = evaluator.roots(self._thetas(shares, coordinates), k)
+        roots = list(base)
         width = self.upper - self.lower
         beyond = (self.values(coordinates) - self.lower) / width - shares
         for i in np.flatnonzero(self.is_continued):
@@ -98,9 +99,9 @@ class Continuation:
             inside[:, i] += steps
             moved = evaluator.roots(self._thetas(inside, coordinates), k)
             factors = np.where(passed, beyond[:, i] / np.where(passed, steps, 1.0), 0.0)
-            for j, (root, other) in enumerate(zip(roots, moved, strict=True)):
+            for j, (root, inner) in enumerate(zip(base, moved, strict=True)):
                 column = factors.reshape(-1, *np.ones(root.ndim - 1, dtype=int))
-                roots[j] = root + column * (other - root)
+                roots[j] = roots[j] + column * (inner - root)
         return roots
 
 

@@ -297,7 +297,6 @@ def refit_likelihood(
     thetas = np.array([optimum.theta, *rivals])[:, order]
     scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
     continuation = continuation_of(evaluator, thetas[:1])
-    evaluator = _coarse_where_sufficient(evaluator, continuation.within(thetas[:1])[0])
     start, *others = continuation.coordinates(thetas)
     for _ in range(options.whitenings):
         evaluator, start = _whitened(evaluator, continuation, start, scales, options)
@@ -309,6 +308,11 @@ def refit_likelihood(
         center = SamplingDistribution.of(continued, other, scales, options.weakest)
         if center.stderr.size == sampling.stderr.size:
             centers.append(center)
+    # Identified directions are known from all stored responses; an eighth is enough for the rest.
+    evaluator = _coarse_where_sufficient(evaluator, continuation.within(thetas[:1])[0])
+    continued = _continued(evaluator, continuation)
+    centers = [replace(center, evaluator=continued) for center in centers]
+    sampling = centers[0] = _moved_to_minimiser(centers[0])
     places = np.array([center.theta for center in centers])
     likelihood = RefitLikelihood(
         evaluator=evaluator,
@@ -505,16 +509,21 @@ def _at_minimiser(
     """Return the sampling distribution at the minimiser for the observed responses near a start."""
     for _ in range(5):
         sampling = SamplingDistribution.of(evaluator, start, scales, options.weakest)
-        (x,), (converged,) = sampling.refit(observed_set(evaluator))
-        start = sampling.thetas(x)
-        if converged and np.abs(x).max(initial=0.0) < 0.5:
-            break
-    else:
-        raise ValueError(
-            "got an estimate that still moves by half a standard error when it is minimised again, "
-            "expected a minimum; use another metric, or prb.sample_smc"
-        )
-    return replace(sampling, theta=start)
+        moved = _moved_to_minimiser(sampling)
+        x, _ = sampling.coordinates(moved.theta)
+        start = moved.theta
+        if np.abs(x).max(initial=0.0) < 0.5:
+            return moved
+    raise ValueError(
+        "got an estimate that still moves by half a standard error when it is minimised again, "
+        "expected a minimum; use another metric, or prb.sample_smc"
+    )
+
+
+def _moved_to_minimiser(sampling: SamplingDistribution) -> SamplingDistribution:
+    """Return the sampling distribution with the minimiser for the observed responses as theta."""
+    (x,), _ = sampling.refit(observed_set(sampling.evaluator))
+    return replace(sampling, theta=sampling.thetas(x))
 
 
 def _whitened(
