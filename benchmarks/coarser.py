@@ -1,7 +1,7 @@
 """What an eighth of a cloud saves on the way to the draws of exp(-d / epsilon), and whether these stay.
 
 Two problems of the scoreboard with several outputs, whose clouds have 8192 points and more: CPU time of
-`sample_smc` without adjustment, on all points and with an eighth of them until the last stage, in turn; medians and
+`sample_smc(adjustment=None)`, on all points and with an eighth of them until the last stage, in turn; medians and
 lengths of 90% intervals of the draws, whose difference is that of seeds if nothing changes. Standard deviations
 tell nothing of 304L: a few draws far out decide them, other ones by chain.
 
@@ -57,7 +57,7 @@ def sampled(optimum: Any, large: int, seed: int) -> tuple[float, Any]:
         tree = prb.sample_smc(
             optimum=optimum,
             model=optimum.model,
-            adjust=False,
+            adjustment=None,
             random_seed=seed,
             progressbar=False,
         )

@@ -4,7 +4,7 @@ Every number at the top of a module in the rooms that touch statistics, elements
 levels of support among them, but for those of `SKIPPED`, that by their nature touch memory or words.
 Each is set to half and to twice its value; of a share beyond one half, or a ratio close to one, that
 is half and twice its distance from one. Then every problem is calibrated that runs code which reads the constant: optimum,
-standard errors, epsilon and an adjusted posterior of 400 draws, or a test of validity. The table has,
+standard errors, epsilon and a posterior of 400 draws, or a test of validity. The table has,
 for each problem whose answers change at all, the largest change over hyperparameters of
 
 - the optimum, in standard errors; the standard errors, and epsilon, as factors;
@@ -254,7 +254,7 @@ def minimised(build: Callable[[], pm.Model], **options: Any) -> prb.Optimum:
 def sampled(optimum: prb.Optimum, random_seed: int) -> dict[str, Any]:
     """Sample, and return all answers."""
     posterior = prb.sample_smc(
-        400, chains=1, model=optimum.model, optimum=optimum, random_seed=random_seed, progressbar=False, adjust=prb.posterior.Affine())  # fmt: skip
+        400, chains=1, model=optimum.model, optimum=optimum, random_seed=random_seed, progressbar=False)  # fmt: skip
     draws = posterior["calibration"].dataset["theta"].values[0]
     return {
         "theta": optimum.theta,
@@ -293,7 +293,6 @@ def validity(case: tuple[Any, ...], random_seed: int) -> dict[str, Any]:
         optimum=optimum,
         random_seed=random_seed,
         progressbar=False,
-        adjust=prb.posterior.Affine(),
     )
     fresh = np.sinh(1.3 + 0.6 * rng.standard_normal(12))
     best = prb.predict(optimum, surface, x, model=model)

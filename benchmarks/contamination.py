@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import logging
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pymc as pm
@@ -24,6 +24,8 @@ from benchmarks.metrics import BY_NAME
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.smc import Sampling, sample
 
+Adjustment = Literal["estimate"] | None
+ADJUSTMENTS: tuple[Adjustment, ...] = ("estimate", None)
 SIZE = 50
 SHARE = 0.05
 DISTANCE = 8.0
@@ -44,9 +46,9 @@ def evaluator_of(metric: str) -> Evaluator:
     return Evaluator(model)
 
 
-def posterior(evaluator: Evaluator, data: Any, adjust: bool) -> Any:
+def posterior(evaluator: Evaluator, data: Any, adjustment: Adjustment) -> Any:
     """Return means and standard deviations of mu and sigma."""
-    tree = sample(evaluator.observing({"y": data}), Sampling(adjust=adjust, random_seed=1))
+    tree = sample(evaluator.observing({"y": data}), Sampling(adjustment=adjustment, random_seed=1))
     draws = tree["posterior"].dataset
     return np.array([[float(draws[n].mean()), float(draws[n].std())] for n in ("mu", "sigma")])
 
@@ -68,7 +70,7 @@ def main() -> None:
           f"{'sd ratio mu':>12s} {'sd ratio sigma':>15s}")  # fmt: skip
     for metric in METRICS:
         evaluator = evaluator_of(metric)
-        for adjust in (True, False):
+        for adjustment in ADJUSTMENTS:
             shifts, ratios = [], []
             for i in range(arguments.replicates):
                 rng = np.random.default_rng([5, i])
@@ -77,14 +79,14 @@ def main() -> None:
                 n_bad = int(SHARE * SIZE) + (rng.random() < SHARE * SIZE % 1)
                 dirty[SIZE - n_bad :] = 10 + DISTANCE
                 clean, after = (
-                    posterior(evaluator, data, adjust),
-                    posterior(evaluator, dirty, adjust),
+                    posterior(evaluator, data, adjustment),
+                    posterior(evaluator, dirty, adjustment),
                 )
                 shifts.append((after[:, 0] - clean[:, 0]) / clean[:, 1])
                 ratios.append(after[:, 1] / clean[:, 1])
             shift, ratio = np.mean(shifts, axis=0), np.median(ratios, axis=0)
             error = np.std(shifts, axis=0, ddof=1) / np.sqrt(len(shifts))
-            name = "adjusted" if adjust else "plain"
+            name = "adjusted" if adjustment else "plain"
             table[f"{metric}/{name}"] = {
                 "shift": shift.tolist(),
                 "standard_error": error.tolist(),

@@ -29,24 +29,19 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.stats import chi2, norm, qmc
 
 from benchmarks import record
-from benchmarks.coverage import proposal, weighted
 
 STORE = record.RESULTS / "joint"
 SIZES = (50, 200, 20)
 LEVEL = 0.89
 METRICS = {"PR": "ProbabilityResidual", "KLD": "KullbackLeibler", "area": "AreaMetric"}
-# As all of them, with the map of draws by refits at the optimum; "given" is the posterior given the
-# estimate of `Joint`, the default.
-SCHOOLS = ("joint", "given", "correlation", "separate")
+SCHOOLS = ("joint", "correlation", "separate")
 METHODS = ("exact", *(f"{school} {metric}" for school in SCHOOLS for metric in METRICS))
 ENOUGH = 20  # data sets of a cell that is told of, and pooled with others
 _BLOCK = 10  # data sets of a problem before it is the next problem's turn
 _FEW = 8  # specimens of the data sets whose estimates are the populations of the design
-_WIDER = 2.5  # the proposal's covariance, in that of the estimate
-_PROPOSED = 1024
-_N_SETS = 100  # refits of the adjustment: half of the default
 
 
 # -- problems --------------------------------------------------------------------------------------
@@ -287,24 +282,17 @@ class Cell:
     def calibrated(self, method: str, x: Any) -> dict[str, Any]:
         """Calibrate one data set; return estimate, posterior and what it cost."""
         from prbayes.estimate.minimization import Minimisation, find_optimum
-        from prbayes.posterior.adjustment import Affine
-        from prbayes.posterior.epsilon import calibrate_epsilon
-        from prbayes.posterior.given_estimate import GivenEstimate
+        from prbayes.posterior.sample import draw_posterior
+        from prbayes.posterior.smc import Sampling
 
         evaluator = self._observing(method, self.problem.response(x))
         free = {rv.name for rv in evaluator.model.free_RVs}
         truth = {k: value[0] for k, value in self._values_of_truth().items() if k in free}
         optimum = find_optimum(evaluator, Minimisation(starts=0, refine=False, start=truth))
-        calibrated = calibrate_epsilon(optimum)
-        epsilon = np.array([calibrated[node.name] for node in evaluator.nodes])
-        for node, value in zip(evaluator.nodes, epsilon, strict=True):
-            node.epsilon.set_value(value)
-        draws, ess = _pseudo_posterior(optimum, epsilon)
-        adjust = GivenEstimate if method.startswith("given") else Affine
-        adjusted = adjust(n_sets=_N_SETS)(evaluator, draws, [optimum.theta])
-        if adjusted.reason and not adjusted.reason.startswith(("Affine", "GivenEstimate")):
-            raise RuntimeError(f"not adjusted: {adjusted.reason}")
-        return self._row(evaluator, optimum.theta, adjusted.thetas, ess)
+        asked = Sampling(draws=1000, chains=4, optimum=optimum)
+        tree = draw_posterior(evaluator, asked)
+        draws = np.asarray(tree["calibration"]["theta"]).reshape(-1, evaluator.size)
+        return self._row(evaluator, optimum.theta, draws, len(draws))
 
     def _observing(self, method: str, outputs: Any) -> Any:
         import prbayes as prb
@@ -339,16 +327,22 @@ class Cell:
         return {"replicate": replicate, **found, "seconds": seconds}
 
 
-def _pseudo_posterior(optimum: Any, epsilon: Any) -> tuple[Any, float]:
-    """Return draws of exp(-d / epsilon) times the prior, and their effective number."""
-    evaluator, covariance = optimum.evaluator, optimum.covariance.copy()
-    # What is not identified has the prior's spread.
-    hidden = np.flatnonzero(np.isinf(np.diag(covariance)))
-    covariance[hidden] = covariance[:, hidden] = 0.0
-    covariance[hidden, hidden] = evaluator.prior_sd[hidden] ** 2
-    thetas, log_q = proposal(optimum.theta, _WIDER * covariance, _PROPOSED)
-    found = evaluator(thetas)
-    return weighted(found.log_prior + found.log_likelihood(epsilon) - log_q, thetas)
+def proposal(center: Any, covariance: Any, size: int = 1024) -> tuple[Any, Any]:
+    """Return Sobol points of a multivariate t with 5 degrees of freedom, and their log-density."""
+    d = len(center)
+    u = np.clip(qmc.Sobol(d + 1, rng=np.random.default_rng(0)).random(size), 1e-9, 1 - 1e-9)
+    z = norm.ppf(u[:, :d]) / np.sqrt(chi2.ppf(u[:, d:], 5) / 5)
+    root = np.linalg.cholesky(covariance)
+    log_density = -(5 + d) / 2 * np.log1p((z**2).sum(axis=1) / 5)
+    return center + z @ root.T, log_density
+
+
+def weighted(log_weights: Any, thetas: Any) -> tuple[Any, float]:
+    """Resample to equal weights, systematically; return draws and the effective sample size."""
+    w = np.exp(log_weights - log_weights.max())
+    w /= w.sum()
+    index = np.searchsorted(np.cumsum(w), (np.arange(4000) + 0.5) / 4000)
+    return thetas[np.minimum(index, len(w) - 1)], float(1 / (w**2).sum())
 
 
 def _short(values: Any) -> list[float]:

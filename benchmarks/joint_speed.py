@@ -84,7 +84,6 @@ def seconds(model: Any) -> tuple[float, float]:
         refine=False,
         random_seed=1,
         progressbar=False,
-        adjust=prb.posterior.Affine(),
     )
     return between - begun, time.process_time() - between
 

@@ -129,7 +129,6 @@ def calibrated(problem: Problem, data: dict[str, Any]) -> tuple[Any, pm.Model, A
         optimum=optimum,
         random_seed=1,
         progressbar=False,
-        adjust=prb.posterior.Affine(),
     )
     return posterior, model, x
 

@@ -103,7 +103,9 @@ def one(kind: str, metric: str, size: int) -> dict[str, float]:
     if what == "particles":
         clock = time.process_time()
         prb.set_epsilon(model, {"y": 0.1})
-        prb.sample_smc(size, chains=1, model=model, random_seed=1, progressbar=False, adjust=False)
+        prb.sample_smc(
+            size, chains=1, model=model, random_seed=1, progressbar=False, adjustment=None
+        )
         out |= {
             "sampling s": time.process_time() - clock,
             "MiB": peak(),

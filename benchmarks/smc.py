@@ -29,7 +29,7 @@ from benchmarks.processes import child
 N = 50
 LEVELS = (np.arange(N) + 0.5) / N
 PROBLEMS = ("linear", "quadratic")
-OWN = ("reweighted", "straight", "resimulated")  # settings of this package
+OWN = ("reweighted", "resimulated")  # settings of this package
 SYSTEMS = (*OWN, "pymc", "pyabc")
 DRAWS, CHAINS = 1000, 4
 # Before the clock starts; the package loads its names when the first is asked for, and the last
@@ -182,7 +182,7 @@ class Clock:
 
 
 def with_prbayes(problem: str, system: str) -> dict[str, Any]:
-    """Sample with this package, by default settings or the straight map.
+    """Sample with this package, by default settings.
 
     The model, the optimum and epsilon are set-up.
     """
@@ -200,12 +200,11 @@ def with_prbayes(problem: str, system: str) -> dict[str, Any]:
         )
     optimum = prb.minimize(model, starts=0)
     setup = clock()
-    tree = prb.sample_smc(
+    tree = prb.sample(
         DRAWS,
         chains=CHAINS,
         optimum=optimum,
         model=model,
-        adjust=prb.posterior.Affine() if system == "straight" else True,
         random_seed=1,
         progressbar=False,
     )

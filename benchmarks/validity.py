@@ -181,7 +181,6 @@ def pipeline(n0: int, n: int, replicates: int) -> dict[str, Any]:
             optimum=optimum,
             random_seed=i,
             progressbar=False,
-            adjust=prb.posterior.Affine(),
         )
         predicted = prb.predict(posterior, same, x, model=model, random_seed=i)
         best = prb.predict(optimum, same, x, random_seed=i)

@@ -32,7 +32,6 @@ __all__ = [  # noqa: F405
     "Simulator",
     "Surrogate",
     "abc_distance",
-    "adjust",
     "area_test",
     "bootstrap",
     "calibrate_epsilon",

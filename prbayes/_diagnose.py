@@ -113,8 +113,8 @@ def diagnose(result: xr.DataTree | Optimum, *, model: pm.Model | None = None) ->
     Looked at are: what is not identified; whether an optimiser converged; R-hat and effective
     sample size of draws, by ArviZ; how many of them differ; how far the particles of `sample_smc`
     moved in its last stage; whether the stored responses of `Reweighted` supported the answer; and,
-    of optima on stored responses and of adjusted draws, whether the data can have come from the
-    best population, by refits (p < .01). If they cannot, notes tell which of several outputs, and
+    of optima on stored responses, whether the data can have come from the best population, by
+    refits (p < .01). If they cannot, notes tell which of several outputs, and
     which correlations of two, disagree. No response is computed; what was not looked at is said.
 
     With the log-likelihood by specimen: a test of the family of the population of the inputs, with
@@ -404,7 +404,7 @@ def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
         *_warnings(posterior.attrs),
         *_texts(modes),
         *_convergence(variables, in_modes=bool(modes)),
-        *_copies(_before_adjustment(result, variables)),
+        *_copies(variables),
         *_motion(result),
         *failed,
         *_unsupported(designs),
@@ -413,8 +413,8 @@ def _of_draws(result: xr.DataTree, model: pm.Model | None) -> Diagnosis:
     lost = _lost_in(result) or _lost_by(designs)
     notes = (*_compared(result), *_left_out(lost), *harmless, *checked.notes)
     if not by_specimen:
-        refits = _of_refits(posterior.attrs, several=_has_several_outputs(result))
-        notes = (*notes, *_unadjusted(posterior.attrs), *refits)
+        refits = _not_looked_at("refits need an optimum; look at prb.diagnose of prb.minimize")
+        notes = (*notes, *_pseudo_posterior(posterior.attrs), *refits)
     findings = (*modes, *checked.findings)
     return Diagnosis(tuple(messages), designs.support, notes, findings, checked.untested)
 
@@ -430,43 +430,16 @@ def _columns(variables: xr.Dataset) -> dict[str, Floats]:
     return columns
 
 
-def _unadjusted(attrs: Mapping[Any, Any]) -> tuple[str, ...]:
-    """Say of draws that were not adjusted what their width is."""
-    # Those of a bootstrap are estimates of resampled specimens, and have no epsilon.
-    done = str(attrs.get("adjustment", "none"))
-    left = done == "none" or done.startswith("none: ")
-    if not left or "converged" in attrs:
+def _pseudo_posterior(attrs: Mapping[Any, Any]) -> tuple[str, ...]:
+    """Report that epsilon sets the width of the draws."""
+    # A bootstrap has no epsilon.
+    if str(attrs.get("adjustment", "none")) != "none" or "converged" in attrs:
         return ()
     return (
         "The draws are those of exp(-discrepancy / epsilon), as wide as epsilon makes them; "
-        "prb.adjust brings them to the width that the data warrant"
+        "prb.sample draws the posterior given the estimate"
         f"{more_in('choose.md#epsilon-and-the-width-of-the-posterior')}.",
     )
-
-
-def _has_several_outputs(result: xr.DataTree) -> bool:
-    """Return whether a simulator of a result has several outputs."""
-    if "observed_data" not in result:
-        return False
-    return any(values.ndim > 1 for values in result["observed_data"].data_vars.values())
-
-
-def _of_refits(attrs: Mapping[Any, Any], *, several: bool) -> tuple[str, ...]:
-    """Say why draws do not tell whether the data can have come from the best population.
-
-    Or which of several outputs disagree.
-    """
-    probability = attrs.get("fit_probability", np.nan)
-    if probability < UNLIKELY and several:
-        return ("Which outputs disagree is told by prb.diagnose of an optimum.",)
-    if np.isfinite(probability):
-        return ()
-    said = str(attrs.get("adjustment", ""))
-    done, _, reason = said.partition(": ")
-    why = "they told nothing here"
-    if done.startswith("none") or not done:
-        why = reason or "there was no adjustment"
-    return _not_looked_at(f"refits tell of it, and {why}; look at prb.diagnose of an optimum")
 
 
 def _warnings(attrs: Mapping[Any, Any]) -> list[str]:
@@ -538,13 +511,6 @@ def _by_element(statistic: str, posterior: xr.Dataset) -> dict[str, float]:
 def _listed(values: Mapping[str, float], form: str) -> str:
     each = [f"{value:{form}} for {name}" for name, value in values.items()]
     return ", ".join(each)
-
-
-def _before_adjustment(result: xr.DataTree, variables: xr.Dataset) -> xr.Dataset:
-    """Return the draws that a sampler made: an adjustment stretches those that are too narrow."""
-    if "unadjusted" not in result:
-        return variables
-    return result["unadjusted"].to_dataset()[list(variables.data_vars)]
 
 
 def _copies(draws: xr.Dataset) -> list[str]:

@@ -43,7 +43,6 @@ from prbayes.plots.posterior import plot_posterior as plot_posterior
 from prbayes.plots.responses import plot_responses as plot_responses
 from prbayes.plots.stages import plot_stages as plot_stages
 from prbayes.plots.validity import plot_validity as plot_validity
-from prbayes.posterior.adjusting import adjust as adjust
 from prbayes.posterior.bootstrapping import bootstrap as bootstrap
 from prbayes.posterior.epsilon import calibrate_epsilon as calibrate_epsilon
 from prbayes.posterior.sample import sample as sample

@@ -167,21 +167,41 @@ def sets_along(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) -
     ValueError
         As `simulated_sets`.
     """
+    points = points_along(evaluator, thetas, rng)
+    return sets_at(evaluator, stored_populations(evaluator, thetas), points)
+
+
+def stored_populations(evaluator: Evaluator, thetas: Floats) -> list[tuple[Floats, Floats]]:
+    """Return stored responses by simulator, (1, n), as `sets_at` takes them."""
+    populations = []
+    for k in range(len(evaluator.nodes)):
+        responses, _ = evaluator.populations(thetas[:1], k)
+        populations.append((responses, np.empty(0)))
+    return populations
+
+
+def points_along(
+    evaluator: Evaluator, thetas: Floats, rng: np.random.Generator
+) -> list[NDArray[np.intp]]:
+    """Draw the specimens of one data set at each theta: points by simulator, (n, specimens).
+
+    Raises
+    ------
+    ValueError
+        As `simulated_sets`.
+    """
     nodes = evaluator.nodes
     n_specimens = specimens(nodes)[1]
     size = (len(thetas), n_specimens)
-    populations = []
+    populations = stored_populations(evaluator, thetas)
     points: dict[int, NDArray[np.intp]] = {}
-    for k in range(len(nodes)):
-        responses, _ = evaluator.populations(thetas[:1], k)
-        populations.append((responses, np.empty(0)))
     for group in groups(nodes):
         _refuse_unlike([nodes[k] for k in group])
         finite = _observable_together(nodes, populations, group)
         uniform = rng.random(size)
         drawn = _drawn_along(evaluator, group[0], thetas, finite, uniform)
         points |= dict.fromkeys(group, drawn)
-    return sets_at(evaluator, populations, [points[k] for k in range(len(nodes))])
+    return [points[k] for k in range(len(nodes))]
 
 
 def _drawn_along(

@@ -28,20 +28,6 @@ UNLIKELY = 0.01
 BEYOND = 1e-4
 
 
-def fit_probability(sampling: SamplingDistribution, n_sets: int, seed: int) -> float:
-    """Return how probable a distance as the data's from their fit is; NaN where nothing tells.
-
-    Parameters
-    ----------
-    sampling : SamplingDistribution
-    n_sets : int
-        Data sets that are drawn and refitted.
-    seed : int
-    """
-    refitted = Refitted.of(sampling, n_sets, seed)
-    return np.nan if refitted is None else refitted.probability
-
-
 @dataclass(frozen=True, eq=False)
 class Refitted:
     """Data sets drawn from the model at the minimiser of the observed data, and their own."""

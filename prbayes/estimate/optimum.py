@@ -268,7 +268,7 @@ def require_sampling(optimum: Optimum, caller: str) -> Optimum:
     if lines:
         raise ValueError(
             f"{caller}: got an optimum around which nothing is known: {'; '.join(lines)}. "
-            "prb.sample_smc(epsilon=..., adjust=False) makes no use of it"
+            "prb.sample_smc(epsilon=..., adjustment=None) makes no use of it"
         )
     return optimum
 

@@ -6,6 +6,7 @@ A metric with ``additive`` has a gradient that is a mean over the observed speci
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from prbayes._checks import Floats
-from prbayes._weighted import finite_sample
+from prbayes._weighted import finite_sample, quantile
 from prbayes.metrics.base import Discrepancy, Part
 from prbayes.metrics.density import BandwidthRule, GaussianKDE, twice_silverman
 
@@ -27,16 +28,22 @@ class ScoreOptions:
     reach : float
         Default bandwidths of the data beyond their ends from which on the score of a log-density is
         constant. It would grow without bound there, and the tail of the population would decide on
-        the posterior.
+        the posterior. The extremes expected of all specimens of the model count as data.
     step : float
         Relative step of central differences.
     block : int
         Number of specimens that are evaluated at once.
+    nodes : int
+        Nodes of the tables of scores as functions of a response.
+    margin : float
+        Default bandwidths beyond all responses at the estimate where the tables end.
     """
 
     reach: float = 2.0
     step: float = 1e-4
     block: int = 128
+    nodes: int = 1024
+    margin: float = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +71,60 @@ class WeightSlopes:
         squares = self.slopes**2 / positive
         variances = squares.sum(axis=1)
         return np.asarray(np.sqrt(variances))
+
+    def neighbours(self, part: Part, options: ScoreOptions) -> tuple[list[Floats], list[Floats]]:
+        """Return features of a part at theta plus and minus a step, (d, ...) each."""
+        target = part.target
+        basis = target.stored(part.of(self.responses))
+        features = target.from_basis(self.weights[None], basis, np)
+        slopes = target.from_basis(self.slopes, basis, np)
+        column = self.steps(options)[:, None]
+        upper, lower = [], []
+        for feature, slope in zip(features, slopes, strict=True):
+            shift = column * slope
+            upper.append(feature + shift)
+            lower.append(feature - shift)
+        return upper, lower
+
+    def steps(self, options: ScoreOptions) -> Floats:
+        """Return the steps of the elements, (d,)."""
+        smallest = np.finfo(float).tiny
+        return np.asarray(options.step / np.maximum(self.spread, smallest))
+
+
+@dataclass(frozen=True, eq=False)
+class ShiftedResponses:
+    """Responses at theta plus and minus a step along each element, from common random numbers.
+
+    Attributes
+    ----------
+    responses : ndarray, shape (M,) or (M, m)
+        At theta itself.
+    upper, lower : ndarray, shape (d, M) or (d, M, m)
+    lengths : ndarray, shape (d,)
+        The steps.
+    """
+
+    responses: Floats
+    upper: Floats
+    lower: Floats
+    lengths: Floats
+
+    @property
+    def weights(self) -> Floats:
+        """Equal weights of the responses, (M,)."""
+        return np.full(len(self.responses), 1 / len(self.responses))
+
+    def neighbours(self, part: Part, options: ScoreOptions) -> tuple[list[Floats], list[Floats]]:
+        """Return features of a part at theta plus and minus a step, (d, ...) each."""
+        weights = np.full(self.upper.shape[:2], 1 / self.upper.shape[1])
+        upper = part.target.features(part.of(self.upper), weights, np)
+        lower = part.target.features(part.of(self.lower), weights, np)
+        return list(upper), list(lower)
+
+    def steps(self, options: ScoreOptions) -> Floats:
+        """Return the steps of the elements, (d,)."""
+        return self.lengths
 
 
 def prepared_on_population(target: Discrepancy, responses: Floats, weights: Floats) -> Discrepancy:
@@ -108,9 +169,10 @@ def _bandwidth_of_fewer(sample: Floats, weights: Floats, rule: BandwidthRule, si
 
 def specimen_scores(
     target: Discrepancy,
-    population: WeightSlopes,
+    population: WeightSlopes | ShiftedResponses,
     specimens: Floats,
     options: ScoreOptions = ScoreOptions(),
+    total: int = 0,
 ) -> Floats:
     """Return the score of each specimen, (n, d).
 
@@ -121,44 +183,86 @@ def specimen_scores(
     ----------
     target : Discrepancy
         With ``additive``.
-    population : WeightSlopes
+    population : WeightSlopes or ShiftedResponses
     specimens : ndarray, shape (n,) or (n, m)
     options : ScoreOptions
+    total : int
+        Number of observed specimens of all simulators.
     """
     if not target.additive:
         raise TypeError(
             f"metric: got {type(target.metric).__name__}, whose gradient is no mean over specimens "
             "of complete records, expected prb.ProbabilityResidual() or prb.KullbackLeibler()"
         )
-    n = len(specimens)
-    d = len(population.slopes)
-    scores = np.zeros((n, d))
+    scores: Any = 0.0
     for part in target.parts:
-        terms = _part_scores(part, population, specimens, options)
-        scores += part.share * terms
-    return scores
+        terms = _part_scores(part, population, part.of(specimens), options, total)
+        scores = scores + part.share * terms
+    return np.asarray(scores)
+
+
+def tabulated_scores(
+    target: Discrepancy,
+    population: ShiftedResponses,
+    specimens: Floats,
+    options: ScoreOptions = ScoreOptions(),
+    total: int = 0,
+) -> Callable[[Floats], Floats]:
+    """Return a function of responses, (..., n) or (..., n, m) -> (..., n, d), by interpolation.
+
+    A score is a smooth function of the one number that a part compares.
+
+    Parameters
+    ----------
+    target : Discrepancy
+        With ``additive``.
+    population : ShiftedResponses
+    specimens : ndarray, shape (n,) or (n, m)
+        Observed responses.
+    options : ScoreOptions
+    total : int
+        Number of observed specimens of all simulators.
+    """
+    from scipy.interpolate import CubicSpline
+
+    tables = []
+    for part in target.parts:
+        known = [np.ravel(part.of(x)) for x in (specimens, population.responses)]
+        values = np.concatenate(known)
+        values = values[np.isfinite(values)]
+        inner = part.target
+        observed, weights = finite_sample(inner.observed, inner.weights)
+        margin = options.margin * twice_silverman(observed, weights)
+        nodes = np.linspace(values.min() - margin, values.max() + margin, options.nodes)
+        scores = part.share * _part_scores(part, population, nodes, options, total)
+        failed = part.share * _part_scores(part, population, np.array([np.inf]), options, total)
+        tables.append((part, CubicSpline(nodes, scores), failed[0]))
+
+    def function(responses: Floats) -> Floats:
+        total: Any = 0.0
+        for part, spline, failed in tables:
+            values = np.asarray(part.of(responses))
+            first, last = spline.x[[0, -1]]
+            inside = np.clip(np.nan_to_num(values), first, last)
+            terms = spline(inside)
+            terms[np.isposinf(values)] = failed
+            total = total + terms
+        return np.asarray(total)
+
+    return function
 
 
 def _part_scores(
-    part: Part, population: WeightSlopes, specimens: Floats, options: ScoreOptions
+    part: Part,
+    population: WeightSlopes | ShiftedResponses,
+    compared: Floats,
+    options: ScoreOptions,
+    total: int,
 ) -> Floats:
-    """Return the scores of specimens in one part of a metric, (n, d)."""
+    """Return the scores, (n, d), of values that a part compares, (n,)."""
     target = part.target
-    responses = part.of(population.responses)
-    basis = target.stored(responses)
-    weights = population.weights[None]
-    features = target.from_basis(weights, basis, np)
-    slopes = target.from_basis(population.slopes, basis, np)
-    smallest = np.finfo(float).tiny
-    spread = np.maximum(population.spread, smallest)
-    steps = options.step / spread
-    column = steps[:, None]
-    upper, lower = [], []
-    for feature, slope in zip(features, slopes, strict=True):
-        shift = column * slope
-        upper.append(feature + shift)
-        lower.append(feature - shift)
-    values = _within_reach(part, specimens, options)
+    upper, lower = population.neighbours(part, options)
+    values = _within_reach(part, population, compared, options, total)
     blocks = []
     for first in range(0, len(values), options.block):
         block = values[first : first + options.block]
@@ -168,19 +272,29 @@ def _part_scores(
         down = single.outer(*lower, xp=np)
         blocks.append(up - down)
     differences = np.concatenate(blocks)
-    return np.asarray(differences / (2 * steps))
+    return np.asarray(differences / (2 * population.steps(options)))
 
 
-def _within_reach(part: Part, specimens: Floats, options: ScoreOptions) -> Floats:
-    """Return what a part compares of specimens, held within reach of the data, (n,)."""
-    values = np.asarray(part.of(specimens))
+def _within_reach(
+    part: Part,
+    population: WeightSlopes | ShiftedResponses,
+    values: Floats,
+    options: ScoreOptions,
+    total: int,
+) -> Floats:
+    """Return values of a log-density's part limited to the reach of the data, (n,)."""
     target = part.target
     if not target.metric.likelihood:
         return values
     observed, weights = finite_sample(target.observed, target.weights)
+    lower, upper = observed.min(), observed.max()
+    if total > len(target.observed):
+        simulated = np.asarray(part.of(population.responses))
+        is_known = np.isfinite(simulated)
+        level = 1 / (total + 1)
+        low, high = quantile(simulated[is_known], population.weights[is_known], [level, 1 - level])
+        lower, upper = min(lower, low), max(upper, high)
     margin = options.reach * twice_silverman(observed, weights)
-    lower = observed.min() - margin
-    upper = observed.max() + margin
-    clipped = np.clip(values, lower, upper)
+    clipped = np.clip(values, lower - margin, upper + margin)
     is_finite = np.isfinite(values)
     return np.where(is_finite, clipped, values)

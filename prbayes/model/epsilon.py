@@ -111,5 +111,5 @@ def set_epsilon(model: pm.Model, epsilon: dict[str, float]) -> None:
             simulator.epsilon.set_value(np.asarray(values[simulator.name]))
     _log.info(
         "draws of exp(-discrepancy / epsilon), as those of pymc.sample, are as wide as epsilon "
-        "makes them; prb.adjust brings them to the width that the data warrant"
+        "makes them; prb.sample draws the posterior given the estimate"
     )

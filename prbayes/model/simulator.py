@@ -748,7 +748,7 @@ def _warn_of_shared_specimens(simulator: AnySimulator, others: list[AnySimulator
                 "%s and %s share specimens, and each epsilon counts them: under pm.sample they "
                 "count twice, and the posterior comes out too narrow; call "
                 "prb.set_epsilon(model, prb.calibrate_epsilon(prb.minimize(model))) before, or use "
-                "prb.sample_smc, whose adjustment knows of it",
+                "prb.sample, whose posterior counts them once",
                 other.name,
                 simulator.name,
             )

@@ -13,6 +13,7 @@ from prbayes._checks import Floats
 from prbayes._progress import CONSOLE, lines, live, shown
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.checkpoint import Checkpoint
+from prbayes.posterior.importance import LogDensity
 from prbayes.posterior.smc_kernel import BatchedKernel
 from prbayes.response.budget import BudgetError
 
@@ -29,7 +30,7 @@ class Chain(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Particles:
-    """Draws of the pseudo-posterior."""
+    """Draws of SMC."""
 
     thetas: Floats  # (chains, draws, d)
     discrepancies: Floats  # (chains, draws, k)
@@ -66,8 +67,20 @@ class Chains:
         self.starts = starts
         self.refined: list[Floats] = []
 
-    def __call__(self, seeds: list[np.random.SeedSequence], progressbar: bool) -> Particles:
+    def __call__(
+        self,
+        seeds: list[np.random.SeedSequence],
+        progressbar: bool,
+        log_likelihood: LogDensity | None = None,
+    ) -> Particles:
         """Run one chain for each seed, or as many as a budget allows.
+
+        Parameters
+        ----------
+        seeds : list of SeedSequence
+        progressbar : bool
+        log_likelihood : callable, optional
+            As for `BatchedKernel`.
 
         Raises
         ------
@@ -81,7 +94,7 @@ class Chains:
             TextColumn("acceptance {task.fields[rate]:.2f}"),
             TimeElapsedColumn(),
         )
-        coarser = self.evaluator.coarser()
+        coarser = self.evaluator.coarser() if log_likelihood is None else None
         done: list[Chain] = []
         stats: list[Stages] = []
         stopped = ""
@@ -98,7 +111,7 @@ class Chains:
                     stats.append(self._saved["stats"][chain])
                     continue
                 try:
-                    kernel, stages = self._begun(chain, seed, coarser)
+                    kernel, stages = self._begun(chain, seed, coarser, log_likelihood)
                     for _ in self._stages(kernel, stages):
                         self._save(done, [*stats, stages], kernel)
                         progress.update(task, completed=kernel.beta, rate=kernel.accept_rate)
@@ -167,7 +180,11 @@ class Chains:
         return Chain(**self._arrays(f"chain{chain}_"))
 
     def _begun(
-        self, chain: int, seed: np.random.SeedSequence, coarser: Evaluator | None
+        self,
+        chain: int,
+        seed: np.random.SeedSequence,
+        coarser: Evaluator | None,
+        log_likelihood: LogDensity | None,
     ) -> tuple[BatchedKernel, Stages]:
         """Return a kernel at the stage its chain had reached, and the statistics until then.
 
@@ -185,6 +202,7 @@ class Chains:
             model=evaluator.model,
             threshold=self.threshold,
             evaluator=coarser if roughly and coarser is not None else evaluator,
+            log_likelihood=log_likelihood,
         )
         kernel.roughly = roughly
         if not goes_on:

@@ -7,22 +7,26 @@ refit and no synthetic data set.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from prbayes._checks import IN_CACHE, Floats
 from prbayes._threads import one_thread
-from prbayes.estimate.data_sets import aligned, groups, observable, specimens
+from prbayes.estimate.data_sets import SETS, aligned, groups, observable, specimens
 from prbayes.estimate.optimum import Optimum
+from prbayes.estimate.refinement import noise_floors
 from prbayes.metrics.score import (
     ScoreOptions,
+    ShiftedResponses,
     WeightSlopes,
     prepared_on_population,
     specimen_scores,
+    tabulated_scores,
 )
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.saddlepoint import (
@@ -45,12 +49,14 @@ class EstimateLikelihoodOptions:
     rounds : int
         Times that metrics are minimised again, with whitening and bandwidth of the population at
         the estimate before. With zero they are those of the observed data.
-    several_outputs : bool
-        Whether only metrics of several outputs are, or those of one as well.
+    few_specimens : int
+        Number of specimens below which metrics of one output are minimised again as well.
     step : float
         Step of differences of log weights, in standard deviations of the prior.
     wide_step : float
         The same if the support of an input moves.
+    resimulated_step : float
+        Step of differences of responses that are computed at each theta, in the same unit.
     effective_responses : float
         Smallest effective number of stored responses at the point of the score. An estimate at an
         edge is moved inside until it is reached.
@@ -65,9 +71,10 @@ class EstimateLikelihoodOptions:
     score: ScoreOptions = field(default_factory=ScoreOptions)
     saddlepoint: SaddlepointOptions = field(default_factory=SaddlepointOptions)
     rounds: int = 2
-    several_outputs: bool = True
+    few_specimens: int = 10
     step: float = 1e-5
     wide_step: float = 0.05
+    resimulated_step: float = 1e-3
     effective_responses: float = 50.0
     distance: float = 3.0
     smallest_spread: float = 1e-4
@@ -75,21 +82,15 @@ class EstimateLikelihoodOptions:
 
 @dataclass(frozen=True, eq=False)
 class EstimateLikelihood:
-    """The likelihood given the estimate, for `importance_sample` and `laplace`.
+    """The likelihood given the estimate.
 
     Attributes
     ----------
     evaluator : Evaluator
     point : ndarray, shape (d,)
         Where the score is taken: the estimate, or a point inside if it is at an edge.
-    simulators : tuple of int
-        The first simulator of each set of simulators that share specimens.
-    observable : tuple of ndarray of bool, shapes (M_j,)
-        Stored responses that could be observed.
-    scores : tuple of Scores
-        Of these.
-    combinations : ndarray, shape (d, r)
-        Combinations of the scores that vary.
+    groups : tuple of StoredScores and ResimulatedScores
+        One of each set of simulators that share specimens.
     scale : ndarray, shape (d,)
         Unit of each element for `laplace`: a standard deviation of the prior, or a hundred standard
         errors of the element alone if these are less.
@@ -98,48 +99,103 @@ class EstimateLikelihood:
 
     evaluator: Evaluator
     point: Floats
-    simulators: tuple[int, ...]
-    observable: tuple[NDArray[np.bool_], ...]
-    scores: tuple[Scores, ...]
-    combinations: Floats
+    groups: tuple[StoredScores | ResimulatedScores, ...]
     scale: Floats
     options: SaddlepointOptions
 
     @one_thread()
     def log_likelihood(self, thetas: Floats) -> Floats:
         """Return the log-density of the score at the estimate, (S, d) -> (S,)."""
-        if self.combinations.shape[1] == 0:
+        if self.groups[0].combinations.shape[1] == 0:
             return np.zeros(len(thetas))
-        largest = max(len(score.values) for score in self.scores)
-        # Weights of a block of populations stay in the cache of the processor.
-        rows = max(16, IN_CACHE // largest)
+        rows = min(group.rows for group in self.groups)
         blocks = []
         for first in range(0, len(thetas), rows):
-            block = self._block(thetas[first : first + rows])
-            blocks.append(block)
+            block = thetas[first : first + rows]
+            pairs = [group.population(self.evaluator, block) for group in self.groups]
+            log_weights, scores = zip(*pairs, strict=True)
+            blocks.append(log_density(log_weights, scores, self.options))
         return np.concatenate(blocks)
 
-    def _block(self, thetas: Floats) -> Floats:
-        log_weights = []
-        for k, known in zip(self.simulators, self.observable, strict=True):
-            _, weights = self.evaluator.populations(thetas, k)
-            logs = _log_normalised(weights[:, known])
-            log_weights.append(logs)
-        return log_density(log_weights, self.scores, self.options)
 
-    def log_posterior(self, thetas: Floats) -> Floats:
-        """Return the unnormalised log-posterior density in unconstrained space, (S, d) -> (S,)."""
-        thetas = np.ascontiguousarray(thetas)
-        evaluator = self.evaluator
-        logs = evaluator.hyperparameters.log_prior(thetas)
-        logs = logs + evaluator.log_other(thetas)
-        is_possible = np.isfinite(logs)
-        if not is_possible.any():
-            return np.full(len(thetas), -np.inf)
-        log_likelihood = self.log_likelihood(thetas[is_possible])
-        result = np.full(len(thetas), -np.inf)
-        result[is_possible] = logs[is_possible] + log_likelihood
-        return result
+@dataclass(frozen=True, eq=False)
+class StoredScores:
+    """Scores of the stored responses of simulators that share specimens.
+
+    Attributes
+    ----------
+    simulator : int
+        The first of them.
+    is_observable : ndarray of bool, shape (M,)
+        Stored responses that could be observed by all.
+    scores : Scores
+        Of these.
+    combinations : ndarray, shape (d, r)
+        Combinations of the scores that vary.
+    """
+
+    simulator: int
+    is_observable: NDArray[np.bool_]
+    scores: Scores
+    combinations: Floats
+
+    @property
+    def rows(self) -> int:
+        """Populations whose weights stay in the cache of the processor."""
+        return max(16, IN_CACHE // len(self.scores.values))
+
+    def population(self, evaluator: Evaluator, thetas: Floats) -> tuple[Floats, Scores]:
+        """Return log weights of populations, (S, M'), and the scores of their responses."""
+        _, weights = evaluator.populations(thetas, self.simulator)
+        return _log_normalised(weights[:, self.is_observable]), self.scores
+
+    def combined(self, combinations: Floats) -> StoredScores:
+        """Return combinations of the scores, (d, r)."""
+        scores = Scores(self.scores.values @ combinations, self.scores.size)
+        return replace(self, scores=scores, combinations=combinations)
+
+
+@dataclass(frozen=True, eq=False)
+class ResimulatedScores:
+    """Scores of responses that are computed at each theta, of simulators that share specimens.
+
+    Attributes
+    ----------
+    simulators : tuple of int
+    tables : tuple of callable
+        Responses to scores, by simulator.
+    mean : ndarray, shape (d,)
+        Of the observed specimens' scores.
+    size : int
+        Number of observed specimens.
+    combinations : ndarray, shape (d, r)
+    """
+
+    simulators: tuple[int, ...]
+    tables: tuple[Callable[[Floats], Floats], ...]
+    mean: Floats
+    size: int
+    combinations: Floats
+    rows: ClassVar[int] = 1
+
+    def population(self, evaluator: Evaluator, thetas: Floats) -> tuple[Floats, Scores]:
+        """Return log weights of one population, (1, M'), and the scores of its responses."""
+        values: Any = -self.mean
+        is_observable: Any = True
+        for k, table in zip(self.simulators, self.tables, strict=True):
+            responses, _ = evaluator.populations(thetas, k)
+            values = values + table(responses[0])
+            is_observable &= observable(responses[0], evaluator.nodes[k].target)
+        count = int(is_observable.sum())
+        log_weights = np.full((1, count), -np.log(max(count, 1)))
+        if not count:
+            log_weights, values = np.full((1, 1), -np.inf), np.zeros((1, len(self.mean)))
+            is_observable = slice(None)
+        return log_weights, Scores(values[is_observable] @ self.combinations, self.size)
+
+    def combined(self, combinations: Floats) -> ResimulatedScores:
+        """Return combinations of the scores, (d, r)."""
+        return replace(self, combinations=combinations)
 
 
 def _log_normalised(weights: Floats) -> Floats:
@@ -157,75 +213,99 @@ def estimate_likelihood(
 ) -> EstimateLikelihood:
     """Return the likelihood of the hyperparameters given the minimiser of their metrics.
 
+    Responses are stored, or computed at each theta from common random numbers.
+
     Simulators that share specimens add the scores of a specimen. Independent simulators add their
     cumulant functions.
 
     Parameters
     ----------
     evaluator : Evaluator
-        Of a model whose simulators have stored responses and metrics with ``additive``.
+        Of a model whose simulators have metrics with ``additive``.
     optimum : Optimum
     options : EstimateLikelihoodOptions
 
     Raises
     ------
-    TypeError
-        If responses are not stored, or a metric's gradient is no mean over specimens.
     ValueError
-        If observed specimens have unequal weights, or are shared in part.
+        If the gradient of the objective is no mean over specimens (`score_obstacle`).
     """
-    _require_stored(evaluator)
+    obstacle = score_obstacle(evaluator)
+    if obstacle is not None:
+        raise ValueError(f"metric: {obstacle}; expected a refit_likelihood")
     order = [optimum.names.index(name) for name in evaluator.names]
     point = move_inside(evaluator, optimum.theta[order], options)
-    for _ in range(options.rounds):
-        evaluator, point = _minimised_on_population(evaluator, point, optimum, options)
+    scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
+    if _needs_population(evaluator, options):
+        for _ in range(options.rounds):
+            evaluator, scales, point = _minimised_on_population(evaluator, point, options)
     evaluator = _coarse_where_sufficient(evaluator, point)
     parts = [
-        _group_scores(evaluator, members, point, optimum, options)
+        _group_scores(evaluator, members, point, scales, options)
         for members in groups(evaluator.nodes)
     ]
-    log_weights = [part.log_weights for part in parts]
-    centered = [part.centered for part in parts]
-    untilted = cumulants(log_weights, centered, np.zeros((1, len(point))))
-    size = sum(score.size for score in centered)
-    covariance = untilted.hessians[0] / size
-    combinations = varying_combinations(covariance, options.saddlepoint)
-    scores = [Scores(score.values @ combinations, score.size) for score in centered]
-    # With a prior far wider than the population a step in its unit would miss all data.
-    precision = _likelihood_spread(evaluator, point, options) * np.sqrt(size)
-    units = 100 / np.maximum(precision, 100)
+    pairs = [part.population(evaluator, point[None]) for part in parts]
+    log_weights, scores = zip(*pairs, strict=True)
+    untilted = cumulants(log_weights, scores, np.zeros((1, len(point))))
+    size = sum(score.size for score in scores)
+    combinations = varying_combinations(untilted.hessians[0] / size, options.saddlepoint)
     return EstimateLikelihood(
         evaluator=evaluator,
         point=point,
-        simulators=tuple(part.simulator for part in parts),
-        observable=tuple(part.observable for part in parts),
-        scores=tuple(scores),
-        combinations=combinations,
-        scale=units * evaluator.prior_sd,
+        groups=tuple(part.combined(combinations) for part in parts),
+        scale=_unit(evaluator, point, optimum, options),
         options=options.saddlepoint,
     )
 
 
-def _minimised_on_population(
+def _unit(
     evaluator: Evaluator, point: Floats, optimum: Optimum, options: EstimateLikelihoodOptions
-) -> tuple[Evaluator, Floats]:
-    """Return metrics of several outputs with the whitening of the population, and their minimiser.
+) -> Floats:
+    """Return a hundred standard errors of each element, or the prior's spread if that is less.
 
-    Metrics of one output are not whitened: without others all is as it was. A minimiser that stored
-    responses do not support is not taken.
+    With a prior far wider than the population a step in its unit would miss all data.
+    """
+    if all(node.bound.stored for node in evaluator.nodes):
+        size = sum(len(node.observed) for node in evaluator.nodes)
+        precision = _likelihood_spread(evaluator, point, options) * np.sqrt(size)
+        units = 100 / np.maximum(precision, 100)
+        return np.asarray(units * evaluator.prior_sd)
+    order = [optimum.names.index(name) for name in evaluator.names]
+    errors = np.sqrt(np.diag(optimum.covariance))[order]
+    return np.asarray(np.minimum(100 * errors, evaluator.prior_sd))
+
+
+def _needs_population(evaluator: Evaluator, options: EstimateLikelihoodOptions) -> bool:
+    """Return whether whitening or bandwidths by the observed data would bias the estimate.
+
+    Simulators of few specimens that happen to scatter little would have a small bandwidth and a
+    large weight in the sum of all.
+    """
+    nodes = evaluator.nodes
+    has_several_outputs = any(node.target.event for node in nodes)
+    fewest = min(len(node.observed) for node in nodes)
+    return has_several_outputs or len(nodes) > 1 or fewest < options.few_specimens
+
+
+def _minimised_on_population(
+    evaluator: Evaluator, point: Floats, options: EstimateLikelihoodOptions
+) -> tuple[Evaluator, Floats, Floats]:
+    """Return metrics with the whitening and bandwidths of the population, and their minimiser.
+
+    With them come the scales of the simulators, (k,). A minimiser that stored responses do not
+    support is not taken.
     """
     from scipy.optimize import minimize
 
-    targets = [node.target for node in evaluator.nodes]
-    is_chosen = [bool(target.event) or not options.several_outputs for target in targets]
-    if not any(is_chosen):
-        return evaluator, point
-    for k, target in enumerate(targets):
+    targets = []
+    for k, node in enumerate(evaluator.nodes):
         responses, weights = evaluator.populations(point[None], k)
-        if is_chosen[k]:
-            targets[k] = prepared_on_population(target, responses[0], weights[0])
+        targets.append(prepared_on_population(node.target, responses[0], weights[0]))
     prepared = evaluator.with_targets(targets)
-    scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
+    scales = prepared.epsilon
+    unset = np.isnan(scales)
+    if unset.any():
+        scales = np.where(unset, noise_floors(prepared, point, SETS), scales)
     unit = evaluator.prior_sd
 
     def objective(shift: Floats) -> tuple[float, Floats]:
@@ -240,67 +320,72 @@ def _minimised_on_population(
     minimum = minimize(objective, np.zeros(len(point)), jac=True, method="BFGS")
     minimiser = move_inside(prepared, point + minimum.x * unit, options)
     sizes = [design["weight_ess"] for design in prepared.support(minimiser[None]).values()]
-    is_supported = np.min(sizes) >= options.effective_responses
-    return prepared, minimiser if is_supported else point
-
-
-@dataclass(frozen=True, eq=False)
-class _GroupScores:
-    """Scores of simulators that share specimens."""
-
-    simulator: int  # the first of them
-    observable: NDArray[np.bool_]  # (M,): stored responses that could be observed by all
-    log_weights: Floats  # (1, M'): of these, at the point of the score
-    stored: Floats  # (M', d)
-    observed: Floats  # (N, d)
-
-    @property
-    def centered(self) -> Scores:
-        """The scores of stored responses, less the mean over the observed specimens."""
-        mean = self.observed.mean(axis=0)
-        return Scores(self.stored - mean, len(self.observed))
+    is_supported = np.min(sizes, initial=np.inf) >= options.effective_responses
+    return prepared, scales, minimiser if is_supported else point
 
 
 def _group_scores(
     evaluator: Evaluator,
     members: Sequence[int],
     point: Floats,
-    optimum: Optimum,
+    scales: Floats,
     options: EstimateLikelihoodOptions,
-) -> _GroupScores:
+) -> StoredScores | ResimulatedScores:
     """Return the scores of specimens in the sum of their simulators' discrepancies."""
-    _require_same_specimens(evaluator, members)
-    numbers, _ = specimens(evaluator.nodes)
+    numbers, total = specimens(evaluator.nodes)
     nodes = [evaluator.nodes[k] for k in members]
-    populations = [_weight_slopes(evaluator, k, point, options) for k in members]
-    mask = np.ones(len(populations[0].weights), dtype=bool)
+    n = len(nodes[0].observed)
+    observed = np.zeros((n, len(point)))
+    functions = []
+    populations = []
+    for k, node in zip(members, nodes, strict=True):
+        # The gradient of the objective is a sum over specimens of these, by units of the prior.
+        factor = evaluator.prior_sd / (n * scales[k])
+        population: WeightSlopes | ShiftedResponses
+        if node.bound.stored:
+            population = _weight_slopes(evaluator, k, point, options)
+        else:
+            population = _shifted_responses(evaluator, k, point, options)
+        populations.append(population)
+        score = partial(
+            specimen_scores, node.target, population, options=options.score, total=total
+        )
+        observed += factor * score(node.observed[np.argsort(numbers[k])])
+        functions.append((factor, score))
+    mean = observed.mean(axis=0)
+    identity = np.eye(len(point))
+    if not all(node.bound.stored for node in nodes):
+        tables = []
+        for (factor, _), node, population in zip(functions, nodes, populations, strict=True):
+            assert isinstance(population, ShiftedResponses)
+            table = tabulated_scores(node.target, population, node.observed, options.score, total)
+            tables.append(partial(_scaled, table, factor))
+        return ResimulatedScores(tuple(members), tuple(tables), mean, n, identity)
+    mask = np.ones(len(populations[0].responses), dtype=bool)
     for node, population in zip(nodes, populations, strict=True):
         mask &= observable(population.responses, node.target)
-    n = len(nodes[0].observed)
-    d = len(point)
-    stored = np.zeros((mask.sum(), d))
-    observed = np.zeros((n, d))
-    for k, node, population in zip(members, nodes, populations, strict=True):
-        # The gradient of the objective is a sum over specimens of these, by units of the prior.
-        scale = n * optimum.scales[node.name]
-        factor = evaluator.prior_sd / scale
-        score = partial(
-            specimen_scores,
-            node.target,
-            population,
-            options=options.score,
-        )
-        order = np.argsort(numbers[k])
-        stored += factor * score(population.responses[mask])
-        observed += factor * score(node.observed[order])
-    weights = populations[0].weights[mask]
-    return _GroupScores(
-        simulator=members[0],
-        observable=mask,
-        log_weights=_log_normalised(weights[None]),
-        stored=stored,
-        observed=observed,
+    stored = -mean + sum(
+        factor * score(population.responses[mask])
+        for (factor, score), population in zip(functions, populations, strict=True)
     )
+    return StoredScores(members[0], mask, Scores(stored, n), identity)
+
+
+def _scaled(table: Callable[[Floats], Floats], factor: Floats, responses: Floats) -> Floats:
+    """Return scores in units of the objective."""
+    return factor * table(responses)
+
+
+def _shifted_responses(
+    evaluator: Evaluator, k: int, theta: Floats, options: EstimateLikelihoodOptions
+) -> ShiftedResponses:
+    """Return the k-th simulator's responses at theta and a step away along each element."""
+    steps = options.resimulated_step * evaluator.prior_sd
+    axes = np.diag(steps)
+    thetas = np.vstack([theta, theta + axes, theta - axes])
+    responses, _ = evaluator.populations(thetas, k)
+    center, upper, lower = np.split(responses, [1, 1 + len(theta)])
+    return ShiftedResponses(center[0], upper, lower, steps)
 
 
 def _weight_slopes(
@@ -333,6 +418,8 @@ def move_inside(evaluator: Evaluator, theta: Floats, options: EstimateLikelihood
     at a point inside is as good a statistic. Elements at an edge are moved towards the middle of
     their prior.
     """
+    if not all(node.bound.stored for node in evaluator.nodes):
+        return theta
     middle = np.median(evaluator.prior_points(256, 0), axis=0)
     way = middle - theta
     is_far = np.abs(way) > options.distance * evaluator.prior_sd
@@ -375,36 +462,24 @@ def _coarse_where_sufficient(evaluator: Evaluator, point: Floats) -> Evaluator:
     return coarse if all(is_sufficient) else evaluator
 
 
-def _require_stored(evaluator: Evaluator) -> None:
-    """Raise if responses are not stored, or observed specimens have unequal weights."""
-    if not evaluator.nodes:
-        raise TypeError("model: got no simulator with a metric, expected one")
+def score_obstacle(evaluator: Evaluator) -> str | None:
+    """Return why the gradient of the objective is no mean over specimens, or None.
+
+    Examples are the area metric, observed responses of unequal weights or with gaps, and
+    simulators that share specimens in part.
+    """
     for node in evaluator.nodes:
-        if not node.bound.stored:
-            raise TypeError(
-                f"{node.name}: propagation: got {type(node.propagation).__name__}, expected "
-                "prb.Reweighted(), whose stored responses serve all hyperparameters"
-            )
+        if not node.target.additive:
+            metric = type(node.metric).__name__
+            return f"{node.name} has a {metric}, whose gradient is no mean over specimens"
         if np.ptp(node.target.weights) > 1e-12:
-            raise ValueError(
-                f"{node.name}: got observed responses of unequal weights, expected equal ones"
-            )
-
-
-def _require_same_specimens(evaluator: Evaluator, members: Sequence[int]) -> None:
-    """Raise unless simulators have the same specimens, each measured once in each."""
+            return f"{node.name} has observed responses of unequal weights"
     numbers, _ = specimens(evaluator.nodes)
-    nodes = [evaluator.nodes[k] for k in members]
-    names = ", ".join(node.name for node in nodes)
-    expected = np.unique(numbers[members[0]])
-    is_same = [np.array_equal(np.sort(numbers[k]), expected) for k in members]
-    if not all(is_same):
-        raise ValueError(
-            f"specimens: got some that {names} share in part or measure twice, expected each "
-            "specimen once in every simulator that shares it"
-        )
-    if not aligned(nodes):
-        raise ValueError(
-            f"specimens: got the same labels in {names} with different inputs or designs, expected "
-            "the same .dist() objects, n and seed in all"
-        )
+    for members in groups(evaluator.nodes):
+        expected = np.unique(numbers[members[0]])
+        is_same = [np.array_equal(np.sort(numbers[k]), expected) for k in members]
+        nodes = [evaluator.nodes[k] for k in members]
+        if not all(is_same) or not aligned(nodes):
+            names = ", ".join(node.name for node in nodes)
+            return f"{names} share specimens in part, or have other inputs or designs"
+    return None

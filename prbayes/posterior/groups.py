@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from prbayes._checks import AT_ONCE, Floats
-from prbayes.model.evaluator import Evaluation, Evaluator
+from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import (
     arviz_attributes,
     labelled,
@@ -19,50 +19,32 @@ from prbayes.model.labels import (
 from prbayes.response.outputs import lacking
 
 # The names that ArviZ's functions which want a number for each observation show when they refuse.
-_LIKELIHOOD = ("one_number_for_all_specimens", "adjustment_of_it")
+_LIKELIHOOD = ("one_number_for_all_specimens", "other_terms")
 _NOTE = (
-    "The log-density of all specimens together, and what the adjustment of the draws adds to it: "
-    "one number for each draw, for power-scaling (psense), of one place for specimens. loo, "
-    "compare and khat want one for each observation and have no meaning here; use "
-    "prb.cross_validate."
+    "The log-density of all specimens together, and that of the model's other terms: one number "
+    "for each draw, for power-scaling (psense), of one place for specimens. loo, compare and khat "
+    "want one for each observation and have no meaning here; use prb.cross_validate."
 )
-# Draws farther than this share of a standard deviation from where an affine map would have them
-# were mapped by another one; rounding is far below.
-_OFF_THE_MAP = 1e-6
-# Share of draws that may be: the adjustment draws those in that are far out.
-_FAR_OUT_DRAWS = 0.02
 
 
 def arviz_groups(
-    evaluator: Evaluator,
-    particles: Floats,
-    discrepancies: Floats,
-    thetas: Floats,
-    known: Floats | None,
-    seed: int | None,
+    evaluator: Evaluator, thetas: Floats, log_likelihood: Floats, seed: int | None
 ) -> dict[str, xr.Dataset]:
     """Return groups that cost no response.
 
     Parameters
     ----------
     evaluator : Evaluator
-        With the epsilons of the draws.
-    particles : ndarray, shape (chains, draws, d)
-        Draws before an adjustment.
-    discrepancies : ndarray, shape (chains, draws, k)
-        Those of them.
     thetas : ndarray, shape (chains, draws, d)
-        Draws after it, or the same.
-    known : ndarray, shape (chains, draws), or None
-        Their log-likelihood, where the adjustment knows it.
+    log_likelihood : ndarray, shape (chains, draws)
+        Of the draws, up to a constant.
     seed : int or None
 
     Returns
     -------
     dict
-        ``prior``, ``log_prior`` and ``log_likelihood``, the last where the density of adjusted
-        draws is known; ``posterior_predictive`` and ``prior_predictive`` of the simulators whose
-        responses are stored.
+        ``prior``, ``log_prior`` and ``log_likelihood``; ``posterior_predictive`` and
+        ``prior_predictive`` of the simulators whose responses are stored.
     """
     draws = thetas.shape[1]
     rng = np.random.default_rng(seed)
@@ -71,10 +53,8 @@ def arviz_groups(
     groups = {
         "prior": _variables(evaluator, prior[None]),
         "log_prior": _log_prior(evaluator, thetas),
+        "log_likelihood": _log_likelihood(evaluator, thetas, log_likelihood),
     }
-    likelihood = _log_likelihood(evaluator, particles, discrepancies, thetas, known)
-    if likelihood is not None:
-        groups["log_likelihood"] = likelihood
     groups["posterior_predictive"] = _predictive(evaluator, thetas, rng)
     groups["prior_predictive"] = _predictive(evaluator, prior[None], rng)
     if not groups["prior_predictive"]:
@@ -179,44 +159,21 @@ def _log_prior(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
     return xr.Dataset(variables, coords={"chain": np.arange(chains), "draw": np.arange(draws)})
 
 
-def _log_likelihood(
-    evaluator: Evaluator,
-    particles: Floats,
-    discrepancies: Floats,
-    thetas: Floats,
-    known: Floats | None,
-) -> xr.Dataset | None:
-    r"""Return the log-likelihood that the draws are of, up to a constant, in two parts.
-
-    An adjustment maps draws of :math:`p(\theta) e^{\ell(\theta)}` by an affine
-    :math:`\theta' = T(\theta)`, so that theirs is
-    :math:`\ell'(\theta') = \ell(\theta) + \log p(\theta) - \log p(\theta')`. None, where the map
-    was another one, and the adjustment does not know it.
+def _log_likelihood(evaluator: Evaluator, thetas: Floats, log_likelihood: Floats) -> xr.Dataset:
+    """Return the log-likelihood of draws in two parts, with that of ordinary terms apart.
 
     Along each dimension of specimens there is one place: ArviZ would take a number without such a
     dimension for that of each specimen, as in `loo_expectations`.
     """
     chains, draws, d = thetas.shape
-    before = particles.reshape(-1, d)
-    after = thetas.reshape(-1, d)
-    k = discrepancies.shape[-1]
-    log_prior = evaluator.hyperparameters.log_prior(before)
-    found = discrepancies.reshape(-1, k)
-    there = Evaluation(log_prior, evaluator.log_other(before), found, np.full_like(found, np.nan))
-    own = there.log_likelihood(evaluator.epsilon)
-    adjustment = np.zeros(len(after))
-    if known is not None:
-        own = known.ravel()
-    elif thetas is not particles:
-        if not _is_affine(before, after):
-            return None
-        adjustment = log_prior - evaluator.hyperparameters.log_prior(after)
+    other = evaluator.log_other(thetas.reshape(-1, d)).reshape(chains, draws)
     together = _dims_of_specimens(evaluator)
     dims = ["chain", "draw", *together]
     shape = (chains, draws, *[1] * len(together))
-    parts = {}
-    for name, values in zip(_LIKELIHOOD, (own, adjustment), strict=True):
-        parts[name] = (dims, values.reshape(shape))
+    values = (log_likelihood - other, other)
+    parts = {
+        name: (dims, part.reshape(shape)) for name, part in zip(_LIKELIHOOD, values, strict=True)
+    }
     coords = {"chain": np.arange(chains), "draw": np.arange(draws)}
     return xr.Dataset(parts, coords=coords, attrs={"note": _NOTE})
 
@@ -226,29 +183,6 @@ def _dims_of_specimens(evaluator: Evaluator) -> list[str]:
     observed = observed_dataset(evaluator)
     firsts = [str(observed[node.name].dims[0]) for node in evaluator.nodes]
     return list(dict.fromkeys(firsts))
-
-
-def _is_affine(before: Floats, after: Floats) -> bool:
-    """Whether draws, (n, d), were mapped by one affine function, but for a few far out."""
-    n, d = before.shape
-    if n <= 2 * (d + 1):
-        return False
-    # Of those in the middle: a few far out are drawn in.
-    away = _farthest(before - np.median(before, axis=0), before)
-    nearest = np.argsort(away)
-    middle = nearest[: n // 2]
-    terms = np.column_stack([np.ones(n), before])
-    coefficients, *_ = np.linalg.lstsq(terms[middle], after[middle])
-    off = _farthest(after - terms @ coefficients, after)
-    far = off > _OFF_THE_MAP
-    return bool(far.mean() <= _FAR_OUT_DRAWS)
-
-
-def _farthest(shifts: Floats, draws: Floats) -> Floats:
-    """Return the largest element of each shift, (n, d), in standard deviations of draws, (n,)."""
-    unit = np.maximum(draws.std(axis=0), 1e-300)
-    relative = np.abs(shifts) / unit
-    return np.asarray(relative.max(axis=1))
 
 
 def _specimens(evaluator: Evaluator, k: int, thetas: Floats, rng: np.random.Generator) -> Floats:

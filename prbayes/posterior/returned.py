@@ -15,7 +15,7 @@ from prbayes.model.evaluator import Evaluator
 # Those of `pymc.to_inference_data` that say something here.
 _IDATA = ("coords", "dims", "log_likelihood", "log_prior")
 # Groups that have variables of the model.
-_OF_VARIABLES = ("posterior", "unadjusted", "prior", "log_prior")
+_OF_VARIABLES = ("posterior", "prior", "log_prior")
 
 
 def checked_names(var_names: object, model: pm.Model) -> list[str] | None:

@@ -11,7 +11,7 @@ Independent simulators add their cumulant functions :math:`N_j K_j(a)` with one 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,6 +81,10 @@ class Cumulants:
     hessians: Floats
 
 
+# Tilts (A, r) and the rows (A,) that they belong to -> cumulant functions of these.
+CumulantFunction = Callable[[Floats, NDArray[np.intp]], Cumulants]
+
+
 @dataclass(frozen=True, eq=False)
 class Saddlepoints:
     """Minima of cumulant functions.
@@ -139,7 +143,7 @@ def saddlepoints(
     scores: Sequence[Scores],
     options: SaddlepointOptions = SaddlepointOptions(),
 ) -> Saddlepoints:
-    """Minimise convex cumulant functions by Newton steps no longer than 1 + |a|.
+    """Minimise the cumulant functions of means of scores.
 
     Parameters
     ----------
@@ -148,12 +152,38 @@ def saddlepoints(
     scores : sequence of Scores
     options : SaddlepointOptions
     """
-    count = len(log_weights[0])
-    r = scores[0].rank
+
+    def function(tilts: Floats, rows: NDArray[np.intp]) -> Cumulants:
+        selected = [logs[rows] for logs in log_weights]
+        return cumulants(selected, scores, tilts)
+
+    shape = len(log_weights[0]), scores[0].rank
     size = sum(score.size for score in scores)
+    return minimum(function, shape, size, options)
+
+
+def minimum(
+    function: CumulantFunction,
+    shape: tuple[int, int],
+    size: int,
+    options: SaddlepointOptions = SaddlepointOptions(),
+) -> Saddlepoints:
+    """Minimise convex cumulant functions by Newton steps no longer than 1 + |a|.
+
+    Parameters
+    ----------
+    function : callable
+        ``function(tilts, rows)``, shapes (A, r), (A,): cumulant functions ``rows``.
+    shape : tuple of int
+        Number of functions S, and of elements of a tilt r.
+    size : int
+        Number of observed specimens.
+    options : SaddlepointOptions
+    """
+    count, r = shape
     ridge = 1e-8 * size * np.eye(r)
-    tilts = np.zeros((count, r))
-    state = cumulants(log_weights, scores, tilts)
+    tilts = np.zeros(shape)
+    state = function(tilts, np.arange(count))
     limit = options.tolerance * size
     converged = np.linalg.norm(state.gradients, axis=1) < limit
     for _ in range(options.iterations):
@@ -168,8 +198,7 @@ def saddlepoints(
         longest = 1 + np.linalg.norm(tilts[rows], axis=1)
         factors = longest / np.maximum(lengths, longest)
         tilts[rows] -= steps * factors[:, None]
-        remaining = [logs[rows] for logs in log_weights]
-        step = cumulants(remaining, scores, tilts[rows])
+        step = function(tilts[rows], rows)
         state.values[rows] = step.values
         state.gradients[rows] = step.gradients
         state.hessians[rows] = step.hessians
@@ -196,7 +225,6 @@ def log_density(
     options : SaddlepointOptions
     """
     size = sum(score.size for score in scores)
-    smallest = scores[0].rank * np.log(options.smallest_variance)
     result = np.full(len(log_weights[0]), -np.inf)
     is_supported = np.ones(len(result), dtype=bool)
     for logs in log_weights:
@@ -206,14 +234,28 @@ def log_density(
         return result
     supported = [logs[is_supported] for logs in log_weights]
     points = saddlepoints(supported, scores, options)
+    result[is_supported] = density_at(points, size, options)
+    return result
+
+
+def density_at(points: Saddlepoints, size: int, options: SaddlepointOptions) -> Floats:
+    """Return log-densities up to a constant, (S,): -inf without a saddlepoint.
+
+    Parameters
+    ----------
+    points : Saddlepoints
+    size : int
+        Number of observed specimens.
+    options : SaddlepointOptions
+    """
+    smallest = points.tilts.shape[1] * np.log(options.smallest_variance)
     covariances = points.cumulants.hessians / size
     signs, log_dets = np.linalg.slogdet(covariances)
     is_usable = points.converged & (signs > 0)
     is_usable &= log_dets > smallest
     log_densities = points.cumulants.values - log_dets / 2
     log_densities[~is_usable] = -np.inf
-    result[is_supported] = log_densities
-    return result
+    return np.asarray(log_densities)
 
 
 def varying_combinations(covariance: Floats, options: SaddlepointOptions) -> Floats:

@@ -21,21 +21,17 @@ from prbayes.model.hyperparameters import THETAS
 from prbayes.model.interruption import designs_as_before, explained
 from prbayes.model.node import model_on_context
 from prbayes.model.turns import in_turn
-from prbayes.posterior.estimate_likelihood import estimate_likelihood
-from prbayes.posterior.groups import arviz_groups, specimen_groups
 from prbayes.posterior.importance import (
     ImportanceOptions,
     ImportanceSample,
     Laplace,
-    LogDensity,
     importance_sample,
     laplace,
 )
 from prbayes.posterior.returned import as_asked, checked_idata_kwargs, checked_names
-from prbayes.posterior.smc import Sampling, evaluator_of, optima_of, sample_likelihood
-from prbayes.posterior.smc import sample as sample_by_smc
-from prbayes.posterior.trees import posterior_tree
-from prbayes.response.budget import limited, unlimited
+from prbayes.posterior.smc import Sampling, evaluator_of, result_tree, sample_posterior
+from prbayes.posterior.target import Target, estimate_target, specimen_target
+from prbayes.response.budget import limited
 
 _OPTIONS = ImportanceOptions()
 
@@ -141,143 +137,69 @@ def sample(
         limited(max_seconds, max_runs),
     ):
         evaluator = evaluator_of(model, optimum, "sample")
-        if evaluator.nodes:
-            tree = _sample_given_estimate(evaluator, asked)
-        else:
-            tree = _sample_likelihood(evaluator, asked)
+        tree = draw_posterior(evaluator, asked)
         return as_asked(tree, names, keywords)
 
 
-def _sample_likelihood(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
-    """Return the result for a model whose simulators have a log-likelihood by specimen."""
-    clock = time.perf_counter()
-    before = evaluator.n_responses
-    density = log_posterior(evaluator)
-    if asked.optimum is None:
-        starts = _starts(evaluator, density)
-    else:
-        starts = list(optima_of(asked.optimum, evaluator))
-    modes = _modes(density, starts, evaluator.prior_sd)
-    if modes is None:
-        return sample_likelihood(evaluator, asked)
-    seed = seed_number(asked.random_seed)
-    sample = importance_sample(density, modes, asked.chains * asked.draws, seed, _OPTIONS)
-    if sample.is_reliable(_OPTIONS):
-        attrs, thetas, stats = _of_importance_sample(sample, asked)
-    elif len(modes) > 1:
-        return sample_likelihood(evaluator, asked)
-    else:
-        attrs, thetas, stats = _by_nuts(evaluator, modes[0], asked)
-    no_metric = np.empty((asked.chains, asked.draws, 0))
-    with unlimited():
-        return posterior_tree(
-            evaluator,
-            thetas,
-            no_metric,
-            no_metric,
-            [],
-            sampler=attrs,
-            sample_stats=stats,
-            warnings=_warnings(evaluator, asked.optimum),
-            seed=asked.random_seed,
-            n_responses=evaluator.n_responses - before,
-            seconds=time.perf_counter() - clock,
-            groups=specimen_groups(evaluator, thetas, asked.random_seed),
-        )
+def draw_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
+    """Return draws of the posterior by importance sampling, or else by NUTS or SMC.
 
-
-def _sample_given_estimate(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
-    """Return the result for metrics: prior times density of the metric's score at the estimate.
-
-    By `sample_smc` where there is no such density, or where importance sampling is not reliable.
+    Stored responses are added where they do not support the draws.
     """
     clock = time.perf_counter()
     before = evaluator.n_responses - evaluator.n_runs
     optimum = asked.optimum
-    if optimum is None:
+    if optimum is None and evaluator.nodes:
         optimum = require_finished(find_optimum(evaluator, Minimisation()))
     asked = replace(asked, optimum=optimum)
+    sample, nuts = None, None
     with designs_as_before(evaluator):
-        sample = _importance_sample_given_estimate(evaluator, optimum, asked)
-    if sample is None:
-        return sample_by_smc(evaluator, asked)
-    attrs, thetas, stats = _of_importance_sample(sample, asked)
-    with unlimited():
-        evaluation = evaluator(sample.draws)
-        shape = (asked.chains, asked.draws, -1)
-        discrepancies = evaluation.discrepancies.reshape(shape)
-        log_likelihood = (sample.log_density - evaluation.log_prior).reshape(shape[:2])
-        return posterior_tree(
+        for _ in range(MAX_ROUNDS + 1):
+            target = _target(evaluator, optimum)
+            modes = _modes(target)
+            if modes is None:
+                break
+            size = asked.chains * asked.draws
+            seed = seed_number(asked.random_seed)
+            sample = importance_sample(target.log_posterior, modes, size, seed, _OPTIONS)
+            if not sample.is_reliable(_OPTIONS):
+                sample = None
+                if len(modes) == 1 and not evaluator.nodes:
+                    nuts = _by_nuts(evaluator, modes[0], asked)
+                break
+            if not refine_at(evaluator, sample.draws[:THETAS]):
+                break
+        if sample is not None:
+            attrs, thetas, stats = _of_importance_sample(sample, asked)
+        elif nuts is not None:
+            attrs, thetas, stats = nuts
+        else:
+            return sample_posterior(evaluator, asked)
+        return result_tree(
             evaluator,
             thetas,
-            discrepancies,
-            evaluation.lost.reshape(shape),
-            [],
-            sampler=attrs,
+            asked,
+            optimum,
+            attrs,
+            log_likelihood=target.log_likelihood if evaluator.nodes else None,
             sample_stats=stats,
-            adjustment="none needed: the posterior is given the metric's own estimate",
-            warnings=optimum.warnings,
-            seed=asked.random_seed,
             n_responses=evaluator.n_responses - before,
             seconds=time.perf_counter() - clock,
-            groups=arviz_groups(
-                evaluator, thetas, discrepancies, thetas, log_likelihood, asked.random_seed
-            ),
         )
 
 
-def _importance_sample_given_estimate(
-    evaluator: Evaluator, optimum: Optimum, asked: Sampling
-) -> ImportanceSample | None:
-    """Return draws given the estimate, or None where they cannot be had or are not reliable.
-
-    Stored responses are added where they do not support the draws. Fewer than ten specimens of a
-    simulator have bandwidths that bias the estimate, and were not studied.
-    """
-    if min(len(node.observed) for node in evaluator.nodes) < 10:
-        return None
-    seed = seed_number(asked.random_seed)
-    for _ in range(MAX_ROUNDS + 1):
-        try:
-            likelihood = estimate_likelihood(evaluator, optimum)
-        except (TypeError, ValueError):
-            return None
-        density = likelihood.log_posterior
-        # Of several outputs the estimate is minimised again, with other coordinates.
-        starts = [likelihood.point, *optima_of(optimum, evaluator)[1:]]
-        modes = _modes(density, starts, likelihood.scale)
-        if modes is None:
-            return None
-        sample = importance_sample(density, modes, asked.chains * asked.draws, seed, _OPTIONS)
-        if not sample.is_reliable(_OPTIONS):
-            return None
-        if not refine_at(evaluator, sample.draws[:THETAS]):
-            return sample
-    return None
+def _target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
+    """Return the posterior of a model."""
+    if not evaluator.nodes:
+        return specimen_target(evaluator, optimum)
+    assert optimum is not None
+    return estimate_target(evaluator, optimum)
 
 
-def log_posterior(evaluator: Evaluator) -> LogDensity:
-    """Return the log-posterior density in unconstrained space, (S, d) -> (S,)."""
-
-    def function(thetas: Floats) -> Floats:
-        evaluation = evaluator(thetas)
-        return evaluation.log_prior + evaluation.log_other
-
-    return function
-
-
-def _warnings(evaluator: Evaluator, optimum: Optimum | None) -> tuple[str, ...]:
-    """Return what the data, the runs and the optimum report."""
-    if optimum is not None:
-        return optimum.warnings
-    findings = [finding for each in evaluator.likelihoods for finding in each.findings]
-    return tuple(str(finding) for finding in findings)
-
-
-def _modes(density: LogDensity, starts: list[Floats], scale: Floats) -> list[Laplace] | None:
-    """Return Laplace approximations of the modes near starts, None if the density jumps there."""
+def _modes(target: Target) -> list[Laplace] | None:
+    """Return Laplace approximations of the modes, None if the density jumps at a start."""
     try:
-        candidates = laplace(density, np.stack(starts), scale)
+        candidates = laplace(target.log_posterior, np.stack(target.starts), target.scale)
     except (ValueError, np.linalg.LinAlgError):
         return None
     candidates.sort(key=lambda mode: (not mode.converged, -mode.log_mass))
@@ -291,22 +213,6 @@ def _modes(density: LogDensity, starts: list[Floats], scale: Floats) -> list[Lap
         if not unusable and all(distance.max() > 0.5 for distance in distances):
             modes.append(mode)
     return modes
-
-
-def _starts(
-    evaluator: Evaluator, density: LogDensity, screened: int = 1024, count: int = 8
-) -> list[Floats]:
-    """Return the best point of the prior, and others of the best quarter far from each other."""
-    thetas = evaluator.prior_points(screened, 0)
-    order = np.argsort(-density(thetas), kind="stable")
-    candidates = thetas[order[: screened // 4]] / evaluator.prior_sd
-    chosen = [0]
-    distance = np.full(len(candidates), np.inf)
-    while len(chosen) < count:
-        away = ((candidates - candidates[chosen[-1]]) ** 2).sum(axis=1)
-        distance = np.minimum(distance, away)
-        chosen.append(int(np.argmax(distance)))
-    return list(candidates[chosen] * evaluator.prior_sd)
 
 
 def _of_importance_sample(

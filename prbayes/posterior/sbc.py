@@ -9,7 +9,7 @@ import logging
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, as_completed
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
@@ -28,8 +28,8 @@ from prbayes.estimate.specimen_refits import (
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import model_on_context
 from prbayes.model.turns import in_turn
-from prbayes.posterior.adjustment import Affine, refuse_adjustment
-from prbayes.posterior.smc import Sampling, sample
+from prbayes.posterior.sample import draw_posterior
+from prbayes.posterior.smc import Adjustment, Sampling, refuse_adjustment, sample
 from prbayes.posterior.trees import calibration_tree
 
 _log = logging.getLogger("prbayes")
@@ -44,7 +44,7 @@ def simulation_based_calibration(
     *,
     model: pm.Model | None = None,
     draws: int = 500,
-    adjust: Affine | bool = True,
+    adjustment: Adjustment = "estimate",
     executor: Executor | None = None,
     random_seed: Seed = 0,
     progressbar: bool = True,
@@ -53,8 +53,8 @@ def simulation_based_calibration(
 
     Each time hyperparameters are drawn from the prior, and specimens from their populations, for
     which the response is called; with the log-likelihood by specimen its emulator gives the
-    responses, nothing is run, and the emulator itself is not checked. Then epsilon,
-    `sample_smc` and its adjustment run as they would on measurements. If posteriors have the right
+    responses, nothing is run, and the emulator itself is not checked. Then `sample`, or
+    `sample_smc` with ``adjustment=None``, runs as on measurements. If posteriors have the right
     width and place, the ranks are uniform. A wide prior asks more than one true value does: it
     shows what happens all over the prior.
 
@@ -67,8 +67,8 @@ def simulation_based_calibration(
         and labels.
     draws : int
         Draws of each posterior, in one chain.
-    adjust : Affine or bool
-        As in `sample_smc`, but with another ``random_seed`` for each data set.
+    adjustment : {"estimate", None}
+        As of `sample_smc`.
     executor : concurrent.futures.Executor, optional
         Where data sets are analysed, ten at a time; the model is sent with cloudpickle.
     random_seed : int, sequence of int, numpy.random.Generator or None
@@ -115,7 +115,7 @@ def simulation_based_calibration(
     model = model_on_context(model, "prb.simulation_based_calibration")
     positive_integer(n, "n", minimum=2)
     positive_integer(draws, "draws", minimum=10)
-    refuse_adjustment(adjust)
+    refuse_adjustment(adjustment)
     executes(executor, "executor")
     flag(progressbar, "progressbar")
     seed = seed_number(random_seed)
@@ -135,7 +135,7 @@ def simulation_based_calibration(
     jobs = []
     for start in starts:
         numbers = range(start, min(start + _CHUNK, n))
-        jobs.append(_Job(numbers, draws, adjust, seed))
+        jobs.append(_Job(numbers, draws, adjustment, seed))
     with shown(progressbar), progress("data sets", n) as report:
         if executor is None:
             parts = [_analyse(evaluator, job, lambda: report(1, "")) for job in jobs]
@@ -154,7 +154,7 @@ def simulation_based_calibration(
             f"first: {failed[0]}"
         )
     return calibration_tree(
-        evaluator, good, failed=len(failed), draws=draws, adjust=adjust, seed=seed
+        evaluator, good, failed=len(failed), draws=draws, adjustment=adjustment, seed=seed
     )
 
 
@@ -164,7 +164,7 @@ class _Job:
 
     which: range
     draws: int
-    adjust: Affine | bool
+    adjustment: Adjustment
     random_seed: int
 
 
@@ -222,12 +222,10 @@ def _one(evaluator: Evaluator, job: _Job, rng: np.random.Generator) -> dict[str,
         params = evaluator.specimen_params(theta[None], k)
         pools.append(specimen_pool(likelihood, params, rng, size=len(likelihood.readings)))
     draws_seed = int(rng.integers(2**31))
-    adjust = job.adjust
-    if isinstance(adjust, Affine):  # the same refits for all data sets would err alike
-        adjust = replace(adjust, random_seed=draws_seed)
-    asked = Sampling(draws=job.draws, adjust=adjust, random_seed=draws_seed)
+    asked = Sampling(draws=job.draws, adjustment=job.adjustment, random_seed=draws_seed)
+    draw = sample if job.adjustment is None else draw_posterior
     with other_specimens(evaluator.likelihoods, [pool.data_set(rng) for pool in pools]):
-        posterior = sample(evaluator.observing(data), asked)["posterior"]
+        posterior = draw(evaluator.observing(data), asked)["posterior"]
     row = {}
     for name, (truth,) in evaluator.constrained(theta[None]).items():
         found = np.asarray(posterior[name])[0]

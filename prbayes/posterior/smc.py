@@ -1,4 +1,4 @@
-"""ABC by sequential Monte Carlo: `sample_smc`."""
+"""Sequential Monte Carlo from the prior: `sample_smc`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from os import PathLike
-from typing import Any, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import pymc as pm
@@ -19,7 +19,6 @@ from prbayes._checks import Floats, Seed, file_path, flag, positive_integer, see
 from prbayes._pages import more_in
 from prbayes._progress import shown
 from prbayes.estimate.minimization import Minimisation, find_optimum, require_finished
-from prbayes.estimate.obstacles import refit_obstacle
 from prbayes.estimate.optimum import Optimum, require_sampling
 from prbayes.estimate.refinement import MAX_ROUNDS, refine_at, refuse, refuse_lost
 from prbayes.model.epsilon import checked_epsilon
@@ -27,26 +26,28 @@ from prbayes.model.evaluator import Evaluator
 from prbayes.model.hyperparameters import THETAS
 from prbayes.model.identity import identity_of, require_same
 from prbayes.model.interruption import designs_as_before, explained
-from prbayes.model.node import Node, model_on_context
+from prbayes.model.node import log_kernel, model_on_context
 from prbayes.model.start import fingerprint, starting_thetas
 from prbayes.model.support import shortcomings
 from prbayes.model.turns import in_turn
-from prbayes.posterior.adjustment import Adjusted, Affine, refuse_adjustment
-from prbayes.posterior.chains import Chains, Particles
+from prbayes.posterior.chains import Chains, Particles, Stages
 from prbayes.posterior.checkpoint import Checkpoint, stored_settings
-from prbayes.posterior.default_adjustment import default_adjustment
 from prbayes.posterior.epsilon import calibrate_epsilon
 from prbayes.posterior.groups import arviz_groups, specimen_groups
+from prbayes.posterior.importance import LogDensity
 from prbayes.posterior.returned import (
     as_asked,
     as_multitrace,
     checked_idata_kwargs,
     checked_names,
 )
+from prbayes.posterior.target import estimate_target, prior_conflicts
 from prbayes.posterior.trees import posterior_tree, share_of_lossy
 from prbayes.response.budget import BudgetError, limited, unlimited
 
 _log = logging.getLogger("prbayes")
+
+Adjustment = Literal["estimate"] | None
 
 # Share of draws that may fall short, as single ones far out do: that of what designs support.
 _FAR_OUT = 0.05
@@ -60,7 +61,7 @@ def sample_smc(
     model: pm.Model | None = None,
     epsilon: float | dict[str, float] | None = None,
     optimum: Optimum | None = None,
-    adjust: Affine | bool = True,
+    adjustment: Adjustment = "estimate",
     threshold: float = 0.5,
     refine: bool = True,
     start: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
@@ -75,9 +76,11 @@ def sample_smc(
     random_seed: Seed = 0,
     progressbar: bool = True,
 ) -> xr.DataTree:
-    """Draw from the pseudo-posterior by sequential Monte Carlo.
+    r"""Draw from the posterior by sequential Monte Carlo from the prior.
 
-    Its density is proportional to the prior times exp(-sum of d_k / epsilon_k).
+    It samples the same posterior as `sample`, also where that has several modes. With
+    ``adjustment=None`` it samples the pseudo-posterior of approximate Bayesian computation, whose
+    density is proportional to the prior times :math:`\exp(-\sum_k d_k / \epsilon_k)`.
 
     Parameters
     ----------
@@ -88,15 +91,15 @@ def sample_smc(
     model : pymc.Model, optional
         The one on the context by default.
     epsilon : float or dict, optional
-        For this run. By default the simulators' own, calibrated where unset (`calibrate_epsilon`).
+        With ``adjustment=None``, for this run. By default the simulators' own, calibrated where
+        unset (`calibrate_epsilon`).
     optimum : Optimum, optional
-        Where to calibrate epsilon, and the centre of the adjustment; `minimize` finds it if needed.
-    adjust : Affine or bool
-        Whether, and how, the draws are brought to the width that the data warrant. By default by
-        ``prb.posterior.GivenEstimate()`` with the same ``random_seed``, and not where they are the
-        posterior as they are, as those of the kernel log-likelihood with one simulator, stored
-        responses and epsilon = 1/N; nor where an epsilon was given, which is then taken at its
-        word. An `Affine` or `GivenEstimate` that is given adjusts in any case.
+        The estimate that the posterior is given, and where to calibrate epsilon; `minimize` finds
+        it if needed.
+    adjustment : {"estimate", None}
+        With "estimate" the posterior is that given the metrics' own estimate, whose width follows
+        from the number of specimens. With None it is as wide as epsilon makes it. The
+        log-likelihood by specimen has one posterior.
     threshold : float
         Share of the effective sample size that a stage keeps; higher means more stages.
     refine : bool
@@ -136,32 +139,23 @@ def sample_smc(
     Returns
     -------
     xarray.DataTree
-        Groups ``posterior`` (chain, draw), ``unadjusted`` (the draws before the adjustment, if
-        there was one), ``sample_stats`` (chain, stage; NaN after the last stage), ``calibration``
-        (discrepancy, epsilon, weight effective sample size, mean raw weight, lost mass,
-        ``lossy_draws``: the share of draws, as they were sampled, of whose populations more than
+        Groups ``posterior`` (chain, draw), ``sample_stats`` (chain, stage; NaN after the last
+        stage), ``calibration`` (discrepancy, epsilon, weight effective sample size, mean raw
+        weight, lost mass, ``lossy_draws``: the share of draws of whose populations more than
         ``max_lost`` has no response; ``discrepancy_error``: the Monte Carlo error of the
         discrepancy at the best draw; by simulator) and ``observed_data``; ArviZ takes it,
         ``to_netcdf`` saves it. For ArviZ there are ``prior``, ``log_prior`` and predictive draws
         (``posterior_predictive``, ``prior_predictive``) of simulators whose responses are stored,
-        and ``log_likelihood`` for power-scaling: one number for each draw, of which adjusted draws
-        are draws; it is left out where they were not adjusted by one affine map. Attributes of
-        ``posterior``: ``log_marginal_likelihood``, from all chains, and
+        and ``log_likelihood`` for power-scaling, with one number for each draw. Attributes of
+        ``posterior``: ``adjustment``; ``log_marginal_likelihood``, from all chains, and
         ``log_marginal_likelihood_sd``, the spread of the chains' own; a number to compare models by
-        with one metric and one epsilon, and with no others. Of an adjustment they have
-        ``adjustment_center_error`` and ``adjustment_width_error``, its Monte Carlo errors from the
-        number of refits, in standard deviations of the draws and as a share of the width, for the
-        worst direction; ``adjustment_moved``, how far it moved the medians, in standard deviations,
-        for the worst hyperparameter; ``fit_probability``, how often data sets drawn from the model
-        at its minimiser are as far from their own fit as the data are; and ``prior_probability``,
-        how often estimates that the prior leads to are as far out as that of the data.
+        with one metric and one epsilon, and with no others.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is not as described, no prior draw has a finite discrepancy, or nothing is
-        known around the optimum (``at_edge`` and ``at_jump`` of `Optimum`) and it is needed for
-        epsilon or the adjustment.
+        If an argument is not as described, no prior draw has a finite density, or nothing is known
+        around the optimum (``at_edge`` and ``at_jump`` of `Optimum`) and it is needed.
     DesignError
         If a design does not support the posterior after refinement.
     StoreError
@@ -188,7 +182,7 @@ def sample_smc(
     positive_integer(draws, "draws", minimum=10)
     positive_integer(chains, "chains")
     model = model_on_context(model, "prb.sample_smc")
-    refuse_adjustment(adjust)
+    refuse_adjustment(adjustment)
     flag(refine, "refine")
     share(threshold, "threshold")
     if checkpoint is not None:
@@ -208,7 +202,7 @@ def sample_smc(
         chains=chains,
         epsilon=epsilon,
         optimum=optimum,
-        adjust=adjust,
+        adjustment=adjustment,
         threshold=threshold,
         refine=refine,
         start=start,
@@ -240,7 +234,7 @@ class Sampling:
     chains: int = 1
     epsilon: float | dict[str, float] | None = None
     optimum: Optimum | None = None
-    adjust: Affine | bool = True
+    adjustment: Adjustment = "estimate"
     threshold: float = 0.5
     refine: bool = True
     start: Any = None
@@ -251,22 +245,63 @@ class Sampling:
     with_groups: bool = False  # whether the result has what ArviZ looks for besides
 
 
+def refuse_adjustment(adjustment: object) -> None:
+    """Raise if it is not one of the two."""
+    if adjustment is not None and adjustment != "estimate":
+        raise ValueError(
+            f'adjustment: got {adjustment!r}, expected "estimate", or None for draws of '
+            "exp(-discrepancy / epsilon)"
+        )
+
+
 def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
-    """Do what `sample_smc` does, for an evaluator."""
-    if not evaluator.nodes:
-        return sample_likelihood(evaluator, asked)
+    """Return draws of the posterior, or of the pseudo-posterior with ``adjustment=None``."""
+    if evaluator.nodes and asked.adjustment is None:
+        return _sample_kernel(evaluator, asked)
+    if asked.epsilon is not None:
+        raise ValueError(
+            f"epsilon: got {asked.epsilon!r}, expected none: this posterior has no scale to "
+            "choose; leave epsilon= out, or pass adjustment=None with a metric"
+        )
+    return sample_posterior(evaluator, asked)
+
+
+def sample_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
+    """Return draws of the posterior: given the estimate, or of a log-likelihood by specimen."""
+    clock = time.perf_counter()
+    before = evaluator.n_responses - evaluator.n_runs
+    with designs_as_before(evaluator):
+        optimum = asked.optimum
+        if optimum is None and evaluator.nodes:
+            optimum = require_finished(find_optimum(evaluator, Minimisation(refine=asked.refine)))
+        rounds = _rounds(evaluator, asked, optimum)
+        particles = rounds.until_supported(asked.progressbar)
+        return result_tree(
+            evaluator,
+            particles.thetas,
+            asked,
+            optimum,
+            {"sampler": "SMC"},
+            log_likelihood=rounds.log_likelihood,
+            stats=particles.stats,
+            warnings=_of_budget(particles.stopped, particles, asked),
+            stopped=particles.stopped,
+            n_responses=evaluator.n_responses - before,
+            seconds=time.perf_counter() - clock,
+        )
+
+
+def _sample_kernel(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
+    """Return draws of prior times exp(-sum of d_k / epsilon_k)."""
     clock = time.perf_counter()
     before = evaluator.n_responses - evaluator.n_runs
     drawn = [design.n_drawn for design in evaluator.designs.values()]
     with epsilons_restored(evaluator), designs_as_before(evaluator):
-        adjustment, optimum = _prepared(evaluator, asked)
-        rounds = _rounds(evaluator, asked, adjustment, optimum)
-        found = rounds.until_supported(asked.progressbar)
+        optimum = _calibrated(evaluator, asked)
+        particles = _rounds(evaluator, asked, optimum).until_supported(asked.progressbar)
         grown = [design.n_drawn for design in evaluator.designs.values()] != drawn
-        if found.particles.stopped and grown:
-            raise BudgetError(found.particles.stopped)
-        found.warn()
-        particles = found.particles
+        if particles.stopped and grown:
+            raise BudgetError(particles.stopped)
         stopped, errors, missing = particles.stopped, None, None
         try:
             errors, missing = _at_the_best(evaluator, particles)
@@ -277,28 +312,22 @@ def sample(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
         with unlimited():
             groups = None
             if asked.with_groups:
-                groups = arviz_groups(
-                    evaluator,
-                    particles.thetas,
-                    particles.discrepancies,
-                    found.thetas,
-                    found.log_likelihood,
-                    asked.random_seed,
-                )
+                thetas = particles.thetas
+                kernels = np.asarray(log_kernel(particles.discrepancies, evaluator.epsilon))
+                other = evaluator.log_other(thetas.reshape(-1, evaluator.size))
+                logs = kernels.sum(axis=-1) + other.reshape(thetas.shape[:2])
+                groups = arviz_groups(evaluator, thetas, logs, asked.random_seed)
             return posterior_tree(
                 evaluator,
-                found.thetas,
+                particles.thetas,
                 particles.discrepancies,
                 particles.lost,
                 particles.stats,
-                unadjusted=None if found.thetas is particles.thetas else particles.thetas,
-                adjustment=found.note,
-                measured=found.measured,
+                sampler={"sampler": "SMC-ABC"},
                 warnings=(
                     *_of_budget(stopped, particles, asked),
                     *_of_lost(evaluator, particles),
                     *(() if optimum is None else optimum.warnings),
-                    *found.warnings,
                 ),
                 errors=errors,
                 missing=missing,
@@ -358,29 +387,26 @@ def _of_lost(evaluator: Evaluator, particles: Particles) -> list[str]:
     return lines
 
 
-def _prepared(evaluator: Evaluator, asked: Sampling) -> tuple[Affine | None, Optimum | None]:
-    """Set the epsilons; return the adjustment, and the optimum that it or they need."""
+def _calibrated(evaluator: Evaluator, asked: Sampling) -> Optimum | None:
+    """Set the epsilons; return the optimum if they are calibrated there."""
     _set_epsilons(evaluator, asked.epsilon)
     unset = [node for node in evaluator.nodes if np.isnan(node.epsilon_value)]
-    adjustment = _adjustment(asked.adjust, evaluator, unset)
     optimum = asked.optimum
-    if optimum is None and _needs_optimum(evaluator, unset, adjustment):
+    if not unset:
+        return optimum
+    if optimum is None:
         optimum = require_finished(find_optimum(evaluator, Minimisation(refine=asked.refine)))
-    if optimum is not None and adjustment is not None:
-        require_sampling(optimum, "sample_smc")
-    if optimum is not None and unset:
-        calibrated = calibrate_epsilon(optimum)
-        for node in unset:
-            node.epsilon.set_value(np.asarray(calibrated[node.name]))
-    return adjustment, optimum
+    require_sampling(optimum, "sample_smc")
+    calibrated = calibrate_epsilon(optimum)
+    for node in unset:
+        node.epsilon.set_value(np.asarray(calibrated[node.name]))
+    return optimum
 
 
-def _rounds(
-    evaluator: Evaluator, asked: Sampling, adjustment: Affine | None, optimum: Optimum | None
-) -> Rounds:
-    """Return the rounds of sampling, perhaps with what a run before has saved."""
+def _rounds(evaluator: Evaluator, asked: Sampling, optimum: Optimum | None) -> Rounds:
+    """Return the rounds of sampling, perhaps with the state that a run before has saved."""
     starts = _starts(evaluator, asked)
-    told = {} if starts is None else {"start": fingerprint(starts)}
+    given = {} if starts is None else {"start": fingerprint(starts)}
     saved = _checkpoint(
         asked.checkpoint,
         evaluator,
@@ -388,25 +414,16 @@ def _rounds(
         draws=asked.draws,
         chains=asked.chains,
         threshold=asked.threshold,
-        adjust=repr(adjustment),
+        adjustment=asked.adjustment,
         refine=asked.refine,
-        **told,
+        **given,
     )
     entropy = asked.random_seed if saved is None else int(saved.settings["entropy"])
-    seeds = np.random.SeedSequence(entropy)
-    if adjustment is not None and not isinstance(asked.adjust, Affine):
-        # Other seeds tell the Monte Carlo error of refits as well.
-        own = asked.random_seed
-        own = int(seeds.generate_state(1)[0]) if own is None else own
-        adjustment = replace(adjustment, random_seed=own)
     return Rounds(
         run=Chains(evaluator, asked.draws, asked.threshold, saved, asked.max_stages, starts),
-        chains=asked.chains,
-        seeds=seeds,
-        adjustment=adjustment,
-        optima=() if optimum is None else optima_of(optimum, evaluator),
-        design_error=0.0 if optimum is None else optimum.design_error,
-        refine=asked.refine and bool(evaluator.designs),
+        seeds=np.random.SeedSequence(entropy),
+        asked=asked,
+        optimum=optimum,
     )
 
 
@@ -423,89 +440,27 @@ def _starts(evaluator: Evaluator, asked: Sampling) -> list[Floats] | None:
     return [starting_thetas(evaluator.hyperparameters, one, asked.draws) for one in each]
 
 
-@dataclass(frozen=True, eq=False)
-class _Draws:
-    """The draws of one round.
+@dataclass(eq=False)
+class Rounds:
+    """Sampling and refinement, again until the designs support the draws.
 
-    Particles of the pseudo-posterior, and what an adjustment made of them.
+    Attributes
+    ----------
+    run : Chains
+    seeds : SeedSequence
+    asked : Sampling
+    optimum : Optimum or None
+    log_likelihood : callable or None
+        Given the estimate, of the last round.
     """
 
-    particles: Particles
-    adjusted: Adjusted | None
-
-    @property
-    def thetas(self) -> Floats:
-        """The draws after the adjustment, if there was one."""
-        return self.particles.thetas if self.adjusted is None else self.adjusted.thetas
-
-    @property
-    def note(self) -> str:
-        """What the adjustment did, or why nothing."""
-        return "none" if self.adjusted is None else self.adjusted.note
-
-    @property
-    def log_likelihood(self) -> Floats | None:
-        """That of the draws, (chains, draws), where the adjustment knows it."""
-        return None if self.adjusted is None else self.adjusted.log_likelihood
-
-    @property
-    def reason(self) -> str | None:
-        """Why an adjustment that was asked for left the draws as they are; None if it did not."""
-        return None if self.adjusted is None else self.adjusted.reason
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What is to be said of the adjustment."""
-        return () if self.adjusted is None else self.adjusted.warnings
-
-    def warn(self) -> None:
-        """Say it in the log."""
-        unadjusted = self.reason is not None
-        where = more_in("choose.md#epsilon-and-the-width-of-the-posterior") if unadjusted else ""
-        for line in self.warnings:
-            _log.warning("%s%s", line, where)
-
-    @property
-    def measured(self) -> dict[str, float]:
-        """What was measured of the adjustment, by name."""
-        found = self.adjusted
-        if found is None or found.reason is not None:
-            return {}
-        return {
-            "adjustment_center_error": found.center_error,
-            "adjustment_width_error": found.width_error,
-            "adjustment_moved": found.moved,
-            "fit_probability": found.fit_probability,
-            "prior_probability": found.prior_probability,
-        }
-
-
-class Sampler(Protocol):
-    """What gives the draws of a round, such as `Chains`."""
-
-    evaluator: Evaluator
-    refined: list[Floats]  # thetas at which designs were refined in earlier rounds
-
-    def __call__(self, seeds: list[np.random.SeedSequence], progressbar: bool) -> Particles:
-        """Return the draws."""
-
-    def saved_refinement(self, round_: int) -> Floats | None:
-        """Return where a finished round refined the designs, if it was saved."""
-
-
-@dataclass(frozen=True, eq=False)
-class Rounds:
-    """Sampling, adjustment and refinement, again until the designs support the draws."""
-
-    run: Sampler
-    chains: int
+    run: Chains
     seeds: np.random.SeedSequence
-    adjustment: Affine | None
-    optima: tuple[Floats, ...]
-    design_error: float  # of the optimum, in standard errors
-    refine: bool
+    asked: Sampling
+    optimum: Optimum | None
+    log_likelihood: LogDensity | None = None
 
-    def until_supported(self, progressbar: bool) -> _Draws:
+    def until_supported(self, progressbar: bool) -> Particles:
         """Return the draws of the first round that its designs support.
 
         Raises
@@ -516,78 +471,98 @@ class Rounds:
             If a budget is spent before.
         """
         evaluator = self.run.evaluator
+        refines = self.asked.refine and bool(evaluator.designs)
         for round_ in range(MAX_ROUNDS + 1):
-            children = self.seeds.spawn(self.chains)
+            children = self.seeds.spawn(self.asked.chains)
             saved = self.run.saved_refinement(round_)
             if saved is not None:
                 self.run.refined.append(saved)
                 refine_at(evaluator, saved)
                 continue
-            found = self._draws(children, progressbar)
-            if not self.refine:
-                return found
-            some = self._some_of(found)
-            if found.particles.stopped and shortcomings(evaluator, some):
-                raise BudgetError(found.particles.stopped)
+            self.log_likelihood = self._log_likelihood()
+            particles = self.run(children, progressbar, self.log_likelihood)
+            if not refines:
+                return particles
+            rows = particles.thetas.reshape(-1, evaluator.size)
+            thetas = np.random.default_rng(self.seeds).permutation(rows)[:THETAS]
+            if particles.stopped and shortcomings(evaluator, thetas):
+                raise BudgetError(particles.stopped)
             if round_ == MAX_ROUNDS:
-                refuse(shortcomings(evaluator, some), evaluator)
-                return found
-            if not refine_at(evaluator, some):
-                return found
-            self.run.refined.append(some)
+                refuse(shortcomings(evaluator, thetas), evaluator)
+                return particles
+            if not refine_at(evaluator, thetas):
+                return particles
+            self.run.refined.append(thetas)
             _log.info("sampling again on the refined design")
         raise AssertionError("the last round returns or raises")
 
-    def _draws(self, children: list[np.random.SeedSequence], progressbar: bool) -> _Draws:
-        particles = self.run(children, progressbar)
-        if self.adjustment is None:
-            return _Draws(particles, None)
-        free = not self.run.evaluator.responses_per_theta
-        with unlimited() if particles.stopped and free else nullcontext():
-            adjusted = self.adjustment(
-                self.run.evaluator, particles.thetas, self.optima, self.design_error
-            )
-        return _Draws(particles, adjusted)
-
-    def _some_of(self, found: _Draws) -> Floats:
-        """Return some draws, before and after the adjustment: the design has to support both."""
-        both = np.concatenate([found.particles.thetas, found.thetas])
-        rows = both.reshape(-1, self.run.evaluator.size)
-        return np.random.default_rng(self.seeds).permutation(rows)[:THETAS]
+    def _log_likelihood(self) -> LogDensity | None:
+        """Return the log-likelihood given the estimate, on the designs as they are."""
+        evaluator = self.run.evaluator
+        if not evaluator.nodes or self.asked.adjustment is None:
+            return None
+        assert self.optimum is not None
+        return estimate_target(evaluator, self.optimum).log_likelihood
 
 
-def sample_likelihood(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
-    """Sample the posterior of a model whose simulators have a log-likelihood by specimen.
+def result_tree(
+    evaluator: Evaluator,
+    thetas: Floats,
+    asked: Sampling,
+    optimum: Optimum | None,
+    sampler: Mapping[str, Any],
+    *,
+    log_likelihood: LogDensity | None,
+    stats: Sequence[Stages] = (),
+    sample_stats: xr.Dataset | None = None,
+    warnings: Sequence[str] = (),
+    stopped: str = "",
+    n_responses: int,
+    seconds: float,
+) -> xr.DataTree:
+    """Return the DataTree of draws of the posterior, (chains, draws, d).
 
-    Nothing is calibrated or adjusted: the draws are those of the posterior.
+    Discrepancies are computed where that costs no response.
     """
-    clock = time.perf_counter()
-    before = evaluator.n_responses
-    if asked.epsilon is not None:
-        raise ValueError(
-            f"epsilon: got {asked.epsilon!r}, expected none: prb.LogLikelihood() is a likelihood "
-            "and has no scale to choose; leave epsilon= out"
-        )
-    rounds = _rounds(evaluator, asked, None, None)
-    particles = rounds.until_supported(asked.progressbar).particles
-    groups = None
+    chains, draws, d = thetas.shape
+    shape = (chains, draws, len(evaluator.nodes))
+    discrepancies, lost = np.full(shape, np.nan), np.full(shape, np.nan)
     with unlimited():
-        if asked.with_groups:
-            groups = specimen_groups(evaluator, particles.thetas, asked.random_seed)
-        optimum_warnings = () if asked.optimum is None else asked.optimum.warnings
+        if evaluator.nodes and not evaluator.responses_per_theta:
+            evaluation = evaluator(thetas.reshape(-1, d))
+            discrepancies = evaluation.discrepancies.reshape(shape)
+            lost = evaluation.lost.reshape(shape)
+        groups = None
+        if asked.with_groups and log_likelihood is None:
+            groups = specimen_groups(evaluator, thetas, asked.random_seed)
+        elif asked.with_groups and log_likelihood is not None:
+            values = log_likelihood(thetas.reshape(-1, d)).reshape(chains, draws)
+            groups = arviz_groups(evaluator, thetas, values, asked.random_seed)
         return posterior_tree(
             evaluator,
-            particles.thetas,
-            particles.discrepancies,
-            particles.lost,
-            particles.stats,
-            warnings=(*_of_budget(particles.stopped, particles, asked), *optimum_warnings),
-            stopped=particles.stopped,
+            thetas,
+            discrepancies,
+            lost,
+            stats,
+            sampler=sampler,
+            sample_stats=sample_stats,
+            adjustment="estimate" if evaluator.nodes else "none",
+            warnings=(*warnings, *_warnings(evaluator, optimum, thetas)),
+            stopped=stopped,
             seed=asked.random_seed,
-            n_responses=evaluator.n_responses - before,
-            seconds=time.perf_counter() - clock,
+            n_responses=n_responses,
+            seconds=seconds,
             groups=groups,
         )
+
+
+def _warnings(evaluator: Evaluator, optimum: Optimum | None, thetas: Floats) -> tuple[str, ...]:
+    """Return the reports of the data, the runs and the optimum, and conflicts with the prior."""
+    if optimum is None:
+        findings = [finding for each in evaluator.likelihoods for finding in each.findings]
+        return tuple(map(str, findings))
+    conflicts = prior_conflicts(optimum, evaluator, thetas) if evaluator.nodes else ()
+    return (*optimum.warnings, *map(str, conflicts))
 
 
 @contextmanager
@@ -619,18 +594,6 @@ def _set_epsilons(evaluator: Evaluator, epsilon: float | dict[str, float] | None
             node.epsilon.set_value(np.asarray(values[node.name]))
 
 
-def _adjustment(adjust: Affine | bool, evaluator: Evaluator, unset: list[Node]) -> Affine | None:
-    """Return the adjustment that was asked for; an epsilon that was given is taken at its word."""
-    if isinstance(adjust, Affine):
-        return adjust
-    nobody_gave_one = all(node in unset or node.epsilon_is_default for node in evaluator.nodes)
-    return default_adjustment(evaluator) if adjust and nobody_gave_one else None
-
-
-def _needs_optimum(evaluator: Evaluator, unset: list[Node], adjustment: Affine | None) -> bool:
-    return bool(unset) or (adjustment is not None and refit_obstacle(evaluator) is None)
-
-
 def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evaluator:
     """Return the evaluator of a model.
 
@@ -642,17 +605,6 @@ def evaluator_of(model: pm.Model, optimum: Optimum | None, caller: str) -> Evalu
     evaluator = optimum.evaluator if own else Evaluator(model)
     require_same(optimum.identity, identity_of(evaluator), f"{caller}: optimum")
     return evaluator
-
-
-def optima_of(optimum: Optimum, evaluator: Evaluator) -> tuple[Floats, ...]:
-    """Return the optimum, and others that the data could as well come from.
-
-    Their elements are in the evaluator's order, which in a clone of the optimum's model may be
-    another one.
-    """
-    order = [optimum.names.index(name) for name in evaluator.names]
-    rivals = [rival["theta"] for rival in optimum.rivals if rival["comparable"]]
-    return tuple(theta[order] for theta in (optimum.theta, *rivals))
 
 
 def _at_the_best(

@@ -15,6 +15,7 @@ from prbayes._checks import random_seed as refuse_seed
 from prbayes.model.evaluator import Evaluation, Evaluator
 from prbayes.model.node import model_on_context
 from prbayes.model.start import starting_thetas
+from prbayes.posterior.importance import LogDensity
 
 # Mean absolute correlation with the particles before a stage at which they count as new draws;
 # among 500 particles that share nothing it is .036. On the way to the posterior six times as much
@@ -48,6 +49,10 @@ class BatchedKernel(SMC_KERNEL):
         Share of the effective sample size that a stage keeps.
     compile_kwargs : dict, optional
         Accepted for PyMC's sake; the populations are evaluated in NumPy.
+    evaluator : Evaluator, optional
+        Of the model.
+    log_likelihood : callable, optional
+        Density of the data in place of exp(-sum of d_k / epsilon_k), (S, d) -> (S,).
     """
 
     stats_dtypes_shapes: ClassVar[dict[str, tuple[type, list[Any]]]] = {
@@ -66,6 +71,7 @@ class BatchedKernel(SMC_KERNEL):
         threshold: float = 0.5,
         compile_kwargs: dict[str, Any] | None = None,
         evaluator: Evaluator | None = None,
+        log_likelihood: LogDensity | None = None,
     ) -> None:
         # PyMC's constructor compiles functions of single particles, which this kernel never calls.
         self.draws = positive_integer(draws, "draws")
@@ -74,8 +80,9 @@ class BatchedKernel(SMC_KERNEL):
         self.threshold = share(threshold, "threshold")
         model = model_on_context(model, "BatchedKernel")
         self.evaluator = evaluator or Evaluator(model)
+        self.log_likelihood = log_likelihood
         unset = [n.name for n in self.evaluator.nodes if np.isnan(n.epsilon_value)]
-        if unset:
+        if unset and log_likelihood is None:
             raise ValueError(
                 f"{unset[0]}: epsilon is not set; call prb.set_epsilon(model, "
                 "prb.calibrate_epsilon(prb.minimize(model))) or use prb.sample_smc, "
@@ -96,6 +103,10 @@ class BatchedKernel(SMC_KERNEL):
         self.rng = rng
 
     def _evaluate(self, thetas: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        if self.log_likelihood is not None:
+            log_prior = self.evaluator.hyperparameters.log_prior(thetas)
+            unknown = np.full((len(thetas), len(self.evaluator.nodes)), np.nan)
+            return log_prior, self.log_likelihood(thetas), unknown, unknown.copy()
         found: Evaluation = self.evaluator(thetas)
         likelihood = found.log_likelihood(self.evaluator.epsilon)
         return found.log_prior, likelihood, found.discrepancies, found.lost

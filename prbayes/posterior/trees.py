@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,13 +28,11 @@ def posterior_tree(
     thetas: Floats,
     discrepancies: Floats,
     lost: Floats,
-    stats: list[dict[str, list[float]]],
+    stats: Sequence[dict[str, list[float]]],
     *,
-    sampler: Mapping[str, Any] | None = None,
+    sampler: Mapping[str, Any],
     sample_stats: xr.Dataset | None = None,
-    unadjusted: Floats | None = None,
     adjustment: str = "none",
-    measured: dict[str, float] | None = None,
     warnings: tuple[str, ...] = (),
     errors: Floats | None = None,
     missing: Mapping[str, Mapping[str, float]] | None = None,
@@ -51,23 +49,18 @@ def posterior_tree(
     evaluator : Evaluator
     thetas : ndarray, shape (chains, draws, d)
     discrepancies : ndarray, shape (chains, draws, k)
-        Before an adjustment; afterwards they are computed anew where that costs no response, and
-        else NaN.
+        NaN where they would cost responses.
     lost : ndarray, shape (chains, draws, k)
-        Before an adjustment: shares of populations without response; NaN of stored responses.
+        Shares of populations without response; NaN of stored responses.
     stats : list of dict
         By chain: statistics by name, one value per stage.
-    sampler : mapping, optional
-        Attributes with the name of another sampler than SMC and its diagnostics.
+    sampler : mapping
+        Attributes with the name of the sampler and its diagnostics.
     sample_stats : Dataset, optional
-        Statistics of such a sampler, in place of those by stage.
-    unadjusted : ndarray, shape (chains, draws, d), or None
+        Statistics of another sampler than SMC, in place of those by stage.
     adjustment : str
-        What was done to the draws.
-    measured : dict, or None
-        Numbers that tell how well the adjustment is known, for the attributes.
+        "estimate" of draws given the estimate, else "none".
     warnings : tuple of str
-        What is not identified, and what is to be said of the adjustment.
     errors : ndarray, shape (k,), or None
         Monte Carlo errors of the discrepancies.
     missing : mapping, optional
@@ -81,16 +74,12 @@ def posterior_tree(
     groups : mapping, optional
         What ArviZ looks for besides.
     """
-    if unadjusted is not None:
-        discrepancies = _discrepancies_again(evaluator, thetas, discrepancies)
     attrs = {
-        "sampler": "SMC-ABC" if evaluator.nodes else "SMC",
         "n_responses": n_responses,
         "seconds": seconds,
         "random_seed": "None" if seed is None else str(seed),
         "adjustment": adjustment,
-        **(measured or {}),
-        **(sampler or {}),
+        **sampler,
         "stopped": stopped,
         "warnings": "\n".join(warnings),
         **versions(),
@@ -107,86 +96,14 @@ def posterior_tree(
             discrepancies,
             errors,
             missing or {},
-            _support(evaluator, thetas, lost, adjusted=unadjusted is not None),
+            _support(evaluator, thetas, lost),
         ).assign_attrs(attrs),
         "observed_data": observed_dataset(evaluator),
     }
     failures = failures_dataset(evaluator)
     if failures.sizes["failure"]:
         tree["failures"] = failures
-    if unadjusted is not None:
-        tree["unadjusted"] = _draws(evaluator, unadjusted)
     return xr.DataTree.from_dict(tree)
-
-
-# Groups of a result that depend on its draws, which are others after an adjustment.
-_OF_DRAWS = ("posterior_predictive", "predictions", "log_likelihood", "log_prior")
-_PRIOR_GROUPS = {"prior", "prior_predictive"}
-
-
-def adjusted_tree(
-    evaluator: Evaluator,
-    given: xr.DataTree,
-    thetas: Floats,
-    *,
-    unadjusted: Floats | None,
-    adjustment: str,
-    measured: dict[str, float],
-    warnings: tuple[str, ...],
-    seconds: float,
-    groups: Mapping[str, xr.Dataset],
-) -> xr.DataTree:
-    """Return the DataTree of another sampler's draws that were adjusted.
-
-    Parameters
-    ----------
-    evaluator : Evaluator
-    given : DataTree
-        The sampler's.
-    thetas : ndarray, shape (chains, draws, d)
-    unadjusted, adjustment, measured, warnings
-        As in `posterior_tree`.
-    seconds : float
-    groups : mapping
-        What ArviZ looks for besides, of the draws that are returned; of the prior in case there was
-        nothing.
-    """
-    told = {
-        "adjustment": adjustment,
-        **measured,
-        "adjustment_seconds": seconds,
-        "warnings": "\n".join(warnings),
-        **versions(),
-    }
-    unknown = np.full((*thetas.shape[:2], len(evaluator.nodes)), np.nan)
-    again = _discrepancies_again(evaluator, thetas, unknown)
-    support = _support(evaluator, thetas, unknown, adjusted=True)
-    no_errors = np.full(len(evaluator.nodes), np.nan)
-    calibration = _calibration(evaluator, thetas, again, no_errors, {}, support)
-    attrs = {str(name): value for name, value in given["posterior"].attrs.items()}
-    own = {
-        "posterior": _posterior(evaluator, thetas, {**attrs, **told}),
-        "calibration": calibration.assign_attrs(told),
-    }
-    if unadjusted is not None:
-        own["unadjusted"] = _draws(evaluator, unadjusted)
-    coords = given["posterior"].coords
-    where = {name: coords[name].values for name in ("chain", "draw") if name in coords}
-    own |= {name: group for name, group in groups.items() if name in _OF_DRAWS}
-    found = {}
-    for name, group in own.items():
-        places = {dim: known[group[dim].values] for dim, known in where.items()}
-        found[name] = group.assign_coords(places)
-    found["observed_data"] = observed_dataset(evaluator)
-    failures = failures_dataset(evaluator)
-    if failures.sizes["failure"]:
-        found["failures"] = failures
-    for name, other in given.children.items():
-        if name not in found and name not in _OF_DRAWS:
-            found[str(name)] = other.to_dataset()
-    if _PRIOR_GROUPS.isdisjoint(found):  # draws of a prior and what they predict belong together
-        found |= {name: group for name, group in groups.items() if name in _PRIOR_GROUPS}
-    return xr.DataTree.from_dict(found)
 
 
 def _posterior(evaluator: Evaluator, thetas: Floats, attrs: dict[str, Any]) -> xr.Dataset:
@@ -278,15 +195,7 @@ def _by_specimen(evaluator: Evaluator, thetas: Floats, beside: xr.Dataset) -> xr
 _EACH_DRAW = ["chain", "draw", "simulator"]
 
 
-def _discrepancies_again(evaluator: Evaluator, thetas: Floats, before: Floats) -> Floats:
-    """Return the discrepancies of adjusted draws, NaN where that would cost responses."""
-    if evaluator.responses_per_theta:
-        return np.full(before.shape, np.nan)
-    rows = thetas.reshape(-1, thetas.shape[-1])
-    return evaluator(rows).discrepancies.reshape(before.shape)
-
-
-def _sample_stats(stats: list[dict[str, list[float]]]) -> xr.Dataset:
+def _sample_stats(stats: Sequence[dict[str, list[float]]]) -> xr.Dataset:
     """Return statistics by chain and stage, NaN after the last one of a chain."""
     n_chains = len(stats)
     n_stages = max(len(chain["beta"]) for chain in stats)
@@ -301,9 +210,7 @@ def _sample_stats(stats: list[dict[str, list[float]]]) -> xr.Dataset:
     return xr.Dataset(variables, coords=coords)
 
 
-def _support(
-    evaluator: Evaluator, thetas: Floats, lost: Floats, *, adjusted: bool
-) -> dict[str, Any]:
+def _support(evaluator: Evaluator, thetas: Floats, lost: Floats) -> dict[str, Any]:
     """Return how well designs support each draw, by simulator; NaN where there is no design.
 
     ``lost``, as in `posterior_tree`, is what is known without one.
@@ -316,7 +223,7 @@ def _support(
         for k, node in enumerate(evaluator.nodes):
             if node.name in found:
                 columns[:, k] = found[node.name][key]
-            elif key == "lost_mass" and not adjusted:
+            elif key == "lost_mass":
                 columns[:, k] = lost[:, :, k].ravel()
         variables[key] = (_EACH_DRAW, columns.reshape(chains, draws, -1))
     too_much = []
@@ -352,7 +259,7 @@ def _by_simulator(evaluator: Evaluator) -> dict[str, Any]:
     }
 
 
-def _evidence(stats: list[dict[str, list[float]]]) -> dict[str, float]:
+def _evidence(stats: Sequence[dict[str, list[float]]]) -> dict[str, float]:
     """Return the log of the chains' mean marginal likelihood, and the spread of their logs."""
     key = "log_marginal_likelihood"
     logs = np.array([stages[key][-1] for stages in stats if key in stages])
@@ -400,7 +307,7 @@ def calibration_tree(
     *,
     failed: int,
     draws: int,
-    adjust: object,
+    adjustment: object,
     seed: int,
 ) -> xr.DataTree:
     """Return the DataTree of a simulation-based calibration.
@@ -422,7 +329,7 @@ def calibration_tree(
             "outside": ", ".join(outside),
             "failed": failed,
             "draws": draws,
-            "adjustment": repr(adjust),
+            "adjustment": str(adjustment),
             "random_seed": str(seed),
             **versions(),
         }

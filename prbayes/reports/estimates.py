@@ -180,30 +180,19 @@ def _width(tree: xr.DataTree) -> list[str]:
     if "adjustment" not in attrs:
         return []
     adjustment = str(attrs["adjustment"])
-    if "unadjusted" in tree:
+    if adjustment == "estimate":
         return [
-            "The draws are adjusted to the width that the data warrant: "
-            "that of the metric's own estimate over repeated sets of specimens, "
-            f"combined with the prior ({adjustment}).",
-            *_width_error(attrs),
+            "The posterior is that given the metric's own estimate: prior times density of the "
+            "estimate over repeated sets of specimens."
         ]
-    if adjustment.startswith("none needed"):
-        return [f"The draws are as they were sampled; an adjustment: {adjustment}."]
-    reason = adjustment.removeprefix("none").removeprefix(": ")
-    why = f" ({reason})" if reason else ""
-    return [f"The draws are not adjusted{why}: their width is that of epsilon."]
+    by_epsilon = "The draws are those of exp(-discrepancy / epsilon): their width is epsilon's."
+    return [by_epsilon] if _has_epsilon(tree) else []
 
 
-def _width_error(attrs: Mapping[Any, Any]) -> list[str]:
-    """Say how well the adjustment is known."""
-    errors = [attrs.get(f"adjustment_{what}_error", math.nan) for what in ("center", "width")]
-    if not all(map(math.isfinite, errors)):
-        return []
-    center, width = errors
-    return [
-        f"From the number of refits its centre has a Monte Carlo error of up to {center:.2f} "
-        f"standard deviations, and its width one of up to {width:.0%}."
-    ]
+def _has_epsilon(tree: xr.DataTree) -> bool:
+    """Return whether a simulator of the result has a metric with an epsilon."""
+    calibration = tree["calibration"].to_dataset()
+    return bool((calibration["is_likelihood"] == 0).any())
 
 
 def _whole(value: float) -> str:

@@ -3,7 +3,7 @@
     uv run python -m benchmarks.scoreboard.rivals.prbayes
 
 With the log-likelihood by specimen (``prbayes likelihood``) the posterior is sampled by
-`prb.sample`. With a metric: the optimum, then `prb.sample_smc`.
+`prb.sample`. With a metric: the optimum, then `prb.sample`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def calibrate(task: Task, settings: dict[str, Any]) -> Draws:
             response = _of_vector(task) if task.problem.correlation else task.response
             prb.Simulator("y", response, *inputs, metric=metric, observed=task.observed)
     optimum = prb.minimize(model, progressbar=False)
-    tree = prb.sample_smc(optimum=optimum, model=model, random_seed=task.seed, progressbar=False)
+    tree = prb.sample(optimum=optimum, model=model, random_seed=task.seed, progressbar=False)
     return in_pymc.draws(tree.posterior, task.problem)
 
 
@@ -83,7 +83,7 @@ METRICS = {
     "kernel log-likelihood": "LogLikelihood",
 }
 # What the defaults were, so that results of other defaults are not gone on with.
-_DEFAULTS = {"adjust": "given the estimate; a log-likelihood as it is"}
+_DEFAULTS = {"sampler": "prb.sample", "posterior": "given the estimate"}
 _GROSS = ("contaminated",)  # problems whose data may have gross errors
 _LIKELIHOOD = {"sampler": "prb.sample", "draws": 1000}
 RIVALS = (

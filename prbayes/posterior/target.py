@@ -1,0 +1,154 @@
+"""The posterior that `sample` and `sample_smc` draw from: priors and a log-likelihood."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from prbayes._checks import Floats
+from prbayes._finding import Finding
+from prbayes.estimate.optimum import Optimum, require_sampling
+from prbayes.inference.checks.prior_conflict import conflict_findings
+from prbayes.model.evaluator import Evaluator
+from prbayes.posterior.estimate_likelihood import estimate_likelihood, score_obstacle
+from prbayes.posterior.importance import LogDensity
+from prbayes.posterior.refit_likelihood import refit_likelihood
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A posterior density in unconstrained space.
+
+    Attributes
+    ----------
+    evaluator : Evaluator
+    log_likelihood : callable
+        (S, d) -> (S,): all terms but the priors.
+    starts : tuple of ndarray, shapes (d,)
+        Points near the modes.
+    scale : ndarray, shape (d,)
+        Unit of each element for `laplace`.
+    """
+
+    evaluator: Evaluator
+    log_likelihood: LogDensity
+    starts: tuple[Floats, ...]
+    scale: Floats
+
+    def log_posterior(self, thetas: Floats) -> Floats:
+        """Return the unnormalised log-density, (S, d) -> (S,); -inf where it is not known."""
+        thetas = np.ascontiguousarray(thetas)
+        result = np.array(self.evaluator.hyperparameters.log_prior(thetas))
+        is_possible = np.isfinite(result)
+        if is_possible.any():
+            result[is_possible] += self.log_likelihood(thetas[is_possible])
+        result[~np.isfinite(result)] = -np.inf
+        return result
+
+
+def specimen_target(evaluator: Evaluator, optimum: Optimum | None) -> Target:
+    """Return the posterior of a model whose simulators have a log-likelihood by specimen."""
+    if optimum is None:
+        starts = _prior_starts(evaluator)
+    else:
+        starts = optima_of(optimum, evaluator)
+    return Target(evaluator, evaluator.log_other, starts, evaluator.prior_sd)
+
+
+def _prior_starts(evaluator: Evaluator, screened: int = 1024, count: int = 8) -> tuple[Floats, ...]:
+    """Return the best point of the prior, and others of the best quarter far from each other."""
+    thetas = evaluator.prior_points(screened, 0)
+    heights = Target(evaluator, evaluator.log_other, (), evaluator.prior_sd).log_posterior(thetas)
+    order = np.argsort(-heights, kind="stable")
+    candidates = thetas[order[: screened // 4]] / evaluator.prior_sd
+    chosen = [0]
+    distance = np.full(len(candidates), np.inf)
+    while len(chosen) < count:
+        away = ((candidates - candidates[chosen[-1]]) ** 2).sum(axis=1)
+        distance = np.minimum(distance, away)
+        chosen.append(int(np.argmax(distance)))
+    return tuple(candidates[chosen] * evaluator.prior_sd)
+
+
+def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
+    """Return the posterior given the metrics' own estimate.
+
+    The estimate of metrics whose gradient is a mean over specimens is an M-estimator, and its
+    density follows from the scores of stored responses. The density of other estimates follows from
+    refits.
+
+    Raises
+    ------
+    ValueError
+        If the density is not known: responses are random, or the optimum is at the edge of a
+        support or at a jump.
+    """
+    require_sampling(optimum, "sample")
+    for node in evaluator.nodes:
+        if node.bound.random:
+            raise ValueError(
+                f"{node.name}: propagation: got {type(node.propagation).__name__}, whose "
+                "discrepancy is random, so that the distribution of its minimiser is not known; "
+                "expected prb.Reweighted() or prb.Resimulated(), or prb.sample_smc with "
+                "adjustment=None, whose draws are as wide as epsilon makes them"
+            )
+    by_scores = score_obstacle(evaluator) is None
+    density = estimate_likelihood if by_scores else refit_likelihood
+    likelihood = density(evaluator, optimum)
+
+    def log_likelihood(thetas: Floats) -> Floats:
+        return likelihood.log_likelihood(thetas) + evaluator.log_other(thetas)
+
+    # The point of the score may differ from the optimum.
+    starts = (likelihood.point, *optima_of(optimum, evaluator)[1:])
+    return Target(evaluator, log_likelihood, starts, likelihood.scale)
+
+
+def optima_of(optimum: Optimum, evaluator: Evaluator) -> tuple[Floats, ...]:
+    """Return the optimum and local optima that the data support as well.
+
+    Their elements are in the evaluator's order, which may differ in a clone of the optimum's model.
+    """
+    order = [optimum.names.index(name) for name in evaluator.names]
+    rivals = [rival["theta"] for rival in optimum.rivals if rival["comparable"]]
+    return tuple(theta[order] for theta in (optimum.theta, *rivals))
+
+
+def prior_conflicts(
+    optimum: Optimum, evaluator: Evaluator, thetas: Floats, size: int = 4096
+) -> tuple[Finding, ...]:
+    """Report hyperparameters whose prior pulls the posterior away from the estimate.
+
+    The predictive distribution of an estimate is that of draws of the prior with the standard
+    errors of the optimum.
+
+    Parameters
+    ----------
+    optimum : Optimum
+    evaluator : Evaluator
+    thetas : ndarray, shape (..., d)
+        Draws of the posterior.
+    size : int
+        Number of draws of the prior.
+    """
+    if optimum.prior or any(rival["comparable"] for rival in optimum.rivals):
+        return ()
+    order = [optimum.names.index(name) for name in evaluator.names]
+    covariance = optimum.covariance[np.ix_(order, order)]
+    is_identified = np.isfinite(np.diag(covariance))
+    if not is_identified.any():
+        return ()
+    within = covariance[np.ix_(is_identified, is_identified)]
+    prior = evaluator.prior_thetas(size, 0)[:, is_identified]
+    rng = np.random.default_rng(5)
+    errors = rng.multivariate_normal(np.zeros(len(within)), within, size, method="eigh")
+    names = np.array(evaluator.readable_names)[is_identified]
+    return conflict_findings(
+        names.tolist(),
+        prior,
+        optimum.theta[order][is_identified],
+        np.sqrt(np.diag(within)),
+        thetas.reshape(-1, evaluator.size)[:, is_identified].mean(axis=0),
+        prior + errors,
+    )
