@@ -244,7 +244,6 @@ TAIL = (
 SLOW = (
     "Simulator",
     "Surrogate.fit",
-    "adjust",
     "area_test",
     "bootstrap",
     "cross_validate",

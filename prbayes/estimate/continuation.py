@@ -117,6 +117,7 @@ class ContinuedEvaluator(Evaluator):
         new = object.__new__(cls)
         vars(new).update(vars(evaluator))
         new.inner = evaluator
+        del new.prior_points  # the method below takes its place
         new.continuation = continuation
         points = continuation.coordinates(evaluator.prior_thetas(THETAS, 0))
         upper, lower = np.quantile(points, [0.84, 0.16], axis=0)
@@ -132,6 +133,10 @@ class ContinuedEvaluator(Evaluator):
     def roots(self, thetas: Floats, k: int) -> list[Floats]:
         """Return the values of the roots of the k-th simulator, shapes (P, *shape)."""
         return self.continuation.roots(self.inner, thetas, k)
+
+    def prior_points(self, size: int, seed: int) -> Floats:
+        """Return coordinates spread evenly over the prior, (size, d)."""
+        return self.continuation.coordinates(self.inner.prior_points(size, seed))
 
     def pulled_back(self, *_: object) -> Floats:
         """Refuse: gradients are differences."""

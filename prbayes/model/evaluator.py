@@ -527,7 +527,7 @@ class Evaluator:
             if design is None:
                 continue
             # Some populations at a time: their weights are held at all points.
-            step = max(1, AT_ONCE // design.n_points)
+            step = max(1, IN_CACHE // design.n_points)
             parts = []
             for first in range(0, max(1, len(thetas)), step):
                 roots = self.roots(thetas[first : first + step], k)

@@ -13,7 +13,6 @@ import xarray as xr
 
 from prbayes._checks import Floats, Seed, positive_integer, seed_number
 from prbayes._progress import shown
-from prbayes.estimate.minimization import Minimisation, find_optimum, require_finished
 from prbayes.estimate.optimum import Optimum
 from prbayes.estimate.refinement import MAX_ROUNDS, refine_at
 from prbayes.model.evaluator import Evaluator
@@ -29,7 +28,7 @@ from prbayes.posterior.importance import (
     laplace,
 )
 from prbayes.posterior.returned import as_asked, checked_idata_kwargs, checked_names
-from prbayes.posterior.smc import Sampling, evaluator_of, result_tree, sample_posterior
+from prbayes.posterior.smc import Sampling, estimate_of, evaluator_of, result_tree, sample_posterior
 from prbayes.posterior.target import Target, estimate_target, specimen_target
 from prbayes.response.budget import limited
 
@@ -57,9 +56,10 @@ def sample(
     from the optimum; of several modes, or where the likelihood jumps at the optimum, sequential
     Monte Carlo from the prior.
 
-    With PR or the Kullback-Leibler divergence and stored responses (`Reweighted`), the posterior is
-    prior times density of the metric's own estimate: of its score there, by a saddlepoint
-    approximation [2]_. It is sampled in the same way. Other metrics are sampled by `sample_smc`.
+    With a metric the posterior is prior times density of its own estimate, by a saddlepoint
+    approximation [2]_: of the score there, for PR and the Kullback-Leibler divergence, or of refits
+    of synthetic data sets. It is sampled in the same way, and by sequential Monte Carlo where
+    importance sampling is not reliable.
 
     Parameters
     ----------
@@ -148,9 +148,7 @@ def draw_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     """
     clock = time.perf_counter()
     before = evaluator.n_responses - evaluator.n_runs
-    optimum = asked.optimum
-    if optimum is None and evaluator.nodes:
-        optimum = require_finished(find_optimum(evaluator, Minimisation()))
+    optimum = estimate_of(evaluator, asked, "sample")
     asked = replace(asked, optimum=optimum)
     sample, nuts = None, None
     with designs_as_before(evaluator):
