@@ -84,25 +84,26 @@ class Coordinates:
     values: Floats
     degree: int
 
-    def monomials(self, rows: NDArray[np.intp]) -> Floats:
-        """Return monomials of standardised coordinates at some points, (q, k)."""
-        values = self.values[:, rows]
+    def monomials(self) -> Floats:
+        """Return monomials of standardised coordinates, (q, n)."""
+        z = _standardised(self.values)
         if self.degree == 1:
-            return _standardised(values)
-        if len(values) > 1:
-            centered = values - values.mean(axis=1, keepdims=True)
-            axes, _, _ = np.linalg.svd(centered, full_matrices=False)
-            values = axes.T @ centered
-        z = _standardised(values)
+            return z
+        if len(z) == 1:
+            return np.concatenate([z, z * z])
+        axes, _, _ = np.linalg.svd(z, full_matrices=False)
+        z = _standardised(axes.T @ z)
         first, second = np.triu_indices(len(z))
         return np.concatenate([z, z[first] * z[second]])
 
 
 def _standardised(values: Floats) -> Floats:
     """Return values (c, n) less their means, in standard deviations."""
-    spread = values.std(axis=1, keepdims=True)
-    spread = np.where(spread > 0, spread, 1.0)
-    return np.asarray((values - values.mean(axis=1, keepdims=True)) / spread)
+    size = values.shape[1]
+    centered = values - (values.sum(axis=1) / size)[:, None]
+    spread = np.sqrt(np.vecdot(centered, centered) / size)
+    spread[spread == 0] = 1.0
+    return np.asarray(centered / spread[:, None])
 
 
 def coordinates_of(dist: pt.TensorVariable, values: Floats) -> list[Coordinates] | None:
@@ -144,8 +145,8 @@ class ExponentialForm:
     Attributes
     ----------
     statistics : ndarray, shape (q + 1, n)
-        Sufficient statistics of all inputs, the last of which is the constant; outside of the
-        support those of a point inside.
+        Sufficient statistics of all inputs, the last of which is the constant; zero outside of the
+        support.
     is_inside : ndarray of bool, shape (n,)
         Points of the support.
     anchors : tuple of ndarray, shapes (q + 1, *event)
@@ -177,23 +178,24 @@ class ExponentialForm:
             if of_input is None:
                 return None
             coordinates += of_input
-        finite = np.isfinite(np.concatenate([u.values for u in coordinates]))
-        is_inside = finite.all(axis=0)
+        with np.errstate(invalid="ignore"):
+            is_inside = np.isfinite(sum(u.values.sum(axis=0) for u in coordinates))
         inside = np.flatnonzero(is_inside)
         if not inside.size:
             return None
-        rows = np.where(is_inside, np.arange(is_inside.size), inside[0])
-        parts = [u.monomials(rows) for u in coordinates]
-        statistics = np.concatenate([*parts, np.ones((1, rows.size))])
-        if inside.size < 2 * len(statistics):
+        parts = [Coordinates(u.values[:, inside], u.degree).monomials() for u in coordinates]
+        at_inside = np.concatenate([*parts, np.ones((1, inside.size))])
+        if inside.size < 2 * len(at_inside):
             return None
-        anchors = inside[_anchors(statistics[:, inside])]
-        at_anchors = statistics[:, anchors]
+        chosen = _anchors(at_inside)
+        at_anchors = at_inside[:, chosen]
         # Points that coincide, or lie in a plane, determine no natural parameters.
         if np.linalg.cond(at_anchors) > 1e6:
             return None
-        values_there = tuple(values[anchors] for values in points)
-        return cls(statistics, is_inside, values_there, np.linalg.inv(at_anchors))
+        statistics = np.zeros((len(at_inside), is_inside.size))
+        statistics[:, inside] = at_inside
+        anchors = tuple(values[inside[chosen]] for values in points)
+        return cls(statistics, is_inside, anchors, np.linalg.inv(at_anchors))
 
     def natural_parameters(self, at_anchors: Floats) -> Floats:
         """Return H from log-densities at the anchors, (S, q + 1) -> (S, q + 1).
