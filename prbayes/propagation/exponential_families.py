@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +25,9 @@ from pytensor.tensor.variable import TensorVariable
 from scipy.linalg import qr
 
 from prbayes._checks import Floats
+from prbayes._threads import one_thread
+from prbayes.response.distributions import compiled_log_density, compiled_log_density_slopes
+from prbayes.response.inputs import Inputs
 
 Columns = list[Floats]
 
@@ -195,6 +200,73 @@ def _anchors(statistics: Floats) -> NDArray[np.intp]:
     near = np.argsort(distance, kind="stable")[: n // 2]
     _, _, pivots = qr(statistics[:, near], mode="economic", pivoting=True)
     return np.asarray(near[pivots[:size]])
+
+
+class PointDensity:
+    """Log-densities of populations of some inputs at points: a matrix product, or PyMC's graph."""
+
+    def __init__(self, inputs: Inputs) -> None:
+        self.inputs = inputs
+        # The last points with the form of their log-density.
+        self._form: tuple[Any, ExponentialForm | None] = (None, None)
+
+    @cached_property
+    def _log_density(self) -> Any:
+        return compiled_log_density(self.inputs)
+
+    @cached_property
+    def _slopes(self) -> Any:
+        return compiled_log_density_slopes(self.inputs)
+
+    def _form_of(self, points: Sequence[Floats]) -> ExponentialForm | None:
+        """Return the log-density at points as a matrix product, if the inputs have that form."""
+        first, form = self._form
+        if first is not points[0]:
+            form = ExponentialForm.of(self.inputs.aleatory, points)
+            self._form = points[0], form
+        return form
+
+    def at(self, params: Sequence[Any], points: Sequence[Floats]) -> Callable[[slice], Floats]:
+        """Return log p(x given theta), (k, n), as a function of which points are wanted.
+
+        Parameters
+        ----------
+        params : sequence of ndarray, shapes (k, *shape)
+            Values of the roots.
+        points : sequence of ndarray, shapes (n, *event)
+        """
+        form = self._form_of(points)
+        if form is None:
+
+            def by_graph(some: slice) -> Floats:
+                (logs,) = self._log_density(*params, *(x[some] for x in points))
+                return np.array(logs)
+
+            return by_graph
+
+        (at_anchors,) = self._log_density(*params, *form.anchors)
+        parameters = form.natural_parameters(at_anchors)
+        rounded = form.is_rounded(at_anchors)
+        narrow = [param[rounded] for param in params]
+
+        def by_product(some: slice) -> Floats:
+            # In one thread, so that the points of a design do not depend on the number of threads.
+            with one_thread():
+                logs = parameters @ form.statistics[:, some]
+            if rounded.any():
+                (logs[rounded],) = self._log_density(*narrow, *(x[some] for x in points))
+            return np.asarray(logs)
+
+        return by_product
+
+    def pulled_back(
+        self, params: Sequence[Any], by_logs: Floats, points: Sequence[Floats]
+    ) -> list[Floats]:
+        """Return derivatives for the roots from those for log-densities at points, (k, n)."""
+        form = self._form_of(points)
+        if form is None:
+            return list(self._slopes(*params, by_logs, *points))
+        return list(self._slopes(*params, form.pulled_back(by_logs), *form.anchors))
 
 
 def normalise(logs: Floats) -> Floats:

@@ -52,15 +52,13 @@ from prbayes.propagation.edges import (
     moving_inputs,
     refuse_moving_atoms,
 )
-from prbayes.propagation.exponential_families import ExponentialForm, normalise
+from prbayes.propagation.exponential_families import PointDensity, normalise
 from prbayes.propagation.ops import CompactOp, OpaqueOp
 from prbayes.propagation.points import base_points
 from prbayes.response.compilation import compile_batched, untraced
 from prbayes.response.costs import Demand
 from prbayes.response.distributions import (
     PopulationSampler,
-    compiled_log_density,
-    compiled_log_density_slopes,
     log_density,
     prior_draws,
     quantiles,
@@ -384,8 +382,7 @@ class Design(Bound):
         self._basis: tuple[Any, Any, Any] = (None, None, None)
         # More conditions than a study has, fewer than fill the memory.
         self._others: deque[tuple[Responses, Floats]] = deque(maxlen=32)
-        # Points with the form of their log-density, the last that were asked for.
-        self._form: tuple[Any, ExponentialForm | None] = (None, None)
+        self._density = PointDensity(inputs)
         self._taken_back: Batches | None = None  # all that there were when some were forgotten
         self._moving: tuple[int, ...] | None = None
         self._coarse: Coarse | None = None
@@ -852,7 +849,7 @@ class Design(Bound):
 
     def _weights_at(self, components: Sequence[Floats], table: Table) -> Floats:
         """Return weights of a table's points in some populations, (T, n): they sum to one."""
-        logs = self._log_densities(components, table.points)(slice(None))
+        logs = self._density.at(components, table.points)(slice(None))
         logs -= table.log_g
         normalise(logs)
         even = 1 / logs.shape[1]
@@ -1010,7 +1007,7 @@ class Design(Bound):
         n = len(points[0])
         log_g = np.empty(n)
         sums = np.zeros((2, counts.size))
-        log_densities = self._log_densities(components, points)
+        log_densities = self._density.at(components, points)
         step = max(1, IN_CACHE // counts.size)
         for start in range(0, n, step):
             chunk = slice(start, start + step)
@@ -1110,46 +1107,6 @@ class Design(Bound):
     # -- Weights --
 
     @cached_property
-    def _log_density(self) -> Any:
-        return compiled_log_density(self.inputs)
-
-    def _form_of(self, points: Sequence[Floats]) -> ExponentialForm | None:
-        """Return the log-density at points as a matrix product, if the inputs have that form."""
-        first, form = self._form
-        if first is not points[0]:
-            form = ExponentialForm.of(self.inputs.aleatory, points)
-            self._form = points[0], form
-        return form
-
-    def _log_densities(
-        self, params: Sequence[Any], points: Sequence[Floats]
-    ) -> Callable[[slice], Floats]:
-        """Return log p(x given theta), (k, n), as a function of which points are wanted."""
-        form = self._form_of(points)
-        if form is None:
-
-            def by_graph(some: slice) -> Floats:
-                (logs,) = self._log_density(*params, *(x[some] for x in points))
-                return np.array(logs)
-
-            return by_graph
-
-        (at_anchors,) = self._log_density(*params, *form.anchors)
-        parameters = form.natural_parameters(at_anchors)
-        rounded = form.is_rounded(at_anchors)
-        narrow = [param[rounded] for param in params]
-
-        def by_product(some: slice) -> Floats:
-            # In one thread, so that the points of a design do not depend on the number of threads.
-            with one_thread():
-                logs = parameters @ form.statistics[:, some]
-            if rounded.any():
-                (logs[rounded],) = self._log_density(*narrow, *(x[some] for x in points))
-            return np.asarray(logs)
-
-        return by_product
-
-    @cached_property
     def _quantiles(self) -> Any:
         symbols = self.inputs.placeholders()
         shapes = [x.type.shape for x in self.inputs.aleatory]
@@ -1194,10 +1151,6 @@ class Design(Bound):
             slopes = pt.grad(None, symbols, known_grads=known, disconnected_inputs="ignore")
         return compile_batched([*symbols, cotangent], slopes)
 
-    @cached_property
-    def _log_density_slopes(self) -> Any:
-        return compiled_log_density_slopes(self.inputs)
-
     def pulled_back(
         self, params: Sequence[Any], weights: Floats, by_weights: Floats
     ) -> list[Floats]:
@@ -1209,11 +1162,10 @@ class Design(Bound):
             mean = np.vecdot(weights, by_weights)
             by_logs = by_weights - mean[:, None]
             by_logs *= weights
-        form = None if self._moving else self._form_of(self.contents.table.points)
-        if form is None:
+        if self._moving:
             slopes = self._log_weight_slopes(*params, by_logs)
         else:
-            slopes = self._log_density_slopes(*params, form.pulled_back(by_logs), *form.anchors)
+            slopes = self._density.pulled_back(params, by_logs, self.contents.table.points)
         found = []
         for root, by_root in zip(self.inputs.roots, slopes, strict=True):
             # What does not depend on the roots comes without the leading axis.
@@ -1260,7 +1212,7 @@ class Design(Bound):
         if self._moving:
             (logs,) = self._log_weights(*params)
             return np.array(logs)
-        logs = self._log_densities(params, table.points)(slice(None))
+        logs = self._density.at(params, table.points)(slice(None))
         logs -= table.log_g
         return logs
 
