@@ -274,7 +274,13 @@ class _Best:
     def of_none(cls, runs: Runs, rows: NDArray[np.intp]) -> _Best:
         """Return what there is before anything was tried."""
         m = runs.y.shape[1]
-        return cls(runs, rows, np.full(m, np.inf), [None] * m, np.empty_like(runs.y))
+        return cls(
+            runs=runs,
+            rows=rows,
+            least=np.full(m, np.inf),
+            models=[None] * m,
+            said=np.empty_like(runs.y),
+        )
 
     def take(self, models: Sequence[Any]) -> None:
         """Take models of the outputs for which they are better."""

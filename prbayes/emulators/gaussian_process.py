@@ -169,7 +169,13 @@ class GaussianProcess(Surface):
             found[row] = 0.0
             coefficients.append(found)
             centers.append(center)
-        return _Mean(kernel, scaled, lengths, np.array(centers), np.stack(coefficients, axis=1))
+        return _Mean(
+            kernel=kernel,
+            scaled=scaled,
+            lengths=lengths,
+            center=np.array(centers),
+            coefficients=np.stack(coefficients, axis=1),
+        )
 
     def slope(self, x: Floats, y: Floats, along: Floats) -> float:
         """Return the likeliest slope with these lengths, that of generalised least squares."""
@@ -194,7 +200,13 @@ def mean_through(kernel: Kernel, lengths: Floats, nugget: float, x: Floats, y: F
     root = _root(own, nugget)
     center = float(y.mean())
     coefficients = cho_solve((root, True), y - center)
-    return _Mean(kernel, scaled, lengths, center, coefficients)
+    return _Mean(
+        kernel=kernel,
+        scaled=scaled,
+        lengths=lengths,
+        center=center,
+        coefficients=coefficients,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -226,7 +226,13 @@ def fit_interpolant(z: Floats, y: Floats, near: NDArray[np.bool_] | None = None)
             if error < least:
                 least = error
                 best = Interpolant(
-                    z, solution[:n], solution[n:], center, half_width, powers, left_out
+                    z=z,
+                    weights=solution[:n],
+                    coefficients=solution[n:],
+                    center=center,
+                    half_width=half_width,
+                    powers=powers,
+                    left_out=left_out,
                 )
     if best is None:
         raise np.linalg.LinAlgError(

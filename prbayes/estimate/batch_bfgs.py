@@ -42,7 +42,13 @@ class _Differences:
         here = np.zeros((1, r))
         if curvature is None:
             unit = step * np.eye(r)
-            return cls(value, step, np.concatenate([here, unit, -unit]), np.eye(r), None)
+            return cls(
+                value=value,
+                step=step,
+                stencil=np.concatenate([here, unit, -unit]),
+                back=np.eye(r),
+                bend=None,
+            )
         # Axes along which a typical function is bent alike, of a mean length of one: along others a
         # function of coordinates that hang together is bent by much more than it is across them,
         # and a difference to one side would move its minimum by as much.
@@ -50,7 +56,13 @@ class _Differences:
         axes *= np.sqrt(r) / np.linalg.norm(axes)
         bent = float(np.trace(axes @ curvature @ axes.T)) / r
         stencil = np.concatenate([here, step * axes])
-        return cls(value, step, stencil, np.linalg.inv(axes).T, step * bent / 2)
+        return cls(
+            value=value,
+            step=step,
+            stencil=stencil,
+            back=np.linalg.inv(axes).T,
+            bend=step * bent / 2,
+        )
 
     def __call__(self, x: Floats, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
         """Return values (A,) and gradients (A, r) of some rows at one point each, (A, r)."""

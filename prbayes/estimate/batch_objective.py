@@ -67,7 +67,15 @@ class BatchObjective:
             targets.append(target)
             responses.append(own)
             bases.append(target.stored(own))
-        return cls(evaluator, scales, chosen, targets, responses, bases, blocks)
+        return cls(
+            evaluator=evaluator,
+            scales=scales,
+            simulators=chosen,
+            targets=targets,
+            values=responses,
+            bases=bases,
+            blocks=blocks,
+        )
 
     @property
     def n_sets(self) -> int:

@@ -100,7 +100,14 @@ class FeatureMap:
         except np.linalg.LinAlgError:
             return None
         lowest, highest = features.min(axis=0), features.max(axis=0)
-        return cls(pieces, interpolator, center, axes, lowest, highest)
+        return cls(
+            pieces=pieces,
+            interpolator=interpolator,
+            center=center,
+            axes=axes,
+            lowest=lowest,
+            highest=highest,
+        )
 
     def against(self, objective: BatchObjective) -> Callable[[Floats, Any], Floats]:
         """Return about the objective as a function of coordinates, ``(x, rows)``."""
@@ -164,7 +171,16 @@ def _features(objective: BatchObjective, thetas: Floats) -> tuple[list[_Piece], 
             nothing = np.zeros(len(seen))
             with_data = one.from_basis(nothing, basis, np)[0].ndim > 1
             kept = basis if with_data else ()
-            pieces.append(_Piece(i, k, own, tuple(constants), nothing, kept))
+            pieces.append(
+                _Piece(
+                    simulator=i,
+                    part=k,
+                    columns=own,
+                    constants=tuple(constants),
+                    nothing=nothing,
+                    basis=kept,
+                )
+            )
     return pieces, np.concatenate(columns, axis=1)
 
 

@@ -52,7 +52,13 @@ class Refitted:
         """Draw data sets at theta itself, which all keep: no minimiser, as a prior holds it."""
         sets = simulated_sets(sampling.evaluator, sampling.theta, n_sets, seed)
         x = np.zeros((n_sets, sampling.stderr.size))
-        return cls(sampling, x[0], sets, x, np.ones(n_sets, dtype=bool))
+        return cls(
+            sampling=sampling,
+            center=x[0],
+            sets=sets,
+            x=x,
+            converged=np.ones(n_sets, dtype=bool),
+        )
 
     @property
     def probability(self) -> float:

@@ -242,7 +242,13 @@ def _descend(objective: _Objective, start: Floats, options: Any) -> LocalOptimum
             value, _ = objective(theta)
     steps = slice(first, objective.count)
     covariance, slope = _inverse_hessian(objective, theta)
-    return LocalOptimum(theta, value, covariance, bool(slope < 0.05), steps)
+    return LocalOptimum(
+        theta=theta,
+        value=value,
+        covariance=covariance,
+        converged=bool(slope < 0.05),
+        steps=steps,
+    )
 
 
 def _inverse_hessian(objective: _Objective, theta: Floats) -> tuple[Floats, float]:

@@ -128,7 +128,13 @@ class Refits:
         shifts, _, _ = descend_by_simplex(value, start, sizes=[0.5])
         # The second ones know the principal axes.
         axes, sd = principal_axes(shifts)
-        along = _Along(objective, theta, prior_sd, axes, sd)
+        along = _Along(
+            objective=objective,
+            theta=theta,
+            prior_sd=prior_sd,
+            axes=axes,
+            steps=sd,
+        )
         begin = shifts @ axes / sd
         x, after, _ = descend_by_simplex(along, begin, sizes=[1.0])
         known = np.isfinite(before)
@@ -180,7 +186,13 @@ class Refits:
         wide = sd > _WIDEST / 5
         steps = np.where(wide, _WIDEST, sd)
         steps = np.minimum(steps, _WIDEST)
-        along = _Along(self.objective, self.theta, self.prior_sd, axes, steps)
+        along = _Along(
+            objective=self.objective,
+            theta=self.theta,
+            prior_sd=self.prior_sd,
+            axes=axes,
+            steps=steps,
+        )
         differences = second_differences(along.mean, steps.size)
         known = np.nan_to_num(differences)
         # From differences along the axes to derivatives in units of the prior's spread.

@@ -722,7 +722,14 @@ def _rivals(plan: _Plan, state: _State) -> list[Rival]:
     assert state.local is not None
     floors = noise_floors(evaluator, state.theta, FEW_SETS)
     noise = _NOISE_SHARE * float((floors / state.scales).sum())
-    best = Best(evaluator, state.theta, state.scales, state.local, noise, state.hold)
+    best = Best(
+        evaluator=evaluator,
+        theta=state.theta,
+        scales=state.scales,
+        local=state.local,
+        noise=noise,
+        hold=state.hold,
+    )
     search = partial(rivals, best, starts=plan.starts, seed=plan.seed)
     clouds = any(design.contents.cloud for design in evaluator.designs.values())
     if clouds and plan.refine:

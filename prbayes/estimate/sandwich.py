@@ -177,7 +177,14 @@ class Information:
         """Return the populations within given steps."""
         thetas = self.theta + stencil(step.size) * step
         values, weights = self.evaluator.populations(thetas, self.k)
-        return Stencil(share, step, values, weights, self.node.bound.blocks, self._target)
+        return Stencil(
+            share=share,
+            step=step,
+            values=values,
+            weights=weights,
+            blocks=self.node.bound.blocks,
+            target=self._target,
+        )
 
     @property
     def blocks(self) -> NDArray[np.intp]:

@@ -117,7 +117,13 @@ def principal_components(
     scores = centered @ axes
     rest = centered - scores @ axes.T
     rest = rest - rest.mean(axis=0)
-    return Components(center, axes, of_data, of_design, _between_neighbours(rest))
+    return Components(
+        center=center,
+        axes=axes,
+        left_out=of_data,
+        design_left_out=of_design,
+        rest_correlation=_between_neighbours(rest),
+    )
 
 
 def _scatter(

@@ -184,7 +184,14 @@ class LogLikelihood(Metric):
                 lower[is_high], upper[is_high] = full(high, "censored")[is_high], np.inf
             values = np.where(is_low | is_high, np.nan, values)
         sd = np.where(np.isfinite(sd), sd, 0.0)
-        return Readings(values, sd, step, lower, upper, np.full(values.shape, self.relative))
+        return Readings(
+            values=values,
+            error=sd,
+            step=step,
+            lower=lower,
+            upper=upper,
+            is_relative=np.full(values.shape, self.relative),
+        )
 
     def _prepare(self, observed: Floats, weights: Floats) -> Discrepancy:
         if self.density is None:

@@ -42,7 +42,14 @@ class Readings:
     def exact(cls, values: Floats) -> Readings:
         """Return readings without error, (N, m)."""
         zero, missing = np.zeros_like(values), np.full_like(values, np.nan)
-        return cls(values, zero, zero, missing, missing, np.zeros(values.shape, dtype=bool))
+        return cls(
+            values=values,
+            error=zero,
+            step=zero,
+            lower=missing,
+            upper=missing,
+            is_relative=np.zeros(values.shape, dtype=bool),
+        )
 
     def __len__(self) -> int:
         return len(self.values)

@@ -184,7 +184,15 @@ def _of_model(model: pm.Model) -> list[Countable]:
         computed = simulator.is_computed
         alike = [earlier for earlier in asked if earlier.responses.runs is responses.runs]
         shared = alike[0].responses.name if alike and not computed else ""
-        asked.append(Asked(responses, simulator.propagation, simulator.target, shared, computed))
+        asked.append(
+            Asked(
+                responses=responses,
+                propagation=simulator.propagation,
+                target=simulator.target,
+                shared=shared,
+                computed=computed,
+            )
+        )
     likelihoods = specimen_likelihoods(model)
     specimens = [SpecimenRuns(likelihoods[rv], m) for rv, m in measurements_of(model).items()]
     return [*asked, *specimens]

@@ -149,7 +149,14 @@ class EmulatedResponse:
         surface = fit_interpolant(z[rows], y[rows], near[rows] if near[rows].any() else None)
         left_out = surface.left_out[near[rows]] if near[rows].any() else surface.left_out
         error = np.sqrt((left_out**2).mean(axis=0))
-        return cls(coordinates, z, y, surface, values.shape[1:], error)
+        return cls(
+            coordinates=coordinates,
+            z=z,
+            y=y,
+            surface=surface,
+            event=values.shape[1:],
+            error=error,
+        )
 
     def __call__(self, inputs: Sequence[Floats]) -> Floats:
         """Return responses of specimens, (n, *event) by input -> (n, *event); no run is made.

@@ -201,7 +201,13 @@ def Simulator(  # noqa: N802 (stands beside pm.Normal and pm.Simulator)
         data = observed
     elif np.isnan(target.observed).any():
         data = pt.constant(target.observed)
-    whole = _Term(name, target, labels, data, dims)
+    whole = _Term(
+        name=name,
+        target=target,
+        labels=labels,
+        data=data,
+        dims=dims,
+    )
     terms = [whole]
     groups = sorted_inputs.groups
     if groups is not None and places is not None:
@@ -547,7 +553,17 @@ def _of_groups(whole: _Term, groups: Groups, places: NDArray[np.intp]) -> list[_
         part = _target(name, target.metric, target.observed[own], weights)
         data = pt.constant(part.observed) if np.isnan(part.observed).any() else part.observed
         labels = None if whole.labels is None else whole.labels[own]
-        terms.append(_Term(name, part, labels, data, None, label, place))
+        terms.append(
+            _Term(
+                name=name,
+                target=part,
+                labels=labels,
+                data=data,
+                dims=None,
+                group=label,
+                place=place,
+            )
+        )
     return terms
 
 

@@ -124,7 +124,13 @@ class Chains:
         if not done:
             raise BudgetError(stopped)
         thetas, discrepancies, lost = map(np.array, zip(*done, strict=True))
-        return Particles(thetas, discrepancies, lost, stats, stopped)
+        return Particles(
+            thetas=thetas,
+            discrepancies=discrepancies,
+            lost=lost,
+            stats=stats,
+            stopped=stopped,
+        )
 
     def _stages(self, kernel: BatchedKernel, stages: Stages) -> Iterator[None]:
         """Do the stages of a chain that are left, and yield after each.

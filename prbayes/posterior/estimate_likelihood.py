@@ -360,7 +360,13 @@ def _group_scores(
             assert isinstance(population, ShiftedResponses)
             table = tabulated_scores(node.target, population, node.observed, options.score, total)
             tables.append(partial(_scaled, table, factor))
-        return ResimulatedScores(tuple(members), tuple(tables), mean, n, identity)
+        return ResimulatedScores(
+            simulators=tuple(members),
+            tables=tuple(tables),
+            mean=mean,
+            size=n,
+            combinations=identity,
+        )
     mask = np.ones(len(populations[0].responses), dtype=bool)
     for node, population in zip(nodes, populations, strict=True):
         mask &= observable(population.responses, node.target)

@@ -231,7 +231,14 @@ class Charts:
         shapes = (d,), (d, k), (d, m), (k,)
         centre, free, solved, location = (np.zeros((n, charts, *shape)) for shape in shapes)
         scale = np.tile(np.eye(k), (n, charts, 1, 1))
-        return cls(centre, free, solved, location, scale, np.zeros((n, charts)))
+        return cls(
+            centre=centre,
+            free=free,
+            solved=solved,
+            location=location,
+            scale=scale,
+            share=np.zeros((n, charts)),
+        )
 
     @classmethod
     def concatenated(cls, parts: list[Charts]) -> Charts:
@@ -518,5 +525,10 @@ def _charts_at(fibres: Fibres, z: Floats, jacobian: Floats) -> Charts:
     shift = (covariance @ slope[..., None])[..., 0]
     shift /= np.maximum(np.sqrt((shift**2).sum(axis=1, keepdims=True)), 1)
     return Charts(
-        z, free, solved, shift, np.linalg.cholesky(Charts.inflation * covariance), np.ones(n)
+        centre=z,
+        free=free,
+        solved=solved,
+        location=shift,
+        scale=np.linalg.cholesky(Charts.inflation * covariance),
+        share=np.ones(n),
     )

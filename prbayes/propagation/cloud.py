@@ -152,7 +152,15 @@ class Emulation:
             return None
         share = 0.0 if share < _LITTLE else share
         error = _error(runs, said, weights.mean(axis=0))
-        return cls(runs, models, said, weights, share, error, event)
+        return cls(
+            runs=runs,
+            models=models,
+            said=said,
+            weights=weights,
+            share=share,
+            error=error,
+            event=event,
+        )
 
     def elsewhere(self, weights: Floats) -> Emulation | None:
         """Return the same surfaces for other populations; None where runs alone are as good."""

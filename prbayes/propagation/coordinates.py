@@ -73,7 +73,13 @@ class Coordinates:
             z = z[np.isfinite(z).all(axis=1)]
             ends += [z.min(axis=0), z.max(axis=0)]
         bounds = np.stack([np.min(ends, axis=0), np.max(ends, axis=0)])
-        return cls(inputs.event_shapes, is_log, center, half_width, bounds)
+        return cls(
+            shapes=inputs.event_shapes,
+            is_log=is_log,
+            center=center,
+            half_width=half_width,
+            bounds=bounds,
+        )
 
     @property
     def size(self) -> int:

@@ -696,7 +696,14 @@ class Design(Bound):
         # Before the runs: what is wrong with it then costs none.
         coarse = None if self._coarse is None else self._coarse(points)
         values = self._responses_at(points)
-        batch = Batches(tuple(points), values, tuple(components), counts, (n,), coarse)
+        batch = Batches(
+            points=tuple(points),
+            values=values,
+            components=tuple(components),
+            counts=counts,
+            sizes=(n,),
+            coarse=coarse,
+        )
         before = self._contents
         batches = batch if before is None else before.batches.followed_by(batch)
         if self._moving is None:

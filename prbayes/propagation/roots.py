@@ -124,7 +124,13 @@ def find_roots(
     # By place: misfits of nearly zero are in an order of rounding.
     order = np.lexsort((*z[kept].T[::-1], specimen[kept]))
     kept = kept[order]
-    return Roots(specimen[kept], z[kept], misfit[kept], residual[kept], jacobian[kept])
+    return Roots(
+        specimen=specimen[kept],
+        z=z[kept],
+        misfit=misfit[kept],
+        residual=residual[kept],
+        jacobian=jacobian[kept],
+    )
 
 
 def _damped_step(jacobian: Floats, residual: Floats, damping: Floats, width: Floats) -> Floats:

@@ -168,7 +168,15 @@ class Emulation:
         error = np.maximum(2 * left_out, options.floor * spread)
         nothing = np.full(z.shape[1], np.inf)
         empty = np.stack([nothing, -nothing])
-        return cls(z, y, box, surface, error, np.inf, empty)
+        return cls(
+            z=z,
+            y=y,
+            box=box,
+            surface=surface,
+            error=error,
+            bias=np.inf,
+            range=empty,
+        )
 
     @classmethod
     def of_function(
@@ -185,7 +193,15 @@ class Emulation:
         error = options.floor * readings.spread()
         infinite = np.full(d, np.inf)
         whole = np.stack([-infinite, infinite])
-        return cls(z, run(z), search_box, DifferencedResponse(run), error, 0.0, whole)
+        return cls(
+            z=z,
+            y=run(z),
+            box=search_box,
+            surface=DifferencedResponse(run),
+            error=error,
+            bias=0.0,
+            range=whole,
+        )
 
     def covers(self, z: Floats) -> bool:
         """Return whether points lie in the range of the roots at which runs were made."""
@@ -377,7 +393,15 @@ def extended(
     surface, _ = surface_near(z, y, readings, spread, name)
     reach = np.concatenate([emulation.range, fresh])
     extremes = np.stack([reach.min(axis=0), reach.max(axis=0)])
-    return Emulation(z, y, emulation.box, surface, error, bias, extremes)
+    return Emulation(
+        z=z,
+        y=y,
+        box=emulation.box,
+        surface=surface,
+        error=error,
+        bias=bias,
+        range=extremes,
+    )
 
 
 def typical_sd(sd: Floats) -> Floats:
@@ -662,7 +686,12 @@ def draw_points(
         )
     n_roots = np.bincount(roots.specimen, minlength=len(readings))
     return SpecimenPoints(
-        points.z, points.outputs, points.log_a, points.log_proposal, n_roots, difference
+        z=points.z,
+        outputs=points.outputs,
+        log_a=points.log_a,
+        log_proposal=points.log_proposal,
+        n_roots=n_roots,
+        difference=difference,
     )
 
 
@@ -884,7 +913,13 @@ def _draw(
     exists = np.repeat(table >= 0, count, axis=1)
     log_proposal = np.where(exists, log_proposal, np.inf)
     log_a = readings.log_density(outputs, error) - log_proposal
-    return _Sample(z_all, outputs, log_a, log_proposal, (table >= 0).sum(axis=1))
+    return _Sample(
+        z=z_all,
+        outputs=outputs,
+        log_a=log_a,
+        log_proposal=log_proposal,
+        n_roots=(table >= 0).sum(axis=1),
+    )
 
 
 def _in_blocks(emulation: Response, z: Floats) -> Floats:
