@@ -526,12 +526,6 @@ INNER = {
         "pymc.distributions.censored.CensoredRV",
         "pytensor.tensor.variable.TensorVariable",
     },
-    "propagation.exponential_families": {
-        "pymc.distributions.continuous.TruncatedNormalRV",
-        "pytensor.graph.basic.Constant",
-        "pytensor.tensor.random.basic",
-        "pytensor.tensor.variable.TensorVariable",
-    },
     "propagation.reweighted": {
         "pytensor.gradient.disconnected_grad",
         "pytensor.graph.traversal.ancestors",

@@ -34,18 +34,18 @@ from prbayes.response.inputs import Inputs
 
 @dataclass(frozen=True)
 class Family:
-    """Coordinates of an element, (n,) -> (n,), whose monomials are the sufficient statistics.
+    """FamilyCoordinates of an element, which are the sufficient statistics, or whose monomials are.
 
     Attributes
     ----------
     coordinates : tuple of callable
-        Not finite outside of the support.
-    degree : int
-        Highest degree of the monomials, 1 or 2.
+        (n,) -> (n,), not finite outside of the support.
+    is_quadratic : bool
+        Whether monomials of degree two are statistics as well.
     """
 
     coordinates: tuple[Callable[[Floats], Floats], ...]
-    degree: int = 1
+    is_quadratic: bool = False
 
 
 def _non_negative(x: Floats) -> Floats:
@@ -58,10 +58,10 @@ def _log_of_rest(x: Floats) -> Floats:
 
 # Their supports do not depend on parameters; that of the truncated normal is in the graph.
 FAMILIES = {
-    type(pm.Normal.rv_op): Family((np.positive,), degree=2),
-    type(pm.HalfNormal.rv_op): Family((_non_negative,), degree=2),
-    type(pm.TruncatedNormal.rv_op): Family((np.positive,), degree=2),
-    type(pm.LogNormal.rv_op): Family((np.log,), degree=2),
+    type(pm.Normal.rv_op): Family((np.positive,), is_quadratic=True),
+    type(pm.HalfNormal.rv_op): Family((_non_negative,), is_quadratic=True),
+    type(pm.TruncatedNormal.rv_op): Family((np.positive,), is_quadratic=True),
+    type(pm.LogNormal.rv_op): Family((np.log,), is_quadratic=True),
     type(pm.Gamma.rv_op): Family((np.positive, np.log)),
     type(pm.InverseGamma.rv_op): Family((np.reciprocal, np.log)),
     type(pm.Beta.rv_op): Family((np.log, _log_of_rest)),
@@ -70,24 +70,24 @@ FAMILIES = {
 
 
 @dataclass(frozen=True, eq=False)
-class Coordinates:
-    """Coordinates of an element of an input, or of a multivariate normal, at points.
+class FamilyCoordinates:
+    """FamilyCoordinates of an element of an input, or of a multivariate normal, at points.
 
     Attributes
     ----------
     values : ndarray, shape (c, n)
         Not finite outside of the support.
-    degree : int
-        Highest degree of the monomials that are sufficient statistics.
+    is_quadratic : bool
+        Whether monomials of degree two are sufficient statistics as well.
     """
 
     values: Floats
-    degree: int
+    is_quadratic: bool
 
-    def monomials(self) -> Floats:
-        """Return monomials of standardised coordinates, (q, n)."""
+    def statistics(self) -> Floats:
+        """Return sufficient statistics of standardised coordinates, (q, n)."""
         z = _standardised(self.values)
-        if self.degree == 1:
+        if not self.is_quadratic:
             return z
         if len(z) == 1:
             return np.concatenate([z, z * z])
@@ -106,7 +106,7 @@ def _standardised(values: Floats) -> Floats:
     return np.asarray(centered / spread[:, None])
 
 
-def coordinates_of(dist: pt.TensorVariable, values: Floats) -> list[Coordinates] | None:
+def coordinates_of(dist: pt.TensorVariable, values: Floats) -> list[FamilyCoordinates] | None:
     """Return the coordinates of all elements of an input at points.
 
     Parameters
@@ -117,11 +117,11 @@ def coordinates_of(dist: pt.TensorVariable, values: Floats) -> list[Coordinates]
 
     Returns
     -------
-    list of Coordinates, or None
+    list of FamilyCoordinates, or None
         None if the distribution is no exponential family with a fixed support.
     """
     if is_mvnormal(dist):
-        return [Coordinates(values.T, 2)]
+        return [FamilyCoordinates(values.T, is_quadratic=True)]
     op = dist.owner.op
     family = FAMILIES.get(type(op))
     if family is None:
@@ -135,7 +135,7 @@ def coordinates_of(dist: pt.TensorVariable, values: Floats) -> list[Coordinates]
     elements = values.reshape(len(values), -1).T
     with np.errstate(all="ignore"):
         stacked = [np.stack([u(x) for u in family.coordinates]) for x in elements]
-    return [Coordinates(u, family.degree) for u in stacked]
+    return [FamilyCoordinates(u, family.is_quadratic) for u in stacked]
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +172,7 @@ class ExponentialForm:
             The distributions of the inputs.
         points : sequence of ndarray, shapes (n, *event)
         """
-        coordinates: list[Coordinates] = []
+        coordinates: list[FamilyCoordinates] = []
         for dist, values in zip(dists, points, strict=True):
             of_input = coordinates_of(dist, values)
             if of_input is None:
@@ -183,18 +183,20 @@ class ExponentialForm:
         inside = np.flatnonzero(is_inside)
         if not inside.size:
             return None
-        parts = [Coordinates(u.values[:, inside], u.degree).monomials() for u in coordinates]
+        parts = [
+            FamilyCoordinates(u.values[:, inside], u.is_quadratic).statistics() for u in coordinates
+        ]
         at_inside = np.concatenate([*parts, np.ones((1, inside.size))])
         if inside.size < 2 * len(at_inside):
             return None
-        chosen = _anchors(at_inside)
-        at_anchors = at_inside[:, chosen]
+        pivots = _anchors(at_inside)
+        at_anchors = at_inside[:, pivots]
         # Points that coincide, or lie in a plane, determine no natural parameters.
         if np.linalg.cond(at_anchors) > 1e6:
             return None
         statistics = np.zeros((len(at_inside), is_inside.size))
         statistics[:, inside] = at_inside
-        anchors = tuple(values[inside[chosen]] for values in points)
+        anchors = tuple(values[inside[pivots]] for values in points)
         return cls(statistics, is_inside, anchors, np.linalg.inv(at_anchors))
 
     def natural_parameters(self, at_anchors: Floats) -> Floats:

@@ -451,14 +451,7 @@ def _adapted(charts: Charts, sample: _Sample, turn: bool) -> Charts:
     share = 0.9 * share + 0.1 * has_chart / np.maximum(has_chart.sum(axis=1, keepdims=True), 1)
     share = np.where(has_chart, share, 0)
     share /= np.maximum(share.sum(axis=1, keepdims=True), 1e-300)
-    return Charts(
-        centre=charts.centre,
-        free=free,
-        solved=solved,
-        location=location,
-        scale=scale,
-        share=share,
-    )
+    return replace(charts, free=free, solved=solved, location=location, scale=scale, share=share)
 
 
 def _shifted_sobol(points: int, dimensions: int, key: tuple[int, int], numbers: Indices) -> Floats:

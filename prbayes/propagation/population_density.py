@@ -74,9 +74,9 @@ class PopulationDensity:
         result = np.empty((n, len(natural)))
         step = max(16, IN_CACHE // 4 // log_a.size)
         for first in range(0, len(natural), step):
-            some = slice(first, first + step)
-            exponents = terms @ parameters[:, some]
-            _log_sum_exp_first(exponents.reshape(count, n, -1), result[:, some])
+            block = slice(first, first + step)
+            exponents = terms @ parameters[:, block]
+            _log_sum_exp_first(exponents.reshape(count, n, -1), result[:, block])
         if is_rounded.any():
             narrow = [root[is_rounded] for root in roots]
             result[:, is_rounded] = self._by_graph(narrow, x, log_a).T
@@ -89,11 +89,11 @@ class PopulationDensity:
         result = np.empty((len(roots[0]), n))
         step = max(1, IN_CACHE // log_a.size)
         for first in range(0, len(result), step):
-            some = slice(first, first + step)
+            block = slice(first, first + step)
             with np.errstate(all="ignore"):
-                (logs,) = self._log_density(*(root[some] for root in roots), *flat)
+                (logs,) = self._log_density(*(root[block] for root in roots), *flat)
             logs = np.where(np.isnan(logs), -np.inf, logs)
-            result[some] = log_sum_exp(logs.reshape(-1, n, count) + log_a)
+            result[block] = log_sum_exp(logs.reshape(-1, n, count) + log_a)
         return result
 
 

@@ -78,3 +78,20 @@ def test_other_distributions_have_no_such_form(dist):
 
 def test_points_that_coincide_have_no_such_form():
     assert ExponentialForm.of([pm.Normal.dist(0, 1)], [np.repeat([0.0, 1.0], 20)]) is None
+
+
+def test_points_outside_of_a_support_take_no_part():
+    """Those below zero, or above the end of a truncated distribution."""
+    points = np.linspace(0.1, 2.0, 40)
+    for dist in (pm.HalfNormal.dist(1), pm.Gamma.dist(2, 1), pm.Exponential.dist(1)):
+        beside = ExponentialForm.of([dist], [np.concatenate([points, [-1.0, np.nan]])])
+        alone = ExponentialForm.of([dist], [points])
+        assert beside.is_inside.tolist() == [True] * 40 + [False] * 2
+        np.testing.assert_array_equal(beside.statistics[:, :40], alone.statistics)
+    truncated = ExponentialForm.of([pm.TruncatedNormal.dist(0, 1, upper=1)], [points])
+    assert truncated.is_inside.tolist() == (points <= 1).tolist()
+
+
+@pytest.mark.parametrize("values", [-np.ones(40), np.full(40, np.nan)])
+def test_points_that_are_all_outside_have_no_such_form(values):
+    assert ExponentialForm.of([pm.InverseGamma.dist(3, 1)], [values]) is None

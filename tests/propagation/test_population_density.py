@@ -81,6 +81,14 @@ def test_invalid_parameters_and_points_have_no_density(name: str) -> None:
     assert np.isneginf(found[3]).tolist() == [name != "normal" and i == 3 for i in range(7)]
 
 
+def test_populations_far_narrower_than_their_points() -> None:
+    """Their rows are those of the graph, beside rows of the product of matrices."""
+    inputs = inputs_of(pm.Normal.dist)
+    roots = by_name(inputs, {"a0": np.full(3, 0.3), "b0": np.array([1e-6, 0.5, 1e-3])})
+    found = PopulationDensity(inputs).log_likelihoods(roots, [X], LOG_A)
+    assert np.allclose(found, by_graph(inputs, roots, [X], LOG_A), rtol=1e-12)
+
+
 def test_squares_of_a_distant_mean_keep_their_digits() -> None:
     inputs = inputs_of(pm.Normal.dist)
     roots = by_name(inputs, {"a0": 1e8 + FIRST, "b0": SECOND})
