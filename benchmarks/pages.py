@@ -94,6 +94,21 @@ def saddlepoint() -> Iterator[Row]:
         ]  # fmt: skip
 
 
+def saddlepoint_refits() -> Iterator[Row]:
+    """Yield offsets and widths of posteriors given estimates by refits, by metric, prior and size."""
+    for name, cell in found("saddlepoint")["summary"].items():
+        study, metric, *rest = name.split(", ")
+        if study != "refits" or "rms offset" not in cell:
+            continue
+        size, prior = rest
+        offset, largest = (max(cell[f"{key} offset"]) for key in ("rms", "largest"))
+        widths = f"{short(min(cell['mean width']))} to {short(max(cell['mean width']))}"
+        yield [
+            metric, size.removeprefix("N = "), prior, str(cell["data sets"] - cell["failed"]),
+            short(offset), short(largest), widths, short(cell["seconds"]),
+        ]  # fmt: skip
+
+
 # Priors of one simulator of one output, and problems of several.
 _CASES = (
     "vague", "bounded", "sharp", "conflict", "two simulators", "4 simulators", "8 simulators",
@@ -457,6 +472,26 @@ def joint_memory() -> Iterator[Row]:
         ]
 
 
+def speed() -> Iterator[Row]:
+    """Return the rows of CPU seconds, memory and import beside their aims."""
+    for row in found("speed")["rows"]:
+        ratio = short(row["ratio"], 3) if row["against"] else ""
+        value = f"{row['value']:.0f}" if row["value"] >= 20 else short(row["value"])
+        aim = short(row["aim"]) if row["aim"] < 1 else f"{row['aim']:g}"
+        yield [row["what"], row["against"], value, ratio, aim, "yes" if row["met"] else "no"]
+
+
+def speed_jobs() -> Iterator[Row]:
+    """Return the rows of CPU seconds by job."""
+    for name, job in found("speed")["jobs"].items():
+        if "error" in job or "bias" in job:
+            cells = [short(job[key]) if key in job else "" for key in _OF_JOBS]
+            yield [name, *cells, job.get("error", "")]
+
+
+_OF_JOBS = ("cold", "warm", "bias", "width")
+
+
 def scale() -> Iterator[Row]:
     """Return the rows of time and memory of large problems."""
     from benchmarks.scale import THETAS
@@ -750,6 +785,7 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "likelihood, ranks": likelihood_ranks,
     "likelihood, sizes of guards": guard_sizes,
     "saddlepoint": saddlepoint,
+    "saddlepoint_refits": saddlepoint_refits,
     "samplers": samplers,
     "size": sizes,
     "size, through prbayes": sizes_through,
@@ -773,6 +809,8 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "joint, errors": joint,
     "joint, time": joint_time,
     "joint, memory": joint_memory,
+    "speed": speed,
+    "speed, jobs": speed_jobs,
     "scale": scale,
     "busy workers": busy_workers,
     "between runs": between_runs,

@@ -1,6 +1,6 @@
-"""Posterior given a metric's estimate, by the saddlepoint density of the score: offsets and widths.
+"""Posterior given a metric's estimate, by the saddlepoint density of the score or of refits: offsets and widths.
 
-Three studies, each against an exact posterior, on data sets with hyperparameters drawn from the prior:
+Five studies, each against an exact posterior, on data sets with hyperparameters drawn from the prior:
 
 - ``one``: y = x, a normal population. Priors are vague, bounded (ends within two standard errors) sharp
   (a quarter and half of a standard error), or in conflict with the data. For the Kullback-Leibler divergence the reference is the
@@ -11,12 +11,19 @@ Three studies, each against an exact posterior, on data sets with hyperparameter
   a simulator of its own, so that minimising takes less time.
 - ``far``: y = x with the truth three prior standard deviations away and a small scatter; and, on ordinary
   data, Laplace approximations from points of the prior in place of the estimate.
+- ``refits``: metrics whose gradient is no mean over specimens, by refits of synthetic data sets, on the
+  data sets of ``one``. The references of the area metric and of the Cramer-von Mises distance are
+  posteriors given the estimate (`benchmarks.refit_pivots`), that of the reverse divergence is the
+  posterior of the full data. With ``--outputs 2`` two simulators, and so four hyperparameters.
+- ``modes``: the response (x - 1)^2 under mu ~ N(0, 2), whose modes mirror each other: the share of the upper mode.
 
 Offsets are in standard deviations of the reference, widths are ratios of standard deviations.
 
     uv run python -m benchmarks.saddlepoint one [--data-sets 20] [--sizes 10 20 50 200]
     uv run python -m benchmarks.saddlepoint several [--data-sets 10] [--sizes 20 50] [--outputs 3 4 8] [--simulators]
     uv run python -m benchmarks.saddlepoint far [--data-sets 20]
+    uv run python -m benchmarks.saddlepoint refits [--data-sets 10] [--metrics area "reverse KLD"] [--outputs 1 2]
+    uv run python -m benchmarks.saddlepoint modes [--data-sets 10]
 """
 
 from __future__ import annotations
@@ -35,7 +42,7 @@ from scipy import stats
 from scipy.interpolate import RectBivariateSpline
 
 import prbayes as prb
-from benchmarks import record
+from benchmarks import record, refit_pivots
 from prbayes.metrics.density import twice_silverman
 from prbayes.posterior.estimate_likelihood import (
     EstimateLikelihood,
@@ -43,12 +50,32 @@ from prbayes.posterior.estimate_likelihood import (
     estimate_likelihood,
 )
 from prbayes.posterior.importance import importance_sample, laplace
+from prbayes.posterior.refit_likelihood import RefitLikelihood, refit_likelihood
+from prbayes.posterior.sample import _modes
 from prbayes.posterior.target import Target
 
 OUT = record.RESULTS / "saddlepoint.json"
 METRICS = {"KLD": prb.KullbackLeibler(), "PR": prb.ProbabilityResidual()}
 DRAWS = 1000
-SIZES = {"one": [10, 20, 50, 200], "several": [20, 50], "far": [20]}
+SIZES = {
+    "one": [10, 20, 50, 200], "several": [20, 50], "far": [20], "refits": [10, 20, 50, 200], "modes": [20],
+}  # fmt: skip
+
+
+def cramer_von_mises(simulated: Any, observed: Any, weights: Any) -> Any:
+    """Return the mean squared difference of distribution functions at the observed values."""
+    values = np.sort(observed)
+    below = [(weights * (simulated <= value)).sum(axis=-1) for value in values]
+    steps = (np.arange(values.size) + 0.5) / values.size
+    return ((np.stack(below, axis=-1) - steps) ** 2).mean(axis=-1)
+
+
+BY_REFITS = {
+    "area": prb.AreaMetric(),
+    "reverse KLD": prb.KullbackLeibler(reverse=True),
+    "Cramér-von Mises": prb.FunctionMetric(cramer_von_mises, weighted=True),
+}
+Likelihood = EstimateLikelihood | RefitLikelihood
 
 
 @dataclass(frozen=True)
@@ -207,33 +234,39 @@ def estimate_log_likelihood(y: Any) -> Callable[[Any, Any], Any]:
 # -- studies --
 
 
-def target(likelihood: EstimateLikelihood) -> Target:
-    """Return the posterior of a likelihood."""
-    evaluator = likelihood.evaluator
-    return Target(evaluator, likelihood.log_likelihood, (likelihood.point,), likelihood.scale)
+def posterior(likelihood: Likelihood, starts: Any = None) -> Target:
+    """Return the posterior of a likelihood, which begins at its point by default."""
+    places = (likelihood.point,) if starts is None else tuple(starts)
+    return Target(likelihood.evaluator, likelihood.log_likelihood, places, likelihood.scale)
 
 
-def sampled(likelihood: EstimateLikelihood, starts: Any, scale: Any) -> tuple[Any, dict[str, Any]]:
+def sampled(likelihood: Likelihood, starts: Any, scale: Any) -> tuple[Any, dict[str, Any]]:
     """Return draws in unconstrained space, and diagnostics."""
     clock = time.process_time()
-    log_posterior = target(likelihood).log_posterior
-    modes = laplace(log_posterior, starts, scale)
-    sample = importance_sample(log_posterior, modes, DRAWS, seed=0)
+    density = posterior(likelihood).log_posterior
+    modes = laplace(density, starts, scale)
+    sample = importance_sample(density, modes, DRAWS, seed=0)
     figures = {"k": sample.pareto_k, "efficiency": sample.efficiency}
     return sample.draws, figures | {"seconds": time.process_time() - clock}
 
 
-def given_estimate(model: pm.Model) -> tuple[EstimateLikelihood, dict[str, Any], dict[str, Any]]:
+def given_estimate(
+    model: pm.Model, function: Callable[[Any, Any], Likelihood] = estimate_likelihood
+) -> tuple[Likelihood, dict[str, Any], dict[str, Any]]:
     """Return the likelihood given the optimum, draws by name, and figures."""
     optimum = prb.minimize(model=model, progressbar=False)
     clock = time.process_time()
-    likelihood = estimate_likelihood(optimum.evaluator, optimum)
+    likelihood = function(optimum.evaluator, optimum)
     setup = time.process_time() - clock
     draws, figures = sampled(likelihood, likelihood.point[None], likelihood.scale)
     support = likelihood.evaluator.support(likelihood.point[None])
     effective = min(float(of["weight_ess"][0]) for of in support.values())
-    stored = [group for group in likelihood.groups if isinstance(group, StoredScores)]
-    points = max(len(group.scores.values) for group in stored)
+    if isinstance(likelihood, RefitLikelihood):
+        points = len(likelihood.sets.estimates)
+    else:
+        points = max(
+            len(each.scores.values) for each in likelihood.groups if isinstance(each, StoredScores)
+        )
     figures |= {
         "setup": setup,
         "effective": effective,
@@ -261,12 +294,61 @@ def normal_model(prior: Prior, metric: Any, y: Any) -> pm.Model:
 
 def one(name: str, size: int, prior_name: str, number: int) -> dict[str, Any]:
     """Return a row of the study of one output."""
+    prior, y = drawn_data(size, prior_name, number)
+    return pair_row(name, prior, y)
+
+
+def drawn_data(size: int, prior_name: str, number: int) -> tuple[Prior, Any]:
+    """Return a prior and a data set."""
     prior = PRIORS[prior_name](size)
     rng = np.random.default_rng([5, size, sorted(PRIORS).index(prior_name), number])
     drawn = float(prior.mean.rvs(random_state=rng)), float(prior.sd.rvs(random_state=rng))
     mean, sd = prior.truth or drawn
-    y = rng.normal(mean, sd, size)
-    return pair_row(name, prior, y)
+    return prior, rng.normal(mean, sd, size)
+
+
+def by_refits(name: str, size: int, prior_name: str, number: int) -> dict[str, Any]:
+    """Return a row of the study of refits."""
+    prior, y = drawn_data(size, prior_name, number)
+    reference = moments_on_grid(refits_reference(name, y), prior, y)
+    _, values, figures = given_estimate(normal_model(prior, BY_REFITS[name], y), refit_likelihood)
+    draws = np.stack([values["mu"], np.log(values["sigma"])], axis=1)
+    return compared(draws, reference) | figures
+
+
+def refits_reference(name: str, y: Any) -> Callable[[Any, Any], Any]:
+    """Return the log-likelihood given the minimiser, of the reverse divergence that of all data."""
+    if name in refit_pivots.REFITS:
+        return refit_pivots.log_likelihood(name, y)
+    return full_log_likelihood(y)
+
+
+def modes_row(name: str, size: int, number: int) -> dict[str, Any]:
+    """Return the share of the upper of two mirror modes, from refits, and the exact one."""
+    rng = np.random.default_rng([21, size, number])
+    y = (rng.normal(2, 0.5, size) - 1) ** 2
+    with pm.Model() as model:
+        x = pm.Normal.dist(pm.Normal("mu", 0, 2), pm.HalfNormal("sigma", 1))
+        prb.Simulator(
+            "y", lambda x: (x - 1) ** 2, x, observed=y, metric=BY_REFITS[name],
+            propagation=prb.Reweighted(1024),
+        )  # fmt: skip
+    optimum = prb.minimize(model=model, progressbar=False)
+    likelihood = refit_likelihood(optimum.evaluator, optimum)
+    target = posterior(likelihood, likelihood.starts)
+    sample = importance_sample(target.log_posterior, _modes(target) or [], DRAWS, seed=0)
+    mu = likelihood.evaluator.constrained(sample.draws)["mu"]
+    means, log_sds = np.linspace(-3, 5, 401)[:, None, None], np.linspace(-2, 1, 150)[None, :, None]
+    root, sds = np.sqrt(y), np.exp(log_sds)
+    pair = np.logaddexp(
+        stats.norm.logpdf(1 + root, means, sds), stats.norm.logpdf(1 - root, means, sds)
+    )
+    logs = pair.sum(axis=-1) + stats.norm.logpdf(means[..., 0], 0, 2)
+    logs = logs + stats.halfnorm.logpdf(sds[..., 0]) + log_sds[..., 0]
+    weights = np.exp(logs - logs.max())
+    exact = float((weights * (means[..., 0] > 1)).sum() / weights.sum())
+    figures = {"k": sample.pareto_k, "efficiency": sample.efficiency}
+    return {"share": float((mu > 1).mean()), "exact share": exact} | figures
 
 
 def pair_row(name: str, prior: Prior, y: Any) -> dict[str, Any]:
@@ -300,6 +382,7 @@ def several(name: str, size: int, outputs: int, number: int) -> dict[str, Any]:
 
 def simulators(name: str, size: int, count: int, number: int) -> dict[str, Any]:
     """Return a row of as many independent simulators, with two hyperparameters each."""
+    metric = (METRICS | BY_REFITS)[name]
     rng = np.random.default_rng([9, size, count, number])
     means, sds = rng.normal(0, 2, count), np.abs(rng.normal(0, 1, count)) + 0.1
     x = means + sds * rng.standard_normal((size, count))
@@ -307,19 +390,26 @@ def simulators(name: str, size: int, count: int, number: int) -> dict[str, Any]:
         for j in range(count):
             inputs = pm.Normal.dist(pm.Normal(f"mu{j}", 0, 2), pm.HalfNormal(f"sigma{j}", 1))
             prb.Simulator(
-                f"y{j}", lambda x: x, inputs, observed=x[:, j], metric=METRICS[name],
+                f"y{j}", lambda x: x, inputs, observed=x[:, j], metric=metric,
                 propagation=prb.Reweighted(1024),
             )  # fmt: skip
+    if name in BY_REFITS:
+        return pairs_row(model, x, refit_likelihood, partial(refits_reference, name))
     return pairs_row(model, x)
 
 
-def pairs_row(model: pm.Model, x: Any) -> dict[str, Any]:
+def pairs_row(
+    model: pm.Model,
+    x: Any,
+    function: Callable[[Any, Any], Likelihood] = estimate_likelihood,
+    reference: Callable[[Any], Callable[[Any, Any], Any]] = full_log_likelihood,
+) -> dict[str, Any]:
     """Return offsets and widths of the mean and log standard deviation of each input, (N, k)."""
-    _, values, figures = given_estimate(model)
+    _, values, figures = given_estimate(model, function)
     draws, references = [], []
     for j, column in enumerate(x.T):
         draws += [values[f"mu{j}"], np.log(values[f"sigma{j}"])]
-        references.append(moments_on_grid(full_log_likelihood(column), vague(len(x)), column))
+        references.append(moments_on_grid(reference(column), vague(len(x)), column))
     return compared(np.stack(draws, axis=1), np.concatenate(references, axis=1)) | figures
 
 
@@ -336,14 +426,14 @@ def starts(name: str, number: int, count: int = 32) -> dict[str, Any]:
     optimum = prb.minimize(model=normal_model(vague(20), METRICS[name], y), progressbar=False)
     likelihood = estimate_likelihood(optimum.evaluator, optimum)
     evaluator = likelihood.evaluator
-    log_posterior = target(likelihood).log_posterior
-    (best,) = laplace(log_posterior, likelihood.point[None], likelihood.scale)
+    density = posterior(likelihood).log_posterior
+    (best,) = laplace(density, likelihood.point[None], likelihood.scale)
     points = evaluator.prior_points(count, number)
-    possible = np.isfinite(log_posterior(points))
+    possible = np.isfinite(density(points))
     arrived = 0
     for start in points[possible]:
         try:
-            (mode,) = laplace(log_posterior, start[None], likelihood.scale)
+            (mode,) = laplace(density, start[None], likelihood.scale)
         except ValueError:
             continue
         away = np.linalg.solve(np.linalg.cholesky(best.covariance), mode.mode - best.mode)
@@ -362,6 +452,13 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         }
     if not good:
         return result
+    if "share" in good[0]:
+        errors = np.array([row["share"] - row["exact share"] for row in good])
+        return result | {
+            "rms error of the share": float(np.sqrt((errors**2).mean())),
+            "largest error of the share": float(np.abs(errors).max()),
+            "largest k": max(row["k"] for row in good),
+        }
     offsets, widths = (np.array([row[key] for row in good]) for key in ("offset", "width"))
     reliable = [row["k"] <= 0.7 and row["efficiency"] >= 0.25 for row in good]
     return result | {
@@ -380,12 +477,24 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def cells(arguments: argparse.Namespace) -> dict[str, Callable[[int], dict[str, Any]]]:
     """Return the cells of a study by name."""
     result: dict[str, Callable[[int], dict[str, Any]]] = {}
-    for name in arguments.metrics:
+    default = {"refits": list(BY_REFITS), "modes": ["area", "reverse KLD"]}
+    for name in arguments.metrics or default.get(arguments.study, list(METRICS)):
         for size in arguments.sizes or SIZES[arguments.study]:
             if arguments.study == "one":
                 # In conflict the pivots' density is not known where it is needed.
                 for prior in PRIORS if name == "KLD" else list(PRIORS)[:3]:
                     result[f"one, {name}, N = {size}, {prior}"] = partial(one, name, size, prior)
+            if arguments.study == "refits":
+                for prior in PRIORS if 1 in arguments.outputs else []:
+                    result[f"refits, {name}, N = {size}, {prior}"] = partial(
+                        by_refits, name, size, prior
+                    )
+                if 2 in arguments.outputs:
+                    result[f"refits, {name}, N = {size}, two simulators"] = partial(
+                        simulators, name, size, 2
+                    )
+            if arguments.study == "modes":
+                result[f"modes, {name}, N = {size}"] = partial(modes_row, name, size)
             if arguments.study == "several":
                 for outputs in arguments.outputs:
                     kind = "simulators" if arguments.simulators else "outputs"
@@ -401,13 +510,14 @@ def cells(arguments: argparse.Namespace) -> dict[str, Callable[[int], dict[str, 
 def main() -> None:
     """Run what is missing."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("study", choices=["one", "several", "far"])
+    parser.add_argument("study", choices=list(SIZES))
     parser.add_argument("--data-sets", type=int, default=20)
     parser.add_argument("--sizes", type=int, nargs="+")
-    parser.add_argument("--outputs", type=int, nargs="+", default=[3, 4, 8])
+    parser.add_argument("--outputs", type=int, nargs="+")
     parser.add_argument("--simulators", action="store_true")
-    parser.add_argument("--metrics", nargs="+", default=list(METRICS), choices=list(METRICS))
+    parser.add_argument("--metrics", nargs="+", choices=[*METRICS, *BY_REFITS])
     arguments = parser.parse_args()
+    arguments.outputs = arguments.outputs or ([1] if arguments.study == "refits" else [3, 4, 8])
     logging.disable(logging.WARNING)
     found = record.load(OUT, {"rows": {}, "summary": {}})
     for cell, function in cells(arguments).items():

@@ -1,7 +1,9 @@
 """Statistical model calibration in PyMC: optimiser and ABC on one model, with one metric."""
 
+from functools import cache
 from importlib import import_module
 from importlib.metadata import version
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -9,7 +11,7 @@ if TYPE_CHECKING:
 
 __version__ = version("prbayes")
 
-# Names of `_public`, each there when it is asked for.
+# Names of `_public`, each imported when it is asked for.
 __all__ = [  # noqa: F405
     "AreaMetric",
     "Diagnosis",
@@ -74,10 +76,23 @@ __all__ = [  # noqa: F405
 
 
 def __getattr__(name: str) -> Any:
-    """Load the public names when the first is asked for: the command line answers before."""
-    if name in __all__:
-        return getattr(import_module("prbayes._public"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    """Import a public name when it is asked for, and no module that it does not need."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = _modules()[name]
+    if module == __name__:
+        return import_module(f"{__name__}.{name}")
+    return getattr(import_module(module), name)
+
+
+@cache
+def _modules() -> dict[str, str]:
+    """Return the module of each public name, from the imports in the source of `_public`."""
+    import ast
+
+    tree = ast.parse(files(__name__).joinpath("_public.py").read_text(encoding="utf-8"))
+    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+    return {alias.name: str(node.module) for node in imports for alias in node.names}
 
 
 def __dir__() -> list[str]:

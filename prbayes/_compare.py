@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pymc as pm
 import xarray as xr
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from prbayes._checks import Floats, called
 from prbayes._html import view
@@ -277,7 +277,7 @@ def _of_optimum(
 
 def _normal(point: Mapping[Any, Any], stderr: Mapping[Any, Any]) -> dict[str, _Estimate]:
     """Return estimate, standard error and normal interval by element of an optimum."""
-    z = norm.ppf((1 + INTERVAL) / 2)
+    z = ndtri((1 + INTERVAL) / 2)
     errors = single_elements(stderr)
     found = {}
     for element, estimate in single_elements(point).items():

@@ -228,7 +228,7 @@ def _of_family(optimum: Optimum) -> tuple[list[str], tuple[str, ...]]:
     if obstacle is not None:
         return [], _not_looked_at(obstacle)
     if evaluator.responses_per_theta:
-        return [], _not_looked_at("it would take responses; draws of prb.sample_smc tell of it")
+        return [], _not_looked_at("it would take responses")
     if optimum.prior:
         scales = np.array(list(optimum.scales.values()))
         held = SamplingDistribution.of(evaluator, optimum.theta, scales)
@@ -553,13 +553,16 @@ def _motion(result: xr.DataTree) -> list[str]:
     calibration = result["calibration"]
     noise = float((calibration["discrepancy_error"] / calibration["epsilon"]).max())  # or NaN
     why = f" (its Monte Carlo error is {noise:.1f} epsilon)" if noise > 1 else ""
+    cure = "Pass more draws, or a threshold of 0.8"
+    if result["posterior"].attrs.get("sampler") == "SMC-ABC":
+        cure = (
+            f"The discrepancy is too noisy{why}, or epsilon too small: use prb.Reweighted or "
+            "prb.Resimulated instead of prb.Fresh, or pass a larger n or epsilon"
+        )
     return [
         f"Particles hardly moved in the last stage of {chains} {', '.join(stuck)} "
         f"({min(last):.2f} accepted steps per particle, expected at least 1), "
-        "so that many draws are the same. "
-        f"The discrepancy is too noisy{why}, or epsilon too small: "
-        "use prb.Reweighted or prb.Resimulated instead of prb.Fresh, "
-        f"or pass a larger n or epsilon{_IN_NUMBERS}."
+        f"so that many draws are the same. {cure}{_IN_NUMBERS}."
     ]
 
 

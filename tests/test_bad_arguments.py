@@ -89,13 +89,6 @@ def posterior() -> xr.DataTree:
 
 
 @cache
-def adjusted() -> xr.DataTree:
-    draws = posterior().copy()
-    draws["posterior"].attrs["adjustment"] = "Affine()"
-    return draws
-
-
-@cache
 def two_outputs() -> pm.Model:
     with pm.Model() as made:
         x = pm.Normal.dist(pm.Normal("mu", 1, 1), 1.0)
@@ -172,6 +165,7 @@ def made(value: Any) -> Any:
 SEED: Sequence[Any] = (-1, 1.5, 2.0, True, "a", np.nan, [1.5], [])
 # Configuration takes an integer, and not the other seeds of PyMC.
 INTEGER_SEED = (*SEED, [1, 2], np.random.default_rng(1), None)
+ADJUSTMENT: Sequence[Any] = ("affine", "none", True, False, 1, np.nan, ["estimate"])
 FLAG: Sequence[Any] = ("no", 1, 0.0, None, [])
 COUNT: Sequence[Any] = (0, -5, 1.5, 64.0, "64", None, True, np.nan, [64])
 SHARE: Sequence[Any] = (0, 1, -0.5, 5, "a", np.nan, None, True)
@@ -607,7 +601,10 @@ TABLE: dict[str, Row] = {
     "calibrate_epsilon": Row(prb.calibrate_epsilon, {"optimum": NO_OPTIMUM}),
     "sample_smc": Row(
         lambda **given: prb.sample_smc(
-            **{"model": model(), "optimum": optimum(), "draws": 20, "chains": 1} | QUIET | given
+            **{"model": model(), "optimum": optimum(), "draws": 20, "chains": 1}
+            | {"adjustment": None}
+            | QUIET
+            | given
         ),
         {
             "draws": (*COUNT, 5),
@@ -621,7 +618,7 @@ TABLE: dict[str, Row] = {
                 1j,
             ),
             "optimum": [value for value in NO_OPTIMUM if value is not None],
-            "adjust": ("affine", 1, None, prb.posterior.Affine),
+            "adjustment": ADJUSTMENT,
             "threshold": SHARE,
             "refine": FLAG,
             "start": (3, "mu", {"nu": [1.0]}, [{}, {}], {"mu": [1.0]}),
@@ -653,22 +650,6 @@ TABLE: dict[str, Row] = {
             "progressbar": FLAG,
         },
     ),
-    "adjust": Row(
-        lambda **given: prb.adjust(
-            **{"idata": posterior(), "model": model(), "optimum": optimum()}
-            | {"progressbar": False}
-            | given
-        ),
-        {
-            "idata": (None, 3, "draws", Name("optimum"), Name("adjusted")),
-            "model": NO_MODEL,
-            "optimum": [value for value in NO_OPTIMUM if value is not None],
-            "by": ("affine", 1, True, prb.posterior.Affine),
-            "refine": FLAG,
-            "progressbar": FLAG,
-        },
-    ),
-    "posterior.Affine": Row(prb.posterior.Affine, {"n_sets": (*COUNT, 1), "random_seed": SEED}),
     "posterior.BatchedKernel": Row(
         lambda **given: prb.posterior.BatchedKernel(
             **{"model": with_epsilon(), "draws": 20} | given
@@ -692,7 +673,7 @@ TABLE: dict[str, Row] = {
             "n": (*COUNT, 1),
             "model": NO_MODEL,
             "draws": (*COUNT, 5),
-            "adjust": ("affine", 1, None, prb.posterior.Affine),
+            "adjustment": ADJUSTMENT,
             "executor": EXECUTOR,
             "random_seed": SEED,
             "progressbar": FLAG,

@@ -567,25 +567,30 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "draws string": (sample_smc(draws="a"), TypeError, r"draws: got str 'a', expected an integer"),
     "chains 0": (sample_smc(chains=0), ValueError, r"chains: got 0, expected an integer >= 1"),
     "SMC epsilon name": (
-        sample_smc(epsilon={"z": 1.0}),
+        sample_smc(epsilon={"z": 1.0}, adjustment=None),
         KeyError,
         r"epsilon: got \['z'\], expected names .*\['y'\]",
     ),
     "SMC epsilon 0": (
-        sample_smc(epsilon=0),
+        sample_smc(epsilon=0, adjustment=None),
         ValueError,
         r"y: epsilon: got 0, expected a positive finite number",
     ),
     "SMC epsilon string": (
-        sample_smc(epsilon={"y": "a"}),
+        sample_smc(epsilon={"y": "a"}, adjustment=None),
         TypeError,
         r"y: epsilon: got str 'a', expected a pos",
     ),
     "SMC optimum": (sample_smc(optimum=3), TypeError, r"optimum: got int, expected an Optimum"),
-    "SMC adjust": (
-        sample_smc(adjust="affine"),
-        TypeError,
-        r"adjust: got str 'affine', expected prb.posterior.Affine\(\), True",
+    "SMC epsilon of an estimate": (
+        sample_smc(epsilon=0.1),
+        ValueError,
+        r"epsilon: got 0\.1, expected none: .*pass adjustment=None",
+    ),
+    "SMC adjustment": (
+        sample_smc(adjustment="affine"),
+        ValueError,
+        r"adjustment: got 'affine', expected \"estimate\", or None",
     ),
     "calibrate a model": (
         lambda: prb.calibrate_epsilon(good()),
@@ -668,7 +673,7 @@ def test_set_epsilon_is_all_or_nothing(epsilon: dict[str, Any], error: type[Exce
         prb.set_epsilon(model, epsilon)
     assert [n.epsilon_value for n in nodes(model).values()] == [0.1, 0.1]
     with pytest.raises(error):
-        prb.sample_smc(model=model, epsilon=epsilon, progressbar=False)
+        prb.sample_smc(model=model, epsilon=epsilon, adjustment=None, progressbar=False)
     assert [n.epsilon_value for n in nodes(model).values()] == [0.1, 0.1]
 
 

@@ -22,6 +22,7 @@ import pytensor.tensor as pt
 import pytest
 from arviz_stats.ecdf_utils import ecdf_pit
 from pymc.distributions.censored import CensoredRV
+from pymc.distributions.continuous import TruncatedNormalRV
 from pymc.distributions.distribution import SymbolicRandomVariable
 from pymc.distributions.multivariate import MvNormal, MvStudentT
 from pymc.distributions.shape_utils import change_dist_size
@@ -43,6 +44,7 @@ from pytensor.graph.traversal import ancestors, toposort, walk
 from pytensor.graph.utils import MissingInputError
 from pytensor.tensor.blockwise import Blockwise
 from pytensor.tensor.elemwise import Elemwise
+from pytensor.tensor.random import basic
 from pytensor.tensor.random.op import RandomVariable
 from pytensor.tensor.random.type import RandomGeneratorType
 from pytensor.tensor.shape import Shape
@@ -517,3 +519,21 @@ def test_a_copy_of_a_function_takes_other_shared_variables() -> None:
     assert (function()[0], copied()[0]) == (0, 3)
     mine.set_value(np.ones(2))
     assert copied()[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("dist", "kind"),
+    [
+        (pm.Normal.dist(0, 1), basic.NormalRV),
+        (pm.HalfNormal.dist(1), basic.HalfNormalRV),
+        (pm.TruncatedNormal.dist(0, 1, lower=0), TruncatedNormalRV),
+        (pm.LogNormal.dist(0, 1), basic.LogNormalRV),
+        (pm.Gamma.dist(2, 1), basic.GammaRV),
+        (pm.InverseGamma.dist(2, 1), basic.InvGammaRV),
+        (pm.Beta.dist(2, 1), basic.BetaRV),
+        (pm.Exponential.dist(2), basic.ExponentialRV),
+        (pm.MvNormal.dist([0, 0], np.eye(2)), basic.MvNormalRV),
+    ],
+)
+def test_exponential_families_have_operations_of_their_own(dist, kind):
+    assert isinstance(dist.owner.op, kind)

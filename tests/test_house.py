@@ -244,7 +244,6 @@ TAIL = (
 SLOW = (
     "Simulator",
     "Surrogate.fit",
-    "adjust",
     "area_test",
     "bootstrap",
     "cross_validate",
@@ -525,6 +524,12 @@ INNER = {
     },
     "propagation.edges": {
         "pymc.distributions.censored.CensoredRV",
+        "pytensor.tensor.variable.TensorVariable",
+    },
+    "propagation.exponential_families": {
+        "pymc.distributions.continuous.TruncatedNormalRV",
+        "pytensor.graph.basic.Constant",
+        "pytensor.tensor.random.basic",
         "pytensor.tensor.variable.TensorVariable",
     },
     "propagation.reweighted": {

@@ -379,7 +379,6 @@ def test_what_has_no_meaning_is_refused(
         (lambda: prb.refine(problem.model), "leave the call out"),
         (lambda: prb.calibrate_epsilon(optimum), "has no epsilon"),
         (lambda: prb.set_epsilon(problem.model, {"y": 0.1}), "has no epsilon"),
-        (lambda: prb.adjust(posterior, model=problem.model), "use its draws as they are"),
     ]
     for call, message in calls:
         with pytest.raises(ValueError, match=message):

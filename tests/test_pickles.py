@@ -79,8 +79,6 @@ MAKE: dict[str, Callable[[], Any]] = {
     "metrics.DensityEstimator": lambda: prb.Histogram(4),
     "metrics.Discrepancy": lambda: target(prb.AreaMetric()),
     "metrics.Minimum": lambda: prb.metrics.Minimum.QUADRATIC,
-    "posterior.Affine": lambda: prb.posterior.Affine(50),
-    "posterior.GivenEstimate": lambda: prb.posterior.GivenEstimate(50, n_fits=300),
     "propagation.DesignError": lambda: prb.propagation.DesignError("y: too thin"),
     "propagation.Propagation": lambda: prb.Fresh(16),
     "reports.Section": lambda: prb.reports.Section("A title"),

@@ -92,7 +92,7 @@ def test_a_sampler_without_a_terminal_says_where_it_is(
             "y", np.positive, x, metric=prb.AreaMetric(), observed=[0.0, 1.0, 2.0],
             epsilon=0.1, propagation=prb.Reweighted(64),
         )  # fmt: skip
-    quiet = {"chains": 2, "model": model, "random_seed": 1, "adjust": False}
+    quiet = {"chains": 2, "model": model, "random_seed": 1, "adjustment": None}
     prb.sample_smc(50, progressbar=False, **quiet)
     assert log.getvalue() == ""
     prb.sample_smc(50, **quiet)
@@ -197,9 +197,8 @@ def test_everything_inside_the_sampler_follows_its_keyword(
 ) -> None:
     # At once, however quick the search is.
     monkeypatch.setattr(prbayes._progress, "_SHOWN_FROM", 0.0)
-    prb.sample_smc(
-        60, chains=1, model=build(prb.Resimulated(16)), random_seed=1, progressbar=visible
-    )
+    settings = {"model": build(prb.Resimulated(16)), "adjustment": None, "random_seed": 1}
+    prb.sample_smc(60, chains=1, progressbar=visible, **settings)
     assert ("SMC chain 0" in screen.getvalue()) == visible
     assert ("evaluations" in screen.getvalue()) == visible
     if not visible:

@@ -50,7 +50,7 @@ def named() -> pm.Model:
 
 def draws(model: pm.Model) -> Any:
     found = prb.sample_smc(
-        20, chains=2, model=model, epsilon=0.05, adjust=False, random_seed=1, progressbar=False
+        20, chains=2, model=model, epsilon=0.05, adjustment=None, random_seed=1, progressbar=False
     )
     return found.posterior
 

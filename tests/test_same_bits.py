@@ -50,7 +50,9 @@ def digest(name: str, response: Any = None, **given: Any) -> str:
     keywords: dict[str, Any] = {"method": "Nelder-Mead"} if name == "Fresh" else {}
     optimum = prb.minimize(model, tolerance=1e-3, max_evaluations=60, **keywords, **QUIET)
     found = [optimum.theta, optimum.covariance]
-    posterior = prb.sample_smc(20, chains=2, model=model, optimum=optimum, random_seed=1, **QUIET)
+    settings: dict[str, Any] = {"adjustment": "estimate" if name == "Reweighted" else None}
+    settings |= {"model": model, "optimum": optimum, "random_seed": 1, **QUIET}
+    posterior = prb.sample_smc(20, chains=2, **settings)
     for group in ("posterior", "sample_stats", "calibration"):
         variables = posterior[group].data_vars.values()
         found += [v.values for v in variables if v.dtype.kind == "f"]

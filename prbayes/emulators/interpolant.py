@@ -12,12 +12,16 @@ no other fit: it is w_i divided by the i-th diagonal element of the inverse of t
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from math import comb
 
 import numpy as np
+from numpy.polynomial.legendre import legder, legval
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dsytrf, dsytri, dsytrs
 
 from prbayes._checks import IN_CACHE, Floats
 from prbayes._threads import one_thread
@@ -54,40 +58,102 @@ class Interpolant:
     def __call__(self, z: Floats) -> tuple[Floats, Floats]:
         """Return values and Jacobian at points, (k, d) -> (k, m), (k, m, d)."""
         m, d = self.weights.shape[1], self.z.shape[1]
+        if d == 1:
+            return self._on_line(z)
         values = np.empty((len(z), m))
         jacobian = np.empty((len(z), m, d))
-        step = max(1, IN_CACHE // len(self.z))
-        for first in range(0, len(z), step):
-            rows = slice(first, first + step)
-            values[rows], jacobian[rows] = self._evaluate(z[rows])
+        moments = [self.weights, *(column[:, None] * self.weights for column in self.z.T)]
+        # d|r|^5 / dz_a = 5 |r|^3 r_a
+        of_cubes = 5 * np.concatenate(moments, axis=1).T
+        for rows, square, cube in self._distances(z):
+            np.sqrt(square, out=cube)
+            cube *= square
+            terms, slopes = _polynomials(self._scaled(z[rows]), self.powers)
+            steepness, *by_axis = np.split(of_cubes @ cube, d + 1)
+            square *= cube
+            values[rows] = (self.coefficients.T @ terms - self.weights.T @ square).T
+            for a in range(d):
+                radial = by_axis[a] - z[rows, a] * steepness
+                polynomial = self.coefficients.T @ slopes[a] / self.half_width[a]
+                jacobian[rows, :, a] = (radial + polynomial).T
         return values, jacobian
 
     def values(self, z: Floats) -> Floats:
         """Return values at points, (k, d) -> (k, m), without the Jacobian."""
+        if self.z.shape[1] == 1:
+            return self._on_line(z, has_slopes=False)[0]
         values = np.empty((len(z), self.weights.shape[1]))
-        step = max(1, IN_CACHE // len(self.z))
-        for first in range(0, len(z), step):
-            rows = slice(first, first + step)
-            square = _squared_distances(z[rows], self.z)
-            scaled = (z[rows] - self.center) / self.half_width
-            terms = _terms(_legendre(scaled, self.powers), self.powers)
-            quintic = square**2 * np.sqrt(square)
-            values[rows] = terms @ self.coefficients - quintic @ self.weights
+        for rows, square, length in self._distances(z):
+            np.sqrt(square, out=length)
+            square *= square
+            square *= length
+            terms = _terms(_legendre(self._scaled(z[rows]), self.powers), self.powers)
+            values[rows] = (self.coefficients.T @ terms - self.weights.T @ square).T
         return values
 
-    def _evaluate(self, z: Floats) -> tuple[Floats, Floats]:
-        square = _squared_distances(z, self.z)
-        cube = square * np.sqrt(square)
-        terms, slopes = _polynomials((z - self.center) / self.half_width, self.powers)
-        values = terms @ self.coefficients - (cube * square) @ self.weights
-        jacobian = np.empty((*values.shape, z.shape[1]))
-        # d|r|^5 / dz_a = 5 |r|^3 r_a
-        steepness = cube @ self.weights
-        for a in range(z.shape[1]):
-            moment = cube @ (self.z[:, a, None] * self.weights)
-            radial = 5 * (moment - z[:, a, None] * steepness)
-            jacobian[:, :, a] = radial + slopes[a] @ self.coefficients / self.half_width[a]
-        return values, jacobian
+    @cached_property
+    def _pieces(self) -> tuple[Floats, Floats, Floats]:
+        """Of one input: sorted runs, middles of the pieces between them, and their polynomials.
+
+        Between two runs the radial functions are a polynomial of degree five. Its coefficients,
+        (6, pieces, m), are those of powers of the distance from the middle of the piece.
+        """
+        order = np.argsort(self.z[:, 0])
+        runs, weights = self.z[order, 0], self.weights[order]
+        middles = np.concatenate([runs[:1], (runs[1:] + runs[:-1]) / 2, runs[-1:]])
+        away = middles[:, None] - runs
+        side = np.where(np.arange(len(middles))[:, None] > np.arange(len(runs)), 1.0, -1.0)
+        powers = [-comb(5, p) * (side * away ** (5 - p)) @ weights for p in range(6)]
+        return runs, middles, np.stack(powers)
+
+    def _on_line(self, z: Floats, *, has_slopes: bool = True) -> tuple[Floats, Floats]:
+        """Return values and Jacobian at points of one input, (k, 1) -> (k, m), (k, m, 1)."""
+        runs, middles, coefficients = self._pieces
+        polynomial = self._legendre_series
+        values = np.empty((len(z), self.weights.shape[1]))
+        jacobian = np.zeros_like(values)
+        step = max(1, IN_CACHE // 64)
+        for first in range(0, len(z), step):
+            rows = slice(first, first + step)
+            column = z[rows, 0]
+            piece = np.searchsorted(runs, column)
+            t = (column - middles[piece])[:, None]
+            u = (column - self.center) / self.half_width
+            value = coefficients[5][piece]
+            slope = np.zeros_like(value)
+            for coefficient in coefficients[4::-1]:
+                slope = slope * t + value if has_slopes else slope
+                value = value * t + coefficient[piece]
+            values[rows] = value + legval(u, polynomial[0]).T
+            if has_slopes:
+                jacobian[rows] = slope + legval(u, polynomial[1]).T
+        return values, jacobian[..., None]
+
+    @cached_property
+    def _legendre_series(self) -> tuple[Floats, Floats]:
+        """Of one input: coefficients of the polynomial and of its derivative, (terms, m)."""
+        series = np.zeros_like(self.coefficients)
+        series[self.powers[:, 0]] = self.coefficients
+        return series, legder(series) / self.half_width
+
+    def _scaled(self, z: Floats) -> Floats:
+        """Return the polynomial's variables, (k, d) -> (d, k)."""
+        return np.ascontiguousarray(((z - self.center) / self.half_width).T)
+
+    def _distances(self, z: Floats) -> Iterator[tuple[slice, Floats, Floats]]:
+        """Return points in blocks: their rows, squared distances to the runs (n, k), and a spare.
+
+        The two arrays are the same for all blocks, so that they stay in the processor's cache.
+        """
+        n = len(self.z)
+        step = min(max(1, IN_CACHE // 4 // n), len(z))
+        arrays = np.empty((2, n, step))
+        for first in range(0, len(z), step):
+            rows = slice(first, first + step)
+            columns = z[rows].T
+            square, spare = arrays[:, :, : columns.shape[1]]
+            _squared_differences(self.z.T, columns, square, spare)
+            yield rows, square, spare
 
 
 @one_thread()
@@ -129,8 +195,9 @@ def fit_interpolant(z: Floats, y: Floats, near: NDArray[np.bool_] | None = None)
     n, d = z.shape
     low, high = z.min(axis=0), z.max(axis=0)
     center, half_width = (low + high) / 2, np.maximum((high - low) / 2, 1e-300)
-    scaled = (z - center) / half_width
-    square = _squared_distances(z, z)
+    scaled = np.ascontiguousarray(((z - center) / half_width).T)
+    square, spare = np.empty((2, n, n))
+    _squared_differences(z.T, z.T, square, spare)
     radial = -(square**2) * np.sqrt(square)
     largest = -radial.min()
     spread = np.where(y.std(axis=0) > 0, y.std(axis=0), 1.0)
@@ -138,18 +205,19 @@ def fit_interpolant(z: Floats, y: Floats, near: NDArray[np.bool_] | None = None)
     best, least = None, np.inf
     for degree in _degrees(n, d):
         powers = _powers(d, degree)
-        terms, _ = _polynomials(scaled, powers)
+        terms = _terms(_legendre(scaled, powers), powers).T
         target = np.concatenate([y, np.zeros((len(powers), y.shape[1]))])
+        matrix = np.block([[radial, terms], [terms.T, np.zeros((len(powers),) * 2)]])
         for nugget in (1e-16, 1e-14, 1e-12, 1e-10, 1e-8):
-            kernel = radial + nugget * largest * np.eye(n)
-            matrix = np.block([[kernel, terms], [terms.T, np.zeros((len(powers),) * 2)]])
-            try:
-                inverse = np.linalg.inv(matrix)
-            except np.linalg.LinAlgError:
+            np.fill_diagonal(matrix[:n, :n], nugget * largest)
+            # Symmetric and indefinite: half the time of a general inverse.
+            factors, pivots, singular = dsytrf(matrix, lower=True)
+            if singular:
                 continue
+            inverse, _ = dsytri(factors, pivots, lower=True)
             # One step of iterative refinement: close runs make the matrix badly conditioned.
-            solution = inverse @ target
-            solution += inverse @ (target - matrix @ solution)
+            solution, _ = dsytrs(factors, pivots, target, lower=True)
+            solution += dsytrs(factors, pivots, target - matrix @ solution, lower=True)[0]
             unsolved = np.abs((target - matrix @ solution)[:n] / spread).max()
             left_out = solution[:n] / np.diag(inverse)[:n, None]
             # Left-out errors look small where the matrix is singular to rounding, so that a
@@ -186,44 +254,54 @@ def _sparse_powers(d: int, degree: int) -> list[tuple[int, ...]]:
 
 
 def _polynomials(u: Floats, powers: NDArray[np.intp]) -> tuple[Floats, list[Floats]]:
-    """Return products of Legendre polynomials, (k, terms), and their d partial derivatives."""
-    d = u.shape[1]
-    degree = int(powers.max())
+    """Return products of Legendre polynomials, (d, k) -> (terms, k), and d partial derivatives."""
     single = _legendre(u, powers)
     slope = np.zeros_like(single)
     # P'_{p+1} = P'_{p-1} + (2 p + 1) P_p
-    for p in range(degree):
-        slope[..., p + 1] = (2 * p + 1) * single[..., p]
+    for p in range(len(single) - 1):
+        slope[p + 1] = (2 * p + 1) * single[p]
         if p > 0:
-            slope[..., p + 1] += slope[..., p - 1]
-    factors = [single[:, a, powers[:, a]] for a in range(d)]
-    terms = _terms(single, powers)
+            slope[p + 1] += slope[p - 1]
+    factors = [single[powers[:, a], a] for a in range(len(u))]
     slopes = []
-    for a in range(d):
-        derivative = slope[:, a, powers[:, a]].copy()
+    for a in range(len(u)):
+        derivative = slope[powers[:, a], a]
         for b, factor in enumerate(factors):
             if b != a:
                 derivative *= factor
         slopes.append(derivative)
-    return terms, slopes
+    return _terms(single, powers), slopes
 
 
 def _legendre(u: Floats, powers: NDArray[np.intp]) -> Floats:
-    """Return the Legendre polynomials of each variable, (k, d, degree + 1)."""
-    return np.asarray(np.polynomial.legendre.legvander(u, int(powers.max())))
+    """Return the Legendre polynomials of each variable, (degree + 1, d, k)."""
+    single = np.ones((int(powers.max()) + 1, *u.shape))
+    single[1] = u
+    # p P_p = (2 p - 1) u P_{p-1} - (p - 1) P_{p-2}
+    for p in range(2, len(single)):
+        np.multiply(single[p - 1], u, out=single[p])
+        single[p] *= 2 * p - 1
+        single[p] -= (p - 1) * single[p - 2]
+        single[p] /= p
+    return single
 
 
 def _terms(single: Floats, powers: NDArray[np.intp]) -> Floats:
-    """Return products of Legendre polynomials, (k, terms)."""
-    terms = np.ones((len(single), len(powers)))
-    for a in range(powers.shape[1]):
-        terms *= single[:, a, powers[:, a]]
+    """Return products of Legendre polynomials, (terms, k)."""
+    terms: Floats = single[powers[:, 0], 0]
+    for a in range(1, powers.shape[1]):
+        terms *= single[powers[:, a], a]
     return terms
 
 
-def _squared_distances(a: Floats, b: Floats) -> Floats:
-    """Return squared distances by differences, since products lose digits of small ones."""
-    square = np.zeros((len(a), len(b)))
-    for column, other in zip(a.T, b.T, strict=True):
-        square += (column[:, None] - other) ** 2
-    return square
+def _squared_differences(a: Floats, b: Floats, out: Floats, spare: Floats) -> None:
+    """Put squared distances of points, (d, n) and (d, k), into ``out``, (n, k).
+
+    By differences, since products lose digits of small ones.
+    """
+    np.subtract(a[0][:, None], b[0], out=out)
+    out *= out
+    for column, other in zip(a[1:], b[1:], strict=True):
+        np.subtract(column[:, None], other, out=spare)
+        spare *= spare
+        out += spare

@@ -86,7 +86,8 @@ class Continuation:
     def roots(self, evaluator: Evaluator, coordinates: Floats, k: int) -> list[Floats]:
         """Return the roots of the k-th simulator, continued linearly in values beyond the ends."""
         shares = self._shares(coordinates, self.margin)
-        roots = evaluator.roots(self._thetas(shares, coordinates), k)
+        base = evaluator.roots(self._thetas(shares, coordinates), k)
+        roots = list(base)
         width = self.upper - self.lower
         beyond = (self.values(coordinates) - self.lower) / width - shares
         for i in np.flatnonzero(self.is_continued):
@@ -98,9 +99,9 @@ class Continuation:
             inside[:, i] += steps
             moved = evaluator.roots(self._thetas(inside, coordinates), k)
             factors = np.where(passed, beyond[:, i] / np.where(passed, steps, 1.0), 0.0)
-            for j, (root, other) in enumerate(zip(roots, moved, strict=True)):
+            for j, (root, inner) in enumerate(zip(base, moved, strict=True)):
                 column = factors.reshape(-1, *np.ones(root.ndim - 1, dtype=int))
-                roots[j] = root + column * (other - root)
+                roots[j] = roots[j] + column * (inner - root)
         return roots
 
 
@@ -117,6 +118,7 @@ class ContinuedEvaluator(Evaluator):
         new = object.__new__(cls)
         vars(new).update(vars(evaluator))
         new.inner = evaluator
+        del new.prior_points  # the method below takes its place
         new.continuation = continuation
         points = continuation.coordinates(evaluator.prior_thetas(THETAS, 0))
         upper, lower = np.quantile(points, [0.84, 0.16], axis=0)
@@ -132,6 +134,10 @@ class ContinuedEvaluator(Evaluator):
     def roots(self, thetas: Floats, k: int) -> list[Floats]:
         """Return the values of the roots of the k-th simulator, shapes (P, *shape)."""
         return self.continuation.roots(self.inner, thetas, k)
+
+    def prior_points(self, size: int, seed: int) -> Floats:
+        """Return coordinates spread evenly over the prior, (size, d)."""
+        return self.continuation.coordinates(self.inner.prior_points(size, seed))
 
     def pulled_back(self, *_: object) -> Floats:
         """Refuse: gradients are differences."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
 
 from prbayes._checks import Floats
 from prbayes._finding import Finding
@@ -89,6 +88,8 @@ def _pushed(sampling: SamplingDistribution, i: int, middle: float) -> bool:
 
     Whatever the others do: one that they can stand for is not pushed.
     """
+    from scipy.optimize import minimize
+
     evaluator = sampling.evaluator
     noise = np.array([one.noise_floor for one in sampling.information])
 

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytensor.tensor as pt
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from prbayes._checks import Floats
 from prbayes.estimate.optimum import Optimum, require_minimiser, require_sampling
@@ -234,6 +233,8 @@ class SpecimenRefits:
         weights : sequence of ndarray, shapes (N,), optional
             Of the specimens, by likelihood, with sum N; all one by default.
         """
+        from scipy.optimize import minimize
+
         if weights is None:
             weights = [np.ones(len(each.readings)) for each in self.evaluator.likelihoods]
         root = self._root

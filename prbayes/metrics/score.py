@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from prbayes._checks import Floats
 from prbayes._weighted import finite_sample, quantile
@@ -227,6 +226,8 @@ def tabulated_scores(
     total : int
         Number of observed specimens of all simulators.
     """
+    from scipy.interpolate import CubicSpline
+
     tables = []
     for part in target.parts:
         known = [np.ravel(part.of(x)) for x in (specimens, population.responses)]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from prbayes._checks import Floats
 from prbayes._weighted import quantile
@@ -92,7 +92,7 @@ def whitening(sample: Floats, weights: Floats, outputs: NDArray[np.intp]) -> Whi
     root = root @ turn
     white = (z - middle) @ root
     squares = (white**2).sum(axis=-1)
-    size = quantile(squares, weights, 0.5) / chi2(m).median()
+    size = quantile(squares, weights, 0.5) / (2 * gammaincinv(m / 2, 0.5))
     axes = root / np.sqrt(size)
     return Whitening(center + middle * unit, axes / unit[:, None])
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.distance import pdist
 from scipy.special import bdtrc
 
 from prbayes._checks import Floats
@@ -241,6 +240,7 @@ def closest_pairs(y: Floats, simulated: Floats, pairs: int = 5) -> float:
     pairs : int
         Number of closest pairs.
     """
+    from scipy.spatial.distance import pdist
 
     def distance(values: Floats) -> float:
         centered = values - values.mean(axis=0)

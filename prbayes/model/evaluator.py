@@ -6,7 +6,7 @@ One evaluator serves all routes.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -101,6 +101,8 @@ class Evaluator:
         self.likelihoods = list(dict.fromkeys(specimen_likelihoods(model).values()))
         self.measurements = list(measurements_of(model).values())
         self.emulated = emulated_simulators(model)
+        for likelihood in self.likelihoods:
+            likelihood.evaluated_by(self.hyperparameters)
         # Compiled, by what they were asked for; they live as long as this evaluator.
         self._objectives: dict[tuple[bool, bool], Any] = {}
         names = self.hyperparameters
@@ -131,9 +133,10 @@ class Evaluator:
     @property
     def is_current(self) -> bool:
         """Whether the model has the data that this was made with: `pymc.set_data` changes them."""
-        now = list(nodes(self.model).values())
-        same = zip(now, self.nodes, strict=False)
-        return len(now) == len(self.nodes) and all(a is b for a, b in same)
+        now = [*nodes(self.model).values(), *specimen_likelihoods(self.model).values()]
+        before = [*self.nodes, *(self.likelihood_of(m) for m in self.measurements)]
+        same = zip(now, before, strict=False)
+        return len(now) == len(before) and all(a is b for a, b in same)
 
     @property
     def names(self) -> list[str]:
@@ -219,8 +222,9 @@ class Evaluator:
             graphs.append(pt.as_tensor(node.bound.discrepancy(params)))
         return list(self.model.replace_rvs_by_values(graphs))
 
-    def _log_other(self) -> Any:
-        ordinary = [rv for rv in self.model.observed_RVs if rv not in self._variables]
+    def _log_other(self, without: Collection[Any] = ()) -> Any:
+        evaluated = {*self._variables, *without}
+        ordinary = [rv for rv in self.model.observed_RVs if rv not in evaluated]
         with without_epsilon_warning():
             likelihood = self.model.logp(vars=ordinary) if ordinary else pt.constant(0.0)
         return likelihood + self.model.potentiallogp
@@ -232,31 +236,45 @@ class Evaluator:
         return ordinary or bool(self.model.potentials)
 
     @cached_property
+    def _without_graph(self) -> list[Any]:
+        """The observed variables of the likelihoods by specimen that need no graph."""
+        return [
+            rv
+            for rv, measurement in measurements_of(self.model).items()
+            if not self.likelihood_of(measurement).needs_graph
+        ]
+
+    @cached_property
     def _evaluate_other(self) -> Any:
-        return self.hyperparameters.compile([self._log_other()])
+        return self.hyperparameters.compile([self._log_other(self._without_graph)])
 
     def log_other(self, thetas: Floats) -> Floats:
         """Return the log-likelihood of ordinary observed variables, and potentials, shape (P,)."""
-        if not self.has_other_terms:
-            return np.zeros(len(thetas))
-        (found,) = self._evaluate_other(np.ascontiguousarray(thetas))
-        return np.array(np.broadcast_to(found, len(thetas)))
+        total = np.zeros(len(thetas))
+        for k, likelihood in enumerate(self.likelihoods):
+            if not likelihood.needs_graph:
+                values = likelihood.log_likelihoods(self.specimen_params(thetas, k))
+                total += values.sum(axis=1)
+        evaluated = len(self.nodes) + len(self._without_graph)
+        if self.model.potentials or len(self.model.observed_RVs) > evaluated:
+            (ordinary,) = self._evaluate_other(np.ascontiguousarray(thetas))
+            total = total + ordinary
+        return total
 
     def specimen_log_likelihoods(self, thetas: Floats) -> dict[str, Floats]:
         """Return log p(y_i | theta) by simulator, shapes (P, S), of those with a likelihood.
 
         Of simulators with common specimens the last has those of all, and the others have none.
         """
-        if not self.likelihoods:
-            return {}
-        rows = max(1, IN_CACHE // max(each.points.log_a.size for each in self.likelihoods))
-        parts = [
-            self._evaluate_specimens(np.ascontiguousarray(thetas[first : first + rows]))
-            for first in range(0, len(thetas), rows)
-        ]
         result = {m.name: np.empty((len(thetas), 0)) for m in self.measurements}
-        for likelihood, columns in zip(self.likelihoods, zip(*parts, strict=True), strict=True):
-            result[likelihood.measurements[-1].name] = np.concatenate(columns)
+        for k, likelihood in enumerate(self.likelihoods):
+            if likelihood.needs_graph:
+                rows = max(1, IN_CACHE // likelihood.points.log_a.size)
+                blocks = np.split(np.ascontiguousarray(thetas), range(rows, len(thetas), rows))
+                values = np.concatenate([self._evaluate_specimens[k](block)[0] for block in blocks])
+            else:
+                values = likelihood.log_likelihoods(self.specimen_params(thetas, k))
+            result[likelihood.measurements[-1].name] = values
         return result
 
     def specimen_params(self, thetas: Floats, k: int) -> dict[Any, Floats]:
@@ -266,8 +284,8 @@ class Evaluator:
         return {v: values[str(v.name)] for v in variables if not is_group(v)}
 
     @cached_property
-    def _evaluate_specimens(self) -> Any:
-        return self.hyperparameters.compile(self.specimen_graphs())
+    def _evaluate_specimens(self) -> list[Any]:
+        return [self.hyperparameters.compile([graph]) for graph in self.specimen_graphs()]
 
     def specimen_graphs(self) -> list[Any]:
         """Return the graphs of the log-likelihoods of the specimens, by likelihood, (S,)."""
@@ -286,7 +304,8 @@ class Evaluator:
         """Evaluate a batch, shape (P, d); invalid thetas leave the others alone."""
         size = len(thetas)
         rows_at_once = [AT_ONCE // max(1, node.bound.n_points) for node in self.nodes]
-        rows_at_once += [IN_CACHE // each.points.log_a.size for each in self.likelihoods]
+        by_graph = [each for each in self.likelihoods if each.needs_graph]
+        rows_at_once += [IN_CACHE // each.points.log_a.size for each in by_graph]
         step = max(1, min(rows_at_once, default=size))
         log_prior = np.empty(size)
         log_other = np.empty(size)
@@ -508,7 +527,7 @@ class Evaluator:
             if design is None:
                 continue
             # Some populations at a time: their weights are held at all points.
-            step = max(1, AT_ONCE // design.n_points)
+            step = max(1, IN_CACHE // design.n_points)
             parts = []
             for first in range(0, max(1, len(thetas)), step):
                 roots = self.roots(thetas[first : first + step], k)

@@ -145,15 +145,33 @@ class Hyperparameters:
 
     @cached_property
     def _log_prior(self) -> Any:
+        """The log-density of each free variable, in its own units, and the Jacobian of all."""
+        model = self.model
         with untraced():
             with priors_alone():
-                graph = self.model.varlogp
-            return self.compile([graph])
+                terms = model.logp(vars=model.free_RVs, jacobian=False, sum=False)
+            jacobian: Any = np.float64(0.0)
+            for rv in model.free_RVs:
+                transform = model.rvs_to_transforms[rv]
+                if transform is not None:
+                    value = model.rvs_to_values[rv]
+                    jacobian += transform.log_jac_det(value, *rv.owner.inputs).sum()
+            graphs = model.replace_rvs_by_values([pt.as_tensor(jacobian)])
+            return self.compile([*(term.sum() for term in terms), *graphs])
+
+    def log_prior_terms(self, thetas: Floats) -> dict[str, Floats]:
+        """Return the log-density of each free variable in the user's own units, shapes (P,)."""
+        values = self._log_prior(np.ascontiguousarray(thetas))[:-1]
+        names = [str(rv.name) for rv in self.model.free_RVs]
+        return {
+            name: np.array(np.broadcast_to(value, len(thetas)))
+            for name, value in zip(names, values, strict=True)
+        }
 
     def log_prior(self, thetas: Floats) -> Floats:
         """Return the log prior density with the Jacobian of the transforms, shape (P,)."""
-        (found,) = self._log_prior(np.ascontiguousarray(thetas))
-        return np.array(np.broadcast_to(found, len(thetas)))
+        values = self._log_prior(np.ascontiguousarray(thetas))
+        return np.array(np.broadcast_to(sum(values), len(thetas)))
 
     def in_support(self, thetas: Floats) -> Any:
         """Return which thetas have a finite log prior, shape (P,)."""
@@ -213,6 +231,7 @@ class Hyperparameters:
         return theta
 
     @cached_property
+    @untraced()
     def _transform(self) -> Any:
         free = self.model.free_RVs
         symbols = [rv.type() for rv in free]

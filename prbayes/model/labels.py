@@ -6,6 +6,7 @@ import importlib.metadata
 import platform
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -22,13 +23,18 @@ def versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
     found = {}
     for name in ("prbayes", "pymc", "pytensor", "arviz", "numpy", "scipy"):
-        found[f"{name}_version"] = importlib.metadata.version(name)
+        found[f"{name}_version"] = _version(name)
     return {**found, "python_version": platform.python_version()}
+
+
+@cache
+def _version(package: str) -> str:
+    return importlib.metadata.version(package)
 
 
 def arviz_attributes() -> dict[str, str]:
     """Return the attributes that ArviZ gives a group."""
-    version = importlib.metadata.version("prbayes")
+    version = _version("prbayes")
     return {
         "created_at": datetime.now(UTC).isoformat(),
         "creation_library": "prbayes",

@@ -10,20 +10,19 @@ import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
 from scipy.special import chdtri, ndtri
 
-from prbayes._checks import AT_ONCE, IN_CACHE, Floats
+from prbayes._checks import IN_CACHE, Floats
 from prbayes.model.hyperparameters import Hyperparameters
 from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.points import sobol
+from prbayes.propagation.population_density import PopulationDensity
 from prbayes.propagation.response_share import ResponseShare
-from prbayes.response.distributions import PopulationSampler, compiled_log_density
 from prbayes.response.grouping import is_group
 from prbayes.response.inputs import Inputs
 
@@ -38,28 +37,33 @@ class Populations:
     inputs : Inputs
     coordinates : Coordinates
     groups : ndarray of int, shape (N,), or None
+    density : PopulationDensity, optional
+        Of the same inputs, as far as it is compiled.
+    evaluated : weak reference to Hyperparameters, optional
+        Those of the model, where an evaluator has compiled them.
     """
 
     model: weakref.ref[pm.Model]
     inputs: Inputs
     coordinates: Coordinates
     groups: NDArray[np.intp] | None
+    density: PopulationDensity | None = None
+    evaluated: weakref.ref[Hyperparameters] | None = None
+
+    @cached_property
+    def _density(self) -> PopulationDensity:
+        return PopulationDensity(self.inputs) if self.density is None else self.density
 
     @cached_property
     def hyperparameters(self) -> Hyperparameters:
         """The hyperparameters of the model."""
+        evaluated = None if self.evaluated is None else self.evaluated()
+        if evaluated is not None:
+            return evaluated
         model = self.model()
         if model is None:
             raise RuntimeError("got a simulator whose model is gone; build the model again")
         return Hyperparameters(model)
-
-    @cached_property
-    def _log_density(self) -> Any:
-        return compiled_log_density(self.inputs)
-
-    @cached_property
-    def _sampler(self) -> PopulationSampler:
-        return PopulationSampler(self.inputs)
 
     def _roots(self, thetas: Floats, group: int) -> list[Floats]:
         """Return the roots of the inputs at thetas, shapes (S, *shape)."""
@@ -86,16 +90,15 @@ class Populations:
         for group in np.unique(groups):
             rows = np.flatnonzero(groups == group)
             of_rows = [v[rows] for v in x]
-            flat = [np.ascontiguousarray(v.reshape(-1, *v.shape[2:])) for v in of_rows]
+            if smoothing is None:
+                roots = self._roots(thetas, int(group))
+                result[:, rows] = self._density.log_likelihoods(roots, of_rows, weights[rows])
+                continue
             step = max(1, IN_CACHE // (len(rows) * count))
             for first in range(0, len(thetas), step):
                 some = slice(first, first + step)
                 roots = self._roots(thetas[some], int(group))
-                if smoothing is not None:
-                    logs = self._normal_log_density(roots, z[rows].reshape(-1, d), smoothing)
-                else:
-                    with np.errstate(all="ignore"):
-                        (logs,) = self._log_density(*roots, *flat)
+                logs = self._normal_log_density(roots, z[rows].reshape(-1, d), smoothing)
                 logs = np.where(np.isnan(logs), -np.inf, logs)
                 logs = logs.reshape(-1, len(rows), count)
                 result[some, rows] = log_sum_exp(logs + weights[rows])
@@ -108,23 +111,17 @@ class Populations:
     def log_share(self, thetas: Floats, share: ResponseShare, size: int) -> Floats:
         """Return log S of the population of each of N specimens, summed over them, (S,)."""
         groups = np.zeros(size, dtype=np.intp) if self.groups is None else self.groups
-        x = self.coordinates.inputs(share.z)
         result = np.zeros(len(thetas))
-        step = max(1, AT_ONCE // len(share.z))
         for group, count in zip(*np.unique(groups, return_counts=True), strict=True):
-            for first in range(0, len(thetas), step):
-                some = slice(first, first + step)
-                with np.errstate(all="ignore"):
-                    (log_p,) = self._log_density(*self._roots(thetas[some], int(group)), *x)
-                log_p = np.nan_to_num(log_p, nan=-np.inf) + self.coordinates.log_jacobian(share.z)
-                result[some] += count * share.log_share(log_p)
+            roots = self._roots(thetas, int(group))
+            result += count * share.of_populations(self._density, roots, self.coordinates)
         return result
 
     def _normal_log_density(
         self, roots: Sequence[Floats], z: Floats, smoothing: Floats, specimens: int = 256
     ) -> Floats:
         """Return the log-density of points (n, d) in smoothed normal populations, (S, n)."""
-        drawn, _ = self._sampler(roots, specimens, np.random.default_rng(0))
+        drawn, _ = self._density.sampler(roots, specimens, np.random.default_rng(0))
         sample = self.coordinates.of(drawn, 2)
         mean = sample.mean(axis=1, keepdims=True)
         centred = sample - mean
@@ -252,7 +249,7 @@ def specimens_of(populations: Populations, thetas: Floats, each: int, seed: int 
         groups = np.unique(populations.groups).tolist()
     parts = []
     for group in groups:
-        drawn, _ = populations._sampler(populations._roots(thetas, group), each, rng)
+        drawn, _ = populations._density.sampler(populations._roots(thetas, group), each, rng)
         z = populations.coordinates.of(drawn, 2)
         parts.append(z.reshape(-1, z.shape[-1]))
     z = np.concatenate(parts)

@@ -39,6 +39,7 @@ from prbayes._checks import Floats, called
 from prbayes._finding import Finding, report
 from prbayes.metrics.readings import Readings
 from prbayes.model.data_checks import data_findings
+from prbayes.model.hyperparameters import Hyperparameters
 from prbayes.model.measurement import Measurement, StackedReadings
 from prbayes.model.node import (
     builds_priors_alone,
@@ -59,6 +60,7 @@ from prbayes.model.run_checks import (
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.fibre_points import fibre_points
+from prbayes.propagation.population_density import PopulationDensity
 from prbayes.propagation.response_share import ResponseShare, response_share
 from prbayes.propagation.roots import Roots
 from prbayes.propagation.specimen_points import (
@@ -69,7 +71,7 @@ from prbayes.propagation.specimen_points import (
     emulate,
 )
 from prbayes.response.costs import in_words
-from prbayes.response.distributions import PopulationSampler, log_density
+from prbayes.response.distributions import log_density
 from prbayes.response.grouping import is_group
 from prbayes.response.inputs import Inputs, aleatory_names
 from prbayes.response.response import Responses
@@ -98,7 +100,8 @@ class SpecimenLikelihood:
 
     def __getstate__(self) -> dict[str, Any]:
         """Replace the weak reference, which has no pickle, by the model."""
-        return {**vars(self), "model": None if self.model is None else self.model()}
+        model = None if self.model is None else self.model()
+        return {**vars(self), "model": model, "_evaluated": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore the weak reference."""
@@ -151,7 +154,7 @@ class SpecimenLikelihood:
     @cached_property
     def coordinates(self) -> Coordinates:
         """Coordinates of the inputs."""
-        return Coordinates.of_prior(self.inputs, len(self.readings))
+        return Coordinates.of_prior(self.inputs, len(self.readings), sampler=self._density.sampler)
 
     def columns(self, measurement: Measurement) -> slice:
         """Return which of all outputs are those of a simulator."""
@@ -332,7 +335,22 @@ class SpecimenLikelihood:
     @property
     def populations(self) -> Populations:
         """Populations of the model's hyperparameters, which compile what they are asked for."""
-        return Populations(self.model, self.inputs, self.coordinates, self.stacked.groups)
+        groups = self.stacked.groups
+        shared = self._density, self._evaluated
+        return Populations(self.model, self.inputs, self.coordinates, groups, *shared)
+
+    @cached_property
+    def _density(self) -> PopulationDensity:
+        return PopulationDensity(self.inputs)
+
+    @cached_property
+    def _evaluated(self) -> weakref.ref[Hyperparameters] | None:
+        """The model's hyperparameters, once an evaluator has them."""
+        return None
+
+    def evaluated_by(self, hyperparameters: Hyperparameters) -> None:
+        """Take what an evaluator of the model has compiled."""
+        vars(self)["_evaluated"] = weakref.ref(hyperparameters)
 
     @property
     def _is_partial(self) -> bool:
@@ -383,17 +401,58 @@ class SpecimenLikelihood:
         return self._prepared[3]
 
     @cached_property
-    def arrays(self) -> tuple[list[Any], Any]:
-        """Shared variables of the points, (N, K, *event) by input, and of the numbers A, (N, K)."""
+    def _weighted_points(self) -> tuple[list[Floats], Floats]:
+        """The points, (N, K, *event) by input, and the numbers A, (N, K)."""
         points = self.points
         # The proposal is a density of z: p(x) dx = p(x(z)) |dx/dz| dz.
         log_a = points.log_a if self.error_is_known else -points.log_proposal
-        log_a = log_a + self.coordinates.log_jacobian(points.z)
+        return self.coordinates.inputs(points.z), log_a + self.coordinates.log_jacobian(points.z)
+
+    @cached_property
+    def arrays(self) -> tuple[list[Any], Any]:
+        """Shared variables of the points, (N, K, *event) by input, and of the numbers A, (N, K)."""
+        points, log_a = self._weighted_points
         shared = [
             pytensor.shared(np.ascontiguousarray(x), name=f"{self.name}_points_{i}")
-            for i, x in enumerate(self.coordinates.inputs(points.z))
+            for i, x in enumerate(points)
         ]
         return shared, pytensor.shared(log_a, name=f"{self.name}_log_a")
+
+    @property
+    def needs_graph(self) -> bool:
+        """Whether only the graph has the log-likelihood: with an unknown error, or repeats."""
+        return not self.error_is_known or self.stacked.repeats is not None
+
+    def log_likelihoods(self, params: Mapping[Any, Floats]) -> Floats:
+        """Return the log-likelihoods of the specimens in batches of populations, (P, S).
+
+        The numbers of `log_likelihood`, for likelihoods that need no graph.
+
+        Parameters
+        ----------
+        params : mapping
+            Values by `variables`, shapes (P, *shape), without the group of a specimen.
+        """
+        x, log_a = self._weighted_points
+        size = len(next(iter(params.values())))
+        result = np.empty((size, len(self.readings)))
+        for place, rows in self.by_group:
+            roots = [
+                np.full(size, place) if is_group(root) else params[root]
+                for root in self.inputs.roots
+            ]
+            of_rows = [v[rows] for v in x]
+            result[:, rows] = self._density.log_likelihoods(roots, of_rows, log_a[rows])
+            if self.share is not None:
+                log_share = self.share.of_populations(self._density, roots, self.coordinates)
+                result[:, rows] -= log_share[:, None]
+        gross_share = self.measurements[0].gross_errors
+        if gross_share is not False:
+            gross_share = np.reshape(params.get(gross_share, gross_share), (-1, 1))
+            gross = np.log(gross_share) + self.stacked.log_gross
+            result = np.logaddexp(np.log1p(-gross_share) + result, gross)
+        weights = self.measurements[0].weights
+        return result if weights is None else result * weights
 
     def log_likelihood(self, params: Mapping[Any, Any]) -> TensorVariable:
         """Return the graph of the log-likelihoods of the specimens, (S,).
@@ -518,7 +577,7 @@ class SpecimenLikelihood:
 
         def drawn() -> Floats:
             if groups is None:
-                specimens, _ = self._sampler(roots, n, rng)
+                specimens, _ = self._density.sampler(roots, n, rng)
             else:
                 specimens = self._of_groups(rng, roots, np.resize(groups, n))
             flat = [x[:, same].reshape(-1, *x.shape[2:]) for x in specimens]
@@ -579,7 +638,7 @@ class SpecimenLikelihood:
                 for root in self.inputs.roots
             ]
             columns = np.flatnonzero(groups == group)
-            specimens, _ = self._sampler(completed, len(columns), rng)
+            specimens, _ = self._density.sampler(completed, len(columns), rng)
             drawn = drawn or [np.empty((x.shape[0], len(groups), *x.shape[2:])) for x in specimens]
             for whole, part in zip(drawn, specimens, strict=True):
                 whole[:, columns] = part
@@ -593,10 +652,6 @@ class SpecimenLikelihood:
         z = self.coordinates.of(inputs, 1)
         z = np.clip(z, self.emulation.box[0], self.emulation.box[1])
         return self.emulation.values(z)
-
-    @cached_property
-    def _sampler(self) -> PopulationSampler:
-        return PopulationSampler(self.inputs)
 
     def observing(self, data: Mapping[str, Any]) -> SpecimenLikelihood:
         """Return the likelihood of other observed values by simulator, with the same runs.

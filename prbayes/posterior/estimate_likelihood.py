@@ -14,7 +14,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from prbayes._checks import IN_CACHE, Floats
 from prbayes._threads import one_thread
@@ -296,6 +295,8 @@ def _minimised_on_population(
     With them come the scales of the simulators, (k,). A minimiser that stored responses do not
     support is not taken.
     """
+    from scipy.optimize import minimize
+
     targets = []
     for k, node in enumerate(evaluator.nodes):
         responses, weights = evaluator.populations(point[None], k)

@@ -16,8 +16,6 @@ from prbayes.model.labels import (
     labelled_responses,
     observed_dataset,
 )
-from prbayes.model.node import priors_alone
-from prbayes.response.compilation import untraced
 from prbayes.response.outputs import lacking
 
 # The names that ArviZ's functions which want a number for each observation show when they refuse.
@@ -154,17 +152,11 @@ def _predictive(evaluator: Evaluator, thetas: Floats, rng: np.random.Generator) 
 def _log_prior(evaluator: Evaluator, thetas: Floats) -> xr.Dataset:
     """Return the log prior density of each variable in the user's own units, by draw."""
     chains, draws, d = thetas.shape
-    free = evaluator.model.free_RVs
-    with untraced():
-        with priors_alone():
-            graphs = evaluator.model.logp(vars=free, jacobian=False, sum=False)
-        density = evaluator.hyperparameters.compile(graphs)
-    values = density(thetas.reshape(-1, d))
-    found = {}
-    for rv, value in zip(free, values, strict=True):
-        total = np.reshape(value, (chains * draws, -1)).sum(axis=1)
-        found[str(rv.name)] = (["chain", "draw"], total.reshape(chains, draws))
-    return xr.Dataset(found, coords={"chain": np.arange(chains), "draw": np.arange(draws)})
+    terms = evaluator.hyperparameters.log_prior_terms(thetas.reshape(-1, d))
+    variables = {
+        name: (["chain", "draw"], value.reshape(chains, draws)) for name, value in terms.items()
+    }
+    return xr.Dataset(variables, coords={"chain": np.arange(chains), "draw": np.arange(draws)})
 
 
 def _log_likelihood(evaluator: Evaluator, thetas: Floats, log_likelihood: Floats) -> xr.Dataset:

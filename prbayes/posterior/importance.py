@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri, logsumexp, ndtri
+from scipy.special import chdtri, gammaln, logsumexp, ndtri
 
 from prbayes._checks import Floats
 from prbayes.propagation.points import sobol
@@ -271,10 +271,11 @@ class _Mixture:
 
     def log_densities(self, points: Floats) -> Floats:
         """Return log(share times density) of each component, (S, M)."""
-        from scipy.stats import multivariate_t
-
-        columns = []
-        for center, root, share in zip(self.centers, self.roots, self.shares, strict=True):
-            log_t = multivariate_t(center, root @ root.T, self.degrees).logpdf(points)
-            columns.append(np.log(share) + np.atleast_1d(log_t))
-        return np.stack(columns, axis=1)
+        nu, d = self.degrees, points.shape[1]
+        away = points - self.centers[:, None]
+        standard = np.linalg.solve(self.roots, away.swapaxes(1, 2))
+        square = np.einsum("mds,mds->ms", standard, standard)
+        log_det = np.log(np.einsum("mdd->md", self.roots)).sum(axis=1)
+        constant = gammaln((nu + d) / 2) - gammaln(nu / 2) - d / 2 * np.log(nu * np.pi)
+        tail = (nu + d) / 2 * np.log1p(square / nu)
+        return np.asarray((np.log(self.shares) + constant - log_det)[:, None] - tail).T

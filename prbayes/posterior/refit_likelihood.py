@@ -13,17 +13,20 @@ doi:10.1214/18-EJS1433).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.special import logsumexp
+from scipy.sparse import csr_array, vstack
+from scipy.special import logsumexp, ndtri
 
 from prbayes._checks import AT_ONCE, Floats
 from prbayes._threads import one_thread
+from prbayes.estimate.batch_objective import BatchObjective
 from prbayes.estimate.continuation import Continuation, ContinuedEvaluator, continuation_of
 from prbayes.estimate.data_sets import (
+    DataSets,
     groups,
     observable,
     observed_set,
@@ -36,6 +39,7 @@ from prbayes.estimate.optimum import Optimum
 from prbayes.estimate.refit import SamplingDistribution
 from prbayes.metrics.score import prepared_on_population
 from prbayes.model.evaluator import Evaluator
+from prbayes.model.hyperparameters import THETAS
 from prbayes.model.support import TOLERABLE, supports_each
 from prbayes.posterior.importance import importance_sample, laplace
 from prbayes.posterior.saddlepoint import (
@@ -57,6 +61,8 @@ class RefitLikelihoodOptions:
     ----------
     n_sets : int
         Number of synthetic data sets.
+    n_starts : int
+        Points around the estimate, the best of which a refit starts from if there are other optima.
     rounds : int
         Rounds that share the data sets. Those of the first are drawn around the estimate, those of
         others around the posterior before.
@@ -74,6 +80,8 @@ class RefitLikelihoodOptions:
         element of the estimate and one more.
     reach : float
         Largest distance of an estimate from the observed one, in standard errors.
+    far : float
+        Largest share of estimates beyond.
     converged : float
         Smallest share of refits that have to converge.
     whitenings : int
@@ -84,13 +92,15 @@ class RefitLikelihoodOptions:
     """
 
     n_sets: int = 1024
+    n_starts: int = 64
     rounds: int = 2
     radius: float = 4.0
     inflation: float = 1.5
     weakest: float = 10.0
-    tail: float = 10.0
+    tail: float = 40.0
     prior_sets: float = 1.0
     reach: float = 10.0
+    far: float = 0.1
     converged: float = 0.9
     whitenings: int = 2
     seed: int = 0
@@ -123,11 +133,11 @@ class RefitLikelihood:
     Attributes
     ----------
     evaluator : Evaluator
-    sampling : SamplingDistribution
-        Of the estimate; in coordinates of the continuation.
+    centers : tuple of SamplingDistribution
+        At the estimate and at optima that are as good; in coordinates of the continuation.
     continuation : Continuation
-    point : ndarray, shape (d,)
-        Theta of the estimate, moved within the ends of the prior.
+    starts : ndarray, shape (M, d)
+        Thetas of these, moved within the ends of the prior.
     scale : ndarray, shape (d,)
         Unit of each element for `laplace`.
     sets : SyntheticSets
@@ -135,12 +145,22 @@ class RefitLikelihood:
     """
 
     evaluator: Evaluator
-    sampling: SamplingDistribution
+    centers: tuple[SamplingDistribution, ...]
     continuation: Continuation
-    point: Floats
+    starts: Floats
     scale: Floats
     sets: SyntheticSets
     options: RefitLikelihoodOptions
+
+    @property
+    def point(self) -> Floats:
+        """Theta of the estimate, moved within the ends of the prior, (d,)."""
+        return np.asarray(self.starts[0])
+
+    @property
+    def sampling(self) -> SamplingDistribution:
+        """The sampling distribution of the estimate."""
+        return self.centers[0]
 
     @one_thread()
     def log_likelihood(self, thetas: Floats) -> Floats:
@@ -158,8 +178,11 @@ class RefitLikelihood:
         logs = self.log_weights(x)
         is_supported = np.isfinite(logs).any(axis=1)
         if is_supported.any():
-            logs, x = logs[is_supported], x[is_supported]
-            result[is_supported] = extended_log_density(logs, self.sets.estimates, x, self.options)
+            logs = logs[is_supported]
+            away = nearest(self.centers, self.sampling.thetas(x[is_supported]))[1]
+            result[is_supported] = extended_log_density(
+                logs, self.sets.estimates, away, self.options
+            )
         return result
 
     def log_weights(self, x: Floats) -> Floats:
@@ -183,30 +206,43 @@ class RefitLikelihood:
         return result
 
 
+def nearest(
+    centers: Sequence[SamplingDistribution], thetas: Floats
+) -> tuple[NDArray[np.intp], Floats]:
+    """Return the nearest center of each theta, (S,), and coordinates around it, (S, r)."""
+    x = np.stack([center.coordinates(thetas)[0] for center in centers])
+    distances = np.linalg.norm(x, axis=2)
+    chosen = distances.argmin(axis=0)
+    return chosen, x[chosen, np.arange(len(thetas))]
+
+
 def extended_log_density(
-    log_weights: Floats, estimates: Floats, x: Floats, options: RefitLikelihoodOptions
+    log_weights: Floats, estimates: Floats, away: Floats, options: RefitLikelihoodOptions
 ) -> Floats:
     """Return the log-density of an estimate of zero, (S,).
 
     The cumulant function is that of the weighted estimates, mixed with that of a normal
-    distribution with their moments. Few effective data sets are joined by the normal distribution
-    around x with one standard error.
+    distribution with their moments. A few data sets with one standard error join the moments, which
+    matters where few of the synthetic ones have weights.
 
     Parameters
     ----------
     log_weights : ndarray, shape (S, R)
     estimates : ndarray, shape (R, r)
-    x : ndarray, shape (S, r)
-        Where the populations are.
+    away : ndarray, shape (S, r)
+        Where the populations are, relative to the observed estimate.
     options : RefitLikelihoodOptions
     """
     r = estimates.shape[1]
     scores = [Scores(estimates, 1)]
-    untilted = cumulants([log_weights], scores, np.zeros_like(x))
+    untilted = cumulants([log_weights], scores, np.zeros_like(away))
     effective = 1 / np.exp(2 * log_weights).sum(axis=1)
-    prior = options.prior_sets * (r + 1)
-    part = effective / (effective + prior)
-    mean = part[:, None] * untilted.gradients + (1 - part)[:, None] * x
+    part = effective / (effective + options.prior_sets * (r + 1))
+    # Beyond all data sets the mean is as far away as the population.
+    lengths = np.linalg.norm(untilted.gradients, axis=1)
+    ratios = np.linalg.norm(away, axis=1) / np.maximum(lengths, 1e-300)
+    factors = np.maximum(ratios, 1) ** (1 - part)
+    mean = factors[:, None] * untilted.gradients
     covariance = part[:, None, None] * untilted.hessians
     covariance += (1 - part)[:, None, None] * np.eye(r)
     standardised = np.linalg.solve(covariance, mean[:, :, None])[:, :, 0]
@@ -225,8 +261,10 @@ def extended_log_density(
             own[:, None, None] * empirical.hessians + rest[:, None, None] * covariance[rows],
         )
 
-    points = minimum(function, x.shape, 1, options.saddlepoint)
-    return density_at(points, 1, options.saddlepoint)
+    points = minimum(function, away.shape, 1, options.saddlepoint)
+    mixed = density_at(points, 1, options.saddlepoint)
+    normal = -(distance + np.linalg.slogdet(covariance)[1]) / 2
+    return np.where(np.isfinite(mixed), mixed, normal)
 
 
 def refit_likelihood(
@@ -252,6 +290,8 @@ def refit_likelihood(
         refits do not converge.
     """
     _require_stored(evaluator)
+    if optimum.at_edge:
+        raise ValueError(_at_edge(", ".join(optimum.at_edge)))
     order = [optimum.names.index(name) for name in evaluator.names]
     rivals = [rival["theta"] for rival in optimum.rivals if rival["comparable"]]
     thetas = np.array([optimum.theta, *rivals])[:, order]
@@ -262,30 +302,52 @@ def refit_likelihood(
         evaluator, start = _whitened(evaluator, continuation, start, scales, options)
     continued = _continued(evaluator, continuation)
     sampling = _at_minimiser(continued, start, scales, options)
-    point = continuation.within(sampling.theta[None], margin=0.05)[0]
+    _require_inside(sampling, options)
+    centers = [sampling]
+    for other in others:
+        center = SamplingDistribution.of(continued, other, scales, options.weakest)
+        if center.stderr.size == sampling.stderr.size:
+            centers.append(center)
+    # Identified directions are known from all stored responses; an eighth is enough for the rest.
+    evaluator = _coarse_where_sufficient(evaluator, continuation.within(thetas[:1])[0])
+    continued = _continued(evaluator, continuation)
+    centers = [replace(center, evaluator=continued) for center in centers]
+    sampling = centers[0] = _moved_to_minimiser(centers[0])
+    places = np.array([center.theta for center in centers])
     likelihood = RefitLikelihood(
         evaluator=evaluator,
-        sampling=sampling,
+        centers=tuple(centers),
         continuation=continuation,
-        point=point,
-        scale=evaluator.prior_sd,
+        starts=continuation.within(places, margin=0.05),
+        scale=_scale(evaluator, sampling, continuation),
         sets=SyntheticSets((), np.empty(0), np.empty((0, sampling.stderr.size))),
         options=options,
     )
+    if not sampling.stderr.size:
+        return likelihood
     number = options.n_sets // options.rounds
-    centers = [sampling, *(SamplingDistribution.of(continued, x, scales) for x in others)]
-    x = _around(sampling, centers, number, options)
-    drawn = _draw(sampling, x, options, seed=0)
+    drawn = _draw(centers, _balls(centers, number, options), options, seed=0)
     for i in range(1, options.rounds):
-        likelihood = replace(likelihood, sets=_pooled(sampling, [drawn]))
-        modes = laplace(likelihood.log_posterior, likelihood.point[None], likelihood.scale)
-        sample = importance_sample(likelihood.log_posterior, modes, number, options.seed)
-        near, _ = sampling.coordinates(continuation.coordinates(sample.draws))
-        middle = np.median(near, axis=0)
-        more = _draw(sampling, middle + options.inflation * (near - middle), options, seed=i)
-        drawn = drawn.joined(more)
-    sets = _pooled(sampling, [drawn])
-    return replace(likelihood, sets=sets)
+        likelihood = replace(likelihood, sets=_pooled(sampling, drawn))
+        x = _posterior_points(likelihood, number)
+        drawn = drawn.joined(_draw(centers, x, options, seed=i))
+    return replace(likelihood, sets=_pooled(sampling, drawn))
+
+
+def _posterior_points(likelihood: RefitLikelihood, number: int) -> Floats:
+    """Return coordinates of draws from the posterior, spread out around each optimum, (n, r)."""
+    options = likelihood.options
+    density = likelihood.log_posterior
+    modes = laplace(density, likelihood.starts, likelihood.scale)
+    sample = importance_sample(density, modes, number, options.seed)
+    thetas = likelihood.continuation.coordinates(sample.draws)
+    x, _ = likelihood.sampling.coordinates(thetas)
+    chosen, _ = nearest(likelihood.centers, thetas)
+    for i in np.unique(chosen):
+        members = chosen == i
+        middle = np.median(x[members], axis=0)
+        x[members] = middle + options.inflation * (x[members] - middle)
+    return x
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,9 +360,8 @@ class _Drawn:
 
     def joined(self, other: _Drawn) -> _Drawn:
         """Return these and others."""
-        from scipy.sparse import vstack
-
-        counts = [vstack(pair, format="csr") for pair in zip(self.counts, other.counts)]
+        pairs = zip(self.counts, other.counts, strict=True)
+        counts = [vstack(pair, format="csr") for pair in pairs]
         return _Drawn(
             np.concatenate([self.x, other.x]),
             tuple(counts),
@@ -308,16 +369,19 @@ class _Drawn:
         )
 
 
-def _pooled(sampling: SamplingDistribution, drawn: list[_Drawn]) -> SyntheticSets:
-    (one,) = drawn
-    logs = _log_likelihoods(sampling, one.counts, one.x)
-    return SyntheticSets(one.counts, logsumexp(logs, axis=0), one.estimates)
+def _pooled(sampling: SamplingDistribution, drawn: _Drawn) -> SyntheticSets:
+    logs = _log_likelihoods(sampling, drawn.counts, drawn.x)
+    return SyntheticSets(drawn.counts, logsumexp(logs, axis=0), drawn.estimates)
 
 
 def _draw(
-    sampling: SamplingDistribution, x: Floats, options: RefitLikelihoodOptions, seed: int
+    centers: Sequence[SamplingDistribution],
+    x: Floats,
+    options: RefitLikelihoodOptions,
+    seed: int,
 ) -> _Drawn:
     """Draw a data set at each of some coordinates, (R, r), and refit it."""
+    sampling = centers[0]
     evaluator = sampling.evaluator
     thetas = sampling.thetas(x)
     supported = _is_supported(evaluator, thetas)
@@ -330,12 +394,16 @@ def _draw(
     rng = np.random.default_rng([options.seed, seed])
     points = points_along(evaluator, thetas, rng)
     sets = sets_at(evaluator, stored_populations(evaluator, thetas), points)
-    estimates, converged = sampling.refit(sets, roughly=True)
+    starts = x if len(centers) == 1 else _best_starts(centers, sets, options)
+    estimates, converged = sampling.refit(sets, starts, roughly=True)
     if converged.mean() < options.converged:
         raise ValueError(
             f"got {int(converged.sum())} of {converged.size} refits that converged, expected at "
             f"least {options.converged:.0%}; use another metric, or prb.sample_smc"
         )
+    is_far = np.abs(estimates).max(axis=1) > options.reach
+    if is_far.mean() > options.far:
+        raise ValueError(_at_edge(f"{is_far.mean():.0%} of the estimates of synthetic data sets"))
     estimates = np.clip(estimates, -options.reach, options.reach)
     numbers, _ = specimens(evaluator.nodes)
     counts = []
@@ -386,26 +454,47 @@ def _is_supported(evaluator: Evaluator, thetas: Floats) -> NDArray[np.bool_]:
     return supported
 
 
-def _around(
-    sampling: SamplingDistribution,
-    centers: list[SamplingDistribution],
-    number: int,
-    options: RefitLikelihoodOptions,
+def _balls(
+    centers: Sequence[SamplingDistribution], number: int, options: RefitLikelihoodOptions
 ) -> Floats:
     """Return points of balls of standard errors around estimates, in coordinates of the first."""
+    sampling = centers[0]
     r = sampling.stderr.size
-    result = []
+    points = []
     for i, center in enumerate(centers):
-        size = center.stderr.size
-        u = sobol(number // len(centers), size + 1, options.seed + i)
-        from scipy.special import ndtri
+        ball = _ball(number // len(centers), r, options, options.seed + i)
+        x, _ = sampling.coordinates(center.thetas(ball))
+        points.append(x)
+    return np.concatenate(points)
 
-        direction = ndtri(u[:, :size])
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        away = options.radius * u[:, size:] ** (1 / max(size, 1)) * direction
-        x, _ = sampling.coordinates(center.thetas(away))
-        result.append(x)
-    return np.concatenate(result).reshape(-1, r)
+
+def _ball(number: int, r: int, options: RefitLikelihoodOptions, seed: int) -> Floats:
+    """Return evenly spread points of a ball, (number, r)."""
+    u = sobol(number, r + 1, seed)
+    directions = ndtri(u[:, :r])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    radii = options.radius * u[:, r:] ** (1 / r)
+    return np.asarray(radii * directions)
+
+
+def _best_starts(
+    centers: Sequence[SamplingDistribution], sets: DataSets, options: RefitLikelihoodOptions
+) -> Floats:
+    """Return the best of some points around the estimate for each data set, (R, r).
+
+    Points nearer to another optimum are left out: all refits are minimisers near the estimate.
+    """
+    sampling = centers[0]
+    ball = _ball(options.n_starts, sampling.stderr.size, options, options.seed)
+    thetas = sampling.thetas(ball)
+    chosen, _ = nearest(centers, thetas)
+    ball, thetas = ball[chosen == 0], thetas[chosen == 0]
+    objective = BatchObjective.of(sampling.evaluator, sampling.scales, sets)
+    best = []
+    for first in range(0, objective.n_sets, 16):
+        values = objective(thetas[None], slice(first, first + 16))
+        best.append(values.argmin(axis=1))
+    return np.asarray(ball[np.concatenate(best)])
 
 
 def _continued(evaluator: Evaluator, continuation: Continuation) -> Evaluator:
@@ -417,16 +506,24 @@ def _continued(evaluator: Evaluator, continuation: Continuation) -> Evaluator:
 def _at_minimiser(
     evaluator: Evaluator, start: Floats, scales: Floats, options: RefitLikelihoodOptions
 ) -> SamplingDistribution:
-    """Return the sampling distribution at the minimiser that observed responses reach from a start."""
+    """Return the sampling distribution at the minimiser for the observed responses near a start."""
     for _ in range(5):
         sampling = SamplingDistribution.of(evaluator, start, scales, options.weakest)
-        (x,), (converged,) = sampling.refit(observed_set(evaluator))
-        start = sampling.thetas(x)
-        if converged and np.abs(x).max(initial=0.0) < 0.5:
-            break
-    else:
-        raise ValueError("got an estimate that does not converge")
-    return replace(sampling, theta=start)
+        moved = _moved_to_minimiser(sampling)
+        x, _ = sampling.coordinates(moved.theta)
+        start = moved.theta
+        if np.abs(x).max(initial=0.0) < 0.5:
+            return moved
+    raise ValueError(
+        "got an estimate that still moves by half a standard error when it is minimised again, "
+        "expected a minimum; use another metric, or prb.sample_smc"
+    )
+
+
+def _moved_to_minimiser(sampling: SamplingDistribution) -> SamplingDistribution:
+    """Return the sampling distribution with the minimiser for the observed responses as theta."""
+    (x,), _ = sampling.refit(observed_set(sampling.evaluator))
+    return replace(sampling, theta=sampling.thetas(x))
 
 
 def _whitened(
@@ -436,7 +533,7 @@ def _whitened(
     scales: Floats,
     options: RefitLikelihoodOptions,
 ) -> tuple[Evaluator, Floats]:
-    """Return metrics of several outputs with the whitening of the population, and their minimiser."""
+    """Return metrics of several outputs, whitened by the population, and their minimiser."""
     targets = [node.target for node in evaluator.nodes]
     if not any(target.event for target in targets):
         return evaluator, start
@@ -448,6 +545,52 @@ def _whitened(
     prepared = evaluator.with_targets(targets)
     sampling = _at_minimiser(_continued(prepared, continuation), start, scales, options)
     return prepared, sampling.theta
+
+
+def _require_inside(sampling: SamplingDistribution, options: RefitLikelihoodOptions) -> None:
+    """Raise if the data identify more at the middle of the prior than at the estimate."""
+    local = sampling.local
+    if not local.unidentified.size:
+        return
+    evaluator = sampling.evaluator
+    middle = np.median(evaluator.prior_points(THETAS, 0), axis=0)
+    shift = (middle - sampling.theta) / local.prior_sd
+    along = local.identified @ (local.identified.T @ shift)
+    inside = sampling.theta + (shift - along) * local.prior_sd
+    there = SamplingDistribution.of(evaluator, inside, sampling.scales, options.weakest)
+    if there.stderr.size > sampling.stderr.size:
+        names = np.array(evaluator.readable_names)
+        is_flat = (local.unidentified**2).sum(axis=1) > 0.5
+        raise ValueError(_at_edge(", ".join(names[is_flat])))
+
+
+def _at_edge(what: str) -> str:
+    return (
+        f"got {what} at an edge, as where a standard deviation is about zero, where estimates pile "
+        "up and have no density; use prb.LogLikelihood(), or prb.sample_smc"
+    )
+
+
+def _scale(
+    evaluator: Evaluator, sampling: SamplingDistribution, continuation: Continuation
+) -> Floats:
+    """Return prior standard deviations, or a hundred standard errors if these are less, (d,)."""
+    axes = sampling.axes * sampling.stderr
+    errors = np.sqrt((axes**2).sum(axis=1))
+    is_known = ~continuation.is_continued & (errors > 0)
+    units = np.where(is_known, np.minimum(100 * errors, 1), 1.0)
+    return np.asarray(units * evaluator.prior_sd)
+
+
+def _coarse_where_sufficient(evaluator: Evaluator, theta: Floats) -> Evaluator:
+    """Return an evaluator with an eighth of the points of large designs, if they are sufficient."""
+    coarse = evaluator.coarser()
+    if coarse is None:
+        return evaluator
+    support = coarse.support(theta[None])
+    sizes = [support[name]["weight_ess"][0] for name in coarse.designs]
+    required = [design.required_ess for design in coarse.designs.values()]
+    return coarse if (np.array(sizes) >= required).all() else evaluator
 
 
 def _require_stored(evaluator: Evaluator) -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,14 @@ class Scores:
     def rank(self) -> int:
         """The number of combinations of scores, r."""
         return int(self.values.shape[1])
+
+    @cached_property
+    def powers(self) -> Floats:
+        """Ones, scores and products of two scores, (1 + r + r (r + 1) / 2, M)."""
+        first, second = np.triu_indices(self.rank)
+        scores = self.values.T
+        ones = np.ones((1, scores.shape[1]))
+        return np.concatenate([ones, scores, scores[first] * scores[second]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,19 +126,17 @@ def cumulants(log_weights: Sequence[Floats], scores: Sequence[Scores], tilts: Fl
     hessians = np.zeros((count, r, r))
     first, second = np.triu_indices(r)
     for logs, score in zip(log_weights, scores, strict=True):
-        psi = score.values
-        exponents = tilts @ psi.T
+        exponents = tilts @ score.powers[1 : 1 + r]
         exponents += logs
         largest = exponents.max(axis=1)
         exponents -= largest[:, None]
-        weights = np.exp(exponents)
-        totals = weights.sum(axis=1)
-        column = totals[:, None]
-        means = weights @ psi / column
-        pairs = psi[:, first] * psi[:, second]
-        products = weights @ pairs / column
+        weights = np.exp(exponents, out=exponents)
+        # The smaller matrix first: half of the time.
+        sums = (score.powers @ weights.T).T
+        totals = sums[:, :1]
+        means, products = np.split(sums[:, 1:] / totals, [r], axis=1)
         squares = means[:, first] * means[:, second]
-        cumulant = np.log(totals) + largest
+        cumulant = np.log(totals[:, 0]) + largest
         covariances = products - squares
         values += score.size * cumulant
         gradients += score.size * means

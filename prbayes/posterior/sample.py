@@ -13,7 +13,6 @@ import xarray as xr
 
 from prbayes._checks import Floats, Seed, positive_integer, seed_number
 from prbayes._progress import shown
-from prbayes.estimate.minimization import Minimisation, find_optimum, require_finished
 from prbayes.estimate.optimum import Optimum
 from prbayes.estimate.refinement import MAX_ROUNDS, refine_at
 from prbayes.model.evaluator import Evaluator
@@ -29,7 +28,7 @@ from prbayes.posterior.importance import (
     laplace,
 )
 from prbayes.posterior.returned import as_asked, checked_idata_kwargs, checked_names
-from prbayes.posterior.smc import Sampling, evaluator_of, result_tree, sample_posterior
+from prbayes.posterior.smc import Sampling, estimate_of, evaluator_of, result_tree, sample_posterior
 from prbayes.posterior.target import Target, estimate_target, specimen_target
 from prbayes.response.budget import limited
 
@@ -149,9 +148,7 @@ def draw_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     """
     clock = time.perf_counter()
     before = evaluator.n_responses - evaluator.n_runs
-    optimum = asked.optimum
-    if optimum is None and evaluator.nodes:
-        optimum = require_finished(find_optimum(evaluator, Minimisation()))
+    optimum = estimate_of(evaluator, asked, "sample")
     asked = replace(asked, optimum=optimum)
     sample, nuts = None, None
     with designs_as_before(evaluator):

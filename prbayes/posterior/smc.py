@@ -41,7 +41,7 @@ from prbayes.posterior.returned import (
     checked_idata_kwargs,
     checked_names,
 )
-from prbayes.posterior.target import estimate_target, prior_conflicts
+from prbayes.posterior.target import estimate_target, prior_conflicts, require_density
 from prbayes.posterior.trees import posterior_tree, share_of_lossy
 from prbayes.response.budget import BudgetError, limited, unlimited
 
@@ -271,9 +271,7 @@ def sample_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
     clock = time.perf_counter()
     before = evaluator.n_responses - evaluator.n_runs
     with designs_as_before(evaluator):
-        optimum = asked.optimum
-        if optimum is None and evaluator.nodes:
-            optimum = require_finished(find_optimum(evaluator, Minimisation(refine=asked.refine)))
+        optimum = estimate_of(evaluator, asked, "sample_smc")
         rounds = _rounds(evaluator, asked, optimum)
         particles = rounds.until_supported(asked.progressbar)
         return result_tree(
@@ -289,6 +287,26 @@ def sample_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
             n_responses=evaluator.n_responses - before,
             seconds=time.perf_counter() - clock,
         )
+
+
+def estimate_of(evaluator: Evaluator, asked: Sampling, caller: str) -> Optimum | None:
+    """Return the estimate that the posterior is given, by a search if needed.
+
+    With a log-likelihood by specimen the optimum that was passed, if any.
+
+    Raises
+    ------
+    ValueError
+        If the density of the estimate is not known (`require_density`), or the optimum is at the
+        edge of a support or at a jump.
+    """
+    optimum = asked.optimum
+    if not evaluator.nodes:
+        return optimum
+    require_density(evaluator)
+    if optimum is None:
+        optimum = require_finished(find_optimum(evaluator, Minimisation(refine=asked.refine)))
+    return require_sampling(optimum, caller)
 
 
 def _sample_kernel(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:

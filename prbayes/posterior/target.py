@@ -8,7 +8,7 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes._finding import Finding
-from prbayes.estimate.optimum import Optimum, require_sampling
+from prbayes.estimate.optimum import Optimum
 from prbayes.inference.checks.prior_conflict import conflict_findings
 from prbayes.model.evaluator import Evaluator
 from prbayes.posterior.estimate_likelihood import estimate_likelihood, score_obstacle
@@ -81,18 +81,9 @@ def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
     Raises
     ------
     ValueError
-        If the density is not known: responses are random, or the optimum is at the edge of a
-        support or at a jump.
+        If the density is not known (`require_density`).
     """
-    require_sampling(optimum, "sample")
-    for node in evaluator.nodes:
-        if node.bound.random:
-            raise ValueError(
-                f"{node.name}: propagation: got {type(node.propagation).__name__}, whose "
-                "discrepancy is random, so that the distribution of its minimiser is not known; "
-                "expected prb.Reweighted() or prb.Resimulated(), or prb.sample_smc with "
-                "adjustment=None, whose draws are as wide as epsilon makes them"
-            )
+    require_density(evaluator)
     by_scores = score_obstacle(evaluator) is None
     density = estimate_likelihood if by_scores else refit_likelihood
     likelihood = density(evaluator, optimum)
@@ -103,6 +94,31 @@ def estimate_target(evaluator: Evaluator, optimum: Optimum) -> Target:
     # The point of the score may differ from the optimum.
     starts = (likelihood.point, *optima_of(optimum, evaluator)[1:])
     return Target(evaluator, log_likelihood, starts, likelihood.scale)
+
+
+def require_density(evaluator: Evaluator) -> None:
+    """Raise if the density of the metrics' estimate is not known, before a search for it.
+
+    Raises
+    ------
+    ValueError
+        If responses are random, or not stored although the density takes refits.
+    """
+    obstacle = score_obstacle(evaluator)
+    for node in evaluator.nodes:
+        if node.bound.random:
+            reason = "its discrepancy is random"
+            expected = "prb.Reweighted() or prb.Resimulated()"
+        elif obstacle is not None and not node.bound.stored:
+            reason = obstacle
+            expected = "prb.Reweighted(), whose stored responses can be refitted"
+        else:
+            continue
+        raise ValueError(
+            f"{node.name}: propagation: got {type(node.propagation).__name__}, with which the "
+            f"distribution of the estimate is not known ({reason}); expected {expected}, or "
+            "prb.sample_smc with adjustment=None, whose draws are as wide as epsilon makes them"
+        )
 
 
 def optima_of(optimum: Optimum, evaluator: Evaluator) -> tuple[Floats, ...]:

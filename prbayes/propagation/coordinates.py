@@ -37,10 +37,16 @@ class Coordinates:
     bounds: Floats
 
     @classmethod
-    def of_prior(cls, inputs: Inputs, n: int = 1, populations: int = 4096) -> Coordinates:
+    def of_prior(
+        cls,
+        inputs: Inputs,
+        n: int = 1,
+        populations: int = 4096,
+        sampler: PopulationSampler | None = None,
+    ) -> Coordinates:
         """Return the coordinates of populations of the prior, and bounds of n specimens of each."""
         roots = prior_draws(inputs.roots, populations, 0)
-        sampler = PopulationSampler(inputs)
+        sampler = PopulationSampler(inputs) if sampler is None else sampler
         rng = np.random.default_rng([0, 11])
 
         def draw(count: int) -> Floats:

@@ -13,7 +13,7 @@ B_k = -log q(x_k). Neither the points x_k nor the proposal density q contain the
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -23,7 +23,9 @@ from scipy.special import logsumexp, stdtrit
 from prbayes._checks import Floats
 from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.propagation.base import DesignError
+from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.points import sobol
+from prbayes.propagation.population_density import PopulationDensity
 from prbayes.propagation.specimen_points import Emulation, PointOptions, first_runs
 
 
@@ -52,9 +54,25 @@ class ResponseShare:
         """
         terms = log_p + self.log_b
         inside = log_sum_exp(terms[..., : self.with_response])
-        outside = log_sum_exp(terms[..., self.with_response :])
-        is_known = np.isfinite(inside)
-        return np.where(is_known, -np.logaddexp(0.0, outside - np.where(is_known, inside, 0)), 0.0)
+        return _log_share(inside, log_sum_exp(terms[..., self.with_response :]))
+
+    def of_populations(
+        self, density: PopulationDensity, roots: Sequence[Floats], coordinates: Coordinates
+    ) -> Floats:
+        """Return log S of the populations at roots, shapes (S, *shape) -> (S,)."""
+        log_b = self.log_b + coordinates.log_jacobian(self.z)
+        x = coordinates.inputs(self.z)
+        inside, outside = (
+            density.log_likelihoods(roots, [v[None, some] for v in x], log_b[None, some])[:, 0]
+            for some in (slice(self.with_response), slice(self.with_response, None))
+        )
+        return _log_share(inside, outside)
+
+
+def _log_share(inside: Floats, outside: Floats) -> Floats:
+    """Return log S of the logs of both integrals, zero where the first one is zero."""
+    is_known = np.isfinite(inside)
+    return np.where(is_known, -np.logaddexp(0.0, outside - np.where(is_known, inside, 0)), 0.0)
 
 
 class SharedDraws(Protocol):

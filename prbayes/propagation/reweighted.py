@@ -21,7 +21,7 @@ from pytensor.gradient import disconnected_grad
 from pytensor.graph.traversal import ancestors
 from pytensor.tensor.variable import TensorVariable
 
-from prbayes._checks import AT_ONCE, Floats, positive_integer
+from prbayes._checks import IN_CACHE, Floats, positive_integer
 from prbayes._threads import one_thread
 from prbayes.emulators.emulator import MOST_RUNS
 from prbayes.emulators.surfaces import Surface
@@ -52,13 +52,13 @@ from prbayes.propagation.edges import (
     moving_inputs,
     refuse_moving_atoms,
 )
+from prbayes.propagation.exponential_families import PointDensity, normalise
 from prbayes.propagation.ops import CompactOp, OpaqueOp
 from prbayes.propagation.points import base_points
 from prbayes.response.compilation import compile_batched, untraced
 from prbayes.response.costs import Demand
 from prbayes.response.distributions import (
     PopulationSampler,
-    compiled_log_density,
     log_density,
     prior_draws,
     quantiles,
@@ -382,6 +382,7 @@ class Design(Bound):
         self._basis: tuple[Any, Any, Any] = (None, None, None)
         # More conditions than a study has, fewer than fill the memory.
         self._others: deque[tuple[Responses, Floats]] = deque(maxlen=32)
+        self._density = PointDensity(inputs)
         self._taken_back: Batches | None = None  # all that there were when some were forgotten
         self._moving: tuple[int, ...] | None = None
         self._coarse: Coarse | None = None
@@ -736,7 +737,7 @@ class Design(Bound):
     ) -> float:
         """Make the table of points anew, of batches and for populations that matter."""
         # The mixture is that of all batches, so its density changes at the old points too.
-        log_g, sums = self._log_mixture(batches.components, batches.counts, batches.points)
+        log_g, ess = self._log_mixture(batches.components, batches.counts, batches.points)
         table = Table(batches.points, batches.values, log_g, self._blocks_of(batches.sizes))
         before = self._contents
         groups = () if before is None else before.groups
@@ -751,10 +752,7 @@ class Design(Bound):
         self._contents = contents
         self._share(self._arrays())
         if fresh and contents.cloud is None:
-            log_ess = 2 * sums[0] - sums[1]
-            ess = np.exp(log_ess)
-            of_these = ess[-fresh:]
-            return float(np.median(of_these))
+            return float(np.median(ess[-fresh:]))
         return self._median_ess(some_of(components, _WEIGHED))
 
     def _emulated(self, contents: Contents, known: Emulation | None) -> Contents:
@@ -851,13 +849,11 @@ class Design(Bound):
 
     def _weights_at(self, components: Sequence[Floats], table: Table) -> Floats:
         """Return weights of a table's points in some populations, (T, n): they sum to one."""
-        (logs,) = self._log_density(*components, *table.points)
-        logs = logs - table.log_g
-        top = logs.max(axis=1, keepdims=True)
-        weights = np.exp(logs - np.where(np.isfinite(top), top, 0.0))
-        total = weights.sum(axis=1, keepdims=True)
-        even = 1 / weights.shape[1]
-        return np.asarray(np.where(total > 0, weights / np.where(total > 0, total, 1.0), even))
+        logs = self._density.at(components, table.points)(slice(None))
+        logs -= table.log_g
+        normalise(logs)
+        even = 1 / logs.shape[1]
+        return np.where(np.isnan(logs), even, logs)
 
     def _median_ess(self, components: Sequence[Floats]) -> float:
         weights = self._weights_at(components, self.contents.table)
@@ -1002,28 +998,34 @@ class Design(Bound):
         *,
         summed: bool = True,
     ) -> tuple[Floats, Floats]:
-        """Return log density of a mixture at points, (n,), and log sums of weights, (2, k).
+        """Return log density of a mixture at points, (n,), and effective sample sizes, (k,).
 
-        The sums over the points, if they are asked for, are of the weights, component over mixture,
-        and of their squares.
+        These are, if they are asked for, of the weights of the points in each component; zero where
+        the component has no point.
         """
-        used = counts > 0
-        share = counts[used, None] / counts.sum()
-        log_share = np.log(share)
+        shares = counts / counts.sum()
         n = len(points[0])
         log_g = np.empty(n)
-        sums = np.full((2, counts.size), -np.inf)
-        step = max(1, AT_ONCE // counts.size)
+        sums = np.zeros((2, counts.size))
+        log_densities = self._density.at(components, points)
+        step = max(1, IN_CACHE // counts.size)
         for start in range(0, n, step):
             chunk = slice(start, start + step)
-            here = [p[chunk] for p in points]
-            (logs,) = self._log_density(*components, *here)
-            log_g[chunk] = _log_sum(logs[used] + log_share, axis=0)
-            if summed:
-                log_weights = logs - log_g[chunk]
-                found = [_log_sum(power * log_weights, axis=1) for power in (1, 2)]
-                sums = np.logaddexp(sums, found)
-        return log_g, sums
+            densities = log_densities(chunk)
+            top = densities.max(axis=0)
+            top = np.where(np.isfinite(top), top, 0.0)
+            densities -= top
+            np.exp(densities, out=densities)
+            mixture = shares @ densities
+            with np.errstate(divide="ignore", invalid="ignore"):
+                log_g[chunk] = np.log(mixture) + top
+                if summed:
+                    densities /= mixture
+                    sums[0] += densities.sum(axis=1)
+                    sums[1] += np.vecdot(densities, densities)
+        with np.errstate(invalid="ignore"):
+            ess = sums[0] ** 2 / sums[1]
+        return log_g, np.where(counts > 0, ess, 0.0)
 
     def copied(self) -> Self:
         """Return a design with the same points, which grows by itself."""
@@ -1105,10 +1107,6 @@ class Design(Bound):
     # -- Weights --
 
     @cached_property
-    def _log_density(self) -> Any:
-        return compiled_log_density(self.inputs)
-
-    @cached_property
     def _quantiles(self) -> Any:
         symbols = self.inputs.placeholders()
         shapes = [x.type.shape for x in self.inputs.aleatory]
@@ -1161,9 +1159,13 @@ class Design(Bound):
         Of the sum of the weights times ``by_weights``, both (k, n), at given roots.
         """
         with np.errstate(invalid="ignore"):
-            mean = (weights * by_weights).sum(axis=-1, keepdims=True)
-            by_logs = weights * (by_weights - mean)
-        slopes = self._log_weight_slopes(*params, by_logs)
+            mean = np.vecdot(weights, by_weights)
+            by_logs = by_weights - mean[:, None]
+            by_logs *= weights
+        if self._moving:
+            slopes = self._log_weight_slopes(*params, by_logs)
+        else:
+            slopes = self._density.pulled_back(params, by_logs, self.contents.table.points)
         found = []
         for root, by_root in zip(self.inputs.roots, slopes, strict=True):
             # What does not depend on the roots comes without the leading axis.
@@ -1200,15 +1202,19 @@ class Design(Bound):
 
     def _weights(self, params: Sequence[Any]) -> tuple[Floats, NDArray[np.bool_]]:
         """Return weights of sum one, (k, n), and which rows have any, (k,): others are NaN."""
-        (logs,) = self._log_weights(*params)
-        top = logs.max(axis=-1, keepdims=True)
-        top = np.where(np.isfinite(top), top, 0.0)
-        weights = np.exp(logs - top)
-        total = weights.sum(axis=-1, keepdims=True)
-        with np.errstate(invalid="ignore"):
-            weights /= total
-        supported = np.isfinite(total) & (total > 0)
-        return weights, supported[:, 0]
+        weights = self._log_weight_rows(params)
+        log_totals = normalise(weights)
+        return weights, np.isfinite(log_totals)
+
+    def _log_weight_rows(self, params: Sequence[Any]) -> Floats:
+        """Return log weights at given roots, (k, n)."""
+        table = self.contents.table
+        if self._moving:
+            (logs,) = self._log_weights(*params)
+            return np.array(logs)
+        logs = self._density.at(params, table.points)(slice(None))
+        logs -= table.log_g
+        return logs
 
     def discrepancies(self, params: Sequence[Any], target: Discrepancy) -> Floats:
         """Return the discrepancies of the populations at given roots, shape (k,).
@@ -1245,21 +1251,17 @@ class Design(Bound):
             reach); ``lost_mass``, the share of weight on points whose response is NaN;
             ``failed_mass``, that of specimens that failed (+inf) in the rest.
         """
-        (logs,) = self._log_weights(*params)
-        total = _log_sum(logs, axis=-1)
-        squares = _log_sum(2 * logs, axis=-1)
+        weights = self._log_weight_rows(params)
+        log_totals = normalise(weights)
         failed = lacking(self.values)
-        broken_ones = np.isposinf(self.values).reshape(self.n_points, -1).any(axis=1)
-        without_response = _log_sum(logs[..., failed], axis=-1)
-        broken = _log_sum(logs[..., broken_ones], axis=-1)
-        known = _log_sum(logs[..., ~failed], axis=-1)
-        with np.errstate(invalid="ignore"):
-            ess = np.exp(2 * total - squares)
-            lost = np.exp(without_response - total)
-            broken_share = np.exp(broken - known)
+        broken = np.isposinf(self.values).reshape(self.n_points, -1).any(axis=1)
+        lost = weights @ failed
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ess = 1 / np.vecdot(weights, weights)
+            broken_share = weights @ broken / (weights @ ~failed)
         return {
             "weight_ess": np.nan_to_num(ess),
-            "mean_weight": np.exp(total - np.log(self.n_points)),
+            "mean_weight": np.exp(log_totals - np.log(self.n_points)),
             "lost_mass": np.nan_to_num(lost, nan=1.0),
             "failed_mass": np.nan_to_num(broken_share),
         }
@@ -1309,16 +1311,3 @@ def _both(first: Floats | None, second: Floats | None) -> Floats | None:
 
 def _end_to_end(first: Floats, second: Floats) -> Floats:
     return np.concatenate([first, second])
-
-
-def _log_sum(logs: Floats, axis: int) -> Floats:
-    """Return log(sum(exp(logs))), -inf where there is nothing.
-
-    NumPy's logaddexp.reduce takes several times as long.
-    """
-    top = logs.max(axis=axis, keepdims=True, initial=-np.inf)
-    top = np.where(np.isfinite(top), top, 0.0)
-    with np.errstate(divide="ignore"):
-        relative = np.exp(logs - top)
-        total = np.log(relative.sum(axis=axis))
-    return np.asarray(total + top.squeeze(axis))

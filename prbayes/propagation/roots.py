@@ -153,20 +153,25 @@ def _distinct(
     np.minimum.at(least, specimen, misfit)
     candidates = np.flatnonzero(np.isfinite(misfit) & (misfit <= least[specimen] + gap))
     candidates = candidates[np.lexsort((misfit[candidates], specimen[candidates]))]
-    kept: list[int] = []
-    for row in candidates.tolist():
-        same = False
-        for other in reversed(kept):
-            if specimen[other] != specimen[row]:
-                break
-            away = z[row] - z[other]
-            # In units of the box, and in standard deviations of the Gauss-Newton approximation.
-            distance = np.abs(away / width).max()
-            is_within_error = ((jacobian[other] @ away) ** 2).sum() < 1.0
-            same = same or bool(distance < 1e-6 or (is_within_error and distance < 1e-2))
-        if not same:
-            kept.append(row)
-    return np.array(kept, dtype=np.intp)
+    count = np.bincount(specimen[candidates], minlength=len(least))
+    if not count.any():
+        return candidates
+    slot = np.arange(len(candidates)) - np.repeat(np.cumsum(count) - count, count)
+    table = np.full((len(least), count.max()), -1)
+    table[specimen[candidates], slot] = candidates
+    kept = table >= 0
+    for k in range(1, table.shape[1]):
+        # Each specimen's k-th candidate, beside the better ones.
+        better = table[:, :k]
+        away = z[table[:, k], None] - z[better]
+        # In units of the box, and in standard deviations of the Gauss-Newton approximation.
+        distance = np.abs(away / width).max(axis=2)
+        standard = np.einsum("nkmd,nkd->nkm", jacobian[better], away)
+        is_within_error = (standard**2).sum(axis=2) < 1.0
+        is_same = (distance < 1e-6) | (is_within_error & (distance < 1e-2))
+        is_distinct = ~(is_same & kept[:, :k]).any(axis=1)
+        kept[:, k] &= is_distinct
+    return table[kept]
 
 
 def gabriel_neighbours(z: Floats, most: int = 32) -> NDArray[np.bool_]:
@@ -182,12 +187,12 @@ def gabriel_neighbours(z: Floats, most: int = 32) -> NDArray[np.bool_]:
     """
     squares = ((z[:, None] - z) ** 2).sum(axis=2)
     near = np.argsort(squares, axis=1, kind="stable")[:, 1 : most + 1]
+    length = np.take_along_axis(squares, near, axis=1)
+    by_third = length[:, :, None] + squares[near[:, :, None], near[:, None, :]]
+    by_third += np.diag(np.full(near.shape[1], np.inf))
+    is_neighbour = by_third.min(axis=1, initial=np.inf) >= length
     result = np.zeros(squares.shape, dtype=bool)
-    for i, others in enumerate(near):
-        length = squares[i, others]
-        by_third = length[:, None] + squares[np.ix_(others, others)]
-        np.fill_diagonal(by_third, np.inf)
-        result[i, others] = by_third.min(axis=0, initial=np.inf) >= length
+    np.put_along_axis(result, near, is_neighbour, axis=1)
     return result | result.T
 
 

@@ -18,15 +18,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri, gammaln, logsumexp, ndtri
+from scipy.special import chdtri, gammaln, ndtri
 
 from prbayes._checks import AT_ONCE, IN_CACHE, Floats
 from prbayes.emulators.interpolant import Interpolant, fit_interpolant
 from prbayes.metrics.readings import Readings
+from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.guards import half_difference, missing_share, predicted_bias
 from prbayes.propagation.points import sobol
@@ -322,8 +324,7 @@ def _narrowing(emulation: Emulation, readings: Readings, roots: Roots) -> float:
     table, log_mass, covariance = _laplace(roots, emulation.box)
     _, _, of_error = _laplace(replace(roots, jacobian=roots.jacobian * factor), emulation.box)
     ((mean, root),) = normal_populations(roots.z[table], log_mass, 1, 0, bootstrap=False)
-    log_w = normal_log_density(roots.z[table], mean, root) + log_mass
-    w = np.exp(log_w - logsumexp(log_w, axis=1, keepdims=True))
+    w = _normalised_weights(normal_log_density(roots.z[table], mean, root) + log_mass)
     whole, part = (np.einsum("rdd->rd", each)[table] for each in (covariance, of_error))
     share = np.einsum("nr,nrd->nd", w, part / (whole + (root**2).sum(axis=1)))
     return float(np.sqrt(len(share) / 2) * share.mean(axis=0).max())
@@ -683,17 +684,25 @@ def _plausible(
         Difference from the largest log-likelihood of the fits, in nats.
     """
 
-    def log_likelihood(sample: _Sample, mean: Floats, root: Floats) -> float:
-        terms = normal_log_density(sample.z, mean, root) + sample.log_a
-        return float(logsumexp(terms, axis=1).sum())
+    def likely(sample: _Sample, few: list[tuple[Floats, Floats]]) -> Floats:
+        return _log_likelihoods(sample, few).sum(axis=1)
 
-    heights = [log_likelihood(samples[k], *fit) for k, few in fits.items() for fit in few]
-    best = max(heights)
+    best = max(likely(samples[k], few).max() for k, few in fits.items())
     narrowed = {k: [(mean, narrowing * root) for mean, root in few] for k, few in fits.items()}
     return {
-        k: [fit for fit in few if log_likelihood(samples[k], *fit) > best - largest]
+        k: list(compress(few, likely(samples[k], few) > best - largest))
         for k, few in narrowed.items()
     }
+
+
+def _log_likelihoods(sample: _Sample, populations: list[tuple[Floats, Floats]]) -> Floats:
+    """Return the log-likelihoods of the specimens in B normal populations, (B, N)."""
+    block = max(1, IN_CACHE // sample.log_a.size)
+    parts = []
+    for first in range(0, len(populations), block):
+        mean, root = map(np.stack, zip(*populations[first : first + block], strict=True))
+        parts.append(log_sum_exp(normal_log_density(sample.z, mean, root) + sample.log_a))
+    return np.concatenate(parts)
 
 
 def _of_error(
@@ -871,7 +880,7 @@ def _draw(
         tail = (nu + d) / 2 * np.log1p(square / nu)
         density = constant - log_det[:, None] - tail
         log_q[:, s] = np.where(table[:, s, None] >= 0, density, -np.inf)
-    log_proposal = logsumexp(log_q, axis=1) + np.log(count)
+    log_proposal = log_sum_exp(log_q.swapaxes(1, 2)) + np.log(count)
     exists = np.repeat(table >= 0, count, axis=1)
     log_proposal = np.where(exists, log_proposal, np.inf)
     log_a = readings.log_density(outputs, error) - log_proposal
@@ -879,9 +888,10 @@ def _draw(
 
 
 def _in_blocks(emulation: Response, z: Floats) -> Floats:
+    """Return values at points, without the Jacobian where the emulation has them alone."""
+    values = getattr(emulation, "values", lambda z: emulation(z)[0])
     step = IN_CACHE
-    parts = [emulation(z[first : first + step])[0] for first in range(0, len(z), step)]
-    return np.concatenate(parts)
+    return np.concatenate([values(z[first : first + step]) for first in range(0, len(z), step)])
 
 
 def _scrambled(components: int, count: int, dimensions: int, seed: tuple[int, int]) -> Floats:
@@ -911,7 +921,7 @@ def _by_component(values: Floats, components: _Components) -> Floats:
 def _component_weights(sample: _Sample, components: _Components) -> tuple[Floats, Floats]:
     """Return normalised weights, (R, k), and log masses, (R,), by component."""
     log_a = _by_component(sample.log_a, components)
-    log_mass = logsumexp(log_a, axis=1)
+    log_mass = log_sum_exp(log_a)
     safe = np.where(np.isfinite(log_mass), log_mass, 0.0)
     return np.exp(log_a - safe[:, None]), log_mass
 
@@ -925,7 +935,7 @@ def _normalised(sample: _Sample, components: _Components) -> _Sample:
     table = components.table
     n, slots = table.shape
     log_a = sample.log_a.reshape(n, slots, -1)
-    total = logsumexp(log_a, axis=2)
+    total = log_sum_exp(log_a)
     by_slot = components.log_mass[np.maximum(table, 0)]
     mass = np.where(table >= 0, by_slot, -np.inf)
     scales = np.isfinite(total) & np.isfinite(mass)
@@ -948,16 +958,7 @@ def _joined(halves: list[_Sample]) -> _Sample:
 
 def _difference(halves: list[_Sample], populations: list[tuple[Floats, Floats]]) -> float:
     """Return the half difference of log L over normal populations."""
-    values = [
-        np.stack(
-            [
-                logsumexp(normal_log_density(half.z, mean, root) + half.log_a, axis=1)
-                for mean, root in populations
-            ]
-        )
-        for half in halves
-    ]
-    return half_difference(*values)
+    return half_difference(*(_log_likelihoods(half, populations) for half in halves))
 
 
 def normal_populations(
@@ -971,34 +972,60 @@ def normal_populations(
         Means and lower Cholesky factors of the covariances.
     """
     rng = np.random.default_rng([seed, 7])
-    n, _, d = z.shape
-    prior = 1e-12 * np.diag(np.maximum(z.reshape(-1, d).var(axis=0), 1e-300))
+    n, count, d = z.shape
+    flat = z.reshape(-1, d)
+    prior = 1e-12 * np.diag(np.maximum(flat.var(axis=0), 1e-300))
 
     def moments(weights: Floats) -> tuple[Floats, Floats]:
-        mean = np.einsum("nk,nkd->d", weights, z)
-        away = z - mean
-        return mean, np.einsum("nk,nkd,nke->de", weights, away, away) + prior
+        weights = weights.reshape(len(weights), -1)
+        mean = weights @ flat
+        away = flat - mean[:, None]
+        return mean, (away * weights[..., None]).swapaxes(1, 2) @ away + prior
 
     def fit(start: tuple[Floats, Floats], share: Floats, steps: int) -> tuple[Floats, Floats]:
         mean, covariance = start
         for _ in range(steps):
             log_w = normal_log_density(z, mean, np.linalg.cholesky(covariance)) + log_a
-            w = np.exp(log_w - logsumexp(log_w, axis=1, keepdims=True)) * share[:, None]
-            mean, covariance = moments(w)
+            mean, covariance = moments(_normalised_weights(log_w) * share[..., None])
         return mean, covariance
 
-    equal = np.full(n, 1 / n)
-    weights = np.exp(log_a - logsumexp(log_a, axis=1, keepdims=True)) / n
-    whole = fit(moments(weights), equal, steps)
-    shares = [rng.dirichlet(np.ones(n)) for _ in range(draws)] if bootstrap else [equal]
-    # A bootstrap sample has its fit near that of all specimens.
-    fits = [fit(whole, share, 5) if bootstrap else whole for share in shares]
-    return [(mean, np.linalg.cholesky(covariance)) for mean, covariance in fits]
+    equal = np.full((1, n), 1 / n)
+    mean, covariance = fit(moments(_normalised_weights(log_a)[None] / n), equal, steps)
+    if bootstrap:
+        # A bootstrap sample has its fit near that of all specimens. In blocks, for memory's sake.
+        shares = np.stack([rng.dirichlet(np.ones(n)) for _ in range(draws)])
+        block = max(1, IN_CACHE // (n * count))
+        fits = [
+            fit((mean, covariance), shares[first : first + block], 5)
+            for first in range(0, draws, block)
+        ]
+        mean, covariance = (np.concatenate(parts) for parts in zip(*fits, strict=True))
+    return list(zip(mean, np.linalg.cholesky(covariance), strict=True))
+
+
+def _normalised_weights(log_w: Floats) -> Floats:
+    """Return weights with sum 1 along the last axis."""
+    weights = np.exp(log_w - log_w.max(axis=-1, keepdims=True))
+    return np.asarray(weights / weights.sum(axis=-1, keepdims=True))
 
 
 def normal_log_density(z: Floats, mean: Floats, root: Floats) -> Floats:
-    """Return the log-density of a normal population, (..., d) -> (...)."""
-    inverse = np.linalg.inv(root)
-    standard = (z - mean) @ inverse.T
-    constant = np.log(np.diag(root)).sum() + len(mean) / 2 * np.log(2 * np.pi)
-    return np.asarray(-0.5 * (standard**2).sum(axis=-1) - constant)
+    """Return log-densities of points in normal populations, of one or of B.
+
+    Parameters
+    ----------
+    z : ndarray, shape (..., d)
+    mean : ndarray, shape (d,) or (B, d)
+    root : ndarray, shape (d, d) or (B, d, d)
+        Lower Cholesky factors of the covariances.
+
+    Returns
+    -------
+    ndarray, shape (...) or (B, ...)
+    """
+    d = z.shape[-1]
+    away = z.reshape(-1, d) - mean[..., None, :]
+    standard = np.linalg.inv(root) @ away.swapaxes(-1, -2)
+    square = np.einsum("...dk,...dk->...k", standard, standard)
+    constant = np.log(np.einsum("...dd->...d", root)).sum(axis=-1) + d / 2 * np.log(2 * np.pi)
+    return np.asarray(-0.5 * square - constant[..., None]).reshape(*mean.shape[:-1], *z.shape[:-1])

@@ -23,6 +23,7 @@ from prbayes.response.compilation import (
     PLAIN,
     compile_batched,
     interpreted,
+    untraced,
     with_leading_axis,
 )
 from prbayes.response.inputs import Inputs, event_shape, is_random, quiet_logp
@@ -69,14 +70,32 @@ def _is_walk(dist: TensorVariable) -> bool:
 
 def compiled_log_density(inputs: Inputs) -> Any:
     """Return log p(x) as a function of roots (k, *shape), then points (n, *event): (k, n)."""
+    symbols, points, density = _log_density(inputs)
+    return compile_batched(symbols, [density], points)
+
+
+def compiled_log_density_slopes(inputs: Inputs) -> Any:
+    """Return the derivatives for the roots of a sum over log p(x), shapes (k, *shape).
+
+    A function of roots (k, *shape), the factors of the sum (k, n), then points (n, *event).
+    """
+    symbols, points, density = _log_density(inputs)
+    factors = pt.dvector("factors")
+    with untraced():
+        known: Any = {density: factors}
+        slopes = pt.grad(None, symbols, known_grads=known, disconnected_inputs="ignore")
+    return compile_batched([*symbols, factors], slopes, points)
+
+
+def _log_density(inputs: Inputs) -> tuple[list[Any], list[Any], TensorVariable]:
+    """Return symbols of roots, (*shape), and points, (n, *event), and their log-density, (n,)."""
     symbols = inputs.placeholders()
     points = []
     for x in inputs.aleatory:
         shape = (None,) * (x.type.ndim + 1)
         points.append(pt.tensor(dtype=x.dtype, shape=shape))
     dists, _ = inputs.rebuilt(symbols)
-    density = log_density(inputs, dists, points)
-    return compile_batched(symbols, [density], points)
+    return symbols, points, log_density(inputs, dists, points)
 
 
 def is_mvnormal(dist: TensorVariable) -> bool:
@@ -95,13 +114,13 @@ def _elliptical_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
     PyMC's own density solves once for each theta and point of a batch.
     """
     *freedom, mean, covariance = dist.owner.op.dist_params(dist.owner)
-    root = pt.linalg.cholesky(covariance, on_error="nan")
-    diagonal = [root[..., i, i] for i in range(size)]
+    root = _cholesky(covariance, size)
+    diagonal = [root[i][i] for i in range(size)]
     # Solve root z = x - mean.
     z: list[Any] = []
     for i in range(size):
         away = x[..., i] - mean[..., i]
-        above = sum(root[..., i, j] * z[j] for j in range(i))
+        above = sum(root[i][j] * z[j] for j in range(i))
         z.append((away - above) / diagonal[i])
     logp: Any = 0
     if freedom:
@@ -114,6 +133,26 @@ def _elliptical_logp(dist: TensorVariable, x: Any, size: int) -> TensorVariable:
             normal = -0.5 * z_i**2 - pt.log(scale) - constant
             logp = logp + normal
     return pt.switch(pt.isnan(logp), -np.inf, logp)
+
+
+def _cholesky(matrix: Any, size: int) -> list[list[Any]]:
+    """Return the rows of a lower Cholesky factor, not numbers if the matrix is not positive.
+
+    Elementwise if it is small: PyTensor's loops over the matrices of a batch.
+    """
+    if size > 4:
+        root = pt.linalg.cholesky(matrix, on_error="nan")
+        return [[root[..., i, j] for j in range(i + 1)] for i in range(size)]
+    rows: list[list[Any]] = []
+    for i in range(size):
+        row: list[Any] = []
+        for j in range(i):
+            known = sum(row[k] * rows[j][k] for k in range(j))
+            row.append((matrix[..., i, j] - known) / rows[j][j])
+        squares = sum(element**2 for element in row)
+        row.append(pt.sqrt(matrix[..., i, i] - squares))
+        rows.append(row)
+    return rows
 
 
 def _studentt_logp(nu: Any, z: Sequence[Any]) -> Any:
@@ -240,6 +279,7 @@ def _seed(generators: Sequence[Any], rng: np.random.Generator) -> None:
 class PriorSampler:
     """Draws of variables from the prior, all in one call of a function that is compiled once."""
 
+    @untraced()
     def __init__(self, roots: Sequence[TensorVariable]) -> None:
         self._names = ", ".join(str(r.name) for r in roots)
         self._shapes = [event_shape(r) for r in roots]
@@ -301,6 +341,7 @@ class PriorPoints:
         If a variable has no inverse distribution function.
     """
 
+    @untraced()
     def __init__(self, variables: Sequence[TensorVariable]) -> None:
         self._shapes = [event_shape(v) for v in variables]
         self._sizes = [int(np.prod(s, dtype=int)) for s in self._shapes]
@@ -328,6 +369,7 @@ class PriorPoints:
 class PopulationSampler:
     """Random draws of n specimens from the populations at given roots."""
 
+    @untraced()
     def __init__(self, inputs: Inputs) -> None:
         self._names = ", ".join(str(x.owner.op) for x in inputs.aleatory)
         symbols = inputs.placeholders()

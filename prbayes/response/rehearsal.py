@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import rankdata
 
 from prbayes._checks import Floats
 from prbayes.response.calling import Points, Tally, respond
@@ -98,6 +97,8 @@ class Rehearsal(Responses):
 
 def _middle(keys: Floats) -> int:
     """Return which point is in the middle of all, by the ranks of each of its numbers."""
+    from scipy.stats import rankdata
+
     ranks = rankdata(keys, axis=0)
     off = ranks - (len(keys) + 1) / 2
     return int((off**2).sum(axis=1).argmin())

@@ -209,3 +209,18 @@ def test_the_terms_are_all_of_a_total_degree(d: int) -> None:
     powers = interpolant._powers(d, degree)
     assert {tuple(row) for row in powers.tolist()} == expected
     assert len(powers) == len(expected)
+
+
+def test_pieces_of_one_input_are_the_radial_functions() -> None:
+    z = np.sort(np.random.default_rng(3).uniform(-1, 1, 40))[:, None]
+    surface = fit_interpolant(z, np.concatenate([np.exp(z), np.sin(5 * z)], axis=1))
+    points = np.concatenate([np.linspace(-1.2, 1.2, 200)[:, None], z])
+    radial = -(np.abs(points - z.T) ** 5) @ surface.weights
+    u = (points[:, 0] - surface.center) / surface.half_width
+    vander = np.polynomial.legendre.legvander(u, surface.powers.max())
+    expected = radial + vander[:, surface.powers[:, 0]] @ surface.coefficients
+    assert np.allclose(surface.values(points), expected, rtol=1e-10, atol=1e-11)
+    values, jacobian = surface(points)
+    assert np.array_equal(values, surface.values(points))
+    steps = (surface.values(points + 1e-5) - surface.values(points - 1e-5)) / 2e-5
+    assert np.allclose(jacobian[..., 0], steps, atol=1e-6)

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pytest
-import xarray as xr
 
 import prbayes as prb
 from prbayes.estimate.disagreement import disagreement
@@ -107,17 +106,3 @@ def test_a_diagnosis_names_what_disagrees_and_is_quiet_otherwise(wrong: bool) ->
     assert optimum.evaluator.n_responses == before
     assert wrong == any("farther from the best population" in text for text in found.messages)
     assert wrong == ("y: what disagrees with the best population are" in str(found))
-
-
-def test_of_draws_the_optimum_tells() -> None:
-    model = model_of(drawn())
-    draws = xr.Dataset(
-        {"mu": (("chain", "draw"), np.random.default_rng(1).normal(0, 0.1, (2, 100)))},
-        attrs={"fit_probability": 0.001, "adjustment": "GivenEstimate()"},
-    )
-    observed = xr.Dataset({"y": (("i", "output"), drawn())})
-    tree = xr.DataTree.from_dict({"posterior": draws, "observed_data": observed})
-    expected = ("Which outputs disagree is told by prb.diagnose of an optimum.",)
-    assert prb.diagnose(tree, model=model).notes == expected
-    tree["posterior"].attrs["fit_probability"] = 0.5
-    assert prb.diagnose(tree, model=model).notes == ()

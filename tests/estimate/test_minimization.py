@@ -464,10 +464,10 @@ def test_a_population_that_collapsed_within_the_bandwidth_is_no_convergence() ->
     ):
         with pytest.raises(ValueError, match=f"{call.__name__}: .*sigma ran to the edge"):
             call(optimum)
-    with pytest.raises(ValueError, match=r"sample_smc: .*sigma ran to the edge .*adjust=False"):
+    with pytest.raises(ValueError, match=r"sample_smc: .*sigma ran to the edge .*adjustment=None"):
         prb.sample_smc(50, chains=1, optimum=optimum, model=model, random_seed=1, progressbar=False)
     tree = prb.sample_smc(
-        50, chains=1, epsilon=1 / 20, adjust=False, optimum=optimum, model=model, random_seed=1
+        50, chains=1, epsilon=1 / 20, adjustment=None, optimum=optimum, model=model, random_seed=1
     )
     assert tree.posterior["sigma"].mean() > 10 * optimum.point["sigma"]
 

@@ -18,7 +18,9 @@ from prbayes.estimate.optimum import plain, require_refits, require_sampling
 @pytest.mark.parametrize("kind", ["at_edge", "at_jump"])
 def test_where_nothing_is_known_an_optimum_is_refused(kind: str) -> None:
     optimum: Any = SimpleNamespace(**({"at_edge": (), "at_jump": ()} | {kind: ("sigma",)}))
-    with pytest.raises(ValueError, match=r"bootstrap: got an optimum around .*sigma.*adjust=False"):
+    with pytest.raises(
+        ValueError, match=r"bootstrap: got an optimum around .*sigma.*adjustment=None"
+    ):
         require_sampling(optimum, "bootstrap")
 
 

@@ -171,43 +171,15 @@ def test_a_barrier_of_less_than_the_noise_separates_nothing() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", [slow("ll"), "pr", "area"])
-def test_each_mode_is_adjusted_by_itself(name: str) -> None:
+def test_each_mode_has_the_width_of_its_estimate(name: str) -> None:
     optimum, idata = fit(name), posterior(name)
     mu = idata.posterior["mu"].values.ravel()
-    if name == "ll":  # whose draws have both modes as they are
-        assert idata.posterior.attrs["adjustment"].startswith("none needed")
-    else:
-        assert idata.posterior.attrs["adjustment"].startswith(
-            "GivenEstimate(n_sets=200, random_seed=1, n_fits=2000), 2 modes each by itself"
-        )
-        # Fits tell the shares to about .05, and a draw changes sides only for that.
-        before = idata.unadjusted["mu"].values.ravel()
-        moved = abs((mu > 1).mean() - (before > 1).mean())
-        assert ((mu > 1) != (before > 1)).mean() == pytest.approx(moved)
     assert 0.3 < (mu > 1).mean() < 0.7
     for side in (mu > 1, mu < 1):
         # The sd of each mode is that of the estimator, not of the distance between modes; linear
         # theory is 15% off.
         np.testing.assert_allclose(mu[side].std(), optimum.stderr["mu"], rtol=0.25)
         assert abs(abs(mu[side].mean() - 1) - 1) < 4 * optimum.stderr["mu"]
-
-
-def test_modes_that_run_into_each_other_are_left_alone(caplog: pytest.LogCaptureFixture) -> None:
-    # An epsilon so large that the ridge between the modes is full of draws.
-    with caplog.at_level(logging.WARNING, logger="prbayes"):
-        idata = prb.sample_smc(
-            200, chains=1, model=fit("pr").model, optimum=fit("pr"), epsilon=5.0, adjust=prb.posterior.Affine(), random_seed=1,
-            progressbar=False,
-        )  # fmt: skip
-    assert (
-        idata.posterior.attrs["adjustment"]
-        == "none: the posterior has modes that run into each other"
-    )
-    assert "unadjusted" not in idata.children
-    (line,) = (one for one in caplog.messages if "run into each other; their width is" in one)
-    assert "#epsilon-and-the-width-of-the-posterior" in line
-    # Whoever reads the report alone is told as well.
-    assert "run into each other" in idata.posterior.attrs["warnings"]
 
 
 # -- unidentified directions

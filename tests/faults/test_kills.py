@@ -42,6 +42,7 @@ with pm.Model() as model:
         found = prb.minimize(progressbar=False).point
     else:
         settings = {"checkpoint": folder + "/run.nc", "progressbar": False}
+        settings["adjustment"] = None
         idata = prb.sample_smc(10, chains=2, random_seed=1, **settings)
         found = float(idata.posterior["mu"].sum())
 print(repr(found))

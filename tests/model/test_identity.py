@@ -94,7 +94,7 @@ def optimum() -> Optimum:
 
 @cache
 def posterior() -> xr.DataTree:
-    return prb.sample_smc(20, chains=1, model=base(), adjust=False, refine=False, **QUIET)
+    return prb.sample_smc(20, chains=1, model=base(), adjustment=None, refine=False, **QUIET)
 
 
 uneven = np.arange(1, 21) / 210
@@ -313,7 +313,7 @@ def test_sample_smc_takes_a_clones_optimum_and_the_clones_own_epsilon() -> None:
     clone = clone_model(base())
     prb.set_epsilon(clone, {"y": 0.3})
     tree = prb.sample_smc(
-        20, chains=1, model=clone, optimum=optimum(), adjust=False, refine=False, **QUIET
+        20, chains=1, model=clone, optimum=optimum(), adjustment=None, refine=False, **QUIET
     )
     assert float(tree["calibration"]["epsilon"][0]) == 0.3
 
@@ -398,7 +398,7 @@ def test_an_epsilon_calibrated_for_another_problem_is_refused() -> None:
         with pytest.raises(
             ValueError, match="sample_smc: epsilon: got a result of another problem"
         ):
-            prb.sample_smc(20, model=other, epsilon=calibrated, **QUIET)
+            prb.sample_smc(20, model=other, epsilon=calibrated, adjustment=None, **QUIET)
     clone = clone_model(base())
     prb.set_epsilon(clone, calibrated)
     (node,) = nodes(clone).values()
@@ -439,7 +439,7 @@ def calibrated() -> dict[str, float]:
 
 
 def sampled(change: str, **given: Any) -> Any:
-    settings: dict[str, Any] = {"chains": 1, "adjust": False, "refine": False, **QUIET}
+    settings: dict[str, Any] = {"chains": 1, "adjustment": None, "refine": False, **QUIET}
     return prb.sample_smc(20, model=other_model(change), **settings, **given)
 
 

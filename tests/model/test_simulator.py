@@ -118,7 +118,7 @@ def stock_smc(model: pm.Model, kernel: Any = pm.smc.IMH, cores: int = 1) -> Any:
 
 
 def own_smc(model: pm.Model) -> Any:
-    return prb.sample_smc(300, chains=2, model=model, random_seed=3, **QUIET)
+    return prb.sample_smc(300, chains=2, model=model, adjustment=None, random_seed=3, **QUIET)
 
 
 SAMPLERS: dict[str, Callable[[pm.Model], Any]] = {
@@ -215,12 +215,13 @@ def test_fresh_is_refused_where_gradients_are_needed(sampler: Callable[[pm.Model
 
 def test_fresh_with_an_epsilon_for_the_run() -> None:
     model, node = build(prb.Fresh(POINTS), epsilon=None)
-    idata = prb.sample_smc(100, chains=1, model=model, epsilon=EPSILON, random_seed=1, **QUIET)
+    settings = {"model": model, "adjustment": None, "random_seed": 1, **QUIET}
+    idata = prb.sample_smc(100, chains=1, epsilon=EPSILON, **settings)
     assert abs(float(idata.posterior["mu"].mean()) - MU) < 0.1
     assert float(idata.calibration["epsilon"][0]) == EPSILON
     assert np.isnan(node.epsilon_value)
     with pytest.raises(TypeError, match=r"y: prb.Fresh .*Nelder-Mead"):
-        prb.sample_smc(100, model=model, **QUIET)
+        prb.sample_smc(100, **settings)
 
 
 # Predictive sampling.
@@ -365,7 +366,9 @@ def test_the_posterior_is_that_of_sample_smc(sampler: str, metric: prb.Metric) -
         nuts = pm.sample(
             700, tune=500, chains=2, nuts_sampler=sampler, random_seed=1, progressbar=False
         )
-    smc = prb.sample_smc(1000, chains=2, model=model, random_seed=1, progressbar=False)
+    smc = prb.sample_smc(
+        1000, chains=2, model=model, adjustment=None, random_seed=1, progressbar=False
+    )
     for name in ("mu", "sigma"):
         sd = float(smc.posterior[name].std())
         # Means of several hundred effective draws each: a standard error of .05 sd; sds to 4%.

@@ -131,7 +131,9 @@ def test_a_failure_ends_the_turn() -> None:
 )
 def test_two_threads_on_one_model_get_what_they_would_have_got_alone(propagation: Any) -> None:
     def sampled(model: pm.Model) -> Any:
-        found = prb.sample_smc(20, chains=1, model=model, random_seed=1, refine=False, **QUIET)
+        found = prb.sample_smc(
+            20, chains=1, model=model, adjustment=None, random_seed=1, refine=False, **QUIET
+        )
         return found["posterior"]["mu"].values
 
     def minimised(model: pm.Model) -> Any:

@@ -14,8 +14,8 @@ import xarray as xr
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.identity import identity_of
-from prbayes.posterior.adjustment import Affine
 from prbayes.posterior.checkpoint import Checkpoint, _sealed, stored_settings
+from prbayes.response.budget import BudgetError
 from prbayes.response.store import StoreError
 
 OBSERVED = np.random.default_rng(1).normal(2.0, 1.0, 40)
@@ -29,7 +29,7 @@ def run(path: Path, **changes: Any) -> Any:
     family: Any = changes.pop("family", pm.Normal)
     simulator = {"metric": prb.KullbackLeibler(), "observed": OBSERVED, "epsilon": 0.05}
     simulator |= {"propagation": prb.Reweighted(64, max_lost=0.9)} | changes.pop("simulator", {})
-    settings = {"draws": 20, "chains": 1, "random_seed": 1, "adjust": False, "refine": False}
+    settings = {"draws": 20, "chains": 1, "random_seed": 1, "adjustment": None, "refine": False}
     settings |= changes.pop("settings", {})
     assert not changes
     with pm.Model() as model:
@@ -61,7 +61,7 @@ CHANGES: dict[str, dict[str, Any]] = {
     "draws": {"settings": {"draws": 30}},
     "chains": {"settings": {"chains": 2}},
     "threshold": {"settings": {"threshold": 0.7}},
-    "adjustment": {"settings": {"adjust": Affine()}},
+    "adjustment": {"settings": {"adjustment": "estimate"}},
     "refinement": {"settings": {"refine": True}},
 }
 
@@ -85,6 +85,19 @@ def test_the_same_run_gives_the_same_draws_at_once(done: tuple[Path, Any]) -> No
     path, first = done
     again = run(path)
     np.testing.assert_array_equal(again["posterior"]["mu"], first["posterior"]["mu"])
+
+
+@pytest.mark.parametrize("adjustment", [None, "estimate"])
+def test_an_interrupted_run_gives_the_draws_that_it_would_have_given(
+    adjustment: str | None, tmp_path: Path
+) -> None:
+    settings = {"adjustment": adjustment, "chains": 2, "threshold": 0.7}
+    at_once = run(tmp_path / "at_once.nc", settings=settings)
+    with pytest.raises(BudgetError, match="max_stages = 1"):
+        run(tmp_path / "run.nc", settings=settings | {"max_stages": 1})
+    resumed = run(tmp_path / "run.nc", settings=settings)
+    for group in ("posterior", "sample_stats"):
+        xr.testing.assert_equal(resumed[group].to_dataset(), at_once[group].to_dataset())
 
 
 def test_a_run_without_a_seed_takes_that_of_the_run_it_goes_on_with(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """What ArviZ looks for beside the posterior, against closed forms and PyMC's own functions."""
 
 from functools import cache
-from typing import Any
 
 import arviz as az
 import numpy as np
@@ -28,7 +27,7 @@ def known_sd(propagation: prb.propagation.Propagation | None = None) -> pm.Model
 
 
 @cache
-def adjusted() -> tuple[pm.Model, prb.Optimum, xr.DataTree]:
+def sampled() -> tuple[pm.Model, prb.Optimum, xr.DataTree]:
     model = known_sd()
     optimum = prb.minimize(model, progressbar=False)
     return model, optimum, prb.sample_smc(500, chains=2, model=model, optimum=optimum, **QUIET)
@@ -36,7 +35,7 @@ def adjusted() -> tuple[pm.Model, prb.Optimum, xr.DataTree]:
 
 @pytest.mark.long
 def test_groups_and_attributes_are_those_of_arviz() -> None:
-    tree = adjusted()[2]
+    tree = sampled()[2]
     for group in ("posterior_predictive", "prior", "prior_predictive", "log_prior"):
         assert tree[group].attrs["inference_library"] == "prbayes"
     assert {"created_at", "creation_library", "sampling_time"} <= set(tree.posterior.attrs)
@@ -46,7 +45,7 @@ def test_groups_and_attributes_are_those_of_arviz() -> None:
 
 @pytest.mark.long
 def test_the_log_prior_is_that_of_the_user_s_own_units() -> None:
-    model, _, tree = adjusted()
+    model, _, tree = sampled()
     draws = tree.posterior["mu"].values
     np.testing.assert_allclose(tree.log_prior["mu"], norm.logpdf(draws, 0, 0.2), rtol=1e-9)
     theirs = pm.stats.compute_log_prior(
@@ -55,14 +54,13 @@ def test_the_log_prior_is_that_of_the_user_s_own_units() -> None:
     np.testing.assert_allclose(tree.log_prior["mu"].values, theirs["mu"].values, rtol=1e-9)
 
 
-@pytest.mark.parametrize("by", [prb.posterior.GivenEstimate(), prb.posterior.Affine()])
-def test_the_likelihood_of_adjusted_draws_times_the_prior_is_their_density(by: Any) -> None:
+def test_the_likelihood_of_the_draws_times_the_prior_is_their_density() -> None:
     """Here a normal one, with a prior that counts."""
-    model, optimum, tree = adjusted()
-    if by != prb.posterior.GivenEstimate():  # the default
-        tree = prb.sample_smc(500, chains=2, model=model, optimum=optimum, adjust=by, **QUIET)
+    _, optimum, tree = sampled()
     mu = tree.posterior["mu"].values.ravel()
-    log = sum(tree.log_likelihood[name].values.ravel() for name in tree.log_likelihood.data_vars)
+    assert set(tree.log_likelihood.data_vars) == {"one_number_for_all_specimens", "other_terms"}
+    log = tree.log_likelihood["one_number_for_all_specimens"].values.ravel()
+    assert np.ptp(tree.log_likelihood["other_terms"].values) == 0
     inner = np.abs(mu - np.median(mu)) < 2 * mu.std()
     curvature, slope, _ = np.polyfit(mu[inner], log[inner], 2)
     sd, centre = (-2 * curvature) ** -0.5, -slope / (2 * curvature)
@@ -74,25 +72,10 @@ def test_the_likelihood_of_adjusted_draws_times_the_prior_is_their_density(by: A
     # standard deviations away.
     np.testing.assert_allclose(sd, optimum.stderr["mu"], rtol=0.3)
     assert abs(centre - optimum.point["mu"]) < sd
-    # That of the draws before, which a straight map alone leaves in need of another term.
-    own = tree.log_likelihood["one_number_for_all_specimens"].values.ravel()
-    assert own.max() < (0 if by == prb.posterior.Affine() else 2)
-    added = np.ptp(tree.log_likelihood["adjustment_of_it"].values)
-    assert added > 0.1 if by == prb.posterior.Affine() else added == 0
-
-
-def test_draws_that_no_affine_map_made_have_no_likelihood_here() -> None:
-    before = np.random.default_rng(1).normal(size=(200, 2))
-    matrix = np.array([[1.2, 0.3], [0.0, 0.8]])
-    assert groups._is_affine(before, before @ matrix + 1)
-    assert not groups._is_affine(before, np.sinh(before))
-    assert not groups._is_affine(before[:5], before[:5])
-    two = np.where(before[:, :1] > 0, before + 5, before)
-    assert not groups._is_affine(before, two)
 
 
 def test_leaving_one_out_of_one_number_is_refused() -> None:
-    tree = adjusted()[2]
+    tree = sampled()[2]
     with pytest.raises(TypeError, match="one_number_for_all_specimens"):
         az.loo(tree)
     assert "power-scaling" in tree.log_likelihood.attrs["note"]
@@ -115,7 +98,7 @@ def labelled_and_two() -> pm.Model:
 def test_one_number_is_not_taken_for_that_of_each_specimen() -> None:
     """It has one place along the specimens, which ArviZ does not align with all of them."""
     for tree, names in (
-        (adjusted()[2], ["y"]),
+        (sampled()[2], ["y"]),
         (prb.sample_smc(20, chains=2, model=labelled_and_two(), **QUIET), ["two", "y"]),
     ):
         for group in tree.log_likelihood.data_vars.values():
@@ -134,7 +117,7 @@ def test_one_number_is_not_taken_for_that_of_each_specimen() -> None:
 
 
 def test_power_scaling_sees_a_prior_that_holds_the_answer_back() -> None:
-    tree = adjusted()[2]
+    tree = sampled()[2]
     table = az.psense_summary(tree)
     # The prior is about as wide as twice the standard error, with a mean five of them away.
     assert table.loc["mu", "prior"] > 0.05
@@ -142,7 +125,7 @@ def test_power_scaling_sees_a_prior_that_holds_the_answer_back() -> None:
 
 
 def test_predictive_draws_are_those_of_pymc_s_own_function() -> None:
-    model, _, tree = adjusted()
+    model, _, tree = sampled()
     ours = tree.posterior_predictive["y"]
     assert ours.sizes == {"chain": 2, "draw": 500, "y_dim_0": 40}
     theirs = pm.sample_posterior_predictive(tree, model=model, **QUIET).posterior_predictive["y"]
@@ -156,7 +139,7 @@ def test_predictive_draws_are_those_of_pymc_s_own_function() -> None:
 
 
 def test_many_numbers_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, optimum, tree = adjusted()
+    _, optimum, tree = sampled()
     monkeypatch.setattr(groups, "AT_ONCE", 2 * 500 * 40 // 4)
     rng = np.random.default_rng(1)
     thetas = tree.calibration["theta"].values
@@ -180,6 +163,6 @@ def test_points_without_a_response_are_never_drawn() -> None:
 
 def test_responses_that_cost_are_not_computed_for_it() -> None:
     model = known_sd(prb.Resimulated(32))
-    tree = prb.sample_smc(20, chains=1, model=model, epsilon=0.1, **QUIET)
+    tree = prb.sample_smc(20, chains=1, model=model, epsilon=0.1, adjustment=None, **QUIET)
     assert "posterior_predictive" not in tree
     assert {"prior", "log_prior", "log_likelihood"} <= set(tree.children)

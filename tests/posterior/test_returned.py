@@ -28,7 +28,8 @@ def model() -> pm.Model:
 
 
 def sample(draws: int = 40, **keywords: Any) -> Any:
-    return prb.sample_smc(draws, chains=2, model=model(), refine=False, **QUIET, **keywords)
+    settings: dict[str, Any] = {"chains": 2, "adjustment": None, "refine": False, **QUIET}
+    return prb.sample_smc(draws, model=model(), **settings, **keywords)
 
 
 @cache

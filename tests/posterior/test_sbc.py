@@ -4,7 +4,6 @@ import logging
 import multiprocessing
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from prbayes._checks import Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.node import nodes
 from prbayes.posterior import sbc
-from prbayes.posterior.smc import Sampling, sample
 from prbayes.response.compilation import PLAIN
 
 OBSERVED = np.random.default_rng(1).normal(1.0, 0.5, 50)
@@ -54,7 +52,7 @@ def build(
 # -- simulation-based calibration: where it runs
 # ---------------------------------------------------------
 
-RUN = {"n": 6, "draws": 50, "progressbar": False}  # fifty draws, or there is no adjustment
+RUN = {"n": 6, "draws": 50, "progressbar": False}
 
 
 @pytest.fixture(autouse=True)
@@ -156,28 +154,13 @@ def test_data_sets_do_not_depend_on_their_number() -> None:
     assert not np.isin(other.truth["mu"].values, result.truth["mu"].values).any()
 
 
-def test_each_data_set_has_refits_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, _ = serial()
-    seen: list[Any] = []
-
-    def asked_for(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
-        seen.append(asked.adjust)
-        return sample(evaluator, replace(asked, adjust=False))
-
-    monkeypatch.setattr(sbc, "sample", asked_for)
-    adjust = prb.posterior.Affine(n_sets=50)
-    prb.simulation_based_calibration(model=model, adjust=adjust, **(RUN | {"n": 2}))
-    assert {one.n_sets for one in seen} == {50}
-    assert len({one.random_seed for one in seen}) == 2
-
-
 def test_ranks_count_the_draws_below_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
     # A posterior that is always the same: 0, 1, ..., 9.
     def fixed(evaluator: Evaluator, asked: object) -> xr.DataTree:
         draws = xr.Dataset({"mu": (["chain", "draw"], np.arange(10.0)[None] / 5 - 1)})
         return xr.DataTree.from_dict({"posterior": draws})
 
-    monkeypatch.setattr(sbc, "sample", fixed)
+    monkeypatch.setattr(sbc, "draw_posterior", fixed)
     result = prb.simulation_based_calibration(20, model=build(), draws=10, progressbar=False)
     truth, ranks = result.truth["mu"].values, result.prior_sbc["mu"].values
     below = np.clip(np.ceil((truth + 1) * 5), 0, 10)
@@ -215,7 +198,7 @@ def test_failures_are_counted_and_not_lost(caplog: pytest.LogCaptureFixture) -> 
     model = build(METRICS["area"], breaking, n=20, epsilon=0.1)
     with caplog.at_level(logging.WARNING, logger="prbayes"):
         result = prb.simulation_based_calibration(
-            12, model=model, draws=20, adjust=False, progressbar=False
+            12, model=model, draws=20, adjustment=None, progressbar=False
         )
     failed = result.prior_sbc.attrs["failed"]
     # All specimens fail where mu < -2 or so, which has some per cent of the prior.
@@ -241,7 +224,7 @@ def test_single_failures_leave_the_others_as_they_are(
             raise error("by chance")
         return row
 
-    keywords = {"model": build(epsilon=0.02), "draws": 10, "adjust": False, "progressbar": False}
+    keywords = {"model": build(epsilon=0.02), "draws": 10, "adjustment": None, "progressbar": False}
     whole = prb.simulation_based_calibration(6, **keywords)
     monkeypatch.setattr(sbc, "_one", sometimes)
     result = prb.simulation_based_calibration(6, **keywords)
@@ -309,7 +292,7 @@ def test_overconfidence_shows() -> None:
     # z) have a mean square of asin(10/11) / (2 pi) = 0.18, six standard errors of 25 uniform ones
     # above 1/12.
     narrow = prb.simulation_based_calibration(
-        25, model=build(epsilon=0.1 / N), draws=50, adjust=False, progressbar=False
+        25, model=build(epsilon=0.1 / N), draws=50, adjustment=None, progressbar=False
     )
     assert spread(narrow) > 4
 
@@ -318,14 +301,14 @@ def test_overconfidence_shows() -> None:
 def test_underconfidence_shows() -> None:
     # Ten times too large an epsilon, ranks Phi(z / sqrt(10)): asin(1/11) / (2 pi) = 0.014.
     wide = prb.simulation_based_calibration(
-        25, model=build(epsilon=10 / N), draws=50, adjust=False, progressbar=False
+        25, model=build(epsilon=10 / N), draws=50, adjustment=None, progressbar=False
     )
     assert spread(wide) < -3
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(METRICS))
-def test_adjusted_posteriors_are_calibrated(name: str) -> None:
+def test_posteriors_given_the_estimate_are_calibrated(name: str) -> None:
     result = prb.simulation_based_calibration(
         100, model=build(METRICS[name]), draws=100, progressbar=False
     )

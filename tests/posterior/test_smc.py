@@ -46,8 +46,8 @@ def two_hyperparameters(**keywords: Any) -> pm.Model:
 
 
 def sample(model: pm.Model, draws: int = 500, **keywords: Any) -> xr.DataTree:
-    # The pseudo-posterior as it is: what brings it to the right width is tested in test_adjust.py.
-    keywords = {"chains": 4, "random_seed": 1, "progressbar": False, "adjust": False} | keywords
+    # The pseudo-posterior; the posterior given the estimate is tested in test_target.py.
+    keywords = {"chains": 4, "random_seed": 1, "progressbar": False, "adjustment": None} | keywords
     return prb.sample_smc(draws, model=model, **keywords)
 
 

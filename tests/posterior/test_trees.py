@@ -150,6 +150,7 @@ def test_chains_with_different_numbers_of_stages() -> None:
         np.ones((2, 3, 2)),
         np.full((2, 3, 2), np.nan),
         stats,
+        sampler={"sampler": "SMC"},
         seed=None,
         n_responses=7,
         seconds=1.5,

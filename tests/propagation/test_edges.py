@@ -208,7 +208,9 @@ def test_nuts_agrees_with_itself_and_with_smc() -> None:
         500, tune=500, chains=4, cores=1, model=model, random_seed=1, progressbar=False
     )
     assert float(az.rhat(nuts)["start"]) < 1.02
-    smc = prb.sample_smc(500, chains=4, model=model, adjust=False, random_seed=1, progressbar=False)
+    smc = prb.sample_smc(
+        500, chains=4, model=model, adjustment=None, random_seed=1, progressbar=False
+    )
     spread = float(smc.posterior["start"].std())
     shift = float(nuts.posterior["start"].mean() - smc.posterior["start"].mean())
     assert abs(shift) < 0.2 * spread

@@ -579,6 +579,7 @@ def test_sample_smc_refines() -> None:
             "y", same, x, metric=AREA, observed=data, epsilon=0.05, propagation=prb.Reweighted(64)
         )
     keywords: dict[str, Any] = {"model": model, "chains": 2, "random_seed": 1, "progressbar": False}
+    keywords["adjustment"] = None
     bare = prb.sample_smc(100, refine=False, **keywords)
     assert bare.posterior.attrs["n_responses"] == 64
     assert not prb.diagnose(bare, model=model).ok

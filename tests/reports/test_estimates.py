@@ -67,24 +67,20 @@ def test_elements_have_the_same_names_in_every_table(section: Any) -> None:
     np.testing.assert_allclose(found, [70, *means.ravel()], atol=1)
 
 
-@pytest.mark.parametrize("note", ["none", "none: there are few draws", "Affine(n_sets=200)"])
-@pytest.mark.parametrize("adjusted", [False, True])
-def test_whether_draws_are_adjusted_is_told_by_the_tree(
-    note: str, adjusted: bool, section: Any
+@pytest.mark.parametrize(
+    ("adjustment", "sentence"),
+    [
+        ("estimate", "The posterior is that given the metric's own estimate: prior times density"),
+        ("none", "The draws are those of exp(-discrepancy / epsilon): their width is epsilon's."),
+    ],
+)
+def test_what_sets_the_width_of_the_draws(
+    adjustment: str, sentence: str, calibrated: Any, section: Any
 ) -> None:
-    draws = xr.Dataset({"p": (["chain", "draw"], np.random.default_rng(1).normal(size=(2, 20)))})
-    groups = {"posterior": draws.assign_attrs(adjustment=note)}
-    if adjusted:
-        groups["unadjusted"] = draws
-    made = prb.Report("x", posterior=xr.DataTree.from_dict(groups), pictures=False)
-    said = section(made, "Posterior").text[1]
-    if adjusted:
-        assert said.startswith("The draws are adjusted to the width that the data warrant")
-        assert said.endswith(f"combined with the prior ({note}).")
-    elif note == "none":
-        assert said == "The draws are not adjusted: their width is that of epsilon."
-    elif note.startswith("none"):
-        assert "not adjusted (there are few draws): their width" in said
+    tree = calibrated.posterior.copy(deep=True)
+    tree["posterior"].attrs["adjustment"] = adjustment
+    made = prb.Report("x", posterior=tree, pictures=False)
+    assert section(made, "Posterior").text[1].startswith(sentence)
 
 
 def test_other_optima_are_told(calibrated: Any, section: Any) -> None:

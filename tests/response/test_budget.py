@@ -177,7 +177,14 @@ def sampled(
 ) -> xr.DataTree:
     made = model or build(PROPAGATIONS[name], black_box)[0]
     return prb.sample_smc(
-        30, chains=2, model=made, checkpoint=checkpoint, random_seed=1, **limits, **QUIET
+        30,
+        chains=2,
+        model=made,
+        adjustment=None,
+        checkpoint=checkpoint,
+        random_seed=1,
+        **limits,
+        **QUIET,
     )
 
 
@@ -229,7 +236,7 @@ def test_finished_chains_are_returned_and_the_rest_goes_on(name: str, tmp_path: 
 def test_a_design_that_grew_for_nothing_is_what_it_was_and_nothing_is_computed_twice() -> None:
     response = Counted()
     model, node = build(prb.Reweighted(16), prb.scalar(response))
-    keywords: dict[str, Any] = {"model": model, "chains": 1} | QUIET
+    keywords: dict[str, Any] = {"model": model, "chains": 1, "adjustment": None} | QUIET
     before = response.calls
     with pytest.raises(BudgetError, match=r"prb\.sample_smc: max_runs = 20 was reached"):
         prb.sample_smc(30, max_runs=20, **keywords)
@@ -247,7 +254,7 @@ def test_a_design_that_grew_for_nothing_is_what_it_was_and_nothing_is_computed_t
 def test_the_optimum_within_is_not_taken_for_an_answer() -> None:
     model, _ = build(prb.Resimulated(16), black_box, epsilon=None)
     with pytest.raises(BudgetError, match=r"prb\.sample_smc: max_runs = 50 was reached"):
-        prb.sample_smc(30, model=model, max_runs=50, **QUIET)
+        prb.sample_smc(30, model=model, adjustment=None, max_runs=50, **QUIET)
 
 
 def test_time_is_a_budget_of_the_sampler() -> None:

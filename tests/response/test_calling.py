@@ -128,6 +128,7 @@ def test_resimulated_and_fresh_use_the_executor_too() -> None:
                 chains=1,
                 model=model(response, propagation),
                 epsilon=1.0,
+                adjustment=None,
                 random_seed=1,
                 progressbar=False,
             )
