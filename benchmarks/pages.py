@@ -447,14 +447,6 @@ def joint() -> Iterator[Row]:
             yield [str(size), f"{schools[school]}, {metric}", str(min(sets)), *row]
 
 
-def joint_time() -> Iterator[Row]:
-    """Return the rows of the time of two outputs."""
-    for key, cell in found("joint_speed")["time"].items():
-        metric, points, unknown = key.split("/")
-        seconds = [" + ".join(f"{value:.1f}" for value in cell[n]) for n in ("one", "two")]
-        yield [metric, points, unknown, *seconds, f"{cell['ratio']:.1f}"]
-
-
 def joint_memory() -> Iterator[Row]:
     """Return the rows of the memory of many directions."""
     for key, cell in found("joint_speed")["memory"].items():
@@ -807,7 +799,6 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "ties": ties,
     "surrogates": surrogates,
     "joint, errors": joint,
-    "joint, time": joint_time,
     "joint, memory": joint_memory,
     "speed": speed,
     "speed, jobs": speed_jobs,
