@@ -17,77 +17,97 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
 from numpy.typing import NDArray
-from pymc.distributions.continuous import TruncatedNormalRV
-from pytensor.graph.basic import Constant
-from pytensor.tensor.random import basic
-from pytensor.tensor.variable import TensorVariable
 from scipy.linalg import qr
 
 from prbayes._checks import Floats
 from prbayes._threads import one_thread
-from prbayes.response.distributions import compiled_log_density, compiled_log_density_slopes
+from prbayes.response.distributions import (
+    compiled_log_density,
+    compiled_log_density_slopes,
+    is_mvnormal,
+)
 from prbayes.response.inputs import Inputs
 
-Columns = list[Floats]
+
+@dataclass(frozen=True)
+class Family:
+    """Coordinates of an element, (n,) -> (n,), whose monomials are the sufficient statistics.
+
+    Attributes
+    ----------
+    coordinates : tuple of callable
+        Not finite outside of the support.
+    degree : int
+        Highest degree of the monomials, 1 or 2.
+    """
+
+    coordinates: tuple[Callable[[Floats], Floats], ...]
+    degree: int = 1
 
 
-def _standardised(x: Floats) -> Floats:
-    """Return values (n, ...) less their mean, in standard deviations."""
-    spread = x.std(axis=0)
-    spread = np.where(spread > 0, spread, 1.0)
-    return np.asarray((x - x.mean(axis=0)) / spread)
+def _non_negative(x: Floats) -> Floats:
+    return np.where(x >= 0, x, np.nan)
 
 
-def _quadratic(x: Floats) -> Columns:
-    z = _standardised(x)
-    return [z, z * z]
+def _log_of_rest(x: Floats) -> Floats:
+    return np.asarray(np.log1p(-x))
 
 
-def _log_quadratic(x: Floats) -> Columns:
-    return _quadratic(np.log(x))
-
-
-def _gamma(x: Floats) -> Columns:
-    return [_standardised(x), _standardised(np.log(x))]
-
-
-def _inverse_gamma(x: Floats) -> Columns:
-    return [_standardised(1 / x), _standardised(np.log(x))]
-
-
-def _beta(x: Floats) -> Columns:
-    return [_standardised(np.log(x)), _standardised(np.log1p(-x))]
-
-
-def _linear(x: Floats) -> Columns:
-    return [_standardised(x)]
-
-
-def _multivariate_normal(x: Floats) -> Columns:
-    """Return statistics of vectors (n, d), first made uncorrelated."""
-    centered = x - x.mean(axis=0)
-    _, _, axes = np.linalg.svd(centered, full_matrices=False)
-    z = _standardised(centered @ axes.T)
-    first, second = np.triu_indices(z.shape[1])
-    return [*z.T, *(z[:, first] * z[:, second]).T]
-
-
-# Statistics of one element, beside the constant; supports do not depend on parameters.
-_OF_ELEMENTS: dict[type, Callable[[Floats], Columns]] = {
-    basic.NormalRV: _quadratic,
-    basic.HalfNormalRV: _quadratic,
-    TruncatedNormalRV: _quadratic,
-    basic.LogNormalRV: _log_quadratic,
-    basic.GammaRV: _gamma,
-    basic.InvGammaRV: _inverse_gamma,
-    basic.BetaRV: _beta,
-    basic.ExponentialRV: _linear,
+# Their supports do not depend on parameters; that of the truncated normal is in the graph.
+FAMILIES = {
+    type(pm.Normal.rv_op): Family((np.positive,), degree=2),
+    type(pm.HalfNormal.rv_op): Family((_non_negative,), degree=2),
+    type(pm.TruncatedNormal.rv_op): Family((np.positive,), degree=2),
+    type(pm.LogNormal.rv_op): Family((np.log,), degree=2),
+    type(pm.Gamma.rv_op): Family((np.positive, np.log)),
+    type(pm.InverseGamma.rv_op): Family((np.reciprocal, np.log)),
+    type(pm.Beta.rv_op): Family((np.log, _log_of_rest)),
+    type(pm.Exponential.rv_op): Family((_non_negative,)),
 }
 
 
-def sufficient_statistics(dist: TensorVariable, values: Floats) -> Floats | None:
-    """Return sufficient statistics of a distribution at values.
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """Coordinates of an element of an input, or of a multivariate normal, at points.
+
+    Attributes
+    ----------
+    values : ndarray, shape (c, n)
+        Not finite outside of the support.
+    degree : int
+        Highest degree of the monomials that are sufficient statistics.
+    """
+
+    values: Floats
+    degree: int
+
+    def monomials(self) -> Floats:
+        """Return monomials of standardised coordinates, (q, n)."""
+        z = _standardised(self.values)
+        if self.degree == 1:
+            return z
+        if len(z) == 1:
+            return np.concatenate([z, z * z])
+        axes, _, _ = np.linalg.svd(z, full_matrices=False)
+        z = _standardised(axes.T @ z)
+        first, second = np.triu_indices(len(z))
+        return np.concatenate([z, z[first] * z[second]])
+
+
+def _standardised(values: Floats) -> Floats:
+    """Return values (c, n) less their means, in standard deviations."""
+    size = values.shape[1]
+    centered = values - (values.sum(axis=1) / size)[:, None]
+    spread = np.sqrt(np.vecdot(centered, centered) / size)
+    spread[spread == 0] = 1.0
+    return np.asarray(centered / spread[:, None])
+
+
+def coordinates_of(dist: pt.TensorVariable, values: Floats) -> list[Coordinates] | None:
+    """Return the coordinates of all elements of an input at points.
 
     Parameters
     ----------
@@ -97,24 +117,25 @@ def sufficient_statistics(dist: TensorVariable, values: Floats) -> Floats | None
 
     Returns
     -------
-    ndarray, shape (q, n), or None
-        Standardised, without the constant; None if the distribution is no exponential family with
-        a fixed support.
+    list of Coordinates, or None
+        None if the distribution is no exponential family with a fixed support.
     """
+    if is_mvnormal(dist):
+        return [Coordinates(values.T, 2)]
     op = dist.owner.op
-    if isinstance(op, basic.MvNormalRV):
-        return np.array(_multivariate_normal(values))
-    statistics = _OF_ELEMENTS.get(type(op))
-    if statistics is None:
+    family = FAMILIES.get(type(op))
+    if family is None:
         return None
-    if isinstance(op, TruncatedNormalRV):
-        _, _, *bounds = op.dist_params(dist.owner)
-        if not all(isinstance(bound, Constant) for bound in bounds):
+    if isinstance(op, type(pm.TruncatedNormal.rv_op)):
+        _, _, lower, upper = op.dist_params(dist.owner)
+        if not isinstance(lower, pt.TensorConstant) or not isinstance(upper, pt.TensorConstant):
             return None
-    elements = values.reshape(len(values), -1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        columns = [column for x in elements.T for column in statistics(x)]
-    return np.array(columns)
+        is_inside = (values >= lower.data) & (values <= upper.data)
+        values = np.where(is_inside, values, np.nan)
+    elements = values.reshape(len(values), -1).T
+    with np.errstate(all="ignore"):
+        stacked = [np.stack([u(x) for u in family.coordinates]) for x in elements]
+    return [Coordinates(u, family.degree) for u in stacked]
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,20 +145,24 @@ class ExponentialForm:
     Attributes
     ----------
     statistics : ndarray, shape (q + 1, n)
-        Sufficient statistics of all inputs, the last of which is the constant.
+        Sufficient statistics of all inputs, the last of which is the constant; zero outside of the
+        support.
+    is_inside : ndarray of bool, shape (n,)
+        Points of the support.
     anchors : tuple of ndarray, shapes (q + 1, *event)
-        Points at which the log-density tells the natural parameters.
+        Points at which the log-density determines the natural parameters.
     inverse : ndarray, shape (q + 1, q + 1)
         Inverse of the statistics at the anchors.
     """
 
     statistics: Floats
+    is_inside: NDArray[np.bool_]
     anchors: tuple[Floats, ...]
     inverse: Floats
 
     @classmethod
     def of(
-        cls, dists: Sequence[TensorVariable], points: Sequence[Floats]
+        cls, dists: Sequence[pt.TensorVariable], points: Sequence[Floats]
     ) -> ExponentialForm | None:
         """Return the form of independent inputs at points; None if they have none.
 
@@ -147,23 +172,30 @@ class ExponentialForm:
             The distributions of the inputs.
         points : sequence of ndarray, shapes (n, *event)
         """
-        n = len(points[0])
-        parts = []
+        coordinates: list[Coordinates] = []
         for dist, values in zip(dists, points, strict=True):
-            part = sufficient_statistics(dist, values)
-            if part is None:
+            of_input = coordinates_of(dist, values)
+            if of_input is None:
                 return None
-            parts.append(part)
-        statistics = np.concatenate([*parts, np.ones((1, n))])
-        if not np.isfinite(statistics).all() or n < 2 * len(statistics):
+            coordinates += of_input
+        with np.errstate(invalid="ignore"):
+            is_inside = np.isfinite(sum(u.values.sum(axis=0) for u in coordinates))
+        inside = np.flatnonzero(is_inside)
+        if not inside.size:
             return None
-        chosen = _anchors(statistics)
-        at_anchors = statistics[:, chosen]
+        parts = [Coordinates(u.values[:, inside], u.degree).monomials() for u in coordinates]
+        at_inside = np.concatenate([*parts, np.ones((1, inside.size))])
+        if inside.size < 2 * len(at_inside):
+            return None
+        chosen = _anchors(at_inside)
+        at_anchors = at_inside[:, chosen]
         # Points that coincide, or lie in a plane, determine no natural parameters.
         if np.linalg.cond(at_anchors) > 1e6:
             return None
-        anchors = tuple(values[chosen] for values in points)
-        return cls(statistics, anchors, np.linalg.inv(at_anchors))
+        statistics = np.zeros((len(at_inside), is_inside.size))
+        statistics[:, inside] = at_inside
+        anchors = tuple(values[inside[chosen]] for values in points)
+        return cls(statistics, is_inside, anchors, np.linalg.inv(at_anchors))
 
     def natural_parameters(self, at_anchors: Floats) -> Floats:
         """Return H from log-densities at the anchors, (S, q + 1) -> (S, q + 1).
@@ -223,6 +255,9 @@ class PointDensity:
         first, form = self._form
         if first is not points[0]:
             form = ExponentialForm.of(self.inputs.aleatory, points)
+            # At an end of a support PyMC's density may be finite, or infinite.
+            if form is not None and not form.is_inside.all():
+                form = None
             self._form = points[0], form
         return form
 

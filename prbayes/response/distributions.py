@@ -68,12 +68,14 @@ def _is_walk(dist: TensorVariable) -> bool:
     return isinstance(dist.owner.op, pm.RandomWalk.rv_type)
 
 
+@untraced()
 def compiled_log_density(inputs: Inputs) -> Any:
     """Return log p(x) as a function of roots (k, *shape), then points (n, *event): (k, n)."""
     symbols, points, density = _log_density(inputs)
     return compile_batched(symbols, [density], points)
 
 
+@untraced()
 def compiled_log_density_slopes(inputs: Inputs) -> Any:
     """Return the derivatives for the roots of a sum over log p(x), shapes (k, *shape).
 
@@ -81,9 +83,8 @@ def compiled_log_density_slopes(inputs: Inputs) -> Any:
     """
     symbols, points, density = _log_density(inputs)
     factors = pt.dvector("factors")
-    with untraced():
-        known: Any = {density: factors}
-        slopes = pt.grad(None, symbols, known_grads=known, disconnected_inputs="ignore")
+    known: Any = {density: factors}
+    slopes = pt.grad(None, symbols, known_grads=known, disconnected_inputs="ignore")
     return compile_batched([*symbols, factors], slopes, points)
 
 

@@ -13,6 +13,7 @@ from scipy.special import logsumexp
 
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
+from prbayes.propagation.exponential_families import ExponentialForm
 from prbayes.propagation.population_density import PopulationDensity
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs, read_inputs
@@ -63,7 +64,7 @@ def test_families_are_those_of_scipy(name: str) -> None:
     density = PopulationDensity(inputs)
     roots = by_name(inputs, {"a0": FIRST, "b0": SECOND})
     found = density.log_likelihoods(roots, [X], LOG_A)
-    assert density._families is not None
+    assert ExponentialForm.of(inputs.aleatory, [X.ravel()]) is not None
     logs = np.stack([of_scipy(a, b).logpdf(X) for a, b in zip(FIRST, SECOND, strict=True)])
     assert np.allclose(found, logsumexp(logs + LOG_A, axis=2), rtol=1e-12, atol=1e-12)
     assert np.allclose(found, by_graph(inputs, roots, [X], LOG_A), rtol=1e-12, atol=1e-12)
@@ -119,7 +120,7 @@ def test_correlated_inputs() -> None:
 def test_other_families_have_their_graph() -> None:
     inputs = inputs_of(lambda a, b: pm.Weibull.dist(alpha=a, beta=b))
     density = PopulationDensity(inputs)
-    assert density._families is None
+    assert ExponentialForm.of(inputs.aleatory, [X.ravel()]) is None
     roots = by_name(inputs, {"a0": FIRST[:3], "b0": SECOND[:3]})
     expected = by_graph(inputs, roots, [X], LOG_A)
     assert np.allclose(density.log_likelihoods(roots, [X], LOG_A), expected, rtol=1e-12)
