@@ -1,6 +1,6 @@
 """What several outputs cost: CPU time beside one output, and peak memory of `prb.Joint`.
 
-*time*: `minimize` and `sample` on a design that is there, for one output and for two of the same
+*time*: `minimize` and `sample_smc` on a design that is there, for one output and for two of the same
 specimens under `Joint`, with the same inputs, hyperparameters, observations and points; pairs in one
 process, and the median of their ratios. *memory*: a process of its own for each number of outputs
 and of points; what the objective with its gradient and a batch of eight thetas add to a model whose
@@ -72,13 +72,19 @@ def model_of(outputs: int, metric: str, points: int, unknown: int) -> Any:
 
 
 def seconds(model: Any) -> tuple[float, float]:
-    """Return CPU seconds of `minimize` and of `sample`, on a design as it is."""
+    """Return CPU seconds of `minimize` and of `sample_smc`, on a design as it is."""
     import prbayes as prb
 
     begun = time.process_time()
     optimum = prb.minimize(model, refine=False, progressbar=False)
     between = time.process_time()
-    prb.sample(model=model, optimum=optimum, random_seed=1, progressbar=False)
+    prb.sample_smc(
+        model=model,
+        optimum=optimum,
+        refine=False,
+        random_seed=1,
+        progressbar=False,
+    )
     return between - begun, time.process_time() - between
 
 

@@ -80,7 +80,7 @@ def saddlepoint() -> Iterator[Row]:
     cells: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for name, cell in found("saddlepoint")["summary"].items():
         study, metric, *rest = name.split(", ")
-        if study in ("one", "several", "refits"):
+        if study in ("one", "several"):
             cells.setdefault((rest[-1], metric), []).append(cell)
     for (case, metric), those in sorted(cells.items(), key=lambda item: _CASES.index(item[0][0])):
         rms, most = (max(max(c[f"{key} offset"]) for c in those) for key in ("rms", "largest"))
@@ -111,7 +111,7 @@ def saddlepoint_refits() -> Iterator[Row]:
 
 # Priors of one simulator of one output, and problems of several.
 _CASES = (
-    "vague", "bounded", "sharp", "conflict", "two simulators", "4 simulators", "8 simulators",
+    "vague", "bounded", "sharp", "conflict", "4 simulators", "8 simulators",
     "3 outputs", "4 outputs", "8 outputs",
 )  # fmt: skip
 
@@ -445,14 +445,6 @@ def joint() -> Iterator[Row]:
         else:
             school, metric = method.split()
             yield [str(size), f"{schools[school]}, {metric}", str(min(sets)), *row]
-
-
-def joint_time() -> Iterator[Row]:
-    """Return the rows of the time of two outputs."""
-    for key, cell in found("joint_speed")["time"].items():
-        metric, points, unknown = key.split("/")
-        seconds = [" + ".join(f"{value:.1f}" for value in cell[n]) for n in ("one", "two")]
-        yield [metric, points, unknown, *seconds, f"{cell['ratio']:.1f}"]
 
 
 def joint_memory() -> Iterator[Row]:
@@ -807,7 +799,6 @@ TABLES: dict[str, Callable[[], Iterator[Row]]] = {
     "ties": ties,
     "surrogates": surrogates,
     "joint, errors": joint,
-    "joint, time": joint_time,
     "joint, memory": joint_memory,
     "speed": speed,
     "speed, jobs": speed_jobs,

@@ -238,7 +238,7 @@ def estimate_likelihood(
     scales = np.array([optimum.scales[node.name] for node in evaluator.nodes])
     if _needs_population(evaluator, options):
         for _ in range(options.rounds):
-            evaluator, scales, point = _minimised_on_population(evaluator, point, options)
+            evaluator, scales, point = _minimised_on_population(evaluator, point, scales, options)
     evaluator = _coarse_where_sufficient(evaluator, point)
     parts = [
         _group_scores(evaluator, members, point, scales, options)
@@ -288,7 +288,7 @@ def _needs_population(evaluator: Evaluator, options: EstimateLikelihoodOptions) 
 
 
 def _minimised_on_population(
-    evaluator: Evaluator, point: Floats, options: EstimateLikelihoodOptions
+    evaluator: Evaluator, point: Floats, scales: Floats, options: EstimateLikelihoodOptions
 ) -> tuple[Evaluator, Floats, Floats]:
     """Return metrics with the whitening and bandwidths of the population, and their minimiser.
 
@@ -302,9 +302,8 @@ def _minimised_on_population(
         responses, weights = evaluator.populations(point[None], k)
         targets.append(prepared_on_population(node.target, responses[0], weights[0]))
     prepared = evaluator.with_targets(targets)
-    scales = prepared.epsilon
-    unset = np.isnan(scales)
-    if unset.any():
+    unset = np.isnan(prepared.epsilon)
+    if len(targets) > 1 and unset.any():
         scales = np.where(unset, noise_floors(prepared, point, SETS), scales)
     unit = evaluator.prior_sd
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from prbayes._checks import AT_ONCE, Floats
+from prbayes._checks import AT_ONCE, IN_CACHE, Floats
 from prbayes.model.evaluator import Evaluator
 from prbayes.model.labels import (
     arviz_attributes,
@@ -186,7 +186,7 @@ def _dims_of_specimens(evaluator: Evaluator) -> list[str]:
 
 
 def _specimens(evaluator: Evaluator, k: int, thetas: Floats, rng: np.random.Generator) -> Floats:
-    """Draw as many responses as were observed at each theta, shape (P, N) or (P, N, m).
+    """Draw as many stored responses as were observed at each theta, shape (P, N) or (P, N, m).
 
     They are specimens of the population's points, by weight and with replacement.
     """
@@ -194,20 +194,20 @@ def _specimens(evaluator: Evaluator, k: int, thetas: Floats, rng: np.random.Gene
     size = len(node.target.observed)
     event = node.target.event
     drawn = np.full((len(thetas), size, *event), np.nan)
-    step = max(1, AT_ONCE // node.bound.n_points)
+    step = max(1, IN_CACHE // node.bound.n_points)
     for first in range(0, len(thetas), step):
         roots = evaluator.roots(thetas[first : first + step], k)
         where = np.flatnonzero(node.bound.valid(roots))
         if not where.size:
             continue
         values, weights = node.bound.populations([root[where] for root in roots])
-        places = first + where
-        for place, points, mass in zip(places, values, weights, strict=True):
-            counted = np.where(lacking(points), 0.0, mass)
-            edges = np.cumsum(counted)
-            total = edges[-1]
+        # The same responses carry all populations.
+        points = values[0]
+        edges = np.cumsum(np.where(lacking(points), 0.0, weights), axis=1)
+        for place, row in zip(first + where, edges, strict=True):
+            total = row[-1]
             if total > 0:
                 uniform = rng.random(size) * total
-                chosen = np.searchsorted(edges, uniform, side="right")
+                chosen = np.searchsorted(row, uniform, side="right")
                 drawn[place] = points[chosen]
     return drawn

@@ -38,7 +38,7 @@ class ImportanceOptions:
     rounds : int
     """
 
-    oversampling: int = 4
+    oversampling: int = 2
     degrees: float = 5.0
     pareto_k: float = 0.7
     efficiency: float = 0.25

@@ -167,8 +167,12 @@ def draw_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
                 break
             if not refine_at(evaluator, sample.draws[:THETAS]):
                 break
+        log_likelihood = None
         if sample is not None:
             attrs, thetas, stats = _of_importance_sample(sample, asked)
+            if evaluator.nodes:
+                log_prior = evaluator.hyperparameters.log_prior(sample.draws)
+                log_likelihood = (sample.log_density - log_prior).reshape(thetas.shape[:2])
         elif nuts is not None:
             attrs, thetas, stats = nuts
         else:
@@ -179,7 +183,7 @@ def draw_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
             asked,
             optimum,
             attrs,
-            log_likelihood=target.log_likelihood if evaluator.nodes else None,
+            log_likelihood=log_likelihood,
             sample_stats=stats,
             n_responses=evaluator.n_responses - before,
             seconds=time.perf_counter() - clock,

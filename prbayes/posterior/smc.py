@@ -274,13 +274,17 @@ def sample_posterior(evaluator: Evaluator, asked: Sampling) -> xr.DataTree:
         optimum = estimate_of(evaluator, asked, "sample_smc")
         rounds = _rounds(evaluator, asked, optimum)
         particles = rounds.until_supported(asked.progressbar)
+        log_likelihood = None
+        if rounds.log_likelihood is not None:
+            rows = particles.thetas.reshape(-1, evaluator.size)
+            log_likelihood = rounds.log_likelihood(rows).reshape(particles.thetas.shape[:2])
         return result_tree(
             evaluator,
             particles.thetas,
             asked,
             optimum,
             {"sampler": "SMC"},
-            log_likelihood=rounds.log_likelihood,
+            log_likelihood=log_likelihood,
             stats=particles.stats,
             warnings=_of_budget(particles.stopped, particles, asked),
             stopped=particles.stopped,
@@ -530,7 +534,7 @@ def result_tree(
     optimum: Optimum | None,
     sampler: Mapping[str, Any],
     *,
-    log_likelihood: LogDensity | None,
+    log_likelihood: Floats | None,
     stats: Sequence[Stages] = (),
     sample_stats: xr.Dataset | None = None,
     warnings: Sequence[str] = (),
@@ -540,7 +544,8 @@ def result_tree(
 ) -> xr.DataTree:
     """Return the DataTree of draws of the posterior, (chains, draws, d).
 
-    Discrepancies are computed where that costs no response.
+    With a metric ``log_likelihood``, (chains, draws), is that given the estimate. Discrepancies are
+    computed where that costs no response.
     """
     chains, draws, d = thetas.shape
     shape = (chains, draws, len(evaluator.nodes))
@@ -554,8 +559,7 @@ def result_tree(
         if asked.with_groups and log_likelihood is None:
             groups = specimen_groups(evaluator, thetas, asked.random_seed)
         elif asked.with_groups and log_likelihood is not None:
-            values = log_likelihood(thetas.reshape(-1, d)).reshape(chains, draws)
-            groups = arviz_groups(evaluator, thetas, values, asked.random_seed)
+            groups = arviz_groups(evaluator, thetas, log_likelihood, asked.random_seed)
         return posterior_tree(
             evaluator,
             thetas,
