@@ -25,7 +25,7 @@ def fleet(products: int, size: int = 20) -> dict[str, Any]:
     from prbayes.metrics.readings import Readings
     from prbayes.model.evaluator import Evaluator
     from prbayes.posterior.importance import importance_sample, laplace
-    from prbayes.propagation.population_density import PopulationDensity
+    from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
     from prbayes.propagation.specimen_points import draw_points, specimen_roots
 
     problem = PROBLEMS["frame"]
@@ -56,11 +56,12 @@ def fleet(products: int, size: int = 20) -> dict[str, Any]:
     free = [str(rv.name) for rv in evaluator.model.free_RVs]
     means, sds = [], []
     for r in range(products):
+        weighted = WeightedPoints.of(likelihood.inputs, x[r], log_a[r])
 
-        def log_posterior(thetas: Any, r: int = r) -> Any:
+        def log_posterior(thetas: Any, weighted: WeightedPoints = weighted) -> Any:
             values = names.constrained(thetas)
             params = [values[name] for name in order]
-            logs = density.log_likelihoods(params, x[r], log_a[r]).sum(axis=1)
+            logs = density.log_likelihoods(params, weighted).sum(axis=1)
             return names.log_prior(thetas) + logs
 
         # The moments of the points are near the mode.

@@ -21,7 +21,7 @@ from prbayes.model.hyperparameters import Hyperparameters
 from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.points import sobol
-from prbayes.propagation.population_density import PopulationDensity
+from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
 from prbayes.propagation.response_share import ResponseShare
 from prbayes.response.grouping import is_group
 from prbayes.response.inputs import Inputs
@@ -92,7 +92,8 @@ class Populations:
             of_rows = [v[rows] for v in x]
             if smoothing is None:
                 roots = self._roots(thetas, int(group))
-                result[:, rows] = self._density.log_likelihoods(roots, of_rows, weights[rows])
+                points = WeightedPoints.of(self.inputs, of_rows, weights[rows])
+                result[:, rows] = self._density.log_likelihoods(roots, points)
                 continue
             step = max(1, IN_CACHE // (len(rows) * count))
             for first in range(0, len(thetas), step):

@@ -60,7 +60,7 @@ from prbayes.model.run_checks import (
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.fibre_points import fibre_points
-from prbayes.propagation.population_density import PopulationDensity
+from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
 from prbayes.propagation.response_share import ResponseShare, response_share
 from prbayes.propagation.roots import Roots
 from prbayes.propagation.specimen_points import (
@@ -409,6 +409,15 @@ class SpecimenLikelihood:
         return self.coordinates.inputs(points.z), log_a + self.coordinates.log_jacobian(points.z)
 
     @cached_property
+    def _points_by_group(self) -> list[WeightedPoints]:
+        """The points of the specimens of each group."""
+        x, log_a = self._weighted_points
+        return [
+            WeightedPoints.of(self.inputs, [v[rows] for v in x], log_a[rows])
+            for _, rows in self.by_group
+        ]
+
+    @cached_property
     def arrays(self) -> tuple[list[Any], Any]:
         """Shared variables of the points, (N, K, *event) by input, and of the numbers A, (N, K)."""
         points, log_a = self._weighted_points
@@ -433,16 +442,14 @@ class SpecimenLikelihood:
         params : mapping
             Values by `variables`, shapes (P, *shape), without the group of a specimen.
         """
-        x, log_a = self._weighted_points
         size = len(next(iter(params.values())))
         result = np.empty((size, len(self.readings)))
-        for place, rows in self.by_group:
+        for (place, rows), points in zip(self.by_group, self._points_by_group, strict=True):
             roots = [
                 np.full(size, place) if is_group(root) else params[root]
                 for root in self.inputs.roots
             ]
-            of_rows = [v[rows] for v in x]
-            result[:, rows] = self._density.log_likelihoods(roots, of_rows, log_a[rows])
+            result[:, rows] = self._density.log_likelihoods(roots, points)
             if self.share is not None:
                 log_share = self.share.of_populations(self._density, roots, self.coordinates)
                 result[:, rows] -= log_share[:, None]

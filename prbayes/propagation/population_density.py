@@ -24,6 +24,32 @@ from prbayes.response.inputs import Inputs
 
 
 @dataclass(frozen=True, eq=False)
+class WeightedPoints:
+    """Points of N specimens, with the matrix form of log-densities there.
+
+    Attributes
+    ----------
+    x : sequence of ndarray, shapes (N, K, *event)
+        By aleatory input.
+    log_a : ndarray, shape (N, K)
+    form : ExponentialForm, optional
+        At the points in the order of (K, N): reductions are then sums of long rows.
+    """
+
+    x: Sequence[Floats]
+    log_a: Floats
+    form: ExponentialForm | None
+
+    @classmethod
+    def of(cls, inputs: Inputs, x: Sequence[Floats], log_a: Floats) -> WeightedPoints:
+        """Return the points with their form, if the inputs have one."""
+        if inputs.nested or not log_a.size:
+            return cls(x, log_a, None)
+        flat = [v.swapaxes(0, 1).reshape(log_a.size, *v.shape[2:]) for v in x]
+        return cls(x, log_a, ExponentialForm.of(inputs.aleatory, flat))
+
+
+@dataclass(frozen=True, eq=False)
 class PopulationDensity:
     """Populations of some inputs, as far as they are compiled: log-densities and draws.
 
@@ -43,26 +69,12 @@ class PopulationDensity:
         """Draws of specimens."""
         return PopulationSampler(self.inputs)
 
-    def log_likelihoods(
-        self, roots: Sequence[Floats], x: Sequence[Floats], log_a: Floats
-    ) -> Floats:
-        """Return log p(y_i | theta), (S, N).
-
-        Parameters
-        ----------
-        roots : sequence of ndarray, shapes (S, *shape)
-        x : sequence of ndarray, shapes (N, K, *event)
-            Points, by aleatory input.
-        log_a : ndarray, shape (N, K)
-        """
+    def log_likelihoods(self, roots: Sequence[Floats], points: WeightedPoints) -> Floats:
+        """Return log p(y_i | theta), (S, N), of populations at roots, shapes (S, *shape)."""
+        form, log_a = points.form, points.log_a
         n, count = log_a.shape
-        if not log_a.size:
-            return np.full((len(roots[0]), n), -np.inf)
-        # The points of a specimen as the first axis: reductions are then sums of long rows.
-        flat = [v.swapaxes(0, 1).reshape(n * count, *v.shape[2:]) for v in x]
-        form = None if self.inputs.nested else ExponentialForm.of(self.inputs.aleatory, flat)
         if form is None:
-            return self._by_graph(roots, x, log_a)
+            return self._by_graph(roots, points)
         with np.errstate(all="ignore"):
             (at_anchors,) = self._log_density(*roots, *form.anchors)
         is_rounded = form.is_rounded(at_anchors)
@@ -79,14 +91,17 @@ class PopulationDensity:
             _log_sum_exp_first(exponents.reshape(count, n, -1), result[:, block])
         if is_rounded.any():
             narrow = [root[is_rounded] for root in roots]
-            result[:, is_rounded] = self._by_graph(narrow, x, log_a).T
+            result[:, is_rounded] = self._by_graph(narrow, points).T
         return result.T
 
-    def _by_graph(self, roots: Sequence[Floats], x: Sequence[Floats], log_a: Floats) -> Floats:
+    def _by_graph(self, roots: Sequence[Floats], points: WeightedPoints) -> Floats:
         """Return the same by the compiled log-density."""
+        log_a = points.log_a
         n, count = log_a.shape
-        flat = [np.ascontiguousarray(v.reshape(n * count, *v.shape[2:])) for v in x]
-        result = np.empty((len(roots[0]), n))
+        result = np.full((len(roots[0]), n), -np.inf)
+        if not log_a.size:
+            return result
+        flat = [np.ascontiguousarray(v.reshape(n * count, *v.shape[2:])) for v in points.x]
         step = max(1, IN_CACHE // log_a.size)
         for first in range(0, len(result), step):
             block = slice(first, first + step)

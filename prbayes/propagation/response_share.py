@@ -25,7 +25,7 @@ from prbayes.numerics.log_sum_exp import log_sum_exp
 from prbayes.propagation.base import DesignError
 from prbayes.propagation.coordinates import Coordinates
 from prbayes.propagation.points import sobol
-from prbayes.propagation.population_density import PopulationDensity
+from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
 from prbayes.propagation.specimen_points import Emulation, PointOptions, first_runs
 
 
@@ -62,11 +62,12 @@ class ResponseShare:
         """Return log S of the populations at roots, shapes (S, *shape) -> (S,)."""
         log_b = self.log_b + coordinates.log_jacobian(self.z)
         x = coordinates.inputs(self.z)
-        inside, outside = (
-            density.log_likelihoods(roots, [v[None, some] for v in x], log_b[None, some])[:, 0]
-            for some in (slice(self.with_response), slice(self.with_response, None))
-        )
-        return _log_share(inside, outside)
+        integrals = []
+        for rows in (slice(self.with_response), slice(self.with_response, None)):
+            of_rows = [v[None, rows] for v in x]
+            points = WeightedPoints.of(density.inputs, of_rows, log_b[None, rows])
+            integrals.append(density.log_likelihoods(roots, points)[:, 0])
+        return _log_share(*integrals)
 
 
 def _log_share(inside: Floats, outside: Floats) -> Floats:

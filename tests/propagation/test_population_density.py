@@ -14,7 +14,7 @@ from scipy.special import logsumexp
 import prbayes as prb
 from prbayes.model.evaluator import Evaluator
 from prbayes.propagation.exponential_families import ExponentialForm
-from prbayes.propagation.population_density import PopulationDensity
+from prbayes.propagation.population_density import PopulationDensity, WeightedPoints
 from prbayes.response.distributions import compiled_log_density
 from prbayes.response.inputs import Inputs, read_inputs
 
@@ -50,6 +50,12 @@ def by_name(inputs: Inputs, values: dict[str, Any]) -> list[Any]:
     return [values[str(root.name)] for root in inputs.roots]
 
 
+def log_likelihoods(inputs: Inputs, roots: Sequence[Any], x: Sequence[Any], log_a: Any) -> Any:
+    """Return the log-likelihoods by the module under test."""
+    points = WeightedPoints.of(inputs, x, log_a)
+    return PopulationDensity(inputs).log_likelihoods(roots, points)
+
+
 def by_graph(inputs: Inputs, roots: Sequence[Any], x: Sequence[Any], log_a: Any) -> Any:
     """Return the log-likelihoods by PyMC's density."""
     flat = [v.reshape(log_a.size, *v.shape[2:]) for v in x]
@@ -61,9 +67,8 @@ def by_graph(inputs: Inputs, roots: Sequence[Any], x: Sequence[Any], log_a: Any)
 def test_families_are_those_of_scipy(name: str) -> None:
     of_pymc, of_scipy = FAMILIES[name]
     inputs = inputs_of(of_pymc)
-    density = PopulationDensity(inputs)
     roots = by_name(inputs, {"a0": FIRST, "b0": SECOND})
-    found = density.log_likelihoods(roots, [X], LOG_A)
+    found = log_likelihoods(inputs, roots, [X], LOG_A)
     assert ExponentialForm.of(inputs.aleatory, [X.ravel()]) is not None
     logs = np.stack([of_scipy(a, b).logpdf(X) for a, b in zip(FIRST, SECOND, strict=True)])
     assert np.allclose(found, logsumexp(logs + LOG_A, axis=2), rtol=1e-12, atol=1e-12)
@@ -76,7 +81,7 @@ def test_invalid_parameters_and_points_have_no_density(name: str) -> None:
     second = np.array([-1.0, 0.0, np.nan, 1.0])
     roots = by_name(inputs, {"a0": np.ones(4), "b0": second})
     outside = np.where(np.arange(7)[:, None] == 3, -2.0, X)
-    found = PopulationDensity(inputs).log_likelihoods(roots, [outside], LOG_A)
+    found = log_likelihoods(inputs, roots, [outside], LOG_A)
     assert np.isneginf(found[:3]).all()
     assert np.isneginf(found[3]).tolist() == [name != "normal" and i == 3 for i in range(7)]
 
@@ -85,17 +90,15 @@ def test_populations_far_narrower_than_their_points() -> None:
     """Their rows are those of the graph, beside rows of the product of matrices."""
     inputs = inputs_of(pm.Normal.dist)
     roots = by_name(inputs, {"a0": np.full(3, 0.3), "b0": np.array([1e-6, 0.5, 1e-3])})
-    found = PopulationDensity(inputs).log_likelihoods(roots, [X], LOG_A)
+    found = log_likelihoods(inputs, roots, [X], LOG_A)
     assert np.allclose(found, by_graph(inputs, roots, [X], LOG_A), rtol=1e-12)
 
 
 def test_squares_of_a_distant_mean_keep_their_digits() -> None:
     inputs = inputs_of(pm.Normal.dist)
     roots = by_name(inputs, {"a0": 1e8 + FIRST, "b0": SECOND})
-    found = PopulationDensity(inputs).log_likelihoods(roots, [1e8 + X], LOG_A)
-    near = PopulationDensity(inputs).log_likelihoods(
-        by_name(inputs, {"a0": FIRST, "b0": SECOND}), [X], LOG_A
-    )
+    found = log_likelihoods(inputs, roots, [1e8 + X], LOG_A)
+    near = log_likelihoods(inputs, by_name(inputs, {"a0": FIRST, "b0": SECOND}), [X], LOG_A)
     assert np.allclose(found, near, rtol=1e-5)
 
 
@@ -106,7 +109,7 @@ def test_independent_inputs_and_vectors_add() -> None:
         inputs = read_inputs("y", [vector, pm.Gamma.dist(alpha=sigma, beta=np.float64(2))], model)
     roots = by_name(inputs, {"a0": np.stack([FIRST, SECOND], axis=1), "b0": SECOND})
     x = [np.stack([X, 2 * X], axis=2), X]
-    found = PopulationDensity(inputs).log_likelihoods(roots, x, LOG_A)
+    found = log_likelihoods(inputs, roots, x, LOG_A)
     assert np.allclose(found, by_graph(inputs, roots, x, LOG_A), rtol=1e-12)
 
 
@@ -119,7 +122,7 @@ def test_correlated_inputs() -> None:
     rhos = np.array([0.0, -0.9, 0.99, 1.01])
     roots = by_name(inputs, {"a0": rhos, "b0": SECOND})
     x = np.stack([X, X[::-1]], axis=2)
-    found = PopulationDensity(inputs).log_likelihoods(roots, [x], LOG_A)
+    found = log_likelihoods(inputs, roots, [x], LOG_A)
     expected = by_graph(inputs, roots, [x], LOG_A)
     assert np.isneginf(found[3]).all()
     assert np.allclose(found[:3], expected[:3], rtol=1e-11)
@@ -127,18 +130,17 @@ def test_correlated_inputs() -> None:
 
 def test_other_families_have_their_graph() -> None:
     inputs = inputs_of(lambda a, b: pm.Weibull.dist(alpha=a, beta=b))
-    density = PopulationDensity(inputs)
     assert ExponentialForm.of(inputs.aleatory, [X.ravel()]) is None
     roots = by_name(inputs, {"a0": FIRST[:3], "b0": SECOND[:3]})
     expected = by_graph(inputs, roots, [X], LOG_A)
-    assert np.allclose(density.log_likelihoods(roots, [X], LOG_A), expected, rtol=1e-12)
+    assert np.allclose(log_likelihoods(inputs, roots, [X], LOG_A), expected, rtol=1e-12)
 
 
 def test_no_points_have_no_density() -> None:
     inputs = inputs_of(pm.Normal.dist)
     roots = by_name(inputs, {"a0": FIRST, "b0": SECOND})
     nothing = np.empty((2, 0))
-    found = PopulationDensity(inputs).log_likelihoods(roots, [nothing], nothing)
+    found = log_likelihoods(inputs, roots, [nothing], nothing)
     assert np.isneginf(found).all()
     assert found.shape == (4, 2)
 
