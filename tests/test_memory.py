@@ -125,7 +125,7 @@ def test_the_support_of_many_populations_is_looked_at_in_parts(
     evaluator = Evaluator(build())
     thetas = evaluator.prior_thetas(50, 1)
     whole = evaluator.support(thetas)["y"]
-    monkeypatch.setattr("prbayes.model.evaluator.AT_ONCE", 1024)
+    monkeypatch.setattr("prbayes.model.evaluator.IN_CACHE", 1024)
     parts = evaluator.support(thetas)["y"]
     assert all(np.array_equal(whole[key], parts[key]) for key in whole)
     design = evaluator.designs["y"]

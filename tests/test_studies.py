@@ -9,17 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
-from scipy.stats import norm
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks import (
     contamination,
-    coverage,
     families,
     likelihood_coverage,
     likelihood_guards,
+    posterior,
     readings_coverage,
     record,
 )
@@ -27,84 +25,20 @@ from benchmarks import (
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize("size", [20, 50])
-@pytest.mark.parametrize(
-    ("problem", "count"), [("linear", 60), ("quadratic", 60), ("correlated", 15)]
-)
-def test_coverage(problem: str, count: int, size: int) -> None:
-    # Two hyperparameters that are nearly independent: at 60 data sets the standard error of the
-    # mean coverage is .03, and that of a standard deviation 9%.
-    rows = coverage.block(problem, size, 0, count, coverage.METRICS)
-    error = (60 / count) ** 0.5
-    for metric in coverage.METRICS:
-        found = coverage.summarise(rows, metric, "affine")
-        # A few of the smallest data sets say that sigma is nearly zero, where no design of 4096
-        # points lies.
-        assert found["failed"] <= (0.2 * count if (problem, size) == ("correlated", 20) else 0)
-        assert abs(np.mean(found["coverage_89%"]) - 0.89) < 0.10 * error
-        assert np.min(found["sd_over_own_sampling_sd"]) > 1 - 0.3 * error
-        # At N = 20 the full study has up to 1.44, its first 60 data sets alone 2.30: some estimates
-        # lie near an edge.
-        assert np.max(found["sd_over_own_sampling_sd"]) < (2.2 if size == 20 else 1.2) + 0.3 * error
-
-
-@pytest.mark.parametrize("sigma", [0.02, 0.13, 0.4999, 0.5, 2.0])
-def test_the_exact_density_of_correlated_inputs_is_its_integral(sigma: float) -> None:
-    mu, given = 3.0, 0.2 * np.sqrt(0.75)
-    for y in (2.0, 3.0, 4.5):
-        expected, _ = quad(
-            lambda z, y=y: norm.pdf(z) * norm.pdf(np.log(y / (mu + sigma * z)), 0.1 * z, given) / y,
-            max(-8.0, -mu / sigma),
-            8.0,
-            epsabs=1e-12,
-            limit=500,
-        )
-        found = coverage.PROBLEMS["correlated"].density(y, mu, sigma)
-        np.testing.assert_allclose(found, expected, rtol=1e-4)
-
-
-def test_estimates_at_an_edge_are_no_spread() -> None:
-    estimates = norm.ppf((np.arange(13) + 0.5) / 13)
-    found = coverage.spread(np.r_[estimates, -8.0, -12.0][:, None])
-    np.testing.assert_allclose(found, estimates.std(ddof=1), rtol=1e-12)
-
-
-def test_a_study_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    called = []
-
-    def block(
-        problem: str, size: int, first: int, count: int, metrics: tuple[str, ...]
-    ) -> list[dict[str, object]]:
-        called.append((problem, size, first))
-        return coverage_block(problem, size, first, 2, metrics)
-
-    coverage_block = coverage.block
-    monkeypatch.setattr(coverage, "block", block)
-    monkeypatch.setattr(coverage, "ProcessPoolExecutor", _Here)
-    arguments = ["coverage", "--problems", "linear", "--sizes", "20", "--store", str(tmp_path)]
-    arguments += ["--out", str(tmp_path / "coverage.json")]
-    for replicates in ("20", "40", "40"):
-        monkeypatch.setattr(sys, "argv", [*arguments, "--replicates", replicates])
-        coverage.main()
-    assert called == [("linear", 20, 0), ("linear", 20, 20)]
-
-
-class _Here:
-    def __init__(self, workers: int, mp_context: object) -> None:
-        pass
-
-    def __enter__(self) -> _Here:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        pass
-
-    def submit(self, function: object, *arguments: object) -> object:
-        from concurrent.futures import Future
-
-        future: Future[object] = Future()
-        future.set_result(function(*arguments))  # type: ignore[operator]
-        return future
+@pytest.mark.parametrize("prior", posterior.PRIORS)
+@pytest.mark.parametrize("metric", posterior.METRICS)
+def test_coverage(metric: str, prior: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(posterior, "STORE", tmp_path)
+    cell = ("linear", prior, 20, metric)
+    # A study continues where it stopped.
+    for until in (10, 40):
+        posterior.continue_cell(cell, until)
+    rows = posterior.rows_of(cell)
+    assert [row["data set"] for row in rows] == list(range(40))
+    found = posterior.summary(rows)
+    assert found["failed"] <= 2
+    # The standard error of a coverage of .89 of 80 intervals is .035.
+    assert abs(np.mean(found["coverage"]) - 0.89) < 4 * 0.035
 
 
 def test_contamination_of_the_probability_residual() -> None:
@@ -113,7 +47,7 @@ def test_contamination_of_the_probability_residual() -> None:
     for i in range(6):
         data = np.random.default_rng([5, i]).normal(10, 1, contamination.SIZE)
         dirty = np.r_[data[:-3], np.full(3, 10 + contamination.DISTANCE)]
-        clean, after = (contamination.posterior(evaluator, d, True) for d in (data, dirty))
+        clean, after = (contamination.posterior(evaluator, d) for d in (data, dirty))
         shifts.append((after[:, 0] - clean[:, 0]) / clean[:, 1])
     mu, sigma = np.mean(shifts, axis=0)
     assert abs(mu) < 0.3

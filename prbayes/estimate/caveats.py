@@ -296,8 +296,8 @@ def small_simulators(evaluator: Evaluator, enough: int = 30) -> list[str]:
     is_biased = [
         node.metric.minimum is Minimum.ABSOLUTE or node.target.likelihood for node in nodes
     ]
-    fewest = min(len(node.observed) for node in nodes)
-    if dependent(nodes) or len(nodes) == 1 or fewest >= enough or not any(is_biased):
+    fewest = min((len(node.observed) for node in nodes), default=enough)
+    if len(nodes) < 2 or fewest >= enough or not any(is_biased) or dependent(nodes):
         return []
     if not _have_hyperparameters_in_common(evaluator):
         return []

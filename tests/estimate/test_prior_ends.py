@@ -56,7 +56,11 @@ def test_data_beyond_a_prior_are_said_to_push_and_draws_stay_there(
     found = model(place + 0.3 * LEVELS, unit, narrow, METRICS[name], propagation)
     with found:
         optimum = prb.minimize(progressbar=False)
-        tree = prb.sample_smc(draws=300, chains=2, random_seed=1, progressbar=False)
+        # Refits of the area metric are at an edge, where its estimate has no density.
+        adjustment: Any = None if name == "area" else "estimate"
+        tree = prb.sample_smc(
+            draws=300, chains=2, adjustment=adjustment, random_seed=1, progressbar=False
+        )
     (line,) = (line for line in optimum.warnings if "the data push mu to" in line)
     assert f"next to the end of its prior at {bound:.4g}" in line
     assert not any("tell less than the prior about mu" in line for line in optimum.warnings)
