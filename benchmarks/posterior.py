@@ -26,6 +26,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 import pymc as pm
@@ -201,13 +202,13 @@ def build(problem: Problem, prior: str, metric: str, size: int) -> Any:
     return Evaluator(model)
 
 
-def analyse(evaluator: Any, problem: Problem, i: int) -> dict[str, Any]:
+def analyse(evaluator: Any, problem: Problem, seed: list[int]) -> dict[str, Any]:
     """Draw a truth and its data, calibrate them, and return the posterior's place and width."""
     from prbayes.estimate.minimization import Minimisation, find_optimum
     from prbayes.posterior.sample import draw_posterior
     from prbayes.posterior.smc import Sampling
 
-    rng = np.random.default_rng([2028, i])
+    rng = np.random.default_rng(seed)
     truth = evaluator.prior_thetas(1, int(rng.integers(2**31)))
     values = [v[0] for v in evaluator.constrained(truth).values()]
     data = {}
@@ -273,6 +274,8 @@ def continue_cell(cell: Cell, until: int) -> None:
     name, prior, size, metric = cell
     problem = PROBLEMS[name]
     evaluator = build(problem, prior, metric, size)
+    # Metrics see the same data; truths of other cells are independent.
+    of_cell = crc32(f"{name}/{prior}/{size}".encode())
     for i in missing:
         row: dict[str, Any]
         try:
@@ -280,7 +283,7 @@ def continue_cell(cell: Cell, until: int) -> None:
                 stack.enter_context(shown(False))
                 for design in evaluator.designs.values():
                     stack.enter_context(design.undone())
-                row = analyse(evaluator, problem, i)
+                row = analyse(evaluator, problem, [2028, i, of_cell])
         except Exception as error:  # a failure is a result
             row = {"error": f"{type(error).__name__}: {error}"[:300]}
         with path(cell).open("a") as file:
