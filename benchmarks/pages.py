@@ -57,8 +57,6 @@ def posterior_coverage() -> Iterator[Row]:
             name,
             f"{short(group['coverage'], 3)} ± {short(group['error'], 3)}",
             f"{group['intervals']:,}",
-            short(group["lowest"]),
-            short(group["highest"]),
             str(group["failed"]),
         ]
 

@@ -59,8 +59,8 @@ def answers(kind: str, factor: float) -> dict[str, Any]:
             propagation=prb.Reweighted(256),
         )
     optimum = prb.minimize(model, progressbar=False)
-    posterior = prb.sample_smc(
-        100, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False
+    posterior = prb.sample(
+        500, chains=2, model=model, optimum=optimum, random_seed=1, progressbar=False
     )
     (epsilon,) = prb.calibrate_epsilon(optimum).values()
     draws = posterior.posterior["mu"].values

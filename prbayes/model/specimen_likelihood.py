@@ -409,15 +409,6 @@ class SpecimenLikelihood:
         return self.coordinates.inputs(points.z), log_a + self.coordinates.log_jacobian(points.z)
 
     @cached_property
-    def _points_by_group(self) -> list[WeightedPoints]:
-        """The points of the specimens of each group."""
-        x, log_a = self._weighted_points
-        return [
-            WeightedPoints.of(self.inputs, [v[rows] for v in x], log_a[rows])
-            for _, rows in self.by_group
-        ]
-
-    @cached_property
     def arrays(self) -> tuple[list[Any], Any]:
         """Shared variables of the points, (N, K, *event) by input, and of the numbers A, (N, K)."""
         points, log_a = self._weighted_points
@@ -426,6 +417,24 @@ class SpecimenLikelihood:
             for i, x in enumerate(points)
         ]
         return shared, pytensor.shared(log_a, name=f"{self.name}_log_a")
+
+    def _points_by_group(self) -> list[WeightedPoints]:
+        """Return the points of the specimens of each group, as the shared variables have them.
+
+        Refits put other specimens there.
+        """
+        shared, shared_log_a = self.arrays
+        log_a = shared_log_a.get_value(borrow=True)
+        last: tuple[Any, list[WeightedPoints]] = vars(self).get("_last_points", (None, []))
+        known, points = last
+        if known is not log_a:
+            x = [variable.get_value(borrow=True) for variable in shared]
+            points = [
+                WeightedPoints.of(self.inputs, [v[rows] for v in x], log_a[rows])
+                for _, rows in self.by_group
+            ]
+            vars(self)["_last_points"] = (log_a, points)
+        return points
 
     @property
     def needs_graph(self) -> bool:
@@ -444,7 +453,7 @@ class SpecimenLikelihood:
         """
         size = len(next(iter(params.values())))
         result = np.empty((size, len(self.readings)))
-        for (place, rows), points in zip(self.by_group, self._points_by_group, strict=True):
+        for (place, rows), points in zip(self.by_group, self._points_by_group(), strict=True):
             roots = [
                 np.full(size, place) if is_group(root) else params[root]
                 for root in self.inputs.roots
