@@ -16,6 +16,7 @@ from prbayes._finding import Finding
 from prbayes._html import view
 from prbayes._pages import more_in
 from prbayes._specimen_checks import Checked, check_draws, check_optimum, separate_modes
+from prbayes.estimate.caveats import small_simulators
 from prbayes.estimate.data_sets import SETS
 from prbayes.estimate.disagreement import disagreement
 from prbayes.estimate.goodness import UNLIKELY, Refitted, of_another_family, of_held_away
@@ -190,7 +191,8 @@ def _of_optimum(optimum: Optimum) -> Diagnosis:
     else:
         checked = check_optimum(optimum)
         family, notes = [], checked.notes
-    messages = _sentences([*optimum.warnings, *family])
+    small = small_simulators(optimum.evaluator)
+    messages = _sentences([*optimum.warnings, *small, *family])
     told = optimum.at_edge or optimum.stopped  # by the warnings
     if not optimum.converged and not told:
         messages.append(_not_converged(optimum.message))

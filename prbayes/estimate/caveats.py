@@ -272,7 +272,6 @@ def caveats(
     And whether the design is too small.
     """
     lines = [f"{node.name}: {node.target.missed}" for node in evaluator.nodes if node.target.missed]
-    lines += small_simulators(evaluator)
     if design_error > _TOLERATED:
         lines.append(_of_design(evaluator, design_error))
     for rival in others:

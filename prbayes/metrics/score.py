@@ -156,7 +156,8 @@ def prepared_on_population(target: Discrepancy, responses: Floats, weights: Floa
         )
         inner = replace(inner, density=GaussianKDE(rule))
     table = responses.reshape(len(responses), -1)
-    is_finite = np.isfinite(table).all(axis=1)
+    # Far away responses of no weight would stretch the grid.
+    is_finite = np.isfinite(table).all(axis=1) & (weights > 1e-8 * weights.max())
     shares = weights[is_finite]
     shares = shares / shares.sum()
     prepared = metric.like(inner).against(responses[is_finite], shares)
