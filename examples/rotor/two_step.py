@@ -132,10 +132,11 @@ def sampled(model, metric, epsilon):
     """Return the posterior; the optimum includes the prior, which identifies the damping.
 
     The posterior given the area metric's estimate needs stored responses: draws are those of ABC.
+    Draws of the log-likelihood with epsilon = 1/N are the posterior.
     """
     prb.set_epsilon(model, epsilon)
     settings = {"chains": 2, "model": model, "random_seed": 1, "progressbar": False}
-    if isinstance(metric, prb.AreaMetric):
+    if isinstance(metric, prb.AreaMetric | prb.LogLikelihood):
         return prb.sample_smc(500, adjustment=None, **settings)
     center = prb.minimize(model, prior=True, progressbar=False)
     return prb.sample(500, optimum=center, **settings)
