@@ -20,6 +20,7 @@ from prbayes._checks import Floats
 from prbayes._finding import Finding
 from prbayes.estimate.differences import cross, slopes
 from prbayes.estimate.failing_region import failing_region_findings
+from prbayes.estimate.identifiability import oriented
 from prbayes.estimate.minimization import Minimisation, find_optimum
 from prbayes.estimate.optimum import Optimum
 from prbayes.estimate.specimen_refits import (
@@ -439,7 +440,9 @@ def _predictive_estimates(optimum: Optimum, prior: Floats) -> Floats:
         covariance = _covariance(evaluator, compiled, theta, rng)
         if np.isfinite(covariance).all():
             values, vectors = np.linalg.eigh(covariance)
-            noise = vectors @ (np.sqrt(np.maximum(values, 0)) * rng.standard_normal(len(theta)))
+            noise = oriented(vectors) @ (
+                np.sqrt(np.maximum(values, 0)) * rng.standard_normal(len(theta))
+            )
             row[:] = theta + ratio * noise
     return estimates
 

@@ -21,6 +21,7 @@ from prbayes._predict import (
     serving,
 )
 from prbayes.decision.quantities import Quantity
+from prbayes.estimate.identifiability import oriented
 from prbayes.estimate.optimum import Optimum, require_sampling
 from prbayes.model.emulated import (
     EmulatedResponse,
@@ -273,7 +274,7 @@ def _normal_thetas(optimum: Optimum, draws: int, caller: str) -> Floats:
         )
     z = ndtri(sobol(draws, optimum.theta.size, seed=0))
     values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    root = oriented(vectors) * np.sqrt(np.maximum(values, 0.0))
     return np.asarray(optimum.theta + z @ root.T)
 
 

@@ -55,6 +55,15 @@ def without(unidentified: Floats, elements: NDArray[np.bool_]) -> Floats:
     return np.asarray(axes[:, strength > 0.5])
 
 
+def oriented(axes: Floats) -> Floats:
+    """Return axes, columns of (d, r), with signs that do not depend on rounding.
+
+    The signs of eigenvectors are arbitrary, and draws along the axes depend on them.
+    """
+    direction = np.cos(np.arange(len(axes)))
+    return np.where(direction @ axes < 0, -axes, axes)
+
+
 def named_direction(direction: Floats, names: list[str]) -> str:
     """Name a direction by its largest elements, relative to the largest: 'mu - 0.8 sigma'."""
     largest = np.argmax(np.abs(direction))

@@ -18,6 +18,7 @@ from prbayes.estimate.batch_objective import BatchObjective
 from prbayes.estimate.batch_simplex import descend_by_simplex
 from prbayes.estimate.curvature import second_differences
 from prbayes.estimate.data_sets import SETS, simulated_sets
+from prbayes.estimate.identifiability import oriented
 from prbayes.estimate.sampling import Local
 from prbayes.model.evaluator import Evaluator
 
@@ -226,7 +227,8 @@ def principal_axes(points: Floats) -> tuple[Floats, Floats]:
     # Runaways are drawn in before they count in the covariance.
     counted = drawn_in(points, 3.0)
     covariance = np.cov(counted, rowvar=False).reshape(d, d)
-    _, axes = np.linalg.eigh(covariance)
+    _, vectors = np.linalg.eigh(covariance)
+    axes = oriented(vectors)
     # Spreads along the axes, none so small that a division by it fails.
     turned = points @ axes
     low, _, high = np.quantile(turned, _LEVELS, axis=0)

@@ -10,6 +10,7 @@ import numpy as np
 
 from prbayes._checks import Floats
 from prbayes.estimate.data_sets import families, siblings
+from prbayes.estimate.identifiability import oriented
 from prbayes.estimate.refit import DesignErrors
 from prbayes.estimate.sampling import Local
 from prbayes.estimate.sandwich import Information
@@ -354,7 +355,7 @@ def spread_around(center: Floats, covariance: Floats, prior_sd: Floats, *, seed:
     sd = np.sqrt(np.clip(values, 0, 1))
     rng = np.random.default_rng(seed)
     z = rng.standard_normal((THETAS, center.size))
-    steps = (z * sd) @ vectors.T
+    steps = (z * sd) @ oriented(vectors).T
     return np.asarray(center + steps * prior_sd)
 
 
@@ -364,5 +365,5 @@ def spread_along(center: Floats, local: Local, *, seed: int = 0) -> Floats:
     sd = np.sqrt(np.clip(values, 0, 1))
     rng = np.random.default_rng(seed)
     z = rng.standard_normal((THETAS, sd.size))
-    steps = (z * sd) @ (local.identified @ vectors).T
+    steps = (z * sd) @ oriented(local.identified @ vectors).T
     return np.asarray(center + steps * local.prior_sd)

@@ -19,6 +19,7 @@ from prbayes.estimate.batch_simplex import descend_by_simplex
 from prbayes.estimate.curvature import second_differences
 from prbayes.estimate.data_sets import SETS, DataSets, observed_set, one_set
 from prbayes.estimate.feature_map import WORTH, Shortcut
+from prbayes.estimate.identifiability import oriented
 from prbayes.estimate.measured import Refits
 from prbayes.estimate.obstacles import measured_by_refits
 from prbayes.estimate.prepared_anew import PREPARED, told_enough
@@ -92,7 +93,7 @@ class SamplingDistribution:
         else:
             local = local_sampling(information, scales, weakest)
         variances, vectors = np.linalg.eigh(local.covariance)
-        axes = local.identified @ vectors
+        axes = oriented(local.identified @ vectors)
         # Rounding may leave a variance of zero or less.
         positive = np.maximum(variances, 1e-300)
         return cls(

@@ -10,6 +10,7 @@ import prbayes as prb
 from prbayes.estimate.identifiability import (
     identified_by_area,
     identified_by_curvature,
+    oriented,
     unidentified_directions,
     without,
 )
@@ -192,3 +193,10 @@ def test_what_is_looked_at_stays_when_the_design_grows() -> None:
     design.add([np.atleast_1d(values) for values in evaluator.roots(theta[None], 0)], 512)
     assert design.n_points == 1536
     np.testing.assert_array_equal(identified_by_area(information), before)
+
+
+def test_signs_of_axes_do_not_matter() -> None:
+    axes, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(5, 3)))
+    turned = oriented(axes * np.array([1.0, -1.0, -1.0]))
+    np.testing.assert_array_equal(turned, oriented(axes))
+    np.testing.assert_array_equal(np.abs(turned), np.abs(axes))
